@@ -1,0 +1,32 @@
+"""The few errors of `calibration`. The command line turns them into exit statuses 1, 2 and 3."""
+
+from __future__ import annotations
+
+
+class CalibrationError(Exception):
+    """Base of all errors of `calibration`; on its own: the computation failed."""
+
+
+class RigError(CalibrationError):
+    """A rig file is malformed or contradicts itself; the message names file, key and what is allowed."""
+
+    def __init__(self, source: str, where: str, reason: str) -> None:
+        super().__init__(f"{source}: {where}: {reason}" if where else f"{source}: {reason}")
+        self.source, self.where, self.reason = source, where, reason
+
+
+class DataError(CalibrationError):
+    """Observations are malformed or do not fit the rig; the message names file, line, column and reason."""
+
+    def __init__(self, source: str, reason: str, line: int | None = None, column: str | None = None) -> None:
+        place = source + (f", line {line}" if line is not None else "") + (f", column {column}" if column else "")
+        super().__init__(f"{place}: {reason}")
+        self.source, self.reason, self.line, self.column = source, reason, line, column
+
+
+class ModelError(CalibrationError):
+    """A model directory is truncated, edited, of another version, or not a model at all."""
+
+
+class UnsafeError(CalibrationError):
+    """The result would be unsafe to use: not identifiable, worse than the live model, another rig's data."""

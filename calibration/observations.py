@@ -1,0 +1,243 @@
+"""The one table that flows: fixes with the joint readings at their own instants, as the contract's CSV has it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.errors import DataError
+from calibration.rig import Rig
+
+Floats = NDArray[np.float64]
+Strings = NDArray[np.str_]
+
+POSITION_COLUMNS = ("x_mm", "y_mm", "z_mm")
+SIGMA_COLUMNS = ("sigma_x_mm", "sigma_y_mm", "sigma_z_mm")
+LABEL_COLUMNS = ("setup", "session", "pose")
+DIRECTIONS = (-1.0, 0.0, 1.0)
+_SIGNAL = re.compile(r"[A-Za-z][A-Za-z0-9_]*_(bar|mA)")
+
+
+@dataclass(frozen=True)
+class Observations:
+    """n observations of one rig.
+
+    Attributes:
+        prism: (n,) prism of each fix.
+        joints: joint name -> (n,) readings, deg or mm as the rig's joint says.
+        position_mm: (n, 3) in the station's frame; NaN rows only where positions were not required.
+        sigma_mm: (n, 3) standard deviation of each coordinate; NaN where not given.
+        setup: (n,) station set-up; "" where not given.
+        session: (n,) calibration session; "" where not given.
+        pose: (n,) standstill; "" where not given. A pose is unique within its session and set-up.
+        extra: optional columns by their CSV name (`time_s`, `theta1_dir`, `boom_valve_mA`, ...) -> (n,), NaN where
+            not measured.
+        ignored_columns: columns of the file that are not part of the contract.
+    """
+
+    prism: Strings
+    joints: Mapping[str, Floats]
+    position_mm: Floats
+    sigma_mm: Floats
+    setup: Strings
+    session: Strings
+    pose: Strings
+    extra: Mapping[str, Floats] = field(default_factory=dict)
+    ignored_columns: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.prism)
+
+    def select(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Observations:
+        """The given rows, by mask or by index."""
+        return replace(
+            self,
+            prism=self.prism[rows],
+            joints={k: v[rows] for k, v in self.joints.items()},
+            position_mm=self.position_mm[rows],
+            sigma_mm=self.sigma_mm[rows],
+            setup=self.setup[rows],
+            session=self.session[rows],
+            pose=self.pose[rows],
+            extra={k: v[rows] for k, v in self.extra.items()},
+        )
+
+    def groups(self) -> Strings:
+        """(n,) labels for grouped splits: sessions or set-ups where there are several, else 100 mm workspace cells."""
+        for labels in (self.session, self.setup):
+            if len(np.unique(labels)) > 1:
+                return labels
+        return self.cells()
+
+    def cells(self, size_mm: float = 100.0) -> Strings:
+        """(n,) workspace cells: coordinates divided by `size_mm` and rounded to even halves, as `round` does."""
+        index = np.rint(self.position_mm / size_mm).astype(int)
+        return np.array([f"{x},{y},{z}" for x, y, z in index], dtype=np.str_)
+
+
+def optional_columns(rig: Rig) -> set[str]:
+    """Numeric columns of the contract that a file may have for `rig`, apart from `<signal>_bar` and `<signal>_mA`."""
+    columns = {"time_s", "dwell_s", "temperature_degC", "payload_kg"}
+    for joint in rig.joints:
+        columns |= {f"{joint.name}_dir", f"{joint.name}_rate", f"{joint.name}_Nm"}
+    return columns | {c.column for c in rig.channels if c.name not in rig.joint_names}
+
+
+def parse_observations(data: bytes, rig: Rig, source: str, *, positions_required: bool = True) -> Observations:
+    """Read an observations CSV; a bad file is refused whole.
+
+    Args:
+        data: the file's bytes (UTF-8, comma, header; a byte-order mark is tolerated).
+        rig: whose joints and prisms the file must have.
+        source: file name for messages.
+        positions_required: False for prediction, where `x_mm,y_mm,z_mm` may be missing or empty.
+
+    Raises:
+        DataError: with file, line, column and reason.
+    """
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise DataError(source, f"byte {error.start} is not UTF-8; save the file as UTF-8", line) from error
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    lines: list[int] = []
+    rows: list[list[str]] = []
+    try:
+        header = [name.strip() for name in next(reader, [])]
+        for row in reader:
+            if row:
+                lines.append(reader.line_num)
+                rows.append(row)
+    except csv.Error as error:
+        raise DataError(source, f"not a CSV file: {error}", reader.line_num) from error
+    _check_header(header, rig, source, positions_required)
+    if not rows:
+        raise DataError(source, "no observations below the header")
+    for line, row in zip(lines, rows, strict=True):
+        if len(row) != len(header):
+            raise DataError(source, f"{len(row)} fields where the header has {len(header)}", line)
+    table = _Table(source, {name: [row[i].strip() for row in rows] for i, name in enumerate(header)}, lines)
+    return _build(table, header, rig, positions_required)
+
+
+def format_observations(
+    observations: Observations, rig: Rig, more: Mapping[str, Sequence[object] | Floats] | None = None
+) -> str:
+    """Observations as the contract's CSV, with shortest exact numbers and empty cells for what is not measured.
+
+    Args:
+        observations: the table.
+        rig: gives the joints' units.
+        more: further columns to append (`predict` adds `x_pred_mm`, ...).
+    """
+    columns: dict[str, Sequence[object] | Floats | Strings] = {"prism": observations.prism}
+    columns |= {rig.joint(name).column: values for name, values in observations.joints.items()}
+    columns |= {name: observations.position_mm[:, i] for i, name in enumerate(POSITION_COLUMNS)}
+    for name in LABEL_COLUMNS:
+        labels: Strings = getattr(observations, name)
+        if np.any(labels != ""):
+            columns[name] = labels
+    if np.isfinite(observations.sigma_mm).any():
+        columns |= {name: observations.sigma_mm[:, i] for i, name in enumerate(SIGMA_COLUMNS)}
+    columns |= dict(observations.extra) | dict(more or {})
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*([_cell(v) for v in values] for values in columns.values()), strict=True))
+    return out.getvalue()
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, float):
+        return "" if math.isnan(value) else repr(float(value))
+    return str(value)
+
+
+@dataclass(frozen=True)
+class _Table:
+    source: str
+    columns: Mapping[str, list[str]]
+    lines: list[int]
+
+    def numbers(self, column: str, *, required: bool) -> Floats:
+        out = np.full(len(self.lines), np.nan)
+        for i, (line, cell) in enumerate(zip(self.lines, self.columns[column], strict=True)):
+            if not cell:
+                if required:
+                    raise DataError(self.source, "empty, but every observation needs it", line, column)
+                continue
+            try:
+                out[i] = float(cell)
+            except ValueError:
+                raise DataError(self.source, f"{cell!r} is not a number", line, column) from None
+            if not math.isfinite(out[i]):
+                raise DataError(self.source, f"{cell!r} is not a finite number; leave it empty", line, column)
+        return out
+
+    def labels(self, column: str) -> Strings:
+        return np.array(self.columns.get(column, [""] * len(self.lines)), dtype=np.str_)
+
+    def check(self, column: str, values: Floats, bad: NDArray[np.bool_], reason: str) -> None:
+        if bad.any():
+            i = int(np.argmax(bad))
+            raise DataError(self.source, f"{values[i]:g} {reason}", self.lines[i], column)
+
+
+def _check_header(header: list[str], rig: Rig, source: str, positions_required: bool) -> None:
+    if not header or header == [""]:
+        raise DataError(source, "the file is empty; a header is needed", 1)
+    doubled = sorted({name for name in header if header.count(name) > 1})
+    if doubled:
+        raise DataError(source, "column appears twice", 1, doubled[0])
+    needed = ["prism", *(j.column for j in rig.joints), *(POSITION_COLUMNS if positions_required else ())]
+    missing = [name for name in needed if name not in header]
+    if missing:
+        raise DataError(source, f"column missing for rig {rig.name!r}; needed: {', '.join(needed)}", 1, missing[0])
+
+
+def _build(table: _Table, header: list[str], rig: Rig, positions_required: bool) -> Observations:
+    prism = table.labels("prism")
+    for line, name in zip(table.lines, prism, strict=True):
+        if name not in rig.prism_names:
+            allowed = ", ".join(rig.prism_names)
+            raise DataError(
+                table.source, f"rig {rig.name!r} has no prism {str(name)!r}; it has {allowed}", line, "prism"
+            )
+
+    def triple(columns: tuple[str, ...], *, required: bool) -> Floats:
+        out = np.full((len(prism), 3), np.nan)
+        for i, name in enumerate(columns):
+            if name in header:
+                out[:, i] = table.numbers(name, required=required)
+        return out
+
+    sigma_mm = triple(SIGMA_COLUMNS, required=False)
+    for i, name in enumerate(SIGMA_COLUMNS):
+        table.check(name, sigma_mm[:, i], sigma_mm[:, i] <= 0, "is not a standard deviation; it must be positive")
+    known = optional_columns(rig)
+    extra_names = [c for c in header if c in known or (_SIGNAL.fullmatch(c) and c not in SIGMA_COLUMNS)]
+    extra = {name: table.numbers(name, required=False) for name in extra_names}
+    for name, values in extra.items():
+        if name.endswith("_dir"):
+            bad = np.isfinite(values) & ~np.isin(values, DIRECTIONS)
+            table.check(name, values, bad, "is not a direction; allowed: -1, 0, 1")
+    used = {"prism", *(j.column for j in rig.joints), *POSITION_COLUMNS, *SIGMA_COLUMNS, *LABEL_COLUMNS, *extra_names}
+    return Observations(
+        prism=prism,
+        joints={j.name: table.numbers(j.column, required=True) for j in rig.joints},
+        position_mm=triple(POSITION_COLUMNS, required=positions_required),
+        sigma_mm=sigma_mm,
+        setup=table.labels("setup"),
+        session=table.labels("session"),
+        pose=table.labels("pose"),
+        extra=extra,
+        ignored_columns=tuple(c for c in header if c not in used),
+    )

@@ -1,0 +1,278 @@
+"""The rig description: joints, rows, prisms, masses, channels and station, read from a TOML file.
+
+A rig file is data; nothing here computes kinematics. Rows are numbered from 1 as in the papers; frame i is the frame
+after row i. Files keep degrees and mm, and so does this description.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator
+from importlib import resources
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from calibration.channels import Channel
+from calibration.errors import RigError
+
+Vector = tuple[float, float, float]
+RowParameter = Literal["alpha", "a", "d", "theta", "beta", "b"]
+Driven = Literal["theta", "d", "a"]
+Convention = Literal["mdh_beta_after", "mdh_beta_before", "dh"]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Joint(_Part):
+    """A joint value: what one encoder or length transducer reads.
+
+    Attributes:
+        name: as in the observations CSV (`theta1`, `L2`).
+        kind: `revolute` (values in deg) or `prismatic` (mm).
+        limits: lowest and highest value, deg or mm.
+        sigma: random error of a reading, 1 sigma, deg or mm; enters the observation covariance.
+        resolution: quantisation step of the reading, deg or mm.
+        linearity: systematic error bound, deg, or a fraction of the stroke for `prismatic`; no noise.
+        max_rate: fastest motion, deg/s or mm/s; a faster jump is no motion.
+    """
+
+    name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
+    kind: Literal["revolute", "prismatic"]
+    limits: tuple[float, float]
+    sigma: float = Field(gt=0)
+    resolution: float = Field(default=0.0, ge=0)
+    linearity: float = Field(default=0.0, ge=0)
+    max_rate: float = Field(default=30.0, gt=0)
+
+    @property
+    def unit(self) -> Literal["deg", "mm"]:
+        """Unit of the joint's values."""
+        return "deg" if self.kind == "revolute" else "mm"
+
+    @property
+    def column(self) -> str:
+        """The joint's column in an observations CSV."""
+        return f"{self.name}_{self.unit}"
+
+    @model_validator(mode="after")
+    def _limits_in_order(self) -> Joint:
+        if self.limits[0] >= self.limits[1]:
+            raise ValueError(f"limits must rise, got {self.limits[0]} .. {self.limits[1]}")
+        return self
+
+
+class FixedTransform(_Part):
+    """A constant transform before a row: Trans(x,y,z) Rot(z) Rot(y) Rot(x), applied in that order."""
+
+    x_mm: float = 0.0
+    y_mm: float = 0.0
+    z_mm: float = 0.0
+    rz_deg: float = 0.0
+    ry_deg: float = 0.0
+    rx_deg: float = 0.0
+
+
+class Row(_Part):
+    """One row of the kinematic table, nominal values.
+
+    Conventions (`Rig.convention`):
+        mdh_beta_after:  Trans(x,a) Rot(x,alpha) Trans(z,d) Rot(z,theta) Rot(y,beta)   (first paper, Eq. 1)
+        mdh_beta_before: Rot(x,alpha) Trans(x,a) Rot(y,beta) Trans(y,b) Rot(z,theta) Trans(z,d)   (second paper)
+        dh:              Rot(z,theta) Trans(z,d) Trans(x,a) Rot(x,alpha)   (standard Denavit-Hartenberg)
+
+    Attributes:
+        alpha_deg, a_mm, d_mm, theta_deg, beta_deg, b_mm: constants of the row.
+        drive: for `theta`, `d` or `a`: which joints move it, as a linear combination {joint: coefficient}.
+        identify: which of the row's constants calibration may correct.
+        before: a fixed transform between the previous frame and this row.
+    """
+
+    alpha_deg: float = 0.0
+    a_mm: float = 0.0
+    d_mm: float = 0.0
+    theta_deg: float = 0.0
+    beta_deg: float = 0.0
+    b_mm: float = 0.0
+    drive: dict[Driven, dict[str, float]] = Field(default_factory=dict)
+    identify: tuple[RowParameter, ...] = ("alpha", "a", "d", "theta")
+    before: FixedTransform | None = None
+
+
+class Prism(_Part):
+    """A reflector.
+
+    Attributes:
+        name: as in the observations CSV.
+        frame: fixed to the frame after this row (0: the base).
+        offset_mm: place in that frame.
+        offset_known: False for a target whose mounting is unknown: it is fitted even at stage nominal.
+    """
+
+    name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
+    frame: int = Field(ge=0)
+    offset_mm: Vector
+    offset_known: bool = True
+
+
+class Mass(_Part):
+    """A lumped mass.
+
+    Attributes:
+        name: which part of the machine.
+        frame: fixed to the frame after this row.
+        kg: mass; a payload's is what is carried unless `payload_kg` is measured.
+        centre_mm: centre of gravity in that frame; None for `midway`.
+        midway: the centre is midway between the origins of frames `frame` and `frame` + 1.
+        payload: this is the payload that `payload_kg` replaces.
+        assumed: not measured and not from the maker.
+    """
+
+    name: str
+    frame: int = Field(ge=0)
+    kg: float = Field(ge=0)
+    centre_mm: Vector | None = None
+    midway: bool = False
+    payload: bool = False
+    assumed: bool = True
+
+    @model_validator(mode="after")
+    def _one_place(self) -> Mass:
+        if (self.centre_mm is None) != self.midway:
+            raise ValueError("give either centre_mm or midway = true")
+        return self
+
+
+class Tolerances(_Part):
+    """Build tolerances, 1 sigma: how far the machine may be from its nominal model."""
+
+    length_mm: float = Field(gt=0)
+    angle_deg: float = Field(gt=0)
+    beta_deg: float = Field(gt=0)
+    prism_mm: float = Field(gt=0)
+
+
+class Station(_Part):
+    """Random error of a fix, 1 sigma.
+
+    Attributes:
+        angle_sigma_arcsec: each circle.
+        distance_sigma_mm, distance_sigma_ppm: a + b * distance.
+        target_sigma_mm: centring on the prism and vibration of the machine, each axis.
+        timing_sigma_s: uncertainty of a fix's instant (design: 5 ms unless the link is known better).
+    """
+
+    angle_sigma_arcsec: float = Field(default=5.0, gt=0)
+    distance_sigma_mm: float = Field(default=2.0, gt=0)
+    distance_sigma_ppm: float = Field(default=2.0, ge=0)
+    target_sigma_mm: float = Field(default=0.0, ge=0)
+    timing_sigma_s: float = Field(default=0.005, ge=0)
+
+
+class Rig(_Part):
+    """A machine: everything that calibration, drivers and simulators need to know of it."""
+
+    name: str
+    convention: Convention
+    gravity: Vector = (0.0, 0.0, -1.0)
+    joints: tuple[Joint, ...] = Field(alias="joint", min_length=1)
+    rows: tuple[Row, ...] = Field(alias="row", min_length=1)
+    prisms: tuple[Prism, ...] = Field(alias="prism", min_length=1)
+    masses: tuple[Mass, ...] = Field(alias="mass", default=())
+    channels: tuple[Channel, ...] = Field(alias="channel", default=())
+    tolerances: Tolerances
+    station: Station = Station()
+
+    @model_validator(mode="after")
+    def _parts_fit(self) -> Rig:
+        for what, names in (
+            ("joint", [j.name for j in self.joints]),
+            ("prism", [p.name for p in self.prisms]),
+            ("channel", [c.name for c in self.channels]),
+        ):
+            doubled = sorted({n for n in names if names.count(n) > 1})
+            if doubled:
+                raise ValueError(f"two {what}s are called {doubled[0]!r}")
+        driven = {name for _, _, name, _ in self.couplings()}
+        known = {j.name for j in self.joints}
+        if driven - known:
+            raise ValueError(f"row is driven by unknown joint {sorted(driven - known)[0]!r}; joints: {sorted(known)}")
+        if known - driven:
+            raise ValueError(f"joint {sorted(known - driven)[0]!r} drives no row")
+        for prism in self.prisms:
+            if prism.frame > len(self.rows):
+                raise ValueError(f"prism {prism.name!r}: frame {prism.frame} is beyond the last row {len(self.rows)}")
+        for mass in self.masses:
+            if mass.frame + mass.midway > len(self.rows):
+                raise ValueError(f"mass {mass.name!r}: frame {mass.frame} is beyond the last row {len(self.rows)}")
+        for number, row in enumerate(self.rows, 1):
+            unused = {"mdh_beta_before": set(), "mdh_beta_after": {"b"}, "dh": {"beta", "b"}}[self.convention]
+            wrong = unused & ({*row.identify} | ({"b"} if row.b_mm else set()) | ({"beta"} if row.beta_deg else set()))
+            if wrong:
+                raise ValueError(f"row {number}: convention {self.convention!r} has no {sorted(wrong)[0]}")
+        for channel in self.channels:
+            joint = next((j for j in self.joints if j.name == channel.name), None)
+            if joint is not None and channel.unit != joint.unit:
+                raise ValueError(f"channel {channel.name!r} is in {channel.unit}, its joint in {joint.unit}")
+        return self
+
+    def couplings(self) -> Iterator[tuple[int, Driven, str, float]]:
+        """Every (row number from 1, driven constant, joint name, coefficient)."""
+        for number, row in enumerate(self.rows, 1):
+            for driven, combination in row.drive.items():
+                for name, coefficient in combination.items():
+                    yield number, driven, name, coefficient
+
+    def joint(self, name: str) -> Joint:
+        """The joint called `name`; KeyError if there is none."""
+        return {j.name: j for j in self.joints}[name]
+
+    def prism(self, name: str) -> Prism:
+        """The prism called `name`; KeyError if there is none."""
+        return {p.name: p for p in self.prisms}[name]
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joint values, in file order."""
+        return tuple(j.name for j in self.joints)
+
+    @property
+    def prism_names(self) -> tuple[str, ...]:
+        """Names of the prisms, in file order."""
+        return tuple(p.name for p in self.prisms)
+
+
+def parse_rig(text: str, source: str) -> Rig:
+    """Read a rig description.
+
+    Args:
+        text: TOML.
+        source: file name for messages.
+
+    Raises:
+        RigError: malformed TOML, unknown keys, impossible values, parts that do not fit each other.
+    """
+    try:
+        return Rig.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise RigError(source, "", f"not valid TOML: {error}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(p + 1) if isinstance(p, int) else str(p) for p in first["loc"])
+        raise RigError(source, where, first["msg"].removeprefix("Value error, ")) from error
+
+
+def shipped_rigs() -> tuple[str, ...]:
+    """Names of the rigs that come with the program."""
+    files = resources.files("calibration").joinpath("rigs").iterdir()
+    return tuple(sorted(f.name.removesuffix(".toml") for f in files if f.name.endswith(".toml")))
+
+
+def shipped_rig(name: str) -> Rig:
+    """A rig that comes with the program; RigError if there is none of that name."""
+    if name not in shipped_rigs():
+        raise RigError(name, "", f"no such rig; shipped: {', '.join(shipped_rigs())}, or give a path to a TOML file")
+    text = resources.files("calibration").joinpath("rigs", f"{name}.toml").read_text(encoding="utf-8")
+    return parse_rig(text, f"{name}.toml")

@@ -1,0 +1,1 @@
+"""Composes drivers, simulators and calibration: configuration, acquisition, store, sessions, jobs, interfaces."""

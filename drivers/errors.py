@@ -1,0 +1,31 @@
+"""The few errors that drivers raise. Each says which link or device, what was expected, and what to do."""
+
+from __future__ import annotations
+
+
+class DriverError(Exception):
+    """Base of all errors of `drivers`.
+
+    Attributes:
+        where: link, device or file (with line) that the error is about.
+    """
+
+    def __init__(self, where: str, message: str) -> None:
+        super().__init__(f"{where}: {message}")
+        self.where = where
+
+
+class LinkError(DriverError):
+    """A port could not be opened, or went away while in use. Worth trying again."""
+
+
+class DeviceError(DriverError):
+    """A device answered with an error, answered nonsense, or did not answer. The link itself works."""
+
+
+class TransmitForbiddenError(DriverError):
+    """Something asked to send on a link, or to a node, for which the configuration does not allow it."""
+
+
+class DescriptionError(DriverError):
+    """An EDS, DBC, mapping table or captured file is malformed; the message names place and reason."""

@@ -1,0 +1,1 @@
+"""A rig made of protocol-true devices with known, hidden imperfections, and replay of captured ones."""
