@@ -29,6 +29,12 @@ class Stamp:
         """The instant `nanoseconds` later (negative: earlier) on the same clocks."""
         return Stamp(self.utc_ns + nanoseconds, self.monotonic_ns + nanoseconds, self.boot_id)
 
+    def since(self, earlier: Stamp) -> int:
+        """Nanoseconds from `earlier` to this instant: monotonic within one boot, UTC from one boot to another."""
+        if self.boot_id == earlier.boot_id:
+            return self.monotonic_ns - earlier.monotonic_ns
+        return self.utc_ns - earlier.utc_ns
+
 
 class Clock(Protocol):
     """What the program may ask of time."""
@@ -80,24 +86,28 @@ class SystemClock:
 
 
 class ScaledClock:
-    """The host's clocks running `rate` times as fast since `origin`: simulated processes share it by sharing both.
+    """A clock that shows `origin` at one instant and runs `rate` times as fast as the host's from then on.
+
+    Simulated processes share it by sharing rate and origin.
 
     Args:
-        rate: simulated seconds per real second, > 0.
-        origin: the instant at which simulated and real time agree.
+        rate: seconds of this clock per real second, > 0.
+        origin: what it shows when the host's monotonic clock shows `real_origin_ns`.
+        real_origin_ns: when that is; when both clocks show the same by default.
     """
 
-    def __init__(self, rate: float, origin: Stamp) -> None:
+    def __init__(self, rate: float, origin: Stamp, real_origin_ns: int | None = None) -> None:
         if rate <= 0:
             raise ValueError(f"rate must be positive, got {rate}")
         self.rate = rate
         self.origin = origin
+        self._real_origin_ns = origin.monotonic_ns if real_origin_ns is None else real_origin_ns
 
     def now(self) -> Stamp:
         return self.origin.shifted(self.monotonic_ns() - self.origin.monotonic_ns)
 
     def monotonic_ns(self) -> int:
-        elapsed_ns = time.monotonic_ns() - self.origin.monotonic_ns
+        elapsed_ns = time.monotonic_ns() - self._real_origin_ns
         return self.origin.monotonic_ns + int(elapsed_ns * self.rate)
 
     def sleep(self, seconds: float) -> None:

@@ -6,7 +6,8 @@ time, and returns records. Fed the same captures it returns the same records, so
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Protocol
@@ -247,3 +248,17 @@ class Decoder(Protocol):
 
     def tick(self, now: Stamp) -> Sequence[Record]:
         """Records that the mere passing of time causes: missed heartbeats, silent channels."""
+
+
+LinkItem = Capture | DeviceEvent | Gap
+
+
+class LinkLoop(Protocol):
+    """The thin loop that owns one port: opens it, reads it, opens it again when it goes away. It decodes nothing."""
+
+    @property
+    def name(self) -> str:
+        """Name of the link, as its captures carry it."""
+
+    def run(self, emit: Callable[[LinkItem], None], stop: threading.Event) -> None:
+        """Hand on every capture at once, and what captures cannot tell (link up, lost, dropped), until `stop`."""

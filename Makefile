@@ -1,0 +1,52 @@
+# Every target sets up what it needs (deploy/bootstrap.sh): a virtual environment in .venv with the locked packages.
+# PYTHON=/path/to/python3.12 chooses the interpreter that .venv is made of.
+
+BIN := .venv/bin
+BOOTSTRAP := deploy/bootstrap.sh -e
+
+# Compiled kernels and font indexes stay in the tree, so that they are found again and no home directory is needed.
+export NUMBA_CACHE_DIR := $(CURDIR)/.cache/numba
+export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
+
+.PHONY: help setup demo test lint bench lock clean
+
+help: ## what there is to make
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
+
+setup: ## the virtual environment alone
+	@$(BOOTSTRAP) .venv requirements-dev.lock
+
+demo: setup ## a simulated rig, from bus traffic to a calibrated model and a report
+	@$(BIN)/rigcal demo
+
+# The deployment tests ask systemd's own tools about the files in deploy/. What reads devices and what keeps their data
+# must be reached by the tests almost line by line.
+test: ## the whole test suite; needs no hardware
+	@$(BOOTSTRAP) -t systemd-analyze=systemd -t udevadm=udev .venv requirements-dev.lock
+	$(BIN)/python -m pytest --cov=drivers --cov=daemon.store --cov-report=term-missing:skip-covered --cov-fail-under=95
+
+lint: setup ## style, types and import floors
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: setup ## acquisition under a saturated bus; measured data; simulated sessions against their noise
+	$(BIN)/python -m tests.bench.acquisition
+	$(BIN)/python -m tests.bench.ur10
+	$(BIN)/python -m tests.calibration.simulated_sessions
+
+# The rig gets requirements.lock, with the build backend that installs the project itself; requirements-dev.lock holds
+# the same versions and the tools besides. Versions stay as they are unless pyproject.toml forces a change;
+# `make lock UPGRADE=--upgrade` takes the newest.
+COMPILE := $(BIN)/uv pip compile --no-config --quiet --universal --python-version 3.11 --generate-hashes \
+	--custom-compile-command "make lock" $(UPGRADE)
+
+lock: setup ## write the lock files anew from pyproject.toml
+	echo 'setuptools>=77' | $(COMPILE) pyproject.toml - --output-file requirements.lock
+	$(COMPILE) pyproject.toml --extra dev --extra bench --constraints requirements.lock --output-file requirements-dev.lock
+
+clean: ## remove everything that make has made
+	rm -rf .venv .cache build rigcal-demo rigcal-sim htmlcov .coverage* *.egg-info
+	rm -rf .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
