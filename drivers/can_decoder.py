@@ -1,0 +1,218 @@
+"""Captures of one CAN link -> readings, events, gaps. Pure: owns no port, no thread and no clock."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Sequence
+
+from drivers.can_channel import ChannelDecoder, PdoChannelDecoder
+from drivers.can_errors import BusErrors
+from drivers.can_summary import CanSummary, IdSummary, RateWindow
+from drivers.canopen_supervision import NodeSupervision
+from drivers.cia301 import Service, classify
+from drivers.clock import NS_PER_S, Stamp
+from drivers.j1939 import J1939Id
+from drivers.readings import CanCapture, Capture, Gap, GapReason, Record
+
+SYNC_ID = 0x080
+SYNC_WINDOW_NS = NS_PER_S // 10
+"""A PDO that follows a SYNC by more was not sampled by it: ten nodes at 20 kbit/s need 60 ms."""
+
+IDS_MAX = 512
+"""Identifiers that are counted one by one; noise on a 29-bit bus must fill neither memory nor an operator's screen."""
+
+_EXTENDED = 1 << 31
+
+_SERVICE_NAMES = {
+    Service.EMCY: "emergencies",
+    Service.SDO_RESPONSE: "SDO answers",
+    Service.HEARTBEAT: "heartbeat",
+}
+
+
+class CanDecoder:
+    """The decoder of one link. `summary` may be called from any thread, everything else from one.
+
+    Args:
+        link: name of the link.
+        channels: decoders of its channels. Nodes of CANopen channels are supervised (see NodeSupervision).
+    """
+
+    def __init__(self, link: str, channels: Iterable[ChannelDecoder]) -> None:
+        self._link = link
+        self._entries: dict[int, _Entry] = {}
+        self._lock = threading.Lock()  # held where `_entries` grows, where `_rates` changes, and where both are copied
+        self._rates = RateWindow()
+        self._unlisted = _Entry()
+        self._channels: list[_ChannelState] = []
+        self._nodes: list[NodeSupervision] = []
+        self._bus_errors = BusErrors(link)
+        self._sync: Stamp | None = None
+        self._started = False
+        nodes: dict[int, list[PdoChannelDecoder]] = {}
+        for decoder in channels:
+            state = _ChannelState(decoder)
+            self._channels.append(state)
+            entry = self._entry(decoder.arbitration_id, decoder.is_extended)
+            entry.channels = (*entry.channels, state)
+            if isinstance(decoder, PdoChannelDecoder):
+                nodes.setdefault(decoder.node, []).append(decoder)
+        for node, decoders in nodes.items():
+            supervision = NodeSupervision(node, decoders)
+            self._nodes.append(supervision)
+            for arbitration_id, handler in supervision.handlers.items():
+                self._entry(arbitration_id, False).handler = handler
+
+    def feed(self, capture: Capture) -> Sequence[Record]:
+        if type(capture) is not CanCapture:
+            return ()
+        stamp = capture.stamp
+        if not self._started:
+            self._start(stamp)
+        if capture.is_error:
+            return self._bus_errors.feed(stamp, capture.arbitration_id, capture.data)
+        key = capture.arbitration_id
+        if key == SYNC_ID and not capture.is_extended:
+            self._sync = stamp  # rigcal's own as well: it is an instant, not a reading
+        if capture.is_transmitted:
+            return ()
+        if capture.is_extended:
+            key |= _EXTENDED
+        entry = self._entries.get(key)
+        if entry is None:
+            entry = self._new_unknown(key)
+        entry.count += 1
+        entry.last_seen = stamp
+        if entry.is_unknown or capture.is_remote:
+            return ()
+        records: list[Record] = []
+        for channel in entry.channels:
+            channel.decode(stamp, self._sync, capture.data, records)
+        if entry.handler is not None:
+            records += entry.handler(stamp, capture.data)
+        return records
+
+    def tick(self, now: Stamp) -> Sequence[Record]:
+        if not self._started:
+            self._start(now)
+        if self._rates.is_due(now):
+            with self._lock:
+                self._rates.mark(now, {key: entry.count for key, entry in self._entries.items()})
+        records: list[Record] = []
+        for channel in self._channels:
+            channel.tick(now, records)
+        for node in self._nodes:
+            records += node.tick(now)
+        return records
+
+    def summary(self, now: Stamp) -> CanSummary:
+        """What was heard until `now`; channels that were never heard are there as well."""
+        with self._lock:
+            entries = sorted(self._entries.items())
+            rates = self._rates.rates_per_s()
+        return CanSummary(
+            link=self._link,
+            ids=tuple(
+                entry.summary(key, rates.get(key), now) for key, entry in entries if entry.count or entry.channels
+            ),
+            unlisted_frames=self._unlisted.count,
+            error_frames=self._bus_errors.count,
+        )
+
+    def _start(self, now: Stamp) -> None:
+        self._started = True
+        for channel in self._channels:
+            channel.last_seen = now
+
+    def _entry(self, arbitration_id: int, is_extended: bool) -> _Entry:
+        key = arbitration_id | (_EXTENDED if is_extended else 0)
+        entry = self._entries.setdefault(key, _Entry())
+        entry.is_unknown = False
+        return entry
+
+    def _new_unknown(self, key: int) -> _Entry:
+        if len(self._entries) >= IDS_MAX:
+            return self._unlisted
+        entry = _Entry()
+        with self._lock:
+            self._entries[key] = entry
+        return entry
+
+
+class _Entry:
+    """One identifier."""
+
+    __slots__ = ("channels", "count", "handler", "is_unknown", "last_seen")
+
+    def __init__(self) -> None:
+        self.channels: tuple[_ChannelState, ...] = ()
+        self.handler: Callable[[Stamp, bytes], list[Record]] | None = None
+        self.is_unknown = True
+        self.count = 0
+        self.last_seen: Stamp | None = None
+
+    def summary(self, key: int, rate_per_s: float | None, now: Stamp) -> IdSummary:
+        last_seen = self.last_seen
+        # Channels of one message read the same counter; one that was silent for longer knows of fewer
+        missed = [channel.missed_frames for channel in self.channels if channel.missed_frames is not None]
+        return IdSummary(
+            arbitration_id=key & ~_EXTENDED,
+            is_extended=bool(key & _EXTENDED),
+            names=self._names(key),
+            count=self.count,
+            rate_per_s=rate_per_s,
+            age_s=None if last_seen is None else max(now.since(last_seen), 0) / NS_PER_S,
+            missed=max(missed, default=None),
+        )
+
+    def _names(self, key: int) -> str:
+        if self.channels:
+            return ", ".join(channel.name for channel in self.channels)
+        if key & _EXTENDED:
+            return str(J1939Id.parse(key & ~_EXTENDED))
+        if key == SYNC_ID:
+            return "SYNC"
+        meaning = classify(key) if self.handler is not None else None
+        return "" if meaning is None else f"{_SERVICE_NAMES[meaning.service]} of node {meaning.node}"
+
+
+class _ChannelState:
+    """One channel: whether it is silent, and which SYNC its next frame belongs to."""
+
+    __slots__ = ("_decoder", "_is_silent", "_is_synchronous", "_sync_used", "_timeout_ns", "last_seen", "name")
+
+    def __init__(self, decoder: ChannelDecoder) -> None:
+        self.name = decoder.name
+        self.last_seen: Stamp | None = None
+        self._decoder = decoder
+        self._timeout_ns = round(decoder.timeout_s * NS_PER_S)
+        self._is_silent = False
+        self._is_synchronous = isinstance(decoder, PdoChannelDecoder) and decoder.is_synchronous
+        self._sync_used: Stamp | None = None
+
+    @property
+    def missed_frames(self) -> int | None:
+        return self._decoder.missed_frames
+
+    def decode(self, stamp: Stamp, sync: Stamp | None, data: bytes, records: list[Record]) -> None:
+        sampled = stamp
+        if self._is_synchronous and sync is not None and sync is not self._sync_used:
+            self._sync_used = sync
+            if 0 <= stamp.since(sync) <= SYNC_WINDOW_NS:
+                sampled = sync
+        decoded = self._decoder.decode(sampled, data)
+        if not decoded:
+            return
+        last_seen = self.last_seen
+        if last_seen is not None and (self._is_silent or stamp.since(last_seen) > self._timeout_ns):
+            self.tick(stamp, records)
+            self._is_silent = False
+            records.append(Gap(self.name, GapReason.SILENT, last_seen, stamp))
+        self.last_seen = stamp
+        records += decoded
+
+    def tick(self, now: Stamp, records: list[Record]) -> None:
+        last_seen = self.last_seen
+        if last_seen is not None and not self._is_silent and now.since(last_seen) > self._timeout_ns:
+            self._is_silent = True
+            records.append(Gap(self.name, GapReason.SILENT, last_seen))

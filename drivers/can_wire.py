@@ -1,0 +1,95 @@
+"""CAN frames as they come over SocketCAN, python-can's `udp_multicast` and slcan adapters. Pure parsers."""
+
+from __future__ import annotations
+
+import re
+import struct
+
+import msgpack
+
+from drivers.canframe import DATA_MAX, EXTENDED_ID_MAX, STANDARD_ID_MAX, Frame
+
+_CAN_FRAME = struct.Struct("=IB3x8s")  # struct can_frame, linux/can.h
+_EFF_FLAG, _RTR_FLAG, _ERR_FLAG = 0x80000000, 0x40000000, 0x20000000
+
+
+def parse_can_frame(datagram: bytes) -> Frame | None:
+    """A `struct can_frame`; None if it is none (CAN FD)."""
+    if len(datagram) != _CAN_FRAME.size:
+        return None
+    identifier, length, data = _CAN_FRAME.unpack(datagram)
+    if length > DATA_MAX:
+        return None
+    is_extended = identifier & _EFF_FLAG != 0
+    is_remote = identifier & _RTR_FLAG != 0
+    if identifier & _ERR_FLAG:
+        return Frame(identifier & EXTENDED_ID_MAX, data[:length], is_error=True)
+    return Frame(
+        identifier & (EXTENDED_ID_MAX if is_extended else STANDARD_ID_MAX),
+        b"" if is_remote else data[:length],
+        is_extended,
+        is_remote,
+    )
+
+
+def parse_multicast(datagram: bytes) -> tuple[Frame, float] | None:
+    """A message as `udp_multicast` packs it (a msgpack map) and its timestamp; None if it is no classic CAN frame."""
+    try:
+        fields = msgpack.unpackb(datagram)
+        identifier, data, timestamp = fields["arbitration_id"], fields["data"], float(fields["timestamp"])
+        is_extended, is_remote = fields["is_extended_id"], fields["is_remote_frame"]
+        is_error, is_fd = fields["is_error_frame"], fields["is_fd"]
+    except (ValueError, TypeError, KeyError, msgpack.UnpackException):
+        return None
+    if not isinstance(identifier, int) or not isinstance(data, bytes) or is_fd or len(data) > DATA_MAX:
+        return None
+    if not 0 <= identifier <= (EXTENDED_ID_MAX if is_extended or is_error else STANDARD_ID_MAX):
+        return None
+    return Frame(identifier, data, bool(is_extended and not is_error), bool(is_remote), bool(is_error)), timestamp
+
+
+class SlcanLines:
+    """Cuts an adapter's bytes into lines and lines into frames. Pure.
+
+    Attributes:
+        malformed: lines that were neither a frame nor an answer to a command.
+    """
+
+    _FRAME = re.compile(rb"(?:t([0-9A-F]{3})|T([0-9A-F]{8})|r([0-9A-F]{3})|R([0-9A-F]{8}))([0-8])([0-9A-F]*)", re.I)
+    _LINE_MAX = 64  # bytes: more without an end is noise
+
+    def __init__(self) -> None:
+        self._rest = b""
+        self.malformed = 0
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """The frames that these bytes complete."""
+        # BEL is the adapter's "error": it ends a line as CR does
+        *lines, self._rest = (self._rest + data).replace(b"\a", b"\r").split(b"\r")
+        if len(self._rest) > self._LINE_MAX:
+            self._rest = b""
+            self.malformed += 1
+        frames = []
+        for line in lines:
+            frame = self._frame(line)
+            if frame is not None:
+                frames.append(frame)
+            elif line and line[:1] not in b"zZVNF":  # sent, version, serial number, status flags
+                self.malformed += 1
+        return frames
+
+    def _frame(self, line: bytes) -> Frame | None:
+        match = self._FRAME.match(line)
+        if match is None:
+            return None
+        standard, extended, remote_standard, remote_extended, length, digits = match.groups()
+        identifier = int(standard or extended or remote_standard or remote_extended, 16)
+        is_extended = bool(extended or remote_extended)
+        if identifier > (EXTENDED_ID_MAX if is_extended else STANDARD_ID_MAX):
+            return None
+        if remote_standard or remote_extended:
+            return Frame(identifier, b"", is_extended, is_remote=True)
+        end = 2 * int(length)
+        if len(digits) not in (end, end + 4):  # with the adapter's time stamp switched on, four digits more
+            return None
+        return Frame(identifier, bytes.fromhex(digits[:end].decode("ascii")), is_extended)

@@ -1,0 +1,393 @@
+"""The CAN link: one loop that owns one bus, stamps every frame as it arrives and hands it on undecoded."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from drivers.can_ports import BATCH_MAX, OVERFLOW, CanPort, Interface, PortSettings, Received, open_port
+from drivers.can_stamps import ReceiveStamps
+from drivers.can_transmit import TransmitPermission
+from drivers.canframe import Frame
+from drivers.canopen_setup import NodeSetup, SetupConversation
+from drivers.cia301 import SYNC_COUNTER_MAX, encode_sync
+from drivers.clock import NS_PER_S, Clock, Stamp
+from drivers.errors import DeviceError, LinkError
+from drivers.readings import CanCapture, Capture, DeviceEvent, EventKind, Gap, GapReason
+
+POLL_S = 0.05  # how long a stop or a set-up request may go unnoticed
+LOSS_CHECK_NS = NS_PER_S
+BACKOFF_FIRST_S = 0.5
+BACKOFF_MAX_S = 30.0
+
+Emit = Callable[[Capture | DeviceEvent | Gap], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CanLinkConfig:
+    """A CAN link.
+
+    Attributes:
+        name: of the link, as channels name it.
+        interface: `socketcan`, `slcan`, `udp_multicast` (between processes) or `virtual` (within one).
+        channel: interface name (`can0`), serial port (`/dev/ttyACM0`), multicast group or any name.
+        bitrate: of the bus, bit/s; set on slcan adapters, a SocketCAN interface is set up by the system.
+        allow_transmit: the link may send at all; without it slcan adapters are opened listen-only.
+        transmit_nodes: nodes that may be addressed.
+        sync_period_ms: send SYNC at this period; None: do not.
+        sync_counter: SYNC carries a counter 1 to 240 (nodes whose object 1019h is 240).
+        receive_buffer_bytes: of the socket; 4 MiB, doubled by the kernel for its overhead, hold over a second of a
+            saturated 1 Mbit/s bus.
+        options: further arguments of python-can's bus (`port` and `hop_limit` of udp_multicast, ...).
+    """
+
+    name: str
+    interface: Interface
+    channel: str
+    bitrate: int | None = None
+    allow_transmit: bool = False
+    transmit_nodes: tuple[int, ...] = ()
+    sync_period_ms: float | None = None
+    sync_counter: bool = False
+    receive_buffer_bytes: int = 4 << 20
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+class SyncProducer:
+    """When to send SYNC: on a fixed monotonic grid, without drift and without bursts after a stall.
+
+    Args:
+        period_ns: of the grid.
+        start_ns: its first instant, monotonic.
+        with_counter: the SYNC carries a counter 1 to 240.
+    """
+
+    def __init__(self, period_ns: int, start_ns: int, with_counter: bool) -> None:
+        self._period_ns = period_ns
+        self._counter = 0 if with_counter else None
+        self.next_ns = start_ns
+
+    def due(self, monotonic_ns: int) -> Frame | None:
+        """The SYNC to send now; None before `next_ns`."""
+        if monotonic_ns < self.next_ns:
+            return None
+        self.next_ns += self._period_ns * ((monotonic_ns - self.next_ns) // self._period_ns + 1)
+        if self._counter is not None:
+            self._counter = self._counter % SYNC_COUNTER_MAX + 1
+        return encode_sync(self._counter)
+
+
+class Backoff:
+    """Waiting times between attempts: doubling from BACKOFF_FIRST_S to BACKOFF_MAX_S, the same every time."""
+
+    def __init__(self) -> None:
+        self._next_s = BACKOFF_FIRST_S
+
+    def next_s(self) -> float:
+        """How long to wait now."""
+        wait_s, self._next_s = self._next_s, min(2 * self._next_s, BACKOFF_MAX_S)
+        return wait_s
+
+    def reset(self) -> None:
+        """All is well again."""
+        self._next_s = BACKOFF_FIRST_S
+
+
+class CanLink:
+    """Owns one CAN bus: receives, survives its loss, and sends only what the configuration allows (default: nothing).
+
+    Args:
+        config: see CanLinkConfig.
+        clock: stamps the frames and paces SYNC and repetitions.
+        setups: what `request_setup` knows how to set up.
+        configure_at_start: set all of them up when the bus is opened for the first time, and only then. For simulated
+            machines, which are always parked; on a real one an operator has to say so each time.
+
+    Raises:
+        TransmitForbiddenError: SYNC or a set-up at the start is asked for where it is not allowed.
+    """
+
+    def __init__(
+        self,
+        config: CanLinkConfig,
+        clock: Clock,
+        setups: Iterable[NodeSetup] = (),
+        *,
+        configure_at_start: bool = False,
+    ) -> None:
+        self.name = config.name
+        self._config = config
+        self._clock = clock
+        self._permission = TransmitPermission(config.name, config.allow_transmit, config.transmit_nodes)
+        if config.sync_period_ms is not None:
+            self._permission.check_link()
+            if config.sync_period_ms <= 0:
+                raise ValueError(f"{config.name}: sync_period_ms must be positive, got {config.sync_period_ms}")
+        self._setups = {setup.node: setup for setup in setups}
+        self._requests = _SetupRequests()
+        self._at_start: list[NodeSetup] = []
+        if configure_at_start and self._setups:
+            self._at_start = self._permitted(self._setups)
+
+    @property
+    def has_setups(self) -> bool:
+        """Whether any CANopen node of this link can be set up."""
+        return bool(self._setups)
+
+    def check_setup(self, nodes: Iterable[int] | None = None) -> None:
+        """Raise what `request_setup` would raise now, and do nothing else."""
+        self._wanted(nodes)
+
+    def request_setup(self, nodes: Iterable[int] | None = None) -> None:
+        """Ask the running loop to identify, check, configure and start nodes; may be called from any thread.
+
+        What comes of it are DeviceEvents: CONFIGURED, WARNING, ALARM. The caller has made sure that the machine is
+        parked now. A request therefore never waits for the bus to be opened, and what is not done when the bus is lost
+        is given up, with an ALARM for each node.
+
+        Args:
+            nodes: node numbers; None: all that the link knows.
+
+        Raises:
+            TransmitForbiddenError: the link is listen-only, or a node is not listed. Nothing is sent to any node then.
+            DeviceError: no set-up is known for a node, or the bus is not open. Nothing is queued then.
+        """
+        if not self._requests.put(self._wanted(nodes)):
+            raise self._not_open()
+
+    def _wanted(self, nodes: Iterable[int] | None) -> list[NodeSetup]:
+        wanted = self._permitted(self._setups if nodes is None else nodes)
+        if not self._requests.is_open:
+            raise self._not_open()
+        return wanted
+
+    def _permitted(self, nodes: Iterable[int]) -> list[NodeSetup]:
+        self._permission.check_link()
+        wanted = []
+        for node in nodes:
+            if node not in self._setups:
+                raise DeviceError(self.name, f"no channel of the rig file is on node {node}")
+            self._permission.check_node(node)
+            wanted.append(self._setups[node])
+        return wanted
+
+    def _not_open(self) -> DeviceError:
+        return DeviceError(self.name, "nothing can be set up: the link is not open; ask again when it is up")
+
+    def run(self, emit: Emit, stop: threading.Event) -> None:
+        """Receive until `stop` is set, opening the bus again whenever it is lost."""
+        backoff = Backoff()
+        outage = _Outage(self.name, emit, self._clock.now())
+        while not stop.is_set():
+            try:
+                self._serve(emit, stop, outage, backoff)
+            except LinkError as error:
+                outage.begin(str(error), self._clock.now())
+                self._clock.wait(stop, backoff.next_s())
+
+    def _serve(self, emit: Emit, stop: threading.Event, outage: _Outage, backoff: Backoff) -> None:
+        """One life of the bus, from opening to `stop` or LinkError."""
+        config = self._config
+        settings = PortSettings(
+            interface=config.interface,
+            channel=config.channel,
+            bitrate=config.bitrate,
+            is_listen_only=not config.allow_transmit,
+            receive_buffer_bytes=config.receive_buffer_bytes,
+            options=config.options,
+        )
+        with contextlib.closing(open_port(self.name, settings)) as port:
+            # An interface that is down opens all the same, and fails at the first read
+            received = port.receive(0.0)
+            session = _Session(self.name, config, self._clock, self._permission, port, emit)
+            at_start, self._at_start = self._at_start, []
+            self._requests.open(at_start)
+            try:
+                outage.end(self._clock.now())
+                while True:
+                    if received:
+                        session.take(received)
+                        backoff.reset()
+                    session.serve(self._requests.take())
+                    if stop.is_set():
+                        return
+                    received = port.receive(session.patience_s())
+            finally:
+                cause = "rigcal was stopped" if stop.is_set() else "the link was lost"
+                session.close(self._requests.close(), cause)
+                outage.last_good = session.last_frame
+
+
+class _SetupRequests:
+    """Set-ups asked for from other threads. None is taken while the bus is closed, and none survives its loss."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._waiting: list[NodeSetup] = []
+        self.is_open = False
+
+    def open(self, at_start: list[NodeSetup]) -> None:
+        with self._lock:
+            self._waiting = at_start
+            self.is_open = True
+
+    def put(self, setups: list[NodeSetup]) -> bool:
+        """Queue them, if the bus is open; else False."""
+        with self._lock:
+            if self.is_open:
+                self._waiting += setups
+            return self.is_open
+
+    def take(self) -> list[NodeSetup]:
+        with self._lock:
+            setups, self._waiting = self._waiting, []
+        return setups
+
+    def close(self) -> list[NodeSetup]:
+        """No more from now on; those that nobody has taken."""
+        with self._lock:
+            self.is_open = False
+            setups, self._waiting = self._waiting, []
+        return setups
+
+
+class _Outage:
+    """Says once that the link is lost, again when the reason changes, and once that it is back."""
+
+    def __init__(self, link: str, emit: Emit, start: Stamp) -> None:
+        self._link = link
+        self._emit = emit
+        self.last_good = start
+        self._reason: str | None = None
+
+    def begin(self, reason: str, now: Stamp) -> None:
+        if self._reason is None:
+            self._emit(Gap(self._link, GapReason.LINK_DOWN, self.last_good))
+        if reason != self._reason:
+            self._emit(DeviceEvent(self._link, now, EventKind.LINK_LOST, reason))
+            self._reason = reason
+
+    def end(self, now: Stamp) -> None:
+        self._emit(DeviceEvent(self._link, now, EventKind.LINK_UP, f"{self._link}: the bus is open"))
+        if self._reason is not None:
+            self._emit(Gap(self._link, GapReason.LINK_DOWN, self.last_good, now))
+            self._reason = None
+
+
+class _Session:
+    """What happens while the bus is open."""
+
+    def __init__(
+        self,
+        name: str,
+        config: CanLinkConfig,
+        clock: Clock,
+        permission: TransmitPermission,
+        port: CanPort,
+        emit: Emit,
+    ) -> None:
+        self._name = name
+        self._clock = clock
+        self._permission = permission
+        self._port = port
+        self._emit = emit
+        self._setup = SetupConversation()
+        self._losses: dict[str, int] = {}
+        opened = clock.now()
+        self._stamps = ReceiveStamps(opened)
+        self._check_losses_ns = opened.monotonic_ns + LOSS_CHECK_NS
+        self._checked = self._heard_then = opened  # when losses were last looked for, and the last frame before that
+        self._sync: SyncProducer | None = None
+        if config.sync_period_ms is not None:
+            period_ns = round(config.sync_period_ms * 1e6)
+            self._sync = SyncProducer(period_ns, opened.monotonic_ns, config.sync_counter)
+
+    @property
+    def last_frame(self) -> Stamp:
+        """When the last frame was received; when the bus was opened if there was none."""
+        return self._stamps.latest
+
+    def take(self, received: list[Received]) -> None:
+        """Stamp and emit what one read gave."""
+        now = self._clock.now()
+        name, emit, stamp_of = self._name, self._emit, self._stamps.stamp
+        stamps = []
+        for frame, kernel_utc_ns in received:
+            stamp = stamp_of(kernel_utc_ns, now)
+            stamps.append(stamp)
+            arbitration_id, data, is_extended, is_remote, is_error = frame
+            emit(CanCapture(name, stamp, arbitration_id, data, is_extended, is_remote, is_error))
+        if len(received) < BATCH_MAX:
+            self._stamps.emptied(now)
+        if self._setup.is_active:
+            for (frame, _), stamp in zip(received, stamps, strict=True):
+                self._setup.feed(frame, stamp)
+
+    def serve(self, requests: Iterable[NodeSetup]) -> None:
+        """Send what is due; look after lost frames.
+
+        Args:
+            requests: set-ups that were asked for since the last call.
+        """
+        monotonic_ns = self._clock.monotonic_ns()
+        if self._sync is not None:
+            sync = self._sync.due(monotonic_ns)
+            if sync is not None:
+                self._send(sync)
+        for request in requests:
+            self._setup.add(request)
+        if self._setup.is_active:
+            self._setup.advance(self._clock.now())
+        # The last node's start and its event are left when it is done
+        for frame in self._setup.take_frames():
+            self._send(frame)
+        self._emit_setup_events()
+        if monotonic_ns >= self._check_losses_ns:
+            self._check_losses_ns = monotonic_ns + LOSS_CHECK_NS
+            self._report_losses()
+
+    def patience_s(self) -> float:
+        """How long the next read may wait, real seconds."""
+        patience_s = POLL_S
+        for deadline_ns in (self._sync.next_ns if self._sync else None, self._setup.deadline_ns):
+            if deadline_ns is not None:
+                left_s = max(deadline_ns - self._clock.monotonic_ns(), 0) / NS_PER_S
+                patience_s = min(patience_s, self._clock.real_seconds(left_s))
+        return patience_s
+
+    def close(self, requests: Iterable[NodeSetup], cause: str) -> None:
+        """The bus is given up because of `cause`: say what is left to say."""
+        self._report_losses()
+        for request in requests:
+            self._setup.add(request)
+        self._setup.abort(self._clock.now(), cause)
+        self._emit_setup_events()
+
+    def _send(self, frame: Frame) -> None:
+        self._permission.check(frame)
+        stamp = self._clock.now()
+        self._port.send(frame)
+        self._emit(CanCapture(self._name, stamp, frame.arbitration_id, frame.data, is_transmitted=True))
+
+    def _emit_setup_events(self) -> None:
+        for event in self._setup.take_events():
+            self._emit(event)
+
+    def _report_losses(self) -> None:
+        now, losses = self._clock.now(), self._port.losses()
+        start, missed = self._checked, 0
+        for reason, total in losses.items():
+            lost = total - self._losses.get(reason, 0)
+            if lost > 0:
+                missed += lost
+                text = f"{self._name}: {lost} frames lost, {reason}"
+                self._emit(DeviceEvent(self._name, now, EventKind.FRAMES_DROPPED, text, lost))
+                if reason == OVERFLOW:
+                    # Told only with the next frame that finds room, so it may lie as far back as the frame before
+                    start = self._heard_then
+        if missed:
+            self._emit(Gap(self._name, GapReason.FRAMES_LOST, start, now, missed))
+        self._losses, self._checked, self._heard_then = losses, now, self._stamps.latest

@@ -1,0 +1,296 @@
+"""CiA 406 encoders and linear transducers: position, speed, alarms and warnings of a TPDO -> readings and events."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from drivers.can_channel import PdoChannel, PdoChannelDecoder, value_reading
+from drivers.clock import NS_PER_S, Stamp
+from drivers.errors import DescriptionError
+from drivers.pdo import PdoField
+from drivers.readings import DecodeFailure, DeviceEvent, EventKind, Reading, Record, Status
+
+POSITION = 0x6004
+POSITION_MULTI_SENSOR = 0x6020
+SPEED = 0x6030
+ALARMS = 0x6503
+WARNINGS = 0x6505
+
+_ALARM_BITS = {0: "position error", 1: "commissioning diagnostics"}
+_WARNING_BITS = {
+    0: "frequency or speed exceeded",
+    1: "light control reserve",
+    2: "CPU watchdog",
+    3: "operating time limit",
+    4: "battery charge low",
+    5: "reference point not reached",
+}
+
+
+def alarm_words(bits: int) -> str:
+    """Object 6503h in words."""
+    return _bit_words(bits, _ALARM_BITS)
+
+
+def warning_words(bits: int) -> str:
+    """Object 6505h in words."""
+    return _bit_words(bits, _WARNING_BITS)
+
+
+def _bit_words(bits: int, names: dict[int, str]) -> str:
+    words = [
+        names.get(bit, f"manufacturer bit {bit}" if bit >= 12 else f"reserved bit {bit}")
+        for bit in range(16)
+        if bits >> bit & 1
+    ]
+    return ", ".join(words) or "none"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PositionChannel(PdoChannel):
+    """What encoders and linear transducers have in common.
+
+    Attributes:
+        sign: +1 or -1, the joint's positive direction against counting direction.
+        zero_counts: position at which the joint reads zero.
+        max_rate_per_s: fastest motion of the joint in units per second; None: jumps are not looked for.
+        jump_margin_s: uncertainty of the time between two samples, within which the joint may also have moved: what a
+            busy computer may be late by where the kernel does not stamp frames.
+        speed_step_per_s: what one count of object 6030h is worth; None: speed is not read.
+    """
+
+    sign: Literal[-1, 1] = 1
+    zero_counts: int = 0
+    max_rate_per_s: float | None = None
+    jump_margin_s: float = 0.25
+    speed_step_per_s: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncoderChannel(PositionChannel):
+    """A rotary encoder: value_deg = sign * (counts - zero_counts) * 360 / units_per_revolution.
+
+    The position wraps at `total_units`, and the value to the interval of that width centred on zero. Where
+    `total_units` is a power of two, bits above it are status bits (POSITAL limit switches) and are masked.
+
+    Attributes:
+        units_per_revolution: object 6001h, or 6501h when scaling is off.
+        total_units: object 6002h.
+    """
+
+    unit: str = "deg"
+    units_per_revolution: int = 65536
+    total_units: int = 65536
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearChannel(PositionChannel):
+    """A linear transducer: value_mm = sign * (counts - zero_counts) * step_nm / 1e6.
+
+    Attributes:
+        position_object: POSITION (6004h) or POSITION_MULTI_SENSOR (6020h).
+        step_nm: measuring step, object 6005h.1 or 6501h.
+        range_mm: measuring range; a value beyond it is refused.
+    """
+
+    unit: str = "mm"
+    position_object: int = POSITION_MULTI_SENSOR
+    step_nm: int = 100_000
+    range_mm: tuple[float, float] = (-1e5, 1e5)
+
+
+class _PositionDecoder(PdoChannelDecoder):
+    """Alarms, warnings, speed and jumps; the position itself is the subclasses'."""
+
+    def __init__(self, channel: PositionChannel, position_object: int, counts_per_unit: float) -> None:
+        super().__init__(channel)
+        mapping = channel.pdo.mapping
+        self._position = _field(channel, position_object)
+        self._alarms = mapping.find(ALARMS)
+        self._warnings = mapping.find(WARNINGS)
+        self._speed = mapping.find(SPEED) if channel.speed_step_per_s is not None else None
+        self._speed_step = (channel.speed_step_per_s or 0.0) * channel.sign
+        fields = (self._position, self._alarms, self._warnings, self._speed)
+        self._needed_bits = max(field.end_bit for field in fields if field is not None)
+        self._has_extras = any(field is not None for field in fields[1:])
+        self._alarm_bits = 0
+        self._warning_bits = 0
+        rate = channel.max_rate_per_s
+        self._jump_rate = None if rate is None else rate * counts_per_unit / NS_PER_S
+        self._margin = 2.0 + (0.0 if rate is None else rate * counts_per_unit * channel.jump_margin_s)
+        self._last: tuple[Stamp, int] | None = None
+
+    def object_read(self, stamp: Stamp, index: int, value: int) -> list[Record]:
+        records: list[Record] = []
+        if index == ALARMS:
+            self._take_alarms(stamp, value, records)
+        elif index == WARNINGS:
+            self._take_warnings(stamp, value, records)
+        return records
+
+    def node_restarted(self) -> None:
+        super().node_restarted()
+        self._alarm_bits = self._warning_bits = 0
+
+    def _take_extras(self, stamp: Stamp, bits: int, records: list[Record]) -> None:
+        if self._alarms is not None:
+            self._take_alarms(stamp, self._alarms.extract(bits), records)
+        if self._warnings is not None:
+            self._take_warnings(stamp, self._warnings.extract(bits), records)
+        if self._speed is not None:
+            counts = self._speed.extract_signed(bits)
+            name, unit = f"{self.name}_rate", f"{self._unit}/s"
+            if self._alarm_bits or self.is_void:
+                records.append(Reading(name, stamp, None, unit, Status.DEVICE_ALARM, counts))
+            else:
+                records.append(value_reading(name, unit, stamp, counts * self._speed_step, counts))
+
+    def _take_alarms(self, stamp: Stamp, bits: int, records: list[Record]) -> None:
+        if bits != self._alarm_bits:
+            text = f"alarms (6503h): {alarm_words(bits)}" if bits else "alarms (6503h) are gone"
+            records.append(DeviceEvent(self.name, stamp, EventKind.ALARM, text, bits))
+            self._alarm_bits = bits
+
+    def _take_warnings(self, stamp: Stamp, bits: int, records: list[Record]) -> None:
+        if bits != self._warning_bits:
+            text = f"warnings (6505h): {warning_words(bits)}" if bits else "warnings (6505h) are gone"
+            records.append(DeviceEvent(self.name, stamp, EventKind.WARNING, text, bits))
+            self._warning_bits = bits
+
+    def _is_jump(self, elapsed_ns: int, moved_counts: int) -> bool:
+        """Whether the joint cannot have moved so far in that time."""
+        return self._jump_rate is not None and abs(moved_counts) > self._jump_rate * max(elapsed_ns, 0) + self._margin
+
+    def _jumped(self, stamp: Stamp, counts: int, before: float, after: float, records: list[Record]) -> None:
+        """A sample that no motion explains: one event, and no value, because it is not known which zero it counts from.
+
+        The samples after it are given as the device gives them: whoever relies on the joint's zero has the event to
+        tell that it must be checked.
+        """
+        text = (
+            f"position jumped from {before:.4f} to {after:.4f} {self._unit}, more than the joint can move: "
+            "a preset was written, or the encoder lost its place; check the joint's zero"
+        )
+        records.append(DeviceEvent(self.name, stamp, EventKind.PRESET_JUMP, text, counts))
+        records.append(Reading(self.name, stamp, None, self._unit, Status.OUT_OF_RANGE, counts))
+
+
+class EncoderDecoder(_PositionDecoder):
+    """Decoder of one `EncoderChannel`.
+
+    Raises:
+        DescriptionError: the PDO does not carry 6004h, or the counts per turn or in all are not positive.
+    """
+
+    def __init__(self, channel: EncoderChannel) -> None:
+        if channel.units_per_revolution < 1 or not 1 <= channel.total_units <= 1 << 32:
+            raise DescriptionError(
+                channel.name, "units_per_revolution must be at least 1 and total_units 1 to 2**32 (a U32)"
+            )
+        super().__init__(channel, POSITION, channel.units_per_revolution / 360.0)
+        total = channel.total_units
+        self._total = total
+        self._is_power_of_two = total & (total - 1) == 0
+        self._shift = self._position.first_bit
+        self._mask = (1 << self._position.length_bits) - 1
+        if self._is_power_of_two:
+            self._mask &= total - 1
+        # For sign -1 the half-open end changes sides, so that -180 deg is written as for sign +1
+        self._half = total // 2 if channel.sign == 1 else (total - 1) // 2
+        self._zero = channel.zero_counts
+        self._deg_per_count = channel.sign * 360.0 / channel.units_per_revolution
+
+    def decode(self, stamp: Stamp, data: bytes) -> list[Record]:
+        if len(data) * 8 < self._needed_bits:
+            return self._too_short(stamp, data, self._needed_bits)
+        records: list[Record] = []
+        bits = int.from_bytes(data, "little")
+        if self._has_extras:
+            self._take_extras(stamp, bits, records)
+        counts = bits >> self._shift & self._mask
+        if self._alarm_bits or self.is_void:
+            self._last = None
+            records.append(Reading(self.name, stamp, None, self._unit, Status.DEVICE_ALARM, counts))
+            return records
+        total = self._total
+        if counts >= total:
+            records.append(Reading(self.name, stamp, None, self._unit, Status.OUT_OF_RANGE, counts))
+            return records
+        half = self._half
+        value = ((counts - self._zero + half) % total - half) * self._deg_per_count
+        if self._jump_rate is not None:
+            last, self._last = self._last, (stamp, counts)
+            if last is not None:
+                moved = (counts - last[1] + total // 2) % total - total // 2
+                if self._is_jump(stamp.since(last[0]), moved):
+                    before = ((last[1] - self._zero + half) % total - half) * self._deg_per_count
+                    self._jumped(stamp, counts, before, value, records)
+                    return records
+        records.append(Reading(self.name, stamp, value, self._unit, Status.OK, counts))
+        return records
+
+
+class LinearDecoder(_PositionDecoder):
+    """Decoder of one `LinearChannel`.
+
+    6020h is signed. 6004h is unsigned by the profile and signed on some transducers: the reading of the two that lies
+    in `range_mm` is taken, and where both do, none.
+
+    Raises:
+        DescriptionError: the PDO does not carry the position object, or the step is not positive.
+    """
+
+    def __init__(self, channel: LinearChannel) -> None:
+        if channel.step_nm < 1:
+            raise DescriptionError(channel.name, f"step_nm must be at least 1, got {channel.step_nm}")
+        self._nm_per_count = channel.sign * channel.step_nm
+        super().__init__(channel, channel.position_object, 1e6 / channel.step_nm)
+        self._zero = channel.zero_counts
+        self._range = channel.range_mm
+        self._may_be_unsigned = channel.position_object == POSITION
+
+    def decode(self, stamp: Stamp, data: bytes) -> list[Record]:
+        if len(data) * 8 < self._needed_bits:
+            return self._too_short(stamp, data, self._needed_bits)
+        records: list[Record] = []
+        bits = int.from_bytes(data, "little")
+        if self._has_extras:
+            self._take_extras(stamp, bits, records)
+        counts = self._position.extract_signed(bits)
+        if self._alarm_bits or self.is_void:
+            self._last = None
+            records.append(Reading(self.name, stamp, None, self._unit, Status.DEVICE_ALARM, counts))
+            return records
+        if counts < 0 and self._may_be_unsigned:
+            unsigned = self._position.extract(bits)
+            if self._is_in_range(unsigned):
+                if self._is_in_range(counts):
+                    reason = f"{unsigned} and {counts} counts both lie in range_mm: narrow it to the transducer's"
+                    records.append(DecodeFailure(self.name, stamp, reason, data))
+                    records.append(Reading(self.name, stamp, None, self._unit, Status.MALFORMED, counts))
+                    return records
+                counts = unsigned
+        if not self._is_in_range(counts):
+            records.append(Reading(self.name, stamp, None, self._unit, Status.OUT_OF_RANGE, counts))
+            return records
+        if self._jump_rate is not None:
+            last, self._last = self._last, (stamp, counts)
+            if last is not None and self._is_jump(stamp.since(last[0]), counts - last[1]):
+                self._jumped(stamp, counts, self._value(last[1]), self._value(counts), records)
+                return records
+        records.append(Reading(self.name, stamp, self._value(counts), self._unit, Status.OK, counts))
+        return records
+
+    def _value(self, counts: int) -> float:
+        return (counts - self._zero) * self._nm_per_count / 1e6
+
+    def _is_in_range(self, counts: int) -> bool:
+        return self._range[0] <= self._value(counts) <= self._range[1]
+
+
+def _field(channel: PdoChannel, index: int) -> PdoField:
+    field = channel.pdo.mapping.find(index)
+    if field is None:
+        raise DescriptionError(channel.name, channel.does_not_carry(f"object {index:04X}h"))
+    return field
