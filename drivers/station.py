@@ -1,0 +1,289 @@
+"""A total station on a serial port: its configuration, the loop that talks to it, the decoder of what it sends."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from typing import Literal, Protocol
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from drivers.bytestream import ByteTimes, Frame, Framer, Garbage
+from drivers.clock import NS_PER_S, Clock, Stamp
+from drivers.conversation import Conversation, Timing
+from drivers.errors import LinkError
+from drivers.readings import (
+    Capture,
+    DecodeFailure,
+    DeviceEvent,
+    EventKind,
+    Fix,
+    Gap,
+    GapReason,
+    LinkItem,
+    Record,
+    SerialCapture,
+)
+from drivers.serialport import SerialConfig, SerialPort
+from drivers.sokkia.conversation import set_conversation
+from drivers.sokkia.interpreter import SetInterpreter
+from drivers.sokkia.set import SetFramer
+from drivers.survey import RecordError, position_mm
+from drivers.target import JumpGuard, LockWatch, MotionLimit, SilenceWatch
+from drivers.topcon.codec import GtsFramer
+from drivers.topcon.conversation import classic_conversation, tracking_conversation
+from drivers.topcon.interpreter import GtsInterpreter
+from drivers.topcon.records import CorrectionScales
+
+__all__ = ["StationConfig", "StationDecoder", "StationLink", "position_mm"]
+
+_LONGEST_READ_S = 0.5  # how soon a loop with nothing to do notices that it is to stop
+_LONGEST_WRITE_S = 5.0
+_SET_PAUSE_S = 0.7  # SET600: the next command comes this long after ACK or NAK
+_UNFINISHED_S = 2.0  # an unfinished record is given up after this; the slowest takes 0.6 s at 1200 baud
+_FIRST_RETRY_S = 0.5
+_LAST_RETRY_S = 10.0
+
+Emit = Callable[[LinkItem], None]
+
+
+class StationConfig(BaseModel):
+    """A total station and how to listen to it.
+
+    Attributes:
+        name: of the station; its captures, fixes and events carry it.
+        profile: `topcon_gts8` (tracking family, polled with C11), `topcon_classic` (single shots with C),
+            `sokkia_set` (SET command family, newer Topcon too), or `passive` (sends nothing, ever).
+        serial: its port.
+        listen_to: whose records a passive listener expects.
+        init: further commands of the set-up, without check sums: `ZB4+`, `ZB52`, `ZB61` (circle clockwise, compensator
+            on, zenith 0) for topcon_gts8, `Xe` (tracking) for sokkia_set. Each must be one that the station
+            acknowledges.
+        crlf: commands end with CR LF after ETX (Topcon), or CR LF rather than CR (Sokkia).
+        measure: what topcon_classic asks for.
+        poll_interval_s: from one request to the next.
+        link_delay_s: constant delay from the measurement to the first byte on the host. Fixes do not contain it; who
+            joins them with the joints takes it off.
+        ack_timeout_s, reply_timeout_s, give_up_s, relock_after_s: see `drivers.conversation.Timing`.
+        max_speed_m_s, jump_slack_m, new_target_after_s: see `drivers.target.MotionLimit`.
+        silence_timeout_s: no record for longer than this is a gap; 0 for a station that speaks when it is told to.
+        ppm_scale, prism_scale_mm: see `drivers.topcon.records.CorrectionScales`.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str = Field(default="station", pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
+    profile: Literal["topcon_gts8", "topcon_classic", "sokkia_set", "passive"] = "topcon_gts8"
+    serial: SerialConfig
+    listen_to: Literal["topcon", "sokkia"] = "topcon"
+    init: tuple[str, ...] = ()
+    crlf: bool = True
+    measure: Literal["slope_distance", "coordinates"] = "slope_distance"
+    poll_interval_s: float = Field(default=0.1, ge=0)
+    link_delay_s: float = Field(default=0.0, ge=0)
+    ack_timeout_s: float = Field(default=2.0, gt=0)
+    reply_timeout_s: float = Field(default=10.0, gt=0)
+    give_up_s: float = Field(default=20.0, gt=0)
+    relock_after_s: float = Field(default=30.0, gt=0)
+    max_speed_m_s: float = Field(default=5.0, gt=0)
+    jump_slack_m: float = Field(default=0.1, gt=0)
+    new_target_after_s: float = Field(default=30.0, gt=0)
+    silence_timeout_s: float = Field(default=5.0, ge=0)
+    ppm_scale: float = Field(default=0.1, gt=0)
+    prism_scale_mm: float = Field(default=0.1, gt=0)
+
+    @field_validator("init")
+    @classmethod
+    def _printable(cls, commands: tuple[str, ...]) -> tuple[str, ...]:
+        for command in commands:
+            if not (command and command.isascii() and command.isprintable()):
+                raise ValueError(f"{command!r} is no command: give printable ASCII without check sum and line end")
+        return commands
+
+    @model_validator(mode="after")
+    def _passive_is_silent(self) -> StationConfig:
+        if self.profile == "passive" and self.init:
+            raise ValueError("a passive listener sends nothing: remove init, or choose another profile")
+        return self
+
+    @property
+    def is_sokkia(self) -> bool:
+        """Whether the station's records are those of the SET family."""
+        return self.profile == "sokkia_set" or (self.profile == "passive" and self.listen_to == "sokkia")
+
+
+def start_conversation(config: StationConfig) -> Conversation | None:
+    """The conversation of the station's profile, at its beginning; None for a passive listener."""
+    init = tuple(command.encode("ascii") for command in config.init)
+    timing = Timing(
+        poll_interval_s=config.poll_interval_s,
+        ack_timeout_s=config.ack_timeout_s,
+        reply_timeout_s=config.reply_timeout_s,
+        give_up_s=config.give_up_s,
+        relock_after_s=config.relock_after_s,
+        pause_after_ack_s=_SET_PAUSE_S if config.is_sokkia else 0.0,
+    )
+    match config.profile:
+        case "topcon_gts8":
+            return tracking_conversation(init, config.crlf, timing)
+        case "topcon_classic":
+            return classic_conversation(init, config.measure == "coordinates", config.crlf, timing)
+        case "sokkia_set":
+            return set_conversation(init, config.crlf, timing)
+        case "passive":
+            return None
+
+
+class StationLink:
+    """Owns a station's port, opens it again when it was lost, talks to the station, hands on what crosses the wire.
+
+    It decodes no value: the conversation looks at answers only to know what to send next.
+
+    Args:
+        config: the station.
+        clock: stamps captures, paces the conversation.
+    """
+
+    def __init__(self, config: StationConfig, clock: Clock) -> None:
+        self.name = config.name
+        self._config = config
+        self._clock = clock
+
+    def run(self, emit: Emit, stop: threading.Event) -> None:
+        """Listen and talk until `stop` is set.
+
+        Emits captures at once, LINK_UP, LINK_LOST, CONFIGURED and INSTRUMENT_ERROR events, and the LINK_DOWN gap.
+        """
+        retry_s = _FIRST_RETRY_S
+        opened: Stamp | None = None
+        down_since: Stamp | None = None
+        told = ""
+        while not stop.is_set():
+            try:
+                port = SerialPort(self._config.serial, self.name, self._clock.real_seconds(_LONGEST_WRITE_S))
+                with closing(port):
+                    self._tell(emit, EventKind.LINK_UP, f"{self._config.serial.path} opened")
+                    if down_since is not None:
+                        emit(Gap(self.name, GapReason.LINK_DOWN, down_since, self._clock.now()))
+                    down_since, told, opened = None, "", self._clock.now()
+                    self._converse(port, emit, stop)
+            except LinkError as error:
+                if opened is not None and self._clock.now().since(opened) > _LAST_RETRY_S * NS_PER_S:
+                    retry_s = _FIRST_RETRY_S  # a port that fails as soon as it is open is tried ever more rarely
+                opened = None
+                if down_since is None:
+                    down_since = self._clock.now()
+                    emit(Gap(self.name, GapReason.LINK_DOWN, down_since))
+                if str(error) != told:  # once a cause, not once an attempt
+                    told = str(error)
+                    self._tell(emit, EventKind.LINK_LOST, told)
+                self._clock.wait(stop, retry_s)
+                retry_s = min(2 * retry_s, _LAST_RETRY_S)
+
+    def _converse(self, port: SerialPort, emit: Emit, stop: threading.Event) -> None:
+        conversation = start_conversation(self._config)
+        while not stop.is_set():
+            wait_s = _LONGEST_READ_S if conversation is None else self._speak(port, conversation, emit)
+            data = port.read(self._clock.real_seconds(wait_s))
+            if data:
+                stamp = self._clock.now()
+                emit(SerialCapture(self.name, stamp, data))
+                if conversation is not None:
+                    conversation.feed(data, stamp.monotonic_ns)
+        if conversation is not None:
+            for command in conversation.closing():
+                self._send(port, command, emit)
+
+    def _speak(self, port: SerialPort, conversation: Conversation, emit: Emit) -> float:
+        """Send what is due; how many seconds there is nothing more to send."""
+        now_ns = self._clock.monotonic_ns()
+        while (command := conversation.step(now_ns)) is not None:
+            self._send(port, command, emit)
+        for notice in conversation.take_notices():
+            self._tell(emit, notice.kind, notice.text)
+        now_ns = self._clock.monotonic_ns()
+        return min(_LONGEST_READ_S, max(0, conversation.wake_ns(now_ns) - now_ns) / NS_PER_S)
+
+    def _send(self, port: SerialPort, command: bytes, emit: Emit) -> None:
+        stamp = self._clock.now()
+        port.write(command)
+        emit(SerialCapture(self.name, stamp, command, is_transmitted=True))
+
+    def _tell(self, emit: Emit, kind: EventKind, text: str) -> None:
+        emit(DeviceEvent(self.name, self._clock.now(), kind, text))
+
+
+class Interpreter(Protocol):
+    """What a protocol's frames mean."""
+
+    def interpret(self, data: bytes, first_byte: Stamp, last_byte: Stamp) -> Sequence[Fix | DeviceEvent]:
+        """The records of one frame; RecordError if it is none that is known."""
+
+
+class StationDecoder:
+    """Captures of a station's link to fixes, events, gaps and failures (`drivers.readings.Decoder`).
+
+    A fix is stamped with the arrival of its first byte. Transmitted captures yield nothing; an answer arrives after
+    them. What the passing of time alone causes is stamped with the instant at which it was due, so records do not
+    depend on how often `tick` is called.
+
+    Args:
+        config: the station, as its link has it.
+    """
+
+    def __init__(self, config: StationConfig) -> None:
+        self._station = config.name
+        self._framer: Framer = SetFramer() if config.is_sokkia else GtsFramer()
+        self._interpreter: Interpreter = (
+            SetInterpreter(config.name)
+            if config.is_sokkia
+            else GtsInterpreter(config.name, CorrectionScales(config.ppm_scale, config.prism_scale_mm))
+        )
+        self._times = ByteTimes(config.serial.character_s)
+        self._lock = LockWatch(config.name)
+        self._guard = JumpGuard(
+            config.name, MotionLimit(config.max_speed_m_s, config.jump_slack_m, config.new_target_after_s)
+        )
+        self._silence = SilenceWatch(config.name, config.silence_timeout_s)
+        self._last_byte: Stamp | None = None
+
+    def feed(self, capture: Capture) -> list[Record]:
+        if not isinstance(capture, SerialCapture):
+            return []
+        records = self.tick(capture.stamp)
+        if capture.is_transmitted:
+            self._times.sent(capture.stamp)
+            return records
+        self._last_byte = capture.stamp
+        self._times.received(len(capture.data), capture.stamp)
+        for item in self._framer.feed(capture.data):
+            records += self._failure(item) if isinstance(item, Garbage) else self._records(item)
+        return records
+
+    def tick(self, now: Stamp) -> list[Record]:
+        records: list[Record] = []
+        if self._last_byte is not None and now.since(self._last_byte) > _UNFINISHED_S * NS_PER_S:
+            for garbage in self._framer.flush("record broken off"):
+                records += self._failure(garbage)
+            self._last_byte = None
+        return records + self._silence.tick(now)
+
+    def _failure(self, garbage: Garbage) -> list[Record]:
+        return [DecodeFailure(self._station, self._times.at(garbage.start), garbage.reason, garbage.raw)]
+
+    def _records(self, frame: Frame) -> list[Record]:
+        first, last = self._times.at(frame.start), self._times.at(frame.end)
+        try:
+            said = self._interpreter.interpret(frame.data, first, last)
+        except RecordError as error:
+            return [DecodeFailure(self._station, first, str(error), frame.data)]
+        records: list[Record] = []
+        for record in said:
+            if isinstance(record, Fix):
+                fix, jump = self._guard.see(record)
+                records += [*self._silence.heard(record), *self._lock.see(record)]
+                records += [fix] if jump is None else [jump, fix]
+            else:
+                records.append(record)
+        return records
