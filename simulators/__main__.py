@@ -1,0 +1,118 @@
+"""`python -m simulators`: a simulated rig as a process of its own, on two ptys."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+
+from calibration.errors import RigError
+from calibration.rig import Rig, parse_rig, shipped_rig, shipped_rigs
+from drivers.clock import ScaledClock, Stamp, SystemClock
+from simulators.effects import parse_effects
+from simulators.faults import parse_faults, random_faults
+from simulators.live import LiveRig, print_line
+from simulators.rig_simulator import RigSimulator, SimulatorSettings
+from simulators.total_station import StationSettings
+from simulators.truth import RigTruth
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m simulators", description=__doc__)
+    add = parser.add_argument
+    add("--rig", required=True, help="a shipped rig's name or a path to a TOML file")
+    add("--seed", type=int, default=0, help="the machine and its noise")
+    add("--perturbation", type=float, default=1.0, help="how many build tolerances the machine deviates")
+    add("--rate", type=float, default=1.0, help="simulated seconds per real second")
+    add("--origin", type=_origin, help="UTC_NS,MONOTONIC_NS,BOOT_ID at which simulated and real time agree")
+    add("--can-port", type=Path, required=True, help="where the slcan port appears")
+    add("--station-port", type=Path, required=True, help="where the station's port appears")
+    add("--effects", default="", help="hidden effects: FAMILY@WHERE[:NAME=VALUE...],...")
+    add("--faults", default="", help="scripted faults: KIND@SECONDS[:NAME=VALUE...],...")
+    add("--random-faults", type=float, metavar="SECONDS", help="further faults at this mean interval")
+    add("--bus-master", choices=("machine", "host"), default="machine", help="who starts the nodes and sends SYNC")
+    add("--sync-ms", type=float, default=50.0, help="the machine's SYNC interval")
+    add("--signal-ms", type=float, default=10.0, help="cycle of the machine's own signals")
+    add("--setup", default="", help="name of the station set-up: decides where the machine stands")
+    add("--profile", choices=("topcon_gts8", "topcon_classic", "sokkia_set"), default="topcon_gts8")
+    add("--baud", type=int, default=9600, help="of the station's line")
+    add("--push-s", type=float, help="the station sends records unasked at this interval")
+    return parser
+
+
+def _origin(text: str) -> Stamp:
+    try:
+        utc_ns, monotonic_ns, boot_id = text.split(",", 2)
+        return Stamp(int(utc_ns), int(monotonic_ns), boot_id)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not UTC_NS,MONOTONIC_NS,BOOT_ID") from None
+
+
+def _load_rig(name_or_path: str) -> Rig:
+    if name_or_path in shipped_rigs():
+        return shipped_rig(name_or_path)
+    try:
+        return parse_rig(Path(name_or_path).read_text(encoding="utf-8"), name_or_path)
+    except (OSError, UnicodeDecodeError) as error:
+        shipped = ", ".join(shipped_rigs())
+        raise RigError(name_or_path, "", f"no shipped rig ({shipped}) and not to be read as a file: {error}") from error
+
+
+def _build(options: argparse.Namespace) -> RigSimulator:
+    if min(options.rate, options.sync_ms, options.signal_ms, options.baud) <= 0 or options.seed < 0:
+        raise ValueError("rate, sync-ms, signal-ms and baud must be positive, seed not negative")
+    if options.push_s is not None and options.push_s <= 0:
+        raise ValueError("push-s must be positive")
+    station = StationSettings(profile=options.profile, baud=options.baud, push_interval_s=options.push_s)
+    settings = SimulatorSettings(
+        bus_master=options.bus_master,
+        sync_period_s=options.sync_ms / 1e3,
+        signal_period_s=options.signal_ms / 1e3,
+        station=station,
+        setup=options.setup,
+    )
+    effects = parse_effects(options.effects)
+    truth = RigTruth(_load_rig(options.rig), options.seed, perturbation=options.perturbation, effects=effects)
+    faults = list(parse_faults(options.faults))
+    if options.random_faults is not None:
+        if options.random_faults <= 0:
+            raise ValueError("random-faults must be positive")
+        kinds = ("lock_loss", "prism_jump", "bad_check", "dropped_ack", "clutter", "joined_buffers")
+        faults += random_faults(options.seed, 86_400.0, options.random_faults, kinds)
+    return RigSimulator(truth, options.seed, settings, faults=faults)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a simulated rig until its standard input ends; returns the exit status."""
+    options = _parser().parse_args(arguments)
+    origin = options.origin or SystemClock().now()
+    wake_read, wake_write = os.pipe()
+    os.set_blocking(wake_write, False)
+
+    def stop(signum: int, frame: FrameType | None) -> None:
+        del signum, frame
+        os.write(wake_write, b"x")
+
+    signal.signal(signal.SIGTERM, stop)
+    signal.signal(signal.SIGINT, stop)
+    try:
+        simulator = _build(options)
+        live = LiveRig(simulator, ScaledClock(options.rate, origin), options.can_port, options.station_port, print_line)
+    except (RigError, ValueError, OSError) as error:
+        sys.stderr.write(f"simulators: {error}\n")
+        return 2
+    try:
+        live.run(sys.stdin.fileno(), wake_read)
+    except BrokenPipeError:  # nobody listens to the answers any more
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    finally:
+        live.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

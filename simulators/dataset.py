@@ -1,0 +1,201 @@
+"""Observations of a simulated machine, straight into the observations table: no protocols, no waiting."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.rig import Joint, Rig, Station
+from simulators.truth import RigTruth
+
+Floats = NDArray[np.float64]
+Strings = NDArray[np.str_]
+
+ARCSEC = np.pi / 180 / 3600
+
+
+@dataclass(frozen=True)
+class SimulatedObservations:
+    """n fixes with their joint readings, and what the truth knows about them.
+
+    Attributes:
+        columns: the observations CSV's columns, in order: name -> (n,) strings or numbers.
+        measured_mm: (n, 3) the fixes, as in x_mm, y_mm, z_mm.
+        oracle_mm: (n, 3) where the true machine has the prism *if the joints are as read*: what a perfect model
+            would predict from the same row.
+    """
+
+    columns: Mapping[str, Floats | Strings]
+    measured_mm: Floats
+    oracle_mm: Floats
+
+    def __len__(self) -> int:
+        return len(self.measured_mm)
+
+    @property
+    def noise_rms_mm(self) -> float:
+        """RMS of the 3-D difference of measurement and oracle: no model can do better but by luck."""
+        return float(np.sqrt(np.mean(np.sum((self.measured_mm - self.oracle_mm) ** 2, axis=1))))
+
+    def csv_text(self) -> str:
+        """The observations CSV; numbers are written so that they read back exactly."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(self.columns)
+        for row in zip(*(c.tolist() for c in self.columns.values()), strict=True):
+            writer.writerow([repr(v) if isinstance(v, float) else v for v in row])
+        return out.getvalue()
+
+
+def random_poses(rig: Rig, n: int, rng: np.random.Generator) -> dict[str, Floats]:
+    """n poses drawn evenly within the joint limits: joint name -> (n,) deg or mm."""
+    return {j.name: rng.uniform(*j.limits, n) for j in rig.joints}
+
+
+def simulate_observations(
+    truth: RigTruth,
+    n_poses: int,
+    seed: int,
+    *,
+    poses: Mapping[str, Floats] | None = None,
+    prisms: Sequence[str] | None = None,
+    prisms_per_pose: Literal["all", "one"] = "all",
+    repeats: int = 1,
+    noise_mm: float | None = None,
+    joint_noise: bool = True,
+    sigma_columns: bool = False,
+    setup: str = "",
+    session: str = "",
+    columns: Mapping[str, Floats] | None = None,
+) -> SimulatedObservations:
+    """Stand still in pose after pose and measure.
+
+    Args:
+        truth: the machine.
+        n_poses: how many poses.
+        seed: the same seed gives the same poses and noise.
+        poses: joint name -> (n_poses,) deg or mm; random within the limits when absent.
+        prisms: which prisms are measured; all of the rig's when absent.
+        prisms_per_pose: `all` of them in each pose, or `one` in turn.
+        repeats: fixes of a prism in a pose.
+        noise_mm: standard deviation of each coordinate; the rig's station noise (angles, distance, target) when absent.
+        joint_noise: joint readings carry the rig's `sigma` and `resolution`, drawn once per pose: a standing joint
+            reads the same at each of its fixes.
+        sigma_columns: also give sigma_x_mm, sigma_y_mm, sigma_z_mm (without the joints' share).
+        setup: station set-up, also decides where the machine stands; session: label.
+        columns: further columns by pose (`payload_kg`, `temperature_degC`) -> (n_poses,).
+
+    Returns:
+        Columns `prism`, the joints, x, y, z, `pose`, `time_s`, `dwell_s`, `<joint>_dir`, `<joint>_rate` (0), and
+        `setup`, `session` where given.
+
+    Raises:
+        KeyError: unknown prism.
+        ValueError: an effect of the machine needs a column that is missing.
+    """
+    rig, rng = truth.rig, np.random.default_rng([seed, 10])
+    names = tuple(rig.prism_names if prisms is None else prisms)
+    held = random_poses(rig, n_poses, rng) if poses is None else {k: np.asarray(v, float) for k, v in poses.items()}
+    before = random_poses(rig, 1, rng)
+    by_pose = _approach(rig, held, before, rng) | dict(columns or {})
+    read = {j.name: _reading(j, held[j.name], rng) if joint_noise else held[j.name] for j in rig.joints}
+
+    turns = len(names) if prisms_per_pose == "all" else 1
+    pose = np.repeat(np.arange(n_poses), turns * repeats)
+    if prisms_per_pose == "all":
+        which = np.tile(np.repeat(np.arange(len(names)), repeats), n_poses)
+    else:
+        which = np.repeat(np.arange(n_poses) % len(names), repeats)
+    shot = np.tile(np.arange(turns * repeats), n_poses)
+
+    true_mm, oracle_mm = np.empty((len(pose), 3)), np.empty((len(pose), 3))
+    for number, name in enumerate(names):
+        rows = which == number
+        if rows.any():
+            there = {k: v[pose[rows]] for k, v in by_pose.items()}
+            for out, joints in ((true_mm, held), (oracle_mm, read)):
+                out[rows] = truth.prism_mm(name, {k: v[pose[rows]] for k, v in joints.items()}, there, setup=setup)
+    if noise_mm is None:
+        measured_mm, sigma_mm = station_noise(rig.station, true_mm, rng)
+    else:
+        measured_mm = true_mm + rng.normal(0, noise_mm, true_mm.shape)
+        sigma_mm = np.full_like(true_mm, noise_mm)
+
+    prism_column: Strings = np.array(names, dtype=np.str_)[which]
+    table: dict[str, Floats | Strings] = {"prism": prism_column}
+    table |= {j.column: read[j.name][pose] for j in rig.joints}
+    table |= {f"{axis}_mm": measured_mm[:, i] for i, axis in enumerate("xyz")}
+    for label, value in (("setup", setup), ("session", session)):
+        if value:
+            table[label] = np.full(len(pose), value)
+    table["pose"] = pose.astype(np.str_)
+    if sigma_columns:
+        table |= {f"sigma_{axis}_mm": sigma_mm[:, i] for i, axis in enumerate("xyz")}
+    # One fix a second in a pose; dwell counts from the end of the motion to the fix.
+    table |= {k: v[pose] + (shot if k in ("time_s", "dwell_s") else 0.0) for k, v in by_pose.items()}
+    table |= {f"{j.name}_rate": np.zeros(len(pose)) for j in rig.joints}
+    return SimulatedObservations(table, measured_mm, oracle_mm)
+
+
+def _approach(
+    rig: Rig, held: Mapping[str, Floats], before: Mapping[str, Floats], rng: np.random.Generator
+) -> dict[str, Floats]:
+    """By pose: when its first fix comes, how long it has stood, and from which side each joint came."""
+    steps = {name: np.diff(values, prepend=before[name]) for name, values in held.items()}
+    travel_s = np.max([np.abs(steps[j.name]) / (0.25 * j.max_rate) for j in rig.joints], axis=0)
+    dwell_s = rng.uniform(5.0, 60.0, len(travel_s))
+    out = {"time_s": np.cumsum(travel_s + dwell_s), "dwell_s": dwell_s}
+    return out | {f"{name}_dir": np.sign(step) for name, step in steps.items()}
+
+
+def _reading(joint: Joint, values: Floats, rng: np.random.Generator) -> Floats:
+    noisy = values + rng.normal(0, joint.sigma, len(values))
+    if joint.resolution == 0.0:
+        return noisy
+    return np.rint(noisy / joint.resolution) * joint.resolution
+
+
+def station_noise(station: Station, true_mm: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Measure positions with a total station in the origin.
+
+    Args:
+        station: its random errors.
+        true_mm: (n, 3).
+        rng: source of the noise.
+
+    Returns:
+        (n, 3) measured positions and (n, 3) the standard deviation of each coordinate.
+    """
+    x, y, z = true_mm.T
+    level_mm = np.hypot(x, y)
+    range_mm = np.maximum(np.hypot(level_mm, z), 1.0)
+    hz, zenith = np.arctan2(x, y), np.arctan2(level_mm, z)
+    sigma_angle = station.angle_sigma_arcsec * ARCSEC
+    sigma_range_mm = station.distance_sigma_mm + station.distance_sigma_ppm * 1e-6 * range_mm
+    hz_, zenith_ = (a + rng.normal(0, sigma_angle, len(a)) for a in (hz, zenith))
+    range_ = range_mm + rng.normal(0, 1.0, len(x)) * sigma_range_mm
+    shake_mm = rng.normal(0, 1.0, true_mm.shape) * station.target_sigma_mm
+    measured = np.column_stack(
+        [
+            range_ * np.sin(zenith_) * np.sin(hz_),
+            range_ * np.sin(zenith_) * np.cos(hz_),
+            range_ * np.cos(zenith_),
+        ]
+    )
+    # Directions of growing range, horizontal circle and zenith angle, each with its own spread.
+    along = np.column_stack([np.sin(zenith) * np.sin(hz), np.sin(zenith) * np.cos(hz), np.cos(zenith)])
+    round_about = np.column_stack([np.cos(hz), -np.sin(hz), np.zeros_like(hz)])
+    downward = np.cross(round_about, along)
+    variance = (
+        (along * sigma_range_mm[:, None]) ** 2
+        + (round_about * (level_mm * sigma_angle)[:, None]) ** 2
+        + (downward * (range_mm * sigma_angle)[:, None]) ** 2
+        + station.target_sigma_mm**2
+    )
+    return measured + shake_mm, np.sqrt(variance)

@@ -1,0 +1,122 @@
+"""The machine as its devices feel it: joints in motion, the loads on them, and the true places of the prisms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulators.dataset import random_poses
+from simulators.machine_signals import MachineState
+from simulators.motion import BoomMotion
+from simulators.truth import RigTruth
+
+Floats = NDArray[np.float64]
+
+# Which joint a valve moves, on machines that have one of that name.
+_VALVE_JOINTS = {"boom": "theta4", "arm": "theta1", "feed": "L3", "slew": "theta3"}
+_BAR_PER_NM = 7e-4  # of the boom's lifting joint in its cylinder
+_IDLE_BAR = 20.0
+_LOAD_EVERY_S = 0.25  # loads change slowly and are costly to compute
+_CONTROL_POINTS = 4
+
+
+class Machine:
+    """A true machine in motion, seen from one station set-up.
+
+    Attributes:
+        truth, motion: what it is made of.
+        setup: the station set-up.
+        control_points_mm: fixed marks around the machine, in the station's frame: name -> (3,).
+
+    Args:
+        truth: its geometry and effects.
+        seed: control points and reading noise.
+        motion: its plan.
+        setup: station set-up, decides where the machine stands.
+    """
+
+    def __init__(self, truth: RigTruth, seed: int, motion: BoomMotion, *, setup: str = "") -> None:
+        self.truth, self.motion, self.setup = truth, motion, setup
+        self.rng = np.random.default_rng([seed, 30])
+        self.control_points_mm = _control_points(np.random.default_rng([seed, 31]))
+        self._rig = truth.rig
+        self._sigma = {j.name: j.sigma for j in self._rig.joints}
+        self._valves = {v: self._rig.joint(j) for v, j in _VALVE_JOINTS.items() if j in self._rig.joint_names}
+        self._load_at_s = -1e9
+        self._load_bar = _IDLE_BAR
+        self._last_place: tuple[str, float, Floats] | None = None
+
+    def joint(self, name: str, t_s: float) -> tuple[float, float]:
+        """What a joint's encoder or transducer senses, random error included, and its rate: deg or mm."""
+        value, rate = self.motion.joint(name, t_s)
+        return value + self._sigma[name] * self.rng.standard_normal(), rate
+
+    def place_mm(self, target: str, t_s: float) -> Floats:
+        """(3,) true position of a prism or control point in the station's frame; KeyError if there is none."""
+        if target in self.control_points_mm:
+            return self.control_points_mm[target]
+        # A tracker asks for direction and distance of one instant one after the other.
+        last = self._last_place
+        if last is None or last[:2] != (target, t_s):
+            last = self._last_place = (target, t_s, self._solve(target, self.motion.values(t_s), t_s))
+        return last[2]
+
+    def prism_at_mm(self, prism: str, pose: Mapping[str, float], columns: Mapping[str, float]) -> Floats:
+        """(3,) true position of a prism in any pose, for whoever checks a model against the truth.
+
+        Args:
+            prism: its name.
+            pose: joint name -> value, deg or mm.
+            columns: what effects need besides (`theta4_dir`); joints count as not having moved where it is missing.
+
+        Raises:
+            ValueError: unknown prism, a joint missing or unknown.
+        """
+        rig = self._rig
+        if prism not in rig.prism_names:
+            raise ValueError(f"no prism {prism!r}; this rig has {', '.join(rig.prism_names)}")
+        if set(pose) != set(rig.joint_names):
+            raise ValueError(f"a pose gives each of {', '.join(rig.joint_names)} once")
+        directions = {f"{j}_dir": 0.0 for j in rig.joint_names} | dict(columns)
+        return self._place(prism, pose, directions)
+
+    def _solve(self, prism: str, pose: Mapping[str, float], t_s: float) -> Floats:
+        columns = {f"{j}_dir": float(d) for j, d in self.motion.directions(t_s).items()}
+        return self._place(prism, pose, columns)
+
+    def _place(self, prism: str, pose: Mapping[str, float], columns: Mapping[str, float]) -> Floats:
+        joints = {name: np.array([value]) for name, value in pose.items()}
+        more = {name: np.array([value]) for name, value in columns.items()}
+        place: Floats = self.truth.prism_mm(prism, joints, more, setup=self.setup)[0]
+        return place
+
+    def state(self, t_s: float) -> MachineState:
+        """Speeds and loads for the machine controller's signals."""
+        speeds = {valve: self.motion.joint(j.name, t_s)[1] / j.max_rate for valve, j in self._valves.items()}
+        return MachineState(speeds, self.boom_load_bar(t_s))
+
+    def boom_load_bar(self, t_s: float) -> float:
+        """Pressure in the lower side of the boom cylinder."""
+        if "boom" in self._valves and abs(t_s - self._load_at_s) >= _LOAD_EVERY_S:
+            self._load_at_s = t_s
+            joints = {name: np.array([value]) for name, value in self.motion.values(t_s).items()}
+            torque = float(self.truth.gravity_load(self._valves["boom"].name, joints, setup=self.setup)[0])
+            self._load_bar = _IDLE_BAR + _BAR_PER_NM * abs(torque)
+        return self._load_bar
+
+    def random_poses(self, n: int, seed: int) -> list[dict[str, float]]:
+        """n poses within the joint limits."""
+        drawn = random_poses(self._rig, n, np.random.default_rng([seed, 32]))
+        return [{name: round(float(values[i]), 4) for name, values in drawn.items()} for i in range(n)]
+
+
+def _control_points(rng: np.random.Generator) -> dict[str, Floats]:
+    """Marks on the walls: all around, 6 to 15 m away, from knee height to the roof."""
+    out = {}
+    for i in range(_CONTROL_POINTS):
+        hz = 2 * np.pi * (i + rng.uniform(0.1, 0.9)) / _CONTROL_POINTS
+        level, up = rng.uniform(6000, 15000), rng.uniform(-1000, 4000)
+        out[f"cp{i + 1}"] = np.array([level * np.sin(hz), level * np.cos(hz), up])
+    return out

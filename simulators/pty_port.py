@@ -1,0 +1,102 @@
+"""A pseudo-terminal behind a symbolic link: the serial port that a simulated device is plugged into."""
+
+from __future__ import annotations
+
+import os
+import pty
+import termios
+import tty
+from pathlib import Path
+
+_BACKLOG = 65536  # bytes kept for a host that does not read; what is more is lost, as on a real line
+
+
+class PtyPort:
+    """A port that can be unplugged.
+
+    Attributes:
+        path: the symbolic link.
+        lost: bytes that nobody read.
+
+    Args:
+        path: where the link appears; its directory must exist. A link that is there already is replaced.
+
+    Raises:
+        OSError: no pty is to be had, or the link cannot be made.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.lost = 0
+        self._master = -1
+        self._slave = -1
+        self._waiting = bytearray()
+        self.plug()
+
+    @property
+    def plugged(self) -> bool:
+        """Whether the port is there."""
+        return self._master >= 0
+
+    def fileno(self) -> int:
+        """The master's file descriptor, for `select`."""
+        return self._master
+
+    def plug(self) -> None:
+        """Make the port appear; does nothing if it is there."""
+        if self.plugged:
+            return
+        self._master, self._slave = pty.openpty()
+        # The slave end stays open here, so that the port outlives hosts that come and go.
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        fresh = self.path.with_name(f".{self.path.name}.{os.getpid()}")
+        fresh.unlink(missing_ok=True)
+        try:
+            fresh.symlink_to(os.ttyname(self._slave))
+            fresh.replace(self.path)
+        except OSError:
+            self._close()
+            raise
+
+    def unplug(self) -> None:
+        """Make the port vanish: link and device; a host that has it open gets errors."""
+        if not self.plugged:
+            return
+        if self.path.is_symlink() and os.readlink(self.path) == os.ttyname(self._slave):
+            self.path.unlink()
+        self._close()
+
+    def _close(self) -> None:
+        os.close(self._master)
+        os.close(self._slave)
+        self._master = self._slave = -1
+        self._waiting.clear()
+
+    def read(self) -> bytes:
+        """What the host wrote since the last call."""
+        if not self.plugged:
+            return b""
+        try:
+            return os.read(self._master, 4096)
+        except BlockingIOError:
+            return b""
+
+    def write(self, data: bytes) -> None:
+        """Send; never blocks."""
+        if not self.plugged or not (data or self._waiting):
+            return
+        room = _BACKLOG - len(self._waiting)
+        self.lost += max(0, len(data) - room)
+        self._waiting += data[: max(0, room)]
+        try:
+            sent = os.write(self._master, self._waiting)
+        except BlockingIOError:
+            return
+        del self._waiting[:sent]
+
+    def discard(self) -> None:
+        """Forget what the host has not read yet."""
+        if self.plugged:
+            self._waiting.clear()
+            termios.tcflush(self._slave, termios.TCIFLUSH)

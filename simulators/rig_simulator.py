@@ -1,0 +1,284 @@
+"""A whole rig: machine, encoder nodes, machine controller, bus master and total station on one time line.
+
+Sans-IO: frames, bytes and the time go in, frames, bytes and events come out. `live.py` puts it on ptys in real or
+scaled time, `generate.py` runs it against a scripted host as fast as it goes. Times are simulated seconds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Literal, Protocol
+
+import numpy as np
+
+from calibration.channels import Cia404Analogue, Cia406Encoder, Cia406Linear, DbcSignal, RawSignal
+from calibration.rig import Rig
+from simulators.bus_controller import BusController
+from simulators.canopen_node import CanopenNode
+from simulators.canopen_nodes import Source, encoder_of, linear_of, pressure_of
+from simulators.fault_effects import apply_fault, check_fault
+from simulators.faults import Fault, FaultSchedule
+from simulators.frame import Frame
+from simulators.machine import Floats, Machine
+from simulators.machine_signals import MachineSignals
+from simulators.motion import BoomMotion
+from simulators.raw_signals import RawSignals
+from simulators.sokkia_station import SokkiaStation
+from simulators.station_tracker import Tracker
+from simulators.topcon_station import TopconStation
+from simulators.total_station import StationSettings, TotalStation
+from simulators.truth import RigTruth
+
+Event = Mapping[str, object]
+
+
+class BusDevice(Protocol):
+    """Something that sends frames of itself."""
+
+    def poll(self, now_s: float) -> list[Frame]:
+        """The frames that are due."""
+
+    def next_deadline(self) -> float:
+        """When `poll` will have something to do."""
+
+
+@dataclass(frozen=True)
+class SimulatorSettings:
+    """How the rig is set up.
+
+    Attributes:
+        bus_master: `machine`: the machine's controller has commissioned the nodes, starts them and sends SYNC; a host
+            may just listen. `host`: the nodes are fresh from the factory, silent until a host sets them up.
+        sync_period_s: the machine's SYNC.
+        signal_period_s: cycle of the machine controller's signals; machine.dbc says 10 ms.
+        station: the instrument.
+        setup: station set-up, decides where the machine stands.
+    """
+
+    bus_master: Literal["machine", "host"] = "machine"
+    sync_period_s: float = 0.05
+    signal_period_s: float = 0.01
+    station: StationSettings = field(default_factory=StationSettings)
+    setup: str = ""
+
+
+@dataclass
+class Output:
+    """What came out of the rig, in order.
+
+    Attributes:
+        frames: on the bus, but for the host's own.
+        station: bytes from the total station.
+        events: `arrived`, `fault`: for whoever drives the rig.
+    """
+
+    frames: list[Frame] = field(default_factory=list)
+    station: bytes = b""
+    events: list[Event] = field(default_factory=list)
+
+
+class RigSimulator:
+    """The rig.
+
+    Attributes:
+        machine, nodes, signals, station, faults: its parts, for faults and tests.
+
+    Args:
+        truth: the true machine.
+        seed: noise.
+        settings: see SimulatorSettings.
+        faults: what goes wrong.
+        start: joint values at the beginning; the middle of the limits where missing.
+
+    Raises:
+        ValueError: a start pose beyond the limits, DBC signals of another machine than the simulated one, or a fault
+            of a part that the rig does not have.
+    """
+
+    def __init__(
+        self,
+        truth: RigTruth,
+        seed: int,
+        settings: SimulatorSettings | None = None,
+        *,
+        faults: Iterable[Fault] = (),
+        start: Mapping[str, float] | None = None,
+    ) -> None:
+        self.settings = settings = settings or SimulatorSettings()
+        rig = truth.rig
+        self.machine = Machine(truth, seed, BoomMotion(rig, start), setup=settings.setup)
+        self.nodes = _nodes(rig, self.machine, seed, commissioned=settings.bus_master == "machine")
+        self.station = _station(rig, self.machine, seed, settings.station)
+        self.signals = _signals(rig, self.machine, seed, settings.signal_period_s)
+        self.faults = FaultSchedule()
+        self._controller = (
+            BusController(settings.sync_period_s) if self.nodes and settings.bus_master == "machine" else None
+        )
+        self._arrivals: list[tuple[float, Mapping[str, float]]] = []
+        self._output = Output()
+        raw = [c for c in rig.channels if isinstance(c, RawSignal)]
+        self._devices: tuple[BusDevice, ...] = (
+            *((self._controller,) if self._controller else ()),
+            *self.nodes,
+            *((self.signals,) if self.signals else ()),
+            *((RawSignals(raw, {c.name: _source(rig, self.machine, c.name) for c in raw}),) if raw else ()),
+        )
+        for node in self.nodes:
+            node.power_on(0.0)
+        self._due = [device.next_deadline() for device in self._devices]
+        for fault in faults:
+            self.inject(fault)
+
+    # Commands
+
+    def aim(self, target: str, now_s: float) -> None:
+        """Point the station at a prism or control point; ValueError if there is none."""
+        self.station.aim_at(target, now_s)
+
+    def move(self, pose: Mapping[str, float], now_s: float, *, speed: float = 0.25, dwell_s: float = 0.0) -> float:
+        """Append a move to the plan, see `BoomMotion.move`; an `arrived` event follows. Returns when it will."""
+        arrival_s = self.machine.motion.move(now_s, pose, speed=speed, dwell_s=dwell_s)
+        self._arrivals.append((arrival_s, dict(pose)))
+        return arrival_s
+
+    def inject(self, fault: Fault) -> None:
+        """Let something go wrong at its time; ValueError when this rig has no such part."""
+        check_fault(self, fault)
+        self.faults.add(fault)
+
+    def in_instrument_frame_mm(self, place_mm: Floats) -> Floats:
+        """(3,) a place as the station would give it: its horizontal circle may have been set to another zero."""
+        zero = math.radians(self.station.circle_zero_deg)
+        east, north, up = place_mm
+        turned = (east * math.cos(zero) - north * math.sin(zero), north * math.cos(zero) + east * math.sin(zero), up)
+        return np.array(turned)
+
+    # The links
+
+    def receive_can(self, frame: Frame, now_s: float) -> None:
+        """A frame that the host sent."""
+        self._spread(frame, now_s)
+
+    def receive_station(self, data: bytes, now_s: float) -> None:
+        """Bytes that the host wrote to the station."""
+        self.station.receive(data, now_s)
+
+    def put(self, frame: Frame) -> None:
+        """A frame that appears on the bus and that no node answers (an error frame)."""
+        self._output.frames.append(frame)
+
+    def tell(self, event: Event) -> None:
+        """An event for whoever drives the rig."""
+        self._output.events.append(event)
+
+    def _spread(self, frame: Frame, now_s: float) -> None:
+        """Let every node hear a frame; nodes answer in the order of their numbers."""
+        for index, node in enumerate(self.nodes, 1 if self._controller else 0):
+            answers = node.receive(frame, now_s)
+            if answers:
+                self._emit(answers, now_s)
+            self._due[index] = node.next_deadline()
+
+    def _emit(self, frames: Sequence[Frame], now_s: float) -> None:
+        """Frames of a device: the host gets them, and the bus master hears them."""
+        self._output.frames.extend(frames)
+        if self._controller is not None:
+            for frame in frames:
+                self._controller.receive(frame, now_s)
+            self._due[0] = self._controller.next_deadline()
+
+    # Time
+
+    def poll(self, now_s: float) -> Output:
+        """Live up to now; returns what came out since the last call."""
+        for fault in self.faults.due(now_s):
+            apply_fault(self, fault, now_s)
+            self.tell({"event": "fault", "kind": fault.kind, **fault.parameters})
+        while self._devices:
+            index = min(range(len(self._due)), key=self._due.__getitem__)
+            if self._due[index] > now_s:
+                break
+            self._poll_device(index, now_s)
+        while self._arrivals and self._arrivals[0][0] <= now_s:
+            _, pose = self._arrivals.pop(0)
+            self.tell({"event": "arrived", "pose": pose})
+            self.machine.motion.forget_before(now_s - 10.0)
+        self._output.station += self.station.poll(now_s)
+        output, self._output = self._output, Output()
+        return output
+
+    def _poll_device(self, index: int, now_s: float) -> None:
+        device = self._devices[index]
+        frames = device.poll(now_s)
+        if device is self._controller:
+            for frame in frames:
+                self._output.frames.append(frame)
+                self._spread(frame, now_s)
+        elif frames:
+            self._emit(frames, now_s)
+        self._due[index] = device.next_deadline()
+
+    def refresh(self) -> None:
+        """A device was changed from outside (a fault): ask all of them again what they are waiting for."""
+        self._due = [device.next_deadline() for device in self._devices]
+
+    def next_deadline(self) -> float:
+        """When `poll` will have something to do."""
+        arrival = self._arrivals[0][0] if self._arrivals else math.inf
+        return min([*self._due, arrival, self.station.next_deadline(), self.faults.next_deadline()])
+
+
+def _nodes(rig: Rig, machine: Machine, seed: int, *, commissioned: bool) -> tuple[CanopenNode, ...]:
+    nodes: list[CanopenNode] = []
+    for number, channel in enumerate(rig.channels):
+        serial = 100_000 + 1000 * (seed % 1000) + number
+        if not isinstance(channel, Cia406Encoder | Cia406Linear | Cia404Analogue):
+            continue
+        source = _source(rig, machine, channel.name)
+        node: CanopenNode
+        if isinstance(channel, Cia406Encoder):
+            node = encoder_of(channel, source, serial)
+        elif isinstance(channel, Cia406Linear):
+            node = linear_of(channel, source, serial)
+        else:
+            node = pressure_of(channel, source, serial)
+        if commissioned:
+            node.commission(
+                sync=channel.mode == "sync",
+                pdo=channel.pdo,
+                period_ms=channel.period_ms,
+                heartbeat_ms=channel.heartbeat_ms,
+            )
+        nodes.append(node)
+    return tuple(sorted(nodes, key=lambda n: n.node))
+
+
+def _source(rig: Rig, machine: Machine, name: str) -> Source:
+    """What a channel senses: its joint, or something believable that no joint follows."""
+    if name in rig.joint_names:
+        return partial(machine.joint, name)
+    channel = next(c for c in rig.channels if c.name == name)
+    if channel.unit == "mm":  # an extra stroke, as of a rod feed: slow strokes of its own
+        return lambda t_s: (600.0 + 400.0 * math.sin(t_s / 20.0), 20.0 * math.cos(t_s / 20.0))
+    return lambda t_s: (machine.boom_load_bar(t_s) + 0.3 * float(machine.rng.standard_normal()), 0.0)
+
+
+def _station(rig: Rig, machine: Machine, seed: int, settings: StationSettings) -> TotalStation:
+    rng = np.random.default_rng([seed, 33])
+    names = (*rig.prism_names, *machine.control_points_mm)
+    tracker = Tracker(names, machine.place_mm, rig.station, rng, settings.tracker)
+    kind = SokkiaStation if settings.profile == "sokkia_set" else TopconStation
+    return kind(settings, tracker, rng)
+
+
+def _signals(rig: Rig, machine: Machine, seed: int, period_s: float) -> MachineSignals | None:
+    described = [c for c in rig.channels if isinstance(c, DbcSignal)]
+    foreign = next((c for c in described if c.dbc.rpartition("/")[2] != "machine.dbc"), None)
+    if foreign is not None:
+        raise ValueError(f"channel {foreign.name}: the simulated machine speaks machine.dbc, not {foreign.dbc}")
+    if not described:
+        return None
+    return MachineSignals(machine.state, np.random.default_rng([seed, 34]), period_s=period_s)
