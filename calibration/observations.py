@@ -22,6 +22,8 @@ POSITION_COLUMNS = ("x_mm", "y_mm", "z_mm")
 SIGMA_COLUMNS = ("sigma_x_mm", "sigma_y_mm", "sigma_z_mm")
 LABEL_COLUMNS = ("setup", "session", "pose")
 DIRECTIONS = (-1.0, 0.0, 1.0)
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_NO_NUMBERS = {"nan", "na", "n/a", "null", "none", "inf", "-inf", "+inf", "infinity", "-"}
 _SIGNAL = re.compile(r"[A-Za-z][A-Za-z0-9_]*_(bar|mA)")
 
 
@@ -174,12 +176,12 @@ class _Table:
                 if required:
                     raise DataError(self.source, "empty, but every observation needs it", line, column)
                 continue
-            try:
-                out[i] = float(cell)
-            except ValueError:
-                raise DataError(self.source, f"{cell!r} is not a number", line, column) from None
+            if not _NUMBER.fullmatch(cell):
+                what = "not measured is an empty cell" if cell.lower() in _NO_NUMBERS else "write it as 1234.5 or 1e-3"
+                raise DataError(self.source, f"{cell!r} is not a finite number; {what}", line, column)
+            out[i] = float(cell)
             if not math.isfinite(out[i]):
-                raise DataError(self.source, f"{cell!r} is not a finite number; leave it empty", line, column)
+                raise DataError(self.source, f"{cell!r} is beyond what a number can be", line, column)
         return out
 
     def labels(self, column: str) -> Strings:

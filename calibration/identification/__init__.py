@@ -1,0 +1,1 @@
+"""Identification: from observations to the parameters of a chain, with their covariance."""

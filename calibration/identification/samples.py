@@ -1,0 +1,170 @@
+"""What the fit sees: fixes of one standstill averaged, each with its measurement covariance.
+
+Fixes of one session, set-up, pose and prism repeat the same readings of the joints: averaging them lowers the
+station's noise, not that of the readings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.kinematics import Chain, ChainData
+from calibration.observations import Floats, Observations
+from calibration.rig import Rig
+
+Integers = NDArray[np.intp]
+
+_LEAST_REPEATS = 10  # degrees of freedom below which the scatter of repeats says nothing
+_REPEAT_LIMIT = 6.0  # a repeat farther than so many sigma from its standstill's median stands alone
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Rows of a fit.
+
+    Attributes:
+        data: (m) bound readings, the mean of each standstill.
+        position_mm: (m, 3) mean position in the station's frame.
+        station_covariance: (m, 3, 3) of that mean, mm^2, without readings, timing and excess.
+        rates: (m, joints) deg/s or mm/s at the fix, 0 where not measured.
+        of_row: (n,) which sample each observation went into.
+        repeat_variance: mm^2 per axis that repeats scatter beyond the station's covariance.
+    """
+
+    data: ChainData
+    position_mm: Floats
+    station_covariance: Floats
+    rates: Floats
+    of_row: Integers
+    repeat_variance: float
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+
+def station_covariance(rig: Rig, position_mm: Floats, sigma_mm: Floats) -> Floats:
+    """(n, 3, 3) covariance of fixes at positions (n, 3), mm^2.
+
+    `sigma_mm` (n, 3) is used where given; elsewhere the instrument's circles, distance and target centring.
+    """
+    station = rig.station
+    range_mm = np.maximum(np.linalg.norm(position_mm, axis=1), 1e-6)
+    radial = (station.distance_sigma_mm + station.distance_sigma_ppm * 1e-6 * range_mm) ** 2
+    across = (range_mm * np.radians(station.angle_sigma_arcsec / 3600.0)) ** 2
+    line = position_mm / range_mm[:, None]
+    identity = np.eye(3)
+    covariance: Floats = (across + station.target_sigma_mm**2)[:, None, None] * identity + (radial - across)[
+        :, None, None
+    ] * line[:, :, None] * line[:, None, :]
+    given = np.isfinite(sigma_mm).all(axis=1)
+    covariance[given] = sigma_mm[given][:, :, None] ** 2 * identity
+    return covariance
+
+
+def reading_covariance(rig: Rig, joint_jacobian: Floats, rates: Floats) -> Floats:
+    """(n, 3, 3) what random errors of the readings and of the fix's instant add, mm^2.
+
+    J_q Sigma_q J_q' + (J_q q_dot)(J_q q_dot)' sigma_t^2, with a reading's variance sigma^2 + resolution^2 / 12.
+    """
+    sigma = np.array([np.hypot(j.sigma, j.resolution / np.sqrt(12.0)) for j in rig.joints])
+    scaled = joint_jacobian * sigma
+    covariance: Floats = scaled @ scaled.transpose(0, 2, 1)
+    velocity = joint_jacobian @ rates[:, :, None] * rig.station.timing_sigma_s
+    moving: Floats = covariance + velocity @ velocity.transpose(0, 2, 1)
+    return moving
+
+
+def joint_rates(rig: Rig, observations: Observations) -> Floats:
+    """(n, joints) `<name>_rate` columns, 0 where there is none."""
+    missing = np.zeros(len(observations))
+    columns = [observations.extra.get(f"{name}_rate", missing) for name in rig.joint_names]
+    rates: Floats = np.nan_to_num(np.column_stack(columns))
+    return rates
+
+
+def averaged(chain: Chain, observations: Observations) -> Samples:
+    """Average the repeats of every standstill; repeats that disagree with it stay apart.
+
+    Raises:
+        DataError: a prism or set-up that the chain does not know.
+    """
+    rig = chain.rig
+    data = chain.bind(observations)
+    position = observations.position_mm
+    covariance = station_covariance(rig, position, observations.sigma_mm)
+    of_row, squares, freedom = _standstills(rig, observations, data.readings, covariance)
+    count = np.bincount(of_row).astype(float)
+    expected = np.trace(covariance, axis1=1, axis2=2).mean() / 3.0
+    repeat_variance = max(0.0, squares / (3.0 * freedom) - expected) if freedom >= _LEAST_REPEATS else 0.0
+
+    def mean(values: Floats) -> Floats:
+        out = np.zeros((len(count), *values.shape[1:]))
+        np.add.at(out, of_row, values)
+        averaged_values: Floats = out / count.reshape(-1, *([1] * (values.ndim - 1)))
+        return averaged_values
+
+    first = np.unique(of_row, return_index=True)[1]
+    start = data.readings[first][of_row]
+    readings = start + _differences(rig, data.readings - start)
+    return Samples(
+        ChainData(mean(readings), data.prism[first], data.setup[first]),
+        mean(position),
+        mean(covariance + repeat_variance * np.eye(3)) / count[:, None, None],
+        mean(joint_rates(rig, observations)),
+        of_row,
+        float(repeat_variance),
+    )
+
+
+def _differences(rig: Rig, change: Floats) -> Floats:
+    """(n, joints) changes of readings, deg or mm, the angles among them the short way round."""
+    turns = np.array([joint.kind == "revolute" for joint in rig.joints])
+    return np.where(turns, (change + 180.0) % 360.0 - 180.0, change)
+
+
+def _standstills(
+    rig: Rig, observations: Observations, readings: Floats, covariance: Floats
+) -> tuple[Integers, float, int]:
+    """Sample index of every row; sum of squared deviations within standstills and its degrees of freedom.
+
+    A row whose position or joints do not agree with the others of its standstill is a sample of its own: their mean
+    would be a place, or a joint value, that never was.
+    """
+    position_mm = observations.position_mm
+    steady = np.array([_REPEAT_LIMIT * joint.sigma + 2 * joint.resolution for joint in rig.joints])
+    keys = zip(
+        observations.session.tolist(),
+        observations.setup.tolist(),
+        observations.pose.tolist(),
+        observations.prism.tolist(),
+        strict=True,
+    )
+    members: dict[tuple[str, ...] | int, list[int]] = {}
+    for row, key in enumerate(keys):
+        members.setdefault(key if key[2] else row, []).append(row)
+    of_row = np.empty(len(observations), dtype=np.intp)
+    following, squares, freedom = 0, 0.0, 0
+    for rows in members.values():
+        together = np.array(rows)
+        if len(rows) > 1:
+            distance = np.linalg.norm(position_mm[rows] - np.median(position_mm[rows], axis=0), axis=1)
+            sigma = np.sqrt(np.trace(covariance[rows], axis1=1, axis2=2))
+            # The half-way point of two repeats proves neither wrong, so their own spread does not widen the limit.
+            spread = 3.0 * np.median(distance) if len(rows) > 2 else 0.0
+            agrees = distance <= np.maximum(_REPEAT_LIMIT * sigma, spread)
+            change = _differences(rig, readings[rows] - readings[rows[0]])
+            agrees &= (np.abs(change - np.median(change, axis=0)) <= steady).all(axis=1)
+            for row in together[~agrees]:
+                of_row[row] = following
+                following += 1
+            together = together[agrees]
+        if len(together) == 0:
+            continue
+        of_row[together] = following
+        following += 1
+        squares += float(((position_mm[together] - position_mm[together].mean(axis=0)) ** 2).sum())
+        freedom += len(together) - 1
+    return of_row, squares, freedom

@@ -1,0 +1,170 @@
+"""A model is data: it comes back as it was written, or is refused in a sentence."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calibration.errors import ModelError
+from calibration.model import CalibratedModel
+from calibration.pipeline import train_residual
+from tests.calibration.conftest import Session
+
+RESIDUAL = {"kind": "rbfn", "signals": [], "prisms": [], "excess_variance_mm2": [0, 0, 0], "files": []}
+
+
+@pytest.fixture(scope="module")
+def with_residual(session: Session) -> CalibratedModel:
+    """The session's model, with a chain that learned a bias on top."""
+    shifted = session.training.position_mm + 30.0 * np.sin(session.training.joints["L3"] / 300.0)[:, None]
+    biased = replace(session.training, position_mm=shifted)
+    loose = replace(session.model, excess_sigma_mm=50.0)
+    model = train_residual(loose, biased, kind="chain")
+    assert model.residual is not None
+    return model
+
+
+def resigned(files: dict[str, bytes], name: str, data: bytes) -> dict[str, bytes]:
+    """The files with one of them edited and the manifest made to agree."""
+    manifest = json.loads(files["manifest.json"])
+    manifest["files"][name] = {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data)}
+    return files | {name: data, "manifest.json": json.dumps(manifest).encode()}
+
+
+def edited(files: dict[str, bytes], **changes: object) -> dict[str, bytes]:
+    document = json.loads(files["model.json"]) | changes
+    return resigned(files, "model.json", json.dumps(document).encode())
+
+
+def test_a_model_comes_back_as_it_was_written(with_residual: CalibratedModel, session: Session) -> None:
+    files = with_residual.to_files()
+    again = CalibratedModel.from_files(files | {"report.html": b"not listed, not read"})
+    assert again.to_files() == files
+    before, after = with_residual.predict(session.held_out), again.predict(session.held_out)
+    np.testing.assert_array_equal(before.position_mm, after.position_mm)
+    np.testing.assert_array_equal(before.sigma_mm, after.sigma_mm)
+    assert again.parameters == with_residual.parameters
+    assert again.provenance == with_residual.provenance
+    assert np.abs(with_residual.correction_mm(session.held_out)).max() > 5.0
+
+
+def test_every_truncated_file_is_refused_before_it_is_parsed(with_residual: CalibratedModel) -> None:
+    files = with_residual.to_files()
+    for name in files:
+        with pytest.raises(ModelError, match=name):
+            CalibratedModel.from_files(files | {name: files[name][: len(files[name]) // 2]})
+
+
+def test_every_missing_file_is_named(with_residual: CalibratedModel) -> None:
+    files = with_residual.to_files()
+    for name in files:
+        with pytest.raises(ModelError, match=f"{name} is missing"):
+            CalibratedModel.from_files({k: v for k, v in files.items() if k != name})
+
+
+@given(st.data())
+def test_no_flipped_byte_gets_through(session: Session, data: st.DataObject) -> None:
+    files = session.model.to_files()
+    name = data.draw(st.sampled_from(sorted(set(files) - {"manifest.json"})))
+    place = data.draw(st.integers(0, len(files[name]) - 1))
+    flipped = bytearray(files[name])
+    flipped[place] ^= data.draw(st.integers(1, 255))
+    with pytest.raises(ModelError, match="SHA-256 differs"):
+        CalibratedModel.from_files(files | {name: bytes(flipped)})
+
+
+@given(st.binary(max_size=200))
+def test_a_manifest_of_arbitrary_bytes_is_refused(session: Session, data: bytes) -> None:
+    with pytest.raises(ModelError, match="manifest"):
+        CalibratedModel.from_files(session.model.to_files() | {"manifest.json": data})
+
+
+def test_a_model_of_another_version_says_which(session: Session) -> None:
+    files = session.model.to_files()
+    manifest = json.loads(files["manifest.json"]) | {"version": 2}
+    with pytest.raises(ModelError, match="version 2, this program reads version 1"):
+        CalibratedModel.from_files(files | {"manifest.json": json.dumps(manifest).encode()})
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"prior": "hearsay"}, "prior"),
+        ({"excess_sigma_mm": float("nan")}, "excess_sigma_mm"),
+        ({"surprise": 1}, "surprise"),
+        ({"parameters": []}, "parameters of model.json are not those of its rig"),
+        (
+            {"placements": {"": {"rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]], "translation_mm": [0, 0, 0]}}},
+            "no rotation",
+        ),
+        ({"ranges": {"theta99": [0, 1]}}, "theta99"),
+        (
+            {
+                "residual": {
+                    "kind": "oracle",
+                    "signals": [],
+                    "prisms": [],
+                    "excess_variance_mm2": [0, 0, 0],
+                    "files": [],
+                }
+            },
+            "the model lacks oracle",
+        ),
+        (
+            {
+                "residual": {
+                    "kind": "rbfn",
+                    "signals": [],
+                    "prisms": [],
+                    "excess_variance_mm2": [0, 0, 0],
+                    "files": ["model.json"],
+                }
+            },
+            "the model lacks rbfn.npz",
+        ),
+    ],
+)
+def test_a_signed_model_that_contradicts_itself_is_refused(
+    session: Session, changes: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ModelError, match=message):
+        CalibratedModel.from_files(edited(session.model.to_files(), **changes))
+
+
+@pytest.mark.parametrize("name", ["rig.toml", "model.json", "covariance.npz"])
+@pytest.mark.parametrize("data", [b"", b"\xff\xfe", b"[]", b"PK\x03\x04 rest"])
+def test_a_signed_file_of_rubbish_is_refused(session: Session, name: str, data: bytes) -> None:
+    with pytest.raises(ModelError):
+        CalibratedModel.from_files(resigned(session.model.to_files(), name, data))
+
+
+def test_pickled_arrays_are_not_loaded(session: Session) -> None:
+    buffer = io.BytesIO()
+    np.savez(buffer, covariance=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(ModelError, match="cannot be read"):
+        CalibratedModel.from_files(resigned(session.model.to_files(), "covariance.npz", buffer.getvalue()))
+
+
+def test_a_residual_of_another_rigs_features_is_refused(with_residual: CalibratedModel) -> None:
+    files = with_residual.to_files()
+    names = json.loads(files["lightgbm.json"])
+    names["features"][0] = "q1_deg"
+    with pytest.raises(ModelError, match="other features"):
+        CalibratedModel.from_files(resigned(files, "lightgbm.json", json.dumps(names).encode()))
+
+
+def test_parameters_carry_corrections_in_build_tolerances(session: Session) -> None:
+    estimates = {p.name: p for p in session.model.parameters}
+    theta3 = estimates["row3.theta"]
+    assert theta3.standard_error < theta3.prior_sigma
+    assert theta3.pull == pytest.approx(theta3.value / theta3.prior_sigma)
+    assert estimates["base.x"].pull == 0.0
+    # What the data cannot see keeps the tolerance it came with.
+    assert estimates["row2.d"].standard_error == pytest.approx(estimates["row1.d"].standard_error, rel=0.01)

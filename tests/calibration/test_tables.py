@@ -1,0 +1,116 @@
+"""Rig files and observations: what is wrong is refused whole, with its place; what is right survives the round trip."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calibration.errors import DataError, RigError
+from calibration.observations import format_observations, parse_observations
+from calibration.rig import parse_rig, shipped_rig, shipped_rigs
+from tests.calibration.conftest import Session, rig_text
+
+RIG = shipped_rig("ur10")
+HEADER = "prism,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,x_mm,y_mm,z_mm"
+ROW = "tmac,1,2,3,4,5,6,100,200,300"
+
+
+def parse(text: str | bytes, **options: bool):  # type: ignore[no-untyped-def]  # Observations
+    return parse_observations(text.encode() if isinstance(text, str) else text, RIG, "data.csv", **options)
+
+
+def test_observations_survive_the_round_trip_exactly(session: Session) -> None:
+    text = format_observations(session.training, session.rig)
+    again = parse_observations(text.encode(), session.rig, "again.csv")
+    assert format_observations(again, session.rig) == text
+    np.testing.assert_array_equal(again.position_mm, session.training.position_mm)
+    np.testing.assert_array_equal(again.joints["L2"], session.training.joints["L2"])
+
+
+def test_optional_columns_are_kept_and_strange_ones_are_listed() -> None:
+    table = parse(f"{HEADER},temperature_degC,q1_dir,boom_valve_mA,remark\n{ROW},21.5,-1,400,fine\n{ROW},,0,,\n")
+    assert table.extra["temperature_degC"][0] == 21.5
+    assert math.isnan(table.extra["temperature_degC"][1])
+    assert set(table.extra) == {"temperature_degC", "q1_dir", "boom_valve_mA"}
+    assert table.ignored_columns == ("remark",)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (b"", r"data\.csv"),
+        (f"{HEADER}\n", "no observations below the header"),
+        (f"{HEADER}\n{ROW},7\n", "line 2: 11 fields where the header has 10"),
+        (f"{HEADER}\n{ROW}\n{ROW.replace('300', 'nan')}\n", "line 3, column z_mm: 'nan' is not a finite number"),
+        (f"{HEADER}\n{ROW.replace('300', 'x')}\n", "line 2, column z_mm: 'x' is not a finite number; write it as"),
+        (f"{HEADER}\n{ROW.replace('300', '1_000')}\n", "'1_000' is not a finite number; write it as 1234.5"),
+        (f"{HEADER}\n{ROW.replace('300', '１２')}\n", "'１２' is not a finite number"),  # noqa: RUF001
+        (f"{HEADER}\n{ROW.replace('300', '1e999')}\n", "is beyond what a number can be"),
+        (f"{HEADER}\n{ROW.replace(',6,', ',,')}\n", "line 2, column q6_deg: empty"),
+        (f"{HEADER}\n{ROW.replace('tmac', 'nose')}\n", "line 2, column prism"),
+        (f"{HEADER.replace('q6_deg', 'q7_deg')}\n{ROW}\n", "q6_deg"),
+        (f"{HEADER},x_mm\n{ROW},1\n", "x_mm"),
+        (f"{HEADER},q1_dir\n{ROW},2\n", "line 2, column q1_dir: 2 is not a direction"),
+        (
+            f"{HEADER},sigma_x_mm,sigma_y_mm,sigma_z_mm\n{ROW},0,1,1\n",
+            "column sigma_x_mm: 0 is not a standard deviation",
+        ),
+        (HEADER.encode() + b"\n\xff\xfe", "line 2: byte .* is not UTF-8"),
+    ],
+)
+def test_a_bad_file_is_refused_with_its_place(text: str | bytes, message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        parse(text)
+
+
+@given(st.binary(max_size=400) | st.text(max_size=400).map(lambda t: f"{HEADER}\n{t}".encode()))
+def test_arbitrary_bytes_are_read_or_refused(data: bytes) -> None:
+    try:
+        table = parse(data)
+    except DataError as error:
+        refusal = str(error)
+    else:
+        refusal = ""
+        assert np.isfinite(table.position_mm).all()
+    assert refusal.startswith("data.csv") or not refusal
+
+
+def test_prediction_rows_may_lack_positions() -> None:
+    header, row = HEADER.removesuffix(",x_mm,y_mm,z_mm"), ROW.removesuffix(",100,200,300")
+    assert np.isnan(parse(f"{header}\n{row}\n", positions_required=False).position_mm).all()
+
+
+def test_cells_round_as_the_contract_says() -> None:
+    table = parse(f"{HEADER}\n{ROW.replace('100,200,300', '149.9,-250.1,50')}\n{ROW}\n")
+    assert table.cells().tolist() == ["1,-3,0", "1,2,3"]
+    assert table.groups().tolist() == table.cells().tolist()
+
+
+def test_every_shipped_rig_reads() -> None:
+    assert shipped_rigs() == ("swdt82", "ur10", "ys100")
+    assert [len(shipped_rig(name).rows) for name in shipped_rigs()] == [9, 6, 6]
+    with pytest.raises(RigError, match="no such rig; shipped: swdt82, ur10, ys100"):
+        shipped_rig("r2d2")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('name = "ur10"', 'name = "ur10', "not valid TOML"),
+        ("length_mm = 1.0", "lenght_mm = 1.0", "tolerances"),
+        ("limits = [-360, 360]", "limits = [360, -360]", "limits must rise"),
+        ("theta = { q1 = 1.0 }", "theta = { q9 = 1.0 }", "unknown joint 'q9'"),
+        ("theta = { q1 = 1.0 }", "theta = { q2 = 1.0 }", "joint 'q1' drives no row"),
+        ("frame = 6", "frame = 7", "beyond the last row 6"),
+        ("d_mm = 127.3", "d_mm = 127.3\nbeta_deg = 1", "convention 'dh' has no beta"),
+    ],
+)
+def test_a_rig_file_that_contradicts_itself_is_refused(old: str, new: str, message: str) -> None:
+    text = rig_text("ur10")
+    assert old in text
+    with pytest.raises(RigError, match=message):
+        parse_rig(text.replace(old, new, 1), "mine.toml")
