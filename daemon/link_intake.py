@@ -1,0 +1,102 @@
+"""One link's thread and the bounded queue behind it: what does not fit is counted, and the loss is a record."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from dataclasses import dataclass
+
+from drivers.clock import Clock, Stamp
+from drivers.readings import CanCapture, DeviceEvent, EventKind, Gap, GapReason, LinkItem, LinkLoop, SerialCapture
+
+log = logging.getLogger(__name__)
+
+RESTART_S = 1.0
+JOIN_S = 10.0  # link loops look at `stop` several times a second
+
+
+@dataclass(slots=True)
+class _Loss:
+    """Captures that found the queue full since it was last drained."""
+
+    count: int
+    first: Stamp
+    last: Stamp
+
+
+class LinkIntake:
+    """Runs a link loop in a thread of its own, again if it dies, and queues what it emits.
+
+    Args:
+        loop: the link.
+        clock: for the restart's delay and stamp.
+        limit: captures that may wait; events and gaps, being few, are always taken.
+    """
+
+    def __init__(self, loop: LinkLoop, clock: Clock, limit: int) -> None:
+        self.name = loop.name
+        self.dropped = 0
+        self.restarts = 0
+        self._loop, self._clock, self._limit = loop, clock, limit
+        # Appends and pops of a deque are atomic: one thread emits, one drains, and only the loss needs a lock.
+        self._queue: deque[LinkItem] = deque()
+        self._loss: _Loss | None = None
+        self._loss_lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+
+    def start(self, stop: threading.Event) -> None:
+        """Start the thread; it ends soon after `stop` is set."""
+        self._thread = threading.Thread(target=self._run, args=(stop,), name=f"link-{self.name}", daemon=True)
+        self._thread.start()
+
+    def join(self) -> None:
+        """Wait until the thread has ended, after `stop` was set."""
+        if self._thread is not None:
+            self._thread.join(JOIN_S)
+            if self._thread.is_alive():
+                log.error("link %s did not stop within %g s; it is left behind", self.name, JOIN_S)
+
+    @property
+    def queued(self) -> int:
+        """How many items wait."""
+        return len(self._queue)
+
+    def drain(self) -> list[LinkItem]:
+        """What waits, oldest first, and at its end what was lost."""
+        queue = self._queue
+        items = [queue.popleft() for _ in range(len(queue))]
+        if self._loss is not None:
+            with self._loss_lock:
+                loss, self._loss = self._loss, None
+            text = f"{loss.count} captures lost: the queue to the store is full; is the disk full, or too slow?"
+            items.append(DeviceEvent(self.name, loss.last, EventKind.FRAMES_DROPPED, text, loss.count))
+            items.append(Gap(self.name, GapReason.FRAMES_LOST, loss.first, loss.last, loss.count))
+        return items
+
+    def _emit(self, item: LinkItem) -> None:
+        if len(self._queue) < self._limit or not isinstance(item, CanCapture | SerialCapture):
+            self._queue.append(item)
+            return
+        self.dropped += 1
+        with self._loss_lock:
+            if self._loss is None:
+                self._loss = _Loss(1, item.stamp, item.stamp)
+            else:
+                self._loss.count += 1
+                self._loss.last = item.stamp
+
+    def _run(self, stop: threading.Event) -> None:
+        while not stop.is_set():
+            try:
+                self._loop.run(self._emit, stop)
+                reason = "it returned"
+            except Exception as error:
+                # A defect in one link must not end the others.
+                log.exception("link %s: its loop failed", self.name)
+                reason = f"{type(error).__name__}: {error}"
+            if not stop.is_set():
+                self.restarts += 1
+                text = f"the link's loop ended ({reason}); it is started again in {RESTART_S:g} s"
+                self._emit(DeviceEvent(self.name, self._clock.now(), EventKind.LINK_LOST, text))
+                self._clock.wait(stop, RESTART_S)

@@ -1,0 +1,174 @@
+"""The store's schema, by migrations that are applied in order and never edited once released.
+
+Conventions: every table is STRICT. An instant is three columns, `utc_ns`, `monotonic_ns` and `boot_id` (-> boots),
+with a prefix where a row has several (`started_utc_ns`, ...). NULL is "bad" or "not there" and a status or reason
+column beside it says which. Columns that end in `_json` hold JSON text.
+"""
+
+from __future__ import annotations
+
+from sqlite_utils import Database, Migrations
+
+MIGRATIONS = Migrations("rigcal")
+
+
+def _instant(prefix: str = "", *, optional: bool = False) -> str:
+    null = "" if optional else " NOT NULL"
+    return (
+        f"{prefix}utc_ns INTEGER{null}, {prefix}monotonic_ns INTEGER{null}, "
+        f"{prefix}boot_id INTEGER{null} REFERENCES boots(id)"
+    )
+
+
+def _one_of(column: str, *allowed: str) -> str:
+    return f"{column} TEXT NOT NULL CHECK ({column} IN ({', '.join(repr(value) for value in allowed)}))"
+
+
+def _create(db: Database, *statements: str) -> None:
+    for statement in statements:
+        db.execute(statement)
+
+
+@MIGRATIONS()
+def m001_runs_and_raw_captures(db: Database) -> None:
+    """Boots, runs of the daemon, links, and every captured byte."""
+    _create(
+        db,
+        # One row per boot of a host. booted_utc_ns: when its monotonic clock was zero, by its first record.
+        """CREATE TABLE boots (id INTEGER PRIMARY KEY, kernel_boot_id TEXT NOT NULL UNIQUE,
+            booted_utc_ns INTEGER NOT NULL) STRICT""",
+        # One row per life of the daemon. alive_: when it was last known to run; clean: it ended in order.
+        f"""CREATE TABLE daemon_runs (id INTEGER PRIMARY KEY, pid INTEGER NOT NULL, software_version TEXT NOT NULL,
+            sqlite_version TEXT NOT NULL, {_instant("started_")}, {_instant("alive_")},
+            {_instant("ended_", optional=True)}, clean INTEGER NOT NULL DEFAULT 0 CHECK (clean IN (0, 1))) STRICT""",
+        f"""CREATE TABLE links (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE,
+            {_one_of("kind", "can", "serial")}) STRICT""",
+        # captures: how many; bytes: their payload before compression; chunk: see captures.py.
+        f"""CREATE TABLE raw_chunks (id INTEGER PRIMARY KEY, link_id INTEGER NOT NULL REFERENCES links(id),
+            {_instant("first_")}, {_instant("last_")}, captures INTEGER NOT NULL, bytes INTEGER NOT NULL,
+            chunk BLOB NOT NULL) STRICT""",
+        "CREATE INDEX raw_chunks_by_time ON raw_chunks(link_id, first_utc_ns)",
+        # Chunks whose records are not stored yet. A table of its own, because to change a flag beside a blob is to
+        # write the blob again.
+        "CREATE TABLE undecoded_chunks (chunk_id INTEGER PRIMARY KEY REFERENCES raw_chunks(id)) STRICT",
+    )
+
+
+@MIGRATIONS()
+def m002_records(db: Database) -> None:
+    """What decoders make of captures."""
+    sample = f"""(id INTEGER PRIMARY KEY, channel_id INTEGER NOT NULL REFERENCES channels(id), {_instant()},
+        value REAL, status TEXT NOT NULL, raw_counts INTEGER, CHECK ((status = 'ok') = (value IS NOT NULL))) STRICT"""
+    _create(
+        db,
+        # A channel that changes its unit is another channel: stored values keep the unit that they were stored in.
+        f"""CREATE TABLE channels (id INTEGER PRIMARY KEY, name TEXT NOT NULL, unit TEXT NOT NULL,
+            {_one_of("kind", "joint", "signal")}, UNIQUE (name, unit, kind)) STRICT""",
+        f"CREATE TABLE joint_samples {sample}",
+        "CREATE INDEX joint_samples_by_time ON joint_samples(channel_id, utc_ns)",
+        f"CREATE TABLE signals {sample}",
+        "CREATE INDEX signals_by_time ON signals(channel_id, utc_ns)",
+        f"""CREATE TABLE fixes (id INTEGER PRIMARY KEY, station TEXT NOT NULL, {_instant()}, {_instant("last_byte_")},
+            status TEXT NOT NULL, lock TEXT NOT NULL, hz_angle_rad REAL, zenith_angle_rad REAL, slope_distance_m REAL,
+            north_m REAL, east_m REAL, up_m REAL, face INTEGER, prism_constant_mm REAL, ppm REAL,
+            tilt_ok INTEGER CHECK (tilt_ok IN (0, 1)), edm_level INTEGER, reason TEXT NOT NULL,
+            raw BLOB NOT NULL) STRICT""",
+        "CREATE INDEX fixes_by_time ON fixes(station, utc_ns)",
+        "CREATE INDEX fixes_by_instant ON fixes(station, boot_id, monotonic_ns)",
+        f"""CREATE TABLE device_events (id INTEGER PRIMARY KEY, device TEXT NOT NULL, {_instant()}, kind TEXT NOT NULL,
+            text TEXT NOT NULL, code INTEGER) STRICT""",
+        "CREATE INDEX device_events_by_time ON device_events(utc_ns)",
+        # count: how many like it in a row, the first of them at this instant; excerpt: the first's first bytes (all
+        # of them are in raw_chunks).
+        f"""CREATE TABLE decode_failures (id INTEGER PRIMARY KEY, device TEXT NOT NULL, {_instant()},
+            reason TEXT NOT NULL, excerpt BLOB NOT NULL, count INTEGER NOT NULL) STRICT""",
+        "CREATE INDEX decode_failures_by_time ON decode_failures(utc_ns)",
+        # end_ is NULL while the gap lasts. The channel `daemon` stands for everything: rigcal itself was not there.
+        f"""CREATE TABLE gaps (id INTEGER PRIMARY KEY, channel TEXT NOT NULL, reason TEXT NOT NULL,
+            {_instant("start_")}, {_instant("end_", optional=True)}, missed INTEGER,
+            UNIQUE (channel, reason, start_boot_id, start_monotonic_ns)) STRICT""",
+        "CREATE INDEX gaps_by_time ON gaps(start_utc_ns)",
+        "CREATE INDEX gaps_open ON gaps(channel) WHERE end_utc_ns IS NULL",
+    )
+
+
+@MIGRATIONS()
+def m003_sessions(db: Database) -> None:
+    """Station set-ups, calibration sessions and the observations that they gather."""
+    _create(
+        db,
+        # prism_constants_json: {prism: mm}.
+        f"""CREATE TABLE station_setups (id TEXT PRIMARY KEY NOT NULL, instrument TEXT NOT NULL, serial TEXT NOT NULL,
+            {_instant("created_")}, tilt_arcsec REAL, ppm REAL,
+            prism_constants_json TEXT NOT NULL DEFAULT '{{}}' CHECK (json_valid(prism_constants_json)),
+            note TEXT NOT NULL DEFAULT '', {_one_of("state", "ok", "moved", "closed")}) STRICT""",
+        """CREATE TABLE control_points (setup_id TEXT NOT NULL REFERENCES station_setups(id), name TEXT NOT NULL,
+            x_mm REAL NOT NULL, y_mm REAL NOT NULL, z_mm REAL NOT NULL, PRIMARY KEY (setup_id, name)) STRICT""",
+        f"""CREATE TABLE calibration_sessions (id TEXT PRIMARY KEY NOT NULL, rig TEXT NOT NULL,
+            rig_sha256 TEXT NOT NULL, rig_text TEXT NOT NULL, setup_id TEXT REFERENCES station_setups(id),
+            prism TEXT NOT NULL, operator TEXT NOT NULL,
+            {_one_of("kind", "single_joint", "multi_joint", "static_poses", "check")},
+            {_one_of("state", "open", "closed", "aborted")}, note TEXT NOT NULL DEFAULT '',
+            {_instant("started_")}, {_instant("ended_", optional=True)}) STRICT""",
+        "CREATE INDEX calibration_sessions_by_state ON calibration_sessions(state, started_utc_ns)",
+        # Mean of the fixes to one control point; misclosure_mm: its distance from the point's known place.
+        f"""CREATE TABLE control_shots (id INTEGER PRIMARY KEY, setup_id TEXT NOT NULL, name TEXT NOT NULL,
+            session_id TEXT REFERENCES calibration_sessions(id), {_one_of("phase", "start", "end")}, {_instant()},
+            x_mm REAL NOT NULL, y_mm REAL NOT NULL, z_mm REAL NOT NULL,
+            fix_ids_json TEXT NOT NULL CHECK (json_valid(fix_ids_json)), misclosure_mm REAL,
+            FOREIGN KEY (setup_id, name) REFERENCES control_points(setup_id, name)) STRICT""",
+        "CREATE INDEX control_shots_by_session ON control_shots(session_id)",
+        # utc_ns ..: the instant that the fix was measured, link delay taken off. values_json: the numeric columns of
+        # the observations CSV that the row has. excluded: why calibration must not use it, NULL when it may.
+        f"""CREATE TABLE observations (id INTEGER PRIMARY KEY,
+            session_id TEXT NOT NULL REFERENCES calibration_sessions(id), fix_id INTEGER REFERENCES fixes(id),
+            setup_id TEXT REFERENCES station_setups(id), prism TEXT NOT NULL, pose TEXT, {_instant()},
+            x_mm REAL NOT NULL, y_mm REAL NOT NULL, z_mm REAL NOT NULL, sigma_x_mm REAL, sigma_y_mm REAL,
+            sigma_z_mm REAL, dwell_s REAL, moving INTEGER NOT NULL CHECK (moving IN (0, 1)),
+            values_json TEXT NOT NULL CHECK (json_valid(values_json)), excluded TEXT) STRICT""",
+        "CREATE INDEX observations_by_session ON observations(session_id, utc_ns)",
+    )
+
+
+@MIGRATIONS()
+def m004_jobs_and_models(db: Database) -> None:
+    """Work that sessions cause, and the models that come of it."""
+    _create(
+        db,
+        f"""CREATE TABLE jobs (id INTEGER PRIMARY KEY, kind TEXT NOT NULL,
+            session_id TEXT REFERENCES calibration_sessions(id),
+            {_one_of("state", "queued", "running", "done", "failed", "cancelled", "interrupted")},
+            depends_on INTEGER REFERENCES jobs(id), progress REAL NOT NULL DEFAULT 0, message TEXT NOT NULL DEFAULT '',
+            {_instant("created_")}, {_instant("started_", optional=True)}, {_instant("ended_", optional=True)},
+            time_limit_s REAL, pid INTEGER, attempts INTEGER NOT NULL DEFAULT 0,
+            result_json TEXT CHECK (result_json IS NULL OR json_valid(result_json)), error TEXT) STRICT""",
+        "CREATE INDEX jobs_by_state ON jobs(state, id)",
+        "CREATE INDEX jobs_by_session ON jobs(session_id)",
+        f"""CREATE TABLE models (id INTEGER PRIMARY KEY, rig TEXT NOT NULL, path TEXT NOT NULL,
+            manifest_sha256 TEXT NOT NULL, stage TEXT NOT NULL, {_one_of("state", "candidate", "live", "retired")},
+            job_id INTEGER REFERENCES jobs(id), {_instant("created_")},
+            metrics_json TEXT NOT NULL DEFAULT '{{}}' CHECK (json_valid(metrics_json))) STRICT""",
+        "CREATE UNIQUE INDEX models_one_live ON models(rig) WHERE state = 'live'",
+        "CREATE INDEX models_by_rig ON models(rig, created_utc_ns)",
+    )
+
+
+@MIGRATIONS()
+def m005_jobs_cover_sessions(db: Database) -> None:
+    """Which sessions a job works on, by their order: times of different boots cannot be compared."""
+    _create(
+        db,
+        # The newest session that was closed when the job was queued: it works on that one and on all before it.
+        "ALTER TABLE jobs ADD COLUMN through_session_id TEXT REFERENCES calibration_sessions(id)",
+        "UPDATE jobs SET through_session_id = session_id",
+        "CREATE INDEX jobs_by_coverage ON jobs(through_session_id, kind)",
+        "CREATE INDEX calibration_sessions_by_kind ON calibration_sessions(rig, state, kind)",
+    )
+
+
+def unknown_migrations(db: Database) -> list[str]:
+    """Migrations that `db` has and this program does not know: it was made by a newer one."""
+    empty = Database(memory=True)
+    known = {migration.name for migration in MIGRATIONS.pending(empty)}
+    empty.close()
+    return sorted({migration.name for migration in MIGRATIONS.applied(db)} - known)

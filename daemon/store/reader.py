@@ -1,0 +1,95 @@
+"""Read-only connections: as many as wanted, in any process, while the daemon writes."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from daemon.store.captures import decode_captures
+from daemon.store.errors import StoreError
+from daemon.store.rows import sql_value, stamp_of
+from drivers.clock import Stamp
+from drivers.readings import Capture
+
+
+class Reader:
+    """A read-only view of a store; a context manager. Belongs to the thread that opened it.
+
+    Args:
+        path: the database.
+
+    Raises:
+        StoreError: there is no store at `path`.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        if not path.is_file():
+            raise StoreError(f"{path}: there is no store; start the daemon, or give the file with --store")
+        # Never immutable=1: the file changes under a live daemon.
+        self._connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
+        self._connection.row_factory = sqlite3.Row
+        try:
+            self._connection.execute("PRAGMA query_only = ON")
+            self._connection.execute("SELECT count(*) FROM boots")
+        except sqlite3.Error as error:
+            self._connection.close()
+            raise StoreError(f"{path}: cannot be read as a store: {error}") from error
+
+    def __enter__(self) -> Reader:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._connection.close()
+
+    def rows(self, sql: str, parameters: Sequence[object] = ()) -> Iterator[dict[str, Any]]:
+        """Rows of a query as mappings, one at a time.
+
+        Raises:
+            sqlite3.Error: the query is wrong, or would write.
+        """
+        for row in self._connection.execute(sql, [*map(sql_value, parameters)]):
+            yield dict(row)
+
+    def boots(self) -> dict[int, str]:
+        """Kernel boot ids by row id, for `rows.stamp_of`."""
+        return {row["id"]: row["kernel_boot_id"] for row in self._connection.execute("SELECT * FROM boots")}
+
+    def captures(
+        self, link: str | None = None, since: Stamp | None = None, until: Stamp | None = None
+    ) -> Iterator[Capture]:
+        """Stored captures of one link, in the order they were stored, or of all links, in the order of their chunks.
+
+        Args:
+            link: name of the link; all when None.
+            since, until: bounds on utc_ns, both inclusive; unbounded when None.
+
+        Raises:
+            StoreError: a chunk is damaged; the message names it.
+        """
+        first = since.utc_ns if since is not None else -(2**63)
+        last = until.utc_ns if until is not None else 2**63 - 1
+        sql = (
+            "SELECT raw_chunks.id, chunk FROM raw_chunks JOIN links ON links.id = link_id "
+            "WHERE last_utc_ns >= ? AND first_utc_ns <= ?" + (" AND links.name = ?" if link is not None else "")
+        )
+        parameters = [first, last] if link is None else [first, last, link]
+        for chunk_id, blob in self._connection.execute(sql + " ORDER BY raw_chunks.id", parameters):
+            try:
+                captures = decode_captures(blob)
+            except StoreError as error:
+                raise StoreError(f"{self.path}: raw chunk {chunk_id}: {error}") from error
+            yield from (c for c in captures if first <= c.stamp.utc_ns <= last)
+
+    def stamp(self, row: Mapping[str, object], prefix: str = "") -> Stamp:
+        """The instant in a row's `<prefix>utc_ns`, `<prefix>monotonic_ns`, `<prefix>boot_id`."""
+        return stamp_of(row, self.boots(), prefix)

@@ -1,0 +1,261 @@
+"""What is known of joints and signals over the last seconds, and how the boom moves.
+
+Motion is told from noise by a reference that follows a resting joint slowly: a joint moves when it is further than
+`motion_threshold` from its reference, which then jumps to it. So a joint that creeps more slowly than the threshold per
+`REST_NS` counts as standing.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, bisect_right
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+from drivers.clock import NS_PER_S
+from drivers.readings import Reading, Status
+
+T = TypeVar("T")
+
+HISTORY_NS = 30 * NS_PER_S  # how long samples are kept for fixes that come late
+RATE_WINDOW_NS = NS_PER_S // 10  # on either side of the instant
+STILL_AFTER_NS = NS_PER_S // 2  # a fix just before motion shows may have been measured when it had begun
+REST_NS = NS_PER_S // 2  # time constant with which a resting joint's reference follows it
+MOTION_STEP_NS = NS_PER_S // 100  # motion is noted this finely
+MAX_GAP_S = 0.25
+STANDING_GAP_NS = NS_PER_S  # the same between two samples that show no motion
+TURN_DEG = 360.0
+
+
+@dataclass(frozen=True)
+class JointInput:
+    """A joint to be joined with fixes.
+
+    Attributes:
+        name: of its channel.
+        unit: `deg` or `mm`; degrees are interpolated the short way round.
+        motion_threshold: a change beyond this is motion and no noise, deg or mm.
+        max_gap_s: the samples around a fix may be this far apart at most; STANDING_GAP_NS if they show no motion.
+    """
+
+    name: str
+    unit: str
+    motion_threshold: float
+    max_gap_s: float = MAX_GAP_S
+
+
+@dataclass(frozen=True)
+class SignalInput:
+    """A signal to be joined with fixes.
+
+    Attributes:
+        name: of its channel.
+        column: its column in an observations CSV (`boom_valve_mA`).
+        max_age_s: an older value is taken for none.
+    """
+
+    name: str
+    column: str
+    max_age_s: float = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """A joint at one instant: value (deg or mm), last direction of motion (-1, 0, 1), rate (per second)."""
+
+    value: float
+    direction: int
+    rate: float | None
+
+
+class History(Generic[T]):
+    """The recent past of something: instants, rising, and what was there."""
+
+    def __init__(self) -> None:
+        self.times_ns: list[int] = []
+        self.items: list[T] = []
+
+    def add(self, at_ns: int, item: T) -> None:
+        """Append, and forget what is too old, but for one: it tells what held until the next."""
+        times_ns = self.times_ns
+        times_ns.append(at_ns)
+        self.items.append(item)
+        if at_ns - times_ns[0] > 2 * HISTORY_NS:  # seldom: to cut a list's head is to move its rest
+            old = max(bisect_left(times_ns, at_ns - HISTORY_NS) - 1, 0)
+            del times_ns[:old], self.items[:old]
+
+    def newer(self, at_ns: int) -> bool:
+        """Whether `at_ns` is beyond all that is here."""
+        return not self.times_ns or at_ns > self.times_ns[-1]
+
+    def latest(self, at_ns: int) -> int:
+        """Index of the last entry at or before `at_ns`; -1 where there is none."""
+        return bisect_right(self.times_ns, at_ns) - 1
+
+    def clear(self) -> None:
+        self.times_ns.clear()
+        self.items.clear()
+
+
+class JointTrack:
+    """Recent samples of one joint, and how it moves."""
+
+    def __init__(self, joint: JointInput) -> None:
+        self.name, self.unit = joint.name, joint.unit
+        self._joint = joint
+        self._max_gap_ns = round(joint.max_gap_s * NS_PER_S)
+        self._samples: History[tuple[float | Status, int]] = History()  # value or what is wrong, last direction
+        self._jumps: History[None] = History()
+        self._reference: float | None = None
+        self._direction = 0
+
+    @property
+    def newest_ns(self) -> int:
+        """Instant of the last sample; far in the past where there is none."""
+        return self._samples.times_ns[-1] if self._samples.times_ns else -(2**63)
+
+    def add(self, at_ns: int, reading: Reading) -> bool:
+        """Take a sample; True when the joint has moved, or is seen for the first time or after a preset."""
+        if not self._samples.newer(at_ns):
+            return False
+        value = reading.value
+        if reading.status is not Status.OK or value is None or not math.isfinite(value):
+            bad = Status.MALFORMED if reading.status is Status.OK else reading.status
+            self._samples.add(at_ns, (bad, self._direction))
+            return False
+        moved = False
+        if self._reference is None:
+            self._reference, moved = value, True
+        else:
+            change = self._difference(value, self._reference)
+            if abs(change) >= self._joint.motion_threshold:
+                self._reference, self._direction, moved = value, 1 if change > 0 else -1, True
+            else:
+                self._reference += change * min(1.0, (at_ns - self.newest_ns) / REST_NS)
+        self._samples.add(at_ns, (value, self._direction))
+        return moved
+
+    def jumped(self, at_ns: int) -> None:
+        """The encoder was preset: its values before and after have nothing to do with each other."""
+        if self._jumps.newer(at_ns):
+            self._jumps.add(at_ns, None)
+        self._reference = None
+
+    def clear(self) -> None:
+        self._samples.clear()
+        self._jumps.clear()
+        self._reference = None
+
+    def at(self, at_ns: int) -> State | str:
+        """The joint at an instant, or why it is not known."""
+        times_ns, items = self._samples.times_ns, self._samples.items
+        before = self._samples.latest(at_ns)
+        if before < 0:
+            return "no sample before the fix"
+        after = before if times_ns[before] == at_ns else before + 1
+        if after == len(times_ns):
+            return "no sample after the fix"
+        start, direction = items[before]
+        end, _ = items[after]
+        if isinstance(start, Status) or isinstance(end, Status):
+            return f"its reading at the fix is {start if isinstance(start, Status) else end}"
+        span_ns = times_ns[after] - times_ns[before]
+        stood = abs(self._difference(end, start)) <= self._joint.motion_threshold
+        if span_ns > (max(STANDING_GAP_NS, self._max_gap_ns) if stood else self._max_gap_ns):
+            return f"its samples around the fix are more than {self._joint.max_gap_s:g} s apart"
+        if self._jumps.latest(times_ns[after]) != self._jumps.latest(times_ns[before]):
+            return "its encoder was preset at the fix"
+        fraction = (at_ns - times_ns[before]) / span_ns if span_ns else 0.0
+        value = start + fraction * self._difference(end, start)
+        if self.unit == "deg" and fraction >= 0.5:
+            value += TURN_DEG * round((end - value) / TURN_DEG)  # past a wrap: the turn of the nearer sample
+        return State(value, direction, self._rate(at_ns))
+
+    def _rate(self, at_ns: int) -> float | None:
+        """Least-squares slope of the samples around an instant; None of a single one."""
+        times_ns, items = self._samples.times_ns, self._samples.items
+        # To the next samples beyond the window: two that came close together would say nothing.
+        first = max(bisect_right(times_ns, at_ns - RATE_WINDOW_NS) - 1, 0)
+        last = bisect_left(times_ns, at_ns + RATE_WINDOW_NS) + 1
+        jump = self._jumps.latest(at_ns)
+        points = [
+            (times_ns[i] - at_ns, value)
+            for i in range(first, min(last, len(times_ns)))
+            if not isinstance(value := items[i][0], Status)
+            and self._jumps.latest(times_ns[i]) == jump
+            and abs(times_ns[i] - at_ns) <= STANDING_GAP_NS
+        ]
+        if len(points) < 2:
+            return None
+        origin = points[0][1]
+        offsets = [self._difference(value, origin) for _, value in points]
+        mean_ns = sum(t for t, _ in points) / len(points)
+        mean = sum(offsets) / len(points)
+        spread = sum((t - mean_ns) ** 2 for t, _ in points)
+        slope = sum((t - mean_ns) * (o - mean) for (t, _), o in zip(points, offsets, strict=True)) / spread
+        return slope * NS_PER_S
+
+    def _difference(self, to: float, since: float) -> float:
+        """Change from `since` to `to`; of an angle the short way round."""
+        change = to - since
+        if self.unit == "deg" and not -TURN_DEG / 2 <= change < TURN_DEG / 2:
+            change = (change + TURN_DEG / 2) % TURN_DEG - TURN_DEG / 2
+        return change
+
+
+class SignalTrack:
+    """Recent values of one signal."""
+
+    def __init__(self, signal: SignalInput) -> None:
+        self.column = signal.column
+        self._max_age_ns = round(signal.max_age_s * NS_PER_S)
+        self._values: History[float | None] = History()
+
+    def add(self, at_ns: int, value: float | None) -> None:
+        """Take a value, None for none."""
+        if self._values.newer(at_ns):
+            self._values.add(at_ns, value)
+
+    def clear(self) -> None:
+        self._values.clear()
+
+    def at(self, at_ns: int) -> float | None:
+        """The value at an instant; None where it is bad, too old or not there."""
+        last = self._values.latest(at_ns)
+        if last < 0 or at_ns - self._values.times_ns[last] > self._max_age_ns:
+            return None
+        return self._values.items[last]
+
+
+class Motion:
+    """When the boom moved last, and which standstill this is."""
+
+    def __init__(self, settle_ns: int) -> None:
+        self._settle_ns = settle_ns
+        self._ended = 0  # standstills that are over
+        self._moves: History[int] = History()  # how many standstills were over at each motion
+
+    def note(self, at_ns: int) -> None:
+        """Some joint has moved."""
+        if self._moves.times_ns:
+            quiet_ns = at_ns - self._moves.times_ns[-1]
+            if quiet_ns < MOTION_STEP_NS:
+                return
+            self._ended += quiet_ns >= self._settle_ns
+        self._moves.add(at_ns, self._ended)
+
+    def restart(self) -> None:
+        """What stood may have moved unseen: the next standstill is another."""
+        self._ended += bool(self._moves.times_ns)
+        self._moves.clear()
+
+    def at(self, at_ns: int) -> tuple[float | None, int | None]:
+        """Dwell in seconds and the number of the standstill, as JoinedFix has them."""
+        last = self._moves.latest(at_ns)
+        if last < 0:
+            return None, None
+        times_ns = self._moves.times_ns
+        dwell_ns = at_ns - times_ns[last]
+        leaving = last + 1 < len(times_ns) and times_ns[last + 1] - at_ns < STILL_AFTER_NS
+        standing = dwell_ns >= self._settle_ns and not leaving
+        return dwell_ns / NS_PER_S, self._moves.items[last] + 1 if standing else None

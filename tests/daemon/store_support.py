@@ -1,0 +1,61 @@
+"""Records and captures for tests of the store, the acquisition and the joiner."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from daemon.store import Reader
+from drivers.clock import Stamp
+from drivers.readings import CanCapture, Fix, LockState, Reading, SerialCapture, Status
+
+BOOT = "boot-a"
+UTC_0 = 1_700_000_000_000_000_000
+MONOTONIC_0 = 5_000_000_000
+
+
+def at(seconds: float, boot_id: str = BOOT) -> Stamp:
+    """The instant `seconds` into a test."""
+    shift = round(seconds * 1e9)
+    return Stamp(UTC_0 + shift, MONOTONIC_0 + shift, boot_id)
+
+
+def frame(number: int, seconds: float | None = None, link: str = "boom", boot_id: str = BOOT) -> CanCapture:
+    """A frame that carries its number, at `seconds`, by default one a millisecond."""
+    when = number / 1000 if seconds is None else seconds
+    return CanCapture(link, at(when, boot_id), 0x181, number.to_bytes(8, "little"))
+
+
+def serial_bytes(data: bytes, seconds: float, link: str = "station") -> SerialCapture:
+    return SerialCapture(link, at(seconds), data)
+
+
+def reading(
+    channel: str, seconds: float, value: float | None, unit: str = "deg", status: Status = Status.OK
+) -> Reading:
+    return Reading(channel, at(seconds), value, unit, status)
+
+
+def fix(seconds: float, status: Status = Status.OK, station: str = "ts1") -> Fix:
+    return Fix(
+        station,
+        at(seconds),
+        at(seconds + 0.01),
+        status,
+        LockState.LOCKED,
+        hz_angle_rad=1.25,
+        zenith_angle_rad=1.5,
+        slope_distance_m=11.7845,
+        face=1,
+        prism_constant_mm=-30.0,
+        ppm=2.5,
+        tilt_ok=True,
+        edm_level=12,
+        raw=b"Q+0117848",
+    )
+
+
+def table(path: Path, name: str, order: str = "rowid") -> list[dict[str, Any]]:
+    """All rows of a table, through a reader of its own."""
+    with Reader(path) as reader:
+        return [*reader.rows(f"SELECT * FROM {name} ORDER BY {order}")]

@@ -1,0 +1,85 @@
+"""Captures survive their encoding exactly, and a damaged chunk is never taken for a good one."""
+
+from __future__ import annotations
+
+import zlib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daemon.store.captures import decode_captures, encode_captures
+from daemon.store.errors import StoreError
+from drivers.clock import Stamp
+from drivers.readings import CanCapture, Capture, SerialCapture
+from tests.daemon.store_support import at, frame, serial_bytes
+
+INT64 = st.integers(-(2**63), 2**63 - 1)
+STAMPS = st.builds(Stamp, INT64, INT64, st.sampled_from(["boot-a", "boot-b", "Anschluß"]))
+CAN = st.builds(
+    CanCapture,
+    st.sampled_from(["boom", "feed"]),
+    STAMPS,
+    st.integers(0, 2**32 - 1),
+    st.binary(max_size=64),
+    st.booleans(),
+    st.booleans(),
+    st.booleans(),
+    st.booleans(),
+)
+SERIAL = st.builds(
+    SerialCapture, st.sampled_from(["station", "zweite"]), STAMPS, st.binary(max_size=300), st.booleans()
+)
+
+
+@given(st.lists(CAN | SERIAL, max_size=40))
+def test_every_field_of_every_capture_comes_back_in_order(captures: list[Capture]) -> None:
+    chunks = encode_captures(captures)
+    back = [capture for chunk in chunks for capture in decode_captures(chunk.blob)]
+    for link in {c.link for c in captures}:
+        assert [c for c in back if c.link == link] == [c for c in captures if c.link == link]
+    assert len(back) == len(captures)
+
+
+def test_a_chunk_says_what_it_holds() -> None:
+    can, serial = encode_captures([frame(1), serial_bytes(b"Q+1", 0.0015), frame(2)])
+    assert (can.link, can.kind, can.captures, can.payload_bytes) == ("boom", "can", 2, 16)
+    assert (can.first, can.last) == (at(0.001), at(0.002))
+    assert (serial.link, serial.kind, serial.captures, serial.payload_bytes) == ("station", "serial", 1, 3)
+
+
+def test_each_boot_gets_a_chunk_of_its_own() -> None:
+    chunks = encode_captures([frame(1), frame(2), frame(1, boot_id="boot-b")])
+    assert [(c.first.boot_id, c.captures) for c in chunks] == [("boot-a", 2), ("boot-b", 1)]
+
+
+def test_a_busy_bus_takes_less_room_than_its_frames_on_the_wire() -> None:
+    (chunk,) = encode_captures([frame(n, n * 125e-6) for n in range(400)])
+    assert len(chunk.blob) < 400 * 8
+
+
+def test_a_frame_that_no_bus_can_carry_is_refused_by_name() -> None:
+    with pytest.raises(StoreError, match=r"'boom'.*cannot be stored"):
+        encode_captures([CanCapture("boom", at(0), 2**32, b"")])
+
+
+@given(st.data())
+def test_any_change_of_a_chunk_is_noticed(data: st.DataObject) -> None:
+    (chunk,) = encode_captures([frame(n) for n in range(5)])
+    place = data.draw(st.integers(0, len(chunk.blob) - 1))
+    change = data.draw(st.integers(1, 255))
+    damaged = bytearray(chunk.blob)
+    damaged[place] ^= change
+    with pytest.raises(StoreError):
+        decode_captures(bytes(damaged))
+    with pytest.raises(StoreError):
+        decode_captures(chunk.blob[:place])
+
+
+def test_a_chunk_of_a_later_version_asks_for_a_newer_program() -> None:
+    (chunk,) = encode_captures([frame(1)])
+    later = bytearray(chunk.blob[:-4])
+    later[4] = 2
+    later += zlib.crc32(later).to_bytes(4, "little")
+    with pytest.raises(StoreError, match="version 2"):
+        decode_captures(bytes(later))
