@@ -1,0 +1,204 @@
+"""The daemon's configuration: one TOML file, checked whole before anything is opened."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from drivers.station import StationConfig
+
+MAX_SOCKET_PATH_BYTES = 107  # unix(7): sun_path holds 108 bytes with the closing zero
+
+
+class ConfigError(Exception):
+    """The configuration cannot be used; the message names file, key, what was found and what is allowed."""
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class CanSection(_Section):
+    """A CAN link.
+
+    Attributes:
+        name: which of the rig's channels it serves (their `link`).
+        interface, channel, bitrate: as python-can has them; `bitrate` is not set on socketcan (networkd does that).
+            `playback` plays the captured log `channel`, as if its first frame came now.
+        allow_transmit: rigcal may send on this bus: SYNC, and active set-up of the nodes listed.
+        transmit_nodes: CANopen nodes that may be written to.
+        sync_period_ms: send SYNC this often, so that all joints are sampled at one instant.
+        options: further settings of the python-can interface.
+    """
+
+    name: str = "boom"
+    interface: Literal["socketcan", "virtual", "udp_multicast", "slcan", "playback"] = "socketcan"
+    channel: str
+    bitrate: int | None = Field(default=None, ge=10_000, le=1_000_000)
+    allow_transmit: bool = False
+    transmit_nodes: tuple[int, ...] = ()
+    sync_period_ms: int | None = Field(default=None, ge=1, le=10_000)
+    options: dict[str, str | int | float | bool] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _sending_is_said(self) -> CanSection:
+        if self.interface == "playback" and self.allow_transmit:
+            raise ValueError("a log that is played back cannot be sent to: remove allow_transmit")
+        if not self.allow_transmit and (self.transmit_nodes or self.sync_period_ms):
+            raise ValueError("transmit_nodes and sync_period_ms need allow_transmit = true; CAN is listen-only without")
+        return self
+
+    @field_validator("transmit_nodes")
+    @classmethod
+    def _nodes_exist(cls, nodes: tuple[int, ...]) -> tuple[int, ...]:
+        if any(not 1 <= node <= 127 for node in nodes):
+            raise ValueError("CANopen nodes are 1 to 127")
+        return nodes
+
+
+class SessionsSection(_Section):
+    """Calibration sessions.
+
+    Attributes:
+        settle_s: how long the boom must have stood before its fixes count as one standstill.
+        fixes_per_shot: how many good fixes are averaged for a control point.
+        shot_timeout_s: how long to wait for them.
+        control_tolerance_mm: a control point that is further off than this says that the set-up moved.
+    """
+
+    settle_s: float = Field(default=1.0, ge=0)
+    fixes_per_shot: int = Field(default=5, ge=1)
+    shot_timeout_s: float = Field(default=60.0, gt=0)
+    control_tolerance_mm: float = Field(default=5.0, gt=0)
+
+
+class JobsSection(_Section):
+    """Background jobs.
+
+    Attributes:
+        enabled: closed sessions trigger jobs.
+        time_limit_s: a job that runs longer is stopped.
+        max_attempts: how often an interrupted job is offered again.
+        seed: of every random choice in identification and residual training.
+    """
+
+    enabled: bool = True
+    time_limit_s: float = Field(default=1800.0, gt=0)
+    max_attempts: int = Field(default=3, ge=1)
+    seed: int = 0
+
+
+class Config(_Section):
+    """Everything `rigcal run` needs to know.
+
+    Attributes:
+        rig: a shipped rig's name or a path to a rig file.
+        state_directory: where store, models and reports live.
+        socket: the control socket; `control.sock` in the runtime or state directory when absent.
+    """
+
+    rig: str
+    state_directory: Path = Field(default_factory=lambda: Path(os.environ.get("STATE_DIRECTORY", "/var/lib/rigcal")))
+    socket: Path | None = None
+    can: tuple[CanSection, ...] = ()
+    station: tuple[StationConfig, ...] = ()
+    sessions: SessionsSection = SessionsSection()
+    jobs: JobsSection = JobsSection()
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> Config:
+        names = [link.name for link in self.can] + [station.name for station in self.station]
+        doubled = sorted({name for name in names if names.count(name) > 1})
+        if doubled:
+            raise ValueError(f"two links are called {doubled[0]!r}; every [[can]] and [[station]] needs its own name")
+        return self
+
+    @property
+    def store_path(self) -> Path:
+        """The store."""
+        return self.state_directory / "rigcal.sqlite"
+
+    @property
+    def models_directory(self) -> Path:
+        """One directory a model."""
+        return self.state_directory / "models"
+
+    @property
+    def socket_path(self) -> Path:
+        """The control socket."""
+        if self.socket is not None:
+            return self.socket
+        return Path(os.environ.get("RUNTIME_DIRECTORY", self.state_directory)) / "control.sock"
+
+
+def parse_config(text: str, source: Path) -> Config:
+    """Check a configuration.
+
+    Args:
+        text: TOML.
+        source: the file, for messages and as the base of relative paths.
+
+    Raises:
+        ConfigError: every wrong key in one message, a line each.
+    """
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{source}: not valid TOML: {error}") from error
+    try:
+        config = Config.model_validate(raw)
+    except ValidationError as error:
+        raise ConfigError("\n".join(f"{source}: {_sentence(e)}" for e in error.errors())) from error
+    base = source.parent
+    rig = config.rig if "/" not in config.rig and not config.rig.endswith(".toml") else str(base / config.rig)
+    config = config.model_copy(
+        update={
+            "rig": rig,
+            "state_directory": base / config.state_directory,
+            "socket": base / config.socket if config.socket else None,
+        }
+    )
+    if len(os.fsencode(config.socket_path)) > MAX_SOCKET_PATH_BYTES:
+        raise ConfigError(
+            f"{source}: socket: {config.socket_path} is longer than the {MAX_SOCKET_PATH_BYTES} bytes a unix socket's "
+            "path may have; set `socket` to a shorter one"
+        )
+    return config
+
+
+def read_config(path: Path) -> Config:
+    """Read and check a configuration file; ConfigError says what is wrong with it."""
+    try:
+        return parse_config(path.read_text(encoding="utf-8"), path.resolve())
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not UTF-8 at byte {error.start}; save it as UTF-8") from error
+
+
+def _sentence(error: Any) -> str:
+    """One pydantic error as `key: what is wrong (allowed: ...)`."""
+    key = ".".join(str(part + 1) if isinstance(part, int) else str(part) for part in error["loc"]) or "file"
+    message = error["msg"].removeprefix("Value error, ")
+    if error["type"] == "extra_forbidden":
+        section: type[BaseModel] = Config
+        for part in error["loc"][:-1]:
+            section = _section_of(section, part)
+        allowed = ", ".join(sorted(section.model_fields))
+        return f"{key}: unknown key; allowed here: {allowed}"
+    if error["type"] == "missing":
+        return f"{key}: missing; it is required"
+    return f"{key}: {message}, found {error['input']!r}"
+
+
+def _section_of(section: type[BaseModel], part: int | str) -> type[BaseModel]:
+    """The section that `part` of an error's location leads to from `section`; an index stays in it."""
+    if isinstance(part, int) or part not in section.model_fields:
+        return section
+    annotation = section.model_fields[part].annotation
+    candidates = (annotation, *get_args(annotation))
+    return next((c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)), section)

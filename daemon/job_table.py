@@ -1,0 +1,295 @@
+"""The store's table of jobs: what is in it, and every way in which a job changes its state.
+
+Each change reads and writes in one transaction, and transactions take turns: what an operator says and what a job's
+process does meet here, and the second of the two finds what the first one did.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from daemon.config import Config
+from daemon.control import CommandError
+from daemon.order import Order, Outcome, Progress
+from daemon.scheduler import CHECK, DueChain, JobFacts, JobKind, SessionFacts, State
+from daemon.store.reader import Reader
+from daemon.store.store import Store
+from drivers.clock import Clock
+
+CANCELLED = Outcome("cancelled", "cancelled by the operator")
+CANCELLABLE = ("queued", "running", "interrupted")
+RETRIABLE = ("failed", "cancelled", "interrupted")
+SHOWN = "id, kind, session_id, state, progress, message, attempts, error"
+
+# These run twice a second beside acquisition, for months: CROSS JOIN and NOT INDEXED keep SQLite's planner from
+# starting with all of a rig's sessions.
+# The newest session of each kind and state; the index by kind holds all that it asks for.
+_SESSIONS = """SELECT id, rowid AS number, kind, state, ended_utc_ns, ended_monotonic_ns, ended_boot_id
+    FROM calibration_sessions WHERE rowid IN
+        (SELECT max(rowid) FROM calibration_sessions WHERE rig = ? AND state IN ('open', 'closed') GROUP BY state, kind)
+    ORDER BY rowid"""
+_JOBS = """SELECT job.id, job.kind, job.session_id, job.state, job.attempts,
+        job.depends_on IS NULL OR before.state = 'done' AS is_ready,
+        job.ended_utc_ns, job.ended_monotonic_ns, job.ended_boot_id
+    FROM jobs AS job CROSS JOIN calibration_sessions AS session ON session.id = job.session_id
+        LEFT JOIN jobs AS before ON before.id = job.depends_on
+    WHERE job.state IN ('queued', 'running', 'interrupted') AND session.rig = ? ORDER BY job.id"""
+# Walks back from the newest session; the first that a job of this kind was queued through ends the walk.
+_COVERED = """SELECT session.rowid AS number FROM calibration_sessions AS session NOT INDEXED
+    WHERE session.rig = ?
+        AND EXISTS (SELECT 1 FROM jobs WHERE jobs.through_session_id = session.id AND jobs.kind = ?)
+    ORDER BY session.rowid DESC LIMIT 1"""
+_NEWEST_MODEL = """SELECT job.result_json FROM jobs AS job
+    JOIN calibration_sessions AS session ON session.id = job.session_id
+    WHERE job.state = 'done' AND job.kind = 'residual' AND session.rig = ? ORDER BY job.id DESC LIMIT 1"""
+_WORKED_ON = """SELECT id, kind FROM calibration_sessions WHERE rig = ? AND state = 'closed'
+        AND rowid <= (SELECT rowid FROM calibration_sessions WHERE id = ?)
+    ORDER BY rowid"""
+_CHAIN = """WITH RECURSIVE chain(id) AS (VALUES (?) UNION SELECT jobs.id FROM jobs JOIN chain ON depends_on = chain.id)
+    SELECT id, state FROM chain JOIN jobs USING (id) ORDER BY id"""
+
+
+class JobTable:
+    """The jobs of one rig.
+
+    Args:
+        store: where they are.
+        rig_name: whose sessions are worked on.
+        clock: for when what happened.
+    """
+
+    def __init__(self, store: Store, rig_name: str, clock: Clock) -> None:
+        self._store = store
+        self._rig = rig_name
+        self._clock = clock
+        self._cancelled: set[int] = set()  # running jobs that the operator wants to end
+
+    # ---- what is there -----------------------------------------------------------------------------------------------
+
+    def state(self) -> State:
+        """What scheduling needs to know."""
+        covered = {
+            kind: rows[0]["number"]
+            for kind in (JobKind.IDENTIFICATION, JobKind.REPORT)
+            if (rows := self._store.rows(_COVERED, (self._rig, kind)))
+        }
+        return State(
+            [
+                SessionFacts(row["id"], row["number"], row["kind"], row["state"], self._store.stamp(row, "ended_"))
+                for row in self._store.rows(_SESSIONS, (self._rig,))
+            ],
+            [
+                JobFacts(
+                    row["id"],
+                    JobKind(row["kind"]),
+                    row["session_id"],
+                    row["state"],
+                    row["attempts"],
+                    bool(row["is_ready"]),
+                    self._store.stamp(row, "ended_"),
+                )
+                for row in self._store.rows(_JOBS, (self._rig,))
+            ],
+            covered,
+            has_model=bool(self._store.rows(_NEWEST_MODEL, (self._rig,))),
+        )
+
+    def all(self) -> list[dict[str, Any]]:
+        """All jobs with their results, newest last. Read beside the writing connection, which must not wait."""
+        with Reader(self._store.path) as reader:
+            rows = list(reader.rows(f"SELECT {SHOWN}, result_json FROM jobs ORDER BY id"))
+        return [row | {"result": json.loads(row.pop("result_json") or "null")} for row in rows]
+
+    def unfinished(self) -> list[dict[str, Any]]:
+        """Jobs that run, wait, or will be offered again, without results, newest last."""
+        return self._store.rows(
+            f"SELECT {SHOWN} FROM jobs WHERE state IN ('queued', 'running', 'interrupted') ORDER BY id"
+        )
+
+    def order(self, job: JobFacts, config: Config) -> Order:
+        """What a job's process is asked to do: the sessions were settled when the job was queued."""
+        (row,) = self._store.rows("SELECT depends_on, through_session_id FROM jobs WHERE id = ?", (job.id,))
+        sessions = self._store.rows(_WORKED_ON, (self._rig, row["through_session_id"]))
+        training = tuple(s["id"] for s in sessions if s["kind"] != CHECK)
+        checks = tuple(s["id"] for s in sessions if s["kind"] == CHECK)
+        if row["depends_on"] is None:
+            before = self._store.rows(_NEWEST_MODEL, (self._rig,))
+        else:
+            before = self._store.rows("SELECT result_json FROM jobs WHERE id = ?", (row["depends_on"],))
+        result = json.loads(before[0]["result_json"]) if before else {}
+        return Order(
+            kind=job.kind.value,
+            job_id=job.id,
+            store=str(config.store_path),
+            models_directory=str(config.models_directory),
+            session_ids=checks if job.kind is JobKind.REPORT else training,
+            model=result.get("model"),
+            train_ids=tuple(result.get("sessions", training)),
+            seed=config.jobs.seed,
+        )
+
+    # ---- what the runner does ----------------------------------------------------------------------------------------
+
+    def queue(self, due: DueChain) -> None:
+        """Queue new jobs, each to run after the one before it."""
+        with self._store.transaction():
+            before: int | None = None
+            for kind in due.kinds:
+                row = {
+                    "kind": kind.value,
+                    "session_id": due.session_id,
+                    "through_session_id": due.through_id,
+                    "state": "queued",
+                    "depends_on": before,
+                    **self._store.instant(self._clock.now(), "created_"),
+                }
+                before = self._store.insert("jobs", row)
+
+    def offer_again(self, job_id: int) -> bool:
+        """Queue an interrupted job again; False if it is interrupted no more."""
+        return bool(self._store.update("jobs", {"id": job_id, "state": "interrupted"}, {"state": "queued"}))
+
+    def begin(self, job: JobFacts, time_limit_s: float) -> bool:
+        """A queued job runs from now on, and shows nothing of earlier runs; False if it is queued no more."""
+        with self._store.transaction():
+            if self._job(job.id)["state"] != "queued":
+                return False
+            self._set(
+                job.id,
+                state="running",
+                attempts=job.attempts + 1,
+                time_limit_s=time_limit_s,
+                progress=0.0,
+                message="",
+                error=None,
+                result_json=None,
+                **self._store.instant(self._clock.now(), "started_"),
+                ended_utc_ns=None,
+                ended_monotonic_ns=None,
+                ended_boot_id=None,
+            )
+            return True
+
+    def note_process(self, job_id: int, pid: int) -> None:
+        """The process that a running job runs in."""
+        self._set(job_id, pid=pid)
+
+    def note_progress(self, job_id: int, progress: Progress) -> None:
+        """How far a running job is."""
+        self._set(job_id, progress=progress.share, message=progress.message)
+
+    def is_cancelled(self, job_id: int) -> bool:
+        """Whether the operator wants a running job to end."""
+        return job_id in self._cancelled
+
+    def end(self, job_id: int, outcome: Outcome) -> Outcome:
+        """A job has ended; with one that failed or was cancelled end those that wait for it.
+
+        Returns:
+            how it ended in the end: what the operator said goes before what the process said.
+        """
+        with self._store.transaction():
+            if job_id in self._cancelled:
+                self._cancelled.discard(job_id)
+                outcome = CANCELLED
+            ended = self._store.instant(self._clock.now(), "ended_")
+            is_done = outcome.state == "done"
+            self._set(
+                job_id,
+                state=outcome.state,
+                error=outcome.error,
+                result_json=outcome.result,
+                progress=1.0 if is_done else 0.0,
+                pid=None,
+                **ended,
+            )
+            if outcome.result is not None and "manifest_sha256" in outcome.result:
+                self._add_model(job_id, outcome.result)
+            if outcome.state in {"failed", "cancelled"}:
+                for waiting in self._chain(job_id)[1:]:
+                    if waiting["state"] in {"queued", "interrupted"}:
+                        error = f"job {job_id} before it is {outcome.state}"
+                        self._set(waiting["id"], state="cancelled", error=error, **ended)
+            return outcome
+
+    def interrupt_running(self, why: str) -> None:
+        """Jobs that the store takes for running, and that nobody runs, did not end: the scheduler offers them again."""
+        for row in self._store.rows("SELECT id FROM jobs WHERE state = 'running'"):
+            self.end(row["id"], Outcome("interrupted", why))
+
+    # ---- what the operator does --------------------------------------------------------------------------------------
+
+    def cancel(self, job_id: object) -> str:
+        """Cancel a job that has not ended.
+
+        Returns:
+            a sentence for the operator.
+
+        Raises:
+            CommandError: there is none, or it has ended.
+        """
+        with self._store.transaction():
+            job = self._job(job_id)
+            if job["state"] not in CANCELLABLE:
+                raise CommandError(f"job {job['id']} is {job['state']}; only one that has not ended can be cancelled")
+            if job["state"] == "running":
+                self._cancelled.add(job["id"])
+                return f"job {job['id']} ({job['kind']}) is being cancelled"
+            self.end(job["id"], CANCELLED)
+            return f"job {job['id']} ({job['kind']}) is cancelled"
+
+    def retry(self, job_id: object) -> str:
+        """Queue a job that did not end well again, and with it those that waited for it; their attempts count anew.
+
+        Returns:
+            a sentence for the operator.
+
+        Raises:
+            CommandError: there is none, it has not ended or ended well, or the one before it did not end well.
+        """
+        with self._store.transaction():
+            job = self._job(job_id)
+            if job["state"] not in RETRIABLE:
+                raise CommandError(f"job {job['id']} is {job['state']}; only one that did not end well can be retried")
+            if job["depends_on"] is not None:
+                before = self._job(job["depends_on"])
+                if before["state"] in RETRIABLE:
+                    raise CommandError(
+                        f"job {job['id']} waits for job {before['id']}, which is {before['state']}; retry that one: "
+                        "those that wait for it follow"
+                    )
+            for waiting in self._chain(job["id"]):
+                self._set(waiting["id"], state="queued", progress=0.0, message="", error=None, attempts=0)
+            return f"job {job['id']} ({job['kind']}) is queued again"
+
+    # ---- parts -------------------------------------------------------------------------------------------------------
+
+    def _job(self, job_id: object) -> dict[str, Any]:
+        found = isinstance(job_id, int) and self._store.rows(
+            "SELECT id, kind, state, depends_on FROM jobs WHERE id = ?", (job_id,)
+        )
+        if not found:
+            raise CommandError(f"there is no job {job_id!r}; `rigcal jobs list` shows them")
+        return found[0]
+
+    def _chain(self, job_id: int) -> list[dict[str, Any]]:
+        """Id and state of a job and, in order, of all that wait for it."""
+        return self._store.rows(_CHAIN, (job_id,))
+
+    def _set(self, job_id: int, **columns: object) -> None:
+        self._store.update("jobs", {"id": job_id}, columns)
+
+    def _add_model(self, job_id: int, result: Mapping[str, Any]) -> None:
+        row = {
+            "rig": self._rig,
+            "path": result["model"],
+            "manifest_sha256": result["manifest_sha256"],
+            "stage": result["stage"],
+            "state": "candidate",
+            "job_id": job_id,
+            "metrics_json": result["metrics"],
+            **self._store.instant(self._clock.now(), "created_"),
+        }
+        self._store.insert("models", row)

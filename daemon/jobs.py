@@ -1,0 +1,148 @@
+"""Runs jobs: queues what is due, one process at a time, and writes down what becomes of it.
+
+The runner is one thread of the daemon. A job's process (`daemon.job_process`) reads the store and tells progress and
+result on its standard output; only the daemon writes.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from daemon.config import Config
+from daemon.job_child import JOB_COMMAND, JobChild
+from daemon.job_table import CANCELLED, JobTable
+from daemon.order import Outcome
+from daemon.scheduler import DueChain, JobFacts, due_jobs, next_job, spent_jobs
+from daemon.store.store import Store
+from drivers.clock import NS_PER_S, Clock, SystemClock
+
+log = logging.getLogger(__name__)
+
+POLL_S = 0.5
+LISTEN_S = 0.2  # a running job that is silent is looked after this often
+STOP_TIMEOUT_S = 30.0
+
+
+class JobRunner:
+    """Queues and runs jobs until stopped.
+
+    Args:
+        store: where jobs, their results and models are written.
+        config: limits, seed and places.
+        rig_name: whose sessions are used.
+        clock: time.
+        command: what carries out an order, with the protocol of `daemon.order`.
+    """
+
+    def __init__(
+        self, store: Store, config: Config, rig_name: str, clock: Clock, *, command: Sequence[str] = JOB_COMMAND
+    ) -> None:
+        self._settings = config.jobs
+        self._config = config
+        self._clock = clock
+        self._command = command
+        self._work_clock = SystemClock()  # work takes real time, whatever the rig's clock does
+        self._table = JobTable(store, rig_name, clock)
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="jobs", daemon=True)
+        self._table.interrupt_running("the daemon ended while it ran")
+
+    def start(self) -> None:
+        """Begin to queue and run."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the running job (it is marked interrupted, and offered again at the next start) and the thread."""
+        self._stopping.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=STOP_TIMEOUT_S)
+
+    def unfinished(self) -> list[dict[str, Any]]:
+        """Jobs that run, wait, or will be offered again, without results, newest last: what `status` shows."""
+        return self._table.unfinished()
+
+    # ---- commands of the operator ------------------------------------------------------------------------------------
+
+    def list_command(self, _arguments: Mapping[str, Any]) -> list[dict[str, Any]]:
+        """All jobs with their results, newest last."""
+        return self._table.all()
+
+    def cancel_command(self, arguments: Mapping[str, Any]) -> str:
+        """Cancel a job that has not ended, and with it those that wait for it."""
+        return self._table.cancel(arguments.get("id"))
+
+    def retry_command(self, arguments: Mapping[str, Any]) -> str:
+        """Queue a job that failed, was cancelled or was interrupted again, and with it those that waited for it."""
+        return self._table.retry(arguments.get("id"))
+
+    # ---- the thread --------------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                did_something = self._step()
+            except Exception:
+                log.exception("the scheduler stumbled; it goes on")
+                did_something = False
+            if not did_something:
+                self._stopping.wait(POLL_S)
+
+    def _step(self) -> bool:
+        """Queue what is due and run what is next; whether a job ran."""
+        state = self._table.state()
+        if any(job.state == "running" for job in state.jobs):
+            # None runs between two steps: the last step stumbled, over a full disk for example.
+            self._table.interrupt_running("the daemon could not see it through; its log may tell why")
+            return False
+        for job in spent_jobs(state, max_attempts=self._settings.max_attempts):
+            self._give_up(job)
+        due = due_jobs(state, self._clock.now(), max_attempts=self._settings.max_attempts)
+        for item in due:
+            if isinstance(item, DueChain):
+                self._table.queue(item)
+            elif self._table.offer_again(item.job_id):
+                log.info("job %d is offered again after an interruption", item.job_id)
+        next_one = next_job(self._table.state() if due else state)
+        if next_one is None or not self._table.begin(next_one, self._settings.time_limit_s):
+            return False
+        self._perform(next_one)
+        return True
+
+    def _give_up(self, job: JobFacts) -> None:
+        error = (
+            f"interrupted {job.attempts} times, as often as [jobs] max_attempts allows; "
+            f"`rigcal jobs retry {job.id}` tries once more"
+        )
+        log.warning("job %d (%s) is given up: %s", job.id, job.kind, error)
+        self._table.end(job.id, Outcome("failed", error))
+
+    def _perform(self, job: JobFacts) -> None:
+        """Run one job to its end."""
+        log.info("job %d (%s for session %s) starts", job.id, job.kind, job.session_id)
+        with JobChild(self._table.order(job, self._config), self._command) as child:
+            self._table.note_process(job.id, child.pid)
+            outcome = self._follow(job.id, child)
+        outcome = self._table.end(job.id, outcome)
+        level = logging.INFO if outcome.state == "done" else logging.WARNING
+        why = f": {outcome.error}" if outcome.error else ""
+        log.log(level, "job %d (%s) is %s%s", job.id, job.kind, outcome.state, why)
+
+    def _follow(self, job_id: int, child: JobChild) -> Outcome:
+        """Write down a process's progress until it tells a result, dies, is cancelled, or its time is up."""
+        limit_s = self._settings.time_limit_s
+        deadline_ns = self._work_clock.monotonic_ns() + int(limit_s * NS_PER_S)
+        while True:
+            if self._stopping.is_set():
+                return Outcome("interrupted", "the daemon was stopped")
+            if self._table.is_cancelled(job_id):
+                return CANCELLED
+            if self._work_clock.monotonic_ns() > deadline_ns:
+                return Outcome("failed", f"took longer than its limit of {limit_s:g} s ([jobs] time_limit_s)")
+            message = child.next_message(LISTEN_S)
+            if isinstance(message, Outcome):
+                return message
+            if message is not None:
+                self._table.note_progress(job_id, message)

@@ -1,0 +1,95 @@
+"""What the daemon and a job's process say to each other: an order one way, a JSON object a line the other.
+
+The process tells any number of `{"progress": 0.3, "message": "..."}` and last `{"result": {...}}` or
+`{"error": "..."}`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+QUOTED_BYTES = 60
+
+
+@dataclass(frozen=True)
+class Order:
+    """What the daemon asks for.
+
+    Attributes:
+        kind: identification, residual or report.
+        job_id: names the files that the job writes.
+        store: the store, opened read-only.
+        models_directory: where models go, a directory each.
+        session_ids: sessions to use: to train on (identification), to hold out (report).
+        model: the model directory to start from (residual, report).
+        train_ids: sessions that the model was trained on (report).
+        seed: of every random choice.
+    """
+
+    kind: str
+    job_id: int
+    store: str
+    models_directory: str
+    session_ids: tuple[str, ...]
+    model: str | None
+    train_ids: tuple[str, ...]
+    seed: int
+
+    def to_line(self) -> bytes:
+        """The line that the process reads."""
+        return json.dumps(asdict(self)).encode() + b"\n"
+
+    @classmethod
+    def from_line(cls, line: str) -> Order:
+        """The order in a line that `to_line` made."""
+        order = json.loads(line)
+        return cls(**order | {key: tuple(order[key]) for key in ("session_ids", "train_ids")})
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a job is.
+
+    Attributes:
+        share: of the whole, 0 to 1.
+        message: what it does now.
+    """
+
+    share: float
+    message: str
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a job ended.
+
+    Attributes:
+        state: done, failed, cancelled or interrupted, as in the store.
+        error: one sentence, None when it is done.
+        result: what the store keeps of a job that is done.
+    """
+
+    state: str
+    error: str | None = None
+    result: Mapping[str, Any] | None = None
+
+
+def parse_message(line: bytes) -> Progress | Outcome:
+    """What a job's process said in one line; a line that is no message is a job that failed."""
+    try:
+        message = json.loads(line)
+    except (ValueError, RecursionError):
+        message = None
+    match message:
+        case {"progress": float() | int() as share, "message": str() as text} if math.isfinite(share):
+            return Progress(min(max(float(share), 0.0), 1.0), text)
+        case {"result": dict() as result}:
+            return Outcome("done", result=result)
+        case {"error": str() as error}:
+            return Outcome("failed", error)
+    said = line.rstrip()[:QUOTED_BYTES].decode("utf-8", "replace")
+    return Outcome("failed", f"its process said {said!r}, which is no message of a job; the daemon's log may tell why")

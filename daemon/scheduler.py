@@ -1,0 +1,176 @@
+"""Which jobs are due: a pure function of what the store holds and of the time. It starts nothing.
+
+A closed session triggers identification, then residual training, then the report. A closed check session triggers a
+report alone: its poses are never trained on. Work waits while a session is open: acquisition comes first.
+
+What a job covers is decided by the order of sessions, never by time: a wall clock may be wrong for whole boots.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+from drivers.clock import NS_PER_S, Stamp
+
+CHECK = "check"
+SESSION_KINDS = ("single_joint", "multi_joint", "static_poses", CHECK)
+
+
+class JobKind(StrEnum):
+    """What a job does."""
+
+    IDENTIFICATION = "identification"
+    RESIDUAL = "residual"
+    REPORT = "report"
+
+
+CHAIN = (JobKind.IDENTIFICATION, JobKind.RESIDUAL, JobKind.REPORT)
+
+
+@dataclass(frozen=True)
+class SessionFacts:
+    """A calibration session, as far as scheduling needs it.
+
+    Attributes:
+        id: of the session.
+        number: grows from one session to the next. One is open at a time, so they end in the order they start.
+        kind: single_joint, multi_joint, static_poses or check.
+        state: open, closed or aborted.
+        ended: when it was closed, None while open.
+    """
+
+    id: str
+    number: int
+    kind: str
+    state: str
+    ended: Stamp | None
+
+
+@dataclass(frozen=True)
+class JobFacts:
+    """A job that has not ended for good, as far as scheduling needs it.
+
+    Attributes:
+        id: of the job.
+        kind: see JobKind.
+        session_id: the session that triggered it.
+        state: queued, running or interrupted.
+        attempts: how often it was started.
+        is_ready: whether the job that it depends on, if any, is done.
+        ended: when it was interrupted last.
+    """
+
+    id: int
+    kind: JobKind
+    session_id: str
+    state: str
+    attempts: int
+    is_ready: bool
+    ended: Stamp | None
+
+
+@dataclass(frozen=True)
+class State:
+    """What the store holds, as far as it can still matter.
+
+    Attributes:
+        sessions: in the order they were started; those older than the newest of their kind and state may be left out.
+        jobs: those that have not ended for good, in the order they were created.
+        covered: kind of job -> number of the newest session that was closed when the newest job of the kind was
+            queued: that job works on it and on all before it. No entry where there is no such job.
+        has_model: a model exists that a check session could be held against.
+    """
+
+    sessions: Sequence[SessionFacts]
+    jobs: Sequence[JobFacts]
+    covered: Mapping[JobKind, int]
+    has_model: bool
+
+
+@dataclass(frozen=True)
+class DueChain:
+    """Jobs to queue, each to run after the one before it is done.
+
+    Attributes:
+        kinds: what to run.
+        session_id: the session that triggers them.
+        through_id: they work on the sessions closed up to and including this one.
+    """
+
+    kinds: tuple[JobKind, ...]
+    session_id: str
+    through_id: str
+
+
+@dataclass(frozen=True)
+class DueRetry:
+    """An interrupted job to queue again."""
+
+    job_id: int
+
+
+def due_jobs(
+    state: State, now: Stamp, *, quiet_s: float = 2.0, retry_after_s: float = 5.0, max_attempts: int = 3
+) -> list[DueChain | DueRetry]:
+    """What should be queued now.
+
+    Args:
+        state: what the store holds.
+        now: the present instant; durations are taken on the monotonic clock, within one boot.
+        quiet_s: how long after a session's end its jobs wait for a next session to begin.
+        retry_after_s: an interrupted job waits this long times its attempts, so that one that kills the daemon does
+            not do so without pause.
+        max_attempts: an interrupted job that was started this often is not offered again.
+    """
+    if _is_open(state):
+        return []
+    due: list[DueChain | DueRetry] = [
+        DueRetry(job.id)
+        for job in state.jobs
+        if job.state == "interrupted"
+        and job.attempts < max_attempts
+        and _passed(job.ended, now, retry_after_s * job.attempts)
+    ]
+    closed = [s for s in state.sessions if s.state == "closed"]
+    if not closed or not _passed(closed[-1].ended, now, quiet_s):
+        return due
+    training = [s for s in closed if s.kind != CHECK]
+    checks = [s for s in closed if s.kind == CHECK]
+    if training and not _is_covered(training[-1], JobKind.IDENTIFICATION, state):
+        due.append(DueChain(CHAIN, training[-1].id, closed[-1].id))  # its report holds the model against the checks
+    elif checks and state.has_model and not _is_covered(checks[-1], JobKind.REPORT, state):
+        due.append(DueChain((JobKind.REPORT,), checks[-1].id, closed[-1].id))
+    return due
+
+
+def spent_jobs(state: State, *, max_attempts: int = 3) -> list[JobFacts]:
+    """Interrupted jobs that were started so often that they are not offered again."""
+    return [job for job in state.jobs if job.state == "interrupted" and job.attempts >= max_attempts]
+
+
+def next_job(state: State) -> JobFacts | None:
+    """The first queued job whose predecessor is done.
+
+    None while a session is open, and while a job runs: one at a time leaves a core for acquisition.
+    """
+    if _is_open(state) or any(job.state == "running" for job in state.jobs):
+        return None
+    return next((job for job in state.jobs if job.state == "queued" and job.is_ready), None)
+
+
+def _is_open(state: State) -> bool:
+    return any(s.state == "open" for s in state.sessions)
+
+
+def _is_covered(session: SessionFacts, kind: JobKind, state: State) -> bool:
+    """Whether a job of this kind was queued after the session had been closed, and so works on it."""
+    return kind in state.covered and state.covered[kind] >= session.number
+
+
+def _passed(since: Stamp | None, now: Stamp, seconds: float) -> bool:
+    """Whether `seconds` have passed; across a reboot, or when a log is replayed once more, they have."""
+    if since is None or since.boot_id != now.boot_id:
+        return True
+    return not 0 <= now.monotonic_ns - since.monotonic_ns < seconds * NS_PER_S

@@ -1,0 +1,80 @@
+"""What a stored session holds, for calibration and report.
+
+Observations come as the contract's CSV: from here on a session is read exactly as an imported file is.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Sequence
+
+from calibration.observations import LABEL_COLUMNS, POSITION_COLUMNS, SIGMA_COLUMNS
+from calibration.rig import Rig
+from daemon.report.inputs import ControlPoint, SetupLine
+from daemon.store.reader import Reader
+from drivers.clock import NS_PER_S
+
+Misclosure = tuple[float, float, float]
+
+
+def sessions_csv(reader: Reader, rig: Rig, session_ids: Sequence[str]) -> bytes:
+    """Observations of the given sessions that calibration may use, oldest first.
+
+    `time_s` counts from the first observation, on UTC: sessions may lie boots apart.
+    """
+    marks = ",".join("?" * len(session_ids))
+    rows = list(
+        reader.rows(
+            "SELECT session_id, setup_id, prism, pose, utc_ns, x_mm, y_mm, z_mm, sigma_x_mm, sigma_y_mm, sigma_z_mm, "
+            f"dwell_s, values_json FROM observations WHERE excluded IS NULL AND session_id IN ({marks}) ORDER BY id",
+            session_ids,
+        )
+    )
+    values = [json.loads(row["values_json"]) for row in rows]
+    joints = [joint.column for joint in rig.joints]
+    more = sorted({name for row in values for name in row} - set(joints))
+    start_ns = min((row["utc_ns"] for row in rows), default=0)
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(["prism", *joints, *POSITION_COLUMNS, *LABEL_COLUMNS, "time_s", *SIGMA_COLUMNS, "dwell_s", *more])
+    for row, measured in zip(rows, values, strict=True):
+        cells = [row["prism"], *(measured.get(name) for name in joints)]
+        cells += [row[name] for name in POSITION_COLUMNS]
+        cells += [row["setup_id"], row["session_id"], row["pose"], round((row["utc_ns"] - start_ns) / NS_PER_S, 6)]
+        cells += [row[name] for name in SIGMA_COLUMNS] + [row["dwell_s"], *(measured.get(name) for name in more)]
+        writer.writerow("" if cell is None else repr(cell) if isinstance(cell, float) else cell for cell in cells)
+    return out.getvalue().encode()
+
+
+def setup_lines(reader: Reader, session_ids: Sequence[str]) -> list[SetupLine]:
+    """The set-ups of the given sessions with the misclosures of their control points, for the report.
+
+    A point shot in several sessions is shown with the first session's start and the last session's end.
+    """
+    marks = ",".join("?" * len(session_ids))
+    setups = reader.rows(
+        "SELECT id, instrument, state FROM station_setups WHERE id IN "
+        f"(SELECT setup_id FROM calibration_sessions WHERE id IN ({marks})) ORDER BY rowid",
+        session_ids,
+    )
+    lines = []
+    for setup in list(setups):
+        shots = reader.rows(
+            "SELECT s.name, s.phase, s.x_mm - p.x_mm AS x, s.y_mm - p.y_mm AS y, s.z_mm - p.z_mm AS z "
+            "FROM control_shots AS s JOIN control_points AS p ON p.setup_id = s.setup_id AND p.name = s.name "
+            f"WHERE s.setup_id = ? AND s.session_id IN ({marks}) ORDER BY s.id",
+            (setup["id"], *session_ids),
+        )
+        first: dict[str, Misclosure] = {}
+        last: dict[str, Misclosure] = {}
+        for shot in shots:
+            misclosure = (shot["x"], shot["y"], shot["z"])
+            if shot["phase"] == "start":
+                first.setdefault(shot["name"], misclosure)
+            else:
+                last[shot["name"]] = misclosure
+        points = [ControlPoint(name, first.get(name), last.get(name)) for name in sorted({*first, *last})]
+        lines.append(SetupLine(setup["id"], setup["instrument"], setup["state"] == "moved", points))
+    return lines

@@ -1,0 +1,198 @@
+"""Station set-ups: where the total station stands, and the control points that tell whether it still does."""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+from collections.abc import Mapping, Sequence
+from statistics import fmean
+from typing import Any
+
+from calibration.rig import Rig
+from daemon.control import REFUSED, CommandError
+from daemon.store.store import Store
+from drivers.clock import Clock
+from drivers.readings import Fix
+
+log = logging.getLogger(__name__)
+
+Place = tuple[float, float, float]
+AXES = ("x_mm", "y_mm", "z_mm")
+
+_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+
+class SetupBook:
+    """The set-ups of a store.
+
+    Args:
+        rig: whose prisms have constants.
+        store: where set-ups are kept.
+        clock: time.
+        tolerance_mm: a control point further off than this says that the set-up moved.
+    """
+
+    def __init__(self, rig: Rig, store: Store, clock: Clock, tolerance_mm: float) -> None:
+        self._rig, self._store, self._clock, self._tolerance_mm = rig, store, clock, tolerance_mm
+
+    def new_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """A station set-up: instrument, tilt, ppm. It replaces none: sessions name theirs."""
+        setup_id = identifier(arguments, "id", "a set-up's id")
+        if self._store.rows("SELECT id FROM station_setups WHERE id = ?", (setup_id,)):
+            raise CommandError(f"set-up {setup_id!r} exists already; a station that was moved is a new set-up")
+        constants = arguments.get("prism_constants_mm", {})
+        unknown = sorted(set(constants) - set(self._rig.prism_names))
+        if unknown:
+            raise CommandError(
+                f"rig {self._rig.name!r} has no prism {unknown[0]!r}; it has {', '.join(self._rig.prism_names)}"
+            )
+        points = {str(n): _place(n, place) for n, place in arguments.get("control_points", {}).items()}
+        row = {
+            "id": setup_id,
+            "instrument": str(arguments.get("instrument", "")),
+            "serial": str(arguments.get("serial", "")),
+            "tilt_arcsec": _finite(arguments, "tilt_arcsec"),
+            "ppm": _finite(arguments, "ppm"),
+            "prism_constants_json": constants,
+            "note": str(arguments.get("note", "")),
+            "state": "ok",
+            **self._store.instant(self._clock.now(), "created_"),
+        }
+        with self._store.transaction():
+            self._store.insert("station_setups", row)
+            for name, place in points.items():
+                self._put_control_point(setup_id, name, place)
+        return {"id": setup_id}
+
+    def list_command(self, _arguments: Mapping[str, Any]) -> list[dict[str, Any]]:
+        """All set-ups with their control points, oldest first."""
+        setups = self._store.rows(
+            "SELECT id, instrument, serial, tilt_arcsec, ppm, state, note FROM station_setups ORDER BY rowid"
+        )
+        return [
+            setup
+            | {
+                "control_points": self._store.rows(
+                    "SELECT name, x_mm, y_mm, z_mm FROM control_points WHERE setup_id = ? ORDER BY rowid",
+                    (setup["id"],),
+                )
+            }
+            for setup in setups
+        ]
+
+    def usable(self, wanted: object) -> str:
+        """The set-up that is asked for, or the newest that has not moved.
+
+        Raises:
+            CommandError: there is none, or it has moved.
+        """
+        setups = self._store.rows("SELECT id, state FROM station_setups ORDER BY rowid")
+        if wanted is None:
+            usable = [s["id"] for s in setups if s["state"] == "ok"]
+            if not usable:
+                raise CommandError("there is no usable station set-up; describe one with `rigcal setup new`")
+            return str(usable[-1])
+        for setup in setups:
+            if setup["id"] == wanted:
+                if setup["state"] != "ok":
+                    raise CommandError(
+                        f"set-up {wanted!r} has {setup['state']}: its control points no longer fit; describe where the "
+                        "station stands now with `rigcal setup new`",
+                        REFUSED,
+                    )
+                return str(wanted)
+        raise CommandError(f"there is no set-up {wanted!r}; known: {', '.join(s['id'] for s in setups) or 'none'}")
+
+    def store_shot(
+        self, setup_id: str, session_id: str, name: str, phase: str, fixes: Sequence[Fix], places_mm: Sequence[Place]
+    ) -> dict[str, Any]:
+        """Write down that a control point was shot, and whether it still is where it was.
+
+        Args:
+            setup_id, session_id: where it belongs.
+            name: of the point; its first shot defines its place.
+            phase: `start` or `end` of the session.
+            fixes, places_mm: what is averaged.
+
+        Returns:
+            point, phase, x_mm, y_mm, z_mm, misclosure_mm (None if this shot defined the point), moved.
+        """
+        known = self._known_place(setup_id, session_id, name, phase)
+        place = {axis: fmean(p[i] for p in places_mm) for i, axis in enumerate(AXES)}
+        reference = known or place
+        misclosure_mm = math.dist([*place.values()], [reference[axis] for axis in AXES])
+        moved = misclosure_mm > self._tolerance_mm
+        with self._store.transaction():
+            if known is None:
+                self._put_control_point(setup_id, name, place)
+            row = {
+                "setup_id": setup_id,
+                "name": name,
+                "session_id": session_id,
+                "phase": phase,
+                **self._store.instant(fixes[0].stamp),
+                **place,
+                "fix_ids_json": [self._store.fix_id(fix) for fix in fixes],
+                "misclosure_mm": misclosure_mm if known else None,
+            }
+            self._store.insert("control_shots", row)
+            if moved:
+                self._store.update("station_setups", {"id": setup_id}, {"state": "moved"})
+        if moved:
+            log.warning("set-up %s moved: control point %s is %.1f mm off", setup_id, name, misclosure_mm)
+        return {"point": name, "phase": phase, **place, "misclosure_mm": row["misclosure_mm"], "moved": moved}
+
+    def _known_place(self, setup_id: str, session_id: str, name: str, phase: str) -> dict[str, float] | None:
+        """Where a control point is known to be; None if this shot defines it.
+
+        A point that only this session's start has shot, and that was not given with the set-up, is defined anew: the
+        operator shoots again because the shot before was no good.
+        """
+        known = self._store.rows(
+            "SELECT x_mm, y_mm, z_mm FROM control_points WHERE setup_id = ? AND name = ?", (setup_id, name)
+        )
+        shots = self._store.rows(
+            "SELECT session_id, phase, misclosure_mm FROM control_shots WHERE setup_id = ? AND name = ?",
+            (setup_id, name),
+        )
+        own = all(s["session_id"] == session_id and s["phase"] == "start" for s in shots)
+        if known and phase == "start" and own and any(s["misclosure_mm"] is None for s in shots):
+            return None
+        return known[0] if known else None
+
+    def _put_control_point(self, setup_id: str, name: str, place: Mapping[str, float]) -> None:
+        key = {"setup_id": setup_id, "name": name}
+        if not self._store.update("control_points", key, place):
+            self._store.insert("control_points", {**key, **place})
+
+    def control_points(self, setup_id: str) -> list[Place]:
+        """Places of a set-up's control points, mm in the station's frame."""
+        rows = self._store.rows("SELECT x_mm, y_mm, z_mm FROM control_points WHERE setup_id = ?", (setup_id,))
+        return [(r["x_mm"], r["y_mm"], r["z_mm"]) for r in rows]
+
+
+def identifier(arguments: Mapping[str, Any], key: str, what: str, default: str = "") -> str:
+    """The name that `arguments` gives under `key`; CommandError if it is none."""
+    name = str(arguments.get(key) or default)
+    if not _ID.fullmatch(name):
+        raise CommandError(f"{what} is 1 to 64 letters, digits, '.', '_' or '-', not {name!r}")
+    return name
+
+
+def _finite(arguments: Mapping[str, Any], key: str) -> float | None:
+    value = arguments.get(key)
+    if value is not None and not (isinstance(value, int | float) and math.isfinite(value)):
+        raise CommandError(f"{key} must be a finite number, not {value!r}")
+    return value
+
+
+def _place(name: object, place: object) -> dict[str, float]:
+    if not _ID.fullmatch(str(name)):
+        raise CommandError(f"a control point's name is 1 to 64 letters, digits, '.', '_' or '-', not {name!r}")
+    if isinstance(place, list | tuple) and len(place) == len(AXES):
+        axes = {axis: _finite({axis: value}, axis) for axis, value in zip(AXES, place, strict=True)}
+        given = {axis: value for axis, value in axes.items() if value is not None}
+        if len(given) == len(AXES):
+            return given
+    raise CommandError(f"control point {name!r}: give three coordinates in mm, not {place!r}")

@@ -1,0 +1,89 @@
+from pathlib import Path
+
+import pytest
+
+from daemon.config import ConfigError, parse_config, read_config
+
+GOOD = """
+rig = "swdt82"
+state_directory = "state"
+
+[[can]]
+channel = "can0"
+
+[[station]]
+serial.path = "/dev/rigcal-station"
+"""
+
+
+def check(text: str, tmp_path: Path) -> str:
+    with pytest.raises(ConfigError) as caught:
+        parse_config(text, tmp_path / "rigcal.toml")
+    return str(caught.value)
+
+
+def test_a_minimal_configuration_listens_only(tmp_path: Path) -> None:
+    config = parse_config(GOOD, tmp_path / "rigcal.toml")
+    assert not config.can[0].allow_transmit
+    assert config.can[0].interface == "socketcan"
+    assert config.station[0].profile == "topcon_gts8"
+
+
+def test_relative_paths_start_at_the_file(tmp_path: Path) -> None:
+    config = parse_config(GOOD.replace("swdt82", "rigs/mine.toml"), tmp_path / "rigcal.toml")
+    assert config.store_path == tmp_path / "state" / "rigcal.sqlite"
+    assert config.rig == str(tmp_path / "rigs/mine.toml")
+
+
+def test_an_unknown_key_is_named_with_what_is_allowed(tmp_path: Path) -> None:
+    message = check(GOOD.replace("channel =", "bitrat = 250000\nchannel ="), tmp_path)
+    assert "rigcal.toml: can.1.bitrat: unknown key; allowed here: allow_transmit, bitrate" in message
+
+
+def test_keys_of_nested_sections_are_told_too(tmp_path: Path) -> None:
+    message = check(GOOD.replace("serial.path", "serial.bauds = 9600\nserial.path"), tmp_path)
+    assert "station.1.serial.bauds: unknown key; allowed here: baud, bytesize, parity, path, stopbits" in message
+
+
+def test_every_wrong_key_is_told_at_once(tmp_path: Path) -> None:
+    message = check('rig = 3\n[[can]]\nchannel = "c"\ninterface = "serial"\n', tmp_path)
+    assert len(message.splitlines()) == 2
+    assert "rig: " in message
+    assert "'socketcan', 'virtual', 'udp_multicast', 'slcan' or 'playback', found 'serial'" in message
+
+
+def test_a_missing_key_is_named(tmp_path: Path) -> None:
+    assert "rig: missing; it is required" in check('state_directory = "x"', tmp_path)
+
+
+def test_sending_without_saying_so_is_refused(tmp_path: Path) -> None:
+    message = check(GOOD.replace('channel = "can0"', 'channel = "can0"\nsync_period_ms = 50'), tmp_path)
+    assert "need allow_transmit = true" in message
+
+
+def test_nodes_outside_canopen_are_refused(tmp_path: Path) -> None:
+    message = check(
+        GOOD.replace('channel = "can0"', 'channel = "can0"\nallow_transmit = true\ntransmit_nodes = [128]'), tmp_path
+    )
+    assert "CANopen nodes are 1 to 127" in message
+
+
+def test_two_links_of_one_name_are_refused(tmp_path: Path) -> None:
+    assert "two links are called 'boom'" in check(GOOD + '[[can]]\nchannel = "can1"\n', tmp_path)
+
+
+def test_broken_toml_names_the_line(tmp_path: Path) -> None:
+    assert "line 2" in check('rig = "swdt82"\n[[can]\n', tmp_path)
+
+
+def test_a_socket_path_too_long_for_the_kernel_is_refused(tmp_path: Path) -> None:
+    assert "unix socket" in check(f'socket = "/{"x" * 120}"\n' + GOOD, tmp_path)
+
+
+def test_a_missing_file_and_a_binary_file_are_sentences(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be read: No such file"):
+        read_config(tmp_path / "none.toml")
+    binary = tmp_path / "binary.toml"
+    binary.write_bytes(b"rig = \xff")
+    with pytest.raises(ConfigError, match="not UTF-8"):
+        read_config(binary)

@@ -1,0 +1,31 @@
+import os
+import socket
+from pathlib import Path
+
+from daemon.notify import Notifier
+
+
+def test_states_reach_the_service_manager(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        Notifier({"NOTIFY_SOCKET": str(tmp_path / "notify")}).send("READY=1", "STATUS=acquiring")
+        assert manager.recv(100) == b"READY=1\nSTATUS=acquiring"
+
+
+def test_abstract_sockets_are_reached() -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(f"\0rigcal-test-{os.getpid()}")
+        Notifier({"NOTIFY_SOCKET": f"@rigcal-test-{os.getpid()}"}).send("WATCHDOG=1")
+        assert manager.recv(100) == b"WATCHDOG=1"
+
+
+def test_outside_systemd_nothing_is_sent() -> None:
+    notifier = Notifier({})
+    notifier.send("READY=1")
+    assert notifier.watchdog_s is None
+
+
+def test_the_watchdog_interval_is_for_this_process_alone() -> None:
+    mine = {"WATCHDOG_USEC": "30000000", "WATCHDOG_PID": str(os.getpid())}
+    assert Notifier(mine).watchdog_s == 30.0
+    assert Notifier(mine | {"WATCHDOG_PID": "1"}).watchdog_s is None

@@ -1,0 +1,129 @@
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from daemon.scheduler import (
+    CHAIN,
+    DueChain,
+    DueRetry,
+    JobFacts,
+    JobKind,
+    SessionFacts,
+    State,
+    due_jobs,
+    next_job,
+    spent_jobs,
+)
+from drivers.clock import NS_PER_S, Stamp
+
+T0 = Stamp(1_700_000_000 * NS_PER_S, 100 * NS_PER_S, "boot")
+LATER = T0.shifted(60 * NS_PER_S)
+REPORT = (JobKind.REPORT,)
+BOTH = {JobKind.IDENTIFICATION: 1, JobKind.REPORT: 1}  # a chain was queued when the first session was closed
+
+
+def session(number: int, kind: str = "static_poses", state: str = "closed", ended: Stamp = T0) -> SessionFacts:
+    return SessionFacts(f"s{number}", number, kind, state, None if state == "open" else ended)
+
+
+def job(number: int, state: str, attempts: int = 1, *, is_ready: bool = True) -> JobFacts:
+    return JobFacts(number, CHAIN[number - 1], "s1", state, attempts, is_ready, T0)
+
+
+def state(
+    *sessions: SessionFacts,
+    jobs: Sequence[JobFacts] = (),
+    covered: Mapping[JobKind, int] | None = None,
+    has_model: bool = False,
+) -> State:
+    return State(sessions, jobs, covered or {}, has_model)
+
+
+def test_a_closed_session_triggers_the_whole_chain() -> None:
+    assert due_jobs(state(session(1)), LATER) == [DueChain(CHAIN, "s1", "s1")]
+
+
+def test_a_session_is_identified_once() -> None:
+    assert due_jobs(state(session(1), covered=BOTH), LATER) == []
+
+
+def test_a_session_after_the_last_chain_triggers_the_next() -> None:
+    assert due_jobs(state(session(1), session(2), covered=BOTH), LATER) == [DueChain(CHAIN, "s2", "s2")]
+
+
+def test_times_of_different_boots_do_not_decide_what_is_covered() -> None:
+    for years in (-5, 5):
+        ended = Stamp(T0.utc_ns + years * 365 * 86_400 * NS_PER_S, NS_PER_S, "other boot")
+        assert due_jobs(state(session(1, ended=ended), covered=BOTH), LATER) == []
+        new = state(session(1, ended=ended), session(2, ended=ended), covered=BOTH)
+        assert due_jobs(new, LATER) == [DueChain(CHAIN, "s2", "s2")]
+
+
+def test_of_several_closed_sessions_the_newest_triggers_for_all() -> None:
+    assert due_jobs(state(session(1), session(2)), LATER) == [DueChain(CHAIN, "s2", "s2")]
+
+
+def test_nothing_is_due_while_a_session_is_open() -> None:
+    interrupted = job(1, "interrupted")
+    assert due_jobs(state(session(1), session(2, state="open"), jobs=[interrupted]), LATER) == []
+
+
+def test_an_aborted_session_triggers_nothing() -> None:
+    assert due_jobs(state(session(1, state="aborted")), LATER) == []
+
+
+def test_sessions_wait_for_the_next_to_begin_after_the_newest() -> None:
+    just_now = T0.shifted(NS_PER_S)
+    assert due_jobs(state(session(1)), just_now) == []
+    assert due_jobs(state(session(1, ended=T0.shifted(-60 * NS_PER_S)), session(2)), just_now) == []
+
+
+def test_a_reboot_ends_every_wait() -> None:
+    assert due_jobs(state(session(1)), replace(T0, boot_id="next")) != []
+
+
+def test_a_log_replayed_once_more_waits_for_nothing() -> None:
+    assert due_jobs(state(session(1)), T0.shifted(-30 * NS_PER_S)) != []
+
+
+def test_a_step_of_the_wall_clock_changes_nothing() -> None:
+    stepped = replace(T0, utc_ns=T0.utc_ns + 3600 * NS_PER_S)
+    assert due_jobs(state(session(1)), stepped) == []
+
+
+def test_a_check_session_triggers_a_report_alone_and_only_with_a_model() -> None:
+    sessions = (session(1), session(2, "check"))
+    assert due_jobs(state(*sessions, covered=BOTH, has_model=True), LATER) == [DueChain(REPORT, "s2", "s2")]
+    assert due_jobs(state(session(1, "check")), LATER) == []
+
+
+def test_a_chain_covers_the_checks_that_were_closed_before_it() -> None:
+    sessions = (session(1), session(2, "check"))
+    assert due_jobs(state(*sessions, has_model=True), LATER) == [DueChain(CHAIN, "s1", "s2")]
+    covered = {JobKind.IDENTIFICATION: 2, JobKind.REPORT: 2}
+    assert due_jobs(state(*sessions, covered=covered, has_model=True), LATER) == []
+
+
+def test_an_interrupted_job_is_offered_again_after_a_pause_until_its_attempts_are_used() -> None:
+    def after(attempts: int) -> State:
+        waiting = [job(2, "queued", 0, is_ready=False), job(3, "queued", 0, is_ready=False)]
+        return state(session(1), jobs=[job(1, "interrupted", attempts), *waiting], covered=BOTH)
+
+    assert due_jobs(after(1), T0.shifted(4 * NS_PER_S)) == []
+    assert due_jobs(after(1), T0.shifted(5 * NS_PER_S)) == [DueRetry(1)]
+    assert due_jobs(after(2), T0.shifted(9 * NS_PER_S)) == []
+    assert due_jobs(after(2), T0.shifted(10 * NS_PER_S)) == [DueRetry(1)]
+    assert due_jobs(after(3), LATER) == []
+    assert spent_jobs(after(2)) == []
+    assert [j.id for j in spent_jobs(after(3))] == [1]
+
+
+def test_queued_jobs_wait_while_a_session_is_open() -> None:
+    assert next_job(state(session(2, state="open"), jobs=[job(1, "queued")])) is None
+
+
+def test_jobs_run_one_at_a_time_in_the_order_of_their_dependence() -> None:
+    waiting = job(2, "queued", is_ready=False)
+    assert next_job(state(jobs=[job(1, "queued"), waiting])) == job(1, "queued")
+    assert next_job(state(jobs=[job(1, "running"), job(2, "queued")])) is None
+    assert next_job(state(jobs=[job(1, "interrupted"), waiting, job(3, "queued")])) == job(3, "queued")
+    assert next_job(state(jobs=[waiting])) is None
