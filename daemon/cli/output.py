@@ -1,0 +1,130 @@
+"""What all commands share: how they end, what `--json` prints, how they read observations."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NoReturn
+
+import click
+from rich.console import Console
+
+from calibration.errors import DataError, ModelError, RigError, UnsafeError
+from daemon.config import ConfigError
+from daemon.control import CommandError
+from drivers.errors import DescriptionError
+
+DONE, FAILED, WRONG_INPUT, REFUSED = 0, 1, 2, 3
+
+Progress = Callable[[float, str], None]
+
+
+def exit_status(error: BaseException) -> int:
+    """The contract's exit status: 2 wrong use or bad input, 3 refused because the result would be unsafe, else 1."""
+    if isinstance(error, CommandError):
+        return error.status
+    if isinstance(error, UnsafeError):
+        return REFUSED
+    bad_input = (RigError, DataError, ModelError, ConfigError, DescriptionError, click.UsageError)
+    return WRONG_INPUT if isinstance(error, bad_input) else FAILED
+
+
+def error_sentence(error: BaseException) -> str:
+    """What went wrong, in one line, for people."""
+    if isinstance(error, click.ClickException):
+        return error.format_message()
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    if isinstance(error, ConfigError):
+        return str(error)  # a line for each wrong key
+    text = " ".join(str(error).split())
+    if type(error).__module__.partition(".")[0] in ("calibration", "drivers", "daemon", "simulators"):
+        return text or type(error).__name__
+    return f"internal error, {type(error).__name__}: {text} (RIGCAL_DEBUG=1 shows where)"
+
+
+class Command(click.Command):
+    """A command whose every failure is one sentence on standard error and an exit status, never a traceback.
+
+    With `--json` the failure is also the one JSON object on standard output: `{"error": SENTENCE, "kind": CLASS}`.
+    RIGCAL_DEBUG=1 in the environment adds the traceback.
+    """
+
+    def make_context(
+        self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
+    ) -> click.Context:
+        as_json = "--json" in args
+        try:
+            return super().make_context(info_name, args, parent, **extra)
+        except click.UsageError as error:
+            if as_json:
+                print_json({"error": error_sentence(error), "kind": type(error).__name__})
+            raise
+
+    def invoke(self, ctx: click.Context) -> Any:
+        as_json = bool(ctx.params.get("as_json"))
+        try:
+            # What a library prints must not end up in the result.
+            with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
+                result = super().invoke(ctx)
+        except (click.exceptions.Exit, click.Abort):
+            raise
+        except Exception as error:  # noqa: BLE001 - the last place where a failure can become a sentence
+            _end_badly(error, as_json=as_json)
+        if as_json:
+            print_json(result)
+        return None
+
+
+def _end_badly(error: Exception, *, as_json: bool) -> NoReturn:
+    if os.environ.get("RIGCAL_DEBUG") == "1":
+        traceback.print_exception(error, file=sys.stderr)
+    sentence = error_sentence(error)
+    if as_json:
+        print_json({"error": sentence, "kind": type(error).__name__})
+    click.echo(f"Error: {sentence}", err=True)
+    raise click.exceptions.Exit(exit_status(error))
+
+
+def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The `--json` option of every command; a `Command` prints what its function returns."""
+    return click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")(function)
+
+
+def print_json(result: Mapping[str, Any]) -> None:
+    """One JSON object on one line; numbers that JSON does not know (NaN, infinity) become null."""
+    click.echo(json.dumps(_plain(result), allow_nan=False))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return value
+
+
+@contextlib.contextmanager
+def progress_display(*, as_json: bool) -> Iterator[Progress]:
+    """A progress bar on standard error where a person is watching; silence elsewhere."""
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    console = Console(stderr=True)
+    with Bar(
+        BarColumn(),
+        TextColumn("{task.description}"),
+        TimeElapsedColumn(),
+        console=console,
+        transient=True,
+        disable=as_json or not console.is_terminal,
+    ) as bar:
+        task = bar.add_task("", total=1.0)
+        yield lambda share, text: bar.update(task, completed=share, description=text)

@@ -1,0 +1,64 @@
+"""The tables that commands print for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from daemon.report.markup import number
+
+_SHOWN = 10
+
+
+def stage_table(result: Mapping[str, Any], title: str | None = None) -> Table:
+    """Errors stage by stage, of all rows and of each prism's, from the contract's result of an evaluation."""
+    table = Table(title=title, title_justify="left", title_style="bold")
+    table.add_column("stage", no_wrap=True)
+    for name in ("mean", "rms", "max", "std"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for prism in result["per_prism"]:
+        table.add_column(f"rms {prism}", justify="right", style="dim")
+    for i, stage in enumerate(result["stages"]):
+        cells = [number(stage[f"{name}_mm"]) for name in ("mean", "rms", "max", "std")]
+        cells += [number(stages[i]["rms_mm"]) for stages in result["per_prism"].values()]
+        table.add_row(stage["stage"], *cells, style="bold" if stage["stage"] == "hybrid" else None)
+    return table
+
+
+def show_evaluation(console: Console, result: Mapping[str, Any], what: str) -> None:
+    """Print the contract's result of `calibrate` or `evaluate`.
+
+    Args:
+        console: where to.
+        result: the JSON object.
+        what: which rows the errors are of, e.g. "the 250 fixes it was fitted to".
+    """
+    console.print(stage_table(result, f"Position error in mm on {what}"))
+    seen = result["identifiability"]
+    console.print(
+        f"noise {number(result['noise_mm'])} mm; learned residual: {result['residual'] or 'none'}; "
+        f"{seen['rank']} of {seen['parameters']} parameters determined by the data",
+        highlight=False,
+    )
+    _sentences(console, "Not determined", seen["unidentifiable"])
+    _sentences(console, "Please note", result["warnings"])
+    if result["ignored_columns"]:
+        console.print(f"Ignored columns: {', '.join(result['ignored_columns'])}", highlight=False, markup=False)
+
+
+def say(console: Console, text: str) -> None:
+    """Print a line as it is."""
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def _sentences(console: Console, title: str, sentences: Sequence[str]) -> None:
+    if not sentences:
+        return
+    console.print(f"{title}:", style="bold", highlight=False)
+    for sentence in sentences[:_SHOWN]:
+        console.print(f"  - {sentence}", highlight=False, markup=False)
+    if len(sentences) > _SHOWN:
+        console.print(f"  and {len(sentences) - _SHOWN} more (--json has all)", highlight=False)

@@ -1,0 +1,200 @@
+"""Model directories: written whole or not at all, read only after their first load has gone well in another process.
+
+A model is a handful of files under a manifest (`calibration.model_format`). LightGBM's parser kills the process on a
+truncated or hostile text, so no process of value parses a model that a child has not parsed before it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+from calibration.errors import CalibrationError, ModelError
+from calibration.model import CalibratedModel
+from calibration.model_format import MANIFEST, check_manifest
+from daemon.modelcheck import IS_NO_MODEL, encode
+
+REPORT = "report.html"
+COMPANIONS = frozenset({REPORT})  # may lie beside the model's files, outside its manifest
+CHECK_TIMEOUT_S = 120.0
+_FILE_MAX_BYTES = 256 * 2**20
+_AT_FDCWD = -100
+_RENAME_EXCHANGE = 2
+
+_checked: set[str] = set()  # manifests of models that a child of this process has loaded
+
+
+def check_target(directory: Path) -> None:
+    """Whether a model may be written to `directory`: nothing there, an empty directory, or a model to be replaced.
+
+    Raises:
+        ModelError: something else is there that would be lost.
+    """
+    if not directory.exists():
+        return
+    if not directory.is_dir():
+        raise ModelError(f"{directory} is a file; name a directory for the model")
+    found = {path.name for path in directory.iterdir()}
+    if not found:
+        return
+    if MANIFEST not in found:
+        raise ModelError(f"{directory} is neither empty nor a model directory; name another one")
+    foreign = sorted(found - set(_listed(directory)) - COMPANIONS - {MANIFEST})
+    if foreign:
+        raise ModelError(f"{directory} holds {foreign[0]!r}, which is no part of the model there; move it away first")
+
+
+def write_model(directory: Path, model: CalibratedModel, companions: Mapping[str, bytes] | None = None) -> str:
+    """Write a model directory; a model already there is replaced in one step, so that a reader sees one or the other.
+
+    The new files are loaded by a child process, written beside the directory, flushed to disk, and renamed.
+
+    Args:
+        directory: where to; parents are made.
+        model: what to write.
+        companions: files to lie beside the model's, of the names in `COMPANIONS`.
+
+    Returns:
+        SHA-256 of the manifest, which names the model.
+
+    Raises:
+        ModelError: `directory` holds something else, or the model does not load again.
+        OSError: the file system refuses.
+    """
+    directory = directory.resolve()
+    check_target(directory)
+    files = model.to_files()
+    _check_in_child(files, directory)
+    directory.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".rigcal-", dir=directory.parent) as scratch:
+        new = Path(scratch) / "new"
+        new.mkdir()
+        for name, data in {**files, **(companions or {})}.items():
+            with (new / name).open("xb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+        _sync_directory(new)
+        _put_in_place(new, directory)
+        _sync_directory(directory.parent)
+    return _sha256(files[MANIFEST])
+
+
+def read_model(directory: Path) -> CalibratedModel:
+    """Read a model directory; the first time a process meets a model, a child process loads it first.
+
+    Raises:
+        ModelError: not a model, truncated, edited, of another version, or it brings down the process that loads it.
+        CalibrationError: this machine lacks what loading it needs.
+    """
+    if not directory.is_dir():
+        raise ModelError(f"{directory} is not a directory; name the one that calibrate wrote")
+    if not (directory / MANIFEST).is_file():
+        raise ModelError(f"{directory} is not a model directory: it has no {MANIFEST}")
+    files = {name: data for name in (MANIFEST, *_listed(directory)) if (data := _read(directory, name)) is not None}
+    try:
+        check_manifest(files)
+    except ModelError as error:
+        raise ModelError(f"{directory}: {error}") from error
+    _check_in_child(files, directory)
+    return CalibratedModel.from_files(files)
+
+
+def model_sha256(directory: Path) -> str:
+    """SHA-256 of the manifest, which names the model; ModelError if there is none."""
+    data = _read(directory, MANIFEST)
+    if data is None:
+        raise ModelError(f"{directory} is not a model directory: it has no {MANIFEST}")
+    return _sha256(data)
+
+
+def _listed(directory: Path) -> list[str]:
+    """Names of the files in the manifest, which need not be sound otherwise."""
+    try:
+        names = list(json.loads(_read(directory, MANIFEST) or b"")["files"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ModelError(f"{directory}: {MANIFEST} is damaged; restore the model, or remove it") from error
+    for name in names:
+        if Path(str(name)).name != name:
+            raise ModelError(f"{directory}: {MANIFEST} lists {name!r}, which is no file name; this is not a model")
+    return names
+
+
+def _read(directory: Path, name: str) -> bytes | None:
+    path = directory / name
+    try:
+        with path.open("rb") as file:
+            data = file.read(_FILE_MAX_BYTES + 1)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise ModelError(f"{directory}: {name} cannot be read: {error.strerror}") from error
+    if len(data) > _FILE_MAX_BYTES:
+        raise ModelError(f"{directory}: {name} is larger than {_FILE_MAX_BYTES} bytes; this is not a model")
+    return data
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _check_in_child(files: Mapping[str, bytes], directory: Path) -> None:
+    """Let a fresh process load the files and predict with them; an error in one sentence if that ends badly."""
+    key = _sha256(files[MANIFEST])
+    if key in _checked:
+        return
+    # -P keeps the current directory off the child's path: what lies there is no code of ours.
+    command = [sys.executable, "-P", "-m", "daemon.modelcheck"]
+    try:
+        child = subprocess.run(command, input=encode(files), capture_output=True, timeout=CHECK_TIMEOUT_S, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise ModelError(f"{directory}: loading the model did not end within {CHECK_TIMEOUT_S:g} s") from error
+    if child.returncode < 0:
+        name = signal.Signals(-child.returncode).name
+        raise ModelError(f"{directory}: the model kills the process that loads it ({name}); restore it")
+    if child.returncode != 0:
+        lines = child.stderr.decode("utf-8", "replace").strip().splitlines() or ["no reason given"]
+        kind = ModelError if child.returncode == IS_NO_MODEL else CalibrationError
+        raise kind(f"{directory}: {lines[-1]}")
+    _checked.add(key)
+
+
+def _put_in_place(new: Path, target: Path) -> None:
+    """Rename `new` to `target`; what was at `target` then lies in `new`'s directory, or is gone if it was empty."""
+    try:
+        new.rename(target)
+    except OSError as error:
+        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+            raise
+        if not _exchange(new, target):
+            # A file system that cannot swap (NFS, some FUSE): for an instant a reader may find nothing.
+            target.rename(new.with_name("old"))
+            new.rename(target)
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Swap two directories in one step (Linux, renameat2(2)); False where the file system cannot."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.renameat2(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) == 0:
+        return True
+    code = ctypes.get_errno()
+    if code in (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP):
+        return False
+    raise OSError(code, os.strerror(code), str(other))
+
+
+def _sync_directory(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

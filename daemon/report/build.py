@@ -1,0 +1,287 @@
+"""The calibration report: one HTML file that a foreman reads from the top and an engineer to the end."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from daemon.report import figures
+from daemon.report.drawing import styled, svg_image
+from daemon.report.inputs import STAGES, ErrorTable, ReportInput, SetupLine, Stage
+from daemon.report.markup import escape, items, number, page, paragraph, picture, section, signed, table
+
+_STAGE_WORDS: dict[Stage, str] = {
+    "nominal": "Nominal: the drawings",
+    "geometric": "Geometric: true lengths and angles",
+    "effects": "Effects: named physics added",
+    "hybrid": "Hybrid: learned residual added",
+}
+_EXPLAINED = 1.15  # within what a few dozen fixes can tell apart
+_OUTLIERS_SHOWN = 20
+_PARAMETERS_SHOWN = 14
+
+
+def build_report(report: ReportInput) -> str:
+    """The report as one self-contained HTML document, the same bytes for the same input."""
+    with styled():
+        parts = [
+            _head(report),
+            _accuracy(report),
+            _by_joint(report),
+            _coverage(report),
+            _parameters(report),
+            _outliers(report),
+            _setups(report),
+            _provenance(report),
+        ]
+    return page(f"Calibration of {report.rig}", "".join(parts))
+
+
+def headline(report: ReportInput) -> str:
+    """The result in one sentence: what the error was, what it is, on which poses."""
+    table_ = report.judged
+    before, after = table_.stage("nominal").rms_mm, table_.stage("hybrid").rms_mm
+    verb = "falls" if after < before else "does not fall: it goes"
+    change = f"the position error {verb} from {number(before)} mm to {number(after)} mm"
+    if report.held_out is None:
+        return f"On the {len(table_)} fixes it was fitted to, {change}."
+    return f"On {len(table_)} held-out fixes, {change}."
+
+
+def _meaning(report: ReportInput) -> str:
+    after = report.judged.stage("hybrid").rms_mm
+    if after <= _EXPLAINED * report.instrument_mm:
+        judgement = "What is left is what the noise of the instruments explains."
+    else:
+        judgement = (
+            f"The instruments' noise explains {number(report.instrument_mm)} mm of it: the rest is physics that the "
+            "model lacks, or measurements noisier than the rig file says."
+        )
+    where = (
+        "No fixes were kept back, so this is how well the model repeats what it was shown, not a promise of accuracy. "
+        if report.held_out is None
+        else "The model never saw these fixes, so this is the accuracy to expect where the data cover the workspace. "
+    )
+    return where + judgement
+
+
+def _head(report: ReportInput) -> str:
+    judged = report.judged
+    before, after = judged.stage("nominal"), judged.stage("hybrid")
+    figures_ = [
+        ("", "before, root mean square", before.rms_mm),
+        ("after", "after, root mean square", after.rms_mm),
+        ("after", "after, worst fix", after.max_mm),
+        ("", "noise of the instruments", report.instrument_mm),
+    ]
+    tiles = "".join(
+        f'<div class="{kind}"><dt>{escape(label)}</dt><dd>{number(value)} <small>mm</small></dd></div>'
+        for kind, label, value in figures_
+    )
+    made = report.provenance.get("made", "")
+    return (
+        f"<header><h1>Calibration report: {escape(report.rig)}</h1>{paragraph(made) if made else ''}"
+        f'<p class="headline">{escape(headline(report)).replace(" mm", "&nbsp;mm")}</p>'
+        f"{paragraph(_meaning(report), 'lead')}"
+        f'<dl class="figures">{tiles}</dl></header>{_warnings(report)}'
+    )
+
+
+def _warnings(report: ReportInput) -> str:
+    sentences = list(report.warnings)
+    sentences += [
+        f"Station set-up {setup.name!r} moved: its fixes do not fit together." for setup in report.setups if setup.moved
+    ]
+    if not sentences:
+        return ""
+    return f'<div class="notice" role="note"><strong>Please note</strong>{items(sentences)}</div>'
+
+
+def _accuracy(report: ReportInput) -> str:
+    judged = report.judged
+    what = f"{len(judged)} fixes that the model was fitted to" if report.held_out is None else "held-out fixes"
+    rows = []
+    for stage in STAGES:
+        s = judged.stage(stage)
+        cells = [_STAGE_WORDS[stage], *(number(v) for v in (s.mean_mm, s.rms_mm, s.max_mm, s.std_mm))]
+        if report.held_out is not None:
+            cells.append(number(report.training.stage(stage).rms_mm))
+        rows.append(cells)
+    header = ["stage of the model", "mean, mm", "rms, mm", "max, mm", "std, mm"]
+    if report.held_out is not None:
+        header.append("rms where fitted, mm")
+    stages = table(header, rows, classes=["", "", "", "best"], caption=f"Position error in space on the {what}")
+    note = paragraph(_stage_notes(report), "note")
+    return section(
+        "How accurate the model is",
+        stages,
+        note,
+        _per_prism(judged),
+        picture(
+            svg_image(
+                figures.errors_by_prism(report),
+                "Position error of every fix per prism before and after calibration, on a logarithmic axis",
+            ),
+            "Every dot is one fix; the axis is logarithmic. The number beside each bar is the root mean square in mm.",
+        ),
+    )
+
+
+def _stage_notes(report: ReportInput) -> str:
+    errors = report.judged.errors_mm
+    sentences = []
+    if np.array_equal(errors["effects"], errors["geometric"]):
+        sentences.append("No named effect is part of this model, so that stage repeats the one before it.")
+    sentences.append(f"Learned residual: {report.residual_reason.rstrip('.')}.")
+    sentences.append(f"Noise of a single fix as the fit found it: {number(report.noise_mm)} mm.")
+    return " ".join(sentences)
+
+
+def _per_prism(judged: ErrorTable) -> str:
+    rows = []
+    for prism in judged.prisms:
+        spreads = [judged.stage(stage, prism) for stage in STAGES]
+        rows.append(
+            [prism, str(spreads[0].n), *(number(s.rms_mm) for s in spreads), number(spreads[-1].max_mm)],
+        )
+    header = ["prism", "fixes", "nominal, mm", "geometric, mm", "effects, mm", "hybrid, mm", "worst, mm"]
+    return table(header, rows, caption="Root mean square per prism, and the worst fix after calibration")
+
+
+def _by_joint(report: ReportInput) -> str:
+    return section(
+        "What is left, joint by joint",
+        paragraph(
+            "If the model is complete, the dots scatter evenly about zero whatever the joint reads. A line that "
+            "bends or drifts is physics that the model lacks: play, sag, or an uneven encoder at that joint."
+        ),
+        picture(
+            svg_image(
+                figures.residual_by_joint(report),
+                "Remaining error components x, y and z against each joint value, with running medians",
+            ),
+            "Measured minus predicted, in the rig's base frame. The lines are running medians; dots beyond the axis "
+            "are drawn at its edge.",
+        ),
+    )
+
+
+def _coverage(report: ReportInput) -> str:
+    return section(
+        "Where it was measured",
+        paragraph("The model is only as good as the poses it has seen: expect less where there are no dots."),
+        "<h3>Joint ranges</h3>",
+        picture(
+            svg_image(figures.joint_coverage(report), "Fixes within the range of every joint"),
+            "Grey is the joint's whole range; every stroke is one fix.",
+        ),
+        "<h3>Workspace</h3>",
+        picture(
+            svg_image(figures.workspace(report), "Prism positions in plan and side view"),
+            "Prism positions in the rig's base frame; the cross is its origin.",
+        ),
+        "<h3>Error left in the workspace</h3>",
+        picture(
+            svg_image(figures.error_map(report), "Remaining error over the workspace in plan and side view"),
+            "Dark is worse. A patch of one colour points at a region; scattered colours are noise.",
+        ),
+    )
+
+
+def _parameters(report: ReportInput) -> str:
+    lines = sorted(report.parameters, key=lambda p: -abs(p.in_tolerances))
+    flagged = sum(abs(p.in_tolerances) > 2 for p in lines)
+    content = [paragraph(_identifiability_words(report))]
+    if report.unidentifiable:
+        content.append(items(report.unidentifiable))
+    if lines:
+        rows, classes = [], []
+        for p in lines[:_PARAMETERS_SHOWN]:
+            size = abs(p.in_tolerances)
+            remark = "beyond building: check the drawing" if size > 3 else "unusual" if size > 2 else ""
+            remark = remark or ("" if p.determined else "not determined")
+            rows.append(
+                [
+                    p.name,
+                    f"{signed(p.correction)} {p.unit}",
+                    f"\N{PLUS-MINUS SIGN} {number(2 * p.sigma, 2)} {p.unit}",
+                    f"{number(p.tolerance)} {p.unit}",
+                    signed(p.in_tolerances, 2),
+                    remark,
+                ]
+            )
+            classes.append("flag" if size > 2 else "")
+        header = ["constant", "correction", "95 % interval", "tolerance", "in tolerances", "remark"]
+        content += [
+            paragraph(
+                f"The {min(len(lines), _PARAMETERS_SHOWN)} largest of {len(lines)} corrections. "
+                + (
+                    "None is more than building explains (3 tolerances)."
+                    if not flagged
+                    else f"{flagged} of them {'is' if flagged == 1 else 'are'} larger than twice the build tolerance."
+                )
+            ),
+            picture(
+                svg_image(figures.corrections(report, _PARAMETERS_SHOWN), "Largest corrections in build tolerances"),
+                "Bars are 95 % intervals. A diamond marks a constant that the data do not determine.",
+            ),
+            table(header, rows, text_columns=(0, 5), classes=classes),
+        ]
+    return section("What was corrected", *content)
+
+
+def _identifiability_words(report: ReportInput) -> str:
+    if report.rank >= report.n_parameters:
+        return f"The data determine all {report.n_parameters} parameters of the model."
+    words = f"The data determine {report.rank} of {report.n_parameters} parameters or combinations of them. "
+    if not report.unidentifiable:
+        return words + "The rest stay near the drawings, as the build tolerances say."
+    return (
+        words
+        + "No pose of these data tells the following apart from others; the build tolerances share out what is found:"
+    )
+
+
+def _outliers(report: ReportInput) -> str:
+    if not report.outliers:
+        return section("Fixes set aside", paragraph("None: every fix was used."))
+    worst = sorted(report.outliers, key=lambda o: -o.sigmas)[:_OUTLIERS_SHOWN]
+    share = 100 * len(report.outliers) / len(report.training)
+    words = (
+        f"{len(report.outliers)} of {len(report.training)} fixes ({number(share, 2)} %) did not fit with the others "
+        "and had little or no say in the fit. They still count in every figure of this report."
+    )
+    rows = [[str(o.row), o.prism, number(o.error_mm), number(o.sigmas, 2)] for o in worst]
+    header = ["row of the data", "prism", "error, mm", "in standard deviations"]
+    caption = f"The {len(worst)} worst" if len(worst) < len(report.outliers) else ""
+    return section("Fixes set aside", paragraph(words), table(header, rows, text_columns=(0, 1), caption=caption))
+
+
+def _setups(report: ReportInput) -> str:
+    if not report.setups:
+        return ""
+    return section("Station set-ups", *(_setup(setup) for setup in report.setups))
+
+
+def _setup(setup: SetupLine) -> str:
+    state = "moved during the session" if setup.moved else "kept its place"
+    text = f"<h3>{escape(setup.name)}</h3>" + paragraph(f"{setup.instrument}; {state}.")
+    if not setup.control_points:
+        return text + paragraph("No control points were shot.", "note")
+    rows = []
+    for point in setup.control_points:
+        cells = [point.name]
+        for misclosure in (point.start_mm, point.end_mm):
+            if misclosure is None:
+                cells += ["\N{EN DASH}"] * 2
+                continue
+            cells += [", ".join(signed(v, 2) for v in misclosure), number(sum(v * v for v in misclosure) ** 0.5, 2)]
+        rows.append(cells)
+    header = ["control point", "start x, y, z, mm", "size, mm", "end x, y, z, mm", "size, mm"]
+    return text + table(header, rows, caption="Misclosure: shot minus known")
+
+
+def _provenance(report: ReportInput) -> str:
+    rows = [[label, value] for label, value in report.provenance.items()]
+    ignored = ", ".join(report.ignored_columns)
+    extra = paragraph(f"Columns of the data that were ignored: {ignored}.", "note") if ignored else ""
+    return section("Where this comes from", table((), rows, text_columns=(0, 1)), extra)

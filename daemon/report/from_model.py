@@ -1,0 +1,131 @@
+"""From a calibrated model and its evaluations to what a report shows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import UTC, datetime
+
+import numpy as np
+
+from calibration.identification.samples import joint_rates, reading_covariance, station_covariance
+from calibration.model import CalibratedModel
+from calibration.observations import Observations
+from calibration.pipeline import Evaluation
+from daemon.report.inputs import (
+    STAGES,
+    ErrorTable,
+    Floats,
+    OutlierLine,
+    ParameterLine,
+    ReportInput,
+    SetupLine,
+)
+from drivers.clock import NS_PER_S
+
+_DETERMINED = 0.9  # of the tolerance: a standard error closer to it has learnt next to nothing from the data
+_LIBRARIES = ("rigcal", "numpy", "scipy", "numba", "lightgbm")
+_LABELS = {
+    "fixes": "fixes fitted",
+    "data_sha256": "their SHA-256",
+    "rig_sha256": "SHA-256 of the rig file",
+    "search": "global search",
+    "residual_seed": "seed of the residual",
+}
+
+
+def report_input(
+    training: Evaluation,
+    held_out: Evaluation | None,
+    *,
+    made_utc_ns: int | None = None,
+    sources: Mapping[str, str] | None = None,
+    setups: Sequence[SetupLine] = (),
+) -> ReportInput:
+    """Gather what a report shows.
+
+    Args:
+        training: the model on the rows it was fitted to.
+        held_out: the model on rows it never saw, if there are any.
+        made_utc_ns: when the report is made; without it the same model and rows give the same report.
+        sources: label -> text: files or sessions that the data came from, and the model's hash.
+        setups: station set-ups and control points, where known.
+    """
+    model = training.model
+    judged = training if held_out is None else held_out
+    return ReportInput(
+        rig=model.rig.name,
+        joints=model.rig.joints,
+        training=_error_table(training),
+        held_out=None if held_out is None else _error_table(held_out),
+        noise_mm=model.noise_mm,
+        instrument_mm=_instrument_mm(judged.model, judged.observations),
+        residual=model.residual.learner.kind if model.residual else None,
+        residual_reason=model.residual_reason,
+        parameters=list(_parameters(model)),
+        n_parameters=model.identifiability.parameters,
+        rank=model.identifiability.rank,
+        unidentifiable=model.identifiability.unidentifiable,
+        outliers=list(_outliers(training)),
+        warnings=judged.warnings,
+        ignored_columns=judged.observations.ignored_columns,
+        provenance=_provenance(model, made_utc_ns, sources or {}),
+        setups=setups,
+    )
+
+
+def _error_table(evaluation: Evaluation) -> ErrorTable:
+    model, observations = evaluation.model, evaluation.observations
+    chain = model.chain
+    origin = np.array([chain.base(model.values, s).translation_mm for s in range(len(chain.setups))])
+    from_base_mm = observations.position_mm - origin[chain.bind(observations).setup]
+    return ErrorTable(
+        prism=observations.prism,
+        joints=observations.joints,
+        position_mm=model.to_base(observations, from_base_mm),
+        errors_mm={stage: model.to_base(observations, evaluation.errors_mm[stage]) for stage in STAGES},
+    )
+
+
+def _instrument_mm(model: CalibratedModel, observations: Observations) -> float:
+    lin = model.chain.linearise(model.values, model.chain.bind(observations))
+    station: Floats = station_covariance(model.rig, lin.position_mm, observations.sigma_mm)
+    readings = reading_covariance(model.rig, lin.joint_jacobian, joint_rates(model.rig, observations))
+    return math.sqrt(float(np.trace(station + readings, axis1=1, axis2=2).mean()))
+
+
+def _parameters(model: CalibratedModel) -> Iterator[ParameterLine]:
+    for p in model.parameters:
+        if math.isinf(p.prior_sigma):
+            continue  # nobody knew it before: there is no tolerance to hold it against
+        scale, unit = (math.degrees(1.0), "deg") if p.unit == "rad" else (1.0, p.unit)
+        yield ParameterLine(
+            name=p.name,
+            unit=unit,
+            correction=p.value * scale,
+            sigma=p.standard_error * scale,
+            tolerance=p.prior_sigma * scale,
+            determined=p.standard_error < _DETERMINED * p.prior_sigma,
+        )
+
+
+def _outliers(training: Evaluation) -> Iterator[OutlierLine]:
+    for outlier in training.outliers:
+        yield OutlierLine(
+            row=outlier.row + 1,
+            prism=str(training.observations.prism[outlier.row]),
+            error_mm=float(np.linalg.norm(training.errors_mm["geometric"][outlier.row])),
+            sigmas=outlier.sigma,
+        )
+
+
+def _provenance(model: CalibratedModel, made_utc_ns: int | None, sources: Mapping[str, str]) -> dict[str, str]:
+    lines = {"rig": model.rig.name, **sources}
+    if made_utc_ns is not None:
+        made = datetime.fromtimestamp(made_utc_ns // NS_PER_S, UTC)
+        lines = {"made": f"{made:%Y-%m-%d %H:%M} UTC", **lines}
+    facts = {name: value for name, value in model.provenance.items() if name not in _LIBRARIES}
+    lines |= {_LABELS.get(name, name.replace("_", " ")): str(value) for name, value in facts.items()}
+    lines["prior"] = model.prior if model.prior_scale == 1 else f"{model.prior}, tolerances x {model.prior_scale:.3g}"
+    versions = [f"{name} {model.provenance[name]}" for name in _LIBRARIES if name in model.provenance]
+    return lines | {"versions": ", ".join(versions)}

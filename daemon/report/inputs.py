@@ -1,0 +1,176 @@
+"""What a calibration report is made from: plain tables, shared by the offline commands and the daemon's jobs.
+
+Nothing here knows how the numbers were computed; `daemon.report.from_model` fills it from a calibrated model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.rig import Joint
+
+Floats = NDArray[np.float64]
+Strings = NDArray[np.str_]
+Stage = Literal["nominal", "geometric", "effects", "hybrid"]
+STAGES: tuple[Stage, ...] = get_args(Stage)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Size of a set of position errors, mm: of their norms, over all rows, outliers too."""
+
+    n: int
+    mean_mm: float
+    rms_mm: float
+    max_mm: float
+    std_mm: float
+
+
+def spread(errors_mm: Floats) -> Spread:
+    """The spread of (n, 3) error vectors in mm; n must be at least 1."""
+    norms = np.linalg.norm(errors_mm, axis=1)
+    return Spread(
+        n=len(norms),
+        mean_mm=float(norms.mean()),
+        rms_mm=float(np.sqrt(np.mean(norms**2))),
+        max_mm=float(norms.max()),
+        std_mm=float(norms.std()),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorTable:
+    """One set of observations with the error that each stage of the model leaves.
+
+    Attributes:
+        prism: (n,) prism of each fix.
+        joints: joint name -> (n,) readings, deg or mm.
+        position_mm: (n, 3) measured positions in the rig's base frame.
+        errors_mm: stage -> (n, 3) measured minus predicted position, in the rig's base frame.
+    """
+
+    prism: Strings
+    joints: Mapping[str, Floats]
+    position_mm: Floats
+    errors_mm: Mapping[Stage, Floats]
+
+    def __len__(self) -> int:
+        return len(self.prism)
+
+    @cached_property
+    def prisms(self) -> tuple[str, ...]:
+        """The prisms that occur, in alphabetical order."""
+        return tuple(str(name) for name in np.unique(self.prism))
+
+    def stage(self, stage: Stage, prism: str | None = None) -> Spread:
+        """Spread of a stage's errors, over all rows or over one prism's."""
+        errors = self.errors_mm[stage]
+        return spread(errors if prism is None else errors[self.prism == prism])
+
+
+@dataclass(frozen=True)
+class ParameterLine:
+    """A corrected constant of the kinematic model.
+
+    Attributes:
+        name: as the model calls it, e.g. `row4.theta`.
+        unit: `mm` or `deg`.
+        correction: what calibration added to the nominal value.
+        sigma: its standard deviation after the fit.
+        tolerance: build tolerance, 1 sigma, as the rig file or the estimated prior scale gives it.
+        determined: False where the data cannot see it and it stayed where the drawings put it.
+    """
+
+    name: str
+    unit: str
+    correction: float
+    sigma: float
+    tolerance: float
+    determined: bool
+
+    @property
+    def in_tolerances(self) -> float:
+        """The correction in units of the build tolerance."""
+        return self.correction / self.tolerance
+
+
+@dataclass(frozen=True)
+class OutlierLine:
+    """A fix that the fit set aside: its row of the training data from 1, its prism, how far off it is."""
+
+    row: int
+    prism: str
+    error_mm: float
+    sigmas: float
+
+
+@dataclass(frozen=True)
+class ControlPoint:
+    """Misclosure of a control point, mm (x, y, z): shot minus known, at a session's start and at its end."""
+
+    name: str
+    start_mm: tuple[float, float, float] | None
+    end_mm: tuple[float, float, float] | None
+
+
+@dataclass(frozen=True)
+class SetupLine:
+    """A station set-up: where the instrument stood and how well it kept its place."""
+
+    name: str
+    instrument: str
+    moved: bool
+    control_points: Sequence[ControlPoint] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class ReportInput:
+    """Everything a report shows.
+
+    Attributes:
+        rig: the rig's name.
+        joints: its joints, for limits and units.
+        training: the rows the model was fitted to.
+        held_out: rows the fit never saw; None if there were none.
+        noise_mm: RMS 3-D noise of a fix as the fit found it: all that the model does not explain.
+        instrument_mm: RMS 3-D error that the station's and the encoders' own noise explains on the judged rows.
+        residual: name of the learned residual, or None.
+        residual_reason: why there is one or none, a sentence.
+        parameters: kinematic constants with a build tolerance.
+        n_parameters, rank: how many parameters there are and how many the data determine.
+        unidentifiable: names of parameters or combinations that the data cannot see.
+        outliers: fixes that the fit set aside.
+        warnings: sentences for the operator.
+        ignored_columns: columns of the data that are not part of the contract.
+        setups: station set-ups with their control points, where known.
+        provenance: label -> value: data hashes, versions, seed, time.
+    """
+
+    rig: str
+    joints: Sequence[Joint]
+    training: ErrorTable
+    held_out: ErrorTable | None
+    noise_mm: float
+    instrument_mm: float
+    residual: str | None
+    residual_reason: str
+    parameters: Sequence[ParameterLine]
+    n_parameters: int
+    rank: int
+    unidentifiable: Sequence[str]
+    outliers: Sequence[OutlierLine]
+    warnings: Sequence[str]
+    ignored_columns: Sequence[str]
+    provenance: Mapping[str, str]
+    setups: Sequence[SetupLine] = ()
+
+    @property
+    def judged(self) -> ErrorTable:
+        """The rows that the report's figures are about: held-out ones, or the training rows where there are none."""
+        return self.training if self.held_out is None else self.held_out

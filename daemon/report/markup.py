@@ -1,0 +1,128 @@
+"""HTML pieces: escaping, tables, numbers, and the style sheet. Text that comes from data or files is always escaped."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Iterable, Sequence
+
+from daemon.report.drawing import MINUS
+
+STYLE = """
+:root { color-scheme: light; --ink: #1d2733; --soft: #5b6670; --line: #dfe4e8; --blue: #0072b2; --warn: #b3261e; }
+* { box-sizing: border-box; }
+body { margin: 0; background: #fff; color: var(--ink);
+  font: 16px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Noto Sans", "DejaVu Sans", sans-serif; }
+main { max-width: 62rem; margin: 0 auto; padding: 2.5rem 1.5rem 4rem; }
+header h1 + p { margin: 0; color: var(--soft); }
+h1 { font-size: 1.05rem; font-weight: 600; margin: 0; letter-spacing: .01em; }
+h2 { font-size: 1.3rem; line-height: 1.3; margin: 3rem 0 .4rem; padding-top: 1.1rem;
+  border-top: 1px solid var(--line); }
+h3 { font-size: 1rem; margin: 1.6rem 0 .3rem; }
+p, ul { max-width: 46rem; margin: .4rem 0 .8rem; }
+.headline { font-size: 1.95rem; line-height: 1.25; font-weight: 650; letter-spacing: -.01em; margin: 1.4rem 0 .6rem;
+  max-width: 50rem; }
+.lead { font-size: 1.08rem; color: var(--soft); max-width: 46rem; }
+.figures { display: grid; grid-template-columns: repeat(4, 1fr); gap: 1rem; margin: 1.6rem 0 .5rem; padding: 0; }
+.figures div { border-top: 3px solid var(--line); padding-top: .5rem; }
+.figures div.after { border-color: var(--blue); }
+.figures dt { color: var(--soft); font-size: .88rem; line-height: 1.35; }
+.figures dd { margin: 0; font-size: 1.7rem; font-weight: 650; font-variant-numeric: tabular-nums; white-space: nowrap; }
+.figures small { font-size: .95rem; font-weight: 400; color: var(--soft); }
+.notice { border-left: 4px solid var(--warn); background: #fdf3f2; padding: .7rem 1rem; margin: 1.4rem 0;
+  max-width: none; }
+.notice ul { margin: .2rem 0 0; padding-left: 1.1rem; }
+.note { color: var(--soft); font-size: .92rem; }
+table { border-collapse: collapse; margin: .8rem 0 1rem; font-size: .94rem; font-variant-numeric: tabular-nums; }
+caption { text-align: left; color: var(--soft); font-size: .9rem; padding-bottom: .3rem; }
+th, td { padding: .34rem .9rem .34rem 0; text-align: right; border-bottom: 1px solid var(--line); vertical-align: top; }
+th { font-weight: 600; color: var(--soft); font-size: .86rem; }
+th:first-child, td:first-child, td.text, th.text { text-align: left; }
+td.text { font-variant-numeric: normal; overflow-wrap: anywhere; }
+tr.best td { font-weight: 650; color: var(--blue); }
+tr.flag td:last-child { color: var(--warn); font-weight: 600; }
+figure { margin: 1rem 0 1.2rem; }
+figure img { width: 100%; height: auto; display: block; }
+figcaption { color: var(--soft); font-size: .92rem; max-width: 46rem; margin-top: .3rem; }
+code { font: .88em/1.4 ui-monospace, "DejaVu Sans Mono", monospace; }
+@media (max-width: 40rem) { .figures { grid-template-columns: 1fr 1fr; } .headline { font-size: 1.5rem; } }
+@media print {
+  @page { margin: 15mm; }
+  body { font-size: 10.5pt; } main { padding: 0; max-width: none; }
+  h2 { break-after: avoid; margin-top: 1.6rem; } figure, table, .notice, .figures { break-inside: avoid; }
+}
+"""
+
+
+def escape(text: object) -> str:
+    """Text made safe to stand in HTML."""
+    return html.escape(str(text), quote=True)
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number to `digits` significant digits and at most three decimals, with a real minus sign; a dash for NaN."""
+    if not math.isfinite(value):
+        return "\N{EN DASH}"
+    if value == 0:
+        return "0"
+    decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
+    most = 3 if abs(value) >= 0.001 else decimals
+    return f"{value:.{min(decimals, most)}f}".replace("-", MINUS)
+
+
+def signed(value: float, digits: int = 3) -> str:
+    """As `number`, with a plus sign where the value is positive."""
+    return ("+" if value > 0 else "") + number(value, digits)
+
+
+def table(
+    header: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    *,
+    text_columns: Sequence[int] = (0,),
+    classes: Sequence[str] = (),
+    caption: str = "",
+) -> str:
+    """A table of escaped cells; `classes` gives one class a row, `text_columns` are set flush left."""
+    head = "".join(f'<th{_text(i, text_columns)} scope="col">{escape(name)}</th>' for i, name in enumerate(header))
+    body = []
+    for line, row in enumerate(rows):
+        kind = f' class="{classes[line]}"' if classes and classes[line] else ""
+        cells = "".join(f"<td{_text(i, text_columns)}>{escape(cell)}</td>" for i, cell in enumerate(row))
+        body.append(f"<tr{kind}>{cells}</tr>")
+    title = f"<caption>{escape(caption)}</caption>" if caption else ""
+    head = f"<thead><tr>{head}</tr></thead>" if header else ""
+    return f"<table>{title}{head}<tbody>{''.join(body)}</tbody></table>"
+
+
+def _text(column: int, text_columns: Sequence[int]) -> str:
+    return ' class="text"' if column in text_columns else ""
+
+
+def section(title: str, *content: str) -> str:
+    """A titled section of ready HTML."""
+    return f"<section><h2>{escape(title)}</h2>{''.join(content)}</section>"
+
+
+def paragraph(text: str, kind: str = "") -> str:
+    """A paragraph of escaped text."""
+    return f'<p class="{kind}">{escape(text)}</p>' if kind else f"<p>{escape(text)}</p>"
+
+
+def items(sentences: Iterable[str]) -> str:
+    """A list of escaped sentences."""
+    return "<ul>" + "".join(f"<li>{escape(s)}</li>" for s in sentences) + "</ul>"
+
+
+def picture(image: str, caption: str) -> str:
+    """A figure from an image element and an escaped caption."""
+    return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"
+
+
+def page(title: str, content: str) -> str:
+    """The whole document: one file, nothing loaded from elsewhere."""
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}</title><style>{STYLE}</style></head>\n<body><main>{content}</main></body></html>\n"
+    )
