@@ -1,0 +1,48 @@
+"""`rigcal`: every command there is."""
+
+from __future__ import annotations
+
+import importlib
+
+import click
+
+# Command -> where it is defined. Imported when used: status must not wait for what only calibration needs.
+COMMANDS = {
+    "calibrate": "offline",
+    "config": "run",
+    "demo": "demo",
+    "devices": "operator",
+    "evaluate": "offline",
+    "jobs": "operator",
+    "predict": "offline",
+    "replay": "run",
+    "run": "run",
+    "session": "operator",
+    "setup": "operator",
+    "status": "operator",
+}
+
+
+class _Commands(click.Group):
+    """The commands, each imported when it is asked for."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+        if cmd_name not in COMMANDS:
+            return None
+        module = importlib.import_module(f"daemon.cli.{COMMANDS[cmd_name]}")
+        command = module.COMMANDS[cmd_name]
+        assert isinstance(command, click.Command)
+        return command
+
+
+@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="rigcal")
+def main() -> None:
+    """Make a drilling boom's kinematic model true."""
+
+
+if __name__ == "__main__":
+    main()

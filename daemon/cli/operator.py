@@ -1,0 +1,377 @@
+"""What an operator says to the running daemon: status, set-ups, sessions, jobs, devices."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from daemon.cli.output import Command, json_option
+from daemon.config import read_config
+from daemon.control import request
+from daemon.scheduler import SESSION_KINDS
+
+DEFAULT_SOCKET = Path("/run/rigcal/control.sock")
+SHOT_TIMEOUT_S = 600.0
+
+Show = Callable[[Console, Any], None]
+
+
+def socket_of(path: Path | None, config: Path | None) -> Path:
+    """Where the daemon listens: --socket, --config, $RIGCAL_SOCKET, else the service's place."""
+    if path is not None:
+        return path
+    if config is not None:
+        return read_config(config).socket_path
+    return Path(os.environ.get("RIGCAL_SOCKET", DEFAULT_SOCKET))
+
+
+def _talks(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Options that every command to the daemon has."""
+    command = json_option(command)
+    command = click.option(
+        "--config", type=click.Path(path_type=Path), help="Configuration of the daemon to talk to (gives its socket)."
+    )(command)
+    return click.option("--socket", type=click.Path(path_type=Path), help="Control socket of the daemon.")(command)
+
+
+def _ask(where: dict[str, Any], command: str, show: Show, timeout_s: float = 120.0, **arguments: Any) -> Any:
+    """Send a command; show its result to people, and return it for `--json`."""
+    given = {key: value for key, value in arguments.items() if value is not None}
+    result = request(socket_of(where["socket"], where["config"]), command, given, timeout_s=timeout_s)
+    if not where["as_json"]:
+        show(Console(), result)
+    return result if isinstance(result, dict) else {"result": result}
+
+
+def _say(console: Console, text: Any) -> None:
+    console.print(str(text), highlight=False, markup=False)
+
+
+# ---- status ----------------------------------------------------------------------------------------------------------
+
+
+@click.command(cls=Command)
+@click.option("--frames", is_flag=True, help="Also every CAN identifier that was heard, with its rate.")
+@_talks
+def status(frames: bool, **where: Any) -> Any:
+    """How the rig's links, channels and station are, and what is going on."""
+    return _ask(where, "status", partial(_show_status, frames=frames))
+
+
+def _show_status(console: Console, status: dict[str, Any], *, frames: bool) -> None:
+    console.print(f"rig [bold]{status['rig']}[/] ({status['mode']}), store {status['store']}", highlight=False)
+    acquisition = status["acquisition"]
+    links = Table("link", "state", "captures", "per s", "queued", "dropped", title="links", title_justify="left")
+    for link in acquisition["links"]:
+        state = {True: "[green]up[/]", False: "[red]down[/]", None: "starting"}[link["up"]]
+        links.add_row(
+            link["name"],
+            state,
+            f"{link['captures']}",
+            f"{link['captures_per_s']:.0f}",
+            f"{link['queued']}",
+            f"{link['dropped']}",
+        )
+    console.print(links)
+    channels = Table("channel", "value", "status", "age s", title="channels", title_justify="left")
+    for channel in acquisition["channels"]:
+        value = "" if channel["value"] is None else f"{channel['value']:.3f} {channel['unit']}"
+        mark = "green" if channel["status"] == "ok" else "red"
+        channels.add_row(channel["name"], value, f"[{mark}]{channel['status']}[/]", f"{channel['age_s']:.1f}")
+    console.print(channels)
+    if frames:
+        console.print(_frame_table(acquisition["frames"]))
+    for station in acquisition["stations"]:
+        why = f" ({station['reason']})" if station["reason"] else ""
+        last = f"last fix {station['status']}{why}"
+        _say(console, f"station {station['name']}: {station['lock']}, {last}, {station['fixes']} fixes")
+    for device, n in acquisition["decode_failures"].items():
+        _say(console, f"{n} captures of {device} could not be decoded")
+    if acquisition["error"]:
+        console.print(f"[red]{acquisition['error']}[/]")
+    if status["session"]:
+        _show_session(console, status["session"])
+    for job in status["jobs"]:
+        _say(console, _job_line(job))
+    for event in reversed(status["events"]):
+        _say(console, f"{_utc(event['utc_ns'])} {event['device']} {event['kind']}: {event['text']}")
+
+
+def _frame_table(frames: list[dict[str, Any]]) -> Table:
+    table = Table("link", "identifier", "what", "frames", "per s", "missed", title="frames", title_justify="left")
+    for frame in frames:
+        rate = "" if frame["rate_per_s"] is None else f"{frame['rate_per_s']:.0f}"
+        missed = "" if frame["missed"] is None else str(frame["missed"])
+        table.add_row(frame["link"], frame["identifier"], frame["names"], str(frame["count"]), rate, missed)
+    return table
+
+
+def _utc(utc_ns: int) -> str:
+    return datetime.fromtimestamp(utc_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S")
+
+
+# ---- set-ups ---------------------------------------------------------------------------------------------------------
+
+
+@click.group()
+def setup() -> None:
+    """Station set-ups: where and how the total station stands."""
+
+
+@setup.command(cls=Command, name="new")
+@click.argument("name")
+@click.option("--instrument", default="", help="Maker and model.")
+@click.option("--serial", default="", help="Serial number.")
+@click.option("--tilt-arcsec", type=float, help="Residual tilt shown after levelling.")
+@click.option("--ppm", type=float, help="Atmospheric correction set on the instrument.")
+@click.option("--prism-constant", multiple=True, metavar="PRISM=MM", help="Prism constant set for a prism.")
+@click.option(
+    "--control-point",
+    multiple=True,
+    metavar="NAME=X,Y,Z",
+    help="Known place of a control point in the station's frame, mm; without one its first shot defines it.",
+)
+@click.option("--note", default="")
+@_talks
+def setup_new(prism_constant: tuple[str, ...], control_point: tuple[str, ...], **options: Any) -> Any:
+    """Describe where the station stands now. A station that was moved is a new set-up."""
+    where = {key: options.pop(key) for key in ("socket", "config", "as_json")}
+    return _ask(
+        where,
+        "setup.new",
+        lambda console, result: _say(console, f"set-up {result['id']} is in use"),
+        id=options.pop("name"),
+        prism_constants_mm={k: v[0] for k, v in _assignments("--prism-constant", prism_constant, "r=-30", 1).items()},
+        control_points=_assignments("--control-point", control_point, "cp1=12000,3500,1800", 3),
+        **options,
+    )
+
+
+def _assignments(option: str, texts: tuple[str, ...], example: str, count: int) -> dict[str, list[float]]:
+    """NAME=NUMBER,... options as numbers."""
+    result = {}
+    for text in texts:
+        name, _, numbers = text.partition("=")
+        try:
+            result[name] = [float(number) for number in numbers.split(",")]
+        except ValueError:
+            result[name] = []
+        if len(result[name]) != count:
+            raise click.BadParameter(f"{text!r}: write it as {example}", param_hint=option)
+    return result
+
+
+@setup.command(cls=Command, name="list")
+@_talks
+def setup_list(**where: Any) -> Any:
+    """All set-ups with their control points."""
+
+    def show(console: Console, setups: list[dict[str, Any]]) -> None:
+        table = Table("set-up", "instrument", "state", "tilt arcsec", "ppm", "control points")
+        for s in setups:
+            points = ", ".join(p["name"] for p in s["control_points"])
+            tilt, ppm = ("" if s[k] is None else f"{s[k]:g}" for k in ("tilt_arcsec", "ppm"))
+            table.add_row(s["id"], s["instrument"], s["state"], tilt, ppm, points)
+        console.print(table)
+
+    return _ask(where, "setup.list", show)
+
+
+# ---- sessions --------------------------------------------------------------------------------------------------------
+
+
+@click.group()
+def session() -> None:
+    """Calibration sessions."""
+
+
+@session.command(cls=Command, name="start")
+@click.option("--prism", required=True, help="The prism that the station follows.")
+@click.option("--kind", type=click.Choice(SESSION_KINDS), default="static_poses", show_default=True)
+@click.option("--setup", help="Station set-up; the newest usable one when not given.")
+@click.option("--operator", default=lambda: os.environ.get("USER", ""), help="Who is responsible.")
+@click.option("--id", help="Name of the session.")
+@click.option("--note", default="")
+@_talks
+def session_start(socket: Path | None, config: Path | None, as_json: bool, **about: Any) -> Any:
+    """Open a session: from now on fixes on the prism become its observations."""
+
+    def show(console: Console, result: dict[str, Any]) -> None:
+        _say(
+            console,
+            f"session {result['id']} is open: prism {result['prism']}, {result['kind']}, set-up {result['setup']}",
+        )
+        _advise(console, result["advice"])
+
+    return _ask({"socket": socket, "config": config, "as_json": as_json}, "session.start", show, **about)
+
+
+@session.command(cls=Command, name="stop")
+@_talks
+def session_stop(**where: Any) -> Any:
+    """Close the open session; identification, residual and report follow by themselves."""
+
+    def show(console: Console, result: dict[str, Any]) -> None:
+        _show_session(console, result)
+        _advise(console, result["advice"])
+
+    return _ask(where, "session.stop", show)
+
+
+@session.command(cls=Command, name="abort")
+@_talks
+def session_abort(**where: Any) -> Any:
+    """Close the open session as unusable."""
+    return _ask(where, "session.abort", _show_session)
+
+
+@session.command(cls=Command, name="shoot")
+@click.argument("point")
+@_talks
+def session_shoot(point: str, **where: Any) -> Any:
+    """Measure control point POINT (the station is aimed at it); its first shot defines its place."""
+
+    def show(console: Console, result: dict[str, Any]) -> None:
+        if result["misclosure_mm"] is None:
+            _say(console, f"{result['point']} is known from now on")
+            return
+        verdict = "[red]the set-up has moved[/]" if result["moved"] else "the set-up holds"
+        console.print(f"{result['point']}: misclosure {result['misclosure_mm']:.1f} mm, {verdict}", highlight=False)
+
+    return _ask(where, "session.shoot", show, timeout_s=SHOT_TIMEOUT_S, point=point)
+
+
+@session.command(cls=Command, name="list")
+@_talks
+def session_list(**where: Any) -> Any:
+    """All sessions."""
+
+    def show(console: Console, sessions: list[dict[str, Any]]) -> None:
+        table = Table("session", "kind", "prism", "set-up", "state", "poses", "observations", "operator")
+        for s in sessions:
+            counts = (str(s["poses"]), str(s["observations"]))
+            table.add_row(s["id"], s["kind"], s["prism"], s["setup"], s["state"], *counts, s["operator"])
+        console.print(table)
+
+    return _ask(where, "session.list", show)
+
+
+@session.command(cls=Command, name="show")
+@click.argument("name")
+@_talks
+def session_show(name: str, **where: Any) -> Any:
+    """One session, with its control points and jobs."""
+
+    def show(console: Console, result: dict[str, Any]) -> None:
+        _show_session(console, result)
+        for job in result["jobs"]:
+            _say(console, _job_line(job))
+
+    return _ask(where, "session.show", show, id=name)
+
+
+@session.command(cls=Command, name="export")
+@click.argument("name")
+@click.option("--config", type=click.Path(path_type=Path), required=True, help="Configuration of the store's daemon.")
+@click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True, help="Directory for the files.")
+@click.option("--format", "can_format", type=click.Choice(["log", "asc", "blf"]), default="log", show_default=True)
+@json_option
+def session_export(name: str, config: Path, out: Path, can_format: Any, *, as_json: bool) -> Any:
+    """Write a session's CAN and serial captures as logs that `rigcal replay` reads, and its observations as CSV."""
+    from daemon.export import export_session
+
+    files = export_session(read_config(config), name, out, can_format)
+    if not as_json:
+        for file in files:
+            click.echo(file)
+    return {"files": [str(file) for file in files]}
+
+
+def _show_session(console: Console, session: dict[str, Any]) -> None:
+    _say(
+        console,
+        f"session {session['id']} ({session['kind']}, prism {session['prism']}, set-up {session['setup']}) is "
+        f"{session['state']}: {session['poses']} poses, {session['observations']} observations",
+    )
+    for reason, n in session["excluded"].items():
+        _say(console, f"  {n} excluded: {reason}")
+    for shot in session["control_shots"]:
+        size = "defined" if shot["misclosure_mm"] is None else f"misclosure {shot['misclosure_mm']:.1f} mm"
+        _say(console, f"  control point {shot['point']} at the {shot['phase']}: {size}")
+    if session["setup_moved"]:
+        console.print("  [red]the set-up has moved: its sessions are doubtful[/]")
+
+
+def _advise(console: Console, advice: list[str]) -> None:
+    for sentence in advice:
+        _say(console, f"  note: {sentence}")
+
+
+# ---- jobs and devices ------------------------------------------------------------------------------------------------
+
+
+@click.group()
+def jobs() -> None:
+    """Background jobs: identification, residual training, reports."""
+
+
+@jobs.command(cls=Command, name="list")
+@_talks
+def jobs_list(**where: Any) -> Any:
+    """All jobs."""
+
+    def show(console: Console, found: list[dict[str, Any]]) -> None:
+        for job in found:
+            _say(console, _job_line(job))
+
+    return _ask(where, "jobs.list", show)
+
+
+@jobs.command(cls=Command, name="cancel")
+@click.argument("number", type=int)
+@_talks
+def jobs_cancel(number: int, **where: Any) -> Any:
+    """Cancel a queued or running job and those that wait for it."""
+    return _ask(where, "jobs.cancel", _say, id=number)
+
+
+@jobs.command(cls=Command, name="retry")
+@click.argument("number", type=int)
+@_talks
+def jobs_retry(number: int, **where: Any) -> Any:
+    """Queue a job again that did not end well."""
+    return _ask(where, "jobs.retry", _say, id=number)
+
+
+def _job_line(job: dict[str, Any]) -> str:
+    detail = job.get("error") or job.get("message") or ""
+    share = f" {100 * job['progress']:.0f} %" if job["state"] == "running" else ""
+    return f"job {job['id']} {job['kind']}: {job['state']}{share} {detail}".rstrip()
+
+
+@click.group()
+def devices() -> None:
+    """CANopen devices of the rig."""
+
+
+@devices.command(cls=Command, name="configure")
+@click.option("--machine-is-parked", is_flag=True, help="The machine is parked and locked out.")
+@_talks
+def devices_configure(machine_is_parked: bool, **where: Any) -> Any:
+    """Check identity and resolution of the encoders, set their transmission, and start them.
+
+    Needs a link with allow_transmit = true that lists the nodes.
+    """
+
+    return _ask(where, "devices.configure", lambda c, r: _say(c, r["text"]), machine_is_parked=machine_is_parked)
+
+
+COMMANDS = {"status": status, "setup": setup, "session": session, "jobs": jobs, "devices": devices}

@@ -1,0 +1,225 @@
+"""`rigcal run`, `rigcal replay`, `rigcal config check`: the daemon itself, and captured logs through it."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import logging
+import tempfile
+import threading
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+
+from daemon.acquisition import Acquisition
+from daemon.cli.output import Command, json_option
+from daemon.composition import decoders, joiner, live, replayed, simulated
+from daemon.config import Config, parse_config, read_config
+from daemon.files import write_file
+from daemon.notify import Notifier
+from daemon.replay import first_captures, merged, stored_readings
+from daemon.rigs import load_rig
+from daemon.scheduler import SESSION_KINDS
+from daemon.service import Daemon, declare_channels, stop_on_signals
+from daemon.sessions import SessionKeeper
+from daemon.setups import SetupBook
+from daemon.store.reader import Reader
+from daemon.store.store import Store
+from drivers.clock import ManualClock
+from drivers.readings import Capture
+
+SIMULATED_CONFIG = """
+rig = "swdt82"
+state_directory = "rigcal-sim"
+
+[[can]]
+channel = "can0"
+
+[[station]]
+serial.path = "/dev/rigcal-station"
+"""
+REPLAYED = "replayed"
+LAST_WAIT_S = 10.0  # beyond every deadline that a fix may wait for its joints
+COUNTED = ("joint_samples", "signals", "fixes", "device_events", "decode_failures", "gaps", "observations")
+_LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
+
+_RATE = click.FloatRange(0.1, 100)
+_DWELL = click.FloatRange(1, 600)
+
+
+@click.command(cls=Command)
+@click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[FILE]...")
+@click.option("--config", type=click.Path(path_type=Path), help="Configuration file (TOML); --sim has one of its own.")
+@click.option("--sim", is_flag=True, help="A simulated rig in place of the configured links.")
+@click.option("--replay", "is_replay", is_flag=True, help="The captured logs FILE... in place of the configured links.")
+@click.option("--rate", type=_RATE, default=1.0, show_default=True, help="Speed of the simulation or replay.")
+@click.option("--seed", type=int, default=1, show_default=True, help="Which simulated machine.")
+@click.option("--effect", "effects", multiple=True, help="A hidden effect of the simulated machine; may be repeated.")
+@click.option("--dwell", "dwell_s", type=_DWELL, default=4.0, show_default=True, help="Simulated stand at a pose, s.")
+@click.option("-v", "--verbose", is_flag=True, help="Log more.")
+@json_option
+def run(
+    files: tuple[Path, ...],
+    config: Path | None,
+    rate: float,
+    seed: int,
+    effects: tuple[str, ...],
+    dwell_s: float,
+    *,
+    sim: bool,
+    is_replay: bool,
+    verbose: bool,
+    as_json: bool,
+) -> dict[str, Any]:
+    """Run the daemon until it is told to stop (SIGTERM, Ctrl-C) or a replay has ended.
+
+    A replay keeps its store in a directory of its own, beside the configured one's.
+    """
+    logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, format=_LOG_FORMAT)
+    if bool(files) != is_replay or (sim and is_replay):
+        raise click.UsageError("give either --sim, or --replay FILE..., or neither")
+    settings = _settings(config, sim=sim)
+    source = load_rig(settings.rig)
+    if is_replay:
+        settings = _apart(settings)
+    stop = threading.Event()
+    settings.state_directory.mkdir(parents=True, exist_ok=True)
+    with contextlib.ExitStack() as stack:
+        stack.callback(stop_on_signals(stop))
+        # The store first: it is what keeps a second daemon from touching anything of the first one's.
+        store = stack.enter_context(contextlib.closing(Store(settings.store_path)))
+        if sim:
+            rig = simulated(settings, source, rate=rate, seed=seed, effects=effects, dwell_s=dwell_s)
+            parts = stack.enter_context(rig)
+        elif is_replay:
+            parts = replayed(settings, source, files, rate)
+        else:
+            parts = live(settings, source)
+        Daemon(settings, store, parts).run(stop, Notifier())
+    if not as_json:
+        click.echo(f"the store is {settings.store_path}")
+    return {"rig": source.rig.name, "mode": parts.mode, "store": str(settings.store_path)}
+
+
+def _settings(config: Path | None, *, sim: bool) -> Config:
+    if config is not None:
+        return read_config(config)
+    if not sim:
+        raise click.UsageError("give --config FILE (only --sim runs without one)")
+    return parse_config(SIMULATED_CONFIG, Path("simulated").resolve())
+
+
+def _apart(settings: Config) -> Config:
+    """The configuration with a new directory for its state: what was recorded elsewhere stays apart from the rig's."""
+    settings.state_directory.mkdir(parents=True, exist_ok=True)
+    directory = Path(tempfile.mkdtemp(prefix="replay-", dir=settings.state_directory))
+    return settings.model_copy(update={"state_directory": directory, "socket": directory / "control.sock"})
+
+
+@click.command(cls=Command)
+@click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--config",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="Configuration whose rig and links the logs are of.",
+)
+@click.option(
+    "--store",
+    "path",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="Store to write; a new file, ending in .sqlite.",
+)
+@click.option("--prism", help="Take the fixes as one closed session on this prism, so that they become observations.")
+@click.option(
+    "--kind", type=click.Choice(SESSION_KINDS), default="static_poses", show_default=True, help="Kind of that session."
+)
+@click.option(
+    "--readings", type=click.Path(path_type=Path), help="Also write everything that was decoded as JSON lines."
+)
+@json_option
+def replay(
+    files: tuple[Path, ...],
+    config: Path,
+    path: Path,
+    prism: str | None,
+    kind: str,
+    readings: Path | None,
+    *,
+    as_json: bool,
+) -> dict[str, Any]:
+    """Feed captured logs through drivers and store, as fast as it goes; the same logs give the same rows.
+
+    FILES are CAN logs (candump .log, Vector .asc or .blf) and serial captures (.serial).
+    """
+    settings = read_config(config)
+    source = load_rig(settings.rig)
+    if path.exists():
+        raise click.UsageError(f"{path} exists; a replay writes a store of its own, name a new file with --store")
+    clock = ManualClock()
+    first_captures(files, settings)  # a bad log is refused before a store is made
+    captures = merged(files, settings)
+    first = next(captures)
+    clock.set(first.stamp)
+    made = decoders(settings, source)
+    with contextlib.closing(Store(path)) as store:
+        declare_channels(store, source.rig)
+        setups = SetupBook(source.rig, store, clock, settings.sessions.control_tolerance_mm)
+        keeper = SessionKeeper(
+            source.rig,
+            source.text,
+            store,
+            setups,
+            joiner(settings, source.rig),
+            settings.sessions,
+            clock,
+            run_id=0,
+            aim=None,
+        )
+        if prism is not None:
+            setups.new_command({"id": REPLAYED, "instrument": "replayed"})
+            keeper.start_command({"id": REPLAYED, "prism": prism, "kind": kind, "operator": "replay"})
+        acquisition = Acquisition((), made, store, clock, on_records=keeper.on_records)
+        acquisition.run_inline(_followed(itertools.chain([first], captures), clock))
+        clock.advance(LAST_WAIT_S)
+        keeper.on_records([])
+        session = keeper.stop_command({}) if prism is not None else None
+    with Reader(path) as reader:
+        if readings is not None:
+            write_file(readings, "".join(f"{line}\n" for line in stored_readings(reader)).encode())
+        counts = {table: next(reader.rows(f"SELECT count(*) AS n FROM {table}"))["n"] for table in COUNTED}
+    if not as_json:
+        for table, n in counts.items():
+            click.echo(f"{n:9d} {table.replace('_', ' ')}")
+    return counts | ({} if session is None else {"session": session})
+
+
+def _followed(captures: Iterable[Capture], clock: ManualClock) -> Iterator[Capture]:
+    """The captures; the clock shows each one's instant when it comes."""
+    for capture in captures:
+        clock.set(capture.stamp)
+        yield capture
+
+
+@click.group("config")
+def config_group() -> None:
+    """The configuration file."""
+
+
+@config_group.command("check", cls=Command)
+@click.argument("path", type=click.Path(path_type=Path))
+@json_option
+def config_check(path: Path, *, as_json: bool) -> dict[str, Any]:
+    """Check a configuration, its rig, and the DBC and EDS files they name, without opening any device."""
+    settings = read_config(path)
+    source = load_rig(settings.rig)
+    links = decoders(settings, source)
+    if not as_json:
+        click.echo(f"{path}: good: rig {source.rig.name}, links {', '.join(links) or 'none'}")
+    return {"rig": source.rig.name, "links": list(links)}
+
+
+COMMANDS = {"run": run, "replay": replay, "config": config_group}

@@ -1,0 +1,247 @@
+"""The composition root: a configuration and a rig become links, decoders, clock and hands.
+
+One function for each way to run; what they compose is the same, and everything above works with any of them. Nothing
+else in `daemon` knows whether a rig is real, simulated or replayed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+from calibration.channels import Cia404Analogue, Cia406Encoder, Cia406Linear
+from calibration.rig import Rig
+from daemon.channels import decoder_factories, node_setups
+from daemon.config import CanSection, Config, ConfigError
+from daemon.control import CommandError
+from daemon.joiner import ObservationJoiner, joint_inputs, signal_inputs
+from daemon.replay import captures_of, first_captures
+from daemon.rigs import RigSource
+from daemon.simulation import SimulatedRig, SimulationError
+from drivers.can_channel import ChannelDecoder
+from drivers.can_decoder import CanDecoder
+from drivers.can_ports import Interface
+from drivers.canbus import CanLink, CanLinkConfig
+from drivers.clock import Clock, ScaledClock, Stamp, SystemClock
+from drivers.readings import Decoder, LinkLoop
+from drivers.serialport import SerialConfig
+from drivers.station import StationDecoder, StationLink
+from simulators.replay import ReplayLink
+
+SIMULATED_SYNC_MS = 200
+SIMULATED_DELAY_S = 0.02  # from a simulated measurement to its record
+
+SIMULATED_SLACK_M = 0.1  # of the target's motion, per time that simulated time runs faster than the computer
+
+Mode = Literal["live", "simulated", "replayed"]
+
+
+def _never() -> bool:
+    return False
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What the daemon runs.
+
+    Attributes:
+        mode: for `status`.
+        rig, rig_text: the machine, and the file that describes it.
+        clock: of everything.
+        links: loops that capture.
+        decoders: link name -> what makes a fresh decoder of its captures.
+        joiner: joins fixes with joints.
+        aim: turns the station to a target, where something can.
+        can_links: those that can be asked for active set-up.
+        is_over: whether there is nothing more to come (a replay has ended).
+    """
+
+    mode: Mode
+    rig: Rig
+    rig_text: str
+    clock: Clock
+    links: Sequence[LinkLoop]
+    decoders: Mapping[str, Callable[[], Decoder]]
+    joiner: ObservationJoiner
+    aim: Callable[[str], None] | None = None
+    can_links: Sequence[CanLink] = ()
+    is_over: Callable[[], bool] = _never
+
+
+def live(config: Config, source: RigSource) -> Parts:
+    """A real rig."""
+    return _parts("live", config, source, SystemClock())
+
+
+@contextlib.contextmanager
+def simulated(
+    config: Config, source: RigSource, *, rate: float, seed: int, effects: tuple[str, ...], dwell_s: float
+) -> Iterator[Parts]:
+    """A simulated rig behind real protocols, in a process of its own, on the configured links' names.
+
+    Args:
+        rate: simulated seconds per second.
+        seed: which machine, which noise, which poses.
+        effects: hidden effects, as the simulator spells them.
+        dwell_s: how long the boom stands at each pose, simulated seconds.
+    """
+    now = SystemClock().now()
+    clock = ScaledClock(rate, Stamp(now.utc_ns, now.monotonic_ns, f"simulated-{uuid.uuid4()}"))
+    ports = config.state_directory / "ports"
+    ports.mkdir(parents=True, exist_ok=True)
+    if len(config.can) > 1 or len(config.station) > 1:
+        raise ConfigError("a simulated rig has one CAN link and one station; configure one [[can]] and one [[station]]")
+    rates = {joint.name: joint.max_rate for joint in source.rig.joints}
+    simulation = SimulatedRig(config.rig, rates, ports, clock, seed=seed, effects=effects)
+    try:
+        nodes = [c.node for c in source.rig.channels if isinstance(c, Cia406Encoder | Cia406Linear | Cia404Analogue)]
+        bus = {
+            "interface": "slcan",
+            "channel": str(simulation.can_port),
+            "bitrate": 250_000,
+            "allow_transmit": True,
+            "transmit_nodes": tuple(nodes),
+            "sync_period_ms": SIMULATED_SYNC_MS,
+            "options": {"sleep_after_open": 0.0},
+        }
+        line = SerialConfig(path=str(simulation.station_port))
+        can = tuple(section.model_copy(update=bus) for section in config.can)
+        station = tuple(
+            section.model_copy(update={"serial": line, "link_delay_s": SIMULATED_DELAY_S}) for section in config.station
+        )
+        rewired = config.model_copy(update={"can": can, "station": station})
+        parts = _parts("simulated", rewired, source, clock, aim=partial(_aim, simulation), time_scale=rate)
+        simulation.drive_around(dwell_s)
+        yield parts
+    finally:
+        simulation.close()
+
+
+def _aim(simulation: SimulatedRig, target: str) -> None:
+    try:
+        simulation.aim(target)
+    except SimulationError as error:
+        raise CommandError(str(error)) from error
+
+
+def replayed(config: Config, source: RigSource, files: Sequence[Path], speed: float) -> Parts:
+    """Captured logs in place of a rig, at `speed` times the recorded one.
+
+    Raises:
+        DescriptionError, ConfigError: a file is malformed, empty, or of a link that is not configured.
+    """
+    starts = first_captures(files, config)
+    first = min((capture.stamp for capture in starts.values()), key=lambda stamp: stamp.monotonic_ns)
+    clock = ScaledClock(speed, first, SystemClock().monotonic_ns())
+    links = [ReplayLink(starts[path].link, captures_of(path, config), clock) for path in files]
+
+    def is_over() -> bool:
+        return all(link.is_finished.is_set() for link in links)
+
+    return _parts("replayed", config, source, clock, links=links, is_over=is_over)
+
+
+def decoders(config: Config, source: RigSource, *, time_scale: float = 1.0) -> dict[str, Callable[[], Decoder]]:
+    """Link name -> what makes a fresh decoder of its captures.
+
+    Args:
+        config, source: links and rig.
+        time_scale: how many times faster than real the rig's clock runs.
+
+    Raises:
+        ConfigError: a channel's link is not configured.
+        DescriptionError: a DBC or EDS file is missing or malformed.
+    """
+    made: dict[str, Callable[[], Decoder]] = {}
+    for section in config.can:
+        factories = decoder_factories(source.rig, source.directory, section.name, time_scale=time_scale)
+
+        made[section.name] = partial(_can_decoder, section.name, factories)
+    for station in config.station:
+        made[station.name] = partial(StationDecoder, station)
+    missing = sorted({c.link for c in source.rig.channels} - set(made))
+    if missing:
+        raise ConfigError(
+            f"rig {source.rig.name!r} has channels on link {missing[0]!r}, which the configuration does not have; add "
+            f'[[can]] name = "{missing[0]}"'
+        )
+    return made
+
+
+def joiner(config: Config, rig: Rig) -> ObservationJoiner:
+    """What joins the fixes of the configured stations with the rig's joints and signals."""
+    return ObservationJoiner(
+        joint_inputs(rig),
+        signal_inputs(rig),
+        link_delay_s={station.name: station.link_delay_s for station in config.station},
+        settle_s=config.sessions.settle_s,
+    )
+
+
+def _can_decoder(link: str, factories: Sequence[Callable[[], ChannelDecoder]]) -> Decoder:
+    return CanDecoder(link, [factory() for factory in factories])
+
+
+def _parts(
+    mode: Mode,
+    config: Config,
+    source: RigSource,
+    clock: Clock,
+    *,
+    links: Sequence[LinkLoop] | None = None,
+    aim: Callable[[str], None] | None = None,
+    is_over: Callable[[], bool] = _never,
+    time_scale: float = 1.0,
+) -> Parts:
+    can_links: list[CanLink] = []
+    played: list[ReplayLink] = []
+    for section in config.can:
+        if section.interface == "playback":
+            played.append(_playback(section, config, clock))
+        else:
+            can_links.append(_can_link(section, section.interface, source, clock, is_simulated=mode == "simulated"))
+    stations = [StationLink(station, clock) for station in config.station]
+    return Parts(
+        mode=mode,
+        rig=source.rig,
+        rig_text=source.text,
+        clock=clock,
+        links=[*can_links, *played, *stations] if links is None else links,
+        decoders=decoders(config, source, time_scale=time_scale),
+        joiner=joiner(config, source.rig),
+        aim=aim,
+        can_links=can_links if links is None else (),
+        is_over=is_over,
+    )
+
+
+def _playback(section: CanSection, config: Config, clock: Clock) -> ReplayLink:
+    path = Path(section.channel)
+    first, now = first_captures([path], config)[path].stamp, clock.now()
+    captures = (
+        replace(capture, link=section.name, stamp=now.shifted(capture.stamp.since(first)))
+        for capture in captures_of(path, config)
+    )
+    return ReplayLink(section.name, captures, clock)
+
+
+def _can_link(
+    section: CanSection, interface: Interface, source: RigSource, clock: Clock, *, is_simulated: bool
+) -> CanLink:
+    config = CanLinkConfig(
+        name=section.name,
+        interface=interface,
+        channel=section.channel,
+        bitrate=section.bitrate,
+        allow_transmit=section.allow_transmit,
+        transmit_nodes=section.transmit_nodes,
+        sync_period_ms=section.sync_period_ms,
+        options=section.options,
+    )
+    setups = node_setups(source.rig, source.directory, section.name)
+    return CanLink(config, clock, setups, configure_at_start=is_simulated)

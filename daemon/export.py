@@ -1,0 +1,77 @@
+"""A stored session as files again: captured logs that `rigcal replay` reads, and the observations CSV."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from calibration.rig import parse_rig
+from daemon.config import Config, ConfigError
+from daemon.control import CommandError
+from daemon.files import write_file
+from daemon.session_data import sessions_csv
+from daemon.store.reader import Reader
+from drivers.canlog import write_can_log
+from drivers.clock import NS_PER_S, Stamp
+from drivers.readings import CanCapture, SerialCapture
+from drivers.seriallog import SerialLogHeader, SerialLogWriter
+
+CanFormat = Literal["log", "asc", "blf"]
+MARGIN_NS = 2 * NS_PER_S  # joints are interpolated, and dwell and direction come from before the first fix
+
+
+def export_session(config: Config, session_id: str, out: Path, can_format: CanFormat) -> list[Path]:
+    """Write a session's captures, a file a link, and its observations.
+
+    Args:
+        config: of the daemon whose store it is; gives the stations' profiles and speeds.
+        session_id: a session that has ended.
+        out: directory, made if need be.
+        can_format: of the CAN logs: candump `log`, Vector `asc` or `blf`.
+
+    Returns:
+        The files, `<session>-<link>.<format>`, `<session>-<station>.serial` and `<session>.csv`.
+
+    Raises:
+        CommandError: no such session, or it is still open.
+        ConfigError: its station is not in the configuration.
+    """
+    with Reader(config.store_path) as reader:
+        found = list(reader.rows("SELECT * FROM calibration_sessions WHERE id = ?", (session_id,)))
+        if not found:
+            raise CommandError(f"{config.store_path} has no session {session_id!r}; `rigcal session list` shows them")
+        session = found[0]
+        if session["ended_utc_ns"] is None:
+            raise CommandError(f"session {session_id!r} is still open; stop it first")
+        since, until = _margin(reader, session, "started_", -MARGIN_NS), _margin(reader, session, "ended_", MARGIN_NS)
+        out.mkdir(parents=True, exist_ok=True)
+        files = []
+        for link in list(reader.rows("SELECT name, kind FROM links ORDER BY id")):
+            captures = reader.captures(link["name"], since, until)
+            if link["kind"] == "can":
+                path = out / f"{session_id}-{link['name']}.{can_format}"
+                write_can_log(path, (c for c in captures if isinstance(c, CanCapture)))
+            else:
+                path = out / f"{session_id}-{link['name']}.serial"
+                with path.open("w", encoding="utf-8", newline="\n") as stream:
+                    writer = SerialLogWriter(stream, _header(config, link["name"]))
+                    for capture in captures:
+                        if isinstance(capture, SerialCapture):
+                            writer.write(capture)
+            files.append(path)
+        table = out / f"{session_id}.csv"
+        write_file(table, sessions_csv(reader, parse_rig(session["rig_text"], "the session's rig"), [session_id]))
+        return [*files, table]
+
+
+def _margin(reader: Reader, session: dict[str, Any], prefix: str, shift_ns: int) -> Stamp:
+    stamp = reader.stamp(session, prefix)
+    assert stamp is not None  # the session has ended
+    return stamp.shifted(shift_ns)
+
+
+def _header(config: Config, link: str) -> SerialLogHeader:
+    for station in config.station:
+        if station.name == link:
+            return SerialLogHeader(link, station.serial.baud, station.profile)
+    raise ConfigError(f"station {link!r} of the stored session is not in the configuration; add its [[station]]")

@@ -1,0 +1,100 @@
+"""Captured files back into captures: one time axis, link names of the configuration; and stored readings as text."""
+
+from __future__ import annotations
+
+import heapq
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from daemon.config import Config, ConfigError
+from daemon.store.reader import Reader
+from drivers.canlog import read_can_log
+from drivers.clock import Stamp
+from drivers.errors import DescriptionError
+from drivers.readings import Capture
+from drivers.seriallog import read_serial_log
+
+CAN_SUFFIXES = (".log", ".asc", ".blf")
+SERIAL_SUFFIX = ".serial"
+BOOT_ID = "replayed"
+
+
+def captures_of(path: Path, config: Config) -> Iterator[Capture]:
+    """Captures of one file, in order, with the link names of the configuration.
+
+    A CAN log's channels are matched with the configured links' names, then with their channels (`can0`); a log of one
+    channel and a configuration of one link belong together in any case.
+
+    A log knows UTC alone, so all stamps are put on one monotonic axis: that of UTC. Recorded time that steps back
+    stands still until it is past again.
+
+    Raises:
+        DescriptionError: the file is malformed (file and line), or is no captured log.
+        ConfigError: a link of the file is not configured.
+    """
+    captures: Iterator[Capture]
+    suffix = path.suffix.lower()
+    if suffix in CAN_SUFFIXES:
+        known = {section.channel: section.name for section in config.can} | {s.name: s.name for s in config.can}
+        what, captures = "[[can]]", read_can_log(path)
+        only = config.can[0].name if len(config.can) == 1 else None
+    elif suffix == SERIAL_SUFFIX:
+        known = {station.name: station.name for station in config.station}
+        what, captures = "[[station]]", read_serial_log(path)
+        only = config.station[0].name if len(config.station) == 1 else None
+    else:
+        allowed = ", ".join((*CAN_SUFFIXES, SERIAL_SUFFIX))
+        raise DescriptionError(str(path), f"not a captured log by its name; allowed endings: {allowed}")
+    latest_ns = 0
+    for capture in captures:
+        link = known.get(capture.link, only)
+        if link is None:
+            raise ConfigError(f"{path}: link {capture.link!r} is not configured as {what}; known: {', '.join(known)}")
+        latest_ns = max(latest_ns, capture.stamp.utc_ns)
+        yield replace(capture, link=link, stamp=Stamp(capture.stamp.utc_ns, latest_ns, BOOT_ID))
+
+
+def first_captures(paths: Sequence[Path], config: Config) -> dict[Path, Capture]:
+    """The first capture of each file; every file is read through, so that a bad one is refused before anything runs.
+
+    Raises:
+        DescriptionError, ConfigError: as `captures_of`; or a file holds no captures.
+    """
+    firsts: dict[Path, Capture] = {}
+    for path in paths:
+        for capture in captures_of(path, config):
+            firsts.setdefault(path, capture)
+        if path not in firsts:
+            raise DescriptionError(str(path), "holds no captures")
+    return firsts
+
+
+def merged(paths: Sequence[Path], config: Config) -> Iterator[Capture]:
+    """Captures of several files in the order of their instants; at one instant in the order of the files."""
+    return heapq.merge(*(captures_of(p, config) for p in paths), key=lambda capture: capture.stamp.monotonic_ns)
+
+
+def stored_readings(reader: Reader) -> Iterator[str]:
+    """Everything that decoding has stored, as JSON lines that depend on nothing but the captures.
+
+    One line a joint sample, signal, fix, event, failure and gap, each kind in the order it was stored.
+    """
+    for table, columns in _TABLES.items():
+        join = " JOIN channels ON channels.id = channel_id" if "channels.name" in columns else ""
+        for row in reader.rows(f"SELECT {columns} FROM {table}{join} ORDER BY {table}.id"):
+            plain = {key: value.hex() if isinstance(value, bytes) else value for key, value in row.items()}
+            yield json.dumps({"table": table, **plain}, separators=(",", ":"))
+
+
+_SAMPLE = "channels.name AS channel, unit, utc_ns, value, status, raw_counts"
+_TABLES = {
+    "joint_samples": _SAMPLE,
+    "signals": _SAMPLE,
+    "fixes": "station, utc_ns, last_byte_utc_ns, status, lock, hz_angle_rad, zenith_angle_rad, slope_distance_m, "
+    "north_m, east_m, up_m, face, prism_constant_mm, ppm, tilt_ok, edm_level, reason, raw",
+    "device_events": "device, utc_ns, kind, text, code",
+    "decode_failures": "device, utc_ns, reason, excerpt, count",
+    "gaps": "channel, reason, start_utc_ns, end_utc_ns, missed",
+}

@@ -1,0 +1,164 @@
+"""The daemon itself: starts the parts in order, keeps the service manager informed, stops them in order."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from typing import Any
+
+from calibration.rig import Rig
+from daemon.acquisition import Acquisition
+from daemon.composition import Parts
+from daemon.config import Config
+from daemon.control import FAILED, REFUSED, CommandError, ControlServer, Handler
+from daemon.jobs import JobRunner
+from daemon.notify import Notifier
+from daemon.sessions import SessionKeeper
+from daemon.setups import SetupBook
+from daemon.store.store import Store
+from drivers.errors import DeviceError, TransmitForbiddenError
+
+log = logging.getLogger(__name__)
+
+BEAT_S = 1.0
+
+
+class Daemon:
+    """Acquisition, sessions, jobs and the control socket, on one store.
+
+    Args:
+        config: as checked.
+        store: open for writing; the caller closes it.
+        parts: links, decoders, clock and hands, as composed for a real, a simulated or a replayed rig.
+    """
+
+    def __init__(self, config: Config, store: Store, parts: Parts) -> None:
+        self._config, self._store, self._parts = config, store, parts
+        store.begin_run(parts.clock.now())
+        declare_channels(store, parts.rig)
+        self._setups = SetupBook(parts.rig, store, parts.clock, config.sessions.control_tolerance_mm)
+        self._sessions = SessionKeeper(
+            parts.rig,
+            parts.rig_text,
+            store,
+            self._setups,
+            parts.joiner,
+            config.sessions,
+            parts.clock,
+            run_id=store.run_id,
+            aim=parts.aim,
+        )
+        self._acquisition = Acquisition(
+            parts.links, parts.decoders, store, parts.clock, on_records=self._sessions.on_records
+        )
+        self._jobs = JobRunner(store, config, parts.rig.name, parts.clock)
+        self._control = ControlServer(config.socket_path, self._commands())
+
+    def run(self, stop: threading.Event, notifier: Notifier) -> None:
+        """Acquire until `stop` is set or a replay has ended; then stop everything in order.
+
+        Raises:
+            AcquisitionError: nothing is stored any more; the process should end, and be started again.
+        """
+        beat_s = min(BEAT_S, (notifier.watchdog_s or BEAT_S) / 2)
+        try:
+            self._acquisition.start()
+            if self._config.jobs.enabled:
+                self._jobs.start()
+            notifier.send("READY=1", f"STATUS=acquiring rig {self._parts.rig.name}")
+            log.info("acquiring rig %s; control socket %s", self._parts.rig.name, self._config.socket_path)
+            while not stop.wait(beat_s):
+                self._acquisition.check()
+                # The watchdog hears of the writer, not of this loop: a hung disk must restart the service.
+                if self._acquisition.alive(within_s=notifier.watchdog_s or 60.0):
+                    notifier.send("WATCHDOG=1")
+                if self._parts.is_over():
+                    log.info("the replay has ended")
+                    return
+        finally:
+            notifier.send("STOPPING=1")
+            self.close()
+
+    def close(self) -> None:
+        """Stop all parts; what was captured is stored first."""
+        self._control.close()
+        self._jobs.stop()
+        self._acquisition.stop()
+        self._store.end_run(self._parts.clock.now())
+        log.info("stopped")
+
+    def _commands(self) -> Mapping[str, Handler]:
+        sessions, jobs = self._sessions, self._jobs
+        return {
+            "status": self._status,
+            "setup.new": self._setups.new_command,
+            "setup.list": self._setups.list_command,
+            "session.start": sessions.start_command,
+            "session.stop": sessions.stop_command,
+            "session.abort": sessions.abort_command,
+            "session.shoot": sessions.shoot_command,
+            "session.list": sessions.list_command,
+            "session.show": sessions.show_command,
+            "jobs.list": jobs.list_command,
+            "jobs.cancel": jobs.cancel_command,
+            "jobs.retry": jobs.retry_command,
+            "devices.configure": self._configure_devices,
+        }
+
+    def _status(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
+        acquisition = asdict(self._acquisition.status())
+        return {
+            "rig": self._parts.rig.name,
+            "mode": self._parts.mode,
+            "acquisition": acquisition,
+            "session": self._sessions.open_session(),
+            "jobs": self._jobs.unfinished(),
+            "events": self._store.rows(
+                "SELECT device, utc_ns, kind, text FROM device_events ORDER BY id DESC LIMIT 12"
+            ),
+            "store": str(self._config.store_path),
+        }
+
+    def _configure_devices(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Active set-up of CANopen devices: only when the operator says that the machine is parked."""
+        if arguments.get("machine_is_parked") is not True:
+            raise CommandError(
+                "say that the machine is parked and locked out (--machine-is-parked): set-up writes to devices"
+            )
+        links = [link for link in self._parts.can_links if link.has_setups]
+        if not links:
+            raise CommandError("no CAN link of this rig has CANopen nodes to set up")
+        try:
+            for link in links:
+                link.check_setup()  # all before any: nothing is half done
+            for link in links:
+                link.request_setup()
+        except TransmitForbiddenError as error:
+            raise CommandError(f"{error}; set-up needs allow_transmit = true and transmit_nodes", REFUSED) from error
+        except DeviceError as error:
+            raise CommandError(str(error), FAILED) from error
+        names = ", ".join(link.name for link in links)
+        return {
+            "links": names,
+            "text": f"the nodes on {names} are being set up; `rigcal status` shows what comes of it",
+        }
+
+
+def declare_channels(store: Store, rig: Rig) -> None:
+    """Tell the store which channels are the rig's joints and which are signals."""
+    joints = {joint.name: joint.unit for joint in rig.joints}
+    store.declare_channels(joints, {c.name: c.unit for c in rig.channels if c.name not in joints})
+
+
+def stop_on_signals(stop: threading.Event) -> Callable[[], None]:
+    """Set `stop` on SIGTERM and SIGINT; returns what puts the old handlers back."""
+    before = {s: signal.signal(s, lambda *_: stop.set()) for s in (signal.SIGTERM, signal.SIGINT)}
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    return restore

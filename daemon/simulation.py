@@ -1,0 +1,159 @@
+"""The simulated rig's process, and the operator's hands that a simulation needs: aiming and moving.
+
+The daemon talks to it over two pseudo-terminals exactly as to a real rig. This module only starts it, stops it, and
+does what people do at a real rig: aim the station at a prism, and drive the boom from pose to pose.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import subprocess
+import sys
+import threading
+from collections import deque
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from drivers.clock import ScaledClock
+
+BOOM_SPEED = 0.45  # of the joints' greatest rates
+POSES_AHEAD = 30  # drawn at a time, and visited by the short way
+
+
+class SimulationError(Exception):
+    """The simulated rig did not start, or refused a command."""
+
+
+class SimulatedRig:
+    """A rig simulated by another process, at the speed of a shared clock.
+
+    Args:
+        rig: shipped name or path.
+        rates: joint name -> its greatest rate, deg/s or mm/s.
+        directory: where the ports appear: `can` (an slcan adapter) and `station`.
+        clock: shared with the process; its rate is the simulation's speed.
+        seed: of the machine's imperfections, of all noise and of the poses.
+        effects: hidden effects, as the simulator spells them.
+    """
+
+    def __init__(
+        self,
+        rig: str,
+        rates: Mapping[str, float],
+        directory: Path,
+        clock: ScaledClock,
+        *,
+        seed: int = 1,
+        effects: tuple[str, ...] = (),
+    ) -> None:
+        self.can_port = directory / "can"
+        self.station_port = directory / "station"
+        self._clock = clock
+        self._seed = seed
+        self._rates = rates
+        self._events: deque[dict[str, Any]] = deque()
+        self._arrived = threading.Condition()
+        self._commands = threading.Lock()
+        origin = f"{clock.origin.utc_ns},{clock.origin.monotonic_ns},{clock.origin.boot_id}"
+        command = [sys.executable, "-m", "simulators", "--rig", rig, "--seed", str(seed), "--rate", str(clock.rate)]
+        command += ["--origin", origin, "--can-port", str(self.can_port), "--station-port", str(self.station_port)]
+        command += ["--bus-master", "host", "--signal-ms", "200", "--effects", ",".join(effects)]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self._reader = threading.Thread(target=self._read, name="simulation", daemon=True)
+        self._reader.start()
+        self._stopping = threading.Event()
+        self._autopilot: threading.Thread | None = None
+        self._expect("ready")
+
+    def aim(self, target: str) -> None:
+        """Turn the station to a prism or a control point."""
+        self._do("aim", "aimed", target=target)
+
+    def move(self, pose: Mapping[str, float]) -> None:
+        """Drive the joints (deg, mm) to `pose` and wait until they stand there."""
+        self._do("move", "moving", pose=dict(pose), speed=BOOM_SPEED)
+        self._expect("arrived")
+
+    def poses(self, number: int, seed: int) -> list[dict[str, float]]:
+        """Random poses inside the joints' limits."""
+        return list(self._do("poses", "poses", n=number, seed=seed)["poses"])
+
+    def drive_around(self, dwell_s: float) -> None:
+        """Keep moving from one random pose to the next, standing `dwell_s` at each, until closed."""
+        self._autopilot = threading.Thread(target=self._drive, args=(dwell_s,), name="autopilot", daemon=True)
+        self._autopilot.start()
+
+    def close(self) -> None:
+        """End the process."""
+        self._stopping.set()
+        if self._process.stdin is not None and not self._process.stdin.closed:
+            self._process.stdin.close()
+        try:
+            self._process.wait(timeout=10)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._reader.join(timeout=5)
+        if self._autopilot is not None:
+            self._autopilot.join(timeout=5)
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+
+    def _drive(self, dwell_s: float) -> None:
+        try:
+            here: dict[str, float] = {}
+            for seed in itertools.count(self._seed):
+                ahead = self.poses(POSES_AHEAD, seed)
+                while ahead:
+                    here = min(ahead, key=partial(self._way, here))
+                    ahead.remove(here)
+                    self.move(here)
+                    if self._clock.wait(self._stopping, dwell_s):
+                        return
+        except SimulationError:
+            if not self._stopping.is_set():
+                raise
+
+    def _way(self, here: Mapping[str, float], there: Mapping[str, float]) -> float:
+        """How long the slowest joint takes from one pose to another, in units of the boom's speed."""
+        return max((abs(there[name] - here[name]) / self._rates[name] for name in here), default=0.0)
+
+    def _do(self, what: str, answer: str, **arguments: Any) -> dict[str, Any]:
+        with self._commands:
+            try:
+                assert self._process.stdin is not None
+                self._process.stdin.write(json.dumps({"do": what, **arguments}) + "\n")
+                self._process.stdin.flush()
+            except (OSError, ValueError) as error:
+                raise SimulationError(f"the simulated rig has ended: {error}") from error
+            return self._expect(answer, "error")
+
+    def _expect(self, *wanted: str, timeout_s: float = 60.0) -> dict[str, Any]:
+        """The next event of the process that is one of `wanted`; other events keep their order."""
+
+        def found() -> dict[str, Any] | None:
+            return next((e for e in self._events if e["event"] in {*wanted, "ended"}), None)
+
+        with self._arrived:
+            if not self._arrived.wait_for(lambda: found() is not None, timeout_s):
+                raise SimulationError(f"the simulated rig did not say {wanted[0]!r} within {timeout_s:g} s")
+            answer = found()
+            assert answer is not None
+            if answer["event"] != "ended":
+                self._events.remove(answer)
+        if answer["event"] != wanted[0]:
+            raise SimulationError(f"the simulated rig: {answer.get('text', 'the process has ended')}")
+        return answer
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            with self._arrived:
+                self._events.append(json.loads(line))
+                self._arrived.notify_all()
+        with self._arrived:
+            self._events.append({"event": "ended"})
+            self._arrived.notify_all()
