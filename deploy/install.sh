@@ -1,0 +1,73 @@
+#!/bin/sh
+# Installs rigcal as a service on a rig's computer, or upgrades it. Run as root, from a checkout; run it again at will.
+#
+#   deploy/install.sh               the program in /opt/rigcal/venv, its user, the service (neither enabled nor started)
+#   DESTDIR=DIR deploy/install.sh   only the files, under DIR: what a package would hold besides the program
+#
+# Files that a site edits (/etc/rigcal/rigcal.toml, the udev rule, the CAN interface) are never overwritten.
+set -eu
+umask 022
+
+here=$(CDPATH='' cd -- "$(dirname -- "$0")" && pwd)
+DESTDIR=${DESTDIR:-}
+
+die() {
+    echo "rigcal installation: $*" >&2
+    exit 1
+}
+
+place() { install -D -m 0644 "$here/$1" "$DESTDIR$2"; }
+
+place_once() {
+    if [ -e "$DESTDIR$2" ]; then
+        echo "kept $DESTDIR$2"
+    else
+        place "$1" "$2"
+    fi
+}
+
+place_files() {
+    place rigcal.service /etc/systemd/system/rigcal.service
+    place rigcal.sysusers /etc/sysusers.d/rigcal.conf
+    place rigcal.modules-load /etc/modules-load.d/rigcal.conf
+    place rigcal.sysctl /etc/sysctl.d/60-rigcal.conf
+    place_once rigcal.toml /etc/rigcal/rigcal.toml
+    place_once 99-rigcal-station.rules /etc/udev/rules.d/99-rigcal-station.rules
+    place_once 80-can0.network /etc/systemd/network/80-can0.network
+}
+
+if [ -n "$DESTDIR" ]; then
+    place_files
+    exit
+fi
+
+[ "$(id -u)" = 0 ] || die "this changes /opt, /etc and the list of users; run it as root"
+command -v systemctl >/dev/null || die "systemd is not installed here; rigcal's service needs it"
+booted=''
+[ ! -d /run/systemd/system ] || booted=yes # sd_booted(3): false in a chroot or an image being built
+
+# Packages are not changed under a running daemon; it is started again whatever becomes of the installation.
+if [ -n "$booted" ] && systemctl --quiet is-active rigcal.service; then
+    echo "Stopping rigcal.service for the upgrade"
+    trap 'systemctl start rigcal.service' EXIT
+    systemctl stop rigcal.service
+fi
+
+"$here/bootstrap.sh" /opt/rigcal/venv "$here/../requirements.lock"
+ln -sfn /opt/rigcal/venv/bin/rigcal /usr/local/bin/rigcal
+place_files
+systemd-sysusers rigcal.conf
+if [ -n "$booted" ]; then
+    systemctl daemon-reload
+    systemctl restart systemd-modules-load.service systemd-sysctl.service
+    udevadm control --reload
+    udevadm trigger --subsystem-match=tty
+fi
+
+cat <<'NEXT'
+rigcal is installed. Then, in this order (deploy/README.md says more):
+  1. edit /etc/rigcal/rigcal.toml and check it:    rigcal config check /etc/rigcal/rigcal.toml
+  2. edit /etc/udev/rules.d/99-rigcal-station.rules: the serial number of the station's adapter
+  3. edit /etc/systemd/network/80-can0.network: the bus's bit rate;   systemctl enable --now systemd-networkd
+  4. systemctl enable --now rigcal
+NEXT
