@@ -19,7 +19,7 @@ class _Channel(BaseModel):
         timeout_s: silent for longer than this is a gap.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
     link: str = "boom"

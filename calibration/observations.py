@@ -22,6 +22,8 @@ POSITION_COLUMNS = ("x_mm", "y_mm", "z_mm")
 SIGMA_COLUMNS = ("sigma_x_mm", "sigma_y_mm", "sigma_z_mm")
 LABEL_COLUMNS = ("setup", "session", "pose")
 DIRECTIONS = (-1.0, 0.0, 1.0)
+_MOST_DEG = 36_000.0  # a hundred turns
+_MOST_MM = 1e7  # 10 km
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _NO_NUMBERS = {"nan", "na", "n/a", "null", "none", "inf", "-inf", "+inf", "infinity", "-"}
 _SIGNAL = re.compile(r"[A-Za-z][A-Za-z0-9_]*_(bar|mA)")
@@ -224,6 +226,27 @@ def _build(table: _Table, header: list[str], rig: Rig, positions_required: bool)
     sigma_mm = triple(SIGMA_COLUMNS, required=False)
     for i, name in enumerate(SIGMA_COLUMNS):
         table.check(name, sigma_mm[:, i], sigma_mm[:, i] <= 0, "is not a standard deviation; it must be positive")
+    joints = {j.name: table.numbers(j.column, required=True) for j in rig.joints}
+    for joint in rig.joints:
+        limit = _MOST_DEG if joint.kind == "revolute" else _MOST_MM
+        values = joints[joint.name]
+        table.check(
+            joint.column, values, np.abs(values) > limit, f"is beyond what a joint can read ({limit:g} {joint.unit})"
+        )
+    position_mm = triple(POSITION_COLUMNS, required=positions_required)
+    for i, name in enumerate(POSITION_COLUMNS):
+        table.check(
+            name,
+            position_mm[:, i],
+            np.abs(position_mm[:, i]) > _MOST_MM,
+            f"is beyond a station's reach ({_MOST_MM:g} mm)",
+        )
+        table.check(
+            SIGMA_COLUMNS[i],
+            sigma_mm[:, i],
+            sigma_mm[:, i] > _MOST_MM,
+            f"is no standard deviation of a fix ({_MOST_MM:g} mm)",
+        )
     known = optional_columns(rig)
     extra_names = [c for c in header if c in known or (_SIGNAL.fullmatch(c) and c not in SIGMA_COLUMNS)]
     extra = {name: table.numbers(name, required=False) for name in extra_names}
@@ -234,8 +257,8 @@ def _build(table: _Table, header: list[str], rig: Rig, positions_required: bool)
     used = {"prism", *(j.column for j in rig.joints), *POSITION_COLUMNS, *SIGMA_COLUMNS, *LABEL_COLUMNS, *extra_names}
     return Observations(
         prism=prism,
-        joints={j.name: table.numbers(j.column, required=True) for j in rig.joints},
-        position_mm=triple(POSITION_COLUMNS, required=positions_required),
+        joints=joints,
+        position_mm=position_mm,
         sigma_mm=sigma_mm,
         setup=table.labels("setup"),
         session=table.labels("session"),

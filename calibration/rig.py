@@ -23,7 +23,7 @@ Convention = Literal["mdh_beta_after", "mdh_beta_before", "dh"]
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Joint(_Part):
@@ -256,7 +256,7 @@ def parse_rig(text: str, source: str) -> Rig:
     """
     try:
         return Rig.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise RigError(source, "", f"not valid TOML: {error}") from error
     except ValidationError as error:
         first = error.errors()[0]

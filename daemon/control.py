@@ -61,7 +61,7 @@ class ControlServer:
             self._socket.close()
             raise CommandError(f"the control socket {path} cannot be made: {error.strerror}", FAILED) from error
         os.chmod(path, 0o660)
-        self._socket.listen(16)
+        self._socket.listen(128)
         self._acceptor = threading.Thread(target=self._accept, name="control", daemon=True)
         self._acceptor.start()
 

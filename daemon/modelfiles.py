@@ -131,6 +131,8 @@ def _listed(directory: Path) -> list[str]:
 
 def _read(directory: Path, name: str) -> bytes | None:
     path = directory / name
+    if path.exists() and not path.is_file():
+        raise ModelError(f"{directory}: {name} is not a regular file; this is not a model")
     try:
         with path.open("rb") as file:
             data = file.read(_FILE_MAX_BYTES + 1)

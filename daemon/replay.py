@@ -11,7 +11,7 @@ from pathlib import Path
 from daemon.config import Config, ConfigError
 from daemon.store.reader import Reader
 from drivers.canlog import read_can_log
-from drivers.clock import Stamp
+from drivers.clock import NS_PER_S, Stamp
 from drivers.errors import DescriptionError
 from drivers.readings import Capture
 from drivers.seriallog import read_serial_log
@@ -19,6 +19,7 @@ from drivers.seriallog import read_serial_log
 CAN_SUFFIXES = (".log", ".asc", ".blf")
 SERIAL_SUFFIX = ".serial"
 BOOT_ID = "replayed"
+LATEST_UTC_NS = 4_102_444_800 * NS_PER_S  # the year 2100
 
 
 def captures_of(path: Path, config: Config) -> Iterator[Capture]:
@@ -52,6 +53,8 @@ def captures_of(path: Path, config: Config) -> Iterator[Capture]:
         link = known.get(capture.link, only)
         if link is None:
             raise ConfigError(f"{path}: link {capture.link!r} is not configured as {what}; known: {', '.join(known)}")
+        if not 0 <= capture.stamp.utc_ns < LATEST_UTC_NS:
+            raise DescriptionError(str(path), f"a capture at {capture.stamp.utc_ns / NS_PER_S:.0f} s is beyond 2100")
         latest_ns = max(latest_ns, capture.stamp.utc_ns)
         yield replace(capture, link=link, stamp=Stamp(capture.stamp.utc_ns, latest_ns, BOOT_ID))
 

@@ -365,7 +365,9 @@ class SessionKeeper:
         if not rows:
             return None
         session = _OpenSession(rows[0]["id"], rows[0]["setup_id"], rows[0]["prism"], rows[0]["kind"])
-        log.warning("session %s was open when rigcal last ended; it goes on", session.id)
+        log.warning("session %s (prism %s) was open when rigcal last ended; it goes on", session.id, session.prism)
+        if self._aim is not None:
+            self._aim(session.prism)  # what aims may have forgotten; an operator's station has kept its lock
         self._control_points = self._setups.control_points(session.setup_id)
         self._jumped = self._earlier_jumps(session.id)
         return session

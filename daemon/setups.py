@@ -18,6 +18,8 @@ from drivers.readings import Fix
 log = logging.getLogger(__name__)
 
 Place = tuple[float, float, float]
+MOST_CONSTANT_MM = 500.0
+MOST_TEXT = 500
 AXES = ("x_mm", "y_mm", "z_mm")
 
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -41,21 +43,23 @@ class SetupBook:
         setup_id = identifier(arguments, "id", "a set-up's id")
         if self._store.rows("SELECT id FROM station_setups WHERE id = ?", (setup_id,)):
             raise CommandError(f"set-up {setup_id!r} exists already; a station that was moved is a new set-up")
-        constants = arguments.get("prism_constants_mm", {})
+        constants = _mapping(arguments, "prism_constants_mm")
+        for prism in constants:
+            _finite(constants, prism, limit=MOST_CONSTANT_MM)
         unknown = sorted(set(constants) - set(self._rig.prism_names))
         if unknown:
             raise CommandError(
                 f"rig {self._rig.name!r} has no prism {unknown[0]!r}; it has {', '.join(self._rig.prism_names)}"
             )
-        points = {str(n): _place(n, place) for n, place in arguments.get("control_points", {}).items()}
+        points = {str(n): _place(n, place) for n, place in _mapping(arguments, "control_points").items()}
         row = {
             "id": setup_id,
-            "instrument": str(arguments.get("instrument", "")),
-            "serial": str(arguments.get("serial", "")),
+            "instrument": _text(arguments, "instrument"),
+            "serial": _text(arguments, "serial"),
             "tilt_arcsec": _finite(arguments, "tilt_arcsec"),
             "ppm": _finite(arguments, "ppm"),
             "prism_constants_json": constants,
-            "note": str(arguments.get("note", "")),
+            "note": _text(arguments, "note"),
             "state": "ok",
             **self._store.instant(self._clock.now(), "created_"),
         }
@@ -174,16 +178,31 @@ class SetupBook:
 
 def identifier(arguments: Mapping[str, Any], key: str, what: str, default: str = "") -> str:
     """The name that `arguments` gives under `key`; CommandError if it is none."""
-    name = str(arguments.get(key) or default)
-    if not _ID.fullmatch(name):
-        raise CommandError(f"{what} is 1 to 64 letters, digits, '.', '_' or '-', not {name!r}")
+    name = arguments.get(key) or default
+    if not isinstance(name, str) or not _ID.fullmatch(name):
+        raise CommandError(f"{what} is 1 to 64 letters, digits, '.', '_' or '-', not {name!r:.80}")
     return name
 
 
-def _finite(arguments: Mapping[str, Any], key: str) -> float | None:
+def _mapping(arguments: Mapping[str, Any], key: str) -> dict[str, Any]:
+    value = arguments.get(key, {})
+    if not isinstance(value, dict):
+        raise CommandError(f"{key} must be an object, not {value!r:.80}")
+    return value
+
+
+def _text(arguments: Mapping[str, Any], key: str) -> str:
+    value = arguments.get(key, "")
+    if not isinstance(value, str) or len(value) > MOST_TEXT or not value.isprintable():
+        raise CommandError(f"{key} must be a text of at most {MOST_TEXT} printable characters, not {value!r:.80}")
+    return value
+
+
+def _finite(arguments: Mapping[str, Any], key: str, limit: float = 1e6) -> float | None:
     value = arguments.get(key)
-    if value is not None and not (isinstance(value, int | float) and math.isfinite(value)):
-        raise CommandError(f"{key} must be a finite number, not {value!r}")
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if value is not None and not (is_number and abs(value) <= limit):
+        raise CommandError(f"{key} must be a finite number of at most {limit:g}, not {value!r:.80}")
     return value
 
 
@@ -191,7 +210,7 @@ def _place(name: object, place: object) -> dict[str, float]:
     if not _ID.fullmatch(str(name)):
         raise CommandError(f"a control point's name is 1 to 64 letters, digits, '.', '_' or '-', not {name!r}")
     if isinstance(place, list | tuple) and len(place) == len(AXES):
-        axes = {axis: _finite({axis: value}, axis) for axis, value in zip(AXES, place, strict=True)}
+        axes = {axis: _finite({axis: value}, axis, limit=1e7) for axis, value in zip(AXES, place, strict=True)}
         given = {axis: value for axis, value in axes.items() if value is not None}
         if len(given) == len(AXES):
             return given

@@ -183,6 +183,8 @@ def predict(directory: Path, data: Path, out: Path | None, *, as_json: bool) -> 
     prepare()
     from daemon.modelfiles import read_model
 
+    if out is not None and out.exists() and out.samefile(data):
+        raise click.UsageError(f"{out} is the data itself; name another file with --out")
     model = read_model(directory)
     observations, raw = read_observations(data, model.rig, positions_required=False)
     table = with_predictions(raw, model.predict(observations))

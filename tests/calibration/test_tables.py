@@ -49,6 +49,11 @@ def test_optional_columns_are_kept_and_strange_ones_are_listed() -> None:
         (f"{HEADER}\n{ROW.replace('300', 'x')}\n", "line 2, column z_mm: 'x' is not a finite number; write it as"),
         (f"{HEADER}\n{ROW.replace('300', '1_000')}\n", "'1_000' is not a finite number; write it as 1234.5"),
         (f"{HEADER}\n{ROW.replace('300', '１２')}\n", "'１２' is not a finite number"),  # noqa: RUF001
+        (f"{HEADER}\n{ROW.replace('300', '1e300')}\n", "line 2, column z_mm: 1e.300 is beyond a station's reach"),
+        (
+            f"{HEADER}\n{ROW.replace('tmac,1,', 'tmac,1e300,')}\n",
+            "column q1_deg: 1e.300 is beyond what a joint can read",
+        ),
         (f"{HEADER}\n{ROW.replace('300', '1e999')}\n", "is beyond what a number can be"),
         (f"{HEADER}\n{ROW.replace(',6,', ',,')}\n", "line 2, column q6_deg: empty"),
         (f"{HEADER}\n{ROW.replace('tmac', 'nose')}\n", "line 2, column prism"),

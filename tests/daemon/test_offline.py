@@ -230,3 +230,22 @@ def test_every_command_explains_itself(command: str) -> None:
     assert result.exit_code == 0
     assert "--data" in result.stdout
     assert "--json" in result.stdout
+
+
+def test_an_output_that_is_a_device_a_pipe_or_the_data_itself_is_refused(work: Path, tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    data = tmp_path / "data.csv"
+    data.write_bytes((work / "test.csv").read_bytes())
+    for out in (pipe, data):
+        refused = run("predict", "--model", work / "model", "--data", data, "--out", out)
+        assert refused.exit_code in {1, 2}
+        assert str(out) in refused.stderr
+    assert pipe.is_fifo()
+    assert data.read_bytes() == (work / "test.csv").read_bytes()
+    link, target = tmp_path / "link.csv", tmp_path / "target.csv"
+    target.write_text("old", encoding="utf-8")
+    link.symlink_to(target)
+    assert run("predict", "--model", work / "model", "--data", data, "--out", link).exit_code == 0
+    assert link.is_symlink()
+    assert target.read_text(encoding="utf-8").startswith("prism,")

@@ -273,6 +273,8 @@ def test_where_something_can_aim_it_is_told_to(rig: Rig) -> None:
     start(rig)
     rig.shoot("cp1", (9000.0, 500.0, 2000.0))
     assert rig.aimed == ["r", "cp1", "r"]
+    rig.new_keeper(aim=rig.aimed.append)
+    assert rig.aimed == ["r", "cp1", "r", "r"], "a session that goes on after a restart is aimed for again"
 
 
 def test_the_operator_is_told_what_is_still_to_be_done(rig: Rig) -> None:
@@ -343,6 +345,15 @@ def test_numbers_of_a_setup_must_be_numbers(rig: Rig) -> None:
         rig.say("setup_new", id="S1", tilt_arcsec=math.nan)
     with pytest.raises(CommandError, match="give three coordinates in mm"):
         rig.say("setup_new", id="S1", control_points={"cp1": [1.0, 2.0]})
+    for bad in ("abc", math.nan, [1], 1e300, True):
+        with pytest.raises(CommandError, match="r must be a finite number"):
+            rig.say("setup_new", id="S1", prism_constants_mm={"r": bad})
+    with pytest.raises(CommandError, match="prism_constants_mm must be an object"):
+        rig.say("setup_new", id="S1", prism_constants_mm=[])
+    with pytest.raises(CommandError, match="note must be a text of at most 500"):
+        rig.say("setup_new", id="S1", note="x" * 100_000)
+    with pytest.raises(CommandError, match="a set-up's id is 1 to 64 letters"):
+        rig.say("setup_new", id=10**30)
     assert rig.say("setup_list") == []
 
 
