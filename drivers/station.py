@@ -41,7 +41,7 @@ __all__ = ["StationConfig", "StationDecoder", "StationLink", "position_mm"]
 _LONGEST_READ_S = 0.5  # how soon a loop with nothing to do notices that it is to stop
 _LONGEST_WRITE_S = 5.0
 _SET_PAUSE_S = 0.7  # SET600: the next command comes this long after ACK or NAK
-_UNFINISHED_S = 2.0  # an unfinished record is given up after this; the slowest takes 0.6 s at 1200 baud
+_UNFINISHED_NS = 2 * NS_PER_S  # an unfinished record is given up after this; the slowest takes 0.6 s at 1200 baud
 _FIRST_RETRY_S = 0.5
 _LAST_RETRY_S = 10.0
 
@@ -263,7 +263,9 @@ class StationDecoder:
 
     def tick(self, now: Stamp) -> list[Record]:
         records: list[Record] = []
-        if self._last_byte is not None and now.since(self._last_byte) > _UNFINISHED_S * NS_PER_S:
+        if self._last_byte is not None and now.since(self._last_byte) > _UNFINISHED_NS:
+            # In the order of their deadlines, so that it does not matter how often time is told.
+            records += self._silence.tick(self._last_byte.shifted(_UNFINISHED_NS))
             for garbage in self._framer.flush("record broken off"):
                 records += self._failure(garbage)
             self._last_byte = None

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -438,6 +438,7 @@ records_of_all_kinds = st.one_of(
 )
 
 
+@example([(0.0, b"\x00", False), (4.0, b"\x00", False), (4.0, b"\x00", False)], "topcon_gts8")
 @given(
     st.lists(st.tuples(st.floats(0, 20), records_of_all_kinds, st.booleans()), max_size=30),
     st.sampled_from(["topcon_gts8", "topcon_classic", "sokkia_set", "passive"]),
