@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 from pathlib import Path
 
@@ -70,6 +71,10 @@ class DbcFile:
         signals: dict[str, Signal] = {item.name: item for item in found.signals}
         wanted = self._signal(signals, message, signal)
         is_extended = bool(found.is_extended_frame)
+        if not (math.isfinite(wanted.scale) and wanted.scale != 0 and math.isfinite(wanted.offset)):
+            raise DescriptionError(
+                self._where, f"signal {signal!r}: factor {wanted.scale} and offset {wanted.offset} make no value"
+            )
         declared = SignalChannel(
             name=name,
             unit=unit,

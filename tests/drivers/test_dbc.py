@@ -202,3 +202,12 @@ def test_a_file_that_refers_to_nothing_is_refused(tmp_path: Path, line: str, rea
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(DescriptionError, match=r"none\.dbc: cannot be read: No such file"):
         DbcFile(tmp_path / "none.dbc")
+
+
+@pytest.mark.parametrize("numbers", ["(0,0)", "(1e400,0)", "(1,1e400)"])
+def test_a_factor_that_makes_no_value_is_refused(tmp_path: Path, numbers: str) -> None:
+    text = DBC.read_text(encoding="cp1252").replace(
+        "SG_ P_Pump_bar : 0|16@1+ (0.1,0)", f"SG_ P_Pump_bar : 0|16@1+ {numbers}"
+    )
+    with pytest.raises(DescriptionError, match=r"signal 'P_Pump_bar': factor .* make no value"):
+        DbcFile(written(tmp_path, text)).channel("pump", "bar", "Pressure1", "P_Pump_bar")
