@@ -11,7 +11,7 @@ from calibration.rig import Rig
 from drivers.can_channel import ChannelDecoder
 from drivers.canopen_setup import PROFILE_ANALOGUE, PROFILE_ENCODER, NodeSetup
 from drivers.cia404 import AnalogueChannel, AnalogueDecoder
-from drivers.cia406 import EncoderChannel, EncoderDecoder, LinearChannel, LinearDecoder
+from drivers.cia406 import JUMP_MARGIN_S, EncoderChannel, EncoderDecoder, LinearChannel, LinearDecoder
 from drivers.dbc import DbcFile
 from drivers.errors import DescriptionError
 from drivers.pdo import TransmitPdo
@@ -19,8 +19,6 @@ from drivers.raw_signal import BitField, SignalChannel, SignalDecoder
 
 # What the devices map to their TPDO1 by default (the rig file names an EDS for others): index, sub-index, bits.
 _USUAL_MAPPING = {"6004": 0x60040020, "6020": 0x60200120, "6130": 0x61300120, "7130": 0x71300110, "9130": 0x91300120}
-
-JUMP_MARGIN_S = 0.25  # how far apart in time the samples of a moving joint may be from what their stamps say
 
 CanopenChannel = Cia406Encoder | Cia406Linear | Cia404Analogue
 

@@ -47,6 +47,9 @@ def _bit_words(bits: int, names: dict[int, str]) -> str:
     return ", ".join(words) or "none"
 
 
+JUMP_MARGIN_S = 0.25  # how far apart in time the samples of a moving joint may be from what their stamps say
+
+
 @dataclass(frozen=True, kw_only=True)
 class PositionChannel(PdoChannel):
     """What encoders and linear transducers have in common.
@@ -63,7 +66,7 @@ class PositionChannel(PdoChannel):
     sign: Literal[-1, 1] = 1
     zero_counts: int = 0
     max_rate_per_s: float | None = None
-    jump_margin_s: float = 0.25
+    jump_margin_s: float = JUMP_MARGIN_S
     speed_step_per_s: float | None = None
 
 
