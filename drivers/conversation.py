@@ -10,11 +10,12 @@ to send next, and goes on for ever: an instrument that is switched off is asked 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Protocol
 
+from drivers.bytestream import Framer, Garbage
 from drivers.clock import NS_PER_S
 from drivers.readings import EventKind
 
@@ -40,6 +41,31 @@ class Dialect(Protocol):
 
     def abandon(self) -> bool:
         """Drop an answer that stopped half-way; True when there was one."""
+
+
+class FramedDialect:
+    """The hearing half of a dialect whose answers a framer takes apart.
+
+    Args:
+        framer: of the family; this dialect's alone.
+        meaning: what the data of one frame says.
+        shortest: garbage of at least so many bytes was an answer once.
+    """
+
+    def __init__(self, framer: Framer, meaning: Callable[[bytes], Heard], shortest: int) -> None:
+        self._framer, self._meaning, self._shortest = framer, meaning, shortest
+
+    def hear(self, data: bytes) -> list[Heard]:
+        heard: list[Heard] = []
+        for item in self._framer.feed(data):
+            if not isinstance(item, Garbage):
+                heard.append(self._meaning(item.data))
+            elif len(item.raw) >= self._shortest:
+                heard.append(Heard.BROKEN)
+        return heard
+
+    def abandon(self) -> bool:
+        return any(len(garbage.raw) >= self._shortest for garbage in self._framer.flush("broken off"))
 
 
 @dataclass(frozen=True, slots=True)

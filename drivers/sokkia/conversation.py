@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from drivers.bytestream import Garbage
 from drivers.clock import Stamp
-from drivers.conversation import Conversation, Heard, Script, Timing
+from drivers.conversation import Conversation, FramedDialect, Heard, Script, Timing
 from drivers.sokkia.set import ACK, CR, LF, NAK, REQUEST_DISTANCE, STOP, SetFramer, parse_identity, parse_reply
 from drivers.survey import RecordError
 
@@ -14,7 +13,7 @@ _SHORTEST_REPLY = 14  # E100 E100 E100
 _ANY_TIME = Stamp(0, 0, "")
 
 
-class SetDialect:
+class SetDialect(FramedDialect):
     """Lines (`drivers.conversation.Dialect`).
 
     Args:
@@ -23,22 +22,10 @@ class SetDialect:
 
     def __init__(self, crlf: bool) -> None:
         self._end = CR + LF if crlf else CR
-        self._framer = SetFramer()
+        super().__init__(SetFramer(), _meaning, _SHORTEST_REPLY)
 
     def encode(self, command: bytes) -> bytes:
         return command + self._end
-
-    def hear(self, data: bytes) -> list[Heard]:
-        heard: list[Heard] = []
-        for item in self._framer.feed(data):
-            if not isinstance(item, Garbage):
-                heard.append(_meaning(item.data))
-            elif len(item.raw) >= _SHORTEST_REPLY:
-                heard.append(Heard.BROKEN)
-        return heard
-
-    def abandon(self) -> bool:
-        return any(len(garbage.raw) >= _SHORTEST_REPLY for garbage in self._framer.flush("broken off"))
 
 
 def _meaning(data: bytes) -> Heard:

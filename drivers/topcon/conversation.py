@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from drivers.bytestream import Garbage
 from drivers.clock import Stamp
-from drivers.conversation import Conversation, Heard, Script, Timing
+from drivers.conversation import Conversation, FramedDialect, Heard, Script, Timing
 from drivers.readings import LockState, Status
 from drivers.survey import RecordError
 from drivers.topcon.codec import ACK, NAK, GtsFramer, encode_frame
@@ -20,7 +19,7 @@ _SHORTEST_RECORD = 20  # `<` has 25 characters; an acknowledgement has 4 or 5
 _ANY_TIME = Stamp(0, 0, "")  # the conversation looks at what records say, not at when
 
 
-class GtsDialect:
+class GtsDialect(FramedDialect):
     """Frames with BCC and ETX (`drivers.conversation.Dialect`).
 
     Args:
@@ -29,22 +28,10 @@ class GtsDialect:
 
     def __init__(self, crlf: bool) -> None:
         self._crlf = crlf
-        self._framer = GtsFramer()
+        super().__init__(GtsFramer(), _meaning, _SHORTEST_RECORD)
 
     def encode(self, command: bytes) -> bytes:
         return encode_frame(command, self._crlf)
-
-    def hear(self, data: bytes) -> list[Heard]:
-        heard: list[Heard] = []
-        for item in self._framer.feed(data):
-            if not isinstance(item, Garbage):
-                heard.append(_meaning(item.data))
-            elif len(item.raw) >= _SHORTEST_RECORD:
-                heard.append(Heard.BROKEN)
-        return heard
-
-    def abandon(self) -> bool:
-        return any(len(garbage.raw) >= _SHORTEST_RECORD for garbage in self._framer.flush("broken off"))
 
 
 def _meaning(data: bytes) -> Heard:
