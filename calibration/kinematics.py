@@ -137,6 +137,10 @@ class Linearisation(NamedTuple):
     joint_jacobian: Floats
 
 
+# Axes of a frame and its origin: arrays (3, m).
+_Frame = tuple[list[Floats], Floats]
+
+
 class _Visited(NamedTuple):
     op: Op
     axis: Floats  # (3, m) in the station's frame
@@ -152,7 +156,7 @@ class Chain:
 
     Attributes:
         parameters: every identifiable constant; the vector `x` of all methods has their order.
-        arm: elementary transforms of all rows; row i ends before `frame_ends[i]` (`frame_ends[0]` is 0).
+        row_ops: per row its elementary transforms.
         prism_ops: per prism its three offset translations.
     """
 
@@ -161,11 +165,9 @@ class Chain:
         self.placements = dict(placements)
         self.setups = tuple(placements)
         self._parameters: list[Parameter] = []
-        self.arm: list[Op] = []
-        self.frame_ends = [0]
-        for number, row in enumerate(rig.rows, 1):
-            self.arm += [op for op in self._row_ops(number, row) if not op.is_identity]
-            self.frame_ends.append(len(self.arm))
+        self.row_ops = [
+            [op for op in self._row_ops(number, row) if not op.is_identity] for number, row in enumerate(rig.rows, 1)
+        ]
         self.prism_ops = [self._prism_ops(name) for name in rig.prism_names]
         self.base_start = len(self._parameters)
         for setup in self.setups:
@@ -234,9 +236,13 @@ class Chain:
             for axis, offset in enumerate(prism.offset_mm)
         ]
 
+    def frame_chain(self, frame: int) -> list[Op]:
+        """The transforms from the base to the frame after a row (0: the base itself)."""
+        return [op for number in self.rig.path(frame) for op in self.row_ops[number - 1]]
+
     def prism_chain(self, prism: int) -> list[Op]:
         """The transforms from the base to a prism."""
-        return self.arm[: self.frame_ends[self.rig.prisms[prism].frame]] + self.prism_ops[prism]
+        return self.frame_chain(self.rig.prisms[prism].frame) + self.prism_ops[prism]
 
     # -- binding ------------------------------------------------------------------------------------------------
 
@@ -299,12 +305,12 @@ class Chain:
     def frames_mm(self, x: Floats, data: ChainData) -> Floats:
         """(n, rows, 3) origins of the frames after each row, in the base frame."""
         origins = np.empty((len(data), len(self.rig.rows), 3))
-        walk = self._walk(x, data, None, self.arm)
-        position, seen = next(walk)[1], 0
-        for frame, end in enumerate(self.frame_ends[1:]):
-            while seen < end:
-                position, seen = next(walk)[1], seen + 1
-            origins[:, frame] = position.T
+        ends = [self._start(x, data, None)]
+        for number, ops in enumerate(self.row_ops, 1):
+            before = ends[self.rig.path(number)[-2] if len(self.rig.path(number)) > 1 else 0]
+            *_, end = self._walk(x, data.readings, ops, before)
+            ends.append(end)
+            origins[:, number - 1] = end[1].T
         return origins
 
     def _base_jacobian(self, x: Floats, data: ChainData, rows: Integers, point: Floats, jacobian: Floats) -> None:
@@ -321,7 +327,7 @@ class Chain:
                 rotation = rotation @ rotation_about(axis, float(x[index.start + offset]))
 
     def _visit(self, x: Floats, data: ChainData, rows: Integers, ops: Sequence[Op], visited: list[_Visited]) -> Floats:
-        walk = self._walk(x, data, rows, ops)
+        walk = self._walk(x, data.readings[rows], ops, self._start(x, data, rows))
         columns, origin = next(walk)
         for op in ops:
             if op.parameter >= 0 or op.drive:
@@ -329,25 +335,20 @@ class Chain:
             columns, origin = next(walk)
         return origin
 
-    def _walk(
-        self, x: Floats, data: ChainData, rows: Integers | None, ops: Iterable[Op]
-    ) -> Iterator[tuple[list[Floats], Floats]]:
-        """Yield (axes of the frame, its origin) before the first and after each transform: arrays (3, m).
-
-        `rows` None starts in the base frame instead of the station's.
-        """
+    def _start(self, x: Floats, data: ChainData, rows: Integers | None) -> _Frame:
+        """The base in the station's frame for the given rows; for `rows` None the base frame itself, for all."""
         if rows is None:
-            readings = data.readings
-            columns = [np.tile(np.eye(3)[:, [axis]], len(data)) for axis in (X, Y, Z)]
-            origin = np.zeros((3, len(data)))
-        else:
-            readings = data.readings[rows]
-            setup = data.setup[rows]
-            bases = [self.base(x, s) for s in range(len(self.setups))]
-            rotation = np.array([b.rotation for b in bases])
-            columns = [np.ascontiguousarray(rotation[:, :, axis][setup].T) for axis in (X, Y, Z)]
-            origin = np.ascontiguousarray(np.array([b.translation_mm for b in bases])[setup].T)
-        yield columns, origin
+            return [np.tile(np.eye(3)[:, [axis]], len(data)) for axis in (X, Y, Z)], np.zeros((3, len(data)))
+        setup = data.setup[rows]
+        bases = [self.base(x, s) for s in range(len(self.setups))]
+        rotation = np.array([b.rotation for b in bases])
+        columns = [np.ascontiguousarray(rotation[:, :, axis][setup].T) for axis in (X, Y, Z)]
+        return columns, np.ascontiguousarray(np.array([b.translation_mm for b in bases])[setup].T)
+
+    def _walk(self, x: Floats, readings: Floats, ops: Iterable[Op], start: _Frame) -> Iterator[_Frame]:
+        """Yield the frame before the first and after each transform."""
+        columns, origin = start
+        yield start
         for op in ops:
             deviation = x[op.parameter] if op.parameter >= 0 else 0.0
             size = op.driven(readings) + deviation if op.drive else op.constant + deviation

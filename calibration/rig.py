@@ -88,6 +88,7 @@ class Row(_Part):
         drive: for `theta`, `d` or `a`: which joints move it, as a linear combination {joint: coefficient}.
         identify: which of the row's constants calibration may correct.
         before: a fixed transform between the previous frame and this row.
+        after: the frame that this row continues from, where it is not the one before it: rows may branch as a tree.
     """
 
     alpha_deg: float = 0.0
@@ -99,6 +100,7 @@ class Row(_Part):
     drive: dict[Driven, dict[str, float]] = Field(default_factory=dict)
     identify: tuple[RowParameter, ...] = ("alpha", "a", "d", "theta")
     before: FixedTransform | None = None
+    after: int | None = Field(default=None, ge=0)
 
 
 class Prism(_Part):
@@ -186,7 +188,7 @@ class Rig(_Part):
     station: Station = Station()
 
     @model_validator(mode="after")
-    def _parts_fit(self) -> Rig:
+    def _names_differ(self) -> Rig:
         for what, names in (
             ("joint", [j.name for j in self.joints]),
             ("prism", [p.name for p in self.prisms]),
@@ -195,27 +197,44 @@ class Rig(_Part):
             doubled = sorted({n for n in names if names.count(n) > 1})
             if doubled:
                 raise ValueError(f"two {what}s are called {doubled[0]!r}")
+        return self
+
+    @model_validator(mode="after")
+    def _joints_fit(self) -> Rig:
         driven = {name for _, _, name, _ in self.couplings()}
         known = {j.name for j in self.joints}
         if driven - known:
             raise ValueError(f"row is driven by unknown joint {sorted(driven - known)[0]!r}; joints: {sorted(known)}")
         if known - driven:
             raise ValueError(f"joint {sorted(known - driven)[0]!r} drives no row")
-        for prism in self.prisms:
-            if prism.frame > len(self.rows):
-                raise ValueError(f"prism {prism.name!r}: frame {prism.frame} is beyond the last row {len(self.rows)}")
-        for mass in self.masses:
-            if mass.frame + mass.midway > len(self.rows):
-                raise ValueError(f"mass {mass.name!r}: frame {mass.frame} is beyond the last row {len(self.rows)}")
-        for number, row in enumerate(self.rows, 1):
-            unused = {"mdh_beta_before": set(), "mdh_beta_after": {"b"}, "dh": {"beta", "b"}}[self.convention]
-            wrong = unused & ({*row.identify} | ({"b"} if row.b_mm else set()) | ({"beta"} if row.beta_deg else set()))
-            if wrong:
-                raise ValueError(f"row {number}: convention {self.convention!r} has no {sorted(wrong)[0]}")
         for channel in self.channels:
             joint = next((j for j in self.joints if j.name == channel.name), None)
             if joint is not None and channel.unit != joint.unit:
                 raise ValueError(f"channel {channel.name!r} is in {channel.unit}, its joint in {joint.unit}")
+        return self
+
+    @model_validator(mode="after")
+    def _rows_fit(self) -> Rig:
+        unused = {"mdh_beta_before": set(), "mdh_beta_after": {"b"}, "dh": {"beta", "b"}}[self.convention]
+        for number, row in enumerate(self.rows, 1):
+            if row.after is not None and row.after >= number:
+                raise ValueError(f"row {number}: it continues from frame {row.after}, which does not come before it")
+            wrong = unused & ({*row.identify} | ({"b"} if row.b_mm else set()) | ({"beta"} if row.beta_deg else set()))
+            if wrong:
+                raise ValueError(f"row {number}: convention {self.convention!r} has no {sorted(wrong)[0]}")
+        return self
+
+    @model_validator(mode="after")
+    def _frames_fit(self) -> Rig:
+        last = len(self.rows)
+        for prism in self.prisms:
+            if prism.frame > last:
+                raise ValueError(f"prism {prism.name!r}: frame {prism.frame} is beyond the last row {last}")
+        for mass in self.masses:
+            if mass.frame + mass.midway > last:
+                raise ValueError(f"mass {mass.name!r}: frame {mass.frame} is beyond the last row {last}")
+            if mass.midway and self.path(mass.frame + 1)[:-1] != self.path(mass.frame):
+                raise ValueError(f"mass {mass.name!r}: row {mass.frame + 1} does not continue from frame {mass.frame}")
         return self
 
     def couplings(self) -> Iterator[tuple[int, Driven, str, float]]:
@@ -224,6 +243,15 @@ class Rig(_Part):
             for driven, combination in row.drive.items():
                 for name, coefficient in combination.items():
                     yield number, driven, name, coefficient
+
+    def path(self, frame: int) -> tuple[int, ...]:
+        """Numbers of the rows between the base and a frame, the base's end first; none for frame 0."""
+        numbers: list[int] = []
+        while frame > 0:
+            numbers.append(frame)
+            after = self.rows[frame - 1].after
+            frame = frame - 1 if after is None else after
+        return tuple(reversed(numbers))
 
     def joint(self, name: str) -> Joint:
         """The joint called `name`; KeyError if there is none."""

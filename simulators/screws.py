@@ -5,7 +5,7 @@ becomes a screw in the base frame at home (all joint values zero):
 
     T_f(q) = exp(S_1 m_1) ... exp(S_k m_k) M_f,   m_i = sum over joints of coefficient * joint value
 
-with k the last motion at or before frame f. Lengths are mm, angles rad. (Lynch & Park, Modern Robotics, ch. 4)
+over the motions that carry frame f. Lengths are mm, angles rad. (Lynch & Park, Modern Robotics, ch. 4)
 """
 
 from __future__ import annotations
@@ -66,6 +66,7 @@ class Screw:
         point_mm: (3,) a point on the axis.
         weights: joint name -> coefficient of the joint's value.
         start: (4, 4) home pose of the frame in which the motion acts; its origin is where a driven length begins.
+        before: number of the motion that carries this one, from 1; 0 for none. Rows may branch.
     """
 
     row: int
@@ -74,6 +75,7 @@ class Screw:
     point_mm: Floats
     weights: Mapping[str, float]
     start: Floats
+    before: int
 
 
 @dataclass(frozen=True)
@@ -83,12 +85,19 @@ class ScrewChain:
     Attributes:
         screws: the driven motions.
         homes: (rows + 1) x (4, 4).
-        last_screw: for each frame the number of screws at or before it.
+        last_screw: for each frame the number of the last motion that carries it, from 1; 0 for none.
     """
 
     screws: tuple[Screw, ...]
     homes: tuple[Floats, ...]
     last_screw: tuple[int, ...]
+
+    def carries(self, screw: int, frame: int) -> bool:
+        """Whether motion number `screw` (from 0) moves a frame."""
+        motion = self.last_screw[frame]
+        while motion > screw + 1:
+            motion = self.screws[motion - 1].before
+        return motion == screw + 1
 
 
 def nominal_constants(rig: Rig) -> tuple[RowConstants, ...]:
@@ -150,21 +159,24 @@ def screw_chain(convention: Convention, rows: Sequence[Row], constants: Sequence
         rows: give the fixed transforms and what drives what; their constants are not used.
         constants: the machine's own, one per row.
     """
-    pose = np.eye(4)
     screws: list[Screw] = []
-    homes = [pose]
+    homes = [np.eye(4)]
     last = [0]
     for number, (row, own) in enumerate(zip(rows, constants, strict=True), 1):
+        origin = number - 1 if row.after is None else row.after
+        pose, motion = homes[origin], last[origin]
         if row.before is not None:
             pose = pose @ _fixed(row.before)
         driven: Mapping[str, Mapping[str, float]] = {str(k): v for k, v in row.drive.items()}
         for kind, axis, name in _ORDER[convention]:
             if name in driven:
                 direction = pose[:3, :3] @ _AXES[axis]
-                screws.append(Screw(number, kind == "turn", direction, pose[:3, 3].copy(), driven[name], pose.copy()))
+                point = pose[:3, 3].copy()
+                screws.append(Screw(number, kind == "turn", direction, point, driven[name], pose.copy(), motion))
+                motion = len(screws)
             pose = pose @ _elementary(kind, axis, getattr(own, name))
         homes.append(pose.copy())
-        last.append(len(screws))
+        last.append(motion)
     return ScrewChain(tuple(screws), tuple(homes), tuple(last))
 
 
@@ -174,7 +186,8 @@ class Posture:
 
     Attributes:
         chain: the machine.
-        rotations, shifts_mm: for each number k of screws the product of the first k exponentials, (n, 3, 3) and (n, 3).
+        rotations, shifts_mm: for each motion the product of its exponential and all that carry it, (n, 3, 3) and
+            (n, 3), after the identity for none.
     """
 
     chain: ScrewChain
@@ -192,7 +205,7 @@ class Posture:
     def axis(self, screw: int) -> tuple[Floats, Floats]:
         """(n, 3) direction and (n, 3) point of screw number `screw` (from 0), carried along by those before it."""
         s = self.chain.screws[screw]
-        R, t = self.rotations[screw], self.shifts_mm[screw]
+        R, t = self.rotations[s.before], self.shifts_mm[s.before]
         return R @ s.axis, R @ s.point_mm + t
 
 
@@ -204,10 +217,9 @@ def pose_chain(chain: ScrewChain, joints: Mapping[str, Floats]) -> Posture:
         joints: joint name -> (n,) values, rad or mm.
     """
     n = len(next(iter(joints.values())))
-    R = np.broadcast_to(np.eye(3), (n, 3, 3))
-    t = np.zeros((n, 3))
-    posture = Posture(chain, [R], [t])
+    posture = Posture(chain, [np.broadcast_to(np.eye(3), (n, 3, 3))], [np.zeros((n, 3))])
     for screw in chain.screws:
+        R, t = posture.rotations[screw.before], posture.shifts_mm[screw.before]
         amount = np.zeros(n)
         for name, coefficient in screw.weights.items():
             amount = amount + coefficient * joints[name]

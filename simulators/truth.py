@@ -205,7 +205,7 @@ class _Body:
         """(n, 3) position in the base frame of a point fixed to a frame, bends included."""
         point = self.posture.point_mm(frame, place_mm)
         for bend in self.bent:
-            if frame >= bend.frame:
+            if self._follows(frame, bend.frame):
                 point = _bent(bend, point)
         return point
 
@@ -220,8 +220,8 @@ class _Body:
                 continue
             axis, point = self._axis(index, screw)
             for mass, place, weight in zip(self.masses, places, weights, strict=True):
-                if index >= self.posture.chain.last_screw[mass.frame]:
-                    continue  # nearer the base than this screw
+                if not self.posture.chain.carries(index, mass.frame):
+                    continue
                 motion = np.cross(axis, (place - point) / 1e3) if screw.turns else axis
                 total += coefficient * np.sum(motion * weight, axis=1)
         return total
@@ -230,17 +230,18 @@ class _Body:
         screws = self.posture.chain.screws
         index = next(i for i, s in enumerate(screws) if s.row == row and not s.turns)
         axis, root = self.posture.axis(index)
-        carried = self.posture.shifts_mm[index + 1] - self.posture.shifts_mm[index]  # pure translation along the axis
+        before = self.posture.shifts_mm[screws[index].before]
+        carried = self.posture.shifts_mm[index + 1] - before  # pure translation along the axis
         length_mm = self.constants[row - 1].a + np.sum(carried * axis, axis=1)
         # The bent tip: loads act where the beam has come to rest.
         tip = root + length_mm[:, None] * axis
         for bend in self.bent:
-            if row >= bend.frame:
+            if self._follows(row, bend.frame):
                 tip = tip + bend.shift_mm
         force, moment, own = np.zeros_like(tip), np.zeros_like(tip), np.zeros_like(tip)
         for mass in self.masses:
             weight = self._weight_newton(mass)
-            if mass.frame >= row:
+            if self._follows(mass.frame, row):
                 force += weight
                 moment += np.cross((self.place_mm(mass.frame, mass.place_mm) - tip) / 1e3, weight)
             elif mass.frame == row - 1:
@@ -251,10 +252,14 @@ class _Body:
         axis, point = self.posture.axis(index)
         for bend in self.bent:
             # A bend comes after its row's driven length and before its row's joint.
-            if screw.row > bend.frame or (screw.row == bend.frame and screw.turns):
+            if self._follows(screw.row, bend.frame) and (screw.row != bend.frame or screw.turns):
                 axis = (rotation_by_vector(bend.rotation_vector) @ axis[:, :, None])[:, :, 0]
                 point = _bent(bend, point)
         return axis, point
+
+    def _follows(self, frame: int, other: int) -> bool:
+        """Whether a frame is another one or beyond it."""
+        return other in (0, *self.rig.path(frame))
 
     def _weight_newton(self, mass: _PointMass) -> Floats:
         n = len(next(iter(self.read.values())))

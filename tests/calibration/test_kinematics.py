@@ -25,6 +25,7 @@ joint = [
 prism = [
     { name = "base", frame = 0, offset_mm = [10, 20, 30] },
     { name = "tip", frame = 4, offset_mm = [100, -50, 20], offset_known = false },
+    { name = "other", frame = 6, offset_mm = [20, 10, 40] },
 ]
 [[row]]
 d_mm = 500
@@ -45,6 +46,14 @@ identify = ["theta"]
 [[row]]
 a_mm = 250
 drive = { a = { lift = 0.5 } }
+[[row]]  # a second arm, whose joint nobody reads: q4 = -(q1 + q2)
+after = 2
+a_mm = 220
+alpha_deg = 60
+drive = { theta = { q1 = -1.0, q2 = -1.0 } }
+[[row]]
+a_mm = 180
+d_mm = 30
 """
 
 
@@ -123,7 +132,8 @@ def test_positions_are_the_product_of_the_rows_matrices(rig: Rig) -> None:
         readings = dict(zip(rig.joint_names, data.readings[i], strict=True))
         arm = [np.eye(4)]
         for number, row in enumerate(rig.rows, 1):
-            arm.append(arm[-1] @ row_matrix(rig, number, row, readings, deviation))
+            before = arm[-1] if row.after is None else arm[row.after]
+            arm.append(before @ row_matrix(rig, number, row, readings, deviation))
             np.testing.assert_allclose(frames[i, number - 1], arm[-1][:3, 3], atol=1e-8)
         offset = np.array(
             [o + deviation[f"prism.{prism.name}.{k}"] for o, k in zip(prism.offset_mm, "xyz", strict=True)]

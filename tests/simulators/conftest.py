@@ -4,7 +4,7 @@ import pytest
 
 from calibration.rig import Rig, parse_rig, shipped_rig
 
-# Every convention detail that the shipped rigs do not use: fixed transforms, scaled couplings, two joints on one row.
+# What the shipped rigs do not use: fixed transforms, scaled couplings, two joints on one row, rows that branch.
 ODD_RIG = """
 name = "odd"
 convention = "{convention}"
@@ -54,6 +54,12 @@ a_mm = 120
 d_mm = 500
 theta_deg = 33
 drive = {{ d = {{ feed = 0.5, reach = 0.1 }} }}
+[[row]]
+after = 1
+alpha_deg = 30
+a_mm = 700
+d_mm = 60
+drive = {{ theta = {{ turn = -1.0, lift = -1.0 }} }}
 [[prism]]
 name = "tip"
 frame = 3
@@ -62,6 +68,15 @@ offset_mm = [10, 150, -20]
 name = "mid"
 frame = 2
 offset_mm = [0, 0, 250]
+[[prism]]
+name = "mast"
+frame = 4
+offset_mm = [0, 30, 200]
+[[mass]]
+name = "mast"
+frame = 4
+kg = 150
+centre_mm = [-200, 0, 100]
 [[mass]]
 name = "head"
 frame = 3

@@ -32,9 +32,9 @@ def frames_by_matrices(truth: RigTruth, joints: dict[str, float]) -> list[Matrix
     """Frame 0, 1, ... in the base frame, by the conventions as calibration/rig.py words them."""
     rig = truth.rig
     value = {j.name: np.deg2rad(joints[j.name]) if j.kind == "revolute" else joints[j.name] for j in rig.joints}
-    T = np.eye(4)
-    out = [T]
+    out = [np.eye(4)]
     for row, own in zip(rig.rows, truth.constants, strict=True):
+        T = out[-1] if row.after is None else out[row.after]
         driven = {k: sum(c * value[n] for n, c in combination.items()) for k, combination in row.drive.items()}
         a, d, theta = own.a + driven.get("a", 0), own.d + driven.get("d", 0), own.theta + driven.get("theta", 0)
         if row.before is not None:
