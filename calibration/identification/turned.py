@@ -6,6 +6,7 @@ Gauss-Newton nor a search within build tolerances reaches.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -88,7 +89,7 @@ def _offsets(chain: Chain, joint: str) -> Floats:
     """(p,) how the rows' angles move when the joint turns by 1 rad."""
     out = np.zeros(len(chain))
     index = chain.rig.joint_names.index(joint)
-    for op in chain.arm:
+    for op in itertools.chain.from_iterable(chain.row_ops):
         for driven, coefficient in op.drive:
             if driven == index and op.rotates and op.parameter >= 0:
                 out[op.parameter] += coefficient / math.radians(1.0)
