@@ -81,7 +81,8 @@ class Row(_Part):
     Conventions (`Rig.convention`):
         mdh_beta_after:  Trans(x,a) Rot(x,alpha) Trans(z,d) Rot(z,theta) Rot(y,beta)   (first paper, Eq. 1)
         mdh_beta_before: Rot(x,alpha) Trans(x,a) Rot(y,beta) Trans(y,b) Rot(z,theta) Trans(z,d)   (second paper)
-        dh:              Rot(z,theta) Trans(z,d) Trans(x,a) Rot(x,alpha)   (standard Denavit-Hartenberg)
+        dh:              Rot(z,theta) Trans(z,d) Trans(x,a) Rot(x,alpha) Rot(y,beta)   (standard Denavit-Hartenberg, with
+            Hayati's beta for the next axis being nearly parallel)
 
     Attributes:
         alpha_deg, a_mm, d_mm, theta_deg, beta_deg, b_mm: constants of the row.
@@ -215,7 +216,7 @@ class Rig(_Part):
 
     @model_validator(mode="after")
     def _rows_fit(self) -> Rig:
-        unused = {"mdh_beta_before": set(), "mdh_beta_after": {"b"}, "dh": {"beta", "b"}}[self.convention]
+        unused = {"mdh_beta_before": set(), "mdh_beta_after": {"b"}, "dh": {"b"}}[self.convention]
         for number, row in enumerate(self.rows, 1):
             if row.after is not None and row.after >= number:
                 raise ValueError(f"row {number}: it continues from frame {row.after}, which does not come before it")

@@ -39,7 +39,13 @@ _ORDER: Mapping[Convention, Sequence[tuple[str, str, str]]] = {
         ("turn", "z", "theta"),
         ("move", "z", "d"),
     ),
-    "dh": (("turn", "z", "theta"), ("move", "z", "d"), ("move", "x", "a"), ("turn", "x", "alpha")),
+    "dh": (
+        ("turn", "z", "theta"),
+        ("move", "z", "d"),
+        ("move", "x", "a"),
+        ("turn", "x", "alpha"),
+        ("turn", "y", "beta"),
+    ),
 }
 
 

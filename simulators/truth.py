@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.rig import Rig, Tolerances
+from calibration.rig import Rig, Row
 from simulators.effects.base import Beam, Bend, Effect
 from simulators.screws import (
     Posture,
@@ -86,8 +86,8 @@ class RigTruth:
         self.effects = tuple(effects)
         rng = np.random.default_rng([seed, 1])
         self.constants = tuple(
-            _perturbed(row, rig.tolerances, rig.convention, rng.standard_normal(6) * perturbation)
-            for row in nominal_constants(rig)
+            _perturbed(own, row, rig, rng.standard_normal(6) * perturbation)
+            for own, row in zip(nominal_constants(rig), rig.rows, strict=True)
         )
         self._chain = screw_chain(rig.convention, rig.rows, self.constants)
         self._prisms = {
@@ -284,15 +284,16 @@ def _bent(bend: Bend, point: Floats) -> Floats:
     return moved
 
 
-def _perturbed(row: RowConstants, tolerances: Tolerances, convention: str, draw: Floats) -> RowConstants:
-    angle, beta = np.deg2rad(tolerances.angle_deg), np.deg2rad(tolerances.beta_deg)
+def _perturbed(own: RowConstants, row: Row, rig: Rig, draw: Floats) -> RowConstants:
+    length, angle, beta = rig.tolerances.length_mm, *np.deg2rad([rig.tolerances.angle_deg, rig.tolerances.beta_deg])
+    has_beta = rig.convention != "dh" or "beta" in row.identify
     return RowConstants(
-        alpha=row.alpha + angle * draw[0],
-        a=row.a + tolerances.length_mm * draw[1],
-        d=row.d + tolerances.length_mm * draw[2],
-        theta=row.theta + angle * draw[3],
-        beta=row.beta + (0.0 if convention == "dh" else beta * draw[4]),
-        b=row.b + (tolerances.length_mm * draw[5] if convention == "mdh_beta_before" else 0.0),
+        alpha=own.alpha + angle * draw[0],
+        a=own.a + length * draw[1],
+        d=own.d + length * draw[2],
+        theta=own.theta + angle * draw[3],
+        beta=own.beta + (beta * draw[4] if has_beta else 0.0),
+        b=own.b + (length * draw[5] if rig.convention == "mdh_beta_before" else 0.0),
     )
 
 

@@ -111,7 +111,7 @@ def test_every_shipped_rig_reads() -> None:
         ("theta = { q1 = 1.0 }", "theta = { q9 = 1.0 }", "unknown joint 'q9'"),
         ("theta = { q1 = 1.0 }", "theta = { q2 = 1.0 }", "joint 'q1' drives no row"),
         ("frame = 6", "frame = 7", "beyond the last row 6"),
-        ("d_mm = 127.3", "d_mm = 127.3\nbeta_deg = 1", "convention 'dh' has no beta"),
+        ("d_mm = 127.3", "d_mm = 127.3\nb_mm = 1", "convention 'dh' has no b"),
     ],
 )
 def test_a_rig_file_that_contradicts_itself_is_refused(old: str, new: str, message: str) -> None:
