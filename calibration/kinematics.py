@@ -27,7 +27,7 @@ _ANGLES: frozenset[RowParameter] = frozenset({"alpha", "theta", "beta"})
 _ROW_ORDER: Mapping[Convention, tuple[tuple[RowParameter, int], ...]] = {
     "mdh_beta_after": (("a", X), ("alpha", X), ("d", Z), ("theta", Z), ("beta", Y)),
     "mdh_beta_before": (("alpha", X), ("a", X), ("beta", Y), ("b", Y), ("theta", Z), ("d", Z)),
-    "dh": (("theta", Z), ("d", Z), ("a", X), ("alpha", X)),
+    "dh": (("theta", Z), ("d", Z), ("a", X), ("alpha", X), ("beta", Y)),
 }
 BASE_COMPONENTS = ("x", "y", "z", "rz", "ry", "rx")
 
@@ -267,6 +267,14 @@ class Chain:
         for axis, angle in zip((Z, Y, X), deviation[3:], strict=True):
             rotation = rotation @ rotation_about(axis, float(angle))
         return Placement(rotation @ self._rotation0[setup], self._translation0[setup] + deviation[:3])
+
+    def base_values(self, setup: int, wanted: Placement) -> Floats:
+        """(6,) base parameters of a set-up with which its base stands as wanted: the inverse of `base`."""
+        r = wanted.rotation @ self._rotation0[setup].T
+        pitch = -math.asin(min(1.0, max(-1.0, float(r[2, 0]))))
+        angles = math.atan2(r[1, 0], r[0, 0]), pitch, math.atan2(r[2, 1], r[2, 2])
+        values: Floats = np.concatenate([wanted.translation_mm - self._translation0[setup], angles])
+        return values
 
     def positions_mm(self, x: Floats, data: ChainData) -> Floats:
         """(n, 3) prism positions in the station's frame for parameters `x` (p,)."""

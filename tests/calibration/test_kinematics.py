@@ -95,7 +95,7 @@ def row_matrix(rig: Rig, number: int, row: Row, readings: dict[str, float], devi
     return {
         "mdh_beta_after": lambda: before @ a @ alpha @ d @ theta @ beta,
         "mdh_beta_before": lambda: before @ alpha @ a @ beta @ b @ theta @ d,
-        "dh": lambda: before @ theta @ d @ a @ alpha,
+        "dh": lambda: before @ theta @ d @ a @ alpha @ beta,
     }[rig.convention]()
 
 
