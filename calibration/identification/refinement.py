@@ -1,16 +1,18 @@
 """Gauss-Newton to the optimum: whitened residuals, build-tolerance priors, outliers weighted out, noise estimated.
 
 The model of an observation: with probability 1 - epsilon its error is normal with the covariance
-Sigma_station + J_q Sigma_q J_q' + timing + s^2 I, else thirty times as wide. s^2 is what the data's own scatter adds,
-so that small sigma columns never make the fit chase a few rows when what the kinematics lack dominates. It is found by
-restricted maximum likelihood (the parameters' degrees of freedom do not count as noise), epsilon by
-expectation-maximisation, and the prior's scale, where asked for, by MacKay's evidence update.
+Sigma_station + J_q Sigma_q J_q' + timing + s^2 I, else thirty times as wide; inliers of one standstill are correlated,
+as they share the errors of its readings (`whitening`). s^2 is what the data's own scatter adds, so that small sigma
+columns never make the fit chase a few rows when what the kinematics lack dominates. It is found by restricted maximum
+likelihood (the parameters' degrees of freedom do not count as noise), epsilon by expectation-maximisation, and the
+prior's scale, where asked for, by MacKay's evidence update.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -19,9 +21,15 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.special import expit
 
 from calibration.errors import CalibrationError
-from calibration.identification.samples import Samples, reading_covariance
-from calibration.kinematics import Chain, Linearisation
+from calibration.identification.additions import Additions
+from calibration.identification.samples import Samples, reading_variance
+from calibration.identification.whitening import Marginals, Whitening, factorise, marginals
+from calibration.kernels.lineariser import Lineariser
+from calibration.kinematics import Chain, ChainData
 from calibration.observations import Floats
+
+Flags = NDArray[np.bool_]
+Prior = Literal["recalibration", "as-built"]
 
 FLAT_MM = 1e3  # "unknown": wide enough to pull on nothing that is measured, finite so that nothing is singular
 FLAT_RAD = 1.0
@@ -31,23 +39,25 @@ _OUTLIER_WIDTH = 30.0
 _OUTLIER_SHARE = (1e-3, 0.4)
 _PRIOR_SCALE = (0.1, 300.0)
 _AS_BUILT_SCALE = 30.0
-_DAMPING = (1e-9, 1e9)
+_DAMPING = (1e-9, 1e-4, 1e9)  # least, first after a refused step, greatest
 _SETTLED = 1e-3
+_LEAST_EXCESS = 1e-12
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Result of `refine`.
+    """Result of `refine` and `posterior`.
 
     Attributes:
-        x: (p,) parameters.
-        covariance: (p, p) posterior covariance; zero rows for parameters that were held.
+        x: (p,) parameters; with k additions (p + k,), their coefficients last.
+        covariance: of `x`, posterior of the model linearised there; zero rows for what was held.
         excess_variance: s^2, mm^2 per axis.
         prior_scale: what the build tolerances were multiplied by.
         outlier_share: epsilon.
         weight: (m,) probability that a sample is no outlier.
-        cost: negative log posterior at the solution; lower is better on the same samples.
+        cost: negative log evidence at the solution; lower is better on the same samples.
         settled: False if the iteration ended before it came to rest.
+        rounds: iterations that it took, 0 where a method does not count them.
     """
 
     x: Floats
@@ -58,14 +68,7 @@ class Fit:
     weight: Floats
     cost: float
     settled: bool
-
-
-@dataclass(frozen=True)
-class _State:
-    x: Floats
-    lin: Linearisation
-    error: Floats  # (m, 3) measured minus modelled
-    known: Floats  # (m, 3, 3) covariance without the excess
+    rounds: int = 0
 
 
 def prior_precision(chain: Chain, scale: float) -> Floats:
@@ -80,197 +83,278 @@ def refine(
     samples: Samples,
     start: Floats,
     *,
-    free: NDArray[np.bool_] | None = None,
-    prior: Literal["recalibration", "as-built"] = "recalibration",
+    free: Flags | None = None,
+    prior: Prior = "recalibration",
     excess_variance: float | None = None,
+    additions: Additions | None = None,
 ) -> Fit:
     """Find the maximum of the posterior near `start`.
 
     Args:
         chain: kinematics.
         samples: m rows.
-        start: (p,) parameters.
-        free: (p,) which parameters move; all by default.
+        start: (p,) parameters; with k additions also (p + k,), else their coefficients start at zero.
+        free: which of them move; all by default, and all additions where it has p entries.
         prior: trust the build tolerances, or estimate one factor on all of them.
         excess_variance: hold s^2 at this value instead of estimating it.
+        additions: coefficients to estimate along, with columns for the m rows.
 
     Raises:
         CalibrationError: the numbers left the range of floating point.
+        ValueError: additions for another number of rows.
     """
-    free = np.ones(len(chain), dtype=bool) if free is None else free
-    tolerated = free & np.isfinite(chain.prior_sigma)
-    scale = _AS_BUILT_SCALE if prior == "as-built" else 1.0
-    state = _state(chain, samples, start)
+    return _fit(_Problem(chain, samples, free, additions), start, prior, excess_variance, moves=True)
+
+
+def posterior(
+    chain: Chain,
+    samples: Samples,
+    x: Floats,
+    *,
+    free: Flags | None = None,
+    prior: Prior = "recalibration",
+    excess_variance: float | None = None,
+    additions: Additions | None = None,
+) -> Fit:
+    """Noise, outliers, covariance and cost as they are at `x` itself, for methods that search by other means.
+
+    Arguments and errors as `refine`; `free` says which parameters the covariance is of.
+    """
+    return _fit(_Problem(chain, samples, free, additions), x, prior, excess_variance, moves=False)
+
+
+def information(
+    chain: Chain,
+    samples: Samples,
+    x: Floats,
+    *,
+    excess_variance: float,
+    weight: Floats | None = None,
+    additions: Additions | None = None,
+) -> Floats:
+    """J' V^-1 J: what the samples alone, without a prior, say of the parameters (p,) or (p + k,).
+
+    Args:
+        chain, samples, x, additions: as `refine`.
+        excess_variance: s^2, mm^2 per axis.
+        weight: (m,) probability that a sample is no outlier; 1 by default.
+    """
+    problem = _Problem(chain, samples, None, additions)
+    state = problem.at(problem.extended(x))
+    given = np.ones(len(samples)) if weight is None else weight[problem.order]
+    whitened = problem.whitening(state, problem.marginals(state, excess_variance), given).whiten(state.jacobian)
+    matrix: Floats = whitened.T @ whitened
+    return matrix
+
+
+@dataclass(frozen=True)
+class _State:
+    x: Floats
+    error: Floats  # (m, 3) measured minus modelled
+    jacobian: Floats  # (m, 3, p + k)
+    by_joint: Floats
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """What is estimated beside the parameters."""
+
+    excess: float
+    share: float
+    scale: float  # of the prior
+
+
+class _Problem:
+    """Chain and samples, rows in the order of their standstills."""
+
+    def __init__(self, chain: Chain, samples: Samples, free: Flags | None, additions: Additions | None) -> None:
+        if additions is not None and len(additions.column) != len(samples):
+            raise ValueError(f"additions have {len(additions.column)} rows where there are {len(samples)} samples")
+        standstill = np.arange(len(samples)) if samples.standstill is None else samples.standstill
+        self.order = np.argsort(standstill, kind="stable")
+        following = np.flatnonzero(np.diff(standstill[self.order])) + 1
+        self._start = np.concatenate([[0], following, [len(samples)]]).astype(np.intp)
+        self.chain = chain
+        self._added = additions.select(self.order) if additions is not None else None
+        self._data = samples.data.select(self.order)
+        self._position_mm = samples.position_mm[self.order]
+        self._station = samples.station_covariance[self.order]
+        self._rates = samples.rates[self.order] * chain.rig.station.timing_sigma_s
+        self._variance = reading_variance(chain.rig)
+        self._linearise = Lineariser(chain)
+        added = np.zeros(0) if additions is None else additions.prior_sigma
+        self._added_precision = 1.0 / added**2
+        given = np.ones(0, dtype=bool) if free is None else free
+        self.free = np.concatenate([given, np.ones(len(chain) + len(added) - len(given), dtype=bool)])
+        self.tolerated = self.free & np.concatenate([np.isfinite(chain.prior_sigma), np.zeros(len(added), dtype=bool)])
+
+    def extended(self, x: Floats) -> Floats:
+        """`x` with the coefficients that it lacks at zero."""
+        return np.concatenate([x, np.zeros(len(self.free) - len(x))])
+
+    def precision(self, scale: float) -> Floats:
+        """Of the priors of all that is free; tolerances of effects are no build tolerances and keep their scale."""
+        precision: Floats = np.concatenate([prior_precision(self.chain, scale), self._added_precision])[self.free]
+        return precision
+
+    def at(self, x: Floats) -> _State:
+        p = len(self.chain)
+        data, added = self._data, self._added
+        if added is not None:
+            data = ChainData(data.readings + added.change(x[p:], data.readings.shape[1]), data.prism, data.setup)
+        position, jacobian, by_joint = self._linearise(x[:p], data)
+        if added is not None:
+            jacobian = np.concatenate([jacobian, by_joint[:, :, added.joint] * added.column[:, None, :]], axis=2)
+        return _State(x, self._position_mm - position, jacobian, by_joint)
+
+    def marginals(self, state: _State, excess: float) -> Marginals:
+        velocity = (state.by_joint @ self._rates[:, :, None])[:, :, 0]
+        return marginals(self._station, velocity, state.by_joint, self._variance, excess, state.error)
+
+    def whitening(self, state: _State, of_rows: Marginals, weight: Floats) -> Whitening:
+        return factorise(self._start, of_rows, state.by_joint, self._variance, weight)
+
+    def original(self, weight: Floats) -> Floats:
+        """Values (m,) in the order of the samples."""
+        out = np.empty_like(weight)
+        out[self.order] = weight
+        return out
+
+
+class _View:
+    """The posterior around a state: outliers weighted, rows whitened, the quadratic model in what is free."""
+
+    def __init__(self, problem: _Problem, state: _State, noise: _Noise) -> None:
+        self.problem, self.state, self.noise = problem, state, noise
+        self.of_rows = problem.marginals(state, noise.excess)
+        self.weight = _inlier_probability(self.of_rows.square, noise.share)
+        self.whitening = problem.whitening(state, self.of_rows, self.weight)
+        free = problem.free
+        self.jacobian = self.whitening.whiten(state.jacobian if free.all() else state.jacobian[:, :, free])
+        self.error = self.whitening.whiten(state.error)[:, 0]
+        self.precision = problem.precision(noise.scale)
+        self.normal = self.jacobian.T @ self.jacobian + np.diag(self.precision)
+        _require_finite(self.normal)
+        self.gradient = self.jacobian.T @ self.error - self.precision * state.x[free]
+
+    @cached_property
+    def covariance(self) -> Floats:
+        scale, factor = _factor(self.normal)
+        inverse: Floats = cho_solve(factor, np.eye(len(self.normal))) * scale[:, None] * scale
+        return inverse
+
+    def squares(self, at: _State) -> float:
+        """Weighted squares plus the prior's at another state, noise and weights as they are here."""
+        whitened = self.whitening.whiten(at.error)
+        return float((whitened**2).sum() + self.precision @ at.x[self.problem.free] ** 2)
+
+    def excess(self, step: Floats) -> float:
+        """s^2 after a Fisher scoring step of the restricted likelihood, the parameters moved by `step` meanwhile.
+
+        It equates e' V^-1 (dV/ds^2) V^-1 e with tr P (dV/ds^2), P = V^-1 - V^-1 J C J' V^-1.
+        """
+        jacobian = self.whitening.finish(self.jacobian)
+        error = self.whitening.finish((self.error - self.jacobian @ step)[:, None])
+        total, curvature = self.whitening.trace
+        left = total - float(np.sum((jacobian.T @ jacobian) * self.covariance))
+        if left <= 0.0:
+            return self.noise.excess
+        change = (float((error**2).sum()) - left) / (curvature * left / total)
+        # Downwards a single step may leave the range in which the quadratic model holds.
+        return max(self.noise.excess + change, 0.1 * self.noise.excess, _LEAST_EXCESS)
+
+    def prior_scale(self, x: Floats) -> float:
+        """MacKay: scale^2 = sum of (x / sigma)^2 over the number of parameters that the data determine."""
+        inside = self.problem.tolerated
+        precision = self.precision[inside[self.problem.free]]
+        determined = float(np.sum(1.0 - np.diag(self.covariance)[inside[self.problem.free]] * precision))
+        squares = float(precision @ x[inside] ** 2) * self.noise.scale**2
+        return float(np.clip(math.sqrt(squares / max(determined, 1.0)), *_PRIOR_SCALE))
+
+    def cost(self) -> float:
+        """Negative log evidence (Laplace), up to a constant: fits of one data set from different starts compare by it.
+
+        Every row's mixture by itself, plus what the correlation among the inliers of standstills adds.
+        """
+        rows, share = self.of_rows, self.noise.share
+        inlier = math.log(1.0 - share) - 0.5 * (rows.square + rows.log_det)
+        outlier = math.log(share) - 3.0 * math.log(_OUTLIER_WIDTH)
+        likelihood = np.logaddexp(inlier, outlier - 0.5 * (rows.square / _OUTLIER_WIDTH**2 + rows.log_det)).sum()
+        together = float(self.error @ self.error) + self.whitening.log_det
+        correlation = 0.5 * (float(self.weight @ rows.square) + float(rows.log_det.sum()) - together)
+        prior = 0.5 * (np.log(self.precision) - self.precision * self.state.x[self.problem.free] ** 2).sum()
+        scale = 1.0 / np.sqrt(np.diag(self.normal))
+        determinant = np.linalg.slogdet(self.normal * scale[:, None] * scale)[1] - 2.0 * np.log(scale).sum()
+        return -float(likelihood + correlation + prior - 0.5 * determinant)
+
+
+def _fit(problem: _Problem, start: Floats, prior: Prior, excess_variance: float | None, *, moves: bool) -> Fit:
+    """Alternate between the parameters (if it `moves`) and what is estimated beside them until all are at rest."""
+    state = problem.at(problem.extended(start))
+    _require_finite(state.error)
     robust = float(np.median(np.linalg.norm(state.error, axis=1))) / 1.54  # median of a 3-D normal's norm
-    excess = max(robust**2, 1e-12) if excess_variance is None else excess_variance
-    share, damping, settled = 0.05, 1e-3, False
-    weight = np.ones(len(samples))
-    for _ in range(_ROUNDS):
-        precision = prior_precision(chain, scale)
-        inverse = _inverses(state.known, excess)
-        before = weight
-        weight = _inlier_probability(state.error, inverse, share)
-        share = float(np.clip(1.0 - weight.mean(), *_OUTLIER_SHARE))
-        normal, gradient = _normal(state, inverse, weight, precision, free)
-        moved, damping, step = _step(chain, samples, state, free, normal, gradient, weight, inverse, precision, damping)
-        change = 0.0
+    excess = max(robust**2, _LEAST_EXCESS) if excess_variance is None else excess_variance
+    noise = _Noise(excess, 0.05, _AS_BUILT_SCALE if prior == "as-built" else 1.0)
+    damping, settled, rounds, weight = 0.0, False, 0, np.ones(len(problem.order))
+    while not settled and rounds < _ROUNDS:
+        rounds += 1
+        view = _View(problem, state, noise)
+        step, size, moved = np.zeros(int(problem.free.sum())), 0.0, state
+        if moves:
+            moved, damping, step, size = _step(view, damping)
+        change = float(np.abs(view.weight - weight).max()) / 10.0
+        weight = view.weight
+        excess, scale = noise.excess, noise.scale
         if excess_variance is None:
-            renewed = _excess(state, weight, excess, normal, gradient, free)
-            change = abs(renewed - excess) / (excess + float(np.trace(state.known, axis1=1, axis2=2).mean()) / 3.0)
-            excess = renewed
-        if prior == "as-built" and tolerated.any():
-            renewed = _prior_scale(moved.x, tolerated, free, _inverse(normal), chain.prior_sigma, scale)
-            change = max(change, abs(math.log(renewed / scale)))
-            scale = renewed
+            excess = view.excess(step)
+            known = float(np.trace(view.of_rows.block, axis1=1, axis2=2).mean()) / 3.0
+            change = max(change, abs(excess - noise.excess) / known)
+        if prior == "as-built" and problem.tolerated.any():
+            scale = view.prior_scale(moved.x)
+            change = max(change, abs(math.log(scale / noise.scale)))
+        noise = _Noise(excess, float(np.clip(1.0 - weight.mean(), *_OUTLIER_SHARE)), scale)
         state = moved
-        if step < _SETTLED and change < _SETTLED and np.abs(weight - before).max() < 10 * _SETTLED:
-            settled = True
-            break
-    precision = prior_precision(chain, scale)
-    inverse = _inverses(state.known, excess)
-    weight = _inlier_probability(state.error, inverse, share)
-    normal, _ = _normal(state, inverse, weight, precision, free)
-    covariance = np.zeros((len(chain), len(chain)))
-    covariance[np.ix_(free, free)] = _inverse(normal)
-    cost = _cost(state, inverse, share, precision, free, normal)
-    if not math.isfinite(cost):
+        settled = max(size, change) < _SETTLED
+    view = _View(problem, state, noise)
+    covariance = np.zeros((len(state.x), len(state.x)))
+    covariance[np.ix_(problem.free, problem.free)] = view.covariance
+    weight = problem.original(view.weight)
+    return Fit(state.x, covariance, noise.excess, noise.scale, noise.share, weight, view.cost(), settled, rounds)
+
+
+def _require_finite(values: Floats) -> None:
+    if not np.isfinite(values).all():
         raise CalibrationError("identification: the fit left the range of numbers; check units of the observations")
-    return Fit(state.x, covariance, excess, scale, share, weight, cost, settled)
 
 
-def _state(chain: Chain, samples: Samples, x: Floats) -> _State:
-    lin = chain.linearise(x, samples.data)
-    known = samples.station_covariance + reading_covariance(chain.rig, lin.joint_jacobian, samples.rates)
-    return _State(x, lin, samples.position_mm - lin.position_mm, known)
-
-
-def _inverses(known: Floats, excess: float) -> Floats:
-    """(m, 3, 3) inverse covariance of the samples."""
-    return np.asarray(np.linalg.inv(known + excess * np.eye(3)), dtype=np.float64)
-
-
-def _square(error: Floats, inverse: Floats) -> Floats:
-    """(m,) squared Mahalanobis lengths."""
-    square: Floats = np.einsum("ni,nij,nj->n", error, inverse, error)
-    return square
-
-
-def _inlier_probability(error: Floats, inverse: Floats, share: float) -> Floats:
+def _inlier_probability(square: Floats, share: float) -> Floats:
     odds = math.log((1.0 - share) / share) + 3.0 * math.log(_OUTLIER_WIDTH)
-    probability: Floats = expit(odds - 0.5 * _square(error, inverse) * (1.0 - _OUTLIER_WIDTH**-2))
+    probability: Floats = expit(odds - 0.5 * square * (1.0 - _OUTLIER_WIDTH**-2))
     return probability
 
 
-def _normal(
-    state: _State, inverse: Floats, weight: Floats, precision: Floats, free: NDArray[np.bool_]
-) -> tuple[Floats, Floats]:
-    """Normal matrix with the prior and the gradient that its inverse turns into a step."""
-    jacobian = state.lin.jacobian[:, :, free]
-    weighted = (weight[:, None, None] * inverse) @ jacobian
-    columns = jacobian.shape[2]
-    normal = jacobian.reshape(-1, columns).T @ weighted.reshape(-1, columns) + np.diag(precision[free])
-    gradient = weighted.reshape(-1, columns).T @ state.error.ravel() - precision[free] * state.x[free]
-    return normal, gradient
-
-
 def _factor(matrix: Floats) -> tuple[Floats, tuple[Floats, bool]]:
-    """Cholesky factor of the matrix scaled to a unit diagonal, and the scale."""
+    """Scale that gives the matrix a unit diagonal, and the Cholesky factor of that."""
     scale = 1.0 / np.sqrt(np.diag(matrix))
     return scale, cho_factor(matrix * scale[:, None] * scale, lower=True)
 
 
-def _inverse(matrix: Floats) -> Floats:
-    scale, factor = _factor(matrix)
-    inverse: Floats = cho_solve(factor, np.eye(len(matrix))) * scale[:, None] * scale
-    return inverse
-
-
-def _step(
-    chain: Chain,
-    samples: Samples,
-    state: _State,
-    free: NDArray[np.bool_],
-    normal: Floats,
-    gradient: Floats,
-    weight: Floats,
-    inverse: Floats,
-    precision: Floats,
-    damping: float,
-) -> tuple[_State, float, float]:
-    """One damped step that does not raise the weighted squares; the new state, damping and step size in sigma."""
-
-    def squares(at: _State) -> float:
-        return float(weight @ _square(at.error, inverse) + precision[free] @ at.x[free] ** 2)
-
-    here = squares(state)
-    while damping < _DAMPING[1]:
+def _step(view: _View, damping: float) -> tuple[_State, float, Floats, float]:
+    """A damped step that does not raise the weighted squares: new state, next damping, the step, its size in sigma."""
+    state, free = view.state, view.problem.free
+    here = float(view.error @ view.error + view.precision @ state.x[free] ** 2)
+    while damping < _DAMPING[2]:
         try:
-            scale, factor = _factor(normal + damping * np.diag(np.diag(normal)))
+            scale, factor = _factor(view.normal + damping * np.diag(np.diag(view.normal)))
         except LinAlgError:
-            damping *= 10.0
+            damping = max(10.0 * damping, _DAMPING[1])
             continue
-        step = scale * cho_solve(factor, scale * gradient)
+        step = scale * cho_solve(factor, scale * view.gradient)
         x = state.x.copy()
         x[free] += step
-        moved = _state(chain, samples, x)
-        if squares(moved) <= here * (1.0 + 1e-12):
-            size = math.sqrt(max(0.0, float(step @ normal @ step) / len(step)))
-            return moved, max(damping / 10.0, _DAMPING[0]), size
-        damping *= 10.0
-    return state, 1e-3, 0.0
-
-
-def _excess(
-    state: _State, weight: Floats, excess: float, normal: Floats, gradient: Floats, free: NDArray[np.bool_]
-) -> float:
-    """A few rising steps of the restricted likelihood in s^2, on the linearised model.
-
-    Each multiplies s^2 by sqrt(e' V^-2 e / tr P), V the covariance, e the error after the parameters' step and
-    P = V^-1 - V^-1 J C J' V^-1 (the minorise-maximise update for variance components).
-    """
-    jacobian = state.lin.jacobian[:, :, free]
-    columns = jacobian.shape[2]
-    covariance = _inverse(normal)
-    error = state.error - jacobian @ (covariance @ gradient)
-    for _ in range(3):
-        inverse = _inverses(state.known, excess)
-        twice = inverse @ inverse
-        squares = float(weight @ _square(error, twice))
-        fitted = (weight[:, None, None] ** 2 * twice @ jacobian).reshape(-1, columns)
-        taken = float(np.sum((jacobian.reshape(-1, columns).T @ fitted) * covariance))
-        left = float(weight @ np.trace(inverse, axis1=1, axis2=2)) - taken
-        if left <= 0.0:
-            break
-        excess = max(excess * math.sqrt(squares / left), 1e-12)
-    return excess
-
-
-def _prior_scale(
-    x: Floats,
-    tolerated: NDArray[np.bool_],
-    free: NDArray[np.bool_],
-    covariance: Floats,
-    sigma: Floats,
-    scale: float,
-) -> float:
-    """MacKay: scale^2 = sum of (x / sigma)^2 over the number of parameters that the data determine."""
-    inside = tolerated[free]
-    variance = np.diag(covariance)[inside] / (sigma[tolerated] * scale) ** 2
-    determined = float(np.sum(1.0 - variance))
-    squares = float(np.sum((x[tolerated] / sigma[tolerated]) ** 2))
-    return float(np.clip(math.sqrt(squares / max(determined, 1.0)), *_PRIOR_SCALE))
-
-
-def _cost(
-    state: _State, inverse: Floats, share: float, precision: Floats, free: NDArray[np.bool_], normal: Floats
-) -> float:
-    """Negative log evidence (Laplace), up to a constant: fits of one data set from different starts compare by it."""
-    square = _square(state.error, inverse)
-    volume = 0.5 * np.linalg.slogdet(inverse)[1]
-    inlier = math.log(1.0 - share) + volume - 0.5 * square
-    outlier = math.log(share) + volume - 3.0 * math.log(_OUTLIER_WIDTH) - 0.5 * square / _OUTLIER_WIDTH**2
-    likelihood = float(np.logaddexp(inlier, outlier).sum())
-    prior = 0.5 * float(np.sum(np.log(precision[free])) - precision[free] @ state.x[free] ** 2)
-    scale = 1.0 / np.sqrt(np.diag(normal))
-    determinant = float(np.linalg.slogdet(normal * scale[:, None] * scale)[1]) - 2.0 * float(np.sum(np.log(scale)))
-    return -(likelihood + prior - 0.5 * determinant)
+        moved = view.problem.at(x)
+        if view.squares(moved) <= here * (1.0 + 1e-12):
+            size = math.sqrt(max(0.0, float(step @ view.normal @ step) / len(step)))
+            return moved, damping / 10.0 if damping > _DAMPING[0] else 0.0, step, size
+        damping = max(10.0 * damping, _DAMPING[1])
+    return state, 0.0, np.zeros(len(view.gradient)), 0.0

@@ -1,7 +1,8 @@
 """What the fit sees: fixes of one standstill averaged, each with its measurement covariance.
 
 Fixes of one session, set-up, pose and prism repeat the same readings of the joints: averaging them lowers the
-station's noise, not that of the readings.
+station's noise, not that of the readings. Those of other prisms in the pose share the readings' errors as well: a
+standing joint errs the same way at each of its fixes.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ class Samples:
         rates: (m, joints) deg/s or mm/s at the fix, 0 where not measured.
         of_row: (n,) which sample each observation went into.
         repeat_variance: mm^2 per axis that repeats scatter beyond the station's covariance.
+        standstill: (m,) samples with the same number share the random errors of their readings; None where each is a
+            standstill of its own.
     """
 
     data: ChainData
@@ -40,9 +43,14 @@ class Samples:
     rates: Floats
     of_row: Integers
     repeat_variance: float
+    standstill: Integers | None = None
 
     def __len__(self) -> int:
         return len(self.data)
+
+    def average(self, values: Floats) -> Floats:
+        """(m, ...) means over the observations of each sample of their `values` (n, ...)."""
+        return _averages(self.of_row, values)
 
 
 def station_covariance(rig: Rig, position_mm: Floats, sigma_mm: Floats) -> Floats:
@@ -64,17 +72,32 @@ def station_covariance(rig: Rig, position_mm: Floats, sigma_mm: Floats) -> Float
     return covariance
 
 
+def reading_variance(rig: Rig) -> Floats:
+    """(joints,) variance of a reading, deg^2 or mm^2: sigma^2 + resolution^2 / 12."""
+    return np.array([joint.sigma**2 + joint.resolution**2 / 12.0 for joint in rig.joints])
+
+
 def reading_covariance(rig: Rig, joint_jacobian: Floats, rates: Floats) -> Floats:
     """(n, 3, 3) what random errors of the readings and of the fix's instant add, mm^2.
 
-    J_q Sigma_q J_q' + (J_q q_dot)(J_q q_dot)' sigma_t^2, with a reading's variance sigma^2 + resolution^2 / 12.
+    J_q Sigma_q J_q' + (J_q q_dot)(J_q q_dot)' sigma_t^2, of each fix by itself.
     """
-    sigma = np.array([np.hypot(j.sigma, j.resolution / np.sqrt(12.0)) for j in rig.joints])
-    scaled = joint_jacobian * sigma
-    covariance: Floats = scaled @ scaled.transpose(0, 2, 1)
+    covariance = covariance_by_joints(joint_jacobian, reading_variance(rig))
     velocity = joint_jacobian @ rates[:, :, None] * rig.station.timing_sigma_s
     moving: Floats = covariance + velocity @ velocity.transpose(0, 2, 1)
     return moving
+
+
+def covariance_by_joints(joint_jacobian: Floats, variance: Floats) -> Floats:
+    """(n, 3, 3) J_q V J_q': what independent errors of the joints' values do to the positions, mm^2.
+
+    Args:
+        joint_jacobian: (n, 3, joints) J_q, mm per deg or mm.
+        variance: (joints,) or (n, joints), deg^2 or mm^2.
+    """
+    scaled = joint_jacobian * np.sqrt(variance)[..., None, :]
+    covariance: Floats = scaled @ scaled.transpose(0, 2, 1)
+    return covariance
 
 
 def joint_rates(rig: Rig, observations: Observations) -> Floats:
@@ -100,23 +123,56 @@ def averaged(chain: Chain, observations: Observations) -> Samples:
     expected = np.trace(covariance, axis1=1, axis2=2).mean() / 3.0
     repeat_variance = max(0.0, squares / (3.0 * freedom) - expected) if freedom >= _LEAST_REPEATS else 0.0
 
-    def mean(values: Floats) -> Floats:
-        out = np.zeros((len(count), *values.shape[1:]))
-        np.add.at(out, of_row, values)
-        averaged_values: Floats = out / count.reshape(-1, *([1] * (values.ndim - 1)))
-        return averaged_values
-
     first = np.unique(of_row, return_index=True)[1]
     start = data.readings[first][of_row]
     readings = start + _differences(rig, data.readings - start)
+    means = ChainData(_averages(of_row, readings), data.prism[first], data.setup[first])
     return Samples(
-        ChainData(mean(readings), data.prism[first], data.setup[first]),
-        mean(position),
-        mean(covariance + repeat_variance * np.eye(3)) / count[:, None, None],
-        mean(joint_rates(rig, observations)),
+        means,
+        _averages(of_row, position),
+        _averages(of_row, covariance + repeat_variance * np.eye(3)) / count[:, None, None],
+        _averages(of_row, joint_rates(rig, observations)),
         of_row,
         float(repeat_variance),
+        _shared(rig, observations.select(first), means, np.bincount(of_row)),
     )
+
+
+def _averages(of_row: Integers, values: Floats) -> Floats:
+    count = np.bincount(of_row)
+    out = np.zeros((len(count), *values.shape[1:]))
+    np.add.at(out, of_row, values)
+    averages: Floats = out / count.reshape(-1, *([1] * (values.ndim - 1)))
+    return averages
+
+
+def _shared(rig: Rig, observations: Observations, means: ChainData, count: Integers) -> Integers:
+    """(m,) number of each sample's standstill, from one observation of each, mean readings and how many it averages.
+
+    A standstill takes a prism in once: a second sample of it is one that disagreed.
+    """
+    steady = _steady(rig)
+    found = np.arange(len(means), dtype=np.intp)
+    begun: dict[tuple[str, str, str], list[tuple[int, Floats, set[int]]]] = {}
+    # Most repeats first, so that the odd one out joins no others.
+    for sample in np.argsort(-count, kind="stable").tolist():
+        key = str(observations.session[sample]), str(observations.setup[sample]), str(observations.pose[sample])
+        if not key[2]:
+            continue
+        prism, readings = int(means.prism[sample]), means.readings[sample]
+        for number, first, prisms in begun.setdefault(key, []):
+            if prism not in prisms and (np.abs(_differences(rig, readings - first)) <= steady).all():
+                prisms.add(prism)
+                found[sample] = number
+                break
+        else:
+            begun[key].append((sample, readings, {prism}))
+    return found
+
+
+def _steady(rig: Rig) -> Floats:
+    """(joints,) by how much readings of a joint that stands still may differ, deg or mm."""
+    return np.array([_REPEAT_LIMIT * joint.sigma + 2 * joint.resolution for joint in rig.joints])
 
 
 def _differences(rig: Rig, change: Floats) -> Floats:
@@ -134,7 +190,7 @@ def _standstills(
     would be a place, or a joint value, that never was.
     """
     position_mm = observations.position_mm
-    steady = np.array([_REPEAT_LIMIT * joint.sigma + 2 * joint.resolution for joint in rig.joints])
+    steady = _steady(rig)
     keys = zip(
         observations.session.tolist(),
         observations.setup.tolist(),
