@@ -1,0 +1,1 @@
+"""Global search: differential evolution on islands."""
