@@ -1,21 +1,30 @@
 """What the data cannot see: singular values of the whitened Jacobian, each parameter measured in prior sigmas.
 
 The prior itself takes no part: a direction counts as seen where the data alone would determine it within ten prior
-sigmas. Everything else stays at its prior and is named, redundant parameters with what they repeat.
+sigmas. Everything else stays at its prior and is named in words: parameters that no fix depends on with the reason
+where it can be known, redundant ones with what they repeat.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.stats.qmc import Halton
 
+from calibration.identification.additions import Additions
 from calibration.identification.samples import Samples, reading_covariance
-from calibration.kinematics import Chain
+from calibration.identification.standing import standing_spread
+from calibration.kinematics import Chain, Linearisation
 from calibration.observations import Floats
 
 _SEEN = 0.1
 _FLAT_SIGMA = {"mm": 1e3, "rad": 1.0}
+_ALIKE = 0.9  # parameters that stay at their prior as much as the one that stays most are equal candidates
+_MARKED = 0.1  # share of a parameter's prior variance that the data leave
 _PART = 0.05  # smallest share of a combination that is worth naming
 _NAMED = 4
 
@@ -25,69 +34,297 @@ class Identifiability:
     """How much of the parameters the data determine.
 
     Attributes:
-        parameters: how many there are.
+        parameters: how many were asked for: of the kinematics, and the coefficients of effects fitted along.
         rank: how many directions of them the data see.
         unidentifiable: one sentence for each direction they do not see.
+        marked: names of the parameters that stay at their prior, by a tenth of their prior variance or more.
+        observability: `O1` .. `O5`, larger is better (`observability_indices`); empty if the data see nothing.
     """
 
     parameters: int
     rank: int
     unidentifiable: tuple[str, ...]
+    marked: tuple[str, ...] = ()
+    observability: Mapping[str, float] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, object]:
         """The contract's JSON object."""
-        return {"parameters": self.parameters, "rank": self.rank, "unidentifiable": list(self.unidentifiable)}
+        return {
+            "parameters": self.parameters,
+            "rank": self.rank,
+            "unidentifiable": list(self.unidentifiable),
+            "marked": list(self.marked),
+            "observability": dict(self.observability),
+        }
 
 
-def identifiability(chain: Chain, samples: Samples, x: Floats, excess_variance: float) -> Identifiability:
-    """Rank and null space at parameters `x` (p,)."""
-    lin = chain.linearise(x, samples.data)
-    covariance = samples.station_covariance + reading_covariance(chain.rig, lin.joint_jacobian, samples.rates)
-    covariance = covariance + excess_variance * np.eye(3)
-    sigma = np.where(np.isinf(chain.prior_sigma), [_FLAT_SIGMA[p.unit] for p in chain.parameters], chain.prior_sigma)
-    whitened = np.linalg.solve(np.linalg.cholesky(covariance), lin.jacobian * sigma).reshape(-1, len(chain))
+@dataclass(frozen=True)
+class _Asked:
+    """The parameters under analysis: their names, what the words call them, and one prior sigma of each."""
+
+    names: tuple[str, ...]
+    words: tuple[str, ...]
+    groups: tuple[str, ...]
+    sigma: Floats
+    columns: NDArray[np.intp]  # which columns of parameters and coefficients
+
+
+def identifiability(
+    chain: Chain,
+    samples: Samples,
+    x: Floats,
+    excess_variance: float,
+    *,
+    free: NDArray[np.bool_] | None = None,
+    additions: Additions | None = None,
+) -> Identifiability:
+    """Rank and null space.
+
+    Args:
+        chain: kinematics.
+        samples: m rows.
+        x: (p,) parameters at which to look, (p + k,) where coefficients are not zero.
+        excess_variance: what the scatter of the data adds to their covariance, mm^2 per axis.
+        free: (p,) which parameters are asked for, the others being known (base and prisms, say); all by default.
+        additions: k coefficients of effects that are fitted along; all of them are asked for.
+    """
+    coefficients = 0 if additions is None else len(additions)
+    at = np.concatenate([x, np.zeros(len(chain) + coefficients - len(x))])
+    asked = _asked(chain, free, additions)
+    whitened = _whitened(chain, samples, at, excess_variance, additions, asked)
+    count = len(asked.names)
     # The triangle has the singular values of the whole, at a fraction of the cost.
     _, singular, vt = np.linalg.svd(np.linalg.qr(whitened, mode="r"), full_matrices=True)
     rank = int((singular > _SEEN).sum())
-    return Identifiability(len(chain), rank, _sentences(chain, vt[rank:], np.linalg.norm(whitened, axis=0)))
+    null = vt[rank:]
+    sentences: list[str] = []
+    if rank < count:
+        moved = {
+            joint: _whitened(chain, shown, at, excess_variance, additions, asked)
+            for joint, shown in _with_still_joints_moved(chain, samples).items()
+        }
+        blind, combinations = _echelon(null, np.linalg.norm(whitened, axis=0))
+        for i in blind:
+            reason = _why_blind(chain, samples, asked.names[i]) or _why(chain, moved, np.eye(count)[i])
+            sentences.append(f"{asked.names[i]}: the data say nothing of {asked.words[i]}{reason}")
+        effect = np.linalg.norm(whitened, axis=0)
+        for pivot, direction in combinations:
+            sentences.append(_repeats(asked, pivot, direction * effect) + _why(chain, moved, direction))
+    left = (null**2).sum(axis=0)
+    return Identifiability(
+        count,
+        rank,
+        tuple(sentences),
+        tuple(name for name, share in zip(asked.names, left, strict=True) if share >= _MARKED),
+        observability_indices(singular[:rank], len(samples)),
+    )
 
 
-def _sentences(chain: Chain, null: Floats, effect: Floats) -> tuple[str, ...]:
-    """Bring the null space (k, p) to reduced echelon form: each row is one parameter and what it repeats.
+def observability_indices(singular: Floats, measurements: int) -> dict[str, float]:
+    """The five observability indices of a set of measurements.
 
-    Parameters are weighed by their `effect` (p,), the length of their columns, so that what a combination moves
-    counts and not the unit it is in.
+    With the singular values s_1 >= ... >= s_r of the identification Jacobian, here whitened by the covariance of the
+    fixes and in prior sigmas of each parameter, so that all are without unit:
+
+        O1 = (s_1 s_2 ... s_r)^(1/r) / sqrt(m)   Borm and Menq (1991): volume of the confidence ellipsoid (D-optimal)
+        O2 = s_r / s_1                           Driels and Pathre (1990): its eccentricity (condition number)
+        O3 = s_r                                 Nahvi, Hollerbach and Hayward (1994): its longest axis (E-optimal)
+        O4 = s_r^2 / s_1                         Nahvi and Hollerbach (1996): amplification of noise
+        O5 = 1 / (1/s_1 + ... + 1/s_r)           Sun and Hollerbach (2008): sum of its axes (near A-optimal)
+
+    Args:
+        singular: (r,) positive, falling, of the directions that the data see.
+        measurements: m, number of fixes.
+
+    Returns:
+        `O1` .. `O5`; empty for r = 0.
     """
-    blind = effect <= _SEEN
-    # Blind parameters span part of the null space by themselves; the rest of it is orthogonal to them.
-    rest = _row_space(null[:, ~blind], len(null) - int(blind.sum()))
-    names = [p.name for p, unseen in zip(chain.parameters, blind, strict=True) if not unseen]
-    found = [
-        f"{p.name}: the data say nothing of it" for p, unseen in zip(chain.parameters, blind, strict=True) if unseen
-    ]
-    rows = rest * effect[~blind]
+    if len(singular) == 0:
+        return {}
+    largest, smallest = float(singular[0]), float(singular[-1])
+    return {
+        "O1": math.exp(float(np.log(singular).mean())) / math.sqrt(measurements),
+        "O2": smallest / largest,
+        "O3": smallest,
+        "O4": smallest**2 / largest,
+        "O5": 1.0 / float((1.0 / singular).sum()),
+    }
+
+
+# -- the Jacobian ----------------------------------------------------------------------------------------------------
+
+
+def _asked(chain: Chain, free: NDArray[np.bool_] | None, additions: Additions | None) -> _Asked:
+    asked = np.ones(len(chain), dtype=bool) if free is None else free
+    names = [p.name for p in chain.parameters]
+    sigma = np.where(np.isinf(chain.prior_sigma), [_FLAT_SIGMA[p.unit] for p in chain.parameters], chain.prior_sigma)
+    words = [_words(chain, name) for name in names]
+    if additions is not None:
+        names += additions.names
+        words += [(text := _words_of_coefficient(name), text) for name in additions.names]
+        sigma = np.concatenate([sigma, additions.prior_sigma])
+    columns = np.concatenate([np.flatnonzero(asked), np.arange(len(chain), len(names))])
+    return _Asked(
+        tuple(names[i] for i in columns),
+        tuple(words[i][0] for i in columns),
+        tuple(words[i][1] for i in columns),
+        sigma[columns],
+        columns,
+    )
+
+
+def _whitened(
+    chain: Chain, samples: Samples, at: Floats, excess_variance: float, additions: Additions | None, asked: _Asked
+) -> Floats:
+    """(3 m, q) change of the fixes in their sigmas by one prior sigma of each parameter asked for."""
+    lin, jacobian = _linearised(chain, samples, at, additions)
+    covariance = samples.station_covariance + reading_covariance(chain.rig, lin.joint_jacobian, samples.rates)
+    covariance = covariance + excess_variance * np.eye(3)
+    whitened = np.linalg.solve(np.linalg.cholesky(covariance), jacobian[:, :, asked.columns] * asked.sigma)
+    return np.asarray(whitened.reshape(-1, len(asked.columns)), dtype=np.float64)
+
+
+def _linearised(
+    chain: Chain, samples: Samples, at: Floats, additions: Additions | None
+) -> tuple[Linearisation, Floats]:
+    """The linearisation and (m, 3, p + k) the Jacobian by parameters and coefficients."""
+    if additions is None:
+        lin = chain.linearise(at, samples.data)
+        return lin, lin.jacobian
+    readings = samples.data.readings
+    corrected = readings + additions.change(at[len(chain) :], readings.shape[1])
+    lin = chain.linearise(at[: len(chain)], replace(samples.data, readings=corrected))
+    by_coefficient = lin.joint_jacobian[:, :, additions.joint] * additions.column[:, None, :]
+    return lin, np.concatenate([lin.jacobian, by_coefficient], axis=2)
+
+
+# -- the null space --------------------------------------------------------------------------------------------------
+
+
+def _echelon(null: Floats, effect: Floats) -> tuple[list[int], list[tuple[int, Floats]]]:
+    """Bring the null space (k, q), in prior sigmas, to reduced echelon form: each row one parameter and its repeats.
+
+    The pivots are the parameters that stay at their prior most; of equal ones the last, as earlier rows are what people
+    look for.
+
+    Returns:
+        Columns whose own `effect` (q,) is nothing; (pivot, (q,) direction of length 1) of the others.
+    """
+    # So small that all of them together are still not seen: each takes one direction of the null space by itself.
+    blind = effect <= _SEEN / math.sqrt(len(effect))
+    others = np.flatnonzero(~blind)
+    rows = _row_space(null[:, others], len(null) - int(blind.sum()))
     pivots: list[int] = []
-    for k in range(len(rows)):
-        size = np.abs(rows[k:])
-        # The last parameter that weighs enough gives way: earlier rows are what people look for.
-        enough = size.max(axis=0) >= 0.5 * size.max()
-        enough[pivots] = False
-        pivot = int(np.flatnonzero(enough)[-1])
-        best = k + int(size[:, pivot].argmax())
-        rows[[k, best]] = rows[[best, k]]
-        rows[k] /= rows[k, pivot]
-        for other in range(len(rows)):
-            if other != k:
-                rows[other] -= rows[other, pivot] * rows[k]
+    left = rows.copy()
+    for _ in range(len(rows)):
+        size = np.linalg.norm(left, axis=0)
+        pivot = int(np.flatnonzero(size >= _ALIKE * size.max())[-1])
+        unit = left[:, pivot] / size[pivot]
+        left = left - np.outer(unit, unit @ left)
+        left[:, pivot] = 0.0
         pivots.append(pivot)
-    for row, pivot in zip(rows, pivots, strict=True):
-        order = np.argsort(-np.abs(row), kind="stable").tolist()
-        others = [names[i] for i in order if i != pivot and abs(row[i]) > _PART]
-        more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
-        found.append(f"{names[pivot]}: repeats {', '.join(others[:_NAMED])}{more}")
-    return tuple(sorted(found))
+    reduced = np.linalg.solve(rows[:, pivots], rows) if pivots else rows
+    found = []
+    for pivot, row in sorted(zip(pivots, reduced, strict=True), key=lambda pair: pair[0]):
+        direction = np.zeros(len(effect))
+        direction[others] = row / np.linalg.norm(row)
+        found.append((int(others[pivot]), direction))
+    return np.flatnonzero(blind).tolist(), found
 
 
 def _row_space(rows: Floats, rank: int) -> Floats:
-    """(rank, p) orthonormal basis of the strongest directions of (k, p) rows."""
+    """(rank, q) orthonormal basis of the strongest directions of (k, q) rows."""
     return np.linalg.svd(rows, full_matrices=False)[2][:rank]
+
+
+# -- words -----------------------------------------------------------------------------------------------------------
+
+
+def _repeats(asked: _Asked, pivot: int, part: Floats) -> str:
+    """`row2.beta repeats row3.theta: beta at row 2 repeats the offset of theta3`.
+
+    `part` (q,) is what each parameter's share of the combination moves: that counts, not the unit it is in.
+    """
+    order = np.argsort(-np.abs(part), kind="stable").tolist()
+    others = [i for i in order if i != pivot and abs(part[i]) > _PART * abs(part[pivot])]
+    named, more = others[:_NAMED], len(others) - _NAMED
+    names = _listed([asked.names[i] for i in named], more)
+    words = _listed(dict.fromkeys(asked.groups[i] for i in named), more)
+    return f"{asked.names[pivot]} repeats {names}: {asked.words[pivot]} repeats {words}"
+
+
+def _listed(items: Iterable[str], more: int) -> str:
+    parts = [*items, *([f"{more} more"] if more > 0 else [])]
+    return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
+
+
+def _words(chain: Chain, name: str) -> tuple[str, str]:
+    """A parameter as the one meant, and as one of several that are named together."""
+    where, _, constant = name.rpartition(".")
+    if where.startswith("base"):
+        setup = where.removeprefix("base")[1:-1]
+        base = f"the base at set-up {setup!r}" if setup else "the base"
+        axis = constant[-1]
+        if constant.startswith("r"):
+            return f"the turn of {base} about {axis}", f"the attitude of {base}"
+        return f"{axis} of {base}", f"the place of {base}"
+    if where.startswith("prism."):
+        prism = f"prism {where.removeprefix('prism.')}"
+        return f"{constant} of {prism}", f"the place of {prism}"
+    number = int(where.removeprefix("row"))
+    couplings = list(chain.rig.couplings())
+    drivers = [joint for row, driven, joint, _ in couplings if (row, driven) == (number, constant)]
+    if len(drivers) == 1 and sum(joint == drivers[0] for _, _, joint, _ in couplings) == 1:
+        return (text := f"the offset of {drivers[0]}"), text
+    return (text := f"{constant} at row {number}"), text
+
+
+def _words_of_coefficient(name: str) -> str:
+    family, _, place = name.partition("@")
+    where, _, coefficient = place.partition(":")
+    return f"{coefficient} of {family} at {where}" if coefficient else f"{family} at {where}"
+
+
+def _why_blind(chain: Chain, samples: Samples, name: str) -> str:
+    """Why no fix depends on a parameter, where it is that no prism beyond it was measured."""
+    where, _, _ = name.rpartition(".")
+    measured = [chain.rig.prisms[i] for i in np.unique(samples.data.prism)]
+    if where.startswith("prism.") and where.removeprefix("prism.") not in {p.name for p in measured}:
+        return f": prism {where.removeprefix('prism.')} was not measured"
+    if where.startswith("row") and not any(int(where[3:]) in chain.rig.path(p.frame) for p in measured):
+        return f": no prism beyond row {where[3:]} was measured"
+    if where.startswith("base[") and not (samples.data.setup == chain.setups.index(where[5:-1])).any():
+        return f": set-up {where[5:-1]!r} has no fixes"
+    return ""
+
+
+def _with_still_joints_moved(chain: Chain, samples: Samples) -> dict[tuple[int, ...], Samples]:
+    """The same rows as they would be had joints that never moved been moved through their limits: each, and all."""
+    readings = samples.data.readings
+    still = np.flatnonzero(np.ptp(readings, axis=0) <= standing_spread(chain.rig)).tolist()
+    if not still:
+        return {}
+    turn = Halton(len(still), scramble=False).random(len(samples))
+    low, high = np.array([chain.rig.joints[j].limits for j in still]).T
+    spread = low + (high - low) * turn
+
+    def moved(which: Sequence[int]) -> Samples:
+        shown = readings.copy()
+        for joint in which:
+            shown[:, joint] = spread[:, still.index(joint)]
+        return replace(samples, data=replace(samples.data, readings=shown))
+
+    return {tuple(which): moved(which) for which in [*([j] for j in still), still]}
+
+
+def _why(chain: Chain, moved: Mapping[tuple[int, ...], Floats], direction: Floats) -> str:
+    """The joints that never moved and would show a direction (q,) if they did."""
+    for joints, whitened in moved.items():
+        if float(np.linalg.norm(whitened @ direction)) > _SEEN:
+            names = [chain.rig.joint_names[j] for j in joints]
+            return (
+                f", as {_listed(names, 0)} never moved"
+                if len(names) == 1
+                else f", as none of {_listed(names, 0)} moved"
+            )
+    return ""

@@ -1,0 +1,1 @@
+"""Single-joint sweeps: the axes that their circles and lines show."""

@@ -1,0 +1,193 @@
+"""The identified model held against the axes that single-joint sweeps show, joint by joint.
+
+What the model says of a sweep is the circle or line through its own places of that sweep, so that both sides pass
+through the same fit. Two things are told apart: the joint's axis itself, which a wrong constant further out leaves
+where it is, and the curve of the prism about or along it (a circle's radius and plane, a line's place), in which
+everything out to the prism takes part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import f as f_distribution
+
+from calibration.identification.sweeps.circle_fit import CENTRE, DIRECTION, FEATURES, RADIUS, TRAVEL
+from calibration.identification.sweeps.circles import Axis, drives_several, predicted_curve
+from calibration.kinematics import Chain
+from calibration.observations import Floats
+
+_CHANCE = 0.001  # that any axis of a right model is found wrong
+_REVERSED = 0.5 * np.pi
+
+
+@dataclass(frozen=True)
+class AxisCheck:
+    """A sweep's axis as measured against the model's; sigma includes measurement, readings and model.
+
+    Attributes:
+        joint, setup, prism: whose sweep it is.
+        angle_deg, angle_sigma_deg: between the axes.
+        offset_mm, offset_sigma_mm: distance of the centres across the axis.
+        along_mm, along_sigma_mm: measured minus modelled place of the circle's plane along its axis; 0 for a line.
+        radius_mm, radius_sigma_mm: measured minus modelled radius; 0 for a line.
+        travel, travel_sigma: measured over modelled motion for the same change of reading.
+        p_axis: probability of so large a difference of the axis and its travel by chance.
+        p_curve: the same for what depends on the prism as well: the circle's radius and plane, a line's place.
+        sentence: what is wrong, if anything is beyond chance.
+    """
+
+    joint: str
+    setup: str
+    prism: str
+    angle_deg: float
+    angle_sigma_deg: float
+    offset_mm: float
+    offset_sigma_mm: float
+    along_mm: float
+    along_sigma_mm: float
+    radius_mm: float
+    radius_sigma_mm: float
+    travel: float
+    travel_sigma: float
+    p_axis: float
+    p_curve: float
+    sentence: str | None
+
+
+def cross_check(chain: Chain, x: Floats, covariance: Floats, axes: Sequence[Axis]) -> tuple[AxisCheck, ...]:
+    """Compare every axis with the model's.
+
+    A difference counts where chance makes it less than once in a thousand checks of a right model. The model's own
+    covariance is added to that of the sweep: where the sweep took part in the fit, chance differs by less than that.
+
+    Args:
+        chain: kinematics.
+        x: (p,) identified parameters.
+        covariance: (p, p) of them.
+        axes: of `find_axes`.
+
+    Returns:
+        One for each axis, in their order: from the base outwards.
+    """
+    return tuple(_check(chain, x, covariance, axis, _CHANCE / (2 * len(axes))) for axis in axes)
+
+
+def disagreements(checks: Iterable[AxisCheck]) -> tuple[str, ...]:
+    """One sentence for each joint that disagrees by more than chance, the joint nearest to the base first.
+
+    An axis that is itself elsewhere is named rather than a curve that only differs in size or place.
+    """
+    worst: dict[str, AxisCheck] = {}
+    for check in checks:
+        if check.sentence is None:
+            continue
+        before = worst.get(check.joint)
+        if before is None or _rank(check) < _rank(before):
+            worst[check.joint] = check
+    return tuple(str(check.sentence) for check in worst.values())
+
+
+def _rank(check: AxisCheck) -> tuple[float, float]:
+    return check.p_axis, check.p_curve
+
+
+def _check(chain: Chain, x: Floats, covariance: Floats, axis: Axis, chance: float) -> AxisCheck:
+    modelled = predicted_curve(chain, x, axis)
+    total = axis.covariance + _model_covariance(chain, x, covariance, axis, modelled.sensitivity)
+    difference = axis.features - modelled.features
+    direction = modelled.features[DIRECTION]
+    tilt = difference[DIRECTION] - (difference[DIRECTION] @ direction) * direction
+    angle = float(np.arccos(np.clip(axis.direction @ direction, -1.0, 1.0)))
+    across = difference[CENTRE] - (difference[CENTRE] @ direction) * direction
+
+    # Rows that pick the independent differences: tilt (2), shift across (2), travel; and plane, radius.
+    u, v = np.linalg.svd(direction[None, :])[2][1:]
+    line = np.zeros((5, FEATURES))
+    line[0, DIRECTION], line[1, DIRECTION], line[2, CENTRE], line[3, CENTRE], line[4, TRAVEL] = u, v, u, v, 1.0
+    circle = np.zeros((2, FEATURES))
+    circle[0, CENTRE], circle[1, RADIUS] = direction, 1.0
+    turns = axis.kind == "revolute"
+    # A slide has a direction and no place; a joint that drives several rows turns about no axis of the machine. Where
+    # their curve runs depends on where the prism is.
+    if not turns or drives_several(chain, axis):
+        line, circle = line[[0, 1, 4]], np.vstack([line[2:4], circle])
+    if not turns:
+        circle = circle[:2]
+    p_axis = _chance(line, difference, total, axis.freedom)
+    p_curve = _chance(circle, difference, total, axis.freedom)
+
+    def sigma(way: Floats, part: slice) -> float:
+        """Standard deviation along a unit vector's way, any way across where there is no difference."""
+        size = float(np.linalg.norm(way))
+        unit = way / size if size > 0.0 else u
+        return float(np.sqrt(unit @ total[part, part] @ unit))
+
+    travel = axis.travel / max(float(modelled.features[TRAVEL]), 1e-12)
+    check = AxisCheck(
+        joint=axis.joint,
+        setup=axis.setup,
+        prism=axis.prism,
+        angle_deg=float(np.degrees(angle)),
+        angle_sigma_deg=float(np.degrees(sigma(tilt, DIRECTION))),
+        offset_mm=float(np.linalg.norm(across)),
+        offset_sigma_mm=sigma(across, CENTRE),
+        along_mm=float(difference[CENTRE] @ direction) if turns else 0.0,
+        along_sigma_mm=float(np.sqrt(direction @ total[CENTRE, CENTRE] @ direction)) if turns else 0.0,
+        radius_mm=float(difference[RADIUS]),
+        radius_sigma_mm=float(np.sqrt(total[RADIUS, RADIUS])),
+        travel=travel,
+        travel_sigma=float(np.sqrt(total[TRAVEL, TRAVEL])) / max(float(modelled.features[TRAVEL]), 1e-12),
+        p_axis=p_axis,
+        p_curve=p_curve,
+        sentence=None,
+    )
+    return _with_sentence(check, chance, turns=turns)
+
+
+def _model_covariance(chain: Chain, x: Floats, covariance: Floats, axis: Axis, sensitivity: Floats) -> Floats:
+    """(8, 8) of the modelled features: by the parameters and by the readings of the joints that stood."""
+    lin = chain.linearise(x, axis.sweep)
+    by_place = sensitivity.reshape(FEATURES, -1)
+    by_parameter = by_place @ lin.jacobian.reshape(-1, len(x))
+    by_reading = by_place @ lin.joint_jacobian.reshape(-1, len(chain.rig.joints))
+    sigma = np.array([np.hypot(j.sigma, j.resolution / np.sqrt(12.0)) for j in chain.rig.joints])
+    sigma[chain.rig.joint_names.index(axis.joint)] = 0.0  # its readings only move the places along the curve
+    readings: Floats = (by_reading * sigma) @ (by_reading * sigma).T
+    return by_parameter @ covariance @ by_parameter.T + readings
+
+
+def _chance(pick: Floats, difference: Floats, covariance: Floats, freedom: int) -> float:
+    """Probability of so large a difference (Hotelling's T^2 as F, the noise being estimated too)."""
+    part = pick @ difference
+    own = pick @ covariance @ pick.T
+    scale = 1.0 / np.sqrt(np.diag(own))
+    square = float(part * scale @ np.linalg.solve(own * scale[:, None] * scale, part * scale))
+    return float(f_distribution.sf(square / len(part), len(part), max(freedom, 1)))
+
+
+def _with_sentence(check: AxisCheck, chance: float, *, turns: bool) -> AxisCheck:
+    where = f"by the sweep of prism {check.prism}" + (f" at set-up {check.setup!r}" if check.setup else "")
+    text = None
+    if np.radians(check.angle_deg) > _REVERSED:
+        text = f"{check.joint} runs the other way than in the model {where}: is its sign right?"
+    elif check.p_axis < chance:
+        away = f" and {check.offset_mm:.1f} +- {check.offset_sigma_mm:.1f} mm" if turns else ""
+        parts = [f"{check.angle_deg:.2f} +- {check.angle_sigma_deg:.2f} deg{away} from where the model has it"]
+        if abs(check.travel - 1.0) > 4.0 * check.travel_sigma:
+            parts.append(f"moves {check.travel:.4g} times as far as the model says for the same change of reading")
+        text = f"the axis of {check.joint} {where} is {' and it '.join(parts)}"
+    elif check.p_curve < chance and not turns:
+        text = (
+            f"as {check.joint} moves, prism {check.prism} runs {check.offset_mm:.1f} +- {check.offset_sigma_mm:.1f} mm "
+            f"beside where the model has it"
+        )
+    elif check.p_curve < chance:
+        text = (
+            f"about {check.joint}, prism {check.prism} runs on a circle that is {check.radius_mm:+.1f} +- "
+            f"{check.radius_sigma_mm:.1f} mm in radius and {check.along_mm:+.1f} +- {check.along_sigma_mm:.1f} mm "
+            f"along the axis from the model's"
+        )
+    return replace(check, sentence=text)
