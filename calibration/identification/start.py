@@ -6,6 +6,7 @@ The rigid transform is Kabsch's (Acta Cryst. A32, 1976), reweighted so that gros
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from calibration.kinematics import Chain, Placement
 from calibration.observations import Floats
 
 _ROUNDS = 200
-_SETTLED_MM = 1e-3
+_SETTLED = 1e-3  # of the misfit
 _LINE = 1e-3  # second singular value over the first below which points lie on a line
 _MIRRORED = 0.3
 
@@ -49,7 +50,15 @@ def rigid_fit(base_mm: Floats, station_mm: Floats, weight: Floats, *, mirrored: 
     return Placement(rotation, to_centre - rotation @ from_centre)
 
 
-def rough_start(chain: Chain, samples: Samples, x: Floats, *, offsets: bool = True) -> Start:
+def rough_start(
+    chain: Chain,
+    samples: Samples,
+    x: Floats,
+    *,
+    offsets: bool = True,
+    mirrored: Literal["refuse", "let pass"] = "refuse",
+    rounds: int = _ROUNDS,
+) -> Start:
     """Place every base, alternating with the offsets of prisms whose mounting is unknown.
 
     Args:
@@ -57,6 +66,8 @@ def rough_start(chain: Chain, samples: Samples, x: Floats, *, offsets: bool = Tr
         samples: rows of every set-up of the chain.
         x: (p,) parameters to begin with; those of the bases are zero.
         offsets: False to leave the offsets of prisms as `x` has them.
+        mirrored: what to do about coordinates that fit much better as their mirror image.
+        rounds: of reweighting at most.
 
     Raises:
         UnsafeError: a set-up with fewer than three fixes, with all fixes on a line, or mirrored.
@@ -71,7 +82,7 @@ def rough_start(chain: Chain, samples: Samples, x: Floats, *, offsets: bool = Tr
     for setup, rows in zip(chain.setups, rows_of, strict=True):
         _check_spread(setup, samples.position_mm[rows])
     base = np.zeros_like(arm)
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         before = base.copy()
         point = arm + offset_jacobian @ offset
         placements = [rigid_fit(point[r], samples.position_mm[r], weight[r]) for r in rows_of]
@@ -90,21 +101,28 @@ def rough_start(chain: Chain, samples: Samples, x: Floats, *, offsets: bool = Tr
                 (offset_jacobian * root[:, :, None]).reshape(-1, len(offset)), (misfit * root).ravel(), rcond=1e-9
             )[0]
         offset = offset + step
-        if max(np.abs(step).max(initial=0.0), np.abs(base - before).max()) < _SETTLED_MM:
+        if max(np.abs(step).max(initial=0.0), np.abs(base - before).max()) < _SETTLED * scale:
             break
-    for setup, placement, rows in zip(chain.setups, placements, rows_of, strict=True):
+    for setup, placement, rows in zip(chain.setups, placements, rows_of, strict=True) if mirrored == "refuse" else ():
         _check_handedness(setup, point[rows], samples.position_mm[rows], weight[rows], placement)
     x = x.copy()
     x[unknown] += offset
     return Start(dict(zip(chain.setups, placements, strict=True)), x, scale)
 
 
+def on_a_line(position_mm: Floats) -> bool:
+    """Whether points (n, 3) leave a turn about them open: fewer than three, or all on a line."""
+    if len(position_mm) < 3:
+        return True
+    spread = np.linalg.svd(position_mm - position_mm.mean(axis=0), compute_uv=False)
+    return bool(spread[1] <= _LINE * spread[0] or spread[0] == 0.0)
+
+
 def _check_spread(setup: str, position_mm: Floats) -> None:
     name = f"set-up {setup!r}" if setup else "the data"
     if len(position_mm) < 3:
         raise UnsafeError(f"{name}: {len(position_mm)} fixes cannot place the base; at least 3 in different places")
-    spread = np.linalg.svd(position_mm - position_mm.mean(axis=0), compute_uv=False)
-    if spread[1] <= _LINE * spread[0] or spread[0] == 0.0:
+    if on_a_line(position_mm):
         raise UnsafeError(f"{name}: all fixes lie on a line, so the base may turn about it; measure other poses")
 
 

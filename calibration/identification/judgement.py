@@ -1,0 +1,165 @@
+"""Judging data and fit: whether they are what they seem, in refusals and in warnings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.errors import UnsafeError
+from calibration.identification.refinement import Fit, Prior
+from calibration.identification.samples import Samples, reading_covariance
+from calibration.identification.start import rough_start
+from calibration.kinematics import Chain, Placement
+from calibration.observations import Floats, Observations
+from calibration.rig import Rig
+
+_NOISE = 2.0  # times the sigma of instruments and repeats: what is left is theirs
+_CHANCE = 4.0  # standard deviations of the chi-square of the corrections
+_FEW = 0.02  # share of the fixes left out
+_FAR_RAD = math.radians(75.0)  # from the rig file: no assembly is off so much, a reading may be
+_TILTED_DEG = 30.0  # no carrier works on such a slope
+_FAR_TOLERANCES = 100.0  # likewise of lengths
+_DISCARDED = 1.0 / 3.0  # share of the fixes
+_DISCARDED_OF_PRISM = 0.8
+_LEAST_DISCARDED = 5
+_FOREIGN = 2.0  # misfit after the fit over what build tolerances explain before it
+
+
+def originals(observations: Observations) -> NDArray[np.intp]:
+    """(n,) the first row with the same readings and position in every digit: later ones are copies, no measurements."""
+    numbers = np.column_stack([*observations.joints.values(), observations.position_mm]).tolist()
+    labels = zip(observations.prism.tolist(), observations.setup.tolist(), strict=True)
+    seen: dict[tuple[object, ...], int] = {}
+    first = [
+        seen.setdefault((*label, *values), row) for row, (label, values) in enumerate(zip(labels, numbers, strict=True))
+    ]
+    return np.array(first, dtype=np.intp)
+
+
+def refuse_mirrored(chain: Chain, samples: Samples) -> None:
+    """UnsafeError where the coordinates are mirrored: no method can know it from a bad fit."""
+    blank = Chain(chain.rig, {setup: Placement.identity() for setup in chain.setups})
+    rough_start(blank, samples, np.zeros(len(blank)), mirrored="refuse")
+
+
+def rms_left_mm(chain: Chain, samples: Samples, x: Floats) -> float:
+    """RMS 3-D error of all samples."""
+    error = samples.position_mm - chain.positions_mm(x[: len(chain)], samples.data)
+    return math.sqrt(float((error**2).sum(axis=1).mean()))
+
+
+def require_enough(rig: Rig, observations: Observations, samples: int | None = None) -> None:
+    """UnsafeError if there are fewer fixes, or `samples` different ones, than could determine the parameters."""
+    parameters = len(Chain(rig, {})) + 6 * len(set(observations.setup.tolist()))
+    needed = math.ceil(parameters / 3)
+    fixes = len(observations)
+    if fixes < needed:
+        raise UnsafeError(f"{fixes} fixes cannot determine {parameters} parameters; measure at least {needed}")
+    if samples is not None and samples < needed:
+        raise UnsafeError(
+            f"{fixes} fixes are repeats of {samples} different ones, which cannot determine {parameters} parameters; "
+            f"measure at least {needed} different ones"
+        )
+
+
+def doubts(observations: Observations, chain: Chain, samples: Samples) -> Iterator[str]:
+    """What about the data weakens the result without preventing it."""
+    copied = np.flatnonzero(originals(observations) != np.arange(len(observations)))
+    if len(copied):
+        yield (
+            f"{len(copied)} of {len(observations)} rows are copies of earlier ones in every digit, the first in row "
+            f"{copied[0] + 1}, and count once"
+        )
+    if len(samples) < len(chain):
+        yield (
+            f"{len(samples)} different fixes for {len(chain)} parameters: much of the model rests on build tolerances "
+            f"alone; measure {2 * len(chain)} or more, in poses all over the work volume"
+        )
+
+
+def tilts(chain: Chain, fit: Fit) -> Iterator[str]:
+    """Set-ups where up at the rig is not up at the station, which a rigid placement hides from the fit."""
+    gravity = np.array(chain.rig.gravity) / np.linalg.norm(chain.rig.gravity)
+    for number, setup in enumerate(chain.setups):
+        up = -chain.base(fit.x, number).rotation @ gravity
+        tilt_deg = math.degrees(math.acos(float(np.clip(up[2], -1.0, 1.0))))
+        if tilt_deg > _TILTED_DEG:
+            name = f"set-up {setup!r}" if setup else "the base"
+            yield (
+                f"{name}: what the rig file calls up is {tilt_deg:.0f} deg from the station's z; check the order of "
+                f"x, y, z, that the station is levelled, and gravity in the rig file (positions are right all the "
+                f"same; loads of gravity would not be)"
+            )
+
+
+def at_the_noise(chain: Chain, samples: Samples, fit: Fit) -> bool:
+    """Whether nothing is left for another optimum to explain.
+
+    Errors at the size that station, readings and repeats account for are as good as any model's, and the corrections
+    that led there are as large as the prior expects (its scale included): another optimum could only tie.
+    """
+    lin = chain.linearise(fit.x, samples.data)
+    known = samples.station_covariance + reading_covariance(chain.rig, lin.joint_jacobian, samples.rates)
+    tolerated = np.isfinite(chain.prior_sigma)
+    pull = fit.x[tolerated] / (fit.prior_scale * chain.prior_sigma[tolerated])
+    ordinary = float(pull @ pull) < len(pull) + _CHANCE * math.sqrt(2.0 * len(pull))
+    variance = float(np.trace(known, axis1=1, axis2=2).mean()) / 3.0
+    discarded = float((fit.weight < 0.5).mean())
+    return ordinary and fit.excess_variance < _NOISE**2 * variance and discarded < _FEW and fit.settled
+
+
+def rms_tolerated_mm(chain: Chain, samples: Samples, nominal: Fit) -> float:
+    """RMS 3-D error of the nominal model that build tolerances explain."""
+    lin = chain.linearise(nominal.x, samples.data)
+    sigma = np.where(np.isinf(chain.prior_sigma), 0.0, chain.prior_sigma)
+    return math.sqrt(float(((lin.jacobian * sigma) ** 2).sum() / len(samples)))
+
+
+def mean_error_mm(chain: Chain, samples: Samples, fit: Fit) -> float:
+    """Mean 3-D error of all samples, discarded ones too."""
+    error = samples.position_mm - chain.positions_mm(fit.x, samples.data)
+    return float(np.linalg.norm(error, axis=1).mean())
+
+
+def beyond_assembly(chain: Chain, fit: Fit) -> bool:
+    """Whether a fit is so far from the rig file that it stands for a reading that means something else."""
+    tolerated = np.isfinite(chain.prior_sigma)
+    angle = tolerated & np.array([p.unit == "rad" for p in chain.parameters])
+    length = tolerated & ~angle
+    far_angle = np.abs(fit.x[angle]) > _FAR_RAD
+    far_length = np.abs(fit.x[length]) > _FAR_TOLERANCES * chain.prior_sigma[length]
+    return bool(far_angle.any() or far_length.any())
+
+
+def refuse_foreign(chain: Chain, samples: Samples, fit: Fit, tolerated_mm: float, prior: Prior) -> None:
+    """Errors that build tolerances cannot explain even before calibration mean another machine or wrong columns."""
+    error = samples.position_mm - chain.positions_mm(fit.x, samples.data)
+    left = math.sqrt(float(fit.weight @ (error**2).sum(axis=1) / fit.weight.sum()))
+    if left > _FOREIGN * tolerated_mm:
+        hint = "" if prior == "as-built" else "; if the nominal model is that far off, use --prior as-built"
+        raise UnsafeError(
+            f"after the fit the fixes are still {left:.0f} mm RMS off, outliers aside, where this rig's build "
+            f"tolerances explain {tolerated_mm:.0f} mm even before it: another rig's data, exchanged columns or other "
+            f"units{hint}"
+        )
+
+
+def refuse_discarded(rig: Rig, samples: Samples, fit: Fit, prior: Prior) -> None:
+    """A fit that holds only because it left out much of the data, or nearly all of a prism, is no fit of the data."""
+    discarded = fit.weight < 0.5
+    for prism, name in enumerate(rig.prism_names):
+        own = discarded[samples.data.prism == prism]
+        if own.sum() >= _LEAST_DISCARDED and own.mean() > _DISCARDED_OF_PRISM:
+            hint = "" if prior == "as-built" else "; --prior as-built also tries joints that are mounted turned"
+            raise UnsafeError(
+                f"the fit had to leave out {own.sum()} of the {len(own)} fixes of prism {name!r}, so it would be wrong "
+                f"there: check which prism was measured, its offset, and zero and sign of the joints before it{hint}"
+            )
+    if discarded.mean() > _DISCARDED:
+        raise UnsafeError(
+            f"the fit had to leave out {discarded.sum()} of {len(discarded)} fixes, so it describes a part of the data "
+            f"only: check columns, units and zeros of the joints, and the station's set-up"
+        )
