@@ -3,23 +3,36 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 
+from calibration.effects.base import Situation
+from calibration.effects.fitted import (
+    FittedEffect,
+    coefficient_values,
+    corrected,
+    fitted_additions,
+    left_out,
+    unknown_variance,
+)
 from calibration.errors import UnsafeError
+from calibration.identification.additions import Additions
 from calibration.identification.identifiability import Identifiability
-from calibration.identification.samples import joint_rates, reading_covariance, station_covariance
-from calibration.kinematics import Chain, Placement
+from calibration.identification.refinement import Prior
+from calibration.identification.samples import (
+    covariance_by_joints,
+    joint_rates,
+    reading_covariance,
+    station_covariance,
+)
+from calibration.kinematics import Chain, Linearisation, Placement
 from calibration.observations import Floats, Observations
-from calibration.residual.features import features
+from calibration.residual.features import Features, features, missing_signals
 from calibration.residual.hybrid import Residual, Trial
 from calibration.rig import Rig
-
-Prior = Literal["recalibration", "as-built"]
 
 _OUTLIER_SIGMA = 5.0
 _OUTSIDE = 0.1  # of a joint's trained range
@@ -64,10 +77,12 @@ class Coverage:
     Attributes:
         fixes: prism -> number of fixes.
         ranges: joint -> lowest and highest reading, deg or mm.
+        torques: joints whose torque was measured in most rows.
     """
 
     fixes: Mapping[str, int]
     ranges: Mapping[str, tuple[float, float]]
+    torques: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -94,8 +109,8 @@ class Prediction:
 
     Attributes:
         position_mm: (n, 3) in the station's frame.
-        sigma_mm: (n, 3) standard deviation of a fix about it: parameters, readings, timing, station, what the model
-            lacks.
+        sigma_mm: (n, 3) standard deviation of a fix about it: parameters, readings, timing, station, effects left out
+            for want of a column, what the model lacks.
     """
 
     position_mm: Floats
@@ -109,14 +124,19 @@ class CalibratedModel:
     Attributes:
         rig, rig_text: the rig description and the TOML it was read from.
         placements: set-up -> where the base stands before the base parameters.
-        values, covariance: (p,), (p, p) all parameters, as `Chain.parameters` orders them.
+        values: (p,) all parameters, as `Chain.parameters` orders them, fitted together with the effects.
+        covariance: (p + k, p + k) of them and of the coefficients of the effects.
+        geometric_values: (p,) fitted without the effects; the same where there are none.
         nominal_values: (p,) with base and unknown prism offsets fitted and nothing else.
         prior, prior_scale: how the build tolerances were used.
-        excess_sigma_mm: what the data scatter beyond station and readings, each axis, at stage geometric.
+        excess_sigma_mm: what the data scatter beyond station and readings, each axis, at stage effects.
         repeat_sigma_mm: what repeats of a standstill scatter beyond the station's own sigma, each axis.
-        geometric_noise_mm: RMS 3-D noise at stage geometric.
+        effects_noise_mm: RMS 3-D noise at stage effects.
         identifiability: what the data determined.
         coverage: what they covered.
+        effects: named physics on top of the kinematics.
+        effects_reason: why these, or why none, a clause.
+        joint_error_scale: what kinematics and effects lack, as `calibration.accuracy.joint_error_scale` finds it.
         outliers: fixes of the training data that were weighted out.
         residual: the learner that was kept, if any.
         trials: learners that were compared.
@@ -130,14 +150,18 @@ class CalibratedModel:
     placements: Mapping[str, Placement]
     values: Floats
     covariance: Floats
+    geometric_values: Floats
     nominal_values: Floats
     prior: Prior
     prior_scale: float
     excess_sigma_mm: float
     repeat_sigma_mm: float
-    geometric_noise_mm: float
+    effects_noise_mm: float
     identifiability: Identifiability
     coverage: Coverage
+    effects: tuple[FittedEffect, ...] = ()
+    effects_reason: str = "switched off"
+    joint_error_scale: float = 0.0
     outliers: tuple[Outlier, ...] = ()
     residual: LearnedResidual | None = None
     trials: tuple[Trial, ...] = ()
@@ -154,14 +178,14 @@ class CalibratedModel:
     def noise_mm(self) -> float:
         """RMS 3-D noise: what the whole model, residual included, leaves of a held-out fix."""
         if self.residual is None:
-            return self.geometric_noise_mm
-        known = self.geometric_noise_mm**2 - 3.0 * self.excess_sigma_mm**2
+            return self.effects_noise_mm
+        known = self.effects_noise_mm**2 - 3.0 * self.excess_sigma_mm**2
         return math.sqrt(max(known, 0.0) + float(self.residual.excess_variance_mm2.sum()))
 
     @property
     def parameters(self) -> tuple[ParameterEstimate, ...]:
         """Every identified constant with its standard error."""
-        sigma = np.sqrt(np.diag(self.covariance))
+        sigma = np.sqrt(np.diag(self.covariance))[: len(self.values)]
         return tuple(
             ParameterEstimate(p.name, p.unit, p.kind, float(value), float(error), p.prior_sigma * self.prior_scale)
             for p, value, error in zip(self.chain.parameters, self.values, sigma, strict=True)
@@ -173,9 +197,27 @@ class CalibratedModel:
         return self.chain.positions_mm(self.nominal_values, self.chain.bind(observations))
 
     def geometric_mm(self, observations: Observations) -> Floats:
-        """(n, 3) positions by the identified kinematics. Raises UnsafeError as `check`."""
+        """(n, 3) positions by the kinematics identified without effects. Raises UnsafeError as `check`."""
         self.check(observations)
-        return self.chain.positions_mm(self.values, self.chain.bind(observations))
+        return self.chain.positions_mm(self.geometric_values, self.chain.bind(observations))
+
+    def effects_mm(self, observations: Observations) -> Floats:
+        """(n, 3) positions by kinematics and effects. Raises UnsafeError as `check`."""
+        self.check(observations)
+        return self.chain.positions_mm(self.values, self.chain.bind(self.corrected(observations)))
+
+    def corrected(self, observations: Observations) -> Observations:
+        """The observations with the joints where the effects have them, and not where they read."""
+        return self._corrected(observations)[0] if self.effects else observations
+
+    def _corrected(self, observations: Observations) -> tuple[Observations, Additions]:
+        additions = fitted_additions(self.effects, self._situation(observations))
+        change = additions.change(coefficient_values(self.effects), len(self.rig.joints))
+        return corrected(observations, change, self.rig.joint_names), additions
+
+    def residual_features(self, observations: Observations, signals: Sequence[str]) -> Features:
+        """What a residual learner sees, effects taken into account."""
+        return features(self.chain, self.values, self.corrected(observations), signals)
 
     def correction_mm(self, observations: Observations) -> Floats:
         """(n, 3) what the residual learner adds, in the station's frame; zero for prisms it was not trained on."""
@@ -186,7 +228,7 @@ class CalibratedModel:
         if not known.any():
             return correction
         rows = observations.select(known)
-        seen = features(self.chain, self.values, rows, self.residual.signals)
+        seen = self.residual_features(rows, self.residual.signals)
         correction[known] = self.to_station(rows, self.residual.learner.predict(seen))
         return correction
 
@@ -221,7 +263,7 @@ class CalibratedModel:
         return Prediction(position + self.correction_mm(observations), sigma)
 
     def deviations(self, observations: Observations) -> Floats:
-        """(n,) errors of stage geometric in sigma (Mahalanobis length)."""
+        """(n,) errors of stage effects in sigma (Mahalanobis length)."""
         self.check(observations)
         position, known, parameters = self._covariances(observations)
         error = observations.position_mm - position
@@ -230,17 +272,35 @@ class CalibratedModel:
         return np.asarray(np.linalg.norm(whitened, axis=1), dtype=np.float64)
 
     def find_outliers(self, observations: Observations) -> tuple[Outlier, ...]:
-        """Fixes farther from stage geometric than noise and parameters explain."""
+        """Fixes farther from stage effects than noise and parameters explain."""
         size = self.deviations(observations)
         return tuple(Outlier(int(row), float(size[row])) for row in np.flatnonzero(size > _OUTLIER_SIGMA))
 
     def _covariances(self, observations: Observations) -> tuple[Floats, Floats, Floats]:
-        """Positions of stage geometric, covariance of fix and readings, covariance by the parameters."""
-        lin = self.chain.linearise(self.values, self.chain.bind(observations))
+        """Positions of stage effects, covariance of fix and readings, covariance by parameters and coefficients."""
+        lin, jacobian = self.linearise(observations)
         known = station_covariance(self.rig, lin.position_mm, observations.sigma_mm)
         known = known + reading_covariance(self.rig, lin.joint_jacobian, joint_rates(self.rig, observations))
         known = known + self.repeat_sigma_mm**2 * np.eye(3)
-        return lin.position_mm, known, lin.jacobian @ self.covariance @ lin.jacobian.transpose(0, 2, 1)
+        known = known + covariance_by_joints(lin.joint_jacobian, self.unknown_variance(observations))
+        return lin.position_mm, known, jacobian @ self.covariance @ jacobian.transpose(0, 2, 1)
+
+    def linearise(self, observations: Observations) -> tuple[Linearisation, Floats]:
+        """Stage effects with its derivatives, and (n, 3, p + k) those by parameters and coefficients, mm per unit."""
+        if not self.effects:
+            lin = self.chain.linearise(self.values, self.chain.bind(observations))
+            return lin, lin.jacobian
+        true, additions = self._corrected(observations)
+        lin = self.chain.linearise(self.values, self.chain.bind(true))
+        by_coefficient = lin.joint_jacobian[:, :, additions.joint] * additions.column[:, None, :]
+        return lin, np.concatenate([lin.jacobian, by_coefficient], axis=2)
+
+    def unknown_variance(self, observations: Observations) -> Floats:
+        """(n, joints) variance of the joints' values by effects left out for want of a column, deg^2 or mm^2."""
+        return unknown_variance(self.effects, self._situation(observations))
+
+    def _situation(self, observations: Observations) -> Situation:
+        return Situation(self.chain, self.values, observations)
 
     def unexplained_mm2(self, observations: Observations, variance_mm2: Floats) -> Floats:
         """What is left of a learner's squared errors when the known noise is taken out.
@@ -267,7 +327,7 @@ class CalibratedModel:
 
         The learner is trained on what these very parameters leave, and makes good what structure did to them.
         """
-        return min(1.0, variance_mm2 / max(self.geometric_noise_mm**2, 1e-12))
+        return min(1.0, variance_mm2 / max(self.effects_noise_mm**2, 1e-12))
 
     def unknown_setups(self, observations: Observations) -> tuple[str, ...]:
         """Set-ups of the observations that the model has no base for."""
@@ -293,21 +353,44 @@ class CalibratedModel:
         for name, (low, high) in self.coverage.ranges.items():
             joint = self.rig.joint(name)
             margin = max(_OUTSIDE * (high - low), 1.0 if joint.kind == "revolute" else 10.0)
-            values = observations.joints[name]
-            outside = int(((values < low - margin) | (values > high + margin)).sum())
+            above = observations.joints[name] - (low - margin)
+            if joint.kind == "revolute":
+                above %= 360.0
+            outside = int(((above < 0.0) | (above > high - low + 2.0 * margin)).sum())
             if outside:
                 found.append(
-                    f"{name}: {outside} of {len(values)} readings are outside the {low:.1f} .. {high:.1f} {joint.unit} "
+                    f"{name}: {outside} of {len(above)} readings are outside the {low:.1f} .. {high:.1f} {joint.unit} "
                     f"of the training data"
                 )
+        found += left_out(self.effects, self._situation(observations))
+        found += self._other_torques(observations)
         if self.residual is not None:
-            missing = [s for s in self.residual.signals if not np.isfinite(observations.extra.get(s, np.nan)).any()]
+            missing = missing_signals(self.rig, observations, self.residual.signals)
             if missing:
                 found.append(f"the residual was trained with {', '.join(missing)}, which this data lacks")
             strange = sorted(set(observations.prism.tolist()) - set(self.residual.prisms))
             if strange:
                 found.append(f"the residual was not trained on prism {', '.join(strange)} and is left out there")
         return tuple(found)
+
+    def _other_torques(self, observations: Observations) -> Iterator[str]:
+        """Joints whose torque is computed where it was measured in training, or the other way round."""
+        learned = self.residual.signals if self.residual is not None else ()
+        used = {e.where for e in self.effects if e.family == "joint_compliance"}
+        used |= {joint.name for joint in self.rig.joints if f"torque_{joint.name}_Nm" in learned}
+        situation = self._situation(observations)
+        for name in sorted(used) if len(observations) else ():
+            before, now = name in self.coverage.torques, situation.is_torque_measured(name)
+            if before and not now:
+                yield (
+                    f"the torque of {name} was measured in training ({name}_Nm), which this data lacks: it is computed "
+                    f"from the rig file's masses, whose error is in no standard deviation"
+                )
+            elif now and not before:
+                yield (
+                    f"the torque of {name} was computed from the rig file's masses in training and is measured here "
+                    f"({name}_Nm): leave the column out, or calibrate with it"
+                )
 
     def to_files(self) -> dict[str, bytes]:
         """The model as named files, `manifest.json` with their SHA-256 among them."""

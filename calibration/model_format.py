@@ -15,17 +15,20 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from calibration.effects.fitted import FittedCoefficient, FittedEffect
+from calibration.effects.library import library
 from calibration.errors import ModelError, RigError
 from calibration.identification.identifiability import Identifiability
+from calibration.identification.refinement import Prior
 from calibration.kinematics import Chain, Placement
-from calibration.model import CalibratedModel, Coverage, LearnedResidual, Outlier, Prior
+from calibration.model import CalibratedModel, Coverage, LearnedResidual, Outlier
 from calibration.residual.features import feature_names
 from calibration.residual.hybrid import LOADERS, Trial
 from calibration.rig import parse_rig
 
 MANIFEST = "manifest.json"
 FORMAT = "rigcal model"
-VERSION = 1
+VERSION = 2
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Variance = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -57,7 +60,23 @@ class _Parameter(_Part):
     unit: str
     value: Finite
     standard_error: Finite
+    geometric_stage_value: Finite
     nominal_stage_value: Finite
+
+
+class _Coefficient(_Part):
+    name: str
+    unit: str
+    value: Finite
+    standard_error: Variance
+    prior_sigma: Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
+
+class _Effect(_Part):
+    family: str
+    where: str
+    settings: dict[str, Finite]
+    coefficients: tuple[_Coefficient, ...]
 
 
 class _Outlier(_Part):
@@ -85,6 +104,8 @@ class _Identifiability(_Part):
     parameters: int
     rank: int
     unidentifiable: tuple[str, ...]
+    marked: tuple[str, ...]
+    observability: dict[str, Finite]
 
 
 class _Document(_Part):
@@ -95,10 +116,14 @@ class _Document(_Part):
     prior_scale: Finite
     excess_sigma_mm: Finite
     repeat_sigma_mm: Finite
-    geometric_noise_mm: Finite
+    effects_noise_mm: Finite
+    effects: tuple[_Effect, ...]
+    effects_reason: str
+    joint_error_scale: Variance
     identifiability: _Identifiability
     fixes: dict[str, int]
     ranges: dict[str, tuple[Finite, Finite]]
+    torques: tuple[str, ...]
     outliers: tuple[_Outlier, ...]
     residual: _Residual | None
     trials: tuple[_Trial, ...]
@@ -124,22 +149,31 @@ def write_model(model: CalibratedModel) -> dict[str, bytes]:
                 unit=p.unit,
                 value=p.value,
                 standard_error=p.standard_error,
+                geometric_stage_value=float(geometric),
                 nominal_stage_value=float(nominal),
             )
-            for p, nominal in zip(model.parameters, model.nominal_values, strict=True)
+            for p, geometric, nominal in zip(
+                model.parameters, model.geometric_values, model.nominal_values, strict=True
+            )
         ),
         prior=model.prior,
         prior_scale=model.prior_scale,
         excess_sigma_mm=model.excess_sigma_mm,
         repeat_sigma_mm=model.repeat_sigma_mm,
-        geometric_noise_mm=model.geometric_noise_mm,
+        effects_noise_mm=model.effects_noise_mm,
+        effects=tuple(_effect(e) for e in model.effects),
+        effects_reason=model.effects_reason,
+        joint_error_scale=model.joint_error_scale,
         identifiability=_Identifiability(
             parameters=model.identifiability.parameters,
             rank=model.identifiability.rank,
             unidentifiable=model.identifiability.unidentifiable,
+            marked=model.identifiability.marked,
+            observability=dict(model.identifiability.observability),
         ),
         fixes=dict(model.coverage.fixes),
         ranges=dict(model.coverage.ranges),
+        torques=model.coverage.torques,
         outliers=tuple(_Outlier(row=o.row, sigma=o.sigma) for o in model.outliers),
         residual=model.residual
         and _Residual(
@@ -167,6 +201,20 @@ def write_model(model: CalibratedModel) -> dict[str, bytes]:
     listed = {name: {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data)} for name, data in files.items()}
     manifest = {"format": FORMAT, "version": VERSION, "files": listed}
     return files | {MANIFEST: (json.dumps(manifest, indent=1) + "\n").encode()}
+
+
+def _effect(effect: FittedEffect) -> _Effect:
+    return _Effect(
+        family=effect.family,
+        where=effect.where,
+        settings=dict(effect.settings),
+        coefficients=tuple(
+            _Coefficient(
+                name=c.name, unit=c.unit, value=c.value, standard_error=c.standard_error, prior_sigma=c.prior_sigma
+            )
+            for c in effect.coefficients
+        ),
+    )
 
 
 def check_manifest(files: Mapping[str, bytes]) -> dict[str, bytes]:
@@ -221,7 +269,9 @@ def read_model(files: Mapping[str, bytes]) -> CalibratedModel:
     placements = {
         setup: Placement(np.array(p.rotation), np.array(p.translation_mm)) for setup, p in document.placements.items()
     }
-    _check_parts(document, Chain(rig, placements), covariance)
+    chain = Chain(rig, placements)
+    _check_parts(document, chain, covariance)
+    effects = tuple(_read_effect(part, chain) for part in document.effects)
     if residual is not None:
         names = feature_names(rig, residual.signals)
         if not residual.learner.fits(names, len(names) - len(residual.signals)):
@@ -232,18 +282,24 @@ def read_model(files: Mapping[str, bytes]) -> CalibratedModel:
         placements=placements,
         values=np.array([p.value for p in document.parameters]),
         covariance=covariance,
+        geometric_values=np.array([p.geometric_stage_value for p in document.parameters]),
         nominal_values=np.array([p.nominal_stage_value for p in document.parameters]),
         prior=document.prior,
         prior_scale=document.prior_scale,
         excess_sigma_mm=document.excess_sigma_mm,
         repeat_sigma_mm=document.repeat_sigma_mm,
-        geometric_noise_mm=document.geometric_noise_mm,
+        effects_noise_mm=document.effects_noise_mm,
         identifiability=Identifiability(
             document.identifiability.parameters,
             document.identifiability.rank,
             document.identifiability.unidentifiable,
+            document.identifiability.marked,
+            document.identifiability.observability,
         ),
-        coverage=Coverage(document.fixes, document.ranges),
+        coverage=Coverage(document.fixes, document.ranges, document.torques),
+        effects=effects,
+        effects_reason=document.effects_reason,
+        joint_error_scale=document.joint_error_scale,
         outliers=tuple(Outlier(o.row, o.sigma) for o in document.outliers),
         residual=residual,
         trials=tuple(Trial(t.kind, t.before_mm, t.after_mm, t.p, t.kept) for t in document.trials),
@@ -257,8 +313,9 @@ def _check_parts(document: _Document, chain: Chain, covariance: np.ndarray) -> N
     expected = [p.name for p in chain.parameters]
     if [p.name for p in document.parameters] != expected:
         raise ModelError("the parameters of model.json are not those of its rig; calibrate again")
-    if covariance.shape != (len(expected), len(expected)) or not np.isfinite(covariance).all():
-        raise ModelError("covariance.npz does not fit the parameters of model.json; calibrate again")
+    size = len(expected) + sum(len(effect.coefficients) for effect in document.effects)
+    if covariance.shape != (size, size) or not np.isfinite(covariance).all():
+        raise ModelError("covariance.npz does not fit the parameters and effects of model.json; calibrate again")
     for setup, placement in document.placements.items():
         rotation = np.array(placement.rotation)
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6:
@@ -266,6 +323,23 @@ def _check_parts(document: _Document, chain: Chain, covariance: np.ndarray) -> N
     strange = [name for name in document.ranges if name not in chain.rig.joint_names]
     if strange:
         raise ModelError(f"model.json speaks of joint {strange[0]!r}, which its rig lacks; calibrate again")
+
+
+def _read_effect(part: _Effect, chain: Chain) -> FittedEffect:
+    """The effect; ModelError where this program's family of that name computes something else from it."""
+    family = library().get(part.family)
+    if family is None or part.where not in family.places(chain.rig):
+        raise ModelError(f"model.json has effect {part.family}@{part.where}, which this program cannot place")
+    coefficients = tuple(
+        FittedCoefficient(c.name, c.unit, c.value, c.standard_error, c.prior_sigma) for c in part.coefficients
+    )
+    try:
+        names = family.names(part.settings)
+    except ValueError as error:
+        raise ModelError(f"model.json has effect {part.family}@{part.where} in no form it takes: {error}") from error
+    if tuple(c.name for c in coefficients) != names:
+        raise ModelError(f"effect {part.family}@{part.where} of model.json needs the coefficients {', '.join(names)}")
+    return FittedEffect(part.family, part.where, coefficients, part.settings)
 
 
 def _first(error: ValidationError) -> str:

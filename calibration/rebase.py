@@ -6,8 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.identification.refinement import Fit, refine
-from calibration.identification.samples import Samples, averaged, reading_covariance
+from calibration.effects.base import Situation
+from calibration.effects.fitted import coefficient_values, fitted_additions
+from calibration.identification.additions import Additions
+from calibration.identification.refinement import Fit, information, refine
+from calibration.identification.samples import Samples, averaged
 from calibration.identification.start import rough_start
 from calibration.kinematics import Chain, Placement
 from calibration.model import CalibratedModel
@@ -32,34 +35,44 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
     start = rough_start(blank, samples, extended(model.values), offsets=False)
     chain = Chain(model.rig, start.placements)
     free = np.arange(len(chain)) >= body
-    fit = refine(chain, samples, extended(model.values), free=free, excess_variance=model.excess_sigma_mm**2)
+    additions = fitted_additions(model.effects, Situation(chain, extended(model.values), observations))
+    additions = replace(additions, column=samples.average(additions.column))
+    moves = np.concatenate([free, np.zeros(len(additions), dtype=bool)])
+    begun = np.concatenate([extended(model.values), coefficient_values(model.effects)])
+    # First with the noise of a rough start: beside that of the model, all fixes would look like outliers.
+    near = refine(chain, samples, begun, free=moves, additions=additions)
+    fit = refine(chain, samples, near.x, free=moves, excess_variance=model.excess_sigma_mm**2, additions=additions)
+    values = fit.x[: len(chain)]
+    geometric = refine(chain, samples, extended(model.geometric_values), free=free).x if model.effects else values
     nominal = refine(chain, samples, extended(model.nominal_values), free=free)
+    known = np.ones(len(model.covariance), dtype=bool)
+    known[body : len(model.values)] = False
     return replace(
         model,
         placements=start.placements,
-        values=fit.x,
-        covariance=_covariance(chain, samples, fit, model.covariance[:body, :body]),
+        values=values,
+        covariance=_covariance(chain, samples, fit, additions, model.covariance[np.ix_(known, known)]),
+        geometric_values=geometric,
         nominal_values=nominal.x,
     )
 
 
-def _covariance(chain: Chain, samples: Samples, fit: Fit, body_covariance: Floats) -> Floats:
-    """(p, p) covariance when the base follows whatever the body's parameters are.
+def _covariance(chain: Chain, samples: Samples, fit: Fit, additions: Additions, known_covariance: Floats) -> Floats:
+    """(p + k, p + k) covariance when the base follows whatever the body's parameters and the coefficients are.
 
-    Much of the body's uncertainty is of directions that a base transform undoes; the new base undoes them as the old
-    one did, so its estimate is correlated with the body's parameters: d base / d body = -H_bb^-1 H_bk.
+    Much of their uncertainty is of directions that a base transform undoes; the new base undoes them as the old one
+    did, so its estimate is correlated with them: d base / d known = -H_bb^-1 H_bk.
     """
-    body = len(body_covariance)
-    lin = chain.linearise(fit.x, samples.data)
-    known = samples.station_covariance + reading_covariance(chain.rig, lin.joint_jacobian, samples.rates)
-    inverse = np.linalg.inv(known + fit.excess_variance * np.eye(3)) * fit.weight[:, None, None]
-    weighted = (inverse @ lin.jacobian[:, :, :body]).reshape(-1, body)
-    base_jacobian = lin.jacobian[:, :, body:].reshape(len(weighted), -1)
-    own = fit.covariance[body:, body:]
-    follows = -own @ base_jacobian.T @ weighted
+    base = np.zeros(len(fit.x), dtype=bool)
+    base[chain.base_start : len(chain)] = True
+    seen = information(
+        chain, samples, fit.x, excess_variance=fit.excess_variance, weight=fit.weight, additions=additions
+    )
+    own = fit.covariance[np.ix_(base, base)]
+    follows = -own @ seen[np.ix_(base, ~base)]
     covariance = np.zeros_like(fit.covariance)
-    covariance[:body, :body] = body_covariance
-    covariance[body:, :body] = follows @ body_covariance
-    covariance[:body, body:] = covariance[body:, :body].T
-    covariance[body:, body:] = own + follows @ body_covariance @ follows.T
+    covariance[np.ix_(~base, ~base)] = known_covariance
+    covariance[np.ix_(base, ~base)] = follows @ known_covariance
+    covariance[np.ix_(~base, base)] = covariance[np.ix_(base, ~base)].T
+    covariance[np.ix_(base, base)] = own + follows @ known_covariance @ follows.T
     return covariance

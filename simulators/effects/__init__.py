@@ -8,6 +8,7 @@ from simulators.effects.boom_droop import BoomDroop
 from simulators.effects.encoder_harmonic import EncoderHarmonic
 from simulators.effects.joint_compliance import JointCompliance
 from simulators.effects.spec import parse_effects
+from simulators.effects.stiffening_compliance import StiffeningCompliance
 from simulators.effects.transducer_scale import TransducerScale
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "Effect",
     "EncoderHarmonic",
     "JointCompliance",
+    "StiffeningCompliance",
     "TransducerScale",
     "parse_effects",
 ]

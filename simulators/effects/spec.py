@@ -10,10 +10,12 @@ from simulators.effects.base import Effect
 from simulators.effects.boom_droop import BoomDroop
 from simulators.effects.encoder_harmonic import EncoderHarmonic
 from simulators.effects.joint_compliance import JointCompliance
+from simulators.effects.stiffening_compliance import StiffeningCompliance
 from simulators.effects.transducer_scale import TransducerScale
 
 FAMILIES: dict[str, type[Effect]] = {
-    kind.family: kind for kind in (JointCompliance, BoomDroop, EncoderHarmonic, Backlash, TransducerScale)
+    kind.family: kind
+    for kind in (JointCompliance, StiffeningCompliance, BoomDroop, EncoderHarmonic, Backlash, TransducerScale)
 }
 
 

@@ -88,8 +88,8 @@ def test_a_manifest_of_arbitrary_bytes_is_refused(session: Session, data: bytes)
 
 def test_a_model_of_another_version_says_which(session: Session) -> None:
     files = session.model.to_files()
-    manifest = json.loads(files["manifest.json"]) | {"version": 2}
-    with pytest.raises(ModelError, match="version 2, this program reads version 1"):
+    manifest = json.loads(files["manifest.json"]) | {"version": 1}
+    with pytest.raises(ModelError, match="version 1, this program reads version 2"):
         CalibratedModel.from_files(files | {"manifest.json": json.dumps(manifest).encode()})
 
 

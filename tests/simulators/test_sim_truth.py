@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from calibration.rig import Rig, shipped_rig
 from simulators.dataset import random_poses
-from simulators.effects import BoomDroop, JointCompliance, parse_effects
+from simulators.effects import BoomDroop, JointCompliance, StiffeningCompliance, parse_effects
 from simulators.truth import RigTruth, replace_effects
 
 Matrix = NDArray[np.float64]
@@ -46,7 +46,7 @@ def frames_by_matrices(truth: RigTruth, joints: dict[str, float]) -> list[Matrix
         elif rig.convention == "mdh_beta_before":
             T = T @ turn(0, own.alpha) @ move(0, a) @ turn(1, own.beta) @ move(1, own.b) @ turn(2, theta) @ move(2, d)
         else:
-            T = T @ turn(2, theta) @ move(2, d) @ move(0, a) @ turn(0, own.alpha)
+            T = T @ turn(2, theta) @ move(2, d) @ move(0, a) @ turn(0, own.alpha) @ turn(1, own.beta)
         out.append(T)
     return out
 
@@ -230,6 +230,23 @@ class TestEffects:
         assert np.allclose(hidden.prism_mm("r", joints), want, atol=1e-4)
         assert np.all(hidden.prism_mm("r", joints)[:, 2] < truth.prism_mm("r", joints)[:, 2])
 
+    def test_a_stiffening_joint_is_soft_without_load_and_stiff_under_it(self) -> None:
+        truth = RigTruth(shipped_rig("ys100"), 3)
+        hidden = replace_effects(truth, [StiffeningCompliance("theta2", 1.6e-6, 4e-7, 500.0)])
+        poses = random_poses(truth.rig, 40, np.random.default_rng(4))
+        load, sunk = truth.gravity_load("theta2", poses), poses["theta2"]
+        for _ in range(12):
+            load = truth.gravity_load("theta2", dict(poses, theta2=sunk))
+            # The slope of the curve, integrated from no load to this one.
+            grid = np.linspace(0.0, 1.0, 2001)[:, None] * load
+            slope = 4e-7 + 1.2e-6 / (1.0 + (grid / 500.0) ** 2)
+            sunk = poses["theta2"] + np.rad2deg(np.trapezoid(slope, grid, axis=0))
+        assert np.allclose(hidden.prism_mm("tool", poses), truth.prism_mm("tool", dict(poses, theta2=sunk)), atol=1e-4)
+        compliance = np.deg2rad(sunk - poses["theta2"]) / load
+        order = np.argsort(np.abs(load))
+        assert (np.diff(compliance[order]) < 1e-12).all()
+        assert 4e-7 < compliance.min() < 0.5 * compliance.max() < 0.8e-6
+
     def test_payload_adds_to_the_load(self, truth, joints) -> None:
         empty, loaded = (
             self.shift(truth, "joint_compliance@theta4", "r", joints, payload_kg=np.full(30, kg)) for kg in (0.0, 400.0)
@@ -301,6 +318,8 @@ class TestEffects:
             "backlash@L2",
             "transducer_scale@theta4",
             "joint_compliance@theta2",
+            "stiffening_compliance@L2",
+            "stiffening_compliance@theta4:knee_Nm=0",
             "boom_droop@theta4",
             "encoder_harmonic@L3",
         ],

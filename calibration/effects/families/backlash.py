@@ -1,0 +1,47 @@
+"""Play between encoder and joint."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.effects.base import Coefficient, JointFamily, Settings, Situation, refuse_settings
+from calibration.observations import Floats
+
+
+class Backlash(JointFamily):
+    """The joint lags by half the play on the side it came from."""
+
+    name: ClassVar[str] = "backlash"
+    equation: ClassVar[str] = "d_theta = width / 2 * direction of the last motion (column <joint>_dir)"
+    source: ClassVar[str] = "gear play; the approach from the other side shows it"
+    kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
+
+    def needs(self, where: str) -> str:
+        return f"the column {where}_dir"
+
+    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
+        return np.isfinite(situation.extra(f"{where}_dir"))
+
+    def names(self, settings: Settings) -> tuple[str, ...]:
+        refuse_settings(settings)
+        return ("width_rad",)
+
+    def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
+        del situation, where, settings
+        return (Coefficient("width_rad", "rad", 1e-3, 0.0, 5e-3),)
+
+    def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
+        del settings
+        direction = np.nan_to_num(situation.extra(f"{where}_dir"))
+        change: Floats = np.degrees(0.5) * direction[:, None]
+        return change
+
+    def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
+        del plausible, settings
+        return float(np.degrees(0.5 * values[0])) ** 2
+
+
+FAMILY = Backlash()

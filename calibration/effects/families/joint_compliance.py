@@ -1,0 +1,142 @@
+"""A joint that gives way under its load, in proportion to it or along a curve."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.effects.base import Coefficient, JointFamily, Settings, Situation
+from calibration.observations import Floats
+
+_LINEAR = "compliance_rad_per_Nm"
+_SIGMA_RAD = 1e-3  # at the largest torque
+_BOUND_RAD = 20e-3
+_KNOTS = 7
+_BENDS_RAD = (0.05e-3, 0.15e-3, 0.5e-3, 1.5e-3, 5e-3)
+_BEND_BOUND_RAD = 50e-3
+_KNOT_POWERS = (1.0, 2.0)
+_SYMMETRIC, _ASYMMETRIC = {"torque_Nm", "knot_power", "bend_rad"}, {"low_Nm", "high_Nm", "bend_rad"}
+_ASYMMETRIC_ODDS = 0.01
+_UNKNOWN_LOADS = 101
+
+
+class JointCompliance(JointFamily):
+    """Deflection by the gravity torque; its stiffness is constant, or changes smoothly with the torque.
+
+    Gears stiffen as they wind up: harmonic drives in three steps, bearings and teeth with a soft zone about zero. The
+    curved variants add a natural cubic spline of s, the torque over the largest one of the training data. Its further
+    coefficients are the changes of slope about its knots, in rad per s, independent of each other beforehand: the
+    prior of a smoothing spline (Wahba 1978), of size `bend_rad`. Beyond the last knot it goes on straight.
+
+    A symmetric curve gives way to both sides alike, g(-s) = -g(s): what is learned on one side holds on the other. Its
+    knots are spread evenly (`knot_power` 1) or towards zero (2). An asymmetric curve has s from the lowest to the
+    highest torque, and even knots; gears are rarely so.
+    """
+
+    name: ClassVar[str] = "joint_compliance"
+    equation: ClassVar[str] = "d_theta = compliance * torque [+ g(s), g a spline, s the torque over the largest]"
+    source: ClassVar[str] = "ICIC 2020, Eqs. 16, 17; curve: stiffness of harmonic drives (Tuttle and Seering 1996)"
+    kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
+
+    def needs(self, where: str) -> str:
+        return f"masses in the rig file or the column {where}_Nm"
+
+    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
+        return np.isfinite(situation.torque(where))
+
+    def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
+        if situation.greatest_torque(where) == 0.0:
+            return ()
+        known = situation.torque(where)[self.known(situation, where)]
+        low, high = float(known.min(initial=np.inf)), float(known.max(initial=-np.inf))
+        if high <= low:
+            return ({},)
+        most = max(-low, high)
+        return (
+            {},
+            *({"torque_Nm": most, "knot_power": power, "bend_rad": b} for power in _KNOT_POWERS for b in _BENDS_RAD),
+            *({"low_Nm": low, "high_Nm": high, "bend_rad": b} for b in _BENDS_RAD),
+        )
+
+    def odds(self, settings: Settings) -> float:
+        return _ASYMMETRIC_ODDS if "low_Nm" in settings else 1.0
+
+    def names(self, settings: Settings) -> tuple[str, ...]:
+        if not settings:
+            return (_LINEAR,)
+        if set(settings) == _SYMMETRIC:
+            sound = settings["torque_Nm"] > 0.0 and settings["knot_power"] in _KNOT_POWERS
+        else:
+            sound = set(settings) == _ASYMMETRIC and settings["low_Nm"] < settings["high_Nm"]
+        if not sound:
+            raise ValueError(
+                "the settings are bend_rad with torque_Nm and knot_power 1 or 2, or with low_Nm and high_Nm"
+            )
+        return (_LINEAR, *(f"bend{knot}_rad" for knot in range(1, _KNOTS + 1)))
+
+    def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
+        torque = situation.greatest_torque(where)
+        linear, *bends = self.names(settings)
+        most = _BOUND_RAD / torque
+        # A drive may report the torque that holds the load in place of the load: the same curve, the other way round.
+        least = -most if situation.is_torque_measured(where) else 0.0
+        return (
+            Coefficient(linear, "rad/(N m)", _SIGMA_RAD / torque, least, most),
+            *(Coefficient(name, "rad", settings["bend_rad"], -_BEND_BOUND_RAD, _BEND_BOUND_RAD) for name in bends),
+        )
+
+    def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
+        known = self.known(situation, where)
+        torque = np.where(known, situation.torque(where), 0.0)
+        columns = torque[:, None]
+        if settings:
+            columns = np.hstack([columns, known[:, None] * _curves(torque, settings)])
+        return np.degrees(columns)
+
+    def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
+        """Of a link that may point anywhere up or down: its load goes as the sine between those of training."""
+        most = _SIGMA_RAD / float(plausible[0])  # as `coefficients` has it
+        low, high = (settings["low_Nm"], settings["high_Nm"]) if "low_Nm" in settings else (-most, most)
+        turns = np.sin(np.linspace(-0.5, 0.5, _UNKNOWN_LOADS) * np.pi)
+        torque = 0.5 * (low + high) + 0.5 * (high - low) * turns
+        columns = torque[:, None]
+        if settings:
+            columns = np.hstack([columns, _curves(torque, settings)])
+        return float(np.mean(np.degrees(columns @ values) ** 2))
+
+
+def _curves(torque: Floats, settings: Settings) -> Floats:
+    """(n, knots) splines, rad per unit change of slope at each knot.
+
+    The straight line that fits each best over the whole range is taken from it, so that the compliance is the mean one.
+    """
+    spread = np.linspace(0.0, 1.0, _KNOTS + 2)
+    whole = np.linspace(-1.0, 1.0, 201)
+    if "torque_Nm" in settings:
+        s = torque / settings["torque_Nm"]
+        knots = spread ** settings["knot_power"]
+        curves, over = _bent(s, knots) - _bent(-s, knots), _bent(whole, knots) - _bent(-whole, knots)
+    else:
+        low, high = settings["low_Nm"], settings["high_Nm"]
+        s = (2.0 * torque - low - high) / (high - low)
+        knots = 2.0 * spread - 1.0
+        curves, over = _bent(s, knots), _bent(whole, knots)
+    line = np.polynomial.polynomial.polyfit(whole, over, 1)
+    straightened: Floats = curves - line[0] - s[:, None] * line[1]
+    return straightened
+
+
+def _bent(s: Floats, knots: Floats) -> Floats:
+    """(n, inner knots) cubic splines whose slope changes by 1 about one of the knots.
+
+    The second derivative is a triangle from the knot before to the knot behind.
+    """
+    cubes, steps = np.abs(s[:, None] - knots) ** 3, np.diff(knots)
+    slopes = np.diff(cubes, axis=1) / steps
+    bent: Floats = np.diff(slopes, axis=1) / (6.0 * (steps[:-1] + steps[1:]))
+    return bent
+
+
+FAMILY = JointCompliance()

@@ -1,0 +1,49 @@
+"""The effect families there are: every file of `calibration/effects/families`."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Mapping
+from functools import cache
+from types import MappingProxyType
+
+from calibration.effects import families
+from calibration.effects.base import Family
+from calibration.rig import Rig
+
+
+@cache
+def library() -> Mapping[str, Family]:
+    """Name -> family, in alphabetical order."""
+    names = sorted(module.name for module in pkgutil.iter_modules(families.__path__))
+    found: dict[str, Family] = {}
+    for name in names:
+        family: Family = importlib.import_module(f"{families.__name__}.{name}").FAMILY
+        found[family.name] = family
+    return MappingProxyType(found)
+
+
+def parse_effects(text: str, rig: Rig) -> tuple[tuple[str, str], ...]:
+    """Read `FAMILY@WHERE,...`.
+
+    Returns:
+        (family, where) of each, in the order of the text.
+
+    Raises:
+        ValueError: an unknown family, a place that this rig does not have for it, one named twice; the message is a
+            sentence that says what there is.
+    """
+    found: list[tuple[str, str]] = []
+    for part in text.split(","):
+        name, _, where = (word.strip() for word in part.strip().partition("@"))
+        if name not in library():
+            raise ValueError(f"effect {name!r} is unknown; there are {', '.join(library())}, as FAMILY@WHERE")
+        places = library()[name].places(rig)
+        if where not in places:
+            there = f"has {', '.join(places)} for it" if places else "has no place for it"
+            raise ValueError(f"{name}@{where}: rig {rig.name!r} {there}")
+        if (name, where) in found:
+            raise ValueError(f"{name}@{where} is named twice")
+        found.append((name, where))
+    return tuple(found)
