@@ -58,8 +58,11 @@ class Data:
 
     @property
     def labels(self) -> Labels:
-        """(n,) labels to split by: groups, or the cells of the only one."""
-        return self.groups if len(np.unique(self.groups)) > 1 else self.cells
+        """(n,) labels to split by: groups, or the cells of the only one, or the rows of the only cell."""
+        for labels in (self.groups, self.cells):
+            if len(np.unique(labels)) > 1:
+                return labels
+        return np.arange(len(self)).astype(np.str_)
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from calibration.kinematics import Chain
 from calibration.observations import Floats, Observations
 from calibration.rig import Rig
+from calibration.torques import gravity_torques, torque_columns
 
 _NOT_FEATURES = frozenset({"time_s"})  # a tree that splits on time knows the past alone
 _LEAST_MEASURED = 0.5
+_VARYING = 1e-6  # of the largest load
 _FRAME_ORIGIN = re.compile(r"frame\d+_[xyz]_mm")
 
 
@@ -25,7 +27,8 @@ class Features:
     Attributes:
         names: of all columns, geometry first.
         geometry: (n, g) joint values (deg or mm), frame origins and the prism in the base frame (mm); never missing.
-        signals: (n, s) optional columns of the observations and estimates of other learners; NaN where not measured.
+        signals: (n, s) optional columns of the observations, joint torques and estimates of other learners; NaN where
+            not measured.
     """
 
     names: tuple[str, ...]
@@ -67,6 +70,28 @@ def usable_signals(observations: Observations) -> tuple[str, ...]:
     return tuple(sorted(names))
 
 
+def usable_torques(chain: Chain, x: Floats, observations: Observations) -> tuple[str, ...]:
+    """Columns `torque_<joint>_Nm`, `torque_<joint>_N` of the loads that are known in every row and vary."""
+    torques = gravity_torques(chain, x, observations)
+    known = np.isfinite(torques).all(axis=0)
+    loads = np.where(known, torques, 0.0)
+    varying = np.ptp(loads, axis=0) > _VARYING * np.abs(loads).max(initial=0.0)
+    return tuple(name for name, varies in zip(torque_columns(chain.rig), varying.tolist(), strict=True) if varies)
+
+
+def missing_signals(rig: Rig, observations: Observations, signals: Sequence[str]) -> tuple[str, ...]:
+    """Signals that the observations have in no row; torques are computed wherever the rig has masses."""
+    sources = {column: f"{joint.name}_Nm" for column, joint in zip(torque_columns(rig), rig.joints, strict=True)}
+    found: list[str] = []
+    for name in signals:
+        if name in sources and rig.masses:
+            continue
+        measured = observations.extra.get(sources.get(name, name))
+        if measured is None or not np.isfinite(measured).any():
+            found.append(sources.get(name, name))
+    return tuple(found)
+
+
 def feature_names(rig: Rig, signals: Sequence[str]) -> tuple[str, ...]:
     """Names of the columns that `features` computes."""
     joints = [j.column for j in rig.joints]
@@ -85,7 +110,7 @@ def features(chain: Chain, x: Floats, observations: Observations, signals: Seque
     Args:
         chain, x: the identified kinematics.
         observations: n rows whose set-ups the chain knows.
-        signals: optional columns to use; one that is absent is NaN throughout.
+        signals: optional columns to use, joint torques among them; one that is absent is NaN throughout.
     """
     data = chain.bind(observations)
     position = chain.positions_mm(x, data)
@@ -96,7 +121,10 @@ def features(chain: Chain, x: Floats, observations: Observations, signals: Seque
         prism[rows] = (position[rows] - base.translation_mm) @ base.rotation
     frames = chain.frames_mm(x, data).reshape(len(data), -1)
     missing = np.full(len(data), np.nan)
-    columns = [observations.extra.get(name, missing) for name in signals]
+    known = dict(observations.extra)
+    if not set(signals).isdisjoint(torque_columns(chain.rig)):
+        known |= zip(torque_columns(chain.rig), gravity_torques(chain, x, observations).T, strict=True)
+    columns = [known.get(name, missing) for name in signals]
     return Features(
         feature_names(chain.rig, signals),
         np.hstack([data.readings, frames, prism]),

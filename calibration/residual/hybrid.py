@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal, Protocol
 
 import numpy as np
@@ -24,6 +24,7 @@ from calibration.residual.crossval import (
 )
 from calibration.residual.features import Features
 from calibration.residual.rbfn import Rbfn, fit_shape
+from calibration.residual.torque_network import TorqueNetwork, fit_torque_network
 
 Kind = Literal["default", "none", "rbfn", "lightgbm", "chain"]
 
@@ -41,7 +42,7 @@ class Residual(Protocol):
 
     @property
     def kind(self) -> str:
-        """`rbfn`, `lightgbm` or `chain`."""
+        """`rbfn`, `lightgbm`, `chain` or `rbf-tcm`."""
 
     def predict(self, features: Features) -> Floats:
         """(n, 3) estimate of the residual in the base frame, mm."""
@@ -84,6 +85,7 @@ LOADERS: Mapping[str, Callable[[Mapping[str, bytes]], Residual]] = {
     "rbfn": Rbfn.from_files,
     "lightgbm": Boosting.from_files,
     "chain": Chained.from_files,
+    TorqueNetwork.kind: TorqueNetwork.from_files,
 }
 
 
@@ -149,9 +151,9 @@ def decide(
     if kind == "none":
         return Decision(None, (), "switched off")
     distinct = len(np.unique(groups))
-    units = groups if distinct >= _LEAST_UNITS else np.char.add(np.char.add(groups, "|"), cells)
+    units = _units(groups, cells)
     if len(features) < _LEAST_ROWS or distinct < 2 or len(np.unique(units)) < _LEAST_UNITS:
-        return Decision(None, (), f"{len(features)} fixes in {distinct} groups are too few to learn a residual from")
+        return Decision(None, (), _too_few(len(features), groups))
     data = Data(features, target_mm, groups, units)
     steps = itertools.count(1)
     validation = CrossValidation(
@@ -184,6 +186,41 @@ def decide(
         f"{best.after_mm:.3g} mm RMS",
         left * _gain_of_all_rows(float(left.sum()), float(with_half.sum())),
     )
+
+
+def torque_compensation(
+    features: Features, target_mm: Floats, groups: Labels, cells: Labels, names: Sequence[str], *, seed: int
+) -> Decision:
+    """The second paper's network on the joint torques: fitted as the paper has it, and kept whether it helps or not.
+
+    Args:
+        features: n rows.
+        target_mm: (n, 3) residuals in the base frame.
+        groups, cells: as for `decide`.
+        names: columns of the torques among the features.
+        seed: of the folds.
+    """
+    units = _units(groups, cells)
+    if len(np.unique(units)) < _LEAST_UNITS:
+        return Decision(None, (), _too_few(len(features), groups))
+    trained = fit_torque_network(features, target_mm, units, names, seed=seed)
+    trial = replace(_trial(TorqueNetwork.kind, target_mm, trained.left_out_mm, units), kept=True)
+    return Decision(
+        trained.network,
+        (trial,),
+        f"a part of the method: {len(trained.network.units)} units on the joint torques bring the error of rows left "
+        f"out from {trial.before_mm:.3g} to {trial.after_mm:.3g} mm RMS",
+        ((target_mm - trained.left_out_mm) ** 2).mean(axis=0),
+    )
+
+
+def _units(groups: Labels, cells: Labels) -> Labels:
+    """(n,) labels to test by: groups, or the cells in them where the groups are too few for a test."""
+    return groups if len(np.unique(groups)) >= _LEAST_UNITS else np.char.add(np.char.add(groups, "|"), cells)
+
+
+def _too_few(rows: int, groups: Labels) -> str:
+    return f"{rows} fixes in {len(np.unique(groups))} groups are too few to learn a residual from"
 
 
 def _gain_of_all_rows(most: float, half: float) -> float:

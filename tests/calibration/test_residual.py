@@ -218,3 +218,14 @@ def test_a_missing_libgomp_ends_in_the_command_that_installs_it(
         boosting.import_lightgbm()
     with pytest.raises(CalibrationError, match="libgomp1"):
         train_residual(session.model, session.training, kind="lightgbm")
+
+
+def test_one_group_that_holds_most_rows_is_no_obstacle() -> None:
+    """As in single-joint sweeps: a prism that stands still while others move ties all of a sweep together."""
+    seen, _ = made_up(400)
+    target = curve(seen.geometry) + np.random.default_rng(1).normal(0, 0.05, (400, 3))
+    groups = np.array([f"{max(row - 280, 0) // 8}" for row in range(400)])  # 288 rows, then fourteen groups of 8
+    with ThreadPoolExecutor(2) as pool:
+        for kind in ("rbfn", "chain"):
+            found = decide(seen, target, groups, groups, kind=kind, seed=0, executor=pool, progress=lambda share: None)
+            assert found.residual is not None

@@ -37,7 +37,7 @@ def outcomes() -> list[Outcome]:
     for seed, effects in enumerate(EFFECTS, 21):
         truth = RigTruth(rig, seed, effects=parse_effects(effects))
         training, held_out = simulated(truth, 250, seed), simulated(truth, 600, seed + 100)
-        model = train_residual(identify(rig, rig_text("swdt82"), training), training)
+        model = train_residual(identify(rig, rig_text("swdt82"), training, effects="none"), training)
         evaluation = evaluate(model, held_out)
         deviation = evaluation.errors_mm["hybrid"] / evaluation.sigma_mm
         geometric, hybrid = (rms(evaluation.errors_mm[stage]) for stage in ("geometric", "hybrid"))

@@ -1,0 +1,1 @@
+"""Published methods, as their papers have them, to be held against the default."""

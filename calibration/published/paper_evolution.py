@@ -1,0 +1,275 @@
+"""The first paper's parallel differential evolution, to the letter: DE/rand/1/bin with reflection (Eqs. 6-11).
+
+Mutation draws from the whole population; sub-populations are evaluated side by side wherever the executor puts them.
+The caller mutates one sub-population while others are being evaluated, so that a generation takes little longer than
+its evaluations. Random numbers are counted by candidate, so the result depends neither on the executor, nor on the
+number of sub-populations, nor on an interruption.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibration.identification.search.checkpoint import Arrays, Checkpoint, keep, pack, problem, unpack
+from calibration.identification.search.islands import Evolved
+from calibration.identification.search.streams import below, scatter, stream, uniform, word
+from calibration.kernels.jit import compiled
+from calibration.observations import Floats
+
+_SAVED_EVERY = 20  # generations; a state of the paper's population is nine megabytes
+_LEAST = 4  # a candidate and three others
+
+
+@dataclass(frozen=True)
+class PaperSettings:
+    """The paper's settings.
+
+    Attributes:
+        population: candidates.
+        generations: of every search.
+        scale_factor: F.
+        crossover: Cr; with 1 every dimension comes from the mutant.
+        subpopulations: how many parts of the population are evaluated side by side.
+    """
+
+    population: int = 30_000
+    generations: int = 400
+    scale_factor: float = 0.5
+    crossover: float = 1.0
+    subpopulations: int = 16
+
+
+@dataclass
+class _Population:
+    """Of one search; changed in place.
+
+    Attributes:
+        generation: how many it has seen.
+        candidates: (n, p).
+        cost: (n,), never NaN.
+    """
+
+    generation: int
+    candidates: Floats
+    cost: Floats
+
+    def best(self) -> Floats:
+        """(p,) the candidate of least cost."""
+        best: Floats = self.candidates[int(self.cost.argmin())].copy()
+        return best
+
+
+def evolve_paper(
+    fitnesses: Sequence[Callable[[Floats], Floats]],
+    judge: Callable[[Floats], Floats],
+    lower: Floats,
+    upper: Floats,
+    *,
+    seed: int,
+    executor: Executor,
+    settings: PaperSettings,
+    progress: Callable[[float], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+    checkpoint: Checkpoint | None = None,
+) -> Evolved:
+    """Search once for every fitness and take the winner that `judge` finds best.
+
+    The paper shuffles its data set and repeats the search: `fitnesses` are the objective on shuffled parts of the
+    data (`paper_objective.PaperObjective.shuffled`), `judge` is the objective on all of it.
+
+    Args:
+        fitnesses: one search each; (candidates, p) -> (candidates,), picklable where the executor is a process pool.
+        judge: likewise.
+        lower, upper: (p,) bounds.
+        seed: of all random streams.
+        executor: evaluates the sub-populations.
+        settings: the paper's by default.
+        progress: told the share that is done, after every generation.
+        should_stop: asked after every generation; the best so far is returned once it says so.
+        checkpoint: continued if it holds a state of this very search, and saved every 20 generations.
+
+    Raises:
+        ValueError: no search, or a population of fewer than four.
+    """
+    if not fitnesses or settings.population < _LEAST:
+        raise ValueError(f"{len(fitnesses)} searches of {settings.population} candidates; at least 1 of {_LEAST}")
+    lower, upper = np.array(lower, dtype=np.float64), np.array(upper, dtype=np.float64)
+    cuts = np.linspace(0, settings.population, settings.subpopulations + 1).astype(int)
+    parts = [slice(*ends) for ends in zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True)]
+    identity: Arrays = {}
+    population, winners, set_aside, unsaved = None, [], None, None
+    if checkpoint is not None:
+        identity = _identity(fitnesses, judge, lower, upper, seed, settings)
+        arrays, set_aside = unpack(checkpoint.load(), identity)
+        if arrays is not None:
+            winners = list(arrays["winners"])
+            population = _Population(int(arrays["generation"]), arrays["candidates"], arrays["cost"])
+    complete, evaluations = True, 0
+    for search in range(len(winners), len(fitnesses)):
+        fitness, first_stream = fitnesses[search], search * (settings.generations + 1)
+        if population is None:
+            candidates = np.empty((settings.population, len(lower)))
+            scatter(word(seed), first_stream, 0, lower, upper, candidates)
+            with _Pending() as pending:
+                for part in parts:
+                    pending.add(executor.submit(fitness, candidates[part]))
+                cost = np.concatenate(pending.results())
+            population = _Population(0, candidates, np.where(np.isnan(cost), np.inf, cost))
+        trial = np.empty_like(population.candidates)
+        while population.generation < settings.generations:
+            if should_stop is not None and should_stop():
+                complete = False
+                break
+            _advance(population, fitness, lower, upper, seed, first_stream, executor, settings, parts, trial)
+            if checkpoint is not None and (
+                population.generation % _SAVED_EVERY == 0 or population.generation == settings.generations
+            ):
+                unsaved = keep(checkpoint, pack(identity, _arrays(population, winners))) or unsaved
+            if progress is not None:
+                share = (search * settings.generations + population.generation) / settings.generations
+                progress(share / len(fitnesses))
+        winners.append(population.best())
+        evaluations = settings.population * (search * (settings.generations + 1) + 1 + population.generation)
+        population = None
+        if not complete:
+            break
+    cost = judge(np.array(winners))
+    best = int(np.where(np.isnan(cost), np.inf, cost).argmin())
+    return Evolved(winners[best], float(cost[best]), evaluations, complete, set_aside, unsaved)
+
+
+def _advance(
+    population: _Population,
+    fitness: Callable[[Floats], Floats],
+    lower: Floats,
+    upper: Floats,
+    seed: int,
+    first_stream: int,
+    executor: Executor,
+    settings: PaperSettings,
+    parts: Sequence[slice],
+    trial: Floats,
+) -> None:
+    """One generation. Parents are replaced only once every part has been mutated."""
+    generation = population.generation + 1
+    with _Pending() as pending:
+        for part in parts:
+            _mutate(
+                population.candidates,
+                lower,
+                upper,
+                settings.scale_factor,
+                settings.crossover,
+                word(seed),
+                first_stream + generation,
+                part.start,
+                trial[part],
+            )
+            pending.add(executor.submit(fitness, trial[part]))
+        for part, trial_cost in zip(parts, pending.results(), strict=True):
+            _select(population.candidates[part], population.cost[part], trial[part], np.array(trial_cost))
+    population.generation = generation
+
+
+class _Pending:
+    """Evaluations under way; what has not begun is called off where one of them, or the caller, fails."""
+
+    def __init__(self) -> None:
+        self._futures: list[Future[Floats]] = []
+
+    def __enter__(self) -> _Pending:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for future in self._futures:
+            future.cancel()
+
+    def add(self, future: Future[Floats]) -> None:
+        self._futures.append(future)
+
+    def results(self) -> list[Floats]:
+        """Costs, in the order of `add`."""
+        return [future.result() for future in self._futures]
+
+
+def _identity(
+    fitnesses: Sequence[Callable[[Floats], Floats]],
+    judge: Callable[[Floats], Floats],
+    lower: Floats,
+    upper: Floats,
+    seed: int,
+    settings: PaperSettings,
+) -> Arrays:
+    def all_costs(candidates: Floats) -> Floats:
+        return np.concatenate([fitness(candidates) for fitness in (*fitnesses, judge)])
+
+    # Sub-populations divide the work and change nothing of the result.
+    undivided = replace(settings, subpopulations=1)
+    return problem("paper", all_costs, lower, upper, start=None, seed=seed, settings=undivided)
+
+
+def _arrays(population: _Population, winners: Sequence[Floats]) -> Arrays:
+    return {
+        "generation": np.array(population.generation),
+        "candidates": population.candidates,
+        "cost": population.cost,
+        "winners": np.array(winners).reshape(len(winners), population.candidates.shape[1]),
+    }
+
+
+@compiled
+def _mutate(
+    population: Floats,
+    lower: Floats,
+    upper: Floats,
+    scale_factor: float,
+    crossover: float,
+    seed: np.uint64,
+    generation: int,
+    first: int,
+    trial: Floats,
+) -> None:
+    """Trials of the candidates from number `first` on: Eqs. 7-10."""
+    n, p = population.shape
+    for i in range(len(trial)):
+        parent = first + i
+        key = stream(seed, generation, parent)
+        draw = p
+        one = two = three = parent
+        while one == parent:
+            one = below(key, draw, n)
+            draw += 1
+        while two in (parent, one):
+            two = below(key, draw, n)
+            draw += 1
+        while three in (parent, one, two):
+            three = below(key, draw, n)
+            draw += 1
+        base, left, right, out = population[one], population[two], population[three], trial[i]
+        for j in range(p):
+            value = base[j] + scale_factor * (left[j] - right[j])
+            if value < lower[j]:
+                value = min(upper[j], 2.0 * lower[j] - value)
+            elif value > upper[j]:
+                value = max(lower[j], 2.0 * upper[j] - value)
+            out[j] = value
+        if crossover < 1.0:
+            forced = below(key, draw, p)
+            for j in range(p):
+                if j != forced and uniform(key, j) >= crossover:
+                    out[j] = population[parent, j]
+
+
+@compiled
+def _select(population: Floats, cost: Floats, trial: Floats, trial_cost: Floats) -> None:
+    """Greedy selection, Eq. 11; a trial without a cost never wins."""
+    n, p = population.shape
+    for i in range(n):
+        if trial_cost[i] < cost[i]:
+            cost[i] = trial_cost[i]
+            for j in range(p):
+                population[i, j] = trial[i, j]

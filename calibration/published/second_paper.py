@@ -1,0 +1,230 @@
+"""The second paper's identifications (ICIC 2020): plain least squares, no priors, nothing robust.
+
+Beyond the paper, a step that would raise the squares is halved until it does not.
+
+KM iterates d_phi = (J'J)^-1 J' dP over the kinematic parameters (Eqs. 5-8). SKCM adds one linear compliance for each
+joint with a torque, d_theta = tau C and so dP = J_e tau C (Eqs. 16, 17), and solves for both together. Where J'J is
+singular the paper strikes redundant parameters by hand; here the directions that the data cannot see are found once, on
+the nominal model, and held: every step is the shortest of all equally good ones. RBF-TCM is KM with the network of
+`calibration.residual.torque_network` on top.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibration.effects.adoption import Adopted
+from calibration.effects.base import Situation
+from calibration.effects.fitted import Choice, joined
+from calibration.errors import CalibrationError, DataError, UnsafeError
+from calibration.identification.additions import Additions
+from calibration.identification.identifiability import identifiability
+from calibration.identification.judgement import refuse_mirrored, rms_left_mm, rms_tolerated_mm
+from calibration.identification.refinement import Fit, prior_precision, refine
+from calibration.identification.samples import Samples, reading_covariance
+from calibration.identification.solve import Solution, place
+from calibration.kernels.lineariser import Lineariser
+from calibration.kinematics import Chain, Linearisation
+from calibration.observations import Floats, Observations
+from calibration.rig import Rig
+from calibration.torques import gravity_torques, loaded_joints
+
+Progress = Callable[[float, str], None]
+
+_SEEN = 1e-6  # singular value over the largest, columns scaled to one length; what repeats another is at 1e-16
+_ROUNDS = 100
+_HALVINGS = 12
+_SETTLED = 1e-4  # of the error: what a step may still change, as a length
+
+
+@dataclass(frozen=True)
+class _State:
+    """Parameters and coefficients `z` (p + k,), and what they make of the samples."""
+
+    z: Floats
+    additions: Additions
+    lin: Linearisation
+    error: Floats  # (m, 3) measured minus modelled
+
+    @property
+    def squares(self) -> float:
+        return float((self.error**2).sum())
+
+    def columns(self) -> Floats:
+        """(3 m, p + k) derivatives of the positions."""
+        added = self.lin.joint_jacobian[:, :, self.additions.joint] * self.additions.column[:, None, :]
+        both: Floats = np.concatenate([self.lin.jacobian, added], axis=2).reshape(3 * len(self.error), -1)
+        return both
+
+
+def km(rig: Rig, observations: Observations, *, progress: Progress) -> Solution:
+    """Kinematic parameters by iterated least squares (Eqs. 5-8).
+
+    Raises:
+        DataError: a prism that the rig lacks.
+        UnsafeError: too few fixes, a base that cannot be placed, mirrored coordinates, another rig's data.
+        CalibrationError: the iteration left the range of numbers.
+    """
+    progress(0.0, "placing the base")
+    chain, samples, start = place(rig, observations)
+    refuse_mirrored(chain, samples)
+    nominal = refine(chain, samples, start.x, free=np.isinf(chain.prior_sigma))
+    progress(0.2, "iterating least squares")
+    fit, rounds = _iterated(chain, samples, nominal.x, _Compliances(samples, Situation(chain, nominal.x, observations)))
+    tolerated_mm = rms_tolerated_mm(chain, samples, nominal)
+    left_mm = rms_left_mm(chain, samples, fit.x)
+    if left_mm > tolerated_mm:
+        raise UnsafeError(
+            f"after plain least squares the fixes are still {left_mm:.0f} mm RMS off, where this rig's build "
+            f"tolerances explain {tolerated_mm:.0f} mm even before it: the method cannot cope with these data; "
+            f"--method default can, or says what is wrong with them"
+        )
+    progress(0.9, "checking what the data determine")
+    seen = identifiability(chain, samples, nominal.x, fit.excess_variance)
+    words = f"plain least squares from the nominal model, {rounds} rounds"
+    return Solution(chain, samples, nominal, fit, seen, words, tolerated_mm)
+
+
+def skcm(rig: Rig, observations: Observations, *, progress: Progress) -> Adopted:
+    """Kinematic parameters and one compliance for each joint with a torque, together (Eqs. 16, 17).
+
+    Returns:
+        The joint fit with its effects; its `geometric` is the fit of `km`.
+
+    Raises:
+        DataError: as `require_torques`, or a prism that the rig lacks.
+        UnsafeError, CalibrationError: as `km`.
+    """
+    require_torques(rig, observations, "skcm")
+    solution = km(rig, observations, progress=lambda share, what: progress(0.7 * share, what))
+    chain, samples, nominal = solution.chain, solution.samples, solution.nominal
+    progress(0.7, "iterating least squares with compliances")
+    situation = Situation(chain, nominal.x, observations)
+    joints = loaded_joints(rig, gravity_torques(chain, nominal.x, observations))
+    choices = tuple(Choice("joint_compliance", rig.joint_names[joint], {}) for joint in joints)
+    compliances = _Compliances(samples, situation, choices)
+    fit, rounds = _iterated(chain, samples, nominal.x, compliances)
+    p = len(chain)
+    errors = np.sqrt(np.diag(fit.covariance))
+    effects = tuple(choice.fitted(situation, fit.x[[p + i]], errors[[p + i]]) for i, choice in enumerate(choices))
+    joint = replace(
+        solution,
+        fit=fit,
+        search=f"plain least squares with compliances from the nominal model, {rounds} rounds",
+        additions=compliances.at(fit.x[:p]),
+    )
+    return Adopted(joint, solution.fit, effects, "a part of the method")
+
+
+def require_torques(rig: Rig, observations: Observations, method: str) -> None:
+    """Refuse data whose joints carry no known torque.
+
+    Args:
+        rig: the rig description.
+        observations: n rows.
+        method: who asks: `skcm` or `rbf-tcm`.
+
+    Raises:
+        DataError: there are neither masses in the rig file nor torques measured in every row.
+    """
+    chain = Chain(rig, {})
+    if not loaded_joints(rig, gravity_torques(chain, np.zeros(len(chain)), observations)):
+        raise DataError(
+            "observations",
+            f"method {method} needs the torques of joints: give rig {rig.name!r} masses, or the data a column "
+            f"<joint>_Nm that is measured in every row",
+        )
+
+
+@dataclass(frozen=True)
+class _Compliances:
+    """The compliances to find, none for kinematics alone; their torques follow the kinematics."""
+
+    samples: Samples
+    situation: Situation
+    choices: tuple[Choice, ...] = ()
+
+    def at(self, x: Floats) -> Additions:
+        """Columns of the samples at kinematic parameters x (p,)."""
+        situation = replace(self.situation, x=x)
+        found = joined([choice.additions(situation) for choice in self.choices], len(situation))
+        return replace(found, column=self.samples.average(found.column))
+
+
+def _iterated(chain: Chain, samples: Samples, start: Floats, compliances: _Compliances) -> tuple[Fit, int]:
+    """Least squares from kinematic parameters `start` (p,) and no compliance, and how many rounds it took."""
+    p = len(chain)
+    linearise, additions = Lineariser(chain), compliances.at(start)
+    state = _state(linearise, samples, np.concatenate([start, np.zeros(len(additions))]), additions)
+    seen, unseen = _directions(state)
+    if 3 * len(samples) <= seen.shape[1]:
+        raise UnsafeError(
+            f"{len(samples)} different fixes cannot determine {seen.shape[1]} parameters by least squares; "
+            f"measure at least {seen.shape[1] // 3 + 1}"
+        )
+    rounds, settled = 0, False
+    while not settled and rounds < _ROUNDS:
+        rounds += 1
+        if len(additions):
+            state = _state(linearise, samples, state.z, compliances.at(state.z[:p]))
+        state, change = _step(linearise, samples, state, seen)
+        settled = change <= _SETTLED
+    return _fit(chain, samples, state, seen, unseen, settled), rounds
+
+
+def _state(linearise: Lineariser, samples: Samples, z: Floats, additions: Additions) -> _State:
+    p = len(z) - len(additions)
+    readings = samples.data.readings + additions.change(z[p:], samples.data.readings.shape[1])
+    lin = linearise(z[:p], replace(samples.data, readings=readings))
+    return _State(z, additions, lin, samples.position_mm - lin.position_mm)
+
+
+def _directions(state: _State) -> tuple[Floats, Floats]:
+    """(p + k, rank) directions that the data see and (p + k, rest) those they do not."""
+    columns = state.columns()
+    length = np.linalg.norm(columns, axis=0)
+    scale = 1.0 / np.where(length > 0.0, length, 1.0)
+    _, size, vt = np.linalg.svd(np.linalg.qr(columns * scale, mode="r"), full_matrices=True)
+    rank = int((size > _SEEN * size[0]).sum())
+    axes = scale[:, None] * vt.T
+    return axes[:, :rank], axes[:, rank:]
+
+
+def _step(linearise: Lineariser, samples: Samples, state: _State, seen: Floats) -> tuple[_State, float]:
+    """One step of least squares, halved while it raises the squares; the new state, and the step over the error."""
+    columns = state.columns() @ seen
+    step = np.linalg.lstsq(columns, state.error.ravel(), rcond=None)[0]
+    change = float(np.linalg.norm(columns @ step)) / max(math.sqrt(state.squares), 1e-9)
+    for halving in range(_HALVINGS):
+        moved = _state(linearise, samples, state.z + seen @ step * 0.5**halving, state.additions)
+        if moved.squares <= state.squares * (1.0 + 1e-12):
+            return moved, change
+    return state, change
+
+
+def _fit(chain: Chain, samples: Samples, state: _State, seen: Floats, unseen: Floats, settled: bool) -> Fit:
+    """The covariance of least squares where the data see, that of the prior where they do not."""
+    m = len(samples)
+    variance = state.squares / (3 * m - seen.shape[1])
+    if not math.isfinite(variance):
+        raise CalibrationError("identification: the fit left the range of numbers; check units of the observations")
+    known = samples.station_covariance + reading_covariance(chain.rig, state.lin.joint_jacobian, samples.rates)
+    excess = max(variance - float(np.trace(known, axis1=1, axis2=2).mean()) / 3.0, 1e-12)
+    triangle = np.linalg.qr(state.columns() @ seen, mode="r")
+    half = seen @ np.linalg.inv(triangle)
+    precision = np.concatenate([prior_precision(chain, 1.0), state.additions.prior_sigma**-2.0])
+    prior = unseen @ np.linalg.inv(unseen.T @ (precision[:, None] * unseen)) @ unseen.T
+    return Fit(
+        x=state.z,
+        covariance=variance * half @ half.T + prior,
+        excess_variance=excess,
+        prior_scale=1.0,
+        outlier_share=0.0,
+        weight=np.ones(m),
+        cost=1.5 * m * math.log(max(state.squares / (3 * m), 1e-300)),
+        settled=settled,
+    )
