@@ -1,0 +1,1 @@
+"""Design of poses: which to measure so that a model becomes as true as it can."""

@@ -1,0 +1,300 @@
+"""The pose plan that the command line prints: what is known, poses that add most to it, what they will bring."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from calibration.accuracy import VOLUME_POSES, ExpectedAccuracy, predicted_accuracy, shares_left
+from calibration.design.knowledge import Knowledge, setup_of
+from calibration.design.poses import CANDIDATES, Plan, draw, plan, volume_root, work_volume
+from calibration.design.visibility import Site, placement, site
+from calibration.errors import UnsafeError
+from calibration.kinematics import Chain, Placement
+from calibration.model import CalibratedModel
+from calibration.observations import Floats
+from calibration.rig import Rig
+
+Progress = Callable[[float, str], None]
+
+_COVERED = 0.8  # of a joint's range
+_SHARE = 0.03  # of the expected variance
+_NAMED = 3
+_CERTAIN_SIGMA = 5.0
+_DIGITS = 2
+
+
+@dataclass(frozen=True)
+class PoseRow:
+    """One pose of a plan.
+
+    Attributes:
+        pose: from 1.
+        joints: column of each joint -> value, deg or mm.
+        sides: `<joint>_dir` of the joints whose approach matters -> -1 or 1.
+        prisms: in view.
+    """
+
+    pose: int
+    joints: Mapping[str, float]
+    sides: Mapping[str, int]
+    prisms: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, object]:
+        """`pose`, a column for each joint, `<joint>_dir` where the approach matters, `prisms`."""
+        return {"pose": self.pose, **self.joints, **self.sides, "prisms": list(self.prisms)}
+
+
+@dataclass(frozen=True)
+class PosePlan:
+    """Poses to measure and what they bring.
+
+    Attributes:
+        rig: the rig description.
+        plan: the poses.
+        at: what stands around the rig.
+        station: where the station's place is from, a sentence.
+        before: accuracy expected of the model as it is; None where only the rig file is known.
+        after: accuracy expected of the model once the poses are measured.
+        advice: what is poorly known and what the poses bring; sentences.
+        warnings: sentences.
+    """
+
+    rig: Rig
+    plan: Plan
+    at: Site
+    station: str
+    before: ExpectedAccuracy | None
+    after: ExpectedAccuracy
+    advice: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def assumptions(self) -> tuple[str, ...]:
+        """What the plan takes for granted, in sentences."""
+        if self.before is not None:
+            return (self.station, *self.at.rules)
+        lacks = "expected error: of a model that lacks nothing, with the noise that the rig file gives"
+        return (self.station, *self.at.rules, lacks)
+
+    @cached_property
+    def rows(self) -> tuple[PoseRow, ...]:
+        """The poses in the order of the motion."""
+        poses, joints = self.plan.poses, self.rig.joint_names
+        return tuple(
+            PoseRow(
+                number + 1,
+                {j.column: round(float(poses.readings[number, i]), _DIGITS) for i, j in enumerate(self.rig.joints)},
+                {f"{name}_dir": int(poses.direction[number, joints.index(name)]) for name in self.plan.approached},
+                tuple(name for name, seen in zip(self.rig.prism_names, poses.seen[number], strict=True) if seen),
+            )
+            for number in range(len(poses))
+        )
+
+    def as_dict(self) -> dict[str, object]:
+        """The JSON object of `rigcal plan`."""
+        return {
+            "rig": self.rig.name,
+            "poses": [row.as_dict() for row in self.rows],
+            "fixes": int(self.plan.poses.seen.sum()),
+            "seconds_of_motion": round(self.plan.seconds_of_motion, 1),
+            "parameters": self.plan.parameters,
+            "determined": self.plan.determined,
+            "observability": self.plan.observability,
+            "predicted_accuracy_mm": self.after.as_dict(),
+            "present_accuracy_mm": self.before.as_dict() if self.before else None,
+            "stands_out_sigma": self.plan.stands_out,
+            "station_mm": [round(float(c), 1) + 0.0 for c in self.at.station_mm],
+            "assumptions": list(self.assumptions),
+            "advice": list(self.advice),
+            "warnings": list(self.warnings),
+        }
+
+
+def plan_poses(
+    rig: Rig,
+    poses: int,
+    rng: np.random.Generator,
+    *,
+    model: CalibratedModel | None = None,
+    station_mm: Floats | None = None,
+    setup: str | None = None,
+    floor_mm: float | None = None,
+    separate: tuple[str, str] | None = None,
+    progress: Progress | None = None,
+) -> PosePlan:
+    """Plan a session, or what to measure after one.
+
+    Without a model the poses make the parameters best determined; with one they lower most what it is expected to err
+    over the work volume; with `separate` they tell two effects apart.
+
+    Args:
+        rig: the rig description.
+        poses: how many.
+        rng: draws candidates and work volume.
+        model: what is known already. At one of its set-ups the poses will be measured, unless `station_mm` is given.
+        station_mm: (3,) place of a new station set-up in the base frame.
+        setup: which of the model's set-ups; by default the one whose base is known best.
+        floor_mm: height of the floor over the base's origin.
+        separate: two effects, each the `family@where` of one in the library.
+        progress: told (share done, what is going on).
+
+    Raises:
+        DataError: fewer reachable poses than asked for; an effect that poses do not show.
+        UnsafeError: a model of another rig, or without that set-up; no reachable pose in view.
+    """
+    report = progress or _silent
+    if model is not None:
+        _require_same(rig, model.rig)
+    report(0.0, "placing the station")
+    present = None if model is None else Knowledge.of_model(model, setup_of(model, setup))
+    knowledge, at, station = _situation(rig, present, station_mm, floor_mm)
+    report(0.1, "drawing poses")
+    candidates = draw(knowledge, at, rng, max(CANDIDATES, poses))
+    volume = work_volume(knowledge, at, rng, VOLUME_POSES)
+    report(0.4, "choosing poses")
+    chosen = plan(knowledge, candidates, poses, volume=None if model is None else volume, separate=separate)
+    report(0.9, "predicting the accuracy")
+    before: ExpectedAccuracy | None = None
+    advice: tuple[str, ...] = ()
+    if model is None or present is None:
+        after = predicted_accuracy(knowledge, chosen.root, volume)
+    else:
+        before = _of_model(model, present, present.root, volume)
+        after = _of_model(model, knowledge, chosen.root, volume)
+        advice = tuple(_advice(model, present, chosen, before, after, moved=station_mm is not None))
+    return PosePlan(rig, chosen, at, station, before, after, advice, tuple(_warnings(rig, chosen, model)))
+
+
+def _require_same(rig: Rig, of_model: Rig) -> None:
+    """UnsafeError unless the rigs are one; which signals they carry on their buses plays no part in a plan."""
+    if of_model.name != rig.name:
+        raise UnsafeError(f"the model is of rig {of_model.name!r}, not of {rig.name!r}; name its own rig")
+    differ = [
+        key for key in type(rig).model_fields if key != "channels" and getattr(rig, key) != getattr(of_model, key)
+    ]
+    if differ:
+        raise UnsafeError(
+            f"rig {rig.name!r} differs from the one that the model was calibrated with, in its {', '.join(differ)}; "
+            f"plan with that rig file, or calibrate anew with this one"
+        )
+
+
+def _situation(
+    rig: Rig, present: Knowledge | None, station_mm: Floats | None, floor_mm: float | None
+) -> tuple[Knowledge, Site, str]:
+    """What is known where the poses will be measured, what stands around, and where the station's place is from."""
+    if present is not None and station_mm is None:
+        at = site(present.chain, present.x, setup=present.setup, floor_mm=floor_mm)
+        label = f"set-up {name!r}" if (name := present.chain.setups[present.setup]) else "the set-up"
+        others = "; choose another with --setup NAME" if len(present.chain.setups) > 1 else ""
+        return present, at, f"station: where {label} of the model has it, {_place(at)}{others}"
+    blank = Chain(rig, {"": Placement.identity()})
+    x = np.zeros(len(blank))
+    if present is not None:
+        x[: blank.base_start] = present.x[: blank.base_start]
+    at = site(blank, x, station_mm=station_mm, floor_mm=floor_mm)
+    chain = Chain(rig, {"": placement(at)})
+    known = present.at_new_setup(chain) if present is not None else Knowledge.of_rig(chain)
+    if station_mm is not None:
+        return known, at, f"station: a new set-up, {_place(at)}"
+    return known, at, f"station: assumed where it sees most, {_place(at)}; give its place with --station X,Y,Z"
+
+
+def _place(at: Site) -> str:
+    return f"at {', '.join(f'{round(float(c))}' for c in at.station_mm)} mm in the base frame"
+
+
+def _of_model(model: CalibratedModel, knowledge: Knowledge, root: Floats, volume: Floats) -> ExpectedAccuracy:
+    parameters, lacking = shares_left(model)
+    return predicted_accuracy(
+        knowledge,
+        root,
+        volume,
+        joint_error_scale=model.joint_error_scale,
+        parameters_share=parameters,
+        lacking_share=lacking,
+    )
+
+
+def _advice(
+    model: CalibratedModel,
+    present: Knowledge,
+    chosen: Plan,
+    before: ExpectedAccuracy,
+    after: ExpectedAccuracy,
+    *,
+    moved: bool,
+) -> Iterator[str]:
+    poses = chosen.poses
+    if moved:
+        yield (
+            f"these {len(poses)} poses would leave an expected error of {after.rms_mm:.3g} mm RMS over the work volume "
+            f"at the new set-up; at its own the model's is {before.rms_mm:.3g} mm"
+        )
+    else:
+        yield (
+            f"these {len(poses)} poses would lower the expected error over the work volume from {before.rms_mm:.3g} to "
+            f"{after.rms_mm:.3g} mm RMS"
+        )
+    yield f"the present model's expected error is {before.where}"
+    if after.lacking_mm > 0.5 * after.rms_mm:
+        yield (
+            f"{after.lacking_mm:.3g} mm of it is what the model lacks, which more poses do not lower; look for an "
+            f"effect or train a residual"
+        )
+    yield from _poorly_known(present, before.readings)
+    rig = model.rig
+    for index, joint in enumerate(rig.joints):
+        low, high = model.coverage.ranges[joint.name]
+        if high - low < _COVERED * (joint.limits[1] - joint.limits[0]):
+            beyond = int(((poses.readings[:, index] < low) | (poses.readings[:, index] > high)).sum())
+            yield (
+                f"{joint.name} was measured only at {low:.0f} .. {high:.0f} of its {joint.limits[0]:g} .. "
+                f"{joint.limits[1]:g} {joint.unit}; {beyond} of these poses go beyond"
+            )
+    for prism, name in enumerate(rig.prism_names):
+        if not model.coverage.fixes.get(name):
+            yield f"prism {name} has no fixes yet; it is in view in {int(poses.seen[:, prism].sum())} of these poses"
+
+
+def _poorly_known(knowledge: Knowledge, volume: Floats) -> Iterator[str]:
+    """The parameters whose exact knowledge would lower the expected variance tr(B C) most.
+
+    Knowing parameter i takes (C B C)_ii / C_ii off it, what others share with it included.
+    """
+    root, by_volume = knowledge.root, volume_root(knowledge, volume)
+    variance = (root**2).sum(axis=1)
+    taken = ((root @ by_volume) ** 2).sum(axis=1) / np.where(variance > 0.0, variance, 1.0)
+    share = taken / float((by_volume**2).sum())
+    sizes = []
+    for i in np.argsort(-share[: len(knowledge.chain)])[:_NAMED]:
+        if share[i] >= _SHARE:
+            parameter, sigma = knowledge.chain.parameters[i], math.sqrt(float(variance[i]))
+            size = f"{math.degrees(sigma):.2g} deg" if parameter.unit == "rad" else f"{sigma:.2g} mm"
+            sizes.append(f"{parameter.name} (+-{size}, {share[i]:.0%})")
+    if sizes:
+        yield f"poorly known for what they do, with their share of the expected variance: {', '.join(sizes)}"
+
+
+def _warnings(rig: Rig, chosen: Plan, model: CalibratedModel | None) -> Iterator[str]:
+    fixes, needed = int(chosen.poses.seen.sum()), math.ceil(chosen.parameters / 3)
+    if model is None and fixes < needed:
+        yield f"{fixes} fixes are too few: to calibrate, {chosen.parameters} parameters need at least {needed}"
+    for prism, name in enumerate(rig.prism_names):
+        if not chosen.poses.seen[:, prism].any():
+            yield f"prism {name} is in view in none of the poses"
+    for effect, sigma in chosen.stands_out.items():
+        if sigma < _CERTAIN_SIGMA:
+            yield (
+                f"{effect} of plausible size would stand out from all else by {sigma:.1f} sigma only: plan more poses, "
+                f"or look for another experiment"
+            )
+
+
+def _silent(share: float, what: str) -> None:
+    """Progress that nobody watches."""

@@ -1,0 +1,287 @@
+"""Which poses a rig can take, and which prisms a station sees in them: its links as capsules, some plain rules.
+
+A rig file knows frames and no shapes. So every link is the straight line between the origins of two frames that follow
+each other, with a radius of 1.2 % of the reach, and a pedestal stands between the base and the floor. Everything here
+is in the base frame.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.kinematics import Chain, ChainData, Placement
+from calibration.observations import Floats
+from calibration.rig import Rig
+
+Flags = NDArray[np.bool_]
+
+NEAREST_MM = 1500.0  # a total station measures no prism nearer, and nobody puts one nearer to a boom that moves
+FARTHEST_MM = 500_000.0
+STEEPEST_DEG = 60.0  # above and below the horizon
+_RADIUS = 0.012  # of the reach: half the width of a boom
+_FLOOR = 0.15  # of the reach, below the base
+_SURFACE = 0.7  # a prism stands on its link, which is no thicker than this share of its distance from the line
+_NEIGHBOURS = 4.0  # radii along the chain; links nearer than that are joined by a bracket
+_BUILT_SO = 0.5  # share of poses; links closer than two radii in more of them are not as straight as drawn here
+_LEAST_LINK_MM = 1.0
+_SPREAD_POSES = 256
+_RING = 16  # places about the base that are tried for the station
+_DISTANCES = (0.4, 0.8, 1.2)  # of the reach
+_EYE_MM = 1600.0  # the instrument above the floor
+
+
+@dataclass(frozen=True)
+class Site:
+    """What stands around a rig.
+
+    Attributes:
+        station_mm: (3,) the instrument's centre.
+        up: (3,) unit vector against gravity.
+        reach_mm: the farthest a frame or prism comes from the base.
+        floor_mm: height of the floor over the base's origin, along `up`.
+        apart: pairs of links that must not touch, by the numbers of their rows; 0 for the pedestal.
+    """
+
+    station_mm: Floats
+    up: Floats
+    reach_mm: float
+    floor_mm: float
+    apart: tuple[tuple[int, int], ...] = ()
+
+    @property
+    def radius_mm(self) -> float:
+        """Radius of every link."""
+        return _RADIUS * self.reach_mm
+
+    @property
+    def rules(self) -> tuple[str, ...]:
+        """What counts as reachable and as in view, in sentences."""
+        return (
+            f"reachable: inside the joint limits, nothing lower than the floor at {self.floor_mm:.0f} mm over the "
+            f"base's origin, links (straight between their frames, {self.radius_mm:.0f} mm in radius) clear of each "
+            f"other and of the base",
+            f"in view: the line from the station passes no link, {NEAREST_MM / 1e3:g} .. {FARTHEST_MM / 1e3:g} m away "
+            f"and within {STEEPEST_DEG:g} deg of the horizon",
+        )
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """The machine in n poses, in the base frame.
+
+    Attributes:
+        rig: the rig description.
+        frames_mm: (n, rows + 1, 3) origins of the base and of the frame after each row.
+        prisms_mm: (n, prisms, 3).
+    """
+
+    rig: Rig
+    frames_mm: Floats
+    prisms_mm: Floats
+
+    @classmethod
+    def of(cls, chain: Chain, x: Floats, readings: Floats) -> Bodies:
+        """For readings (n, joints), deg or mm, and parameters `x` (p,)."""
+        n, prisms = len(readings), len(chain.rig.prisms)
+        here = Chain(chain.rig, {"": Placement.identity()})
+        own = np.concatenate([x[: chain.base_start], np.zeros(6)])
+        zero = np.zeros(n * prisms, dtype=np.intp)
+        frames = here.frames_mm(own, ChainData(readings, zero[:n], zero[:n]))
+        every = ChainData(np.repeat(readings, prisms, axis=0), np.tile(np.arange(prisms), n), zero)
+        return cls(
+            chain.rig,
+            np.concatenate([np.zeros((n, 1, 3)), frames], axis=1),
+            here.positions_mm(own, every).reshape(n, prisms, 3),
+        )
+
+    def __len__(self) -> int:
+        return len(self.frames_mm)
+
+    @property
+    def everything_mm(self) -> Floats:
+        """(n, frames + prisms, 3)."""
+        return np.concatenate([self.frames_mm, self.prisms_mm], axis=1)
+
+    @cached_property
+    def _parents(self) -> tuple[int, ...]:
+        """The frame that each row continues from."""
+        return tuple((0, *self.rig.path(number))[-2] for number in range(1, len(self.rig.rows) + 1))
+
+    @cached_property
+    def _lengths_mm(self) -> Floats:
+        """(rows,) mean length of every link."""
+        span = self.frames_mm[:, 1:] - self.frames_mm[:, list(self._parents)]
+        lengths: Floats = np.linalg.norm(span, axis=2).mean(axis=0)
+        return lengths
+
+    @cached_property
+    def links(self) -> tuple[int, ...]:
+        """Numbers of the rows that have a link of their own."""
+        return tuple(int(i) + 1 for i in np.flatnonzero(self._lengths_mm >= _LEAST_LINK_MM))
+
+    def link_mm(self, number: int) -> tuple[Floats, Floats]:
+        """(n, 3) both ends of the link of a row."""
+        return self.frames_mm[:, self._parents[number - 1]], self.frames_mm[:, number]
+
+    def between_mm(self, one: int, other: int) -> float:
+        """Mean length of the machine between two links, along the chain; 0 where they share a frame.
+
+        Links go by the number of their row; the pedestal is 0 and ends at the base.
+        """
+        ends = [(self._parents[number - 1], number) if number else (0, 0) for number in (one, other)]
+        return min(self._apart_mm(a, b) for a in ends[0] for b in ends[1])
+
+    def _apart_mm(self, one: int, other: int) -> float:
+        rows = set(self.rig.path(one)) ^ set(self.rig.path(other))
+        return float(sum(self._lengths_mm[number - 1] for number in rows))
+
+
+def limits(rig: Rig) -> tuple[Floats, Floats]:
+    """(joints,) lowest and highest value of every joint, deg or mm."""
+    low, high = np.array([joint.limits for joint in rig.joints]).T
+    return low, high
+
+
+def spread_poses(rig: Rig, n: int = _SPREAD_POSES) -> Floats:
+    """(n, joints) poses that fill the joint limits evenly, always the same (Kronecker sequence, Roberts' ratios)."""
+    joints = len(rig.joints)
+    ratio = 2.0
+    for _ in range(50):  # the root of g^(d+1) = g + 1
+        ratio = (1.0 + ratio) ** (1.0 / (joints + 1))
+    low, high = limits(rig)
+    turn = (0.5 + np.arange(1, n + 1)[:, None] * ratio ** -np.arange(1.0, joints + 1)) % 1.0
+    return np.asarray(low + (high - low) * turn, dtype=np.float64)
+
+
+def site(
+    chain: Chain,
+    x: Floats,
+    *,
+    setup: int | None = None,
+    station_mm: Floats | None = None,
+    floor_mm: float | None = None,
+) -> Site:
+    """What stands around a rig.
+
+    Args:
+        chain, x: kinematics and its parameters (p,).
+        setup: the set-up of the chain whose station it is.
+        station_mm: (3,) the station in the base frame. Without it and without a set-up: on its tripod on the floor
+            about the base, never within reach of the machine, where it sees most.
+        floor_mm: height of the floor over the base's origin; 15 % of the reach below it by default.
+    """
+    up = -np.array(chain.rig.gravity) / np.linalg.norm(chain.rig.gravity)
+    bodies = Bodies.of(chain, x, spread_poses(chain.rig))
+    reach = float(np.linalg.norm(bodies.everything_mm, axis=2).max())
+    floor = -_FLOOR * reach if floor_mm is None else floor_mm
+    at = Site(np.zeros(3), up, reach, floor)
+    if setup is not None:
+        base = chain.base(x, setup)
+        at = replace(
+            at, station_mm=-base.rotation.T @ base.translation_mm, up=base.rotation.T @ np.array([0.0, 0.0, 1.0])
+        )
+    elif station_mm is not None:
+        at = replace(at, station_mm=np.asarray(station_mm, dtype=np.float64))
+    at = replace(at, apart=_apart(bodies, at))
+    return _best_place(bodies, at) if setup is None and station_mm is None else at
+
+
+def placement(at: Site) -> Placement:
+    """Where the base stands in the frame of a levelled station there."""
+    up = at.up
+    across = np.cross(np.eye(3)[int(np.argmin(np.abs(up)))], up)
+    east = across / np.linalg.norm(across)
+    rotation = np.array([east, np.cross(up, east), up])
+    if np.allclose(up, [0.0, 0.0, 1.0]):
+        rotation = np.eye(3)
+    return Placement(rotation, -rotation @ at.station_mm)
+
+
+def _best_place(bodies: Bodies, at: Site) -> Site:
+    toward = placement(at).rotation
+    reachable = is_reachable(bodies, at)
+    seen_most, best = -1, at
+    for distance in _DISTANCES:
+        for turn in np.arange(_RING) * (2.0 * math.pi / _RING):
+            level = distance * at.reach_mm * (math.cos(turn) * toward[0] + math.sin(turn) * toward[1])
+            place = replace(at, station_mm=level + (at.floor_mm + _EYE_MM) * at.up)
+            clear = np.linalg.norm(bodies.everything_mm - place.station_mm, axis=2).min() > NEAREST_MM
+            seen = int(in_view(bodies, place)[reachable].sum()) if clear or distance == _DISTANCES[-1] else -1
+            if seen > seen_most:
+                seen_most, best = seen, place
+    return best
+
+
+def is_reachable(bodies: Bodies, at: Site) -> Flags:
+    """(n,) poses in which nothing is below the floor and no link touches another or the pedestal."""
+    good: Flags = np.all(bodies.everything_mm @ at.up >= at.floor_mm, axis=1)
+    for one, other in at.apart:
+        good &= _gap_mm(bodies, at, one, other) >= 2.0 * at.radius_mm
+    return good
+
+
+def _apart(bodies: Bodies, at: Site) -> tuple[tuple[int, int], ...]:
+    """Pairs of links, by row number and 0 for the pedestal, that are no neighbours and do not always touch."""
+    found = []
+    for i, one in enumerate((0, *bodies.links)):
+        for other in bodies.links[i:]:
+            if bodies.between_mm(one, other) > _NEIGHBOURS * at.radius_mm:
+                touches = _gap_mm(bodies, at, one, other) < 2.0 * at.radius_mm
+                if touches.mean() < _BUILT_SO:
+                    found.append((one, other))
+    return tuple(found)
+
+
+def _gap_mm(bodies: Bodies, at: Site, one: int, other: int) -> Floats:
+    """(n,) distance between the lines of two links, or of the pedestal and a link."""
+    ends = bodies.link_mm(one) if one else _pedestal(at, len(bodies))
+    return segment_distance(*ends, *bodies.link_mm(other))
+
+
+def in_view(bodies: Bodies, at: Site) -> Flags:
+    """(n, prisms) prisms that the station sees."""
+    n = len(bodies)
+    station = np.broadcast_to(at.station_mm, (n, 3))
+    obstacles = [bodies.link_mm(number) for number in bodies.links] + [_pedestal(at, n)]
+    seen = np.ones((n, len(bodies.rig.prisms)), dtype=bool)
+    for prism in range(seen.shape[1]):
+        target = bodies.prisms_mm[:, prism]
+        sight = target - station
+        range_mm = np.linalg.norm(sight, axis=1)
+        steep = np.abs(sight @ at.up) > math.sin(math.radians(STEEPEST_DEG)) * range_mm
+        seen[:, prism] = (range_mm >= NEAREST_MM) & (range_mm <= FARTHEST_MM) & ~steep
+        for ends in obstacles:
+            on_it = _SURFACE * segment_distance(*ends, target, target)
+            seen[:, prism] &= segment_distance(*ends, station, target) >= np.minimum(at.radius_mm, on_it)
+    return seen
+
+
+def segment_distance(p0: Floats, p1: Floats, q0: Floats, q1: Floats) -> Floats:
+    """(n,) shortest distances between line segments p0 p1 and q0 q1, all (n, 3); Ericson, Real-Time Collision
+    Detection (2005), section 5.1.9."""
+    u, v, w = p1 - p0, q1 - q0, p0 - q0
+    a, e, b = _dot(u, u), _dot(v, v), _dot(u, v)
+    c, f = _dot(u, w), _dot(v, w)
+    tiny = 1e-12
+    determinant = a * e - b * b
+    s = np.clip(np.where(determinant > tiny * a * e, (b * f - c * e) / np.maximum(determinant, tiny), 0.0), 0.0, 1.0)
+    t = np.where(e > tiny, (b * s + f) / np.maximum(e, tiny), 0.0)
+    t = np.clip(t, 0.0, 1.0)
+    s = np.clip(np.where(a > tiny, (b * t - c) / np.maximum(a, tiny), 0.0), 0.0, 1.0)
+    distance: Floats = np.linalg.norm(w + s[:, None] * u - t[:, None] * v, axis=1)
+    return distance
+
+
+def _dot(a: Floats, b: Floats) -> Floats:
+    product: Floats = np.einsum("ni,ni->n", a, b)
+    return product
+
+
+def _pedestal(at: Site, n: int) -> tuple[Floats, Floats]:
+    foot = min(at.floor_mm, 0.0) * at.up
+    return np.zeros((n, 3)), np.broadcast_to(foot, (n, 3))
