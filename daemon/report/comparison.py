@@ -1,0 +1,183 @@
+"""Methods side by side: the second paper's Table 4 as a page, for any rig and data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calibration.comparison import FIGURES, NOMINAL, Comparison, MethodResult
+from daemon.report.drawing import AFTER, BEFORE, INK, MIDDLE, new_figure, plain_log_axis, styled, svg_image
+from daemon.report.markup import escape, items, number, page, paragraph, picture, section, table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LABELS: Mapping[str, str] = {
+    NOMINAL: "nominal",
+    "km": "KM",
+    "skcm": "SKCM",
+    "rbf-tcm": "RBF-TCM",
+    "default": "rigcal (default)",
+    "pde-paper": "Zhou et al. 2022",
+}
+_COLOURS: Mapping[str, str] = {
+    NOMINAL: BEFORE,
+    "km": "#e69f00",
+    "skcm": "#009e73",
+    "rbf-tcm": "#cc79a7",
+    "default": AFTER,
+    "pde-paper": MIDDLE,
+}
+HEADER = ("method", "mean", "max", "std", "rms", "mean, training", "seconds", "on top of the kinematics")
+LOWEST = "*"
+TEXT_COLUMNS = (0, len(HEADER) - 1)
+_TRAINING = "training_mean_mm"  # the lowest of these is no merit
+_PARTS = {"rbfn": "RBFN", "lightgbm": "LightGBM", "chain": "RBFN + LightGBM", "rbf-tcm": "RBF on torques"}
+_BARS = (("mean_mm", "mean"), ("max_mm", "max"), ("std_mm", "standard deviation"))
+
+
+def comparison_page(comparison: Comparison, sources: Mapping[str, str]) -> str:
+    """One self-contained HTML document; `sources` says where the data come from."""
+    with styled():
+        content = [
+            _head(comparison),
+            section(
+                "Errors",
+                table(
+                    HEADER,
+                    table_rows(comparison),
+                    caption=f"Position error in mm on {comparison.held_out} held-out fixes; {LOWEST} the lowest",
+                    text_columns=TEXT_COLUMNS,
+                    classes=["best" if r.method == "default" else "" for r in comparison.results],
+                ),
+                _refusals(comparison),
+                picture(
+                    svg_image(bars(comparison), "Mean, greatest and standard deviation of the error per method"),
+                    "On the held-out fixes; the axes are logarithmic.",
+                ),
+                picture(
+                    svg_image(curves(comparison), "Held-out errors of every method, sorted by size"),
+                    "Every method's held-out errors, sorted: at 50 % is the median, at 100 % the worst fix.",
+                ),
+            ),
+            section("Where this comes from", table((), list(map(list, sources.items())), text_columns=(0, 1))),
+        ]
+    return page(f"Methods compared: {comparison.rig}", "".join(content))
+
+
+def table_rows(comparison: Comparison) -> list[list[str]]:
+    """Cells as in `HEADER`, the lowest of each column of held-out errors marked."""
+    lowest = {figure: comparison.lowest(figure) for figure in FIGURES if figure != _TRAINING}
+    rows = []
+    for result in comparison.results:
+        row = result.as_dict()
+        cells = [LABELS[result.method]]
+        if result.reason is not None:
+            rows.append([*cells, "not applicable", *[""] * (len(HEADER) - 2)])
+            continue
+        for figure in FIGURES:
+            mark = f" {LOWEST}" if result.method in lowest.get(figure, ()) else ""
+            value = row[figure]
+            assert isinstance(value, float)
+            cells.append(number(value) + mark)
+        cells.append("" if result.seconds is None else number(result.seconds))
+        cells.append(", ".join(_PARTS.get(part, part.replace("_", " ")) for part in result.adds))
+        rows.append(cells)
+    return rows
+
+
+def refusals(comparison: Comparison) -> list[str]:
+    """A sentence for every method that does not apply."""
+    return [f"{LABELS[r.method]}: not applicable: {r.reason}" for r in comparison.results if r.reason is not None]
+
+
+def bars(comparison: Comparison) -> Figure:
+    """Mean, greatest and standard deviation of the held-out error, a bar for every method."""
+    from matplotlib.ticker import LogLocator
+
+    results = _applicable(comparison)
+    figure = new_figure(0.9 + 0.34 * len(results))
+    for axes, (key, title) in zip(figure.subplots(1, len(_BARS), sharey=True), _BARS, strict=True):
+        values = [value for r in results if isinstance(value := r.as_dict()[key], float)]
+        drawn = axes.barh(range(len(values)), values, height=0.62, color=[_COLOURS[r.method] for r in results])
+        plain_log_axis(axes, "x")
+        axes.xaxis.set_major_locator(LogLocator(10))
+        low, high = max(min(values), 1e-6), max(values)
+        span = max(high / low, 2.0)
+        axes.set_xlim(low / span**0.25, high * span**0.35)
+        axes.bar_label(drawn, labels=[number(value) for value in values], padding=3, fontsize=8.5)
+        axes.set_title(title)
+        axes.set_xlabel("mm")
+        axes.grid(False, axis="y")
+        axes.tick_params(axis="y", length=0, labelcolor=INK)
+        axes.set_yticks(range(len(results)), [LABELS[r.method] for r in results])
+    figure.axes[0].invert_yaxis()
+    return figure
+
+
+def curves(comparison: Comparison) -> Figure:
+    """Held-out errors of every method in rising order."""
+    figure = new_figure(3.9)
+    axes = figure.add_subplot()
+    for result in _applicable(comparison):
+        assert result.error_mm is not None
+        share = 100.0 * (np.arange(len(result.error_mm)) + 1) / len(result.error_mm)
+        width = 2.4 if result.method == "default" else 1.4
+        axes.plot(
+            share, np.sort(result.error_mm), color=_COLOURS[result.method], linewidth=width, label=LABELS[result.method]
+        )
+    plain_log_axis(axes)
+    axes.set_xlim(0, 100)
+    axes.set_xlabel("share of the held-out fixes with at most this error, %")
+    axes.set_ylabel("position error, mm")
+    figure.legend(loc="outside upper left", ncols=6)
+    return figure
+
+
+def _applicable(comparison: Comparison) -> list[MethodResult]:
+    return [result for result in comparison.results if result.error_mm is not None]
+
+
+def headline(comparison: Comparison) -> str:
+    """The result in one sentence."""
+    lowest = comparison.lowest("mean_mm")
+    best = next(result for result in comparison.results if result.method in lowest)
+    nominal = comparison.results[0]
+    assert best.error_mm is not None
+    assert nominal.error_mm is not None
+    return (
+        f"{LABELS[best.method]} has the lowest mean error on {comparison.held_out} held-out fixes: "
+        f"{number(float(best.error_mm.mean()))} mm, where the nominal model has "
+        f"{number(float(nominal.error_mm.mean()))} mm."
+    )
+
+
+def _head(comparison: Comparison) -> str:
+    result = comparison.as_dict()
+    warnings = result["warnings"]
+    assert isinstance(warnings, list)
+    return (
+        f"<header><h1>Methods compared: {escape(comparison.rig)}</h1>"
+        + paragraph(f"{comparison.training} training fixes and {comparison.held_out} held-out ones")
+        + f'<p class="headline">{escape(headline(comparison)).replace(" mm", "&nbsp;mm")}</p>'
+        + paragraph(
+            "Every method was calibrated on the same training fixes and judged on the held-out ones, by its last "
+            "stage. Seconds are of the whole calibration.",
+            "lead",
+        )
+        + f"</header>{notice(warnings)}"
+    )
+
+
+def notice(warnings: list[str]) -> str:
+    """A box of sentences, nothing where there are none."""
+    if not warnings:
+        return ""
+    return f'<div class="notice" role="note"><strong>Please note</strong>{items(warnings)}</div>'
+
+
+def _refusals(comparison: Comparison) -> str:
+    sentences = refusals(comparison)
+    return items(sentences) if sentences else ""
