@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import math
 import re
@@ -157,6 +158,11 @@ def format_observations(
     writer.writerow(columns)
     writer.writerows(zip(*([_cell(v) for v in values] for values in columns.values()), strict=True))
     return out.getvalue()
+
+
+def data_sha256(observations: Observations, rig: Rig) -> str:
+    """SHA-256 of the observations in canonical form: the same for a file, a stored session and a replay of it."""
+    return hashlib.sha256(format_observations(observations, rig).encode()).hexdigest()
 
 
 def _cell(value: object) -> str:

@@ -3,85 +3,47 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib import metadata
 
 import numpy as np
-from threadpoolctl import threadpool_limits
+from numpy.typing import NDArray
 
-from calibration.errors import DataError
+from calibration.accuracy import joint_error_scale
+from calibration.effects.adoption import Adopted, with_effects
+from calibration.evaluation import Evaluation, evaluate, require_positions
+from calibration.identification.judgement import originals
+from calibration.identification.refinement import Prior
 from calibration.identification.samples import reading_covariance, station_covariance
-from calibration.identification.solve import Solution, solve
-from calibration.model import CalibratedModel, Coverage, LearnedResidual, Outlier, Prediction, Prior
-from calibration.observations import Floats, Observations, Strings, format_observations
-from calibration.rebase import with_refitted_base
-from calibration.residual.features import features, usable_signals
+from calibration.identification.search.checkpoint import Checkpoint
+from calibration.identification.solve import Solution
+from calibration.methods import TORQUE_NETWORK, WITHOUT_LEARNER, Options, identify_by
+from calibration.model import CalibratedModel, Coverage, LearnedResidual, Prediction
+from calibration.observations import Observations, data_sha256
+from calibration.residual.features import usable_signals, usable_torques
 from calibration.residual.folds import group_labels
-from calibration.residual.hybrid import Kind, decide
+from calibration.residual.hybrid import Decision, Kind, decide, torque_compensation
 from calibration.rig import Rig
+from calibration.single_thread import SingleThreaded, one_blas_thread
+from calibration.training_warnings import training_warnings
 
 Progress = Callable[[float, str], None]
 
-STAGES = ("nominal", "geometric", "effects", "hybrid")
-METHODS = ("default",)
-EFFECTS = ("auto", "none")
+__all__ = [
+    "Evaluation",
+    "calibrate",
+    "compensate_torques",
+    "evaluate",
+    "identify",
+    "predict",
+    "train_residual",
+]
+
 _MOST_WORKERS = 4
-_LISTED = 10
-_BADLY = 0.3  # of what build tolerances explain
-_FAR_RAD = math.radians(10.0)
-_PULLED = 4.0  # build tolerances
-_IMMOBILE = 0.01  # of the span between a joint's limits
-_BEYOND_LIMITS = 0.05
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """A model on observations.
-
-    Attributes:
-        model: what was evaluated, with the base refitted where that was asked for.
-        observations: the rows.
-        errors_mm: stage -> (n, 3) measured minus modelled, in the station's frame.
-        sigma_mm: (n, 3) standard deviation that the model expects of the hybrid stage's errors.
-        outliers: rows farther off than noise explains.
-        warnings: about model and data.
-    """
-
-    model: CalibratedModel
-    observations: Observations
-    errors_mm: Mapping[str, Floats]
-    sigma_mm: Floats
-    outliers: tuple[Outlier, ...]
-    warnings: tuple[str, ...]
-
-    def __len__(self) -> int:
-        return len(self.observations)
-
-    def stages(self, prism: str | None = None) -> list[dict[str, str | float]]:
-        """Mean, RMS, greatest and standard deviation of the 3-D error of every stage, over all rows or one prism's."""
-        rows = np.ones(len(self), dtype=bool) if prism is None else self.observations.prism == prism
-        return [{"stage": stage, **_statistics(self.errors_mm[stage][rows])} for stage in STAGES]
-
-    def as_dict(self, seconds: float) -> dict[str, object]:
-        """The contract's JSON object of `calibrate` and `evaluate`; `seconds` is what the caller's clock says."""
-        return {
-            "rig": self.model.rig.name,
-            "n": len(self),
-            "seconds": seconds,
-            "stages": self.stages(),
-            "per_prism": {prism: self.stages(prism) for prism in _present(self.observations.prism)},
-            "effects": [],
-            "residual": self.model.residual.learner.kind if self.model.residual else None,
-            "noise_mm": self.model.noise_mm,
-            "identifiability": self.model.identifiability.as_dict(),
-            "warnings": list(self.warnings),
-            "ignored_columns": list(self.observations.ignored_columns),
-        }
 
 
 def identify(
@@ -92,60 +54,84 @@ def identify(
     seed: int = 0,
     prior: Prior = "recalibration",
     method: str = "default",
+    effects: str = "auto",
     executor: Executor | None = None,
     progress: Progress | None = None,
+    should_stop: Callable[[], bool] | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> CalibratedModel:
-    """Identify the kinematics.
+    """Identify the kinematics, and the effects that the data or the caller ask for.
 
     Args:
         rig, rig_text: the rig description and the TOML it was read from, which travels in the model.
         observations: training rows, all with positions.
         seed: of everything random; the same seed gives the same model on every executor.
         prior: trust the build tolerances, or estimate their scale.
-        method: `default`.
+        method: one of `methods.METHODS`.
+        effects: `auto`, `none` or FAMILY@WHERE,...
         executor: runs the search; threads of its own by default.
         progress: told (share done, what is going on); what it raises ends the work.
+        should_stop: asked during a global search; once it says so, the best so far is taken.
+        checkpoint: where a global search keeps its state, and goes on from.
 
     Raises:
-        DataError: rows without positions, prisms the rig lacks.
+        DataError: rows without positions, prisms the rig lacks, data that the method or an effect cannot use.
         UnsafeError: too few fixes, a base that cannot be placed, mirrored coordinates, another rig's data.
-        ValueError: an unknown method.
+        ValueError: an unknown method or effect.
     """
-    if method not in METHODS:
-        raise ValueError(f"method {method!r} is not available; available: {', '.join(METHODS)}")
-    _require_positions(observations)
+    require_positions(observations)
     with _executor(executor) as pool:
-        solution = solve(rig, observations, prior=prior, seed=seed, executor=pool, progress=progress or _silent)
-    fit, samples = solution.fit, solution.samples
+        options = Options(prior, effects, seed, pool, progress or _silent, should_stop, checkpoint)
+        adopted = identify_by(method, rig, observations, options)
+        model = _model(rig, rig_text, observations, adopted, prior, {"seed": seed, "method": method})
+    return model
+
+
+def _model(
+    rig: Rig,
+    rig_text: str,
+    observations: Observations,
+    adopted: Adopted,
+    prior: Prior,
+    provenance: Mapping[str, str | int | float],
+) -> CalibratedModel:
+    # What the kinematics alone found stays in the model; effects are put on top.
+    kinematics = replace(adopted.solution, fit=adopted.geometric, additions=None)
+    fit, samples = kinematics.fit, kinematics.samples
+    distinct = observations.select(_is_original(observations))
     model = CalibratedModel(
         rig=rig,
         rig_text=rig_text,
-        placements=solution.chain.placements,
+        placements=kinematics.chain.placements,
         values=fit.x,
         covariance=fit.covariance,
-        nominal_values=solution.nominal.x,
+        geometric_values=fit.x,
+        nominal_values=kinematics.nominal.x,
         prior=prior,
         prior_scale=fit.prior_scale,
         excess_sigma_mm=float(np.sqrt(fit.excess_variance)),
         repeat_sigma_mm=float(np.sqrt(samples.repeat_variance)),
-        geometric_noise_mm=_noise_mm(solution, observations),
-        identifiability=solution.identifiability,
+        effects_noise_mm=_noise_mm(kinematics, observations),
+        identifiability=kinematics.identifiability,
         coverage=Coverage(
-            {prism: int((observations.prism == prism).sum()) for prism in rig.prism_names},
+            {prism: int((distinct.prism == prism).sum()) for prism in rig.prism_names},
             {name: (float(v.min()), float(v.max())) for name, v in observations.joints.items()},
+            tuple(name for name in rig.joint_names if _is_measured(observations, f"{name}_Nm")),
         ),
         provenance={
             "data_sha256": data_sha256(observations, rig),
             "rig_sha256": hashlib.sha256(rig_text.encode()).hexdigest(),
             "fixes": len(observations),
-            "seed": seed,
-            "method": method,
-            "search": solution.search,
+            **provenance,
+            "search": kinematics.search,
             **_versions(),
         },
     )
+    model = with_effects(model, adopted)
     model = replace(model, outliers=model.find_outliers(observations))
-    return replace(model, warnings=tuple(_training_warnings(model, observations, solution)))
+    model = replace(model, joint_error_scale=joint_error_scale(model, distinct))
+    doubts = (*adopted.warnings, *training_warnings(model, observations, adopted.solution))
+    return replace(model, warnings=doubts)
 
 
 def train_residual(
@@ -173,15 +159,12 @@ def train_residual(
     """
     report = progress or _silent
     report(0.0, "learning the residual")
-    _require_positions(observations)
-    good = np.ones(len(observations), dtype=bool)
-    good[[o.row for o in model.find_outliers(observations)]] = False
-    rows = observations.select(good)
+    rows = _without_outliers(model, observations)
     signals = usable_signals(rows)
     with _executor(executor) as pool:
         decision = decide(
-            features(model.chain, model.values, rows, signals),
-            model.to_base(rows, rows.position_mm - model.geometric_mm(rows)),
+            model.residual_features(rows, signals),
+            model.to_base(rows, rows.position_mm - model.effects_mm(rows)),
             group_labels(rows),
             rows.cells(),
             kind=kind,
@@ -189,10 +172,53 @@ def train_residual(
             executor=pool,
             progress=lambda share: report(share, "learning the residual"),
         )
+    return _with_residual(model, rows, decision, signals, seed)
+
+
+@one_blas_thread()
+def compensate_torques(model: CalibratedModel, observations: Observations, *, seed: int = 0) -> CalibratedModel:
+    """Add the second paper's network on the joint torques (RBF-TCM), as the paper has it: always kept.
+
+    Args:
+        model: identified on the same rows.
+        observations: training rows.
+        seed: of folds.
+
+    Raises:
+        UnsafeError: a set-up that the model does not know.
+    """
+    rows = _without_outliers(model, observations)
+    torques = usable_torques(model.chain, model.values, rows)
+    decision = torque_compensation(
+        model.residual_features(rows, torques),
+        model.to_base(rows, rows.position_mm - model.effects_mm(rows)),
+        group_labels(rows),
+        rows.cells(),
+        torques,
+        seed=seed,
+    )
+    return _with_residual(model, rows, decision, torques, seed)
+
+
+def _without_outliers(model: CalibratedModel, observations: Observations) -> Observations:
+    require_positions(observations)
+    good = np.ones(len(observations), dtype=bool)
+    good[[o.row for o in model.find_outliers(observations)]] = False
+    return observations.select(good & _is_original(observations))
+
+
+def _is_original(observations: Observations) -> NDArray[np.bool_]:
+    """(n,) False for copies of an earlier row, which are no further measurement."""
+    return np.asarray(originals(observations) == np.arange(len(observations)))
+
+
+def _with_residual(
+    model: CalibratedModel, rows: Observations, decision: Decision, signals: tuple[str, ...], seed: int
+) -> CalibratedModel:
     learned = None
     if decision.residual is not None:
         excess = model.unexplained_mm2(rows, decision.variance_mm2)
-        learned = LearnedResidual(decision.residual, signals, tuple(_present(rows.prism)), excess)
+        learned = LearnedResidual(decision.residual, signals, tuple(np.unique(rows.prism).tolist()), excess)
     return replace(
         model,
         residual=learned,
@@ -214,18 +240,18 @@ def calibrate(
     residual: Kind = "default",
     executor: Executor | None = None,
     progress: Progress | None = None,
+    should_stop: Callable[[], bool] | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> tuple[CalibratedModel, Evaluation]:
     """Identify, train the residual, and evaluate on the training rows themselves.
 
     Args:
-        effects: `none`, or `auto`, which has no effects to choose from yet and does the same.
-        residual: as `train_residual`'s `kind`; the rest as `identify`.
+        residual: as `train_residual`'s `kind`; by `default` the second paper's methods have their own network or none.
+        others: as `identify`.
 
     Raises:
         ValueError: an unknown method or effect; all else as `identify` and `train_residual`.
     """
-    if effects not in EFFECTS:
-        raise ValueError(f"effects {effects!r} are not available; available: {', '.join(EFFECTS)}")
     report = progress or _silent
     model = identify(
         rig,
@@ -234,51 +260,26 @@ def calibrate(
         seed=seed,
         prior=prior,
         method=method,
+        effects=effects,
         executor=executor,
         progress=lambda share, what: report(0.4 * share, what),
+        should_stop=should_stop,
+        checkpoint=checkpoint,
     )
-    model = train_residual(
-        model,
-        observations,
-        kind=residual,
-        seed=seed,
-        executor=executor,
-        progress=lambda share, what: report(0.4 + 0.55 * share, what),
-    )
+    if method == TORQUE_NETWORK and residual == "default":
+        model = compensate_torques(model, observations, seed=seed)
+    else:
+        model = train_residual(
+            model,
+            observations,
+            kind="none" if method in WITHOUT_LEARNER and residual == "default" else residual,
+            seed=seed,
+            executor=executor,
+            progress=lambda share, what: report(0.4 + 0.55 * share, what),
+        )
     evaluation = evaluate(model, observations)
     report(1.0, "done")
     return model, evaluation
-
-
-def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: bool = False) -> Evaluation:
-    """Errors of every stage on observations.
-
-    Args:
-        model: the model.
-        observations: rows with positions.
-        refit_base: fit the base transform of every set-up, and nothing else, on these rows.
-
-    Raises:
-        UnsafeError: a set-up that the model does not know, or whose base cannot be placed with these rows.
-    """
-    _require_positions(observations)
-    warnings = list(model.warnings)
-    if refit_base:
-        model = with_refitted_base(model, observations)
-        names = ", ".join(repr(s) for s in model.placements)
-        warnings.append(f"the base transform of set-up {names} was fitted on these {len(observations)} fixes")
-    warnings += [w for w in model.doubts(observations) if w not in warnings]
-    prediction = model.predict(observations)
-    geometric = observations.position_mm - model.geometric_mm(observations)
-    errors = {
-        "nominal": observations.position_mm - model.nominal_mm(observations),
-        "geometric": geometric,
-        "effects": geometric,
-        "hybrid": observations.position_mm - prediction.position_mm,
-    }
-    return Evaluation(
-        model, observations, errors, prediction.sigma_mm, model.find_outliers(observations), tuple(warnings)
-    )
 
 
 def predict(model: CalibratedModel, observations: Observations) -> Prediction:
@@ -290,9 +291,9 @@ def predict(model: CalibratedModel, observations: Observations) -> Prediction:
     return model.predict(observations)
 
 
-def data_sha256(observations: Observations, rig: Rig) -> str:
-    """SHA-256 of the observations in canonical form: the same for a file, a stored session and a replay of it."""
-    return hashlib.sha256(format_observations(observations, rig).encode()).hexdigest()
+def _is_measured(observations: Observations, column: str) -> bool:
+    values = observations.extra.get(column)
+    return values is not None and bool(np.isfinite(values).mean() > 0.5)
 
 
 def _noise_mm(solution: Solution, observations: Observations) -> float:
@@ -305,87 +306,15 @@ def _noise_mm(solution: Solution, observations: Observations) -> float:
     return float(np.sqrt(mean + 3.0 * (fit.excess_variance + samples.repeat_variance)))
 
 
-def _training_warnings(model: CalibratedModel, observations: Observations, solution: Solution) -> Iterator[str]:
-    if not solution.fit.settled:
-        yield "the fit had not come to rest when it ended; treat the result with care"
-    if model.geometric_noise_mm > _BADLY * solution.tolerated_mm:
-        hint = "; try --prior as-built" if model.prior == "recalibration" else ""
-        yield (
-            f"the kinematics fit badly: {model.geometric_noise_mm:.1f} mm RMS are left where build tolerances explain "
-            f"{solution.tolerated_mm:.0f} mm before the fit; check zeros and signs of the joints and the rig file{hint}"
-        )
-    for parameter in model.parameters:
-        if parameter.kind == "row" and parameter.unit == "rad" and abs(parameter.value) > _FAR_RAD:
-            yield (
-                f"{parameter.name} came out {math.degrees(parameter.value):+.1f} deg from the rig file; "
-                f"check how the joint and its encoder are mounted, and correct the file"
-            )
-    for prism, fixes in model.coverage.fixes.items():
-        if fixes == 0:
-            yield f"prism {prism!r} has no fixes; its offset stays at its nominal value"
-    for joint in model.rig.joints:
-        low, high = model.coverage.ranges[joint.name]
-        if high - low < _IMMOBILE * (joint.limits[1] - joint.limits[0]):
-            yield (
-                f"{joint.name} never moved ({low:.2f} .. {high:.2f} {joint.unit}); "
-                f"what only its motion shows stays at its prior"
-            )
-        margin = _BEYOND_LIMITS * (joint.limits[1] - joint.limits[0])
-        values = observations.joints[joint.name]
-        beyond = int(((values < joint.limits[0] - margin) | (values > joint.limits[1] + margin)).sum())
-        if beyond:
-            yield (
-                f"{joint.name}: {beyond} of {len(values)} readings are beyond its limits {joint.limits[0]:g} .. "
-                f"{joint.limits[1]:g} {joint.unit}; check column and unit"
-            )
-    if model.outliers:
-        worst = sorted(model.outliers, key=lambda o: -o.sigma)
-        rows = ", ".join(str(o.row + 1) for o in worst[:_LISTED])
-        more = f" and {len(worst) - _LISTED} more" if len(worst) > _LISTED else ""
-        yield (
-            f"{len(worst)} of {len(observations)} training fixes are outliers and were weighted out (row {rows}{more}; "
-            f"up to {worst[0].sigma:.0f} sigma)"
-        )
-    pulled = sorted((p for p in model.parameters if abs(p.pull) > _PULLED), key=lambda p: -abs(p.pull))
-    if pulled and model.prior == "recalibration":
-        names = ", ".join(f"{p.name} ({p.pull:+.1f})" for p in pulled[:_LISTED])
-        yield f"corrected by more than {_PULLED:g} build tolerances: {names}; an unmodelled effect may hide there"
-
-
-def _statistics(error_mm: Floats) -> dict[str, float]:
-    norm = np.linalg.norm(error_mm, axis=1)
-    return {
-        "mean_mm": float(norm.mean()),
-        "rms_mm": float(np.sqrt((norm**2).mean())),
-        "max_mm": float(norm.max()),
-        "std_mm": float(norm.std()),
-    }
-
-
-def _present(prisms: Strings) -> list[str]:
-    return sorted(set(prisms.tolist()))
-
-
-def _require_positions(observations: Observations) -> None:
-    if len(observations) == 0:
-        raise DataError("observations", "there are none")
-    if not np.isfinite(observations.position_mm).all():
-        raise DataError("observations", "every row needs a measured position", column="x_mm")
-
-
 @contextmanager
 def _executor(executor: Executor | None) -> Iterator[Executor]:
-    """The executor, or threads of our own; meanwhile each call into BLAS keeps to its thread.
-
-    BLAS threads under worker threads wait for each other in busy loops (several times slower on two cores), and other
-    numbers of them make other sums.
-    """
-    with threadpool_limits(1, user_api="blas"):
+    """The executor, or threads of our own; here and in the workers each call into BLAS keeps to its thread."""
+    with one_blas_thread():
         if executor is not None:
-            yield executor
+            yield SingleThreaded(executor)
             return
         with ThreadPoolExecutor(max_workers=min(_MOST_WORKERS, os.cpu_count() or 1)) as pool:
-            yield pool
+            yield SingleThreaded(pool)
 
 
 def _versions() -> dict[str, str]:

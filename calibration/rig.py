@@ -81,8 +81,8 @@ class Row(_Part):
     Conventions (`Rig.convention`):
         mdh_beta_after:  Trans(x,a) Rot(x,alpha) Trans(z,d) Rot(z,theta) Rot(y,beta)   (first paper, Eq. 1)
         mdh_beta_before: Rot(x,alpha) Trans(x,a) Rot(y,beta) Trans(y,b) Rot(z,theta) Trans(z,d)   (second paper)
-        dh:              Rot(z,theta) Trans(z,d) Trans(x,a) Rot(x,alpha) Rot(y,beta)   (standard Denavit-Hartenberg, with
-            Hayati's beta for the next axis being nearly parallel)
+        dh:              Rot(z,theta) Trans(z,d) Trans(x,a) Rot(x,alpha) Rot(y,beta)   (standard
+            Denavit-Hartenberg, with Hayati's beta for a next axis that is nearly parallel)
 
     Attributes:
         alpha_deg, a_mm, d_mm, theta_deg, beta_deg, b_mm: constants of the row.

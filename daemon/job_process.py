@@ -20,6 +20,7 @@ from calibration.errors import CalibrationError
 from calibration.model import CalibratedModel
 from calibration.observations import Observations, parse_observations
 from calibration.rig import Rig
+from daemon.checkpoint import FileCheckpoint
 from daemon.files import write_file
 from daemon.modelfiles import REPORT, read_model, write_model
 from daemon.numba_cache import prepare
@@ -80,8 +81,11 @@ def _identify(order: Order, progress: Progress) -> dict[str, Any]:
     text = _rig_text(order)
     rig = parse_rig(text, "the sessions' rig")
     observations = _observations(order, rig, order.session_ids)
-    model = pipeline.identify(rig, text, observations, seed=order.seed, progress=progress)
-    return _write(order, model, "geometric", observations, order.session_ids)
+    # The job keeps its number when it runs again, so it goes on where the daemon was killed.
+    with FileCheckpoint(Path(order.models_directory) / f"{order.job_id:05d}.checkpoint") as checkpoint:
+        model = pipeline.identify(rig, text, observations, seed=order.seed, progress=progress, checkpoint=checkpoint)
+        stage = "effects" if model.effects else "geometric"
+        return _write(order, model, stage, observations, order.session_ids)
 
 
 def _train_residual(order: Order, progress: Progress) -> dict[str, Any]:

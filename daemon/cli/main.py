@@ -9,11 +9,13 @@ import click
 # Command -> where it is defined. Imported when used: status must not wait for what only calibration needs.
 COMMANDS = {
     "calibrate": "offline",
+    "compare": "compare",
     "config": "run",
     "demo": "demo",
     "devices": "operator",
     "evaluate": "offline",
     "jobs": "operator",
+    "plan": "plan",
     "predict": "offline",
     "replay": "run",
     "run": "run",
@@ -29,7 +31,7 @@ class _Commands(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
         return list(COMMANDS)
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002 - as above
         if cmd_name not in COMMANDS:
             return None
         module = importlib.import_module(f"daemon.cli.{COMMANDS[cmd_name]}")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +18,7 @@ from rich.console import Console
 from calibration.errors import DataError
 from calibration.observations import Observations, parse_observations
 from calibration.rig import Rig
+from daemon.checkpoint import FileCheckpoint
 from daemon.cli.output import Command, json_option, progress_display
 from daemon.cli.tables import say, show_evaluation
 from daemon.files import write_file
@@ -24,12 +27,14 @@ from daemon.rigs import load_rig
 from drivers.clock import NS_PER_S, SystemClock
 
 if TYPE_CHECKING:
-    from calibration.model import Prediction, Prior
+    from calibration.identification.refinement import Prior
+    from calibration.model import Prediction
     from calibration.residual.hybrid import Kind
 
 METHODS = ("default", "pde-paper", "km", "skcm", "rbf-tcm")
 RESIDUALS = ("default", "none", "rbfn", "lightgbm", "chain")
 PRIORS = ("recalibration", "as-built")
+CONNECT_TIMEOUT_S = 5
 PREDICTED_COLUMNS = tuple(f"{name}_pred_mm" for name in ("x", "y", "z", "sigma_x", "sigma_y", "sigma_z"))
 
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
@@ -91,6 +96,17 @@ class _Stopwatch:
     help="Trust the rig's build tolerances, or estimate from the data how far off the drawings are.",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of every random choice.")
+@click.option(
+    "--time-limit",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="SECONDS",
+    help="End the global search after this time, and go on with the best until then.",
+)
+@click.option(
+    "--dask",
+    metavar="ADDRESS",
+    help="Address of a dask scheduler whose workers share the work (needs the `dask` extra); the result is the same.",
+)
 @json_option
 def calibrate(
     rig: str,
@@ -101,12 +117,15 @@ def calibrate(
     residual: Kind,
     prior: Prior,
     seed: int,
+    time_limit: float | None,
+    dask: str | None,
     *,
     as_json: bool,
 ) -> dict[str, object]:
     """Calibrate a rig from observations; write the model and its report to a directory.
 
-    The figures are about the rows it was fitted to; `evaluate` gives those for rows it never saw.
+    The figures are about the rows it was fitted to; `evaluate` gives those for rows it never saw. A global search keeps
+    its state beside DIR (DIR.checkpoint): the same command, killed and given again, goes on where it was.
     """
     watch = _Stopwatch()
     prepare()
@@ -115,12 +134,15 @@ def calibrate(
     from daemon.report import build_report
     from daemon.report.from_model import report_input
 
-    _require_available("--method", method, pipeline.METHODS)
-    _require_available("--effects", effects, pipeline.EFFECTS)
     source = load_rig(rig)
+    _check_effects(effects, method, source.rig)
     modelfiles.check_target(out)
     observations, raw = read_observations(data, source.rig)
-    with progress_display(as_json=as_json) as progress:
+    with (
+        FileCheckpoint(out.resolve().with_name(f"{out.resolve().name}.checkpoint")) as checkpoint,
+        progress_display(as_json=as_json) as progress,
+        _cluster(dask) as executor,
+    ):
         model, training = pipeline.calibrate(
             source.rig,
             source.text,
@@ -130,11 +152,14 @@ def calibrate(
             method=method,
             effects=effects,
             residual=residual,
+            executor=executor,
             progress=progress,
+            should_stop=None if time_limit is None else lambda: watch.seconds > time_limit,
+            checkpoint=checkpoint,
         )
-    sources = {"data": f"{data.name}, SHA-256 {hashlib.sha256(raw).hexdigest()}"}
-    document = build_report(report_input(training, None, made_utc_ns=watch.utc_ns, sources=sources))
-    modelfiles.write_model(out, model, {modelfiles.REPORT: document.encode("utf-8")})
+        sources = {"data": f"{data.name}, SHA-256 {hashlib.sha256(raw).hexdigest()}"}
+        document = build_report(report_input(training, None, made_utc_ns=watch.utc_ns, sources=sources))
+        modelfiles.write_model(out, model, {modelfiles.REPORT: document.encode("utf-8")})
     result = training.as_dict(watch.seconds)
     if not as_json:
         console = Console()
@@ -221,9 +246,38 @@ def with_predictions(raw: bytes, prediction: Prediction) -> str:
     return out.getvalue()
 
 
-def _require_available(option: str, value: str, available: Sequence[str]) -> None:
-    if value not in available:
-        raise click.BadParameter(f"{value!r} is not available; available: {', '.join(available)}", param_hint=option)
+def _check_effects(effects: str, method: str, rig: Rig) -> None:
+    """Refuse effects that are misspelt, that the rig has no place for, or that the method does not take."""
+    if effects in ("auto", "none"):
+        return
+    from calibration.effects.library import parse_effects
+
+    try:
+        parse_effects(effects, rig)
+    except ValueError as error:
+        raise click.BadParameter(str(error), param_hint="--effects") from error
+    if method != "default":
+        raise click.BadParameter(f"--method {method} takes none", param_hint="--effects")
+
+
+@contextlib.contextmanager
+def _cluster(address: str | None) -> Iterator[Executor | None]:
+    """The executor of a dask cluster; None without an address, for threads on this machine."""
+    if address is None:
+        yield None
+        return
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise click.BadParameter(
+            "the `dask` extra is not installed: pip install 'rigcal[dask]'", param_hint="--dask"
+        ) from error
+    try:
+        client = Client(address, timeout=CONNECT_TIMEOUT_S)
+    except (OSError, ValueError) as error:
+        raise click.BadParameter(f"no dask scheduler at {address}: {error}", param_hint="--dask") from error
+    with client:
+        yield client.get_executor()
 
 
 COMMANDS = {"calibrate": calibrate, "evaluate": evaluate, "predict": predict}

@@ -38,15 +38,49 @@ def show_evaluation(console: Console, result: Mapping[str, Any], what: str) -> N
     """
     console.print(stage_table(result, f"Position error in mm on {what}"))
     seen = result["identifiability"]
+    effects = ", ".join(f"{e['family']}@{e['where']}" for e in result["effects"])
     console.print(
-        f"noise {number(result['noise_mm'])} mm; learned residual: {result['residual'] or 'none'}; "
+        f"noise {number(result['noise_mm'])} mm; effects: {effects or 'none'}; "
+        f"learned residual: {result['residual'] or 'none'}; "
         f"{seen['rank']} of {seen['parameters']} parameters determined by the data",
         highlight=False,
     )
+    expected = result["expected_accuracy"]
+    if expected is not None:
+        place = f" at set-up {expected['setup']!r}" if expected["setup"] else ""
+        console.print(
+            f"expected of the model itself over the work volume{place}: {number(expected['rms_mm'])} mm RMS, 95 % "
+            f"within {number(expected['p95_mm'])} mm, {expected['where']}",
+            highlight=False,
+            markup=False,
+        )
+    if result["axes"]:
+        console.print(_axis_table(result["axes"]))
     _sentences(console, "Not determined", seen["unidentifiable"])
     _sentences(console, "Please note", result["warnings"])
     if result["ignored_columns"]:
         console.print(f"Ignored columns: {', '.join(result['ignored_columns'])}", highlight=False, markup=False)
+
+
+def _axis_table(axes: Sequence[Mapping[str, Any]]) -> Table:
+    """The model held against single-joint sweeps: for each joint the sweep that disagrees most."""
+    table = Table(title="Axes of single-joint sweeps, measured against the model", title_justify="left")
+    for name in ("joint", "prism", "angle, deg", "offset, mm", "by chance"):
+        table.add_column(name, justify="left" if name in ("joint", "prism") else "right", no_wrap=True)
+    for joint in dict.fromkeys(axis["joint"] for axis in axes):
+        own = [axis for axis in axes if axis["joint"] == joint]
+        worst = min(own, key=lambda axis: min(axis["p_axis"], axis["p_curve"]))
+        cells = [
+            f"{number(worst[name])} ± {number(worst[sigma])}"
+            for name, sigma in (
+                ("angle_deg", "angle_sigma_deg"),
+                ("offset_mm", "offset_sigma_mm"),
+            )
+        ]
+        chance = f"{min(worst['p_axis'], worst['p_curve']):.2g}"
+        style = "bold" if worst["sentence"] else None
+        table.add_row(joint, worst["prism"], *cells, chance, style=style)
+    return table
 
 
 def say(console: Console, text: str) -> None:

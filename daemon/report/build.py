@@ -18,6 +18,7 @@ _STAGE_WORDS: dict[Stage, str] = {
 _EXPLAINED = 1.15  # within what a few dozen fixes can tell apart
 _OUTLIERS_SHOWN = 20
 _PARAMETERS_SHOWN = 14
+_COEFFICIENTS_SHOWN = 2
 
 
 def build_report(report: ReportInput) -> str:
@@ -26,8 +27,11 @@ def build_report(report: ReportInput) -> str:
         parts = [
             _head(report),
             _accuracy(report),
+            _expected(report),
             _by_joint(report),
+            _axes(report),
             _coverage(report),
+            _effects(report),
             _parameters(report),
             _outliers(report),
             _setups(report),
@@ -130,7 +134,9 @@ def _stage_notes(report: ReportInput) -> str:
     errors = report.judged.errors_mm
     sentences = []
     if np.array_equal(errors["effects"], errors["geometric"]):
-        sentences.append("No named effect is part of this model, so that stage repeats the one before it.")
+        sentences.append(
+            f"No named effect is part of this model ({report.effects_reason}), so that stage repeats the one before it."
+        )
     sentences.append(f"Learned residual: {report.residual_reason.rstrip('.')}.")
     sentences.append(f"Noise of a single fix as the fit found it: {number(report.noise_mm)} mm.")
     return " ".join(sentences)
@@ -145,6 +151,50 @@ def _per_prism(judged: ErrorTable) -> str:
         )
     header = ["prism", "fixes", "nominal, mm", "geometric, mm", "effects, mm", "hybrid, mm", "worst, mm"]
     return table(header, rows, caption="Root mean square per prism, and the worst fix after calibration")
+
+
+def _expected(report: ReportInput) -> str:
+    if report.expected is None:
+        return ""
+    rows = [
+        [prism, *(number(value) for value in (of.rms_mm, of.median_mm, of.p95_mm, of.p99_mm))]
+        for prism, of in report.expected.per_prism.items()
+    ]
+    place = f" at set-up {report.expected.setup!r}" if report.expected.setup else ""
+    return section(
+        "What to expect elsewhere",
+        paragraph(
+            f"How far the model itself is expected to be off, in {len(report.expected.readings)} poses of the whole "
+            f"work volume{place}, measured or not, without the noise of a fix: {number(report.expected.rms_mm)} mm "
+            f"root mean square, {report.expected.where}."
+        ),
+        table(["prism", "rms, mm", "median, mm", "95 % within, mm", "99 % within, mm"], rows),
+    )
+
+
+def _axes(report: ReportInput) -> str:
+    if not report.axes:
+        return ""
+    rows, classes = [], []
+    for axis in report.axes:
+        offset = f"{number(axis.offset_mm)} \N{PLUS-MINUS SIGN} {number(axis.offset_sigma_mm, 2)}"
+        angle = f"{number(axis.angle_deg)} \N{PLUS-MINUS SIGN} {number(axis.angle_sigma_deg, 2)}"
+        chance = number(min(axis.p_axis, axis.p_curve))
+        rows.append([axis.joint, axis.prism, angle, offset, chance, "disagrees" if axis.sentence else ""])
+        classes.append("flag" if axis.sentence else "")
+    return section(
+        "Axes measured by single-joint sweeps",
+        paragraph(
+            "Where one joint moved alone, its prism's circle or line shows the joint's axis without any model. Here it "
+            "is held against the axis of the calibrated model; intervals are one standard deviation."
+        ),
+        table(
+            ["joint", "prism", "angle between, deg", "distance, mm", "by chance", "remark"],
+            rows,
+            text_columns=(0, 1, 5),
+            classes=classes,
+        ),
+    )
 
 
 def _by_joint(report: ReportInput) -> str:
@@ -184,6 +234,29 @@ def _coverage(report: ReportInput) -> str:
             svg_image(figures.error_map(report), "Remaining error over the workspace in plan and side view"),
             "Dark is worse. A patch of one colour points at a region; scattered colours are noise.",
         ),
+    )
+
+
+def _effects(report: ReportInput) -> str:
+    if not report.effects:
+        return ""
+    rows: list[list[str]] = []
+    for effect in report.effects:
+        head = [effect.family.replace("_", " "), effect.where, f"{number(effect.change)} {effect.unit}"]
+        for name, value, sigma, unit in effect.coefficients[:_COEFFICIENTS_SHOWN]:
+            interval = f"\N{PLUS-MINUS SIGN} {number(2 * sigma, 2)} {unit}"
+            rows.append([*head, name, f"{signed(value)} {unit}", interval])
+            head = [""] * 3
+        more = len(effect.coefficients) - _COEFFICIENTS_SHOWN
+        if more > 0:
+            rows.append([*head, f"and {more} more, which bend its curve", "", ""])
+    header = ["effect", "where", "changes the joint by up to", "coefficient", "value", "95 % interval"]
+    return section(
+        "Named effects",
+        paragraph(
+            f"Physics beyond true lengths and angles, fitted together with them: {report.effects_reason.rstrip('.')}."
+        ),
+        table(header, rows, text_columns=(0, 1, 3)),
     )
 
 

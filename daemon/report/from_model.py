@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np
 
+from calibration.effects.fitted import FittedCoefficient
 from calibration.identification.samples import joint_rates, reading_covariance, station_covariance
 from calibration.model import CalibratedModel
 from calibration.observations import Observations
 from calibration.pipeline import Evaluation
 from daemon.report.inputs import (
     STAGES,
+    EffectLine,
     ErrorTable,
     Floats,
     OutlierLine,
@@ -23,8 +26,9 @@ from daemon.report.inputs import (
 )
 from drivers.clock import NS_PER_S
 
-_DETERMINED = 0.9  # of the tolerance: a standard error closer to it has learnt next to nothing from the data
 _LIBRARIES = ("rigcal", "numpy", "scipy", "numba", "lightgbm")
+# Unit of a coefficient -> how its name ends, what to multiply by, and the unit that people read.
+_SMALL_UNITS = {"rad": ("_rad", 1e3, "mrad"), "rad/(N m)": ("_rad_per_Nm", 1e6, "mrad/(kN m)")}
 _LABELS = {
     "fixes": "fixes fitted",
     "data_sha256": "their SHA-256",
@@ -71,6 +75,10 @@ def report_input(
         ignored_columns=judged.observations.ignored_columns,
         provenance=_provenance(model, made_utc_ns, sources or {}),
         setups=setups,
+        effects=list(_effects(training)),
+        effects_reason=model.effects_reason,
+        expected=judged.expected,
+        axes=judged.axes,
     )
 
 
@@ -88,7 +96,7 @@ def _error_table(evaluation: Evaluation) -> ErrorTable:
 
 
 def _instrument_mm(model: CalibratedModel, observations: Observations) -> float:
-    lin = model.chain.linearise(model.values, model.chain.bind(observations))
+    lin, _ = model.linearise(observations)
     station: Floats = station_covariance(model.rig, lin.position_mm, observations.sigma_mm)
     readings = reading_covariance(model.rig, lin.joint_jacobian, joint_rates(model.rig, observations))
     return math.sqrt(float(np.trace(station + readings, axis1=1, axis2=2).mean()))
@@ -105,8 +113,30 @@ def _parameters(model: CalibratedModel) -> Iterator[ParameterLine]:
             correction=p.value * scale,
             sigma=p.standard_error * scale,
             tolerance=p.prior_sigma * scale,
-            determined=p.standard_error < _DETERMINED * p.prior_sigma,
+            determined=p.name not in model.identifiability.marked,
         )
+
+
+def _effects(training: Evaluation) -> Iterator[EffectLine]:
+    model, observations = training.model, training.observations
+    for effect in model.effects:
+        alone = replace(model, effects=(effect,)).corrected(observations).joints[effect.where]
+        yield EffectLine(
+            family=effect.family,
+            where=effect.where,
+            change=float(np.abs(alone - observations.joints[effect.where]).max()),
+            unit=model.rig.joint(effect.where).unit,
+            coefficients=[_readable(c) for c in effect.coefficients],
+        )
+
+
+def _readable(coefficient: FittedCoefficient) -> tuple[str, float, float, str]:
+    """Name, value, standard error and unit, without long rows of zeros."""
+    suffix, scale, unit = _SMALL_UNITS.get(
+        coefficient.unit, ("", 1.0, "" if coefficient.unit == "1" else coefficient.unit)
+    )
+    name = coefficient.name.removesuffix(suffix)
+    return name, coefficient.value * scale, coefficient.standard_error * scale, unit
 
 
 def _outliers(training: Evaluation) -> Iterator[OutlierLine]:
@@ -114,7 +144,7 @@ def _outliers(training: Evaluation) -> Iterator[OutlierLine]:
         yield OutlierLine(
             row=outlier.row + 1,
             prism=str(training.observations.prism[outlier.row]),
-            error_mm=float(np.linalg.norm(training.errors_mm["geometric"][outlier.row])),
+            error_mm=float(np.linalg.norm(training.errors_mm["effects"][outlier.row])),
             sigmas=outlier.sigma,
         )
 

@@ -8,12 +8,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.rig import Joint
+
+if TYPE_CHECKING:  # both bring numba, which `status` and `--help` must not wait for
+    from calibration.accuracy import ExpectedAccuracy
+    from calibration.identification.sweeps.cross_check import AxisCheck
 
 Floats = NDArray[np.float64]
 Strings = NDArray[np.str_]
@@ -101,6 +105,23 @@ class ParameterLine:
 
 
 @dataclass(frozen=True)
+class EffectLine:
+    """A named effect that the model has.
+
+    Attributes:
+        family, where: as the library spells them.
+        change, unit: by how much it changes the joint at most, over the rows it was fitted to, `deg` or `mm`.
+        coefficients: of each its name, value, standard deviation and unit.
+    """
+
+    family: str
+    where: str
+    change: float
+    unit: str
+    coefficients: Sequence[tuple[str, float, float, str]]
+
+
+@dataclass(frozen=True)
 class OutlierLine:
     """A fix that the fit set aside: its row of the training data from 1, its prism, how far off it is."""
 
@@ -142,6 +163,8 @@ class ReportInput:
         instrument_mm: RMS 3-D error that the station's and the encoders' own noise explains on the judged rows.
         residual: name of the learned residual, or None.
         residual_reason: why there is one or none, a sentence.
+        effects: named effects of the model.
+        effects_reason: why these or why none, a clause.
         parameters: kinematic constants with a build tolerance.
         n_parameters, rank: how many parameters there are and how many the data determine.
         unidentifiable: names of parameters or combinations that the data cannot see.
@@ -150,6 +173,8 @@ class ReportInput:
         ignored_columns: columns of the data that are not part of the contract.
         setups: station set-ups with their control points, where known.
         provenance: label -> value: data hashes, versions, seed, time.
+        expected: how true the model expects itself to be over the work volume, where that is known.
+        axes: the model held against single-joint sweeps of the judged rows.
     """
 
     rig: str
@@ -169,6 +194,10 @@ class ReportInput:
     ignored_columns: Sequence[str]
     provenance: Mapping[str, str]
     setups: Sequence[SetupLine] = ()
+    effects: Sequence[EffectLine] = ()
+    effects_reason: str = "switched off"
+    expected: ExpectedAccuracy | None = None
+    axes: Sequence[AxisCheck] = ()
 
     @property
     def judged(self) -> ErrorTable:

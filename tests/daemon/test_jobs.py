@@ -13,8 +13,9 @@ from sqlite_utils import Database
 
 from daemon.control import CommandError
 from daemon.job_child import JobChild
+from daemon.job_process import perform
 from daemon.job_table import JobTable
-from daemon.modelfiles import model_sha256
+from daemon.modelfiles import model_sha256, read_model
 from daemon.order import Order, Outcome, Progress, parse_message
 from daemon.scheduler import CHAIN, next_job
 from daemon.store.migrations import MIGRATIONS
@@ -79,6 +80,19 @@ def test_a_chain_runs_in_order_and_leaves_its_models_and_report(rig: JobRig) -> 
     assert Path(report["result"]["report"]).stat().st_size > 10_000
     stages = {s["stage"]: s["rms_mm"] for s in report["result"]["evaluation"]["stages"]}
     assert stages["geometric"] < stages["nominal"] / 2
+
+
+def test_a_job_goes_on_from_the_checkpoint_of_its_number_and_leaves_none(rig: JobRig) -> None:
+    rig.measured("a", 20, prisms=["r", "s"])
+    for row in rig.store.rows("SELECT id, z_mm FROM observations"):  # misfit enough for a global search
+        rig.store.update("observations", {"id": row["id"]}, {"z_mm": row["z_mm"] + (15.0 if row["id"] % 3 else -15.0)})
+    checkpoint = rig.config.models_directory / "00001.checkpoint"
+    checkpoint.parent.mkdir(parents=True)
+    checkpoint.write_bytes(b"no state of a search")
+    order = Order("identification", 1, str(rig.config.store_path), str(checkpoint.parent), ("a",), None, (), 0)
+    result = perform(order, lambda share, text: None)
+    assert "the checkpoint cannot be read, so the search began anew" in read_model(Path(result["model"])).warnings
+    assert not checkpoint.exists()
 
 
 def test_data_that_determine_nothing_fail_in_a_sentence_whatever_lies_in_the_current_directory(

@@ -4,8 +4,10 @@ import csv
 import io
 import json
 import os
+import re
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,14 +16,15 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from calibration import methods
 from daemon.cli.main import main as rigcal
-from daemon.cli.offline import PREDICTED_COLUMNS
+from daemon.cli.offline import METHODS, PREDICTED_COLUMNS
 from daemon.modelfiles import write_model
 from tests.daemon.offline_support import held_out_csv, small_calibration, train_csv
 
 KEYS = [
     "rig", "n", "seconds", "stages", "per_prism", "effects", "residual", "noise_mm", "identifiability", "warnings",
-    "ignored_columns",
+    "ignored_columns", "expected_accuracy", "axes",
 ]  # fmt: skip
 STAGES = ["nominal", "geometric", "effects", "hybrid"]
 STAGE_KEYS = ["stage", "mean_mm", "rms_mm", "max_mm", "std_mm"]
@@ -56,7 +59,7 @@ def assert_contract(answer: dict[str, Any], n: int) -> None:
     for stages in (answer["stages"], answer["per_prism"]["tmac"]):
         assert [stage["stage"] for stage in stages] == STAGES
         assert all(list(stage) == STAGE_KEYS for stage in stages)
-    assert list(answer["identifiability"]) == ["parameters", "rank", "unidentifiable"]
+    assert list(answer["identifiability"])[:3] == ["parameters", "rank", "unidentifiable"]
 
 
 def test_calibrate_then_evaluate_as_programs(work: Path, tmp_path: Path) -> None:
@@ -74,8 +77,9 @@ def test_calibrate_then_evaluate_as_programs(work: Path, tmp_path: Path) -> None
 
     out = tmp_path / "model"
     done = command(
-        "calibrate", "--rig", "ur10", "--data", work / "train.csv", "--out", out, "--residual", "none", "--json"
-    )
+        "calibrate", "--rig", "ur10", "--data", work / "train.csv", "--out", out,
+        "--effects", "none", "--residual", "none", "--json",
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     answer = json.loads(done.stdout)
     assert_contract(answer, 240)
@@ -175,8 +179,10 @@ def test_too_few_fixes_are_refused_as_unsafe(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (("--method", "km"), "'km' is not available; available: default"),
-        (("--effects", "boom_droop@boom"), "'boom_droop@boom' is not available; available: auto, none"),
+        (("--method", "oracle"), "'oracle' is not one of"),
+        (("--effects", "witchcraft@q1"), "effect 'witchcraft' is unknown; there are"),
+        (("--effects", "angle_scale@theta1"), "rig 'ur10' has q1, q2, q3, q4, q5, q6 for it"),
+        (("--method", "km", "--effects", "angle_scale@q1"), "--method km takes none"),
         (("--residual", "oracle"), "'oracle' is not one of"),
         (("--seed", "-1"), "-1 is not in the range x>=0"),
         (("--rig", "digger"), "digger: neither a shipped rig"),
@@ -185,7 +191,7 @@ def test_too_few_fixes_are_refused_as_unsafe(tmp_path: Path) -> None:
     ],
 )
 def test_wrong_use_ends_in_status_2_and_says_what_there_is(
-    work: Path, here: Path, arguments: tuple[str, str], sentence: str
+    work: Path, here: Path, arguments: tuple[str, ...], sentence: str
 ) -> None:
     given = ["calibrate", "--rig", "ur10", "--data", work / "train.csv", "--out", "model"]
     result = run(*given, *arguments)
@@ -249,3 +255,45 @@ def test_an_output_that_is_a_device_a_pipe_or_the_data_itself_is_refused(work: P
     assert run("predict", "--model", work / "model", "--data", data, "--out", link).exit_code == 0
     assert link.is_symlink()
     assert target.read_text(encoding="utf-8").startswith("prism,")
+
+
+def test_every_method_of_the_command_is_one_of_the_mathematics() -> None:
+    assert METHODS == methods.METHODS
+
+
+def test_a_killed_search_goes_on_where_it_was(work: Path, tmp_path: Path) -> None:
+    out, checkpoint = tmp_path / "model", tmp_path / "model.checkpoint"
+    data = tmp_path / "few.csv"
+    data.write_bytes(b"".join(train_csv().splitlines(keepends=True)[:31]))
+    given = ["calibrate", "--rig", "ur10", "--data", str(data), "--out", str(out), "--method", "pde-paper", "--json"]
+    program = "from daemon.cli.main import main; main()"
+    with subprocess.Popen([sys.executable, "-c", program, *given], stdout=subprocess.DEVNULL) as process:
+        deadline = time.monotonic() + 120.0
+        while not checkpoint.exists() and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        process.kill()
+    assert checkpoint.exists()
+    result = run(*given, "--residual", "none", "--time-limit", "0.001")
+    assert result.exit_code == 0, result.stdout
+    assert any("stopped before its end" in warning for warning in json.loads(result.stdout)["warnings"])
+    assert not checkpoint.exists()
+    provenance = json.loads((out / "model.json").read_text(encoding="utf-8"))["provenance"]
+    evaluations = int(re.search(r"([\d,]+) evaluations", provenance["search"])[1].replace(",", ""))  # type: ignore[index]
+    assert evaluations >= 21 * 30_000  # 20 generations from the checkpoint; a search begun anew would have seen one
+
+
+def test_a_refusal_leaves_no_checkpoint_behind(work: Path, tmp_path: Path) -> None:
+    checkpoint = tmp_path / "model.checkpoint"
+    checkpoint.write_bytes(b"of an earlier run that was killed")
+    data = tmp_path / "few.csv"
+    data.write_bytes(b"".join(train_csv().splitlines(keepends=True)[:4]))
+    assert run("calibrate", "--rig", "ur10", "--data", data, "--out", tmp_path / "model").exit_code == 3
+    assert not checkpoint.exists()
+
+
+def test_a_cluster_that_is_not_there_is_named(work: Path, here: Path) -> None:
+    result = run(
+        "calibrate", "--rig", "ur10", "--data", work / "train.csv", "--out", "m", "--dask", "tcp://127.0.0.1:1"
+    )
+    assert result.exit_code == 2
+    assert "no dask scheduler at tcp://127.0.0.1:1" in " ".join(result.stderr.split())

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from daemon.report import build_report, headline, summary_png
-from daemon.report.inputs import ErrorTable, spread
+from daemon.report.inputs import EffectLine, ErrorTable, spread
 from daemon.report.markup import number, signed
 from tests.daemon.report_inputs import report_input
 
@@ -71,6 +71,20 @@ def test_report_has_every_section(outline: Outline) -> None:
         "Station set-ups",
         "Where this comes from",
     ]
+
+
+def test_named_effects_have_a_section_with_their_sizes() -> None:
+    effect = EffectLine(
+        "joint_compliance",
+        "theta4",
+        0.071,
+        "deg",
+        [("compliance", 0.0052, 0.0004, "mrad/(kN m)"), ("bend1", -0.12, 0.3, "mrad"), ("bend2", 0.0, 0.4, "mrad")],
+    )
+    outline = Outline(build_report(report_input(effects=[effect], effects_reason="the data ask for it")))
+    assert "Named effects" in outline.headings
+    for words in ("the data ask for it.", "joint compliance", "0.071 deg", "+0.005 mrad/(kN m)", "and 1 more"):
+        assert words in outline.text
 
 
 def test_report_is_one_file_that_loads_nothing(document: str, outline: Outline) -> None:

@@ -1,0 +1,147 @@
+"""A model on observations: errors of every stage, doubts, axes, and how true it is expected to be elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from calibration.accuracy import ExpectedAccuracy, expected_accuracy
+from calibration.errors import DataError, UnsafeError
+from calibration.identification.samples import averaged
+from calibration.identification.sweeps.circles import find_axes
+from calibration.identification.sweeps.cross_check import AxisCheck, cross_check, disagreements
+from calibration.model import CalibratedModel, Outlier
+from calibration.observations import Floats, Observations, data_sha256
+from calibration.rebase import with_refitted_base
+from calibration.single_thread import one_blas_thread
+
+STAGES = ("nominal", "geometric", "effects", "hybrid")
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A model on observations.
+
+    Attributes:
+        model: what was evaluated, with the base refitted where that was asked for.
+        observations: the rows.
+        errors_mm: stage -> (n, 3) measured minus modelled, in the station's frame.
+        sigma_mm: (n, 3) standard deviation that the model expects of the hybrid stage's errors.
+        outliers: rows farther off than noise explains.
+        warnings: about model and data.
+        axes: the model held against the axes that single-joint sweeps among the rows show.
+        expected: how true the model expects itself to be over the work volume; None where the rig can take no pose.
+    """
+
+    model: CalibratedModel
+    observations: Observations
+    errors_mm: Mapping[str, Floats]
+    sigma_mm: Floats
+    outliers: tuple[Outlier, ...]
+    warnings: tuple[str, ...]
+    axes: tuple[AxisCheck, ...]
+    expected: ExpectedAccuracy | None
+
+    def __len__(self) -> int:
+        return len(self.observations)
+
+    def stages(self, prism: str | None = None) -> list[dict[str, str | float]]:
+        """Mean, RMS, greatest and standard deviation of the 3-D error of every stage, over all rows or one prism's."""
+        rows = np.ones(len(self), dtype=bool) if prism is None else self.observations.prism == prism
+        return [{"stage": stage, **_statistics(self.errors_mm[stage][rows])} for stage in STAGES]
+
+    def as_dict(self, seconds: float) -> dict[str, object]:
+        """The contract's JSON object of `calibrate` and `evaluate`; `seconds` is what the caller's clock says."""
+        return {
+            "rig": self.model.rig.name,
+            "n": len(self),
+            "seconds": seconds,
+            "stages": self.stages(),
+            "per_prism": {prism: self.stages(prism) for prism in np.unique(self.observations.prism).tolist()},
+            "effects": [effect.as_dict() for effect in self.model.effects],
+            "residual": self.model.residual.learner.kind if self.model.residual else None,
+            "noise_mm": self.model.noise_mm,
+            "identifiability": self.model.identifiability.as_dict(),
+            "warnings": list(self.warnings),
+            "ignored_columns": list(self.observations.ignored_columns),
+            "expected_accuracy": self.expected.as_dict() if self.expected else None,
+            "axes": [asdict(axis) for axis in self.axes],
+        }
+
+
+@one_blas_thread()
+def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: bool = False) -> Evaluation:
+    """Errors of every stage on observations.
+
+    Args:
+        model: the model.
+        observations: rows with positions.
+        refit_base: fit the base transform of every set-up, and nothing else, on these rows.
+
+    Raises:
+        UnsafeError: a set-up that the model does not know, or whose base cannot be placed with these rows.
+    """
+    require_positions(observations)
+    trained = model.provenance.get("data_sha256") == data_sha256(observations, model.rig)
+    warnings = [w if trained else f"in training: {w}" for w in model.warnings]
+    if refit_base:
+        model = with_refitted_base(model, observations)
+        names = ", ".join(repr(s) for s in model.placements)
+        warnings.append(f"the base transform of set-up {names} was fitted on these {len(observations)} fixes")
+    warnings += [w for w in model.doubts(observations) if w not in warnings]
+    prediction = model.predict(observations)
+    errors = {
+        "nominal": observations.position_mm - model.nominal_mm(observations),
+        "geometric": observations.position_mm - model.geometric_mm(observations),
+        "effects": observations.position_mm - model.effects_mm(observations),
+        "hybrid": observations.position_mm - prediction.position_mm,
+    }
+    axes = _axes(model, observations)
+    warnings += [w for w in disagreements(axes) if w not in warnings]
+    return Evaluation(
+        model,
+        observations,
+        errors,
+        prediction.sigma_mm,
+        model.find_outliers(observations),
+        tuple(warnings),
+        axes,
+        _expected(model),
+    )
+
+
+def _axes(model: CalibratedModel, observations: Observations) -> tuple[AxisCheck, ...]:
+    """The model against the single-joint sweeps among the rows, with the joints where the effects have them.
+
+    The uncertainty of the effects' coefficients is left out, which makes an axis disagree a little sooner.
+    """
+    parameters = len(model.chain)
+    axes = find_axes(model.chain, averaged(model.chain, model.corrected(observations)))
+    return cross_check(model.chain, model.values, model.covariance[:parameters, :parameters], axes)
+
+
+def _expected(model: CalibratedModel) -> ExpectedAccuracy | None:
+    try:
+        return expected_accuracy(model, np.random.default_rng(0))
+    except UnsafeError:
+        return None
+
+
+def require_positions(observations: Observations) -> None:
+    """DataError unless there are rows, each with a measured position."""
+    if len(observations) == 0:
+        raise DataError("observations", "there are none")
+    if not np.isfinite(observations.position_mm).all():
+        raise DataError("observations", "every row needs a measured position", column="x_mm")
+
+
+def _statistics(error_mm: Floats) -> dict[str, float]:
+    norm = np.linalg.norm(error_mm, axis=1)
+    return {
+        "mean_mm": float(norm.mean()),
+        "rms_mm": float(np.sqrt((norm**2).mean())),
+        "max_mm": float(norm.max()),
+        "std_mm": float(norm.std()),
+    }

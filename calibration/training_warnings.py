@@ -1,0 +1,114 @@
+"""What people should know of a calibration: doubts about its data and about its result, one sentence each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from calibration.identification.solve import Solution
+from calibration.model import CalibratedModel
+from calibration.observations import Observations
+
+_LISTED = 10
+_BADLY = 0.3  # of what build tolerances explain
+_FAR_RAD = math.radians(10.0)
+_PULLED = 4.0  # build tolerances
+_IMMOBILE = 0.01  # of the span between a joint's limits
+_BEYOND_LIMITS = 0.05
+_TOO_SMALL = 0.3  # of the expected scatter
+_FEW_FIXES = 6
+
+
+def training_warnings(model: CalibratedModel, observations: Observations, solution: Solution) -> Iterator[str]:
+    """Every doubt.
+
+    Args:
+        model: the model with its outliers.
+        observations: the rows that it was fitted to.
+        solution: what it was made from.
+    """
+    yield from solution.warnings
+    yield from _of_fit(model, observations, solution)
+    yield from _of_coverage(model, observations)
+    yield from _of_outliers(model, observations, solution)
+    yield from _of_result(model)
+
+
+def _of_fit(model: CalibratedModel, observations: Observations, solution: Solution) -> Iterator[str]:
+    if not solution.fit.settled:
+        yield "the fit had not come to rest when it ended; treat the result with care"
+    unexplained_mm = math.sqrt(3.0) * model.excess_sigma_mm
+    if unexplained_mm > _BADLY * solution.tolerated_mm:
+        hint = "; try --prior as-built" if model.prior == "recalibration" else ""
+        yield (
+            f"the kinematics fit badly: {unexplained_mm:.1f} mm RMS are left beyond what station and readings explain, "
+            f"where build tolerances explain {solution.tolerated_mm:.0f} mm before the fit; check zeros and signs of "
+            f"the joints, the rig file, and whether the station stood still{hint}"
+        )
+    left = observations.position_mm - model.effects_mm(observations)
+    left_mm = math.sqrt(float((left**2).sum(axis=1).mean()))
+    if left_mm < _TOO_SMALL * model.effects_noise_mm:
+        yield (
+            f"the fixes scatter by {left_mm:.2g} mm RMS where their standard deviations say "
+            f"{model.effects_noise_mm:.2g}: too large ones make a loose fit; check the sigma columns or the rig file's "
+            f"station"
+        )
+
+
+def _of_coverage(model: CalibratedModel, observations: Observations) -> Iterator[str]:
+    for setup in sorted(model.placements):
+        fixes = int((observations.setup == setup).sum())
+        if fixes < _FEW_FIXES and len(model.placements) > 1:
+            yield f"set-up {setup!r} rests on {fixes} fixes: its base is known by them alone"
+    for prism, fixes in model.coverage.fixes.items():
+        if fixes == 0:
+            yield f"prism {prism!r} has no fixes; its offset stays at its nominal value"
+    for joint in model.rig.joints:
+        low, high = model.coverage.ranges[joint.name]
+        if high - low < _IMMOBILE * (joint.limits[1] - joint.limits[0]):
+            yield (
+                f"{joint.name} never moved ({low:.2f} .. {high:.2f} {joint.unit}); "
+                f"what only its motion shows stays at its prior"
+            )
+        margin = _BEYOND_LIMITS * (joint.limits[1] - joint.limits[0])
+        values = observations.joints[joint.name]
+        beyond = int(((values < joint.limits[0] - margin) | (values > joint.limits[1] + margin)).sum())
+        if beyond:
+            yield (
+                f"{joint.name}: {beyond} of {len(values)} readings are beyond its limits {joint.limits[0]:g} .. "
+                f"{joint.limits[1]:g} {joint.unit}; check column and unit"
+            )
+
+
+def _of_outliers(model: CalibratedModel, observations: Observations, solution: Solution) -> Iterator[str]:
+    if model.outliers:
+        worst = sorted(model.outliers, key=lambda o: -o.sigma)
+        rows = ", ".join(str(o.row + 1) for o in worst[:_LISTED])
+        more = f" and {len(worst) - _LISTED} more" if len(worst) > _LISTED else ""
+        share = (
+            "were weighted out" if (solution.fit.weight < 1.0).any() else "count as much as all others in this method"
+        )
+        yield (
+            f"{len(worst)} of {len(observations)} training fixes are outliers and {share} (row {rows}{more}; "
+            f"up to {worst[0].sigma:.0f} sigma)"
+        )
+
+
+def _of_result(model: CalibratedModel) -> Iterator[str]:
+    for effect in model.effects:
+        value = effect.coefficients[0].value
+        if effect.family == "joint_compliance" and effect.where in model.coverage.torques and value < 0.0:
+            yield (
+                f"joint_compliance@{effect.where} is negative: {effect.where}_Nm seems to be the torque that holds the "
+                f"load, not the load; the model takes it so"
+            )
+    for parameter in model.parameters:
+        if parameter.kind == "row" and parameter.unit == "rad" and abs(parameter.value) > _FAR_RAD:
+            yield (
+                f"{parameter.name} came out {math.degrees(parameter.value):+.1f} deg from the rig file; "
+                f"check how the joint and its encoder are mounted, and correct the file"
+            )
+    pulled = sorted((p for p in model.parameters if abs(p.pull) > _PULLED), key=lambda p: -abs(p.pull))
+    if pulled and model.prior == "recalibration":
+        names = ", ".join(f"{p.name} ({p.pull:+.1f})" for p in pulled[:_LISTED])
+        yield f"corrected by more than {_PULLED:g} build tolerances: {names}; an unmodelled effect may hide there"
