@@ -4,8 +4,10 @@
 BIN := .venv/bin
 BOOTSTRAP := deploy/bootstrap.sh -e
 
-# Compiled kernels and font indexes stay in the tree, so that they are found again and no home directory is needed.
-export NUMBA_CACHE_DIR := $(CURDIR)/.cache/numba
+# Compiled kernels and font indexes stay in the tree, so that they are found again and no home directory is needed. Each
+# state of the sources has its own: numba does not see that a function which it compiled into another one has changed.
+COMPILED := $(sort $(shell grep -rl --include=*.py 'kernels.jit\|import numba' calibration))
+export NUMBA_CACHE_DIR := $(CURDIR)/.cache/numba/$(firstword $(shell cat $(COMPILED) | cksum))
 export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 
 .PHONY: help setup demo test lint bench lock clean
@@ -31,10 +33,12 @@ lint: setup ## style, types and import floors
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: setup ## acquisition under a saturated bus; measured data; simulated sessions against their noise
-	$(BIN)/python -m tests.bench.acquisition
-	$(BIN)/python -m tests.bench.ur10
+BENCHES := acquisition kernels refinement evolution peers far_starts design ur10 table4 zhou2022
+
+bench: setup ## speed and accuracy beside the peers', as ratios; an hour on two cores
+	@for name in $(BENCHES); do echo "== $$name"; $(BIN)/python -m tests.bench.$$name || exit 1; done
 	$(BIN)/python -m tests.calibration.simulated_sessions
+	$(BIN)/python -m tests.calibration.interval_coverage
 
 # The rig gets requirements.lock, with the build backend that installs the project itself; requirements-dev.lock holds
 # the same versions and the tools besides. Versions stay as they are unless pyproject.toml forces a change;
