@@ -34,6 +34,7 @@ CANDIDATES = 8192  # a small part of the published search's population; a call t
 REFERENCE_CANDIDATES = 16
 BARS = {"float64": 200.0, "float32": 400.0}
 EFFICIENCY_BAR = 0.85
+PIECES = 8  # more than workers, so that none waits long for the last
 POINTS = "points, blocks of 16"
 PRECISIONS = ("float64", "float32")
 
@@ -200,7 +201,7 @@ def compare_with_numpy(executor: ThreadPoolExecutor, duration_s: float) -> None:
     kernels: dict[str, Callable[[], object]] = {}
     for precision in PRECISIONS:
         kernels[f"{precision} 1"] = partial(fitness[precision], problem.population)
-        kernels[f"{precision} 2"] = partial(evaluate, fitness[precision], problem.population, executor, 2)
+        kernels[f"{precision} 2"] = partial(evaluate, fitness[precision], problem.population, executor, PIECES)
     products = {f"multiply {precision}": multiply(precision) for precision in PRECISIONS}
     seconds = Stopwatch({**numpy_forms, **kernels, **products}, duration_s).seconds
     numpy_us = {name: seconds[name] / count[name] * 1e6 for name in numpy_forms}
@@ -231,7 +232,7 @@ def scale_with_poses(executor: ThreadPoolExecutor, duration_s: float, all_poses:
             fitness = problem.fitness(precision)
             work: dict[str, Callable[[], object]] = {
                 "one": partial(fitness, problem.population),
-                "two": partial(evaluate, fitness, problem.population, executor, 2),
+                "two": partial(evaluate, fitness, problem.population, executor, PIECES),
             }
             seconds = Stopwatch(work, duration_s).seconds
             us, two = (seconds[name] / candidates * 1e6 for name in ("one", "two"))
