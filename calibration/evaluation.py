@@ -84,8 +84,7 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
         UnsafeError: a set-up that the model does not know, or whose base cannot be placed with these rows.
     """
     require_positions(observations)
-    trained = model.provenance.get("data_sha256") == data_sha256(observations, model.rig)
-    warnings = [w if trained else f"in training: {w}" for w in model.warnings]
+    warnings = _of_training(model, observations)
     if refit_base:
         model = with_refitted_base(model, observations)
         names = ", ".join(repr(s) for s in model.placements)
@@ -110,6 +109,13 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
         axes,
         _expected(model),
     )
+
+
+def _of_training(model: CalibratedModel, observations: Observations) -> list[str]:
+    """The model's own warnings, told apart where the rows are not those that it was fitted to."""
+    if not model.warnings or model.provenance.get("data_sha256") == data_sha256(observations, model.rig):
+        return list(model.warnings)
+    return [f"in training: {warning}" for warning in model.warnings]
 
 
 def _axes(model: CalibratedModel, observations: Observations) -> tuple[AxisCheck, ...]:

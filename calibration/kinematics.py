@@ -195,11 +195,6 @@ class Chain:
         """Where the six parameters of a set-up's base are."""
         return slice(self.base_start + 6 * setup, self.base_start + 6 * setup + 6)
 
-    def prism_index(self, prism: int) -> slice:
-        """Where the three parameters of a prism's offset are."""
-        first = self.prism_ops[prism][0].parameter
-        return slice(first, first + 3)
-
     # -- construction -------------------------------------------------------------------------------------------
 
     def _add(self, name: str, *, angle: bool, sigma: float, kind: Literal["row", "prism"]) -> int:

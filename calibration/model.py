@@ -292,7 +292,7 @@ class CalibratedModel:
             return lin, lin.jacobian
         true, additions = self._corrected(observations)
         lin = self.chain.linearise(self.values, self.chain.bind(true))
-        by_coefficient = lin.joint_jacobian[:, :, additions.joint] * additions.column[:, None, :]
+        by_coefficient = additions.moved_mm(lin.joint_jacobian)
         return lin, np.concatenate([lin.jacobian, by_coefficient], axis=2)
 
     def unknown_variance(self, observations: Observations) -> Floats:

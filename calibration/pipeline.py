@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from calibration.accuracy import joint_error_scale
 from calibration.effects.adoption import Adopted, with_effects
+from calibration.effects.base import Situation
 from calibration.evaluation import Evaluation, evaluate, require_positions
 from calibration.identification.judgement import originals
 from calibration.identification.refinement import Prior
@@ -22,7 +23,7 @@ from calibration.identification.samples import reading_covariance, station_covar
 from calibration.identification.search.checkpoint import Checkpoint
 from calibration.identification.solve import Solution
 from calibration.methods import TORQUE_NETWORK, WITHOUT_LEARNER, Options, identify_by
-from calibration.model import CalibratedModel, Coverage, LearnedResidual, Prediction
+from calibration.model import CalibratedModel, Coverage, LearnedResidual
 from calibration.observations import Observations, data_sha256
 from calibration.residual.features import usable_signals, usable_torques
 from calibration.residual.folds import group_labels
@@ -39,7 +40,6 @@ __all__ = [
     "compensate_torques",
     "evaluate",
     "identify",
-    "predict",
     "train_residual",
 ]
 
@@ -99,6 +99,7 @@ def _model(
     kinematics = replace(adopted.solution, fit=adopted.geometric, additions=None)
     fit, samples = kinematics.fit, kinematics.samples
     distinct = observations.select(_is_original(observations))
+    situation = Situation(kinematics.chain, fit.x, observations)
     model = CalibratedModel(
         rig=rig,
         rig_text=rig_text,
@@ -116,7 +117,7 @@ def _model(
         coverage=Coverage(
             {prism: int((distinct.prism == prism).sum()) for prism in rig.prism_names},
             {name: (float(v.min()), float(v.max())) for name, v in observations.joints.items()},
-            tuple(name for name in rig.joint_names if _is_measured(observations, f"{name}_Nm")),
+            tuple(name for name in rig.joint_names if situation.is_torque_measured(name)),
         ),
         provenance={
             "data_sha256": data_sha256(observations, rig),
@@ -280,20 +281,6 @@ def calibrate(
     evaluation = evaluate(model, observations)
     report(1.0, "done")
     return model, evaluation
-
-
-def predict(model: CalibratedModel, observations: Observations) -> Prediction:
-    """Positions with standard deviations.
-
-    Raises:
-        UnsafeError: a set-up that the model does not know.
-    """
-    return model.predict(observations)
-
-
-def _is_measured(observations: Observations, column: str) -> bool:
-    values = observations.extra.get(column)
-    return values is not None and bool(np.isfinite(values).mean() > 0.5)
 
 
 def _noise_mm(solution: Solution, observations: Observations) -> float:

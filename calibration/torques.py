@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 
+from calibration.kernels.lineariser import Lineariser
 from calibration.kinematics import Chain, ChainData, Placement
 from calibration.observations import Floats, Observations
 from calibration.rig import Prism, Rig
@@ -70,8 +71,10 @@ def _computed(chain: Chain, x: Floats, readings: Floats, observations: Observati
     own = np.concatenate([x[:rows], np.zeros(len(body) - rows)])
     setup = np.zeros(len(readings), dtype=np.intp)
     load = np.zeros(readings.shape)
+    linearise = Lineariser(body)
     for point, (mass, share) in enumerate(mass_of):
-        lowered = body.joint_jacobian(own, ChainData(readings, setup + point, setup)).transpose(0, 2, 1) @ direction
+        by_joint = linearise(own, ChainData(readings, setup + point, setup)).joint_jacobian
+        lowered = by_joint.transpose(0, 2, 1) @ direction
         load += share * weight_newton[:, [mass]] * lowered
     # N mm per deg of a reading are 180 / pi N mm per rad; N mm per mm are N.
     return load * [math.degrees(1.0) / 1e3 if j.kind == "revolute" else 1.0 for j in rig.joints]

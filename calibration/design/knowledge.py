@@ -99,8 +99,7 @@ class Knowledge:
         lin = self._lineariser(self.x, data)
         if not self.effects:
             return lin, lin.jacobian
-        column = np.repeat(additions.column, prisms, axis=0)
-        by_coefficient = lin.joint_jacobian[:, :, additions.joint] * column[:, None, :]
+        by_coefficient = additions.select(np.repeat(np.arange(len(readings)), prisms)).moved_mm(lin.joint_jacobian)
         return lin, np.concatenate([lin.jacobian, by_coefficient], axis=2)
 
     def unknown_variance(self, readings: Floats, direction: Floats | None = None) -> Floats:

@@ -232,7 +232,7 @@ def whitened(knowledge: Knowledge, candidates: Candidates, columns: Additions | 
         jacobian[:, :, :known] = by_known @ knowledge.root
         if columns is not None:
             shift = np.repeat(columns.column[rows] * columns.prior_sigma, prisms, axis=0)
-            jacobian[:, :, known:] = lin.joint_jacobian[:, :, columns.joint] * shift[:, None, :]
+            jacobian[:, :, known:] = replace(columns, column=shift).moved_mm(lin.joint_jacobian)
         stacked = jacobian.reshape(n, 3 * prisms, total)
         stacked[hidden] = 0.0
         out[rows] = np.linalg.solve(np.linalg.cholesky(covariance), stacked)

@@ -112,7 +112,7 @@ class LinearFit:
             )
             moved = next(same, None)
             if moved is None:
-                moved = self._turned(self._joint_jacobian[:, :, own.joint] * own.column[:, None, :])
+                moved = self._turned(own.moved_mm(self._joint_jacobian))
             found.append(Alternative(moved, own.prior_sigma))
         return tuple(found)
 

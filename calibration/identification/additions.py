@@ -40,6 +40,11 @@ class Additions:
             out[:, joint] += self.column[:, i] * coefficients[i]
         return out
 
+    def moved_mm(self, joint_jacobian: Floats) -> Floats:
+        """(m, 3, k) what unit coefficients move, for the (m, 3, joints) Jacobian by readings in mm per deg or mm."""
+        moved: Floats = joint_jacobian[:, :, self.joint] * self.column[:, None, :]
+        return moved
+
     def select(self, rows: NDArray[np.bool_] | Integers) -> Additions:
         """The same coefficients for the given rows, by mask or by index."""
         return Additions(self.names, self.joint, self.column[rows], self.prior_sigma)

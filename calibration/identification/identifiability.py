@@ -194,7 +194,7 @@ def _linearised(
     readings = samples.data.readings
     corrected = readings + additions.change(at[len(chain) :], readings.shape[1])
     lin = chain.linearise(at[: len(chain)], replace(samples.data, readings=corrected))
-    by_coefficient = lin.joint_jacobian[:, :, additions.joint] * additions.column[:, None, :]
+    by_coefficient = additions.moved_mm(lin.joint_jacobian)
     return lin, np.concatenate([lin.jacobian, by_coefficient], axis=2)
 
 

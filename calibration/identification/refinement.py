@@ -53,7 +53,6 @@ class Fit:
         covariance: of `x`, posterior of the model linearised there; zero rows for what was held.
         excess_variance: s^2, mm^2 per axis.
         prior_scale: what the build tolerances were multiplied by.
-        outlier_share: epsilon.
         weight: (m,) probability that a sample is no outlier.
         cost: negative log evidence at the solution; lower is better on the same samples.
         settled: False if the iteration ended before it came to rest.
@@ -64,7 +63,6 @@ class Fit:
     covariance: Floats
     excess_variance: float
     prior_scale: float
-    outlier_share: float
     weight: Floats
     cost: float
     settled: bool
@@ -204,7 +202,7 @@ class _Problem:
             data = ChainData(data.readings + added.change(x[p:], data.readings.shape[1]), data.prism, data.setup)
         position, jacobian, by_joint = self._linearise(x[:p], data)
         if added is not None:
-            jacobian = np.concatenate([jacobian, by_joint[:, :, added.joint] * added.column[:, None, :]], axis=2)
+            jacobian = np.concatenate([jacobian, added.moved_mm(by_joint)], axis=2)
         return _State(x, self._position_mm - position, jacobian, by_joint)
 
     def marginals(self, state: _State, excess: float) -> Marginals:
@@ -319,7 +317,7 @@ def _fit(problem: _Problem, start: Floats, prior: Prior, excess_variance: float 
     covariance = np.zeros((len(state.x), len(state.x)))
     covariance[np.ix_(problem.free, problem.free)] = view.covariance
     weight = problem.original(view.weight)
-    return Fit(state.x, covariance, noise.excess, noise.scale, noise.share, weight, view.cost(), settled, rounds)
+    return Fit(state.x, covariance, noise.excess, noise.scale, weight, view.cost(), settled, rounds)
 
 
 def _require_finite(values: Floats) -> None:

@@ -56,7 +56,7 @@ class _State:
 
     def columns(self) -> Floats:
         """(3 m, p + k) derivatives of the positions."""
-        added = self.lin.joint_jacobian[:, :, self.additions.joint] * self.additions.column[:, None, :]
+        added = self.additions.moved_mm(self.lin.joint_jacobian)
         both: Floats = np.concatenate([self.lin.jacobian, added], axis=2).reshape(3 * len(self.error), -1)
         return both
 
@@ -223,7 +223,6 @@ def _fit(chain: Chain, samples: Samples, state: _State, seen: Floats, unseen: Fl
         covariance=variance * half @ half.T + prior,
         excess_variance=excess,
         prior_scale=1.0,
-        outlier_share=0.0,
         weight=np.ones(m),
         cost=1.5 * m * math.log(max(state.squares / (3 * m), 1e-300)),
         settled=settled,

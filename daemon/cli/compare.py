@@ -17,7 +17,8 @@ from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
 
-from daemon.cli.offline import PRIORS, read_observations
+from daemon.cli.offline import read_observations
+from daemon.cli.options import FILE, prior_option, rig_option, seed_option
 from daemon.cli.output import Command, json_option, progress_display
 from daemon.cli.tables import say
 from daemon.files import write_file
@@ -33,13 +34,11 @@ if TYPE_CHECKING:
 PROTOCOLS = ("zhou2022",)
 _WIDEST = 1000
 
-_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
-
 
 @click.command(cls=Command)
-@click.option("--rig", required=True, metavar="RIG", help="Name of a shipped rig, or path of a rig file.")
-@click.option("--data", type=_FILE, required=True, metavar="CSV", help="Observations to fit.")
-@click.option("--holdout", type=_FILE, required=True, metavar="CSV", help="Observations to judge by, never fitted.")
+@rig_option
+@click.option("--data", type=FILE, required=True, metavar="CSV", help="Observations to fit.")
+@click.option("--holdout", type=FILE, required=True, metavar="CSV", help="Observations to judge by, never fitted.")
 @click.option(
     "--protocol",
     type=click.Choice(PROTOCOLS),
@@ -52,19 +51,13 @@ _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
     metavar="DIR",
     help="Where the page with the plots goes, as comparison-RIG.html; the current directory by default.",
 )
-@click.option(
-    "--prior",
-    type=click.Choice(PRIORS),
-    default="recalibration",
-    show_default=True,
-    help="Trust the rig's build tolerances, or estimate from the data how far off the drawings are.",
-)
+@prior_option
 @click.option(
     "--refit-base",
     is_flag=True,
     help="Fit where the base stands in the station's frame, and nothing else, on the held-out rows first.",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of every random choice.")
+@seed_option
 @click.option(
     "--time-limit",
     type=click.FloatRange(min=0, min_open=True),

@@ -19,6 +19,7 @@ from calibration.errors import DataError
 from calibration.observations import Observations, parse_observations
 from calibration.rig import Rig
 from daemon.checkpoint import FileCheckpoint
+from daemon.cli.options import FILE, prior_option, rig_option, seed_option
 from daemon.cli.output import Command, json_option, progress_display
 from daemon.cli.tables import say, show_evaluation
 from daemon.files import write_file
@@ -33,14 +34,12 @@ if TYPE_CHECKING:
 
 METHODS = ("default", "pde-paper", "km", "skcm", "rbf-tcm")
 RESIDUALS = ("default", "none", "rbfn", "lightgbm", "chain")
-PRIORS = ("recalibration", "as-built")
 CONNECT_TIMEOUT_S = 5
 PREDICTED_COLUMNS = tuple(f"{name}_pred_mm" for name in ("x", "y", "z", "sigma_x", "sigma_y", "sigma_z"))
 
-_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _DIRECTORY = click.Path(path_type=Path)
 
-_data = click.option("--data", type=_FILE, required=True, metavar="CSV", help="Observations, one row per fix.")
+_data = click.option("--data", type=FILE, required=True, metavar="CSV", help="Observations, one row per fix.")
 _model = click.option(
     "--model", "directory", type=_DIRECTORY, required=True, metavar="DIR", help="The directory calibrate wrote."
 )
@@ -70,7 +69,7 @@ class _Stopwatch:
 
 
 @click.command(cls=Command)
-@click.option("--rig", required=True, metavar="RIG", help="Name of a shipped rig, or path of a rig file.")
+@rig_option
 @_data
 @click.option("--out", type=_DIRECTORY, required=True, metavar="DIR", help="Where to write; replaces a model there.")
 @click.option("--method", type=click.Choice(METHODS), default="default", show_default=True, help="How to identify.")
@@ -88,14 +87,8 @@ class _Stopwatch:
     show_default=True,
     help="Learner of what is left; `default` takes the one that helps on data it has not seen, or none.",
 )
-@click.option(
-    "--prior",
-    type=click.Choice(PRIORS),
-    default="recalibration",
-    show_default=True,
-    help="Trust the rig's build tolerances, or estimate from the data how far off the drawings are.",
-)
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of every random choice.")
+@prior_option
+@seed_option
 @click.option(
     "--time-limit",
     type=click.FloatRange(min=0, min_open=True),

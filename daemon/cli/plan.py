@@ -16,6 +16,7 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from calibration.rig import Rig
+from daemon.cli.options import rig_option, seed_option
 from daemon.cli.output import Command, json_option, progress_display
 from daemon.cli.tables import say
 from daemon.files import write_file
@@ -32,7 +33,7 @@ _LIST_SEPARATOR = " "
 
 
 @click.command(cls=Command)
-@click.option("--rig", required=True, metavar="RIG", help="Name of a shipped rig, or path of a rig file.")
+@rig_option
 @click.option(
     "--model",
     "directory",
@@ -65,7 +66,7 @@ _LIST_SEPARATOR = " "
 @click.option(
     "--out", type=click.Path(path_type=Path, dir_okay=False), metavar="CSV", help="Also write the poses to a file."
 )
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of every random choice.")
+@seed_option
 @json_option
 def plan(
     rig: str,

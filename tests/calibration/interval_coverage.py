@@ -105,8 +105,9 @@ def true_parameters(chain: Chain, truth: RigTruth) -> Floats:
     for number, (true_row, nominal, row) in enumerate(constants, 1):
         for name in row.identify:
             out[chain.index(f"row{number}.{name}")] = getattr(true_row, name) - getattr(nominal, name)
-    for prism, part in enumerate(chain.rig.prisms):
-        out[chain.prism_index(prism)] = truth.prism_offset_mm(part.name) - np.array(part.offset_mm)
+    for part in chain.rig.prisms:
+        offset = [chain.index(f"prism.{part.name}.{axis}") for axis in "xyz"]
+        out[offset] = truth.prism_offset_mm(part.name) - np.array(part.offset_mm)
     for setup, label in enumerate(chain.setups):
         base, start = truth.placement(label), chain.placements[label]
         r = base.rotation @ start.rotation.T  # Rot(z) Rot(y) Rot(x)

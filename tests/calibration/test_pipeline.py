@@ -11,7 +11,7 @@ import pytest
 
 from calibration.errors import DataError, UnsafeError
 from calibration.observations import Observations, data_sha256
-from calibration.pipeline import calibrate, evaluate, identify, predict, train_residual
+from calibration.pipeline import calibrate, evaluate, identify, train_residual
 from simulators.truth import RigTruth
 from tests.calibration.conftest import Session, rig_text, rms, simulated
 
@@ -98,7 +98,7 @@ def test_what_progress_raises_ends_the_work(session: Session) -> None:
 
 
 def test_predictions_know_their_own_uncertainty(session: Session) -> None:
-    prediction = predict(session.model, session.held_out)
+    prediction = session.model.predict(session.held_out)
     deviation = (session.held_out.position_mm - prediction.position_mm) / prediction.sigma_mm
     assert 0.8 < (deviation**2).mean() < 1.2
     assert 0.93 < (np.abs(deviation) < 1.96).mean() < 0.97
@@ -107,7 +107,7 @@ def test_predictions_know_their_own_uncertainty(session: Session) -> None:
 def test_prediction_needs_no_positions(session: Session) -> None:
     blind = replace(session.held_out, position_mm=np.full((500, 3), np.nan))
     np.testing.assert_array_equal(
-        predict(session.model, blind).position_mm, predict(session.model, session.held_out).position_mm
+        session.model.predict(blind).position_mm, session.model.predict(session.held_out).position_mm
     )
 
 
@@ -137,7 +137,7 @@ def test_an_unknown_set_up_is_refused_unless_its_base_is_refitted(session: Sessi
     with pytest.raises(UnsafeError, match=r"set-up 'elsewhere' is unknown to the model .*--refit-base"):
         evaluate(session.model, moved)
     with pytest.raises(UnsafeError, match="--refit-base"):
-        predict(session.model, moved)
+        session.model.predict(moved)
     evaluation = evaluate(session.model, moved, refit_base=True)
     assert rms(evaluation.errors_mm["geometric"]) < 6.0
     assert "base transform of set-up 'elsewhere' was fitted on these 300 fixes" in evaluation.warnings[-1]

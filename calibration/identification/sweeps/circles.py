@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
 from calibration.identification.refinement import prior_precision
-from calibration.identification.samples import Samples
+from calibration.identification.samples import Samples, reading_variance
 from calibration.identification.standing import standing_spread
 from calibration.identification.start import rigid_fit, rough_start
 from calibration.identification.sweeps.circle_fit import (
@@ -90,11 +90,6 @@ class Axis:
     def centre_mm(self) -> Floats:
         """(3,) centre of the circle or middle of the line."""
         return self.features[CENTRE]
-
-    @property
-    def centre_sigma_mm(self) -> float:
-        """Standard error of the centre, its worst way."""
-        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[CENTRE, CENTRE])[-1]))
 
     @property
     def radius_mm(self) -> float:
@@ -310,7 +305,7 @@ def _axis(chain: Chain, measured: _Measured, pooled: float, freedom: int) -> Axi
     weighted = curve.sensitivity * (scale * measured.variance)[:, None]
     covariance = np.tensordot(weighted, curve.sensitivity, axes=([1, 2], [1, 2]))
     values = _values(chain, joint.name, measured.sweep)
-    sigma = np.hypot(joint.sigma, joint.resolution / np.sqrt(12.0))
+    sigma = float(np.sqrt(reading_variance(chain.rig)[measured.joint]))
     read = np.radians(sigma) if joint.kind == "revolute" else sigma
     covariance[TRAVEL, TRAVEL] += (curve.features[TRAVEL] * read) ** 2 / float(((values - values.mean()) ** 2).sum())
     return Axis(

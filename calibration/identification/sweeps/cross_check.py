@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import f as f_distribution
 
+from calibration.identification.samples import reading_variance
 from calibration.identification.sweeps.circle_fit import CENTRE, DIRECTION, FEATURES, RADIUS, TRAVEL
 from calibration.identification.sweeps.circles import Axis, drives_several, predicted_curve
 from calibration.kinematics import Chain
@@ -153,7 +154,7 @@ def _model_covariance(chain: Chain, x: Floats, covariance: Floats, axis: Axis, s
     by_place = sensitivity.reshape(FEATURES, -1)
     by_parameter = by_place @ lin.jacobian.reshape(-1, len(x))
     by_reading = by_place @ lin.joint_jacobian.reshape(-1, len(chain.rig.joints))
-    sigma = np.array([np.hypot(j.sigma, j.resolution / np.sqrt(12.0)) for j in chain.rig.joints])
+    sigma = np.sqrt(reading_variance(chain.rig))
     sigma[chain.rig.joint_names.index(axis.joint)] = 0.0  # its readings only move the places along the curve
     readings: Floats = (by_reading * sigma) @ (by_reading * sigma).T
     return by_parameter @ covariance @ by_parameter.T + readings
