@@ -104,7 +104,7 @@ def simulate_observations(
     held = random_poses(rig, n_poses, rng) if poses is None else {k: np.asarray(v, float) for k, v in poses.items()}
     before = random_poses(rig, 1, rng)
     by_pose = _approach(rig, held, before, rng) | dict(columns or {})
-    read = {j.name: _reading(j, held[j.name], rng) if joint_noise else held[j.name] for j in rig.joints}
+    read = {j.name: read_joint(j, held[j.name], rng) if joint_noise else held[j.name] for j in rig.joints}
 
     turns = len(names) if prisms_per_pose == "all" else 1
     pose = np.repeat(np.arange(n_poses), turns * repeats)
@@ -154,7 +154,8 @@ def _approach(
     return out | {f"{name}_dir": np.sign(step) for name, step in steps.items()}
 
 
-def _reading(joint: Joint, values: Floats, rng: np.random.Generator) -> Floats:
+def read_joint(joint: Joint, values: Floats, rng: np.random.Generator) -> Floats:
+    """(n,) what an encoder or transducer says of true values, deg or mm: with its random error, in whole steps."""
     noisy = values + rng.normal(0, joint.sigma, len(values))
     if joint.resolution == 0.0:
         return noisy

@@ -8,16 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulators.dataset import random_poses
+from simulators.hydraulics import VALVE_JOINTS, boom_load_bar, motion_columns
 from simulators.machine_signals import MachineState
 from simulators.motion import BoomMotion
 from simulators.truth import RigTruth
 
 Floats = NDArray[np.float64]
 
-# Which joint a valve moves, on machines that have one of that name.
-_VALVE_JOINTS = {"boom": "theta4", "arm": "theta1", "feed": "L3", "slew": "theta3"}
-_BAR_PER_NM = 7e-4  # of the boom's lifting joint in its cylinder
-_IDLE_BAR = 20.0
 _LOAD_EVERY_S = 0.25  # loads change slowly and are costly to compute
 _CONTROL_POINTS = 4
 
@@ -43,9 +40,9 @@ class Machine:
         self.control_points_mm = _control_points(np.random.default_rng([seed, 31]))
         self._rig = truth.rig
         self._sigma = {j.name: j.sigma for j in self._rig.joints}
-        self._valves = {v: self._rig.joint(j) for v, j in _VALVE_JOINTS.items() if j in self._rig.joint_names}
+        self._valves = {v: self._rig.joint(j) for v, j in VALVE_JOINTS.items() if j in self._rig.joint_names}
         self._load_at_s = -1e9
-        self._load_bar = _IDLE_BAR
+        self._load_bar = float(boom_load_bar(0.0))
         self._last_place: tuple[str, float, Floats] | None = None
 
     def joint(self, name: str, t_s: float) -> tuple[float, float]:
@@ -69,7 +66,8 @@ class Machine:
         Args:
             prism: its name.
             pose: joint name -> value, deg or mm.
-            columns: what effects need besides (`theta4_dir`); joints count as not having moved where it is missing.
+            columns: what effects need besides (`theta4_dir`, `theta4_rate`, `boom_valve_mA`, ...); where it is missing
+                the machine stands, and joints count as not having moved.
 
         Raises:
             ValueError: unknown prism, a joint missing or unknown.
@@ -79,12 +77,18 @@ class Machine:
             raise ValueError(f"no prism {prism!r}; this rig has {', '.join(rig.prism_names)}")
         if set(pose) != set(rig.joint_names):
             raise ValueError(f"a pose gives each of {', '.join(rig.joint_names)} once")
-        directions = {f"{j}_dir": 0.0 for j in rig.joint_names} | dict(columns)
-        return self._place(prism, pose, directions)
+        standing = self._columns(dict.fromkeys(rig.joint_names, 0.0), dict.fromkeys(rig.joint_names, 0))
+        return self._place(prism, pose, standing | dict(columns))
 
     def _solve(self, prism: str, pose: Mapping[str, float], t_s: float) -> Floats:
-        columns = {f"{j}_dir": float(d) for j, d in self.motion.directions(t_s).items()}
-        return self._place(prism, pose, columns)
+        rates = {j: self.motion.joint(j, t_s)[1] for j in self._rig.joint_names}
+        return self._place(prism, pose, self._columns(rates, self.motion.directions(t_s)))
+
+    def _columns(self, rates: Mapping[str, float], directions: Mapping[str, int]) -> dict[str, float]:
+        """What effects may depend on besides the pose, without any sensor's noise."""
+        speeds = {j.name: rates[j.name] / j.max_rate for j in self._rig.joints}
+        columns = {f"{j}_dir": float(d) for j, d in directions.items()} | {f"{j}_rate": r for j, r in rates.items()}
+        return columns | {name: float(value) for name, value in motion_columns(speeds).items()}
 
     def _place(self, prism: str, pose: Mapping[str, float], columns: Mapping[str, float]) -> Floats:
         joints = {name: np.array([value]) for name, value in pose.items()}
@@ -103,7 +107,7 @@ class Machine:
             self._load_at_s = t_s
             joints = {name: np.array([value]) for name, value in self.motion.values(t_s).items()}
             torque = float(self.truth.gravity_load(self._valves["boom"].name, joints, setup=self.setup)[0])
-            self._load_bar = _IDLE_BAR + _BAR_PER_NM * abs(torque)
+            self._load_bar = float(boom_load_bar(torque))
         return self._load_bar
 
     def random_poses(self, n: int, seed: int) -> list[dict[str, float]]:

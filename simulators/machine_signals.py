@@ -14,16 +14,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from simulators.frame import Frame
+from simulators.hydraulics import (
+    CURRENT_DITHER_MA,
+    PRESSURE_NOISE_BAR,
+    oil_temperature_degC,
+    pump_bar,
+    return_bar,
+    valve_current_mA,
+)
 
 VALVE_CURRENTS = 0x200
 PRESSURES = 0x201
 VALVES = ("boom", "arm", "feed", "slew")  # in the order of the frame
-
-_DEAD_BAND_MA = 180.0  # a spool starts to open
-_FULL_MA = 750.0
-_IDLE_BAR = 22.0
-_WORKING_BAR = 180.0
-_RETURN_BAR = 12.0
 
 
 @dataclass(frozen=True)
@@ -92,17 +94,15 @@ class MachineSignals:
         currents = []
         for valve in VALVES:
             speed = state.speeds.get(valve, 0.0)
-            current = math.copysign(_DEAD_BAND_MA + (_FULL_MA - _DEAD_BAND_MA) * abs(speed), speed) if speed else 0.0
-            dither = self._rng.normal(0.0, 4.0) if speed else 0.0
-            currents.append(round(max(-2000.0, min(2000.0, current + dither))))
+            dither = self._rng.normal(0.0, CURRENT_DITHER_MA) if speed else 0.0
+            currents.append(round(max(-2000.0, min(2000.0, float(valve_current_mA(speed)) + dither))))
         return struct.pack("<4h", *currents)
 
     def _pressures(self, state: MachineState, now_s: float) -> bytes:
         if now_s < self._void_until:
             return b"\xff" * 7 + bytes([self._counter | 0xF0])
-        working = max((abs(s) for s in state.speeds.values()), default=0.0)
-        pump = _IDLE_BAR + (_WORKING_BAR * min(1.0, 0.5 + working) if working else 0.0)
-        rise = 55.0 - (55.0 - self._start_temperature) * math.exp(-now_s / 1500.0)
-        bars = (pump, state.boom_load_bar, _RETURN_BAR + 40.0 * max(0.0, -state.speeds.get("boom", 0.0)))
-        tenths = [max(0, min(6000, round(10 * (b + self._rng.normal(0.0, 0.4))))) for b in bars]
-        return struct.pack("<3HBB", *tenths, max(0, min(250, round(rise + 40))), self._counter)
+        fastest = max((abs(s) for s in state.speeds.values()), default=0.0)
+        temperature = float(oil_temperature_degC(now_s, self._start_temperature))
+        bars = (float(pump_bar(fastest)), state.boom_load_bar, float(return_bar(state.speeds.get("boom", 0.0))))
+        tenths = [max(0, min(6000, round(10 * (b + self._rng.normal(0.0, PRESSURE_NOISE_BAR))))) for b in bars]
+        return struct.pack("<3HBB", *tenths, max(0, min(250, round(temperature + 40))), self._counter)

@@ -157,10 +157,18 @@ class RigTruth:
         body = self._solve(joints, columns or {}, setup)
         return self.placement(setup).to_station_mm(body.place_mm(frame, place))
 
-    def gravity_load(self, joint: str, joints: Mapping[str, Floats], *, setup: str = "") -> Floats:
-        """(n,) generalised gravity force on a joint, N m or N; positive drives the joint's value up."""
+    def gravity_load(
+        self, joint: str, joints: Mapping[str, Floats], columns: Mapping[str, Floats] | None = None, *, setup: str = ""
+    ) -> Floats:
+        """(n,) generalised gravity force on a joint, N m or N; positive drives the joint's value up.
+
+        Args:
+            joint: its name.
+            joints, setup: as for `prism_mm`.
+            columns: `payload_kg` where the payload differs from the rig description's.
+        """
         loose = replace_effects(self, ()) if self.effects else self
-        return loose._solve(joints, {}, setup).torque(joint)
+        return loose._solve(joints, columns or {}, setup).torque(joint)
 
     def _solve(self, joints: Mapping[str, Floats], columns: Mapping[str, Floats], setup: str | None) -> _Body:
         read = {}

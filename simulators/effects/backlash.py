@@ -1,4 +1,4 @@
-"""Play between encoder and joint: the joint lags by half the play on the side it came from."""
+"""Play between encoder and joint: the encoder lags behind the joint by half the play, on the side it came from."""
 
 from __future__ import annotations
 

@@ -10,12 +10,23 @@ from simulators.effects.base import Effect
 from simulators.effects.boom_droop import BoomDroop
 from simulators.effects.encoder_harmonic import EncoderHarmonic
 from simulators.effects.joint_compliance import JointCompliance
+from simulators.effects.load_hysteresis import LoadHysteresis
 from simulators.effects.stiffening_compliance import StiffeningCompliance
 from simulators.effects.transducer_scale import TransducerScale
+from simulators.effects.valve_current_error import ValveCurrentError
 
 FAMILIES: dict[str, type[Effect]] = {
     kind.family: kind
-    for kind in (JointCompliance, StiffeningCompliance, BoomDroop, EncoderHarmonic, Backlash, TransducerScale)
+    for kind in (
+        JointCompliance,
+        StiffeningCompliance,
+        BoomDroop,
+        EncoderHarmonic,
+        Backlash,
+        LoadHysteresis,
+        TransducerScale,
+        ValveCurrentError,
+    )
 }
 
 
