@@ -19,13 +19,13 @@ from scipy.optimize import minimize
 from calibration.design.knowledge import Knowledge, setup_of
 from calibration.design.poses import work_volume
 from calibration.design.visibility import site
-from calibration.identification.samples import averaged, covariance_by_joints, reading_covariance
-from calibration.model import CalibratedModel
+from calibration.identification.samples import Samples, averaged, covariance_by_joints, reading_variance
+from calibration.kinematics import Integers
+from calibration.model import OUTLIER_SIGMA, CalibratedModel
 from calibration.observations import Floats, Observations
 from calibration.rig import Rig
 
 VOLUME_POSES = 1000
-_OUTLIER_SIGMA = 5.0
 _SURE = 5.0  # in log likelihood; less is chance
 _LINEARITY_DEG = 0.1  # of an encoder whose rig file gives none
 _LINEARITY = 1e-3  # of a transducer's stroke
@@ -238,10 +238,11 @@ def joint_error_sizes(rig: Rig) -> Floats:
 def joint_error_scale(model: CalibratedModel, observations: Observations) -> float:
     """What the kinematics (and effects) lack: the size of an error of every joint, in `joint_error_sizes`.
 
-    The errors of the training standstills have the covariance Sigma_known + s^2 I + k^2 J_q D J_q' - J C J': station
-    and readings, even noise, an error of the joints with the lever arms J_q, less what the fit took. Repeats of a
-    standstill are averaged: they repeat the joints' errors. Maximum likelihood in s and k, with k = 0 unless the data
-    prefer another by 5 in log likelihood.
+    The errors of the training fixes have the covariance Sigma_known + s^2 I + k^2 J_q D J_q' - J C J': station and
+    readings, even noise, an error of the joints with the lever arms J_q, less what the fit took. Repeats are averaged.
+    Maximum likelihood in s and k, with k = 0 unless the data prefer another by 5 in log likelihood. For that the prisms
+    of a standstill count together, as a joint's error is the same at each; but the size of k is that of the fixes each
+    by itself, which holds also where what the model lacks moves the prisms of a standstill otherwise than joints do.
 
     Args:
         model: fitted to these rows; outliers are left out.
@@ -250,44 +251,98 @@ def joint_error_scale(model: CalibratedModel, observations: Observations) -> flo
     Returns:
         k >= 0; 0 where even noise explains the scatter.
     """
-    scale, gain = _joint_error(model, observations)
+    rows = observations.select(model.deviations(observations) <= OUTLIER_SIGMA)
+    if len(rows) == 0:
+        return 0.0
+    samples = averaged(model.chain, rows)
+    each = np.arange(len(samples))
+    scale, gain = _likeliest(_groups(model, rows, samples, each), model.excess_sigma_mm)
+    if samples.standstill is not None and gain > _SURE:
+        _, gain = _likeliest(_groups(model, rows, samples, samples.standstill), model.excess_sigma_mm)
     return scale if gain > _SURE else 0.0
 
 
-def _joint_error(model: CalibratedModel, observations: Observations) -> tuple[float, float]:
-    """The likeliest size of an error of every joint, and what it gains in log likelihood over none."""
-    good = model.deviations(observations) < _OUTLIER_SIGMA
-    rows = observations.select(good)
-    if len(rows) == 0:
-        return 0.0, 0.0
-    samples = averaged(model.chain, rows)
-    lin, jacobian = model.linearise(rows)
+@dataclass(frozen=True)
+class _Groups:
+    """Groups of equally many samples that err together, g of them with c = 3 coordinates a sample.
+
+    Attributes:
+        error: (g, c) measured minus modelled.
+        known: (g, c, c) covariance by station and readings.
+        by_joint: (g, c, c) covariance by an error of every joint in `joint_error_sizes`.
+        taken: (g, c, c) what the fit took.
+    """
+
+    error: Floats
+    known: Floats
+    by_joint: Floats
+    taken: Floats
+
+    @cached_property
+    def least(self) -> Floats:
+        """(g, 1) variance that any combination of a group's coordinates keeps."""
+        least: Floats = _FLOOR * _traces(self.known)[:, None] / self.error.shape[1]
+        return least
+
+    def cost(self, even: float, lever: float) -> float:
+        """Negative log likelihood for s^2 and k^2."""
+        covariance = self.known + even * np.eye(self.error.shape[1]) + lever * self.by_joint - self.taken
+        value, vector = np.linalg.eigh(covariance)
+        value = np.maximum(value, self.least)
+        along = np.einsum("gji,gj->gi", vector, self.error)
+        return 0.5 * float(np.log(value).sum() + (along**2 / value).sum())
+
+
+def _groups(model: CalibratedModel, rows: Observations, samples: Samples, label: Integers) -> list[_Groups]:
+    """The samples in groups of one label (m,)."""
+    rig = model.rig
+    lin, by_parameter = model.linearise(rows)
     error = samples.average(rows.position_mm - lin.position_mm)
-    by_reading, jacobian = samples.average(lin.joint_jacobian), samples.average(jacobian)
-    known = samples.station_covariance + reading_covariance(model.rig, by_reading, samples.rates)
-    known = known + covariance_by_joints(by_reading, samples.average(model.unknown_variance(rows)))
-    taken = jacobian @ model.covariance @ jacobian.transpose(0, 2, 1)
-    by_joint = covariance_by_joints(by_reading, joint_error_sizes(model.rig) ** 2)
-    if not by_joint.any():
+    by_reading, by_parameter = samples.average(lin.joint_jacobian), samples.average(by_parameter)
+    unsure = reading_variance(rig) + samples.average(model.unknown_variance(rows))
+    velocity = by_reading @ samples.rates[:, :, None] * rig.station.timing_sigma_s
+    alone = samples.station_covariance + velocity @ velocity.transpose(0, 2, 1)
+    order = np.argsort(label, kind="stable")
+    start, count = np.unique(label[order], return_index=True, return_counts=True)[1:]
+    found = []
+    for size in np.unique(count).tolist():
+        at = order[start[count == size][:, None] + np.arange(size)]  # (g, size) samples
+        shape = len(at), 3 * size
+        known = np.zeros((len(at), size, 3, size, 3))
+        for i in range(size):
+            known[:, i, :, i] = alone[at[:, i]]
+        arms, fitted = by_reading[at].reshape(*shape, -1), by_parameter[at].reshape(*shape, -1)
+        found.append(
+            _Groups(
+                error[at].reshape(shape),
+                known.reshape(*shape, 3 * size) + covariance_by_joints(arms, unsure[at].mean(axis=1)),
+                covariance_by_joints(arms, joint_error_sizes(rig) ** 2),
+                fitted @ model.covariance @ fitted.transpose(0, 2, 1),
+            )
+        )
+    return found
+
+
+def _likeliest(groups: list[_Groups], excess_sigma_mm: float) -> tuple[float, float]:
+    """The likeliest size of an error of every joint, and what it gains in log likelihood over none."""
+    coordinates = sum(g.error.size for g in groups)
+    known = sum(float(_traces(g.known).sum()) for g in groups) / coordinates
+    by_joint = sum(float(_traces(g.by_joint).sum()) for g in groups) / coordinates
+    if by_joint == 0.0:
         return 0.0, 0.0
-    least = _FLOOR * np.trace(known, axis1=1, axis2=2) / 3.0
 
     def cost(logarithms: Floats) -> float:
         """Negative log likelihood for log s^2 and, where given, log k^2."""
         even, lever = [*np.exp(logarithms), 0.0][:2]
-        value, vector = np.linalg.eigh(known + even * np.eye(3) + lever * by_joint - taken)
-        value = np.maximum(value, least[:, None])
-        along = np.einsum("nji,nj->ni", vector, error)
-        return 0.5 * float(np.log(value).sum() + (along**2 / value).sum())
+        return sum(g.cost(even, lever) for g in groups)
 
     def best(*start: float) -> tuple[Floats, float]:
         found = minimize(cost, np.array(start), method="Nelder-Mead", options={"xatol": 0.01, "fatol": 0.01})
         return found.x, float(found.fun)
 
-    even = math.log(max(model.excess_sigma_mm**2, 0.01 * float(least.mean())))
-    lever = even - math.log(float(np.trace(by_joint, axis1=1, axis2=2).mean()) / 3.0)
+    even = math.log(max(excess_sigma_mm**2, 0.01 * _FLOOR * known))
     _, without = best(even)
-    at, with_joints = best(even, lever)
+    at, with_joints = best(even, even - math.log(by_joint))
     return math.exp(0.5 * float(at[1])), without - with_joints
 
 

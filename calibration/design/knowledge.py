@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from calibration.effects.base import Situation
-from calibration.effects.fitted import FittedEffect, coefficient_values, fitted_additions, unknown_variance
+from calibration.effects.fitted import AppliedEffects, FittedEffect
 from calibration.errors import UnsafeError
 from calibration.identification.refinement import prior_precision
 from calibration.kernels.lineariser import Lineariser
@@ -89,8 +89,8 @@ class Knowledge:
             direction: (n, joints) from which side each joint comes, -1 or 1; nothing is known of it by default.
         """
         prisms = len(self.chain.rig.prisms)
-        additions = fitted_additions(self.effects, self._situation(readings, direction))
-        true = readings + additions.change(coefficient_values(self.effects), len(self.chain.rig.joints))
+        columns = self._applied.columns(self._situation(readings, direction))
+        true = readings + self._applied.change(columns)
         data = ChainData(
             np.repeat(true, prisms, axis=0),
             np.tile(np.arange(prisms), len(readings)),
@@ -99,7 +99,7 @@ class Knowledge:
         lin = self._lineariser(self.x, data)
         if not self.effects:
             return lin, lin.jacobian
-        by_coefficient = additions.select(np.repeat(np.arange(len(readings)), prisms)).moved_mm(lin.joint_jacobian)
+        by_coefficient = lin.joint_jacobian[:, :, self._applied.joint] * np.repeat(columns, prisms, axis=0)[:, None, :]
         return lin, np.concatenate([lin.jacobian, by_coefficient], axis=2)
 
     def unknown_variance(self, readings: Floats, direction: Floats | None = None) -> Floats:
@@ -107,8 +107,12 @@ class Knowledge:
 
         Arguments as for `linearise`.
         """
-        variance = unknown_variance(self.effects, self._situation(readings, direction))
+        variance = self._applied.unknown_variance(self._situation(readings, direction))
         return np.repeat(variance, len(self.chain.rig.prisms), axis=0)
+
+    @cached_property
+    def _applied(self) -> AppliedEffects:
+        return AppliedEffects(self.effects, self.chain)
 
     @cached_property
     def _lineariser(self) -> Lineariser:

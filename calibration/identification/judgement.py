@@ -6,14 +6,13 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.errors import UnsafeError
 from calibration.identification.refinement import Fit, Prior
 from calibration.identification.samples import Samples, reading_covariance
 from calibration.identification.start import rough_start
 from calibration.kinematics import Chain, Placement
-from calibration.observations import Floats, Observations
+from calibration.observations import Floats, Observations, originals
 from calibration.rig import Rig
 
 _NOISE = 2.0  # times the sigma of instruments and repeats: what is left is theirs
@@ -26,17 +25,6 @@ _DISCARDED = 1.0 / 3.0  # share of the fixes
 _DISCARDED_OF_PRISM = 0.8
 _LEAST_DISCARDED = 5
 _FOREIGN = 2.0  # misfit after the fit over what build tolerances explain before it
-
-
-def originals(observations: Observations) -> NDArray[np.intp]:
-    """(n,) the first row with the same readings and position in every digit: later ones are copies, no measurements."""
-    numbers = np.column_stack([*observations.joints.values(), observations.position_mm]).tolist()
-    labels = zip(observations.prism.tolist(), observations.setup.tolist(), strict=True)
-    seen: dict[tuple[object, ...], int] = {}
-    first = [
-        seen.setdefault((*label, *values), row) for row, (label, values) in enumerate(zip(labels, numbers, strict=True))
-    ]
-    return np.array(first, dtype=np.intp)
 
 
 def refuse_mirrored(chain: Chain, samples: Samples) -> None:

@@ -50,7 +50,8 @@ class Fit:
 
     Attributes:
         x: (p,) parameters; with k additions (p + k,), their coefficients last.
-        covariance: of `x`, posterior of the model linearised there; zero rows for what was held.
+        covariance: of `x`, posterior of the model linearised there, the uncertainty of an estimated prior scale in it;
+            zero rows for what was held.
         excess_variance: s^2, mm^2 per axis.
         prior_scale: what the build tolerances were multiplied by.
         weight: (m,) probability that a sample is no outlier.
@@ -237,9 +238,7 @@ class _View:
 
     @cached_property
     def covariance(self) -> Floats:
-        scale, factor = _factor(self.normal)
-        inverse: Floats = cho_solve(factor, np.eye(len(self.normal))) * scale[:, None] * scale
-        return inverse
+        return _inverse(self.normal)
 
     def squares(self, at: _State) -> float:
         """Weighted squares plus the prior's at another state, noise and weights as they are here."""
@@ -261,13 +260,29 @@ class _View:
         # Downwards a single step may leave the range in which the quadratic model holds.
         return max(self.noise.excess + change, 0.1 * self.noise.excess, _LEAST_EXCESS)
 
+    @property
+    def determined(self) -> float:
+        """gamma: how many of the parameters with a build tolerance the data determine."""
+        inside = self.problem.tolerated[self.problem.free]
+        return float(np.sum(1.0 - np.diag(self.covariance)[inside] * self.precision[inside]))
+
     def prior_scale(self, x: Floats) -> float:
         """MacKay: scale^2 = sum of (x / sigma)^2 over the number of parameters that the data determine."""
         inside = self.problem.tolerated
         precision = self.precision[inside[self.problem.free]]
-        determined = float(np.sum(1.0 - np.diag(self.covariance)[inside[self.problem.free]] * precision))
         squares = float(precision @ x[inside] ** 2) * self.noise.scale**2
-        return float(np.clip(math.sqrt(squares / max(determined, 1.0)), *_PRIOR_SCALE))
+        return float(np.clip(math.sqrt(squares / max(self.determined, 1.0)), *_PRIOR_SCALE))
+
+    @property
+    def covariance_of_unsure_scale(self) -> Floats:
+        """The covariance where the prior's scale is estimated, and so uncertain itself.
+
+        Given squares of gamma determined parameters, scale^2 is inverse chi-square distributed: gamma / (gamma - 2)
+        times the estimate in the mean. What the data do not see is that much less certain.
+        """
+        inside = self.problem.tolerated[self.problem.free]
+        mean = 1.0 + 2.0 / max(self.determined - 2.0, 1.0)
+        return _inverse(self.normal - np.diag(np.where(inside, self.precision * (1.0 - 1.0 / mean), 0.0)))
 
     def cost(self) -> float:
         """Negative log evidence (Laplace), up to a constant: fits of one data set from different starts compare by it.
@@ -315,7 +330,8 @@ def _fit(problem: _Problem, start: Floats, prior: Prior, excess_variance: float 
         settled = max(size, change) < _SETTLED
     view = _View(problem, state, noise)
     covariance = np.zeros((len(state.x), len(state.x)))
-    covariance[np.ix_(problem.free, problem.free)] = view.covariance
+    unsure = prior == "as-built" and problem.tolerated.any()
+    covariance[np.ix_(problem.free, problem.free)] = view.covariance_of_unsure_scale if unsure else view.covariance
     weight = problem.original(view.weight)
     return Fit(state.x, covariance, noise.excess, noise.scale, weight, view.cost(), settled, rounds)
 
@@ -335,6 +351,12 @@ def _factor(matrix: Floats) -> tuple[Floats, tuple[Floats, bool]]:
     """Scale that gives the matrix a unit diagonal, and the Cholesky factor of that."""
     scale = 1.0 / np.sqrt(np.diag(matrix))
     return scale, cho_factor(matrix * scale[:, None] * scale, lower=True)
+
+
+def _inverse(matrix: Floats) -> Floats:
+    scale, factor = _factor(matrix)
+    inverse: Floats = cho_solve(factor, np.eye(len(matrix))) * scale[:, None] * scale
+    return inverse
 
 
 def _step(view: _View, damping: float) -> tuple[_State, float, Floats, float]:

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.identification.standing import standing_spread
 from calibration.kinematics import Chain, ChainData
-from calibration.observations import Floats, Observations
+from calibration.observations import Floats, Observations, originals
 from calibration.rig import Rig
 
 Integers = NDArray[np.intp]
@@ -31,7 +32,7 @@ class Samples:
         position_mm: (m, 3) mean position in the station's frame.
         station_covariance: (m, 3, 3) of that mean, mm^2, without readings, timing and excess.
         rates: (m, joints) deg/s or mm/s at the fix, 0 where not measured.
-        of_row: (n,) which sample each observation went into.
+        of_row: (n,) which sample each observation went into, a copy into that of its original.
         repeat_variance: mm^2 per axis that repeats scatter beyond the station's covariance.
         standstill: (m,) samples with the same number share the random errors of their readings; None where each is a
             standstill of its own.
@@ -109,12 +110,14 @@ def joint_rates(rig: Rig, observations: Observations) -> Floats:
 
 
 def averaged(chain: Chain, observations: Observations) -> Samples:
-    """Average the repeats of every standstill; repeats that disagree with it stay apart.
+    """Average the repeats of every standstill; repeats that disagree with it stay apart, copies count once.
 
     Raises:
         DataError: a prism or set-up that the chain does not know.
     """
     rig = chain.rig
+    distinct, original = np.unique(originals(observations), return_inverse=True)
+    observations = observations.select(distinct)
     data = chain.bind(observations)
     position = observations.position_mm
     covariance = station_covariance(rig, position, observations.sigma_mm)
@@ -132,7 +135,7 @@ def averaged(chain: Chain, observations: Observations) -> Samples:
         _averages(of_row, position),
         _averages(of_row, covariance + repeat_variance * np.eye(3)) / count[:, None, None],
         _averages(of_row, joint_rates(rig, observations)),
-        of_row,
+        of_row[original],
         float(repeat_variance),
         _shared(rig, observations.select(first), means, np.bincount(of_row)),
     )
@@ -151,7 +154,7 @@ def _shared(rig: Rig, observations: Observations, means: ChainData, count: Integ
 
     A standstill takes a prism in once: a second sample of it is one that disagreed.
     """
-    steady = _steady(rig)
+    spread = standing_spread(rig)
     found = np.arange(len(means), dtype=np.intp)
     begun: dict[tuple[str, str, str], list[tuple[int, Floats, set[int]]]] = {}
     # Most repeats first, so that the odd one out joins no others.
@@ -161,18 +164,13 @@ def _shared(rig: Rig, observations: Observations, means: ChainData, count: Integ
             continue
         prism, readings = int(means.prism[sample]), means.readings[sample]
         for number, first, prisms in begun.setdefault(key, []):
-            if prism not in prisms and (np.abs(_differences(rig, readings - first)) <= steady).all():
+            if prism not in prisms and (np.abs(_differences(rig, readings - first)) <= spread).all():
                 prisms.add(prism)
                 found[sample] = number
                 break
         else:
             begun[key].append((sample, readings, {prism}))
     return found
-
-
-def _steady(rig: Rig) -> Floats:
-    """(joints,) by how much readings of a joint that stands still may differ, deg or mm."""
-    return np.array([_REPEAT_LIMIT * joint.sigma + 2 * joint.resolution for joint in rig.joints])
 
 
 def _differences(rig: Rig, change: Floats) -> Floats:
@@ -190,7 +188,7 @@ def _standstills(
     would be a place, or a joint value, that never was.
     """
     position_mm = observations.position_mm
-    steady = _steady(rig)
+    from_middle = standing_spread(rig) / 2.0
     keys = zip(
         observations.session.tolist(),
         observations.setup.tolist(),
@@ -212,7 +210,7 @@ def _standstills(
             spread = 3.0 * np.median(distance) if len(rows) > 2 else 0.0
             agrees = distance <= np.maximum(_REPEAT_LIMIT * sigma, spread)
             change = _differences(rig, readings[rows] - readings[rows[0]])
-            agrees &= (np.abs(change - np.median(change, axis=0)) <= steady).all(axis=1)
+            agrees &= (np.abs(change - np.median(change, axis=0)) <= from_middle).all(axis=1)
             for row in together[~agrees]:
                 of_row[row] = following
                 following += 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from calibration.identification.judgement import (
     beyond_assembly,
     doubts,
     mean_error_mm,
-    originals,
     refuse_discarded,
     refuse_foreign,
     require_enough,
@@ -30,7 +29,8 @@ from calibration.identification.samples import Samples, averaged
 from calibration.identification.search.checkpoint import Checkpoint
 from calibration.identification.search.global_search import search_globally
 from calibration.identification.start import Start, rough_start
-from calibration.identification.sweeps.circles import find_axes, start_from_axes
+from calibration.identification.sweeps.axis_start import start_from_axes
+from calibration.identification.sweeps.circles import find_axes
 from calibration.kinematics import Chain, Placement
 from calibration.observations import Floats, Observations
 from calibration.rig import Rig
@@ -77,10 +77,7 @@ def place(rig: Rig, observations: Observations) -> tuple[Chain, Samples, Start]:
     """
     setups = sorted(set(observations.setup.tolist()))
     blank = Chain(rig, {setup: Placement.identity() for setup in setups})
-    first = originals(observations)
-    distinct, of_row = np.unique(first, return_inverse=True)
-    samples = averaged(blank, observations.select(distinct))
-    samples = replace(samples, of_row=samples.of_row[of_row])
+    samples = averaged(blank, observations)
     start = rough_start(blank, samples, np.zeros(len(blank)), mirrored="let pass")
     return Chain(rig, start.placements), samples, start
 
@@ -155,7 +152,7 @@ def solve(
     refuse_foreign(chain, samples, fit, tolerated_mm, prior)
     refuse_discarded(rig, samples, fit, prior)
     progress(0.9, "checking what the data determine")
-    seen = identifiability(chain, samples, nominal.x, fit.excess_variance)
+    seen = identifiability(chain, samples, fit.x, fit.excess_variance)
     return Solution(chain, samples, nominal, fit, seen, search, tolerated_mm, tuple(warnings))
 
 

@@ -102,7 +102,7 @@ def pde_paper(
         samples,
         nominal,
         fit,
-        identifiability(chain, samples, nominal.x, fit.excess_variance),
+        identifiability(chain, samples, x, fit.excess_variance),
         f"the first paper's differential evolution, {evolved.evaluations:,} evaluations, not refined",
         tolerated_mm,
         warnings,

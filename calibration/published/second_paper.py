@@ -84,7 +84,7 @@ def km(rig: Rig, observations: Observations, *, progress: Progress) -> Solution:
             f"--method default can, or says what is wrong with them"
         )
     progress(0.9, "checking what the data determine")
-    seen = identifiability(chain, samples, nominal.x, fit.excess_variance)
+    seen = identifiability(chain, samples, fit.x, fit.excess_variance)
     words = f"plain least squares from the nominal model, {rounds} rounds"
     return Solution(chain, samples, nominal, fit, seen, words, tolerated_mm)
 

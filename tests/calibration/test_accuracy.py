@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,9 +9,10 @@ from calibration.accuracy import ExpectedAccuracy, expected_accuracy, joint_erro
 from calibration.design.knowledge import Knowledge
 from calibration.design.planning import plan_poses
 from calibration.model import CalibratedModel
-from calibration.observations import Floats, Observations
+from calibration.observations import Floats, Observations, parse_observations
 from calibration.pipeline import identify
 from calibration.rig import shipped_rig
+from simulators.dataset import simulate_observations
 from simulators.effects.spec import parse_effects
 from simulators.truth import RigTruth
 from tests.calibration.conftest import Session, rig_text, rms, simulated, split_by_cells
@@ -115,3 +118,14 @@ def test_repeats_of_a_standstill_are_no_further_evidence_of_what_the_model_lacks
     thrice = training.select(np.repeat(np.arange(len(training)), 3))
     assert joint_error_scale(model, training) == 0.0
     assert joint_error_scale(model, thrice) == 0.0
+
+
+def test_prisms_of_a_standstill_are_no_further_evidence_of_what_the_model_lacks() -> None:
+    """The readings of fifty standstills err the same way at each of their four prisms, and nothing else is wrong."""
+    rig = shipped_rig("swdt82")
+    table = simulate_observations(RigTruth(rig, 1001), 50, 1001, noise_mm=3.0).csv_text()
+    training = parse_observations(table.encode(), rig, "simulated.csv")
+    model = identify(rig, rig_text("swdt82"), training, effects="none")
+    alone = replace(training, pose=np.full(len(training), ""))
+    assert joint_error_scale(model, alone) > 0.0  # what they would say were each a standstill of its own
+    assert joint_error_scale(model, training) == 0.0

@@ -120,12 +120,22 @@ def test_a_fifth_of_gross_outliers_with_a_reversed_joint_is_still_named(session:
 
 
 def test_copied_rows_count_once_and_are_named(session: Session) -> None:
-    rows = np.concatenate([np.arange(250), np.arange(100)])
-    model = identify(session.rig, rig_text("swdt82"), replace(session.training.select(rows), pose=np.full(350, "")))
-    once = identify(session.rig, rig_text("swdt82"), replace(session.training, pose=np.full(250, "")))
+    position = session.training.position_mm.copy()
+    position[7] += [0.0, 0.0, 3000.0]
+    training = replace(session.training, position_mm=position, pose=np.full(250, ""))
+    copied = training.select(np.concatenate([np.arange(250), np.arange(100)]))
+    model = identify(session.rig, rig_text("swdt82"), copied)
+    once = identify(session.rig, rig_text("swdt82"), training)
     assert any(w.startswith("100 of 350 rows are copies of earlier ones") and "row 251" in w for w in model.warnings)
+    assert any(w.startswith("1 of 250 training fixes are outliers") and "(row 8;" in w for w in model.warnings)
     np.testing.assert_array_equal(model.values, once.values)
     np.testing.assert_array_equal(model.covariance, once.covariance)
+    assert (model.outliers, model.noise_mm) == (once.outliers, once.noise_mm)
+    assert model.provenance["fixes"] == 250
+    few, often = training.select(np.arange(40)), training.select(np.arange(120) % 40)
+    refitted, again = (evaluate(once, rows, refit_base=True) for rows in (few, often))
+    np.testing.assert_array_equal(refitted.model.covariance, again.model.covariance)
+    assert any("was fitted on these 40 fixes" in w for w in again.warnings)
     with pytest.raises(UnsafeError, match="18 different ones"):
         identify(session.rig, rig_text("swdt82"), session.training.select(np.arange(40) % 18))
 

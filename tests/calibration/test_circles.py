@@ -10,8 +10,9 @@ import pytest
 from calibration.identification.refinement import Fit, refine
 from calibration.identification.samples import Samples, averaged
 from calibration.identification.start import rough_start
+from calibration.identification.sweeps.axis_start import start_from_axes
 from calibration.identification.sweeps.circle_fit import Kind, fit_curve, without_outliers
-from calibration.identification.sweeps.circles import Axis, find_axes, predicted_curve, start_from_axes
+from calibration.identification.sweeps.circles import Axis, find_axes, predicted_curve
 from calibration.identification.sweeps.cross_check import cross_check, disagreements
 from calibration.kinematics import Chain, Placement
 from calibration.observations import Floats, Observations, parse_observations

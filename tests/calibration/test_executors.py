@@ -12,6 +12,14 @@ import pytest
 from distributed import Client, LocalCluster
 
 from calibration.identification.search.islands import Evolved
+from calibration.model_format import write_model
+from calibration.observations import parse_observations
+from calibration.pipeline import calibrate
+from calibration.rig import shipped_rig
+from simulators.dataset import simulate_observations
+from simulators.effects import EncoderHarmonic
+from simulators.truth import RigTruth
+from tests.calibration.conftest import rig_text
 from tests.calibration.searches import SEARCHES, File, assert_same, search_until_killed
 
 SPAWN = multiprocessing.get_context("spawn")
@@ -62,6 +70,22 @@ def test_spawned_processes(search: str, reference: Evolved, processes: Executor)
 
 def test_a_dask_cluster(search: str, reference: Evolved, cluster: Client) -> None:
     assert_same(SEARCHES[search](cluster.get_executor()), reference)
+
+
+def test_a_whole_calibration_on_a_dask_cluster_is_that_of_threads_byte_by_byte(cluster: Client) -> None:
+    rig = shipped_rig("ys100")
+    harmonic = EncoderHarmonic("theta2", 4e-3, 3e-3, 2)  # beyond the kinematics: it is searched for, and then learnt
+    table = simulate_observations(RigTruth(rig, 3, effects=(harmonic,)), 80, 3, noise_mm=0.1).csv_text()
+    observations = parse_observations(table.encode(), rig, "simulated.csv")
+
+    def files(executor: Executor) -> dict[str, bytes]:
+        model, _ = calibrate(rig, rig_text("ys100"), observations, effects="none", executor=executor)
+        assert "global search found" in str(model.provenance["search"])
+        assert model.residual is not None
+        return write_model(model)
+
+    with ThreadPoolExecutor(2) as pool:
+        assert files(pool) == files(cluster.get_executor())
 
 
 class Reversed(Executor):

@@ -9,10 +9,11 @@ import pytest
 
 from calibration.identification.additions import Additions
 from calibration.identification.identifiability import Identifiability, identifiability, observability_indices
-from calibration.identification.samples import Samples
+from calibration.identification.samples import Samples, averaged
 from calibration.kinematics import Chain, ChainData, Placement
 from calibration.rig import Rig, shipped_rig
 from simulators.dataset import random_poses
+from tests.calibration.conftest import Session
 
 
 def uniform_samples(rig: Rig, n: int = 250, seed: int = 0, setups: tuple[str, ...] = ("",)) -> tuple[Chain, Samples]:
@@ -59,6 +60,16 @@ def test_the_booms_redundancies_are_found(known: tuple[str, ...], parameters: in
     found = identifiability(chain, samples, np.zeros(len(chain)), 0.0, free=free)
     assert (found.parameters, found.rank) == (parameters, rank)
     assert len(found.unidentifiable) == parameters - rank
+
+
+def test_a_model_is_judged_where_it_was_fitted_and_keeps_the_booms_redundancies(session: Session) -> None:
+    model = session.model
+    samples = averaged(model.chain, session.training)
+    fitted = identifiability(model.chain, samples, model.values, model.excess_sigma_mm**2)
+    nominal = identifiability(model.chain, samples, model.nominal_values, model.excess_sigma_mm**2)
+    assert model.identifiability.observability == pytest.approx(dict(fitted.observability), rel=1e-9)
+    assert model.identifiability.observability != pytest.approx(dict(nominal.observability), rel=1e-4)
+    assert (model.identifiability.parameters, model.identifiability.rank) == (56, 44)
 
 
 def test_the_second_papers_redundancies_are_found_and_named() -> None:

@@ -10,7 +10,7 @@ from scipy.linalg import block_diag
 
 from calibration.errors import CalibrationError
 from calibration.identification.additions import Additions
-from calibration.identification.refinement import Fit, information, posterior, prior_precision, refine
+from calibration.identification.refinement import Fit, Prior, information, posterior, prior_precision, refine
 from calibration.identification.samples import Samples, averaged, reading_variance
 from calibration.identification.solve import place
 from calibration.kernels.lineariser import Lineariser
@@ -235,6 +235,22 @@ def test_the_scale_of_build_tolerances_leaves_the_prior_of_effects_alone(session
     still = Additions(("nothing@theta4:nothing",), np.array([2]), np.zeros((len(samples), 1)), np.array([0.7]))
     fit = refine(chain, samples, start.x, prior="as-built", additions=still)
     assert np.sqrt(fit.covariance[-1, -1]) == pytest.approx(0.7)
+
+
+def test_an_estimated_prior_scale_leaves_what_the_data_do_not_see_less_certain(session: Session) -> None:
+    near = np.isin(session.training.prism, ("w", "b"))  # rows 6 to 9 move neither
+    chain, samples, start = place(session.rig, session.training.select(near))
+    blind = [chain.index(name) for name in ("row6.a", "row7.d", "row9.theta", "prism.r.x")]
+
+    def share(prior: Prior) -> Floats:
+        fit = refine(chain, samples, start.x, prior=prior)
+        return np.diag(fit.covariance)[blind] / (fit.prior_scale * chain.prior_sigma[blind]) ** 2
+
+    np.testing.assert_allclose(share("recalibration"), 1.0)
+    # The mean of an inverse chi-square of gamma degrees of freedom: no more of them than parameters that are seen.
+    determined = 2.0 + 2.0 / (share("as-built") - 1.0)
+    np.testing.assert_allclose(determined, determined[0])
+    assert 5.0 < determined[0] < 28.0
 
 
 def test_additions_of_other_rows_are_refused(session: Session) -> None:

@@ -6,21 +6,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from calibration.identification.standing import standing_spread
-from calibration.observations import Floats, Observations
+from calibration.identification.standing import LEAST_STOPS, standing_spread, stops
+from calibration.observations import Observations
 from calibration.rig import Rig
 
 Flags = NDArray[np.bool_]
 Integers = NDArray[np.intp]
-
-_LEAST_STOPS = 5
 
 
 def single_joint_rows(rig: Rig, observations: Observations) -> Flags:
     """(n,) which rows were measured while one joint alone was moved from stop to stop.
 
     A row does if there is a joint for which at least five different readings, its own among them, were taken at its
-    set-up while every other joint stood still. That is of all joints: whether they move the prism is no matter here.
+    set-up while every other joint stood still. That is of all joints, and of every row's own neighbours: the sweeps of
+    `find_axes` ask for those alone that move the prism, and share no row.
     """
     found = np.zeros(len(observations), dtype=bool)
     scaled = np.column_stack([observations.joints[name] for name in rig.joint_names]) / standing_spread(rig)
@@ -33,7 +32,7 @@ def single_joint_rows(rig: Rig, observations: Observations) -> Flags:
             if others.shape[1] == 0:
                 others = np.zeros((len(poses), 1))
             near = cKDTree(others).query_ball_point(others, 1.0, p=np.inf)
-            swept |= np.array([_stops(poses[group, joint]) >= _LEAST_STOPS for group in near])
+            swept |= np.array([stops(np.sort(poses[group, joint]), 1.0)[-1] + 1 >= LEAST_STOPS for group in near])
         found[rows] = swept[of_row]
     return found
 
@@ -46,8 +45,3 @@ def standstills(observations: Observations) -> Integers:
     for row, label in enumerate(labels):
         numbers[row] = seen.setdefault(label, row) if label[2] else row
     return numbers
-
-
-def _stops(readings: Floats) -> int:
-    """How many different readings there are, in units in which one stop's differ by less than 1."""
-    return 1 + int((np.diff(np.sort(readings)) > 1.0).sum())
