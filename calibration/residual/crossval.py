@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.observations import Floats
-from calibration.residual.boosting import cross_validate
+from calibration.residual.boosting import Settings, Tuned, cross_validate
 from calibration.residual.features import Features
 from calibration.residual.folds import folds
+from calibration.residual.gaussian_process import fit_gaussian_process
 from calibration.residual.rbfn import Shape, choose_shape, fit_shape
 
 Labels = NDArray[np.str_]
@@ -35,13 +36,13 @@ class Data:
         features: n rows.
         target_mm: (n, 3) residuals in the base frame.
         groups: (n,) labels that no fold separates.
-        cells: (n,) finer labels, for splits inside a single group.
+        units: (n,) labels that are no coarser, for splits inside a single group.
     """
 
     features: Features
     target_mm: Floats
     groups: Labels
-    cells: Labels
+    units: Labels
 
     def __len__(self) -> int:
         return len(self.features)
@@ -53,13 +54,13 @@ class Data:
             features=self.features.select(rows),
             target_mm=self.target_mm[rows],
             groups=self.groups[rows],
-            cells=self.cells[rows],
+            units=self.units[rows],
         )
 
     @property
     def labels(self) -> Labels:
-        """(n,) labels to split by: groups, or the cells of the only one, or the rows of the only cell."""
-        for labels in (self.groups, self.cells):
+        """(n,) labels to split by: groups, or the units of the only one, or the rows of the only unit."""
+        for labels in (self.groups, self.units):
             if len(np.unique(labels)) > 1:
                 return labels
         return np.arange(len(self)).astype(np.str_)
@@ -71,11 +72,11 @@ class OutOfFold:
 
     Attributes:
         estimate_mm: (n, 3) from the learner that was trained without the row's fold.
-        rounds: number of trees of each axis where their error is least; empty without trees.
+        tuned: settings and number of the trees; None without trees.
     """
 
     estimate_mm: Floats
-    rounds: tuple[int, ...] = ()
+    tuned: Tuned | None = None
 
 
 class CrossValidation:
@@ -83,7 +84,7 @@ class CrossValidation:
 
     Args:
         data: all rows.
-        count: number of folds.
+        count: number of folds; fewer where there are fewer groups.
         seed: of folds and learners.
         executor: runs what is independent; results do not depend on it.
         advance: told after each piece of work.
@@ -95,16 +96,19 @@ class CrossValidation:
         self.data = data
         self.seed = seed
         self.split = folds(data.labels, count, seed)
+        self.count = int(self.split.max()) + 1
         self._executor = executor
         self._advance = advance
-        self._training = [data.select(self.split != fold) for fold in range(self.split.max() + 1)]
-        self._held = [data.features.select(self.split == fold) for fold in range(self.split.max() + 1)]
+        self._training = [data.select(self.split != fold) for fold in range(self.count)]
+        self._held = [data.features.select(self.split == fold) for fold in range(self.count)]
         self._shapes: list[Shape] = []
 
-    def estimate(self, kind: str) -> OutOfFold:
-        """Out-of-fold estimates of `rbfn`, `lightgbm` or `chain`."""
+    def estimate(self, kind: str, settings: Settings | None = None) -> OutOfFold:
+        """Out-of-fold estimates of `rbfn`, `lightgbm`, `chain` or `gp`; without `settings` the trees are tuned."""
+        if kind == "gp":
+            return OutOfFold(self._process())
         if kind == "lightgbm":
-            return self._trees(list(zip([d.features for d in self._training], self._held, strict=True)))
+            return self._trees(list(zip([d.features for d in self._training], self._held, strict=True)), settings, None)
         if not self._shapes:
             for shape in self._executor.map(partial(best_shape, seed=self.seed), self._training):
                 self._shapes.append(shape)
@@ -116,7 +120,7 @@ class CrossValidation:
         for part in self._executor.map(work, self._training, self._held, self._shapes):
             parts.append(part)
             self._advance()
-        return self._trees(parts)
+        return self._trees(parts, settings, parts[0][0].names)
 
     def _network(self) -> Floats:
         out = np.empty_like(self.data.target_mm)
@@ -124,10 +128,21 @@ class CrossValidation:
             out[self.split == fold] = fit_shape(training.features, training.target_mm, shape, self.seed).predict(held)
         return out
 
-    def _trees(self, parts: Sequence[tuple[Features, Features]]) -> OutOfFold:
-        found = OutOfFold(*cross_validate(parts, self.data.target_mm, self.split, self.seed, self._executor))
+    def _process(self) -> Floats:
+        out = np.empty_like(self.data.target_mm)
+        estimates = self._executor.map(partial(_process_estimate, seed=self.seed), self._training, self._held)
+        for fold, estimate in enumerate(estimates):
+            out[self.split == fold] = estimate
+            self._advance()
+        return out
+
+    def _trees(
+        self, parts: Sequence[tuple[Features, Features]], settings: Settings | None, names: Sequence[str] | None
+    ) -> OutOfFold:
+        target, split = self.data.target_mm, self.split
+        found = cross_validate(parts, target, split, self.seed, self._executor, settings=settings, names=names)
         self._advance()
-        return found
+        return OutOfFold(*found)
 
 
 def best_shape(data: Data, seed: int) -> Shape:
@@ -144,6 +159,12 @@ def with_network(data: Data, shape: Shape, seed: int) -> Features:
         network = fit_shape(data.features.select(~held), data.target_mm[~held], shape, seed)
         out[held] = network.predict(data.features.select(held))
     return data.features.with_signals(NETWORK_SIGNALS, out)
+
+
+def _process_estimate(training: Data, held: Features, *, seed: int) -> Floats:
+    """What a Gaussian process of the training rows says of the held-out ones."""
+    process = fit_gaussian_process(training.features, training.target_mm, seed)
+    return np.zeros((len(held), 3)) if process is None else process.predict(held)
 
 
 def _chain_features(training: Data, held: Features, shape: Shape, *, seed: int) -> tuple[Features, Features]:

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.kernels.machine import Located
 from calibration.kinematics import Chain
 from calibration.observations import Floats, Observations
 from calibration.rig import Rig
-from calibration.torques import gravity_torques, torque_columns
+from calibration.torques import GravityLoads, gravity_torques, torque_columns
 
 _NOT_FEATURES = frozenset({"time_s"})  # a tree that splits on time knows the past alone
 _LEAST_MEASURED = 0.5
 _VARYING = 1e-6  # of the largest load
+DEFLECTION = ("deflection_x_mm", "deflection_y_mm", "deflection_z_mm")
+_COMPLIANCE_RAD_PER_NM = 1e-7  # of every joint: what counts of a deflection is its shape
+_RIGID = 6  # ways in which a base can be off
 _FRAME_ORIGIN = re.compile(r"frame\d+_[xyz]_mm")
+_PLACE = re.compile(r"(frame\d+|prism)_[xyz]_mm")
 
 
 @dataclass(frozen=True)
@@ -29,11 +36,16 @@ class Features:
         geometry: (n, g) joint values (deg or mm), frame origins and the prism in the base frame (mm); never missing.
         signals: (n, s) optional columns of the observations, joint torques and estimates of other learners; NaN where
             not measured.
+        joint_jacobian: (n, 3, joints) how an error of each joint moves the prism in the base frame, mm per deg or mm.
+        parameter_jacobian: (n, 3, p) the same of each constant of rows and prisms, and of shifting and turning the
+            base along and about its own axes, whatever the set-up; mm per mm or rad.
     """
 
     names: tuple[str, ...]
     geometry: Floats
     signals: Floats
+    joint_jacobian: Floats
+    parameter_jacobian: Floats
 
     def __len__(self) -> int:
         return len(self.geometry)
@@ -44,15 +56,30 @@ class Features:
 
     def columns(self, names: Sequence[str]) -> Floats:
         """(n, k) the columns of these names; ValueError for one that is not there."""
-        return self.table()[:, [self.names.index(name) for name in names]]
+        return self.table()[:, column_places(self.names, tuple(names))]
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Features:
         """The given rows, by mask or by index."""
-        return replace(self, geometry=self.geometry[rows], signals=self.signals[rows])
+        return replace(
+            self,
+            geometry=self.geometry[rows],
+            signals=self.signals[rows],
+            joint_jacobian=self.joint_jacobian[rows],
+            parameter_jacobian=self.parameter_jacobian[rows],
+        )
 
     def with_signals(self, names: Sequence[str], columns: Floats) -> Features:
         """With further signal columns (n, k)."""
-        return Features((*self.names, *names), self.geometry, np.hstack([self.signals, columns]))
+        return replace(self, names=(*self.names, *names), signals=np.hstack([self.signals, columns]))
+
+
+@lru_cache(maxsize=64)
+def column_places(names: tuple[str, ...], wanted: tuple[str, ...]) -> NDArray[np.intp]:
+    """Where the wanted names are among all; ValueError for one that is not there.
+
+    A learner asks for the same ones with each prediction.
+    """
+    return np.array([names.index(name) for name in wanted], dtype=np.intp)
 
 
 def usable_signals(observations: Observations) -> tuple[str, ...]:
@@ -79,12 +106,18 @@ def usable_torques(chain: Chain, x: Floats, observations: Observations) -> tuple
     return tuple(name for name, varies in zip(torque_columns(chain.rig), varying.tolist(), strict=True) if varies)
 
 
+def usable_loads(chain: Chain, x: Floats, observations: Observations) -> tuple[str, ...]:
+    """Columns of loads that are known and vary, and of the deflection that they would make."""
+    torques = usable_torques(chain, x, observations)
+    return (*torques, *DEFLECTION) if any(name.endswith("_Nm") for name in torques) else torques
+
+
 def missing_signals(rig: Rig, observations: Observations, signals: Sequence[str]) -> tuple[str, ...]:
-    """Signals that the observations have in no row; torques are computed wherever the rig has masses."""
+    """Signals that the observations have in no row; loads are computed wherever the rig has masses."""
     sources = {column: f"{joint.name}_Nm" for column, joint in zip(torque_columns(rig), rig.joints, strict=True)}
     found: list[str] = []
     for name in signals:
-        if name in sources and rig.masses:
+        if rig.masses and (name in sources or name in DEFLECTION):
             continue
         measured = observations.extra.get(sources.get(name, name))
         if measured is None or not np.isfinite(measured).any():
@@ -93,10 +126,22 @@ def missing_signals(rig: Rig, observations: Observations, signals: Sequence[str]
 
 
 def feature_names(rig: Rig, signals: Sequence[str]) -> tuple[str, ...]:
-    """Names of the columns that `features` computes."""
+    """Names of the columns that an `Extractor` computes."""
     joints = [j.column for j in rig.joints]
     frames = [f"frame{i + 1}_{axis}_mm" for i in range(len(rig.rows)) for axis in "xyz"]
     return (*joints, *frames, *(f"prism_{axis}_mm" for axis in "xyz"), *signals)
+
+
+def no_features(chain: Chain, signals: Sequence[str]) -> Features:
+    """The columns that a chain's features have, without a row."""
+    names, joints = feature_names(chain.rig, signals), len(chain.rig.joints)
+    return Features(
+        names,
+        np.empty((0, len(names) - len(signals))),
+        np.empty((0, len(signals))),
+        np.empty((0, 3, joints)),
+        np.empty((0, 3, chain.base_start + _RIGID)),
+    )
 
 
 def is_frame_origin(name: str) -> bool:
@@ -104,29 +149,64 @@ def is_frame_origin(name: str) -> bool:
     return _FRAME_ORIGIN.fullmatch(name) is not None
 
 
-def features(chain: Chain, x: Floats, observations: Observations, signals: Sequence[str]) -> Features:
-    """Compute the features.
+def is_place(name: str) -> bool:
+    """Whether a column is a coordinate of a frame's origin or of the prism, which follow from the joints."""
+    return _PLACE.fullmatch(name) is not None
+
+
+def _rigid(place_mm: Floats) -> Floats:
+    """(n, 3, 6) how shifts along the base frame's axes and turns about them move places (n, 3)."""
+    out = np.zeros((len(place_mm), 3, _RIGID))
+    for axis in range(3):
+        out[:, axis, axis] = 1.0
+        one, other = (axis + 1) % 3, (axis + 2) % 3
+        out[:, one, 3 + axis], out[:, other, 3 + axis] = -place_mm[:, other], place_mm[:, one]
+    return out
+
+
+class Extractor:
+    """Puts the features of a rig's observations together; build it once for a model.
 
     Args:
         chain, x: the identified kinematics.
-        observations: n rows whose set-ups the chain knows.
         signals: optional columns to use, joint torques among them; one that is absent is NaN throughout.
     """
-    data = chain.bind(observations)
-    position = chain.positions_mm(x, data)
-    prism = np.empty_like(position)
-    for setup in range(len(chain.setups)):
-        rows = data.setup == setup
-        base = chain.base(x, setup)
-        prism[rows] = (position[rows] - base.translation_mm) @ base.rotation
-    frames = chain.frames_mm(x, data).reshape(len(data), -1)
-    missing = np.full(len(data), np.nan)
-    known = dict(observations.extra)
-    if not set(signals).isdisjoint(torque_columns(chain.rig)):
-        known |= zip(torque_columns(chain.rig), gravity_torques(chain, x, observations).T, strict=True)
-    columns = [known.get(name, missing) for name in signals]
-    return Features(
-        feature_names(chain.rig, signals),
-        np.hstack([data.readings, frames, prism]),
-        np.column_stack(columns) if columns else np.empty((len(data), 0)),
-    )
+
+    def __init__(self, chain: Chain, x: Floats, signals: Sequence[str]) -> None:
+        self._names, self._signals = feature_names(chain.rig, signals), tuple(signals)
+        self._torques = torque_columns(chain.rig)
+        turning = np.array([joint.kind == "revolute" for joint in chain.rig.joints])
+        self._deg_per_nm = math.degrees(_COMPLIANCE_RAD_PER_NM) * turning
+        self._loads = None if set(signals).isdisjoint((*self._torques, *DEFLECTION)) else GravityLoads(chain, x)
+        self._parameters, self._frames = chain.base_start, 3 * len(chain.rig.rows)
+
+    def __call__(self, readings: Floats, located: Located, extra: Mapping[str, Floats]) -> Features:
+        """Features of n rows.
+
+        Args:
+            readings: (n, joints) deg or mm, where the effects have them.
+            located: the rows there, with the Jacobian by parameters.
+            extra: optional columns of the rows.
+        """
+        n, known = len(readings), extra
+        if self._loads is not None:
+            loads = self._loads(readings, extra)
+            turned = np.where(np.isfinite(loads), loads, 0.0) * self._deg_per_nm
+            deflection = (located.joint_jacobian @ turned[:, :, None])[:, :, 0]
+            known = {
+                **extra,
+                **dict(zip(self._torques, loads.T, strict=True)),
+                **dict(zip(DEFLECTION, deflection.T, strict=True)),
+            }
+        signals = np.full((n, len(self._signals)), np.nan)
+        for index, name in enumerate(self._signals):
+            column = known.get(name)
+            if column is not None:
+                signals[:, index] = column
+        return Features(
+            self._names,
+            np.concatenate([readings, located.frames_mm[:, 1:].reshape(n, self._frames), located.prism_mm], axis=1),
+            signals,
+            located.joint_jacobian,
+            np.concatenate([located.jacobian[:, :, : self._parameters], _rigid(located.prism_mm)], axis=2),
+        )

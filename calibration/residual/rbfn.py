@@ -1,13 +1,13 @@
-"""Radial basis function network: Gaussian units on the geometry, linear output by ridge regression.
+"""The network that learns the residual (Zhou et al. 2022, Eqs. 12-13), and the features that it sees.
 
-Zhou et al. 2022, Eqs. 12-13, with units, width and ridge chosen by grouped cross-validation. There is no constant term:
-far from everything that was trained on, the estimate fades to zero.
+Joints and prism are what positions depend on; frames' origins say the same in more columns, and held-out errors are
+no smaller with them. Signals take part where cross-validation finds them worth it.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -15,24 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.observations import Floats
-from calibration.residual.features import Features
-from calibration.residual.folds import folds
+from calibration.residual.features import Features, is_frame_origin
+from calibration.residual.rbf_network import Hyperparameters, RbfNetwork, choose_hyperparameters
 
-_UNITS = (30, 100, 250)
-_WIDTHS = (0.35, 0.7, 1.4, 2.8)  # in median distances between observations
-_RIDGES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
-_INNER_FOLDS = 3
-_LLOYD_ROUNDS = 8
 _FILE = "rbfn.npz"
 
 
 @dataclass(frozen=True)
 class Shape:
-    """Hyperparameters: number of units, their width in median distances, ridge."""
+    """What `choose_shape` found: names of the network's inputs, and its hyperparameters."""
 
-    units: int
-    width: float
-    ridge: float
+    names: tuple[str, ...]
+    hyperparameters: Hyperparameters
 
 
 @dataclass(frozen=True)
@@ -40,108 +34,70 @@ class Rbfn:
     """A fitted network.
 
     Attributes:
-        centre, scale: (g,) standardisation of the geometry; scale 0 leaves a column out.
-        units: (m, g) standardised centres.
-        width: of every unit, in standardised distance.
-        output: (m, 3) weights, mm.
+        names: of the features that are its inputs.
+        network: fitted to them.
     """
 
     kind: ClassVar[str] = "rbfn"
 
-    centre: Floats
-    scale: Floats
-    units: Floats
-    width: float
-    output: Floats
+    names: tuple[str, ...]
+    network: RbfNetwork
 
     def predict(self, features: Features) -> Floats:
         """(n, 3) estimate of the residual in the base frame, mm."""
-        scaled = (features.geometry - self.centre) * self.scale
-        estimate: Floats = _activation(_squared_distance(scaled, self.units), self.width) @ self.output
-        return estimate
+        return self.network.predict(features.columns(self.names))
 
-    def fits(self, names: Sequence[str], geometry: int) -> bool:
-        """Whether it was trained on so many geometry columns."""
-        return len(self.centre) == geometry <= len(names)
+    def fits(self, features: Features) -> bool:
+        """Whether its inputs are among these columns."""
+        return set(self.names) <= set(features.names)
 
     def to_files(self) -> dict[str, bytes]:
         """One npz file without pickled objects."""
         buffer = io.BytesIO()
-        np.savez(buffer, centre=self.centre, scale=self.scale, units=self.units, width=[self.width], output=self.output)
+        network = self.network
+        np.savez(
+            buffer,
+            names=np.array(self.names, dtype=np.str_),
+            centre=network.centre_,
+            scale=network.scale_,
+            units=network.units_,
+            output=network.output_,
+        )
         return {_FILE: buffer.getvalue()}
 
     @classmethod
     def from_files(cls, files: Mapping[str, bytes]) -> Rbfn:
         """Inverse of `to_files`; KeyError or ValueError where parts are missing or do not fit."""
         with np.load(io.BytesIO(files[_FILE]), allow_pickle=False) as stored:
-            centre, scale, units, width, output = (stored[k] for k in ("centre", "scale", "units", "width", "output"))
-        if units.shape != (len(output), len(centre)) or scale.shape != centre.shape or output.shape[1:] != (3,):
+            names = tuple(str(name) for name in stored["names"])
+            centre, scale, units, output = (stored[k] for k in ("centre", "scale", "units", "output"))
+        inputs = (len(names),)
+        if centre.shape != inputs or scale.shape != inputs or (*units.shape, 3) != (len(output), *inputs, 3):
             raise ValueError("shapes of the network do not fit each other")
-        return cls(centre, scale, units, float(width[0]), output)
+        if output.shape[1:] != (3,) or not all(np.isfinite(part).all() for part in (centre, scale, units, output)):
+            raise ValueError("the network has weights that are no numbers")
+        return cls(names, RbfNetwork.of(centre, scale, units, output))
 
 
 def choose_shape(features: Features, target_mm: Floats, groups: NDArray[np.str_], seed: int) -> Shape:
-    """The hyperparameters with the least held-out squared error."""
-    split = folds(groups, _INNER_FOLDS, seed)
-    most = max(2, min(np.bincount(split).sum() - np.bincount(split).max(), len(features)) // 2)
-    candidates = sorted({min(units, int(most)) for units in _UNITS})
-    error: dict[Shape, float] = {}
-    for fold in np.unique(split):
-        held = split == fold
-        centre, scale = _standardisation(features.geometry[~held])
-        inside = (features.geometry[~held] - centre) * scale
-        outside = (features.geometry[held] - centre) * scale
-        for units in candidates:
-            centres, reach = _units(inside, units, seed)
-            near, far = _squared_distance(inside, centres), _squared_distance(outside, centres)
-            for width in _WIDTHS:
-                activation = _activation(near, width * reach)
-                # One decomposition serves all ridges.
-                size, axes = np.linalg.eigh(activation.T @ activation)
-                moment = axes.T @ (activation.T @ target_mm[~held])
-                unseen = _activation(far, width * reach) @ axes
-                for ridge in _RIDGES:
-                    left = target_mm[held] - unseen @ (moment / (np.maximum(size, 0.0) + ridge)[:, None])
-                    shape = Shape(units, width, ridge)
-                    error[shape] = error.get(shape, 0.0) + float((left**2).sum())
-    return min(error, key=lambda shape: error[shape])
+    """The inputs and hyperparameters with the least squared error on held-out groups.
+
+    Args:
+        features: n rows.
+        target_mm: (n, 3) residuals in the base frame.
+        groups: (n,) labels that no fold separates, at least two.
+        seed: of folds and networks.
+    """
+    places = [name for name in features.names[: features.geometry.shape[1]] if not is_frame_origin(name)]
+    signals = features.names[features.geometry.shape[1] :]
+    found = []
+    for names in dict.fromkeys((tuple(places), (*places, *signals))):
+        chosen, error = choose_hyperparameters(features.columns(names), target_mm, groups, seed=seed)
+        found.append((error, Shape(names, chosen)))
+    return min(found, key=lambda pair: pair[0])[1]
 
 
 def fit_shape(features: Features, target_mm: Floats, shape: Shape, seed: int) -> Rbfn:
-    """Fit with given hyperparameters."""
-    centre, scale = _standardisation(features.geometry)
-    scaled = (features.geometry - centre) * scale
-    units, reach = _units(scaled, min(shape.units, len(features)), seed)
-    width = shape.width * reach
-    activation = _activation(_squared_distance(scaled, units), width)
-    normal = activation.T @ activation + shape.ridge * np.eye(len(units))
-    output = np.asarray(np.linalg.solve(normal, activation.T @ target_mm), dtype=np.float64)
-    return Rbfn(centre, scale, units, width, output)
-
-
-def _standardisation(geometry: Floats) -> tuple[Floats, Floats]:
-    spread = geometry.std(axis=0)
-    constant = spread <= 1e-9 * np.maximum(1.0, np.abs(geometry).max(axis=0))
-    return geometry.mean(axis=0), np.where(constant, 0.0, 1.0 / np.where(constant, 1.0, spread))
-
-
-def _squared_distance(a: Floats, b: Floats) -> Floats:
-    square: Floats = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2.0 * a @ b.T
-    return np.maximum(square, 0.0)
-
-
-def _activation(squared_distance: Floats, width: float) -> Floats:
-    return np.exp(squared_distance * (-0.5 / width**2))
-
-
-def _units(scaled: Floats, count: int, seed: int) -> tuple[Floats, float]:
-    """Centres by k-means and the median distance between observations."""
-    generator = np.random.default_rng(seed)
-    centres = scaled[np.sort(generator.permutation(len(scaled))[:count])]
-    reach = float(np.median(np.sqrt(_squared_distance(scaled, centres))))
-    for _ in range(_LLOYD_ROUNDS):
-        nearest = _squared_distance(scaled, centres).argmin(axis=1)
-        members = np.bincount(nearest, minlength=count)
-        total = (nearest == np.arange(count)[:, None]) @ scaled
-        centres = np.where(members[:, None] > 0, total / np.maximum(members, 1)[:, None], centres)
-    return centres, max(reach, 1e-9)
+    """Fit with given inputs and hyperparameters; arguments as for `choose_shape`."""
+    network = RbfNetwork(shape.hyperparameters, seed=seed)
+    return Rbfn(shape.names, network.fit(features.columns(shape.names), target_mm))

@@ -53,9 +53,9 @@ class TorqueNetwork:
         estimate: Floats = _design(features.columns(self.names), self.units, self.inverse_width) @ self.output
         return estimate
 
-    def fits(self, names: Sequence[str], geometry: int) -> bool:
+    def fits(self, features: Features) -> bool:
         """Whether its torques are among these columns."""
-        return set(self.names) <= set(names[geometry:])
+        return set(self.names) <= set(features.names)
 
     def to_files(self) -> dict[str, bytes]:
         """One npz file without pickled objects."""

@@ -1,0 +1,58 @@
+"""Whether one estimate is better than another beyond chance: a paired one-sided t-test over groups of rows.
+
+The one place where rigcal decides that something helps: for a learner within a calibration, and for a model that is to
+take another's place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from calibration.observations import Floats
+
+CHANCE = 0.01
+WORTHWHILE = 0.01  # relative; a smaller gain is not worth a change
+
+
+@dataclass(frozen=True)
+class PairedTest:
+    """Two estimates on the same rows.
+
+    Attributes:
+        before_mm, after_mm: RMS of the 3-D error over all rows.
+        p: probability of such a gain by chance; 1 where fewer than two groups, or groups without any spread, allow
+            no test.
+        rows, groups: how many there were.
+    """
+
+    before_mm: float
+    after_mm: float
+    p: float
+    rows: int
+    groups: int
+
+    @property
+    def is_better(self) -> bool:
+        """The second estimate is better beyond chance, and by enough to matter."""
+        return self.p < CHANCE and self.after_mm < (1.0 - WORTHWHILE) * self.before_mm
+
+
+def paired_test(before_mm2: Floats, after_mm2: Floats, groups: NDArray[np.str_] | NDArray[np.intp]) -> PairedTest:
+    """Compare squared errors, each group's mean gain taken as one draw.
+
+    Args:
+        before_mm2, after_mm2: (n,) squared 3-D errors of the two estimates, n > 0.
+        groups: (n,) labels of rows whose errors hang together.
+    """
+    _, index, size = np.unique(groups, return_inverse=True, return_counts=True)
+    gain = np.bincount(index, before_mm2 - after_mm2) / size
+    p = 1.0
+    if len(gain) > 1 and (spread := float(gain.std(ddof=1))) > 0.0:
+        p = float(stats.t.sf(gain.mean() / (spread / np.sqrt(len(gain))), len(gain) - 1))
+    return PairedTest(
+        float(np.sqrt(before_mm2.mean())), float(np.sqrt(after_mm2.mean())), p, len(before_mm2), len(gain)
+    )

@@ -1,0 +1,83 @@
+"""Intervals that hold 90 % of what is measured, whatever the shape of the errors (split conformal prediction).
+
+A predicted standard deviation says how errors compare between predictions; how many of them an error may be is counted
+on rows that the model was fitted without (Papadopoulos et al. 2002; Lei et al. 2018), along each axis by itself: what
+gravity does to a boom is in one of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from calibration.observations import Floats
+
+LEVEL = 0.9
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Share of errors inside their intervals.
+
+    Attributes:
+        axes: of x, y and z.
+        radius: of the balls.
+    """
+
+    axes: tuple[float, ...]
+    radius: float
+
+    def as_dict(self) -> dict[str, object]:
+        """As in the JSON of `calibrate` and `evaluate`."""
+        return {"level": LEVEL, "axis_coverage": list(self.axes), "radius_coverage": self.radius}
+
+
+@dataclass(frozen=True)
+class Intervals:
+    """How many predicted standard deviations hold an error with probability `LEVEL`.
+
+    Attributes:
+        axes: of the error along x, y, z of the station's frame.
+        radius: of its 3-D norm, in units of the root of the three variances' sum.
+    """
+
+    axes: tuple[float, float, float] = (float(stats.norm.ppf((1.0 + LEVEL) / 2.0)),) * 3
+    radius: float = float(np.sqrt(stats.chi2.ppf(LEVEL, 3) / 3.0))
+
+    def at_other_setups(self) -> Intervals:
+        """The same where nobody knows which way x and y point, seen from the machine; z is up at all set-ups."""
+        level = float(np.sqrt((self.axes[0] ** 2 + self.axes[1] ** 2) / 2.0))
+        return Intervals((level, level, self.axes[2]), self.radius)
+
+    def half_mm(self, sigma_mm: Floats) -> Floats:
+        """(n, 3) half widths of the intervals of x, y and z for standard deviations (n, 3)."""
+        half_mm: Floats = sigma_mm * np.array(self.axes)
+        return half_mm
+
+    def radius_mm(self, sigma_mm: Floats) -> Floats:
+        """(n,) radii of the balls for standard deviations (n, 3)."""
+        return np.asarray(self.radius * np.linalg.norm(sigma_mm, axis=1), dtype=np.float64)
+
+    def coverage(self, error_mm: Floats, sigma_mm: Floats) -> Coverage:
+        """How many of the errors (n, 3) are inside, for standard deviations (n, 3)."""
+        axes = (np.abs(error_mm) <= self.half_mm(sigma_mm)).mean(axis=0)
+        radius = (np.linalg.norm(error_mm, axis=1) <= self.radius_mm(sigma_mm)).mean()
+        return Coverage(tuple(axes.tolist()), float(radius))
+
+
+def conformal_intervals(error_mm: Floats, sigma_mm: Floats, independent: int) -> Intervals:
+    """Count how many standard deviations held-out errors are.
+
+    Args:
+        error_mm: (n, 3) errors of rows that the model was fitted without, in the station's frame.
+        sigma_mm: (n, 3) predicted standard deviations.
+        independent: how many of the rows are independent of each other; a new one exceeds the largest of m with
+            probability 1 / (m + 1), so few of them make the intervals wider.
+    """
+    scaled = np.abs(error_mm) / sigma_mm
+    norm = np.linalg.norm(error_mm, axis=1) / np.linalg.norm(sigma_mm, axis=1)
+    share = min(1.0, LEVEL * (1.0 + 1.0 / independent))
+    x, y, z = np.quantile(scaled, share, axis=0).tolist()
+    return Intervals((x, y, z), float(np.quantile(norm, share)))

@@ -1,0 +1,236 @@
+"""The region that a residual was trained on: outside it the estimate fades to zero, and the model says so.
+
+Three things make a row strange. A joint beyond the readings it was trained with; a pose that is farther from all
+trained poses than those on which cross-validation has shown that the learner helps; and a signal that is missing or
+that reads what it never read, as a shifted sensor or another unit does. In the first two cases the estimate fades. A
+strange signal is replaced by its usual value, and the estimate counts for less by as much as it gained from that
+signal. All weights are smooth: a rig that moves out of the region sees no step.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.kernels import region as kernel
+from calibration.model_checks import LARGEST, float_array
+from calibration.observations import Floats
+from calibration.residual.features import Features
+from calibration.rig import Joint
+
+FILE = "region.npz"
+
+_MARGIN = 0.1  # of a range, that readings may leave it before anything fades
+_LEAST_MARGIN = {"revolute": 1.0, "prismatic": 10.0}  # deg, mm
+_POSES = 256
+_MOST_ROWS = 5000  # that representatives are chosen from
+_USUAL = 0.99  # of the held-out rows are no farther from trained poses than "near"
+_ROOM = 1.25  # in that distance
+_LEAST_NEAR = 0.02  # in ranges of the joints
+_OFTEN_MISSING = 0.05
+_PROBED = 500  # rows that tell what a signal matters
+_NOTABLE = 0.01  # of a residual's gain; signals that matter less are not spoken of
+_FADED = 0.9  # weights above are not spoken of
+
+
+@dataclass(frozen=True)
+class Region:
+    """What a residual was trained on.
+
+    Attributes:
+        joints: (5, j) centre and half of each joint's trained range, margin, scale of distances (deg or mm), and 360
+            for angles whose whole turns change nothing or 0.
+        poses: (m, j) representative readings.
+        near: distance to the nearest of them, in scales of the joints, up to which the estimate counts in full.
+        signals: names of the s signal columns.
+        table: (6, s) lowest, highest, margin and usual value of each, share of the gain that is lost without it, and
+            whether training rows lacked it as well, 0 or 1.
+    """
+
+    joints: Floats
+    poses: Floats
+    near: float
+    signals: tuple[str, ...]
+    table: Floats
+
+    def settle(self, features: Features) -> tuple[Features, Floats]:
+        """The features as the learner knows them, and how much its estimate counts.
+
+        Args:
+            features: n rows with the columns that the region was fitted to.
+
+        Returns:
+            Features with angles less whole turns, and strange signals at their usual values; (n,) weights, 0 to 1.
+        """
+        geometry, signals = features.geometry.copy(), features.signals.copy()
+        weight = kernel.settle(self.joints, self.poses, self.near, self.table, geometry, signals)
+        return replace(features, geometry=geometry, signals=signals), weight
+
+    def doubts(self, features: Features, joints: Sequence[Joint]) -> Iterator[str]:
+        """Sentences on rows outside the region, and on signals that are not what they were in training."""
+        if len(features) == 0:
+            return
+        for name, values, (low, high, room, _, loss, _) in self._notable(features):
+            outside = int(((values < low - room) | (values > high + room)).sum())
+            if outside:
+                yield (
+                    f"{name}: {outside} of {len(values)} readings are outside the {low:.4g} .. {high:.4g} of the "
+                    f"training data (a shifted sensor, or another unit?); there the residual does without it, which "
+                    f"costs {loss:.0%} of what it gains"
+                )
+        _, weight = self.settle(features)
+        faded = int((weight < _FADED).sum())
+        if faded:
+            yield (
+                f"the residual fades: {faded} of {len(weight)} rows lie outside the region it was trained on "
+                f"({', '.join(self._reasons(features, joints))}); {int((weight == 0.0).sum())} rows get none of it"
+            )
+
+    def _notable(self, features: Features) -> Iterator[tuple[str, Floats, Floats]]:
+        """Name, values and column of the table of each signal that matters."""
+        for k in np.flatnonzero(self.table[kernel.LOSS] >= _NOTABLE):
+            yield self.signals[k], features.signals[:, k], self.table[:, k]
+
+    def _reasons(self, features: Features, joints: Sequence[Joint]) -> Iterator[str]:
+        centre, half, margin, _, turn = self.joints
+        away = features.geometry[:, : len(joints)] - centre
+        near = away - turn * np.floor(away / np.where(turn > 0.0, turn, np.inf) + 0.5)
+        away = np.where(np.abs(away) > half, near, away)
+        inside = (np.abs(away) <= half + margin).all(axis=1)
+        for k, joint in enumerate(joints):
+            for side, beyond, limit in (("below", -away, centre - half), ("above", away, centre + half)):
+                strange = int((beyond[:, k] > half[k] + margin[k]).sum())
+                if strange:
+                    yield f"{joint.name} {side} {limit[k]:.1f} {joint.unit} in {strange}"
+        by_joints = replace(self, signals=(), table=self.table[:, :0])
+        _, weight = by_joints.settle(replace(features, signals=features.signals[:, :0]))
+        far = int(((weight < _FADED) & inside).sum())
+        if far:
+            yield f"far from every trained pose in {far}"
+        for name, values, (low, high, room, _, _, gaps) in self._notable(features):
+            missing, outside = ~np.isfinite(values) & (gaps == 0.0), (values < low - room) | (values > high + room)
+            for what, rows in (("missing", missing), ("strange", outside)):
+                if rows.any():
+                    yield f"{name} {what} in {int(rows.sum())}"
+
+    def fits(self, joints: int) -> bool:
+        """Whether its tables have the shapes and the numbers that `settle` relies on."""
+        return (
+            self.joints.shape == (5, joints)
+            and self.poses.ndim == 2
+            and len(self.poses) > 0
+            and self.poses.shape[1] == joints
+            and self.table.shape == (6, len(self.signals))
+            and all(bool((np.abs(part) <= LARGEST).all()) for part in (self.joints, self.poses))
+            and bool((np.abs(self.table) <= LARGEST**2).all())
+            and 0.0 < self.near <= LARGEST
+            and bool((self.joints[[kernel.MARGIN, kernel.SCALE]] > 0.0).all() and (self.table[kernel.ROOM] > 0.0).all())
+            and bool((self.joints[[kernel.HALF, kernel.TURN]] >= 0.0).all())
+            and bool((self.table[kernel.LOW] <= self.table[kernel.HIGH]).all())
+            and bool(((self.table[kernel.LOSS] >= 0.0) & (self.table[kernel.LOSS] <= 1.0)).all())
+        )
+
+    def to_files(self) -> dict[str, bytes]:
+        """One npz file without pickled objects."""
+        buffer = io.BytesIO()
+        signals = np.array(self.signals, dtype=np.str_)
+        np.savez(buffer, joints=self.joints, poses=self.poses, near=[self.near], signals=signals, table=self.table)
+        return {FILE: buffer.getvalue()}
+
+    @classmethod
+    def from_files(cls, files: Mapping[str, bytes]) -> Region:
+        """Inverse of `to_files`; KeyError or ValueError where parts are missing. `fits` says whether they match."""
+        with np.load(io.BytesIO(files[FILE]), allow_pickle=False) as stored:
+            joints, poses, near, table = (float_array(stored, k) for k in ("joints", "poses", "near", "table"))
+            signals = np.asarray(stored["signals"])
+        if near.shape != (1,) or signals.ndim != 1 or signals.dtype.kind != "U":
+            raise ValueError(f"{FILE} holds no list of signals, or not one distance")
+        return cls(joints, poses, float(near[0]), tuple(signals.tolist()), table)
+
+
+def fit_region(
+    features: Features,
+    joints: Sequence[Joint],
+    turns: Floats,
+    signals: Sequence[str],
+    split: NDArray[np.intp],
+    predict: Callable[[Features], Floats],
+    gain_mm2: float,
+) -> Region:
+    """The region of a learner.
+
+    Args:
+        features: n rows that it was trained on.
+        joints: of the rig, whose readings are the first columns.
+        turns: (j,) 360 for joints whose whole turns change nothing, else 0.
+        signals: names of the signal columns.
+        split: (n,) fold that held each row out when the learner was found to help.
+        predict: (n, 3) estimates of the learner for features.
+        gain_mm2: by how much it lowered the mean squared error of held-out rows.
+    """
+    readings = features.geometry[:, : len(joints)]
+    low, high = readings.min(axis=0), readings.max(axis=0)
+    least = np.array([_LEAST_MARGIN[joint.kind] for joint in joints])
+    margin = np.maximum(_MARGIN * (high - low), least)
+    table = np.array([(low + high) / 2.0, (high - low) / 2.0, margin, margin / _MARGIN, turns])
+    scaled = readings / table[kernel.SCALE]
+    return Region(
+        table,
+        np.ascontiguousarray(readings[_representatives(scaled)]),
+        _ROOM * max(_usual_distance(scaled, split), _LEAST_NEAR),
+        tuple(signals),
+        _signal_table(features, predict, gain_mm2),
+    )
+
+
+def _representatives(scaled: Floats) -> NDArray[np.intp]:
+    """Rows that lie as far apart as can be, each next the farthest from those before (Gonzalez 1985), 256 at most."""
+    offered = np.unique(np.linspace(0, len(scaled) - 1, min(len(scaled), _MOST_ROWS)).astype(np.intp))
+    points = scaled[offered]
+    chosen = [int(((points - points.mean(axis=0)) ** 2).sum(axis=1).argmin())]
+    square = ((points - points[chosen[0]]) ** 2).sum(axis=1)
+    while len(chosen) < _POSES and square.max() > 0.0:
+        chosen.append(int(square.argmax()))
+        square = np.minimum(square, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
+    return offered[chosen]
+
+
+def _usual_distance(scaled: Floats, split: NDArray[np.intp]) -> float:
+    """How far held-out rows lie from the representatives of the others, nearly all of them."""
+    found = []
+    for fold in np.unique(split):
+        training, held = scaled[split != fold], scaled[split == fold]
+        poses = training[_representatives(training)]
+        square = (held**2).sum(axis=1)[:, None] + (poses**2).sum(axis=1) - 2.0 * held @ poses.T
+        found.append(np.sqrt(np.maximum(square.min(axis=1), 0.0)))
+    return float(np.quantile(np.concatenate(found), _USUAL))
+
+
+def _signal_table(features: Features, predict: Callable[[Features], Floats], gain_mm2: float) -> Floats:
+    """(6, s) of `Region.table`."""
+    signals = features.signals
+    count = signals.shape[1]
+    if count == 0:
+        return np.empty((6, 0))
+    low, high, usual = np.nanmin(signals, axis=0), np.nanmax(signals, axis=0), np.nanmedian(signals, axis=0)
+    room = np.maximum(_MARGIN * (high - low), 1e-9 * np.maximum(np.abs(low), np.abs(high)))
+    room = np.maximum(room, 1e-12)
+    gaps = np.isnan(signals).mean(axis=0) > _OFTEN_MISSING
+    rows = np.unique(np.linspace(0, len(features) - 1, min(len(features), _PROBED)).astype(np.intp))
+    probe = features.select(rows)
+    with_all = predict(probe)
+
+    def cost_mm2(columns: NDArray[np.intp]) -> float:
+        replaced = probe.signals.copy()
+        replaced[:, columns] = usual[columns]
+        return float(((predict(replace(probe, signals=replaced)) - with_all) ** 2).sum(axis=1).mean())
+
+    cost = np.array([cost_mm2(np.array([k])) for k in range(count)])
+    # Signals that stand in for each other cost little one by one, and much together.
+    together = cost_mm2(np.arange(count)) / max(float(cost.sum()), 1e-12)
+    share = cost * max(1.0, together) / max(gain_mm2, 1e-12)
+    return np.array([low, high, room, usual, np.minimum(share, 1.0), gaps.astype(float)])
