@@ -1,4 +1,4 @@
-"""Every method on the same training rows, judged on the same held-out rows."""
+"""Every method, and every residual on the default's kinematics, fitted and judged on the same rows."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError, UnsafeError
+from calibration.evaluation import Evaluation, evaluate
 from calibration.identification.refinement import Prior
 from calibration.model import CalibratedModel
 from calibration.observations import Floats, Observations
-from calibration.pipeline import Evaluation, calibrate, evaluate
+from calibration.pipeline import calibrate, identify, train_residual
+from calibration.residual_comparison import RESIDUALS, compare_residuals
 from calibration.rig import Rig
 
 Progress = Callable[[float, str], None]
@@ -28,10 +30,10 @@ class MethodResult:
     """What one method makes of the data; a method that refuses them has a reason and no errors.
 
     Attributes:
-        method: `nominal`, or a name of `pipeline.calibrate`'s methods.
+        method: `nominal`, a name of `pipeline.calibrate`'s methods, or of `RESIDUALS` on the default's kinematics.
         error_mm: (n,) size of the last stage's error on every held-out row.
         training_error_mm: the same on the training rows.
-        seconds: for the whole calibration; None for the nominal model, which comes with any method.
+        seconds: for the whole calibration with identification; None for the nominal model, which comes with any method.
         adds: what it puts on top of the kinematics: families of effects, then the residual's learner.
         reason: why the method does not apply.
         notes: what this method alone has to say of data and fit.
@@ -74,7 +76,7 @@ class Comparison:
     Attributes:
         rig: name.
         training, held_out: how many rows.
-        results: the nominal model first, then `METHODS`.
+        results: the nominal model first, then `METHODS`, with `RESIDUALS` above the default.
         warnings: what all methods that apply have to say of data and fit.
     """
 
@@ -113,10 +115,13 @@ def compare(
     refit_base: bool = False,
     time_limit_s: float | None = None,
     methods: Sequence[str] = METHODS,
+    residuals: Sequence[str] = RESIDUALS,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Comparison:
     """Calibrate by every method and evaluate each one's last stage on the held-out rows.
+
+    The default method identifies once; every one of `RESIDUALS` is then learned from what this one model leaves.
 
     Args:
         rig, rig_text: the rig description and the TOML it was read from.
@@ -128,6 +133,7 @@ def compare(
         refit_base: fit the base transform of the held-out set-ups, and nothing else, on the held-out rows first.
         time_limit_s: ends a method's global search.
         methods: which.
+        residuals: which take part where `default` does.
         executor: runs the searches; threads by default.
         progress: told (share done, what is going on).
 
@@ -136,49 +142,122 @@ def compare(
         CalibrationError: what the default method says (or else the last one), where no method applies.
     """
     require_known_setups(training, held_out, refit_base=refit_base)
+    task = _Task(rig, rig_text, training, held_out, clock, seed, prior, refit_base, time_limit_s, executor)
     results: list[MethodResult] = []
     nominal: MethodResult | None = None
     refused: dict[str, CalibrationError] = {}
-    notes: dict[str, tuple[str, ...]] = {}
     for number, method in enumerate(methods):
-        began = clock()
 
         def report(share: float, what: str, number: int = number, method: str = method) -> None:
             if progress is not None:
                 progress((number + share) / len(methods), f"{method}: {what}")
 
-        def late(began: float = began) -> bool:
-            return time_limit_s is not None and clock() - began > time_limit_s
-
         try:
-            model, trained = calibrate(
-                rig,
-                rig_text,
-                training,
-                seed=seed,
-                prior=prior,
-                method=method,
-                executor=executor,
-                progress=report,
-                should_stop=late,
-            )
-            seconds = round(clock() - began, 3)
-            evaluation = evaluate(model, held_out, refit_base=refit_base)
+            own = task.default(residuals, report) if method == "default" else task.method(method, report)
         except CalibrationError as error:
             refused[method] = error
             results.append(MethodResult(method, reason=" ".join(str(error).split())))
             continue
-        if nominal is None:
-            nominal = MethodResult(NOMINAL, _norms(evaluation, NOMINAL), _norms(trained, NOMINAL))
-        notes[method] = evaluation.warnings
-        held, fitted = (_norms(e, "hybrid") for e in (evaluation, trained))
-        results.append(MethodResult(method, held, fitted, seconds, _adds(model)))
+        nominal = nominal or own[0]
+        results.extend(own[1:])
     if nominal is None:
         raise refused.get("default") or list(refused.values())[-1]
-    common = tuple(note for note in next(iter(notes.values())) if all(note in others for others in notes.values()))
-    own = {method: tuple(note for note in said if note not in common) for method, said in notes.items()}
-    finished = [replace(result, notes=own.get(result.method, ())) for result in results]
+    said = [set(result.notes) for result in results if result.method in methods and result.reason is None]
+    common = tuple(n for n in dict.fromkeys(n for r in results for n in r.notes) if all(n in notes for notes in said))
+    finished = [replace(r, notes=tuple(note for note in r.notes if note not in common)) for r in results]
     return Comparison(rig.name, len(training), len(held_out), (nominal, *finished), common)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What `compare` was given; its methods return the nominal model's result first, then their own."""
+
+    rig: Rig
+    rig_text: str
+    training: Observations
+    held_out: Observations
+    clock: Callable[[], float]
+    seed: int
+    prior: Prior
+    refit_base: bool
+    time_limit_s: float | None
+    executor: Executor | None
+
+    def method(self, method: str, report: Progress) -> list[MethodResult]:
+        """Calibrate by a method, and evaluate."""
+        began = self.clock()
+        model, trained = calibrate(
+            self.rig,
+            self.rig_text,
+            self.training,
+            seed=self.seed,
+            prior=self.prior,
+            method=method,
+            executor=self.executor,
+            progress=report,
+            should_stop=lambda: self._is_late(began),
+        )
+        seconds = self.clock() - began
+        return self._results(method, trained, evaluate(model, self.held_out, refit_base=self.refit_base), seconds)
+
+    def default(self, residuals: Sequence[str], report: Progress) -> list[MethodResult]:
+        """Identify by the default method, then train the residuals one by one, and the default's last."""
+        began = self.clock()
+        model = identify(
+            self.rig,
+            self.rig_text,
+            self.training,
+            seed=self.seed,
+            prior=self.prior,
+            executor=self.executor,
+            progress=lambda share, what: report(0.2 * share, what),
+            should_stop=lambda: self._is_late(began),
+        )
+        identified = self.clock()
+        learned = train_residual(
+            model,
+            self.training,
+            seed=self.seed,
+            executor=self.executor,
+            progress=lambda share, what: report(0.2 + 0.3 * share, what),
+        )
+        seconds = self.clock() - began
+        evaluation = evaluate(learned, self.held_out, refit_base=self.refit_base)
+        nominal, default = self._results("default", evaluate(learned, self.training), evaluation, seconds)
+        found = compare_residuals(
+            learned,
+            self.training,
+            self.held_out,
+            residuals,
+            refit_base=self.refit_base,
+            clock=self.clock,
+            seed=self.seed,
+            executor=self.executor,
+            progress=lambda share, what: report(0.5 + 0.5 * share, what),
+        )
+        families = _families(model)
+        others = [
+            MethodResult(
+                r.kind,
+                r.held_out_mm,
+                r.training_mm,
+                None if r.reason else round(identified - began + r.seconds, 3),
+                families if r.adds is None else (*families, r.adds),
+                r.reason,
+                r.notes,
+            )
+            for r in found
+        ]
+        return [nominal, *others, default]
+
+    def _results(self, method: str, trained: Evaluation, evaluation: Evaluation, seconds: float) -> list[MethodResult]:
+        nominal = MethodResult(NOMINAL, _norms(evaluation, NOMINAL), _norms(trained, NOMINAL))
+        held, fitted = (_norms(e, "hybrid") for e in (evaluation, trained))
+        adds = _adds(evaluation.model)
+        return [nominal, MethodResult(method, held, fitted, round(seconds, 3), adds, notes=evaluation.warnings)]
+
+    def _is_late(self, began: float) -> bool:
+        return self.time_limit_s is not None and self.clock() - began > self.time_limit_s
 
 
 def require_known_setups(training: Observations, held_out: Observations, *, refit_base: bool) -> None:
@@ -227,9 +306,12 @@ def _keys(*columns: NDArray[np.str_] | Floats) -> NDArray[np.str_]:
     return np.array(["\x1f".join(map(repr, row)) for row in zip(*(c.tolist() for c in columns), strict=True)])
 
 
+def _families(model: CalibratedModel) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(effect.family for effect in model.effects))
+
+
 def _adds(model: CalibratedModel) -> tuple[str, ...]:
-    learner = () if model.residual is None else (model.residual.learner.kind,)
-    return (*dict.fromkeys(effect.family for effect in model.effects), *learner)
+    return _families(model) + (() if model.residual is None else (model.residual.learner.kind,))
 
 
 def _norms(evaluation: Evaluation, stage: str) -> Floats:

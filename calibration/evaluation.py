@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -13,10 +13,14 @@ from calibration.identification.samples import averaged
 from calibration.identification.sweeps.circles import find_axes
 from calibration.identification.sweeps.cross_check import AxisCheck, cross_check, disagreements
 from calibration.model import CalibratedModel, Outlier
-from calibration.observations import Floats, Observations, data_sha256
+from calibration.observations import Floats, Observations, data_sha256, originals
 from calibration.rebase import with_refitted_base
+from calibration.residual.hybrid import tree_importance
 from calibration.single_thread import one_blas_thread
 
+_STRANGE = 3.0  # times the expected error, in the median; a right model's are 0.9
+_LEAST_TO_JUDGE = 10
+_FEATURES_SHOWN = 10  # as in Zhou et al. 2022, Fig. 10
 STAGES = ("nominal", "geometric", "effects", "hybrid")
 
 
@@ -68,7 +72,13 @@ class Evaluation:
             "ignored_columns": list(self.observations.ignored_columns),
             "expected_accuracy": self.expected.as_dict() if self.expected else None,
             "axes": [asdict(axis) for axis in self.axes],
+            "importance": self._importance(),
+            "intervals": self.model.intervals.coverage(self.errors_mm["hybrid"], self.sigma_mm).as_dict(),
         }
+
+    def _importance(self) -> list[dict[str, str | float]] | None:
+        found = tree_importance(self.model.residual.learner) if self.model.residual else None
+        return None if found is None else [asdict(feature) for feature in found[:_FEATURES_SHOWN]]
 
 
 @one_blas_thread()
@@ -78,33 +88,38 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
     Args:
         model: the model.
         observations: rows with positions.
-        refit_base: fit the base transform of every set-up, and nothing else, on these rows.
+        refit_base: fit the base transform of every set-up, and nothing else, on these rows, for each stage by itself.
 
     Raises:
         UnsafeError: a set-up that the model does not know, or whose base cannot be placed with these rows.
     """
     require_positions(observations)
+    effects = model
+    if refit_base:
+        effects = with_refitted_base(replace(model, residual=None), observations)
+        model = effects if model.residual is None else with_refitted_base(model, observations)
+    prediction = model.predict(observations)
     warnings = _of_training(model, observations)
     if refit_base:
-        model = with_refitted_base(model, observations)
         names = ", ".join(repr(s) for s in model.placements)
-        warnings.append(f"the base transform of set-up {names} was fitted on these {len(observations)} fixes")
+        fixes = len(np.unique(originals(observations)))
+        warnings.append(f"the base transform of set-up {names} was fitted on these {fixes} fixes")
     warnings += [w for w in model.doubts(observations) if w not in warnings]
-    prediction = model.predict(observations)
     errors = {
-        "nominal": observations.position_mm - model.nominal_mm(observations),
-        "geometric": observations.position_mm - model.geometric_mm(observations),
-        "effects": observations.position_mm - model.effects_mm(observations),
+        "nominal": observations.position_mm - effects.nominal_mm(observations),
+        "geometric": observations.position_mm - effects.geometric_mm(observations),
+        "effects": observations.position_mm - effects.effects_mm(observations),
         "hybrid": observations.position_mm - prediction.position_mm,
     }
-    axes = _axes(model, observations)
+    warnings += _strange(errors["hybrid"], prediction.sigma_mm)
+    axes = _axes(effects, observations)
     warnings += [w for w in disagreements(axes) if w not in warnings]
     return Evaluation(
         model,
         observations,
         errors,
         prediction.sigma_mm,
-        model.find_outliers(observations),
+        effects.find_outliers(observations),
         tuple(warnings),
         axes,
         _expected(model),
@@ -116,6 +131,16 @@ def _of_training(model: CalibratedModel, observations: Observations) -> list[str
     if not model.warnings or model.provenance.get("data_sha256") == data_sha256(observations, model.rig):
         return list(model.warnings)
     return [f"in training: {warning}" for warning in model.warnings]
+
+
+def _strange(error_mm: Floats, sigma_mm: Floats) -> Iterator[str]:
+    """What errors far beyond the expected say: the model is not of this machine, or no longer."""
+    times = float(np.median(np.linalg.norm(error_mm, axis=1) / np.linalg.norm(sigma_mm, axis=1)))
+    if len(error_mm) >= _LEAST_TO_JUDGE and times > _STRANGE:
+        yield (
+            f"the model does not describe this data: half of the fixes are off by more than {times:.1f} times the "
+            f"expected; another machine or rig file, a moved base or prism, or a column that was read differently"
+        )
 
 
 def _axes(model: CalibratedModel, observations: Observations) -> tuple[AxisCheck, ...]:

@@ -156,6 +156,7 @@ class Chain:
 
     Attributes:
         parameters: every identifiable constant; the vector `x` of all methods has their order.
+        joint_index: name of a joint -> its column among the readings.
         row_ops: per row its elementary transforms.
         prism_ops: per prism its three offset translations.
     """
@@ -164,6 +165,9 @@ class Chain:
         self.rig = rig
         self.placements = dict(placements)
         self.setups = tuple(placements)
+        self.joint_index = {name: index for index, name in enumerate(rig.joint_names)}
+        self._prism_index = {name: index for index, name in enumerate(rig.prism_names)}
+        self._setup_index = {name: index for index, name in enumerate(self.setups)}
         self._parameters: list[Parameter] = []
         self.row_ops = [
             [op for op in self._row_ops(number, row) if not op.is_identity] for number, row in enumerate(rig.rows, 1)
@@ -245,12 +249,21 @@ class Chain:
         """Look up prisms and set-ups.
 
         Raises:
-            DataError: a prism that the rig lacks or a set-up without a placement.
+            DataError: a prism that the rig lacks, a set-up without a placement, a joint without readings or with one
+                that is no number.
         """
+        lacking = self.joint_index.keys() - observations.joints.keys()
+        if lacking:
+            raise DataError("observations", f"joint {min(lacking)} is missing; are they another rig's?")
+        readings = np.array([observations.joints[name] for name in self.joint_index], dtype=np.float64)
+        if not np.isfinite(readings).all():
+            joint, row = np.argwhere(~np.isfinite(readings))[0]
+            column = self.rig.joints[joint].column
+            raise DataError("observations", f"the reading of row {row} (from 0) is not a finite number", column=column)
         return ChainData(
-            np.column_stack([observations.joints[name] for name in self.rig.joint_names]),
-            _indices(observations.prism.tolist(), self.rig.prism_names, "prism"),
-            _indices(observations.setup.tolist(), self.setups, "set-up"),
+            np.ascontiguousarray(readings.T),
+            _indices(observations.prism.tolist(), self._prism_index, "prism"),
+            _indices(observations.setup.tolist(), self._setup_index, "set-up"),
         )
 
     # -- evaluation ---------------------------------------------------------------------------------------------
@@ -388,9 +401,9 @@ def _groups(labels: Integers) -> Iterator[tuple[int, Integers]]:
         yield int(label), np.flatnonzero(labels == label)
 
 
-def _indices(labels: Sequence[str], known: Sequence[str], what: str) -> Integers:
-    index = {name: i for i, name in enumerate(known)}
-    unknown = sorted(set(labels) - set(known))
-    if unknown:
-        raise DataError("observations", f"{what} {unknown[0]!r} is unknown; known: {', '.join(map(repr, known))}")
-    return np.array([index[label] for label in labels], dtype=np.intp)
+def _indices(labels: Sequence[str], index: Mapping[str, int], what: str) -> Integers:
+    try:
+        return np.array([index[label] for label in labels], dtype=np.intp)
+    except KeyError:
+        first, known = min(set(labels) - set(index)), ", ".join(map(repr, index))
+        raise DataError("observations", f"{what} {first!r} is unknown; known: {known}") from None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
@@ -13,13 +13,15 @@ from calibration.identification.solve import solve
 from calibration.observations import Observations
 from calibration.published.first_paper import pde_paper
 from calibration.published.second_paper import km, require_torques, skcm
+from calibration.residual.hybrid import Kind
 from calibration.rig import Rig
 
 Progress = Callable[[float, str], None]
 
 METHODS = ("default", "pde-paper", "km", "skcm", "rbf-tcm")
 TORQUE_NETWORK = "rbf-tcm"  # the method whose learner is its own
-WITHOUT_LEARNER = ("km", "skcm")  # methods that end before any residual
+# What a published method ends with.
+OWN_LEARNERS: Mapping[str, Kind] = {"km": "none", "skcm": "none", "pde-paper": "chain"}
 _OWN_EFFECTS = "the method has none of its own"
 
 

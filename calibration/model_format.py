@@ -8,9 +8,13 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import struct
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from dataclasses import asdict
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -22,17 +26,30 @@ from calibration.identification.identifiability import Identifiability
 from calibration.identification.refinement import Prior
 from calibration.kinematics import Chain, Placement
 from calibration.model import CalibratedModel, Coverage, LearnedResidual, Outlier
-from calibration.residual.features import feature_names
+from calibration.model_checks import LARGEST, check_covariance, check_names, check_placement, float_array
+from calibration.residual.conformal import Intervals
+from calibration.residual.features import no_features
 from calibration.residual.hybrid import LOADERS, Trial
+from calibration.residual.region import Region
 from calibration.rig import parse_rig
 
 MANIFEST = "manifest.json"
 FORMAT = "rigcal model"
-VERSION = 2
+VERSION = 3
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Variance = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
-Triple = tuple[Finite, Finite, Finite]
+Bounded = Annotated[float, Field(gt=-LARGEST, lt=LARGEST, allow_inf_nan=False)]
+Size = Annotated[float, Field(ge=0.0, le=LARGEST, allow_inf_nan=False)]
+Variance = Annotated[float, Field(ge=0.0, le=LARGEST**2, allow_inf_nan=False)]
+Multiple = Annotated[float, Field(gt=0.0, le=LARGEST, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=0)]
+Triple = tuple[Bounded, Bounded, Bounded]
+
+# Beside KeyError: what the parsers of JSON, TOML, zip archives, npy headers and the learners end with on hostile bytes.
+_UNREADABLE = (
+    *(ArithmeticError, AttributeError, EOFError, IndexError, MemoryError, OSError, RuntimeError, TypeError, ValueError),
+    *(RigError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
+)
 
 
 class _Part(BaseModel):
@@ -58,37 +75,37 @@ class _Placement(_Part):
 class _Parameter(_Part):
     name: str
     unit: str
-    value: Finite
-    standard_error: Finite
-    geometric_stage_value: Finite
-    nominal_stage_value: Finite
+    value: Bounded
+    standard_error: Size
+    geometric_stage_value: Bounded
+    nominal_stage_value: Bounded
 
 
 class _Coefficient(_Part):
     name: str
     unit: str
-    value: Finite
-    standard_error: Variance
-    prior_sigma: Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+    value: Bounded
+    standard_error: Size
+    prior_sigma: Multiple
 
 
 class _Effect(_Part):
     family: str
     where: str
-    settings: dict[str, Finite]
+    settings: dict[str, Bounded]
     coefficients: tuple[_Coefficient, ...]
 
 
 class _Outlier(_Part):
-    row: int
-    sigma: Finite
+    row: Count
+    sigma: Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
 
 class _Trial(_Part):
     kind: str
     before_mm: Finite
     after_mm: Finite
-    p: Finite
+    p: Annotated[float, Field(ge=0.0, le=1.0)]
     kept: bool
 
 
@@ -100,9 +117,14 @@ class _Residual(_Part):
     files: tuple[str, ...]
 
 
+class _Intervals(_Part):
+    axes: tuple[Multiple, Multiple, Multiple]
+    radius: Multiple
+
+
 class _Identifiability(_Part):
-    parameters: int
-    rank: int
+    parameters: Count
+    rank: Count
     unidentifiable: tuple[str, ...]
     marked: tuple[str, ...]
     observability: dict[str, Finite]
@@ -113,21 +135,23 @@ class _Document(_Part):
     placements: dict[str, _Placement]
     parameters: tuple[_Parameter, ...]
     prior: Prior
-    prior_scale: Finite
-    excess_sigma_mm: Finite
-    repeat_sigma_mm: Finite
-    effects_noise_mm: Finite
+    prior_scale: Multiple
+    excess_sigma_mm: Size
+    repeat_sigma_mm: Size
+    effects_noise_mm: Size
     effects: tuple[_Effect, ...]
     effects_reason: str
-    joint_error_scale: Variance
+    joint_error_scale: Size
     identifiability: _Identifiability
-    fixes: dict[str, int]
-    ranges: dict[str, tuple[Finite, Finite]]
+    fixes: dict[str, Count]
+    ranges: dict[str, tuple[Bounded, Bounded]]
     torques: tuple[str, ...]
+    payload: tuple[Variance, Variance] | None
     outliers: tuple[_Outlier, ...]
     residual: _Residual | None
     trials: tuple[_Trial, ...]
     residual_reason: str
+    intervals: _Intervals
     warnings: tuple[str, ...]
     provenance: dict[str, str | int | Finite]
 
@@ -135,6 +159,7 @@ class _Document(_Part):
 def write_model(model: CalibratedModel) -> dict[str, bytes]:
     """All files of a model."""
     learned = model.residual.learner.to_files() if model.residual else {}
+    region = model.residual.region.to_files() if model.residual else {}
     document = _Document(
         rig=model.rig.name,
         placements={
@@ -174,6 +199,7 @@ def write_model(model: CalibratedModel) -> dict[str, bytes]:
         fixes=dict(model.coverage.fixes),
         ranges=dict(model.coverage.ranges),
         torques=model.coverage.torques,
+        payload=model.coverage.payload,
         outliers=tuple(_Outlier(row=o.row, sigma=o.sigma) for o in model.outliers),
         residual=model.residual
         and _Residual(
@@ -187,16 +213,19 @@ def write_model(model: CalibratedModel) -> dict[str, bytes]:
             _Trial(kind=t.kind, before_mm=t.before_mm, after_mm=t.after_mm, p=t.p, kept=t.kept) for t in model.trials
         ),
         residual_reason=model.residual_reason,
+        intervals=_Intervals(**asdict(model.intervals)),
         warnings=model.warnings,
         provenance=dict(model.provenance),
     )
     arrays = io.BytesIO()
-    np.savez(arrays, covariance=model.covariance)
+    refitted: dict[str, Any] = {} if model.base_covariance is None else {"base_covariance": model.base_covariance}
+    np.savez(arrays, covariance=model.covariance, **refitted)
     files = {
         "rig.toml": model.rig_text.encode(),
         "model.json": (document.model_dump_json(indent=1) + "\n").encode(),
         "covariance.npz": arrays.getvalue(),
         **learned,
+        **region,
     }
     listed = {name: {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data)} for name, data in files.items()}
     manifest = {"format": FORMAT, "version": VERSION, "files": listed}
@@ -254,28 +283,39 @@ def read_model(files: Mapping[str, bytes]) -> CalibratedModel:
         rig_text = checked["rig.toml"].decode()
         rig = parse_rig(rig_text, "rig.toml of the model")
         with np.load(io.BytesIO(checked["covariance.npz"]), allow_pickle=False) as arrays:
-            covariance = np.asarray(arrays["covariance"], dtype=np.float64)
+            covariance = float_array(arrays, "covariance")
+            base_covariance = float_array(arrays, "base_covariance") if "base_covariance" in arrays else None
         residual = None
         if document.residual is not None:
             part = document.residual
             learner = LOADERS[part.kind]({name: checked[name] for name in part.files})
-            residual = LearnedResidual(learner, part.signals, part.prisms, np.array(part.excess_variance_mm2))
+            region = Region.from_files(checked)
+            residual = LearnedResidual(learner, part.signals, part.prisms, np.array(part.excess_variance_mm2), region)
     except KeyError as error:
-        raise ModelError(f"the model lacks {error.args[0]}; calibrate again") from error
+        raise ModelError(f"the model lacks {str(error.args[0]).split(' is not a file')[0]}; calibrate again") from error
     except ValidationError as error:
         raise ModelError(f"model.json is malformed ({_first(error)}); calibrate again") from error
-    except (RigError, TypeError, ValueError, zipfile.BadZipFile, EOFError, OSError) as error:
-        raise ModelError(f"the model cannot be read ({error}); calibrate again") from error
+    except _UNREADABLE as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ModelError(f"the model cannot be read ({reason}); calibrate again") from error
+    if (
+        document.rig != rig.name
+        or document.provenance.get("rig_sha256") != hashlib.sha256(rig_text.encode()).hexdigest()
+    ):
+        raise ModelError("rig.toml is not the rig file that the model was calibrated with; calibrate again")
     placements = {
         setup: Placement(np.array(p.rotation), np.array(p.translation_mm)) for setup, p in document.placements.items()
     }
     chain = Chain(rig, placements)
-    _check_parts(document, chain, covariance)
+    _check_parts(document, chain, covariance, base_covariance)
     effects = tuple(_read_effect(part, chain) for part in document.effects)
     if residual is not None:
-        names = feature_names(rig, residual.signals)
-        if not residual.learner.fits(names, len(names) - len(residual.signals)):
+        if not residual.learner.fits(no_features(chain, residual.signals)):
             raise ModelError("the residual was trained on other features than the model's rig has; calibrate again")
+        if not residual.region.fits(len(rig.joints)):
+            raise ModelError("the residual's region does not fit the model's rig; calibrate again")
+        if residual.region.signals != residual.signals:
+            raise ModelError("the residual's region was fitted with other signals than model.json has; calibrate again")
     return CalibratedModel(
         rig=rig,
         rig_text=rig_text,
@@ -296,7 +336,7 @@ def read_model(files: Mapping[str, bytes]) -> CalibratedModel:
             document.identifiability.marked,
             document.identifiability.observability,
         ),
-        coverage=Coverage(document.fixes, document.ranges, document.torques),
+        coverage=Coverage(document.fixes, document.ranges, document.torques, document.payload),
         effects=effects,
         effects_reason=document.effects_reason,
         joint_error_scale=document.joint_error_scale,
@@ -304,25 +344,29 @@ def read_model(files: Mapping[str, bytes]) -> CalibratedModel:
         residual=residual,
         trials=tuple(Trial(t.kind, t.before_mm, t.after_mm, t.p, t.kept) for t in document.trials),
         residual_reason=document.residual_reason,
+        intervals=Intervals(**document.intervals.model_dump()),
+        base_covariance=base_covariance,
         warnings=document.warnings,
         provenance=document.provenance,
     )
 
 
-def _check_parts(document: _Document, chain: Chain, covariance: np.ndarray) -> None:
+def _check_parts(document: _Document, chain: Chain, covariance: np.ndarray, base_covariance: np.ndarray | None) -> None:
     expected = [p.name for p in chain.parameters]
     if [p.name for p in document.parameters] != expected:
         raise ModelError("the parameters of model.json are not those of its rig; calibrate again")
     size = len(expected) + sum(len(effect.coefficients) for effect in document.effects)
-    if covariance.shape != (size, size) or not np.isfinite(covariance).all():
-        raise ModelError("covariance.npz does not fit the parameters and effects of model.json; calibrate again")
-    for setup, placement in document.placements.items():
-        rotation = np.array(placement.rotation)
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6:
-            raise ModelError(f"the base of set-up {setup!r} is no rotation; calibrate again")
-    strange = [name for name in document.ranges if name not in chain.rig.joint_names]
-    if strange:
-        raise ModelError(f"model.json speaks of joint {strange[0]!r}, which its rig lacks; calibrate again")
+    check_covariance(covariance, size, "parameters and effects")
+    if base_covariance is not None:
+        check_covariance(base_covariance, len(expected) - chain.base_start, "set-ups")
+    for setup, placement in chain.placements.items():
+        check_placement(setup, placement)
+    rig = chain.rig
+    check_names((*document.ranges, *document.torques), rig.joint_names, "joint")
+    check_names((*document.fixes, *(document.residual.prisms if document.residual else ())), rig.prism_names, "prism")
+    reversed_ranges = [name for name, (low, high) in document.ranges.items() if low > high]
+    if reversed_ranges:
+        raise ModelError(f"the range of joint {reversed_ranges[0]!r} in model.json ends before it begins")
 
 
 def _read_effect(part: _Effect, chain: Chain) -> FittedEffect:

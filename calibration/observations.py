@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import DataError
+from calibration.limits import on_one_turn
 from calibration.rig import Rig
 
 Floats = NDArray[np.float64]
@@ -25,6 +26,15 @@ LABEL_COLUMNS = ("setup", "session", "pose")
 DIRECTIONS = (-1.0, 0.0, 1.0)
 _MOST_DEG = 36_000.0  # a hundred turns
 _MOST_MM = 1e7  # 10 km
+# What an optional column can be, by how its name ends (the first that fits); what is beyond is in another unit, or
+# noise that would drown every number it meets.
+_POSSIBLE = {
+    "payload_kg": (0.0, 1e5),
+    "_degC": (-100.0, 500.0),
+    "_rate": (-1e5, 1e5),
+    "_Nm": (-1e9, 1e9),
+    "": (-1e12, 1e12),
+}
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _NO_NUMBERS = {"nan", "na", "n/a", "null", "none", "inf", "-inf", "+inf", "infinity", "-"}
 _SIGNAL = re.compile(r"[A-Za-z][A-Za-z0-9_]*_(bar|mA)")
@@ -36,7 +46,8 @@ class Observations:
 
     Attributes:
         prism: (n,) prism of each fix.
-        joints: joint name -> (n,) readings, deg or mm as the rig's joint says.
+        joints: joint name -> (n,) readings, deg or mm as the rig's joint says; from a file, angles are on the turn of
+            the joint's limits (`limits.on_one_turn`).
         position_mm: (n, 3) in the station's frame; NaN rows only where positions were not required.
         sigma_mm: (n, 3) standard deviation of each coordinate; NaN where not given.
         setup: (n,) station set-up; "" where not given.
@@ -165,6 +176,17 @@ def data_sha256(observations: Observations, rig: Rig) -> str:
     return hashlib.sha256(format_observations(observations, rig).encode()).hexdigest()
 
 
+def originals(observations: Observations) -> NDArray[np.intp]:
+    """(n,) the first row with the same readings and position in every digit: later ones are copies, no measurements."""
+    numbers = np.column_stack([*observations.joints.values(), observations.position_mm]).tolist()
+    labels = zip(observations.prism.tolist(), observations.setup.tolist(), strict=True)
+    seen: dict[tuple[object, ...], int] = {}
+    first = [
+        seen.setdefault((*label, *values), row) for row, (label, values) in enumerate(zip(labels, numbers, strict=True))
+    ]
+    return np.array(first, dtype=np.intp)
+
+
 def _cell(value: object) -> str:
     if isinstance(value, float):
         return "" if math.isnan(value) else repr(float(value))
@@ -260,10 +282,13 @@ def _build(table: _Table, header: list[str], rig: Rig, positions_required: bool)
         if name.endswith("_dir"):
             bad = np.isfinite(values) & ~np.isin(values, DIRECTIONS)
             table.check(name, values, bad, "is not a direction; allowed: -1, 0, 1")
+        low, high = next(ends for ending, ends in _POSSIBLE.items() if name.endswith(ending))
+        bad = (values < low) | (values > high)
+        table.check(name, values, bad, f"is beyond what it can be ({low:g} .. {high:g}); is it in another unit?")
     used = {"prism", *(j.column for j in rig.joints), *POSITION_COLUMNS, *SIGMA_COLUMNS, *LABEL_COLUMNS, *extra_names}
     return Observations(
         prism=prism,
-        joints=joints,
+        joints=on_one_turn(rig, joints),
         position_mm=position_mm,
         sigma_mm=sigma_mm,
         setup=table.labels("setup"),

@@ -17,22 +17,27 @@ from calibration.accuracy import joint_error_scale
 from calibration.effects.adoption import Adopted, with_effects
 from calibration.effects.base import Situation
 from calibration.evaluation import Evaluation, evaluate, require_positions
-from calibration.identification.judgement import originals
 from calibration.identification.refinement import Prior
 from calibration.identification.samples import reading_covariance, station_covariance
 from calibration.identification.search.checkpoint import Checkpoint
 from calibration.identification.solve import Solution
-from calibration.methods import TORQUE_NETWORK, WITHOUT_LEARNER, Options, identify_by
-from calibration.model import CalibratedModel, Coverage, LearnedResidual
-from calibration.observations import Observations, data_sha256
-from calibration.residual.features import usable_signals, usable_torques
-from calibration.residual.folds import group_labels
+from calibration.intervals import with_intervals
+from calibration.limits import turns_deg
+from calibration.methods import OWN_LEARNERS, TORQUE_NETWORK, Options, identify_by
+from calibration.model import OUTLIER_SIGMA, CalibratedModel, Coverage, LearnedResidual
+from calibration.observations import Observations, data_sha256, originals
+from calibration.residual.features import usable_loads, usable_signals, usable_torques
+from calibration.residual.folds import group_labels, standstill_labels
 from calibration.residual.hybrid import Decision, Kind, decide, torque_compensation
+from calibration.residual.region import fit_region
 from calibration.rig import Rig
 from calibration.single_thread import SingleThreaded, one_blas_thread
 from calibration.training_warnings import training_warnings
 
+Flags = NDArray[np.bool_]
 Progress = Callable[[float, str], None]
+
+_MEDIAN_LENGTH = 1.538  # of three standard normal numbers
 
 __all__ = [
     "Evaluation",
@@ -40,6 +45,7 @@ __all__ = [
     "compensate_torques",
     "evaluate",
     "identify",
+    "rows_to_learn_from",
     "train_residual",
 ]
 
@@ -98,7 +104,8 @@ def _model(
     # What the kinematics alone found stays in the model; effects are put on top.
     kinematics = replace(adopted.solution, fit=adopted.geometric, additions=None)
     fit, samples = kinematics.fit, kinematics.samples
-    distinct = observations.select(_is_original(observations))
+    original = _is_original(observations)
+    distinct = observations.select(original)
     situation = Situation(kinematics.chain, fit.x, observations)
     model = CalibratedModel(
         rig=rig,
@@ -112,27 +119,36 @@ def _model(
         prior_scale=fit.prior_scale,
         excess_sigma_mm=float(np.sqrt(fit.excess_variance)),
         repeat_sigma_mm=float(np.sqrt(samples.repeat_variance)),
-        effects_noise_mm=_noise_mm(kinematics, observations),
+        effects_noise_mm=_noise_mm(kinematics, distinct),
         identifiability=kinematics.identifiability,
         coverage=Coverage(
             {prism: int((distinct.prism == prism).sum()) for prism in rig.prism_names},
             {name: (float(v.min()), float(v.max())) for name, v in observations.joints.items()},
             tuple(name for name in rig.joint_names if situation.is_torque_measured(name)),
+            _payload(observations),
         ),
         provenance={
             "data_sha256": data_sha256(observations, rig),
             "rig_sha256": hashlib.sha256(rig_text.encode()).hexdigest(),
-            "fixes": len(observations),
+            "fixes": len(distinct),
             **provenance,
             "search": kinematics.search,
             **_versions(),
         },
     )
     model = with_effects(model, adopted)
-    model = replace(model, outliers=model.find_outliers(observations))
+    model = replace(model, outliers=tuple(o for o in model.find_outliers(observations) if original[o.row]))
     model = replace(model, joint_error_scale=joint_error_scale(model, distinct))
-    doubts = (*adopted.warnings, *training_warnings(model, observations, adopted.solution))
+    model = with_intervals(model, distinct)
+    doubts = (*adopted.warnings, *training_warnings(model, distinct, adopted.solution))
     return replace(model, warnings=doubts)
+
+
+def _payload(observations: Observations) -> tuple[float, float] | None:
+    """The lowest and highest `payload_kg`; None where no row has it."""
+    payload = observations.extra.get("payload_kg", np.empty(0))
+    measured = payload[np.isfinite(payload)]
+    return (float(measured.min()), float(measured.max())) if len(measured) else None
 
 
 def train_residual(
@@ -160,20 +176,21 @@ def train_residual(
     """
     report = progress or _silent
     report(0.0, "learning the residual")
-    rows = _without_outliers(model, observations)
-    signals = usable_signals(rows)
+    good = rows_to_learn_from(model, observations)
+    rows = observations.select(good)
+    signals = (*usable_signals(rows), *usable_loads(model.chain, model.values, model.corrected(rows)))
     with _executor(executor) as pool:
         decision = decide(
             model.residual_features(rows, signals),
             model.to_base(rows, rows.position_mm - model.effects_mm(rows)),
             group_labels(rows),
-            rows.cells(),
+            standstill_labels(rows),
             kind=kind,
             seed=seed,
             executor=pool,
             progress=lambda share: report(share, "learning the residual"),
         )
-    return _with_residual(model, rows, decision, signals, seed)
+    return _with_residual(model, observations, good, decision, signals, seed)
 
 
 @one_blas_thread()
@@ -188,44 +205,75 @@ def compensate_torques(model: CalibratedModel, observations: Observations, *, se
     Raises:
         UnsafeError: a set-up that the model does not know.
     """
-    rows = _without_outliers(model, observations)
+    good = rows_to_learn_from(model, observations)
+    rows = observations.select(good)
     torques = usable_torques(model.chain, model.values, rows)
     decision = torque_compensation(
         model.residual_features(rows, torques),
         model.to_base(rows, rows.position_mm - model.effects_mm(rows)),
         group_labels(rows),
-        rows.cells(),
+        standstill_labels(rows),
         torques,
         seed=seed,
     )
-    return _with_residual(model, rows, decision, torques, seed)
+    return _with_residual(model, observations, good, decision, torques, seed)
 
 
-def _without_outliers(model: CalibratedModel, observations: Observations) -> Observations:
+def rows_to_learn_from(model: CalibratedModel, observations: Observations) -> Flags:
+    """(n,) which rows a residual is learned from: neither outliers nor copies of an earlier row.
+
+    Where the kinematics leave much, and that is when there is most to learn, many rows are farther off than noise
+    explains; here an outlier is farther off than the other rows.
+    """
     require_positions(observations)
-    good = np.ones(len(observations), dtype=bool)
-    good[[o.row for o in model.find_outliers(observations)]] = False
-    return observations.select(good & _is_original(observations))
+    size = model.deviations(observations)
+    usual = max(1.0, float(np.median(size)) / _MEDIAN_LENGTH)
+    return _is_original(observations) & (size <= OUTLIER_SIGMA * usual)
 
 
-def _is_original(observations: Observations) -> NDArray[np.bool_]:
+def _is_original(observations: Observations) -> Flags:
     """(n,) False for copies of an earlier row, which are no further measurement."""
     return np.asarray(originals(observations) == np.arange(len(observations)))
 
 
 def _with_residual(
-    model: CalibratedModel, rows: Observations, decision: Decision, signals: tuple[str, ...], seed: int
+    model: CalibratedModel,
+    observations: Observations,
+    good: Flags,
+    decision: Decision,
+    signals: tuple[str, ...],
+    seed: int,
 ) -> CalibratedModel:
-    learned = None
-    if decision.residual is not None:
-        excess = model.unexplained_mm2(rows, decision.variance_mm2)
-        learned = LearnedResidual(decision.residual, signals, tuple(np.unique(rows.prism).tolist()), excess)
-    return replace(
+    told = replace(
         model,
-        residual=learned,
+        residual=None,
         trials=decision.trials,
         residual_reason=decision.reason,
         provenance={**model.provenance, "residual_seed": seed},
+    )
+    distinct = _is_original(observations)
+    if decision.residual is None:
+        return with_intervals(told, observations.select(distinct))
+    rows = observations.select(good)
+    region = fit_region(
+        model.residual_features(rows, signals),
+        model.rig.joints,
+        turns_deg(model.rig),
+        signals,
+        decision.split,
+        decision.residual.predict,
+        next(t.before_mm**2 - t.after_mm**2 for t in decision.trials if t.kind == decision.residual.kind),
+    )
+    excess = model.unexplained_mm2(rows, decision.variance_mm2)
+    prisms = tuple(np.unique(rows.prism).tolist())
+    learned = LearnedResidual(decision.residual, signals, prisms, excess, region)
+    # Trained on all rows, the learner leaves less than those of the folds did.
+    less = np.sqrt(decision.variance_mm2.sum() / (decision.left_mm**2).mean(axis=0).sum())
+    return with_intervals(
+        replace(told, residual=learned),
+        observations.select(distinct),
+        good[distinct],
+        model.to_station(rows, less * decision.left_mm),
     )
 
 
@@ -273,7 +321,7 @@ def calibrate(
         model = train_residual(
             model,
             observations,
-            kind="none" if method in WITHOUT_LEARNER and residual == "default" else residual,
+            kind=OWN_LEARNERS.get(method, residual) if residual == "default" else residual,
             seed=seed,
             executor=executor,
             progress=lambda share, what: report(0.4 + 0.55 * share, what),

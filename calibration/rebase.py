@@ -16,9 +16,14 @@ from calibration.kinematics import Chain, Placement
 from calibration.model import CalibratedModel
 from calibration.observations import Floats, Observations
 
+_ROUNDS = 2  # the residual turns with the base: after the first by a few mrad, then by nothing that is seen
+
 
 def with_refitted_base(model: CalibratedModel, observations: Observations) -> CalibratedModel:
     """The model at the set-ups of these observations.
+
+    A base is fitted to what the whole model leaves, its residual included: one fitted without would take up what the
+    residual has at these few places, and a prediction would add that a second time.
 
     Raises:
         DataError: a prism that the rig lacks.
@@ -42,18 +47,32 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
     # First with the noise of a rough start: beside that of the model, all fixes would look like outliers.
     near = refine(chain, samples, begun, free=moves, additions=additions)
     fit = refine(chain, samples, near.x, free=moves, excess_variance=model.excess_sigma_mm**2, additions=additions)
-    values = fit.x[: len(chain)]
-    geometric = refine(chain, samples, extended(model.geometric_values), free=free).x if model.effects else values
+    effects_values = fit.x[: len(chain)]
+    left = samples
+    for _ in range(_ROUNDS if model.residual is not None else 0):
+        here = replace(model, placements=start.placements, values=fit.x[: len(chain)], covariance=fit.covariance)
+        correction, lacking = here.predictor.correction(observations)
+        left = replace(
+            samples,
+            position_mm=samples.position_mm - samples.average(correction),
+            station_covariance=samples.station_covariance + samples.average(lacking),
+        )
+        fit = refine(chain, left, fit.x, free=moves, excess_variance=0.0, additions=additions)
+    geometric = effects_values
+    if model.effects:
+        geometric = refine(chain, samples, extended(model.geometric_values), free=free).x
     nominal = refine(chain, samples, extended(model.nominal_values), free=free)
     known = np.ones(len(model.covariance), dtype=bool)
     known[body : len(model.values)] = False
     return replace(
         model,
         placements=start.placements,
-        values=values,
-        covariance=_covariance(chain, samples, fit, additions, model.covariance[np.ix_(known, known)]),
+        values=fit.x[: len(chain)],
+        covariance=_covariance(chain, left, fit, additions, model.covariance[np.ix_(known, known)]),
+        base_covariance=fit.covariance[body : len(chain), body : len(chain)],
         geometric_values=geometric,
         nominal_values=nominal.x,
+        intervals=model.intervals.at_other_setups(),
     )
 
 

@@ -8,16 +8,63 @@ Jacobian of the masses' places by the readings, which holds for couplings, prism
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
-from calibration.kernels.lineariser import Lineariser
-from calibration.kinematics import Chain, ChainData, Placement
+from calibration.kernels.machine import Carrier
+from calibration.kinematics import Chain
 from calibration.observations import Floats, Observations
-from calibration.rig import Prism, Rig
+from calibration.rig import Rig
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
 _LEAST_LOAD = 1e-6  # of the largest load; a joint with less than this in every pose carries nothing
+
+
+class GravityLoads:
+    """Gravity's load on the joints of a machine whose parameters stay; build it once and ask for any rows.
+
+    Args:
+        chain: kinematics; where its bases stand plays no part.
+        x: (p,) its parameters.
+    """
+
+    def __init__(self, chain: Chain, x: Floats) -> None:
+        rig = chain.rig
+        self._measured = [(i, f"{j.name}_Nm") for i, j in enumerate(rig.joints) if j.kind == "revolute"]
+        self._carrier: Carrier | None = None
+        if not rig.masses:
+            return
+        frames, offsets_mm, share = _points(rig)
+        self._carrier = Carrier(chain, x, frames, offsets_mm)
+        self._share_newton = STANDARD_GRAVITY * share
+        self._kilograms = np.array([mass.kg for mass in rig.masses])
+        self._payload = np.array([mass.payload for mass in rig.masses])
+        self._direction = np.array(rig.gravity) / np.linalg.norm(rig.gravity)
+        # N mm per deg of a reading are 180 / pi N mm per rad; N mm per mm are N.
+        self._unit = np.array([math.degrees(1.0) / 1e3 if j.kind == "revolute" else 1.0 for j in rig.joints])
+
+    def __call__(self, readings: Floats, extra: Mapping[str, Floats]) -> Floats:
+        """(n, joints) loads, as `gravity_torques` describes them.
+
+        Args:
+            readings: (n, joints) deg or mm.
+            extra: optional columns of the rows; `payload_kg` and `<name>_Nm` count.
+        """
+        if self._carrier is None:
+            load = np.full(readings.shape, np.nan)
+        else:
+            kilograms = np.empty((len(readings), len(self._kilograms)))
+            kilograms[:] = self._kilograms
+            payload = extra.get("payload_kg")
+            if payload is not None:
+                kilograms = np.where(self._payload & np.isfinite(payload)[:, None], payload[:, None], kilograms)
+            load = self._carrier.work(readings, kilograms @ self._share_newton, self._direction) * self._unit
+        for index, column in self._measured:
+            measured = extra.get(column)
+            if measured is not None:
+                load[:, index] = np.where(np.isfinite(measured), measured, load[:, index])
+        return load
 
 
 def gravity_torques(chain: Chain, x: Floats, observations: Observations) -> Floats:
@@ -36,14 +83,8 @@ def gravity_torques(chain: Chain, x: Floats, observations: Observations) -> Floa
     Returns:
         NaN where a torque is neither measured nor, for want of masses, to be computed.
     """
-    rig = chain.rig
-    readings = np.column_stack([observations.joints[name] for name in rig.joint_names])
-    load = _computed(chain, x, readings, observations) if rig.masses else np.full(readings.shape, np.nan)
-    for index, joint in enumerate(rig.joints):
-        measured = observations.extra.get(f"{joint.name}_Nm")
-        if joint.kind == "revolute" and measured is not None:
-            load[:, index] = np.where(np.isfinite(measured), measured, load[:, index])
-    return load
+    readings = np.array([observations.joints[name] for name in chain.joint_index]).T
+    return GravityLoads(chain, x)(readings, observations.extra)
 
 
 def loaded_joints(rig: Rig, torques: Floats) -> tuple[int, ...]:
@@ -60,49 +101,19 @@ def torque_columns(rig: Rig) -> tuple[str, ...]:
     return tuple(f"torque_{j.name}_{'Nm' if j.kind == 'revolute' else 'N'}" for j in rig.joints)
 
 
-def _computed(chain: Chain, x: Floats, readings: Floats, observations: Observations) -> Floats:
-    """(n, joints) loads by the masses of the rig."""
-    rig = chain.rig
-    direction = np.array(rig.gravity) / np.linalg.norm(rig.gravity)
-    weight_newton = STANDARD_GRAVITY * _kilograms(rig, observations)
-    points, mass_of = _points(rig)
-    body = Chain(rig.model_copy(update={"prisms": points}), {"": Placement.identity()})
-    rows = sum(p.kind == "row" for p in chain.parameters)
-    own = np.concatenate([x[:rows], np.zeros(len(body) - rows)])
-    setup = np.zeros(len(readings), dtype=np.intp)
-    load = np.zeros(readings.shape)
-    linearise = Lineariser(body)
-    for point, (mass, share) in enumerate(mass_of):
-        by_joint = linearise(own, ChainData(readings, setup + point, setup)).joint_jacobian
-        lowered = by_joint.transpose(0, 2, 1) @ direction
-        load += share * weight_newton[:, [mass]] * lowered
-    # N mm per deg of a reading are 180 / pi N mm per rad; N mm per mm are N.
-    return load * [math.degrees(1.0) / 1e3 if j.kind == "revolute" else 1.0 for j in rig.joints]
-
-
-def _kilograms(rig: Rig, observations: Observations) -> Floats:
-    """(n, masses) what each mass of the rig weighs in each row."""
-    kg = np.tile([mass.kg for mass in rig.masses], (len(observations), 1))
-    payload = observations.extra.get("payload_kg")
-    if payload is not None:
-        carried = np.array([mass.payload for mass in rig.masses])
-        kg = np.where(carried & np.isfinite(payload)[:, None], payload[:, None], kg)
-    return kg
-
-
-def _points(rig: Rig) -> tuple[tuple[Prism, ...], tuple[tuple[int, float], ...]]:
-    """Points of the machine, and which mass hangs at each with which share.
+def _points(rig: Rig) -> tuple[list[int], Floats, Floats]:
+    """Points at which the masses hang: their frames, (m, 3) places in them, and (masses, m) the share of each mass.
 
     A mass midway between two origins is half at each: that has the same weight, moment and energy.
     """
-    places: list[tuple[int, tuple[float, float, float]]] = []
-    shares: list[tuple[int, float]] = []
+    origin = (0.0, 0.0, 0.0)
+    places: list[tuple[int, tuple[float, float, float], int, float]] = []
     for index, mass in enumerate(rig.masses):
         if mass.centre_mm is not None:
-            places.append((mass.frame, mass.centre_mm))
-            shares.append((index, 1.0))
+            places.append((mass.frame, mass.centre_mm, index, 1.0))
         else:
-            places += [(mass.frame, (0.0, 0.0, 0.0)), (mass.frame + 1, (0.0, 0.0, 0.0))]
-            shares += [(index, 0.5), (index, 0.5)]
-    points = tuple(Prism(name=f"mass{i}", frame=frame, offset_mm=place) for i, (frame, place) in enumerate(places))
-    return points, tuple(shares)
+            places += [(mass.frame, origin, index, 0.5), (mass.frame + 1, origin, index, 0.5)]
+    share = np.zeros((len(rig.masses), len(places)))
+    for point, (_, _, index, part) in enumerate(places):
+        share[index, point] = part
+    return [place[0] for place in places], np.array([place[1] for place in places]), share

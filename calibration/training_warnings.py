@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 
 from calibration.identification.solve import Solution
+from calibration.limits import beyond_limits
 from calibration.model import CalibratedModel
 from calibration.observations import Observations
 
@@ -14,7 +15,7 @@ _BADLY = 0.3  # of what build tolerances explain
 _FAR_RAD = math.radians(10.0)
 _PULLED = 4.0  # build tolerances
 _IMMOBILE = 0.01  # of the span between a joint's limits
-_BEYOND_LIMITS = 0.05
+_BEYOND_LIMITS = 0.05  # of the same
 _TOO_SMALL = 0.3  # of the expected scatter
 _FEW_FIXES = 6
 
@@ -24,7 +25,7 @@ def training_warnings(model: CalibratedModel, observations: Observations, soluti
 
     Args:
         model: the model with its outliers.
-        observations: the rows that it was fitted to.
+        observations: the rows that it was fitted to, each once where there are copies.
         solution: what it was made from.
     """
     yield from solution.warnings
@@ -70,9 +71,8 @@ def _of_coverage(model: CalibratedModel, observations: Observations) -> Iterator
                 f"{joint.name} never moved ({low:.2f} .. {high:.2f} {joint.unit}); "
                 f"what only its motion shows stays at its prior"
             )
-        margin = _BEYOND_LIMITS * (joint.limits[1] - joint.limits[0])
         values = observations.joints[joint.name]
-        beyond = int(((values < joint.limits[0] - margin) | (values > joint.limits[1] + margin)).sum())
+        beyond = int(beyond_limits(joint, values, _BEYOND_LIMITS).sum())
         if beyond:
             yield (
                 f"{joint.name}: {beyond} of {len(values)} readings are beyond its limits {joint.limits[0]:g} .. "

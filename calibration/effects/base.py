@@ -15,7 +15,7 @@ from scipy.stats import qmc
 from calibration.kinematics import Chain
 from calibration.observations import Floats, Observations
 from calibration.rig import Joint, Rig
-from calibration.torques import gravity_torques
+from calibration.torques import GravityLoads
 
 _VOLUME_POSES = 256
 _LEAST_LOAD = 1e-6  # of the largest on any revolute joint; less is rounding
@@ -48,11 +48,13 @@ class Situation:
     Attributes:
         chain, x: kinematics and its parameters (p,), for the loads; where the base stands plays no part.
         observations: n rows.
+        loads: those of chain and x, where they have been prepared.
     """
 
     chain: Chain
     x: Floats
     observations: Observations
+    loads: GravityLoads | None = None
 
     def __len__(self) -> int:
         return len(self.observations)
@@ -68,11 +70,12 @@ class Situation:
 
     def extra(self, column: str) -> Floats:
         """(n,) an optional column, NaN where it was not measured."""
-        return self.observations.extra.get(column, np.full(len(self), np.nan))
+        measured = self.observations.extra.get(column)
+        return np.full(len(self), np.nan) if measured is None else measured
 
     def torque(self, joint: str) -> Floats:
         """(n,) load on a joint, N m or N; NaN where it is not known."""
-        return self._torques[:, self.rig.joint_names.index(joint)]
+        return self._torques[:, self.chain.joint_index[joint]]
 
     def is_torque_measured(self, joint: str) -> bool:
         """Whether most rows have the joint's own torque column."""
@@ -80,7 +83,9 @@ class Situation:
 
     @cached_property
     def _torques(self) -> Floats:
-        return gravity_torques(self.chain, self.x, self.observations)
+        loads = self.loads or GravityLoads(self.chain, self.x)
+        joints = self.observations.joints
+        return loads(np.array([joints[name] for name in self.chain.joint_index]).T, self.observations.extra)
 
     @cached_property
     def work_volume(self) -> Situation:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import accumulate
 
 import numpy as np
 
 from calibration.effects.base import Settings, Situation
 from calibration.effects.library import library
 from calibration.identification.additions import Additions
+from calibration.kinematics import Chain
 from calibration.observations import Floats, Observations
 
 _CHANCE = 2.0  # standard errors
@@ -107,41 +109,69 @@ def joined(parts: Sequence[Additions], rows: int) -> Additions:
     )
 
 
-def fitted_additions(effects: Sequence[FittedEffect], situation: Situation) -> Additions:
-    """The coefficients of a model's effects, for other observations.
+class AppliedEffects:
+    """A model's effects, prepared for any observations of its rig.
 
     An effect does nothing in rows that lack what it needs.
+
+    Args:
+        effects: with k coefficients together.
+        chain: whose joints they are at.
+
+    Attributes:
+        joint: (k,) index of the joint that each coefficient changes.
     """
-    parts = [
-        _additions(
-            effect.family,
-            effect.where,
-            effect.settings,
-            [c.name for c in effect.coefficients],
-            [c.prior_sigma for c in effect.coefficients],
-            situation,
-        )
-        for effect in effects
-    ]
-    return joined(parts, len(situation))
+
+    def __init__(self, effects: Sequence[FittedEffect], chain: Chain) -> None:
+        ends = list(accumulate((len(effect.coefficients) for effect in effects), initial=0))
+        self._parts = [(library()[effect.family], effect, slice(*ends[i : i + 2])) for i, effect in enumerate(effects)]
+        at = [chain.joint_index[effect.where] for effect in effects]
+        self.joint = np.repeat(np.array(at, dtype=np.intp), np.diff(ends))
+        self._by_joint = np.zeros((ends[-1], len(chain.joint_index)))
+        self._by_joint[np.arange(ends[-1]), self.joint] = coefficient_values(effects)
+        # Most effects lack nothing ever; what the others leave open does not depend on the rows.
+        self._unknown = [
+            (family, effect.where, joint, _left_open(effect))
+            for (family, effect, _), joint in zip(self._parts, at, strict=True)
+            if family.needs(effect.where)
+        ]
+
+    def columns(self, situation: Situation) -> Floats:
+        """(n, k) change of each coefficient's joint, deg or mm, per unit of the coefficient."""
+        out = np.empty((len(situation), len(self.joint)))
+        for family, effect, own in self._parts:
+            out[:, own] = family.columns(situation, effect.where, effect.settings)
+        return out
+
+    def change(self, columns: Floats) -> Floats:
+        """(n, joints) by what the coefficients with these columns change the joints, deg or mm."""
+        change: Floats = columns @ self._by_joint
+        return change
+
+    def unknown_variance(self, situation: Situation) -> Floats:
+        """(n, joints) variance of the joints' values in rows that lack what an effect needs, deg^2 or mm^2."""
+        out = np.zeros((len(situation), self._by_joint.shape[1]))
+        for family, where, joint, variance in self._unknown:
+            known = family.known(situation, where)
+            if not known.all():
+                out[~known, joint] += variance
+        return out
+
+
+def fitted_additions(effects: Sequence[FittedEffect], situation: Situation) -> Additions:
+    """The coefficients of a model's effects, for other observations."""
+    applied = AppliedEffects(effects, situation.chain)
+    return Additions(
+        tuple(f"{effect.family}@{effect.where}:{c.name}" for effect in effects for c in effect.coefficients),
+        applied.joint,
+        applied.columns(situation),
+        np.array([c.prior_sigma for effect in effects for c in effect.coefficients]),
+    )
 
 
 def coefficient_values(effects: Sequence[FittedEffect]) -> Floats:
     """(k,) values of all coefficients, in the order of `fitted_additions`."""
     return np.array([c.value for effect in effects for c in effect.coefficients])
-
-
-def unknown_variance(effects: Sequence[FittedEffect], situation: Situation) -> Floats:
-    """(n, joints) variance of the joints' values by effects in rows that lack what they need, deg^2 or mm^2."""
-    out = np.zeros((len(situation), len(situation.rig.joints)))
-    for effect in effects:
-        family = library()[effect.family]
-        values = np.array([c.value for c in effect.coefficients])
-        plausible = np.array([c.prior_sigma for c in effect.coefficients])
-        lacking = ~family.known(situation, effect.where)
-        joint = situation.rig.joint_names.index(effect.where)
-        out[lacking, joint] += family.unknown_variance(values, plausible, effect.settings)
-    return out
 
 
 def corrected(observations: Observations, change: Floats, names: Sequence[str]) -> Observations:
@@ -162,6 +192,13 @@ def left_out(effects: Sequence[FittedEffect], situation: Situation) -> tuple[str
                 f"{effect.family}@{effect.where} is left out{rows}: this data lacks {family.needs(effect.where)}"
             )
     return tuple(sentences)
+
+
+def _left_open(effect: FittedEffect) -> float:
+    """Mean square of what an effect does to its joint where what it needs is not known, deg^2 or mm^2."""
+    values = np.array([c.value for c in effect.coefficients])
+    plausible = np.array([c.prior_sigma for c in effect.coefficients])
+    return library()[effect.family].unknown_variance(values, plausible, effect.settings)
 
 
 def _additions(

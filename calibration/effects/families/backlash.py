@@ -12,7 +12,7 @@ from calibration.observations import Floats
 
 
 class Backlash(JointFamily):
-    """The joint lags by half the play on the side it came from."""
+    """The encoder lags behind the joint by half the play, on the side it came from."""
 
     name: ClassVar[str] = "backlash"
     equation: ClassVar[str] = "d_theta = width / 2 * direction of the last motion (column <joint>_dir)"
@@ -35,8 +35,8 @@ class Backlash(JointFamily):
 
     def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
         del settings
-        direction = np.nan_to_num(situation.extra(f"{where}_dir"))
-        change: Floats = np.degrees(0.5) * direction[:, None]
+        direction = situation.extra(f"{where}_dir")
+        change: Floats = np.degrees(0.5) * np.where(np.isfinite(direction), direction, 0.0)[:, None]
         return change
 
     def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:

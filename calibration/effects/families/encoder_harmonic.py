@@ -35,7 +35,7 @@ class EncoderHarmonic(JointFamily):
 
     def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
         angle = settings["k"] * np.radians(situation.reading(where))
-        change: Floats = np.degrees(np.column_stack([np.cos(angle), np.sin(angle)]))
+        change: Floats = np.degrees(np.array([np.cos(angle), np.sin(angle)])).T
         return change
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.effects.base import Coefficient, JointFamily, Settings, Situation
+from calibration.kernels.jit import compiled
 from calibration.observations import Floats
 
 _LINEAR = "compliance_rad_per_Nm"
@@ -89,11 +91,7 @@ class JointCompliance(JointFamily):
 
     def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
         known = self.known(situation, where)
-        torque = np.where(known, situation.torque(where), 0.0)
-        columns = torque[:, None]
-        if settings:
-            columns = np.hstack([columns, known[:, None] * _curves(torque, settings)])
-        return np.degrees(columns)
+        return np.degrees(known[:, None] * _columns(np.where(known, situation.torque(where), 0.0), settings))
 
     def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
         """Of a link that may point anywhere up or down: its load goes as the sine between those of training."""
@@ -101,10 +99,12 @@ class JointCompliance(JointFamily):
         low, high = (settings["low_Nm"], settings["high_Nm"]) if "low_Nm" in settings else (-most, most)
         turns = np.sin(np.linspace(-0.5, 0.5, _UNKNOWN_LOADS) * np.pi)
         torque = 0.5 * (low + high) + 0.5 * (high - low) * turns
-        columns = torque[:, None]
-        if settings:
-            columns = np.hstack([columns, _curves(torque, settings)])
-        return float(np.mean(np.degrees(columns @ values) ** 2))
+        return float(np.mean(np.degrees(_columns(torque, settings) @ values) ** 2))
+
+
+def _columns(torque: Floats, settings: Settings) -> Floats:
+    """(n, k) deflection in rad per unit of each coefficient."""
+    return np.hstack([torque[:, None], _curves(torque, settings)]) if settings else torque[:, None]
 
 
 def _curves(torque: Floats, settings: Settings) -> Floats:
@@ -112,31 +112,50 @@ def _curves(torque: Floats, settings: Settings) -> Floats:
 
     The straight line that fits each best over the whole range is taken from it, so that the compliance is the mean one.
     """
-    spread = np.linspace(0.0, 1.0, _KNOTS + 2)
-    whole = np.linspace(-1.0, 1.0, 201)
     if "torque_Nm" in settings:
-        s = torque / settings["torque_Nm"]
-        knots = spread ** settings["knot_power"]
-        curves, over = _bent(s, knots) - _bent(-s, knots), _bent(whole, knots) - _bent(-whole, knots)
-    else:
-        low, high = settings["low_Nm"], settings["high_Nm"]
-        s = (2.0 * torque - low - high) / (high - low)
-        knots = 2.0 * spread - 1.0
-        curves, over = _bent(s, knots), _bent(whole, knots)
-    line = np.polynomial.polynomial.polyfit(whole, over, 1)
-    straightened: Floats = curves - line[0] - s[:, None] * line[1]
-    return straightened
+        return _straightened(torque / settings["torque_Nm"], settings["knot_power"])
+    low, high = settings["low_Nm"], settings["high_Nm"]
+    return _straightened((2.0 * torque - low - high) / (high - low), None)
 
 
-def _bent(s: Floats, knots: Floats) -> Floats:
-    """(n, inner knots) cubic splines whose slope changes by 1 about one of the knots.
+def _straightened(s: Floats, knot_power: float | None) -> Floats:
+    """(n, knots) splines at loads between -1 and 1, symmetric ones where the knots have a power."""
+    knots, line = _shape(knot_power)
+    out = np.empty((len(s), _KNOTS))
+    _bent(np.ascontiguousarray(s), knots, line, knot_power is not None, out)
+    return out
+
+
+@cache
+def _shape(knot_power: float | None) -> tuple[Floats, Floats]:
+    """Knots, and (2, knots) the straight lines that fit the splines best between -1 and 1."""
+    spread = np.linspace(0.0, 1.0, _KNOTS + 2)
+    knots = 2.0 * spread - 1.0 if knot_power is None else spread**knot_power
+    whole = np.linspace(-1.0, 1.0, 201)
+    over = np.empty((len(whole), _KNOTS))
+    _bent(whole, knots, np.zeros((2, _KNOTS)), knot_power is not None, over)
+    return knots, np.asarray(np.polynomial.polynomial.polyfit(whole, over, 1), dtype=np.float64)
+
+
+@compiled
+def _bent(s: Floats, knots: Floats, line: Floats, symmetric: bool, out: Floats) -> None:
+    """Fill `out` (n, inner knots) with cubic splines whose slope changes by 1 about one of the knots, less `line`.
 
     The second derivative is a triangle from the knot before to the knot behind.
     """
-    cubes, steps = np.abs(s[:, None] - knots) ** 3, np.diff(knots)
-    slopes = np.diff(cubes, axis=1) / steps
-    bent: Floats = np.diff(slopes, axis=1) / (6.0 * (steps[:-1] + steps[1:]))
-    return bent
+    for n in range(len(s)):
+        for k in range(out.shape[1]):
+            left, at, right = knots[k], knots[k + 1], knots[k + 2]
+            value = _triangle(s[n], left, at, right)
+            if symmetric:
+                value -= _triangle(-s[n], left, at, right)
+            out[n, k] = value - line[0, k] - s[n] * line[1, k]
+
+
+@compiled
+def _triangle(s: float, left: float, at: float, right: float) -> float:
+    a, b, c = abs(s - left) ** 3, abs(s - at) ** 3, abs(s - right) ** 3
+    return ((c - b) / (right - at) - (b - a) / (at - left)) / (6.0 * (right - left))
 
 
 FAMILY = JointCompliance()
