@@ -19,11 +19,11 @@ from calibration.identification.solve import Solution
 from calibration.observations import Floats, Observations
 from calibration.pipeline import calibrate, evaluate
 from calibration.published.second_paper import km, skcm
-from calibration.residual.features import features, usable_torques
-from calibration.residual.folds import group_labels
+from calibration.residual.features import usable_torques
+from calibration.residual.folds import group_labels, standstill_labels
 from calibration.residual.hybrid import torque_compensation
 from calibration.rig import Rig
-from tests.calibration.conftest import rig_text
+from tests.calibration.conftest import features, rig_text
 from tests.calibration.simulated_ys100 import linear, robot, stiffening
 
 METHODS = ("nominal", "KM", "SKCM", "RBF-TCM", "rigcal")
@@ -73,7 +73,7 @@ def _compensated_mm(solution: Solution, training: Observations, held_out: Observ
         features(chain, x, training, names),
         _error_mm(solution, x, training) @ rotation,
         group_labels(training),
-        training.cells(),
+        standstill_labels(training),
         names,
         seed=seed,
     )

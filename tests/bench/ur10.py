@@ -57,7 +57,7 @@ def main() -> None:
 def _rigcal(*arguments: str) -> dict[str, list[dict[str, float]]]:
     command = [sys.executable, "-m", "daemon.cli.main", *arguments, "--json"]
     result: dict[str, list[dict[str, float]]] = json.loads(
-        subprocess.run(command, check=True, capture_output=True).stdout
+        subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout
     )
     return result
 

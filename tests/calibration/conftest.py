@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -11,9 +11,12 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
+from calibration.kernels.machine import Machine
+from calibration.kinematics import Chain
 from calibration.model import CalibratedModel
-from calibration.observations import Observations, parse_observations
+from calibration.observations import Floats, Observations, parse_observations
 from calibration.pipeline import identify
+from calibration.residual.features import Extractor, Features
 from calibration.rig import Rig, shipped_rig
 from simulators.dataset import simulate_observations
 from simulators.truth import RigTruth
@@ -41,6 +44,12 @@ def simulated(truth: RigTruth, fixes: int, seed: int, setup: str = "", repeats: 
         truth, fixes // repeats, seed, prisms_per_pose="one", noise_mm=3.0, setup=setup, repeats=repeats
     )
     return parse_observations(data.csv_text().encode(), truth.rig, "simulated.csv")
+
+
+def features(chain: Chain, x: Floats, observations: Observations, signals: Sequence[str]) -> Features:
+    """What a residual learner sees of observations: `Extractor` for kinematics without a model."""
+    data = chain.bind(observations)
+    return Extractor(chain, x, signals)(data.readings, Machine(chain, x).linearise(data), observations.extra)
 
 
 def rms(error_mm: np.ndarray) -> float:

@@ -5,6 +5,7 @@ import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -19,6 +20,8 @@ from calibration.published.zhou2022.motion import single_joint_rows, standstills
 from calibration.published.zhou2022.protocol import Protocol, run_protocol
 from calibration.published.zhou2022.table3 import Experiment
 from calibration.published.zhou2022.trajectory import tip_path
+from calibration.residual.hybrid import Kind
+from calibration.residual_comparison import RESIDUALS
 from calibration.rig import Rig, parse_rig, shipped_rig
 from simulators.dataset import simulate_observations
 from simulators.effects import parse_effects
@@ -60,7 +63,7 @@ def torso() -> tuple[Rig, str, Observations, Observations]:
 @pytest.fixture(scope="module")
 def ys100() -> tuple[Rig, Observations, Observations, Comparison]:
     rig, training, held_out = robot(1001, stiffening(1001))
-    found = compare(rig, rig_text("ys100"), training, held_out, clock=clock, methods=METHODS[:-1])
+    found = compare(rig, rig_text("ys100"), training, held_out, clock=clock, methods=METHODS[:-1], residuals=())
     return rig, training, held_out, found
 
 
@@ -124,6 +127,67 @@ def test_where_no_method_applies_the_default_s_reason_is_the_error() -> None:
     with pytest.raises(UnsafeError) as found:
         compare(rig, rig_text("ys100"), few, held_out, clock=clock, methods=("default", "km"))
     assert str(found.value) == str(alone.value)
+
+
+@pytest.fixture(scope="module")
+def drooping() -> tuple[Observations, Observations, Comparison]:
+    """A boom that droops, its effects found or not; the held-out rows stand at another set-up."""
+    rig = shipped_rig("swdt82")
+    truth = RigTruth(rig, 1003, effects=parse_effects("boom_droop@boom,encoder_harmonic@theta3:k=3"))
+    training, held_out = (
+        parsed(simulate_observations(truth, 25, seed, setup=setup).csv_text(), rig)
+        for seed, setup in ((1, "east"), (2, "west"))
+    )
+    found = compare(
+        rig,
+        rig_text("swdt82"),
+        training,
+        held_out,
+        clock=clock,
+        methods=("default",),
+        residuals=("effects", "table", "rbfn-paper", "rbfn"),
+        refit_base=True,
+    )
+    return training, held_out, found
+
+
+def test_every_learner_there_is_can_be_compared() -> None:
+    assert sorted(RESIDUALS) == sorted(["effects", "table", "rbfn-paper", *set(get_args(Kind)) - {"default", "none"}])
+
+
+def test_residuals_share_one_identification_and_differ_in_what_is_learned(
+    drooping: tuple[Observations, Observations, Comparison],
+) -> None:
+    found = drooping[-1]
+    assert [r.method for r in found.results] == ["nominal", "effects", "table", "rbfn-paper", "rbfn", "default"]
+    assert all(r.reason is None for r in found.results)
+    _, bare, table, paper, network, _ = found.results
+    assert bare.adds == tuple(family for family in table.adds if family != "table")
+    assert paper.adds == (*bare.adds, "rbfn-paper")
+    mean = {r.method: float(r.error_mm.mean()) for r in found.results if r.error_mm is not None}
+    trained = {r.method: float(r.training_error_mm.mean()) for r in found.results if r.training_error_mm is not None}
+    assert mean["rbfn"] <= mean["effects"]
+    assert trained["table"] < trained["effects"]
+    assert trained["rbfn-paper"] < trained["effects"]
+    assert network.adds == (*bare.adds, "rbfn") or any("left out" in note for note in network.notes)
+
+
+def test_the_paper_s_network_is_reported_with_its_best_width_beside(
+    drooping: tuple[Observations, Observations, Comparison],
+) -> None:
+    (note,) = drooping[-1].results[3].notes
+    assert "theta = 0.05" in note
+    assert "at the best for each prism" in note
+
+
+def test_without_a_residual_the_figures_are_those_of_the_effects(
+    drooping: tuple[Observations, Observations, Comparison],
+) -> None:
+    training, held_out, found = drooping
+    model = pipeline.identify(shipped_rig("swdt82"), rig_text("swdt82"), training)
+    stage = pipeline.evaluate(model, held_out, refit_base=True).stages()[2]
+    assert stage["stage"] == "effects"
+    assert found.results[1].as_dict()["rms_mm"] == pytest.approx(stage["rms_mm"], rel=1e-9)
 
 
 def test_rows_and_poses_that_training_and_held_out_data_share_are_named() -> None:

@@ -88,8 +88,8 @@ def test_a_manifest_of_arbitrary_bytes_is_refused(session: Session, data: bytes)
 
 def test_a_model_of_another_version_says_which(session: Session) -> None:
     files = session.model.to_files()
-    manifest = json.loads(files["manifest.json"]) | {"version": 1}
-    with pytest.raises(ModelError, match="version 1, this program reads version 2"):
+    manifest = json.loads(files["manifest.json"]) | {"version": 2}
+    with pytest.raises(ModelError, match="version 2, this program reads version 3"):
         CalibratedModel.from_files(files | {"manifest.json": json.dumps(manifest).encode()})
 
 
@@ -143,6 +143,95 @@ def test_a_signed_model_that_contradicts_itself_is_refused(
 def test_a_signed_file_of_rubbish_is_refused(session: Session, name: str, data: bytes) -> None:
     with pytest.raises(ModelError):
         CalibratedModel.from_files(resigned(session.model.to_files(), name, data))
+
+
+def archive(**arrays: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]  # its stub takes the names for allow_pickle
+    return buffer.getvalue()
+
+
+BASE = ("placements", "")
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        ((*BASE, "rotation"), [[1, 0, 0], [0, 1, 0], [0, 0, -1]], "no rotation"),
+        ((*BASE, "rotation"), [[1e200, 1e200, 0], [1e200, -1e200, 0], [0, 0, 1]], "rotation"),
+        ((*BASE, "translation_mm", 0), 1e9, "translation_mm"),
+        (("parameters", 3, "value"), 1e300, "value"),
+        (("parameters", 3, "geometric_stage_value"), -1e9, "geometric_stage_value"),
+        (("parameters", 0, "standard_error"), -1.0, "standard_error"),
+        (("prior_scale",), 0.0, "prior_scale"),
+        (("excess_sigma_mm",), -5.0, "excess_sigma_mm"),
+        (("excess_sigma_mm",), 1e200, "excess_sigma_mm"),
+        (("repeat_sigma_mm",), -1.0, "repeat_sigma_mm"),
+        (("effects_noise_mm",), -1.0, "effects_noise_mm"),
+        (("joint_error_scale",), 1e308, "joint_error_scale"),
+        (("intervals", "radius"), 1e300, "radius"),
+        (("residual", "prisms"), ["p99"], "prism 'p99', which its rig lacks"),
+        (("residual", "excess_variance_mm2", 0), 1e300, "excess_variance_mm2"),
+        (("fixes",), {"p99": 3}, "prism 'p99', which its rig lacks"),
+        (("ranges", "theta3"), [9.0, -9.0], "ends before it begins"),
+        (("torques",), ["theta99"], "theta99"),
+        (("outliers",), [{"row": -5, "sigma": 6.0}], "row"),
+    ],
+)
+def test_a_signed_model_of_no_machine_is_refused(
+    with_residual: CalibratedModel, path: tuple[str | int, ...], value: object, message: str
+) -> None:
+    files = with_residual.to_files()
+    document = json.loads(files["model.json"])
+    part = document
+    for key in path[:-1]:
+        part = part[key]
+    part[path[-1]] = value
+    with pytest.raises(ModelError, match=message):
+        CalibratedModel.from_files(resigned(files, "model.json", json.dumps(document).encode()))
+
+
+@pytest.mark.parametrize(
+    "damage", ["negative", "one-sided", "beyond its variances", "huge", "complex", "words", "flat"]
+)
+def test_a_matrix_that_is_no_covariance_is_refused(session: Session, damage: str) -> None:
+    covariance = session.model.covariance
+    scale = np.sqrt(np.diag(covariance))
+    damaged = {
+        "negative": -covariance,
+        "one-sided": np.triu(covariance),
+        "beyond its variances": np.outer(scale, scale) * (2.0 - np.eye(len(scale))),
+        "huge": covariance * 1e300,
+        "complex": covariance + 1j,
+        "words": covariance.astype(str),
+        "flat": covariance.ravel(),
+    }[damage]
+    with pytest.raises(ModelError, match="covariance"):
+        CalibratedModel.from_files(resigned(session.model.to_files(), "covariance.npz", archive(covariance=damaged)))
+
+
+def test_files_that_break_their_parsers_are_refused(with_residual: CalibratedModel) -> None:
+    files = with_residual.to_files()
+    compressed = io.BytesIO()
+    np.savez_compressed(compressed, covariance=with_residual.covariance)
+    stream = bytearray(compressed.getvalue())
+    stream[100:200] = bytes(100)
+    deep = b"[" * 100_000
+    encrypted = bytearray(files["covariance.npz"])
+    encrypted[encrypted.index(b"PK\x01\x02") + 8] |= 1
+    for name, data in (
+        ("lightgbm.json", deep),
+        ("model.json", deep),
+        ("rig.toml", b"a = " + deep),
+        ("covariance.npz", bytes(stream)),
+        ("covariance.npz", bytes(encrypted)),
+        ("rbfn.npz", b"PK\x03\x04"),
+    ):
+        assert name in files
+        with pytest.raises(ModelError) as refused:
+            CalibratedModel.from_files(resigned(files, name, data))
+        assert "\n" not in str(refused.value)
+        assert str(refused.value).endswith("calibrate again")
 
 
 def test_pickled_arrays_are_not_loaded(session: Session) -> None:

@@ -51,6 +51,8 @@ def test_the_report_is_the_contracts_json_object(session: Session) -> None:
         "ignored_columns",
         "expected_accuracy",
         "axes",
+        "importance",
+        "intervals",
     ]
     assert (report["rig"], report["n"], report["seconds"]) == ("swdt82", 500, 1.5)
     assert [s["stage"] for s in report["stages"]] == ["nominal", "geometric", "effects", "hybrid"]

@@ -14,16 +14,16 @@ from calibration.effects.fitted import coefficient_values, corrected, fitted_add
 from calibration.errors import DataError, UnsafeError
 from calibration.identification.solve import Solution, place
 from calibration.kinematics import Chain
-from calibration.model import CalibratedModel, LearnedResidual
+from calibration.model import CalibratedModel
 from calibration.observations import Floats, Observations
-from calibration.pipeline import identify
+from calibration.pipeline import compensate_torques, identify
 from calibration.published.second_paper import km, require_torques, skcm
-from calibration.residual.features import Features, features, missing_signals, usable_torques
+from calibration.residual.features import Features, missing_signals, usable_torques
 from calibration.residual.hybrid import LOADERS, torque_compensation
 from calibration.residual.torque_network import TorqueNetwork, fit_torque_network
 from calibration.rig import Rig, parse_rig, shipped_rig
 from calibration.torques import gravity_torques, torque_columns
-from tests.calibration.conftest import rig_text, rms, simulated
+from tests.calibration.conftest import features, rig_text, rms, simulated
 from tests.calibration.simulated_ys100 import linear, robot, stiffening
 
 RIGS = Path(__file__).parent.parent / "rigs"
@@ -240,9 +240,8 @@ def test_the_network_comes_back_from_its_files_the_same(compensated) -> None:
     again = LOADERS["rbf-tcm"](network.to_files())
     np.testing.assert_array_equal(again.predict(seen), network.predict(seen))
     assert again.kind == "rbf-tcm"
-    geometry = seen.geometry.shape[1]
-    assert again.fits(seen.names, geometry)
-    assert not again.fits(seen.names[:-1], geometry)
+    assert again.fits(seen)
+    assert not again.fits(replace(seen, names=seen.names[:-1]))
 
 
 def test_a_network_whose_parts_do_not_fit_is_refused(compensated) -> None:
@@ -258,7 +257,7 @@ def test_the_first_unit_stands_where_the_error_is_largest_and_units_are_never_mo
     rng = np.random.default_rng(0)
     torques = rng.uniform(-100.0, 100.0, (90, 2))
     target = np.column_stack([np.sin(torques[:, 0] / 8.0), np.cos(torques[:, 1] / 9.0), rng.normal(0.0, 0.01, 90)])
-    seen = Features(("q_deg", "torque_a_Nm", "torque_b_Nm"), np.zeros((90, 1)), torques)
+    seen = Features(("q_deg", "torque_a_Nm", "torque_b_Nm"), np.zeros((90, 1)), torques, *2 * [np.empty((90, 3, 0))])
     labels = np.arange(90).astype(np.str_)
     network = fit_torque_network(seen, target, labels, seen.names[1:], seed=0).network
     assert len(network.units) <= 40
@@ -268,7 +267,7 @@ def test_the_first_unit_stands_where_the_error_is_largest_and_units_are_never_mo
 
 
 def test_too_few_rows_make_no_network() -> None:
-    seen = Features(("torque_a_Nm",), np.empty((8, 0)), np.arange(8.0)[:, None])
+    seen = Features(("torque_a_Nm",), np.empty((8, 0)), np.arange(8.0)[:, None], *2 * [np.empty((8, 3, 0))])
     labels = np.arange(8).astype(np.str_)
     decision = torque_compensation(seen, np.ones((8, 3)), labels, labels, seen.names, seed=0)
     assert decision.residual is None
@@ -310,11 +309,9 @@ def test_every_rig_with_masses_can_be_compensated() -> None:
 
 
 def test_a_model_with_the_network_predicts_the_same_from_its_files(compensated) -> None:
-    solution, network, training, held_out = compensated
+    solution, _, training, held_out = compensated
     rig = solution.chain.rig
-    model = identify(rig, rig_text(rig.name), training)
-    learned = LearnedResidual(network, network.names, ("tool",), np.zeros(3))
-    with_network = replace(model, residual=learned)
+    with_network = compensate_torques(identify(rig, rig_text(rig.name), training, method="km"), training)
     correction = with_network.correction_mm(held_out)
     assert rms(correction) > 0.05
     np.testing.assert_allclose(

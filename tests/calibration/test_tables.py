@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -65,11 +66,34 @@ def test_optional_columns_are_kept_and_strange_ones_are_listed() -> None:
             "column sigma_x_mm: 0 is not a standard deviation",
         ),
         (HEADER.encode() + b"\n\xff\xfe", "line 2: byte .* is not UTF-8"),
+        *[
+            (
+                f"{HEADER},{column}\n{ROW},\n{ROW},{value}\n",
+                rf"line 3, column {column}: {re.escape(f'{float(value):g}')} is beyond what it can be .*another unit",
+            )
+            for column, value in [
+                ("payload_kg", "-500"),
+                ("payload_kg", "110000"),
+                ("temperature_degC", "-300"),
+                ("temperature_degC", "1e300"),
+                ("q3_rate", "1e300"),
+                ("q4_Nm", "-1e300"),
+                ("boom_valve_mA", "1e300"),
+                ("lift_bar", "1e13"),
+                ("time_s", "1e300"),
+            ]
+        ],
     ],
 )
 def test_a_bad_file_is_refused_with_its_place(text: str | bytes, message: str) -> None:
     with pytest.raises(DataError, match=message):
         parse(text)
+
+
+def test_what_optional_columns_can_be_is_wide() -> None:
+    columns = {"payload_kg": 1e5, "temperature_degC": -40.0, "q1_rate": -720.0, "q1_Nm": -1e6, "time_s": 1.7e9}
+    table = parse(f"{HEADER},{','.join(columns)}\n{ROW},{','.join(map(str, columns.values()))}\n")
+    assert {name: values.tolist() for name, values in table.extra.items()} == {k: [v] for k, v in columns.items()}
 
 
 @given(st.binary(max_size=400) | st.text(max_size=400).map(lambda t: f"{HEADER}\n{t}".encode()))

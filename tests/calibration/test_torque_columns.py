@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calibration.errors import CalibrationError
 from calibration.kinematics import Chain
-from calibration.observations import Observations, parse_observations
+from calibration.model import CalibratedModel
+from calibration.observations import Floats, Observations, parse_observations
 from calibration.pipeline import evaluate, identify
 from calibration.rig import Rig, shipped_rig
 from calibration.torques import gravity_torques
@@ -18,6 +20,12 @@ from simulators.truth import RigTruth
 from tests.calibration.conftest import rig_text, rms
 
 EFFECTS = "joint_compliance@theta2:compliance_rad_per_Nm=4e-7,joint_compliance@theta3:compliance_rad_per_Nm=6e-7"
+
+
+def weighed(rows: Observations, payload: Floats | None) -> Observations:
+    """With these payloads in place of the rows' own, and without measured torques."""
+    extra = {name: values for name, values in rows.extra.items() if not name.endswith("_Nm") and name != "payload_kg"}
+    return replace(rows, extra=extra if payload is None else {**extra, "payload_kg": payload})
 
 
 def fixes(rig: Rig, truth: RigTruth, poses: int, seed: int, sign: float) -> Observations:
@@ -58,3 +66,68 @@ def test_coefficients_of_effects_count_among_what_the_data_must_determine() -> N
     coefficients = sum(len(effect.coefficients) for effect in full.effects)
     assert coefficients > 0
     assert full.identifiability.parameters == plain.identifiability.parameters + coefficients
+
+
+@pytest.fixture(scope="module")
+def carrying() -> CalibratedModel:
+    """A model of an arm that carried 0 to 110 kg in training."""
+    rig = shipped_rig("ys100")
+    payload = np.random.default_rng(7).uniform(0.0, 110.0, 60)
+    payload[:2] = 0.0, 110.0
+    truth = RigTruth(rig, 5, perturbation=0.6, effects=parse_effects(EFFECTS))
+    data = simulate_observations(truth, 60, 5, noise_mm=0.03, columns={"payload_kg": payload})
+    rows = parse_observations(data.csv_text().encode(), rig, "simulated.csv")
+    return identify(rig, rig_text("ys100"), rows, effects="joint_compliance@theta2,joint_compliance@theta3")
+
+
+def of_payload(model: CalibratedModel, rows: Observations) -> list[str]:
+    return [doubt for doubt in model.doubts(rows) if "payload" in doubt]
+
+
+def test_a_payload_that_training_did_not_have_is_named(carrying: CalibratedModel) -> None:
+    rig = carrying.rig
+    rows = fixes(rig, RigTruth(rig, 5), 40, 8, 1.0)
+    inside, heavy, gappy = (np.full(40, kg) for kg in (60.0, 60.0, 60.0))
+    heavy[:7], gappy[:5] = 400.0, np.nan
+    assert carrying.coverage.payload == (0.0, 110.0)
+    assert of_payload(carrying, weighed(rows, inside)) == []
+    assert of_payload(carrying, weighed(rows, heavy)) == [
+        "payload_kg: 7 of 40 rows are outside the 0 .. 110 kg of the training data; the loads that effects and "
+        "residual use are beyond what was seen"
+    ]
+    missing = "payload_kg is missing in {} of 40 rows: the rig file's payload is taken there"
+    assert of_payload(carrying, weighed(rows, gappy)) == [missing.format(5)]
+    assert of_payload(carrying, weighed(rows, None)) == [missing.format(40)]
+    again = CalibratedModel.from_files(carrying.to_files())
+    assert again.doubts(weighed(rows, heavy)) == carrying.doubts(weighed(rows, heavy))
+
+
+def test_a_payload_says_nothing_where_no_load_is_computed_from_it(carrying: CalibratedModel) -> None:
+    rig = carrying.rig
+    measured = fixes(rig, RigTruth(rig, 5), 40, 8, 1.0)
+    assert of_payload(carrying, measured) == []  # it is in the torques
+    heavy = weighed(measured, np.full(40, 400.0))
+    assert of_payload(replace(carrying, effects=(), covariance=carrying.covariance[:-2, :-2]), heavy) == []
+
+
+def test_a_payload_where_training_had_the_rig_files_own_is_named(carrying: CalibratedModel) -> None:
+    rig = carrying.rig
+    rows = fixes(rig, RigTruth(rig, 5), 40, 8, 1.0)
+    plain = replace(carrying, coverage=replace(carrying.coverage, payload=None))
+    assert of_payload(plain, weighed(rows, None)) == []
+    assert of_payload(plain, weighed(rows, np.full(40, 110.0))) == []
+    (said,) = of_payload(plain, weighed(rows, np.full(40, 20.0)))
+    assert said.startswith("payload_kg: 40 of 40 rows are outside the 110 .. 110 kg of the training data")
+
+
+def test_a_prediction_that_is_not_finite_is_refused(carrying: CalibratedModel) -> None:
+    rig = carrying.rig
+    rows = fixes(rig, RigTruth(rig, 5), 40, 8, 1.0)
+    strange = np.arange(40) == 17
+    endless = replace(rows, extra={**rows.extra, "theta2_rate": np.where(strange, 1e200, 0.0)})
+    with np.errstate(over="ignore", invalid="ignore"), pytest.raises(CalibrationError, match="prediction of row 17"):
+        carrying.predict(endless)
+    heavy = replace(rows, extra={**rows.extra, "theta2_Nm": np.where(strange, 1.7e308, 0.0)})
+    for use in (carrying.predict, carrying.effects_mm, carrying.predictor.parts):
+        with np.errstate(all="ignore"), pytest.raises(CalibrationError, match="prediction of row 17"):
+            use(heavy)

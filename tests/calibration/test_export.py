@@ -1,0 +1,70 @@
+"""A model for other programs: what it says, and how well its grid stands for it."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibration.errors import DataError
+from calibration.export import correction_grid, document
+from calibration.kinematics import Chain, Placement
+from tests.calibration.conftest import Session, rms
+
+
+def test_the_document_holds_every_parameter_with_its_unit_and_error(session: Session) -> None:
+    told = json.loads(json.dumps(document(session.model), allow_nan=False))
+    parameters = {p["name"]: p for p in told["parameters"]}
+    assert len(parameters) == sum(p.kind != "base" for p in session.model.parameters)
+    length = parameters["row5.a"]
+    assert (length["unit"], length["nominal"]) == ("mm", 5000.0)
+    assert length["value"] == pytest.approx(length["nominal"] + length["correction"])
+    assert 0.0 < length["standard_error"] < 6.0
+    assert told["provenance"]["data_sha256"] == session.model.provenance["data_sha256"]
+    assert told["expected_accuracy"]["rms_mm"] > 0.0
+
+
+def test_the_documents_parameters_and_base_are_the_models_kinematics(session: Session) -> None:
+    """Whoever puts the values of the document into the row convention gets the model's positions."""
+    told = json.loads(json.dumps(document(session.model)))
+    (base,) = told["bases"]
+    chain = Chain(session.rig, {"": Placement(np.array(base["rotation"]), np.array(base["translation_mm"]))})
+    corrections = {p["name"]: p["correction"] for p in told["parameters"]}
+    x = np.array([corrections.get(p.name, 0.0) for p in chain.parameters])
+    rows = session.held_out.select(np.arange(20))
+    np.testing.assert_allclose(
+        chain.positions_mm(x, chain.bind(rows)), session.model.geometric_mm(rows), rtol=0, atol=1e-6
+    )
+
+
+def test_the_grid_interpolated_linearly_is_close_to_the_model(session: Session) -> None:
+    grid = correction_grid(session.model, ("r",), 20_000, np.random.default_rng(0))
+    assert len(grid.readings) <= 20_000
+    size = rms(grid.corrected_mm["r"] - grid.nominal_mm["r"])
+    assert grid.rms_mm < 0.15 * size, "what is left of the correction by drawings alone"
+    coarse = correction_grid(session.model, ("r",), 2_000, np.random.default_rng(0))
+    assert grid.rms_mm < 0.7 * coarse.rms_mm, "more nodes come closer"
+    at_nodes = grid.correction_mm("r", grid.readings[::977])
+    np.testing.assert_allclose(at_nodes, (grid.corrected_mm["r"] - grid.nominal_mm["r"])[::977], atol=1e-9)
+
+
+def test_nodes_span_what_the_model_was_trained_on_and_joints_that_matter_get_more(session: Session) -> None:
+    grid = correction_grid(session.model, ("w",), 2_000, np.random.default_rng(0))
+    for name, nodes in grid.nodes.items():
+        assert (nodes[0], nodes[-1]) == session.model.coverage.ranges[name]
+        assert (np.diff(nodes) > 0).all()
+    assert {name for name, nodes in grid.nodes.items() if len(nodes) > 2} == {"theta1", "theta3"}, "all that moves w"
+    assert 0.5 < grid.reachable.mean() <= 1.0
+
+
+def test_a_joint_that_stood_still_in_training_has_nodes_around_its_place(session: Session) -> None:
+    ranges = dict(session.model.coverage.ranges) | {"L2": (700.0, 700.0)}
+    model = replace(session.model, coverage=replace(session.model.coverage, ranges=ranges))
+    assert correction_grid(model, ("r",), 600, np.random.default_rng(0)).nodes["L2"].tolist() == [699.5, 700.5]
+
+
+def test_what_makes_no_grid_is_refused(session: Session) -> None:
+    with pytest.raises(DataError, match="no prism 'x'"):
+        correction_grid(session.model, ("x",), 2_000, np.random.default_rng(0))
+    with pytest.raises(DataError, match="make 512 poses"):
+        correction_grid(session.model, ("r",), 511, np.random.default_rng(0))
