@@ -162,8 +162,12 @@ def decoders(config: Config, source: RigSource, *, time_scale: float = 1.0) -> d
         factories = decoder_factories(source.rig, source.directory, section.name, time_scale=time_scale)
 
         made[section.name] = partial(_can_decoder, section.name, factories)
+        _check_identifiers(section.name, config.own_identifiers(section.name), factories)
     for station in config.station:
         made[station.name] = partial(StationDecoder, station)
+    if config.tip is not None and config.tip.prism not in source.rig.prism_names:
+        prisms = ", ".join(source.rig.prism_names)
+        raise ConfigError(f"tip.prism: rig {source.rig.name!r} has no prism {config.tip.prism!r}; it has {prisms}")
     missing = sorted({c.link for c in source.rig.channels} - set(made))
     if missing:
         raise ConfigError(
@@ -181,6 +185,17 @@ def joiner(config: Config, rig: Rig) -> ObservationJoiner:
         link_delay_s={station.name: station.link_delay_s for station in config.station},
         settle_s=config.sessions.settle_s,
     )
+
+
+def _check_identifiers(link: str, own: Sequence[int], factories: Sequence[Callable[[], ChannelDecoder]]) -> None:
+    """Refuse own messages under an identifier that a device of the rig sends."""
+    for factory in factories:
+        channel = factory()
+        if channel.arbitration_id in own and not channel.is_extended:
+            raise ConfigError(
+                f"tip.can.arbitration_id: {channel.arbitration_id:03X}h is what channel {channel.name!r} is read from "
+                f"on link {link!r}; choose another"
+            )
 
 
 def _can_decoder(link: str, factories: Sequence[Callable[[], ChannelDecoder]]) -> Decoder:
@@ -204,7 +219,10 @@ def _parts(
         if section.interface == "playback":
             played.append(_playback(section, config, clock))
         else:
-            can_links.append(_can_link(section, section.interface, source, clock, is_simulated=mode == "simulated"))
+            own, is_simulated = config.own_identifiers(section.name), mode == "simulated"
+            can_links.append(
+                _can_link(section, section.interface, source, clock, own_identifiers=own, is_simulated=is_simulated)
+            )
     stations = [StationLink(station, clock) for station in config.station]
     return Parts(
         mode=mode,
@@ -231,7 +249,13 @@ def _playback(section: CanSection, config: Config, clock: Clock) -> ReplayLink:
 
 
 def _can_link(
-    section: CanSection, interface: Interface, source: RigSource, clock: Clock, *, is_simulated: bool
+    section: CanSection,
+    interface: Interface,
+    source: RigSource,
+    clock: Clock,
+    *,
+    own_identifiers: tuple[int, ...],
+    is_simulated: bool,
 ) -> CanLink:
     config = CanLinkConfig(
         name=section.name,
@@ -240,6 +264,7 @@ def _can_link(
         bitrate=section.bitrate,
         allow_transmit=section.allow_transmit,
         transmit_nodes=section.transmit_nodes,
+        own_identifiers=own_identifiers,
         sync_period_ms=section.sync_period_ms,
         options=section.options,
     )

@@ -9,7 +9,9 @@ from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from drivers.can_transmit import is_free
 from drivers.station import StationConfig
+from drivers.tip_frames import FRAMES
 
 MAX_SOCKET_PATH_BYTES = 107  # unix(7): sun_path holds 108 bytes with the closing zero
 
@@ -92,6 +94,45 @@ class JobsSection(_Section):
     seed: int = 0
 
 
+class TipCanSection(_Section):
+    """The live corrected tip on a CAN link: two frames a time, as docs/tip-frames.md has them.
+
+    Attributes:
+        link: name of a [[can]] link that may transmit.
+        arbitration_id: 11-bit identifier of the first frame; the second has the next one. Both must be free in CANopen,
+            680h to 6DFh.
+    """
+
+    link: str
+    arbitration_id: int
+
+    @property
+    def identifiers(self) -> tuple[int, ...]:
+        """Identifiers of all its frames."""
+        return tuple(range(self.arbitration_id, self.arbitration_id + FRAMES))
+
+    @field_validator("arbitration_id")
+    @classmethod
+    def _is_free(cls, first: int) -> int:
+        if not all(is_free(identifier) for identifier in range(first, first + FRAMES)):
+            raise ValueError("CANopen leaves 680h to 6DFh free, and two identifiers are needed: give 0x680 to 0x6DE")
+        return first
+
+
+class TipSection(_Section):
+    """The live corrected tip.
+
+    Attributes:
+        prism: which prism's place it is, where a command names none.
+        rate_hz: how often it is sent.
+        can: where it is sent; nowhere when absent.
+    """
+
+    prism: str
+    rate_hz: float = Field(default=5.0, gt=0, le=20)
+    can: TipCanSection | None = None
+
+
 class Config(_Section):
     """Everything `rigcal run` needs to know.
 
@@ -108,6 +149,7 @@ class Config(_Section):
     station: tuple[StationConfig, ...] = ()
     sessions: SessionsSection = SessionsSection()
     jobs: JobsSection = JobsSection()
+    tip: TipSection | None = None
 
     @model_validator(mode="after")
     def _names_differ(self) -> Config:
@@ -116,6 +158,23 @@ class Config(_Section):
         if doubled:
             raise ValueError(f"two links are called {doubled[0]!r}; every [[can]] and [[station]] needs its own name")
         return self
+
+    @model_validator(mode="after")
+    def _the_tip_may_be_sent(self) -> Config:
+        if self.tip is None or self.tip.can is None:
+            return self
+        wanted = self.tip.can.link
+        link = next((section for section in self.can if section.name == wanted), None)
+        if link is None:
+            raise ValueError(f"tip.can.link is {wanted!r}, and no [[can]] link is called so")
+        if not link.allow_transmit:
+            raise ValueError(f"tip.can needs allow_transmit = true on link {wanted!r}; CAN is listen-only without")
+        return self
+
+    def own_identifiers(self, link: str) -> tuple[int, ...]:
+        """Identifiers of rigcal's own messages on a CAN link."""
+        can = self.tip.can if self.tip is not None else None
+        return can.identifiers if can is not None and can.link == link else ()
 
     @property
     def store_path(self) -> Path:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.errors import CalibrationError
+from calibration.errors import CalibrationError, ModelError
 from calibration.model import CalibratedModel
 from calibration.observations import Observations, parse_observations
 from calibration.rig import Rig
@@ -64,13 +64,18 @@ def perform(order: Order, progress: Progress) -> dict[str, Any]:
 
     Returns:
         What the store keeps: `model` (its directory), `manifest_sha256`, `stage`, `metrics`, `sessions`; for a
-        report `report` (the file) and `evaluation` (the contract's object).
+        report `report` (the file) and `evaluation` (the contract's object); for a comparison `comparison`.
 
     Raises:
         CalibrationError: in a sentence, what is wrong with data or result.
     """
     prepare()
-    work = {"identification": _identify, "residual": _train_residual, "report": _report}[order.kind]
+    work = {
+        "identification": _identify,
+        "residual": _train_residual,
+        "report": _report,
+        "comparison": _compare,
+    }[order.kind]
     return work(order, progress)
 
 
@@ -91,7 +96,7 @@ def _identify(order: Order, progress: Progress) -> dict[str, Any]:
 def _train_residual(order: Order, progress: Progress) -> dict[str, Any]:
     from calibration import pipeline
 
-    model = read_model(Path(str(order.model)))
+    model = read_model(Path(str(order.model)), order.model_sha256)
     observations = _observations(order, model.rig, order.train_ids)
     model = pipeline.train_residual(model, observations, seed=order.seed, progress=progress)
     return _write(order, model, "hybrid", observations, order.train_ids)
@@ -104,7 +109,7 @@ def _report(order: Order, progress: Progress) -> dict[str, Any]:
 
     progress(0.0, "evaluating")
     directory = Path(str(order.model))
-    model = read_model(directory)
+    model = read_model(directory, order.model_sha256)
     training = pipeline.evaluate(model, _observations(order, model.rig, order.train_ids))
     held_out = None
     if order.session_ids:
@@ -125,6 +130,33 @@ def _report(order: Order, progress: Progress) -> dict[str, Any]:
         "held_out": held_out is not None,
         "evaluation": judged.as_dict(0.0),
     }
+
+
+def _compare(order: Order, progress: Progress) -> dict[str, Any]:
+    """The candidate beside the live model, on sessions that neither was trained on."""
+    result: dict[str, Any] = {"model": order.model, "sessions": list(order.train_ids)}
+    about = {
+        "manifest_sha256": order.model_sha256,
+        "live": order.live_id,
+        "live_manifest_sha256": order.live_sha256,
+        "sessions": list(order.session_ids),
+    }
+    if not order.session_ids:
+        sentence = "no check session holds fixes that neither model was trained on; nothing can be compared yet"
+        return result | {"comparison": about | {"is_better": False, "sentence": sentence}}
+    from calibration.promotion import compare_held_out
+
+    progress(0.0, "comparing with the live model")
+    candidate = read_model(Path(str(order.model)), order.model_sha256)
+    live, note = None, ""
+    if order.live_model is not None:
+        try:
+            live = read_model(Path(order.live_model), order.live_sha256)
+        except ModelError as error:
+            # What cannot be used any more must not keep a good model from its place; the operator sees why.
+            note = f"the live model cannot be read ({error}); "
+    compared = compare_held_out(candidate, live, _observations(order, candidate.rig, order.session_ids)).as_dict()
+    return result | {"comparison": about | compared | {"sentence": f"{note}{compared['sentence']}"}}
 
 
 def _rig_text(order: Order) -> str:

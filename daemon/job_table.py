@@ -7,13 +7,13 @@ process does meet here, and the second of the two finds what the first one did.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from typing import Any
 
 from daemon.config import Config
-from daemon.control import CommandError
+from daemon.control import REFUSED, CommandError
+from daemon.model_table import ModelRow, ModelTable, trained_on
 from daemon.order import Order, Outcome, Progress
-from daemon.scheduler import CHECK, DueChain, JobFacts, JobKind, SessionFacts, State
+from daemon.scheduler import CHECK, CHECKS, DueChain, JobFacts, JobKind, SessionFacts, State
 from daemon.store.reader import Reader
 from daemon.store.store import Store
 from drivers.clock import Clock
@@ -64,6 +64,7 @@ class JobTable:
         self._store = store
         self._rig = rig_name
         self._clock = clock
+        self._models = ModelTable(store, rig_name, clock)
         self._cancelled: set[int] = set()  # running jobs that the operator wants to end
 
     # ---- what is there -----------------------------------------------------------------------------------------------
@@ -110,15 +111,19 @@ class JobTable:
 
     def order(self, job: JobFacts, config: Config) -> Order:
         """What a job's process is asked to do: the sessions were settled when the job was queued."""
-        (row,) = self._store.rows("SELECT depends_on, through_session_id FROM jobs WHERE id = ?", (job.id,))
+        (row,) = self._store.rows("SELECT depends_on, through_session_id, model_id FROM jobs WHERE id = ?", (job.id,))
         sessions = self._store.rows(_WORKED_ON, (self._rig, row["through_session_id"]))
         training = tuple(s["id"] for s in sessions if s["kind"] != CHECK)
         checks = tuple(s["id"] for s in sessions if s["kind"] == CHECK)
+        if row["model_id"] is not None:
+            return self._comparison(job, config, self._models.get(row["model_id"]), checks)
         if row["depends_on"] is None:
             before = self._store.rows(_NEWEST_MODEL, (self._rig,))
         else:
             before = self._store.rows("SELECT result_json FROM jobs WHERE id = ?", (row["depends_on"],))
         result = json.loads(before[0]["result_json"]) if before else {}
+        if job.kind is JobKind.COMPARISON:
+            return self._comparison(job, config, self._models.at(result["model"]), checks)
         return Order(
             kind=job.kind.value,
             job_id=job.id,
@@ -126,26 +131,45 @@ class JobTable:
             models_directory=str(config.models_directory),
             session_ids=checks if job.kind is JobKind.REPORT else training,
             model=result.get("model"),
+            model_sha256=result.get("manifest_sha256"),
             train_ids=tuple(result.get("sessions", training)),
             seed=config.jobs.seed,
+        )
+
+    def _comparison(self, job: JobFacts, config: Config, model: ModelRow, checks: tuple[str, ...]) -> Order:
+        """A model beside the live one, on the check sessions that neither was trained on."""
+        live = self._models.live()
+        if live is not None and live.id == model.id:
+            live = None  # it is live already, and only the nominal model is left to compare it with
+        seen = trained_on([model, live])
+        return Order(
+            kind=job.kind.value,
+            job_id=job.id,
+            store=str(config.store_path),
+            models_directory=str(config.models_directory),
+            session_ids=tuple(name for name in checks if name not in seen),
+            model=str(model.path),
+            model_sha256=model.manifest_sha256,
+            train_ids=model.sessions,
+            seed=config.jobs.seed,
+            live_model=str(live.path) if live else None,
+            live_sha256=live.manifest_sha256 if live else None,
+            live_id=live.id if live else None,
         )
 
     # ---- what the runner does ----------------------------------------------------------------------------------------
 
     def queue(self, due: DueChain) -> None:
-        """Queue new jobs, each to run after the one before it."""
+        """Queue new jobs: training in its order, and what checks a model after the job that makes it, and nothing else.
+
+        A report that fails thus keeps no comparison from running, nor the other way round.
+        """
         with self._store.transaction():
-            before: int | None = None
+            made_by: int | None = None
             for kind in due.kinds:
-                row = {
-                    "kind": kind.value,
-                    "session_id": due.session_id,
-                    "through_session_id": due.through_id,
-                    "state": "queued",
-                    "depends_on": before,
-                    **self._store.instant(self._clock.now(), "created_"),
-                }
-                before = self._store.insert("jobs", row)
+                job_id = self._add(kind, due.session_id, due.through_id, depends_on=made_by)
+                if kind not in CHECKS:
+                    made_by = job_id
 
     def offer_again(self, job_id: int) -> bool:
         """Queue an interrupted job again; False if it is interrupted no more."""
@@ -206,7 +230,9 @@ class JobTable:
                 **ended,
             )
             if outcome.result is not None and "manifest_sha256" in outcome.result:
-                self._add_model(job_id, outcome.result)
+                self._models.add(job_id, outcome.result)
+            if outcome.result is not None and "comparison" in outcome.result:
+                self._models.note_comparison(outcome.result["model"], outcome.result["comparison"])
             if outcome.state in {"failed", "cancelled"}:
                 for waiting in self._chain(job_id)[1:]:
                     if waiting["state"] in {"queued", "interrupted"}:
@@ -264,7 +290,50 @@ class JobTable:
                 self._set(waiting["id"], state="queued", progress=0.0, message="", error=None, attempts=0)
             return f"job {job['id']} ({job['kind']}) is queued again"
 
+    def compare(self, model: ModelRow) -> str:
+        """Queue a comparison of a model with the live one, on all check sessions that are closed.
+
+        Returns:
+            a sentence for the operator.
+
+        Raises:
+            CommandError: no check session is closed.
+        """
+        closed = self._store.rows(
+            "SELECT id, kind FROM calibration_sessions WHERE rig = ? AND state = 'closed' ORDER BY rowid", (self._rig,)
+        )
+        checks = [session["id"] for session in closed if session["kind"] == CHECK]
+        if not checks:
+            raise CommandError(
+                "no check session is closed, so nothing is held out to compare on; hold one with `rigcal session "
+                "start --kind check`",
+                REFUSED,
+            )
+        job_id = self._add(JobKind.COMPARISON, checks[-1], closed[-1]["id"], model_id=model.id)
+        return f"job {job_id} will compare model {model.id} with the live one"
+
     # ---- parts -------------------------------------------------------------------------------------------------------
+
+    def _add(
+        self,
+        kind: JobKind,
+        session_id: str,
+        through_id: str,
+        *,
+        depends_on: int | None = None,
+        model_id: int | None = None,
+    ) -> int:
+        """Queue a job; its number."""
+        row = {
+            "kind": kind.value,
+            "session_id": session_id,
+            "through_session_id": through_id,
+            "state": "queued",
+            "depends_on": depends_on,
+            "model_id": model_id,
+            **self._store.instant(self._clock.now(), "created_"),
+        }
+        return self._store.insert("jobs", row)
 
     def _job(self, job_id: object) -> dict[str, Any]:
         found = isinstance(job_id, int) and self._store.rows(
@@ -280,16 +349,3 @@ class JobTable:
 
     def _set(self, job_id: int, **columns: object) -> None:
         self._store.update("jobs", {"id": job_id}, columns)
-
-    def _add_model(self, job_id: int, result: Mapping[str, Any]) -> None:
-        row = {
-            "rig": self._rig,
-            "path": result["model"],
-            "manifest_sha256": result["manifest_sha256"],
-            "stage": result["stage"],
-            "state": "candidate",
-            "job_id": job_id,
-            "metrics_json": result["metrics"],
-            **self._store.instant(self._clock.now(), "created_"),
-        }
-        self._store.insert("models", row)

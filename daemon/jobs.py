@@ -12,8 +12,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from daemon.config import Config
+from daemon.control import REFUSED, CommandError
 from daemon.job_child import JOB_COMMAND, JobChild
 from daemon.job_table import CANCELLED, JobTable
+from daemon.model_table import ModelRow
 from daemon.order import Outcome
 from daemon.scheduler import DueChain, JobFacts, due_jobs, next_job, spent_jobs
 from daemon.store.store import Store
@@ -63,6 +65,20 @@ class JobRunner:
     def unfinished(self) -> list[dict[str, Any]]:
         """Jobs that run, wait, or will be offered again, without results, newest last: what `status` shows."""
         return self._table.unfinished()
+
+    def compare(self, model: ModelRow) -> str:
+        """Queue a comparison of a model with the live one and say so.
+
+        Raises:
+            CommandError: nothing is held out, or no job would ever run.
+        """
+        if not self._settings.enabled:
+            raise CommandError(
+                f"model {model.id} cannot be compared: jobs are switched off; set [jobs] enabled = true in the "
+                "configuration and start rigcal again",
+                REFUSED,
+            )
+        return self._table.compare(model)
 
     # ---- commands of the operator ------------------------------------------------------------------------------------
 

@@ -44,6 +44,25 @@ class JoinedFix:
         return {**self.values, **({} if self.dwell_s is None else {"dwell_s": self.dwell_s})}
 
 
+@dataclass(frozen=True)
+class MachineState:
+    """All that is known of the machine at the newest instant at which every joint is known.
+
+    Attributes:
+        monotonic_ns: that instant.
+        boot_id: which boot `monotonic_ns` belongs to.
+        oldest: the joint that was last read then; the others were read then or later.
+        values: observations CSV column -> number, as of a JoinedFix.
+        dwell_s: as of a JoinedFix.
+    """
+
+    monotonic_ns: int
+    boot_id: str
+    oldest: str
+    values: Mapping[str, float]
+    dwell_s: float | None
+
+
 def joint_inputs(rig: Rig) -> list[JointInput]:
     """The joints of a rig, for an ObservationJoiner.
 
@@ -122,6 +141,16 @@ class ObservationJoiner:
             self._newest_ns = max(self._newest_ns, now.monotonic_ns)
         return self._release()
 
+    def latest(self) -> MachineState | str:
+        """The machine at the newest instant at which every joint is known, or why there is none."""
+        last = min(self._joints.values(), key=lambda joint: joint.newest_ns)
+        if last.newest_ns < 0:
+            return f"{last.name}: no reading yet"
+        values, missing = self._values(last.newest_ns, "the newest instant that all joints were read")
+        if missing:
+            return missing
+        return MachineState(last.newest_ns, self._boot_id, last.name, values, self._motion.at(last.newest_ns)[0])
+
     def _restart(self, boot_id: str) -> list[JoinedFix]:
         """Another boot, another monotonic clock: nothing of the one before can be compared with it."""
         ended = [self._join(fix, stamp) for fix, stamp in self._pending]
@@ -162,13 +191,20 @@ class ObservationJoiner:
         return done
 
     def _join(self, fix: Fix, stamp: Stamp) -> JoinedFix:
-        at_ns = stamp.monotonic_ns
+        values, refused = self._values(stamp.monotonic_ns, "the fix")
+        if refused:
+            self.refusals[refused] += 1
+        dwell_s, standstill = self._motion.at(stamp.monotonic_ns)
+        return JoinedFix(fix, stamp, values, dwell_s, standstill, refused)
+
+    def _values(self, at_ns: int, of: str) -> tuple[dict[str, float], str]:
+        """Columns of joints and signals at an instant, and why a joint is missing among them; "" if none is."""
         values: dict[str, float] = {}
-        refused = ""
+        missing = ""
         for joint in self._joints.values():
-            found = joint.at(at_ns)
+            found = joint.at(at_ns, of)
             if isinstance(found, str):
-                refused = refused or f"{joint.name}: {found}"
+                missing = missing or f"{joint.name}: {found}"
                 continue
             values[f"{joint.name}_{joint.unit}"] = found.value
             values[f"{joint.name}_dir"] = float(found.direction)
@@ -178,7 +214,4 @@ class ObservationJoiner:
             value = signal.at(at_ns)
             if value is not None:
                 values[signal.column] = value
-        if refused:
-            self.refusals[refused] += 1
-        dwell_s, standstill = self._motion.at(at_ns)
-        return JoinedFix(fix, stamp, values, dwell_s, standstill, refused)
+        return values, missing

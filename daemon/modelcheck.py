@@ -15,6 +15,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from calibration.errors import CalibrationError, ModelError
+from calibration.model_checks import LARGEST
 from calibration.observations import Observations
 from daemon.numba_cache import prepare
 
@@ -28,7 +29,7 @@ def encode(files: Mapping[str, bytes]) -> bytes:
 
 
 def main() -> int:
-    """Load the model on standard input and predict with it at the middle of every joint's range."""
+    """Load the model on standard input and predict with it."""
     files = {name: base64.b64decode(text) for name, text in json.load(sys.stdin.buffer).items()}
     prepare()
     try:
@@ -40,21 +41,37 @@ def main() -> int:
 
 
 def _smoke_test(files: Mapping[str, bytes]) -> None:
+    """Every prism at every set-up, at the middle of the joints' limits and where the residual was trained."""
     from calibration.model import CalibratedModel
 
     model = CalibratedModel.from_files(files)
-    n = len(model.rig.prism_names)
-    middle = Observations(
-        prism=np.array(model.rig.prism_names),
-        joints={joint.name: np.full(n, sum(joint.limits) / 2) for joint in model.rig.joints},
+    prisms, setups = model.rig.prism_names, tuple(model.placements)
+    poses = np.array([[sum(joint.limits) / 2 for joint in model.rig.joints]])
+    if model.residual is not None:
+        poses = np.concatenate([poses, model.residual.region.poses])
+    n = len(poses) * len(prisms) * len(setups)
+    rows = Observations(
+        prism=np.tile(np.repeat(np.array(prisms), len(poses)), len(setups)),
+        joints={
+            joint.name: np.tile(readings, len(prisms) * len(setups))
+            for joint, readings in zip(model.rig.joints, poses.T, strict=True)
+        },
         position_mm=np.full((n, 3), np.nan),
         sigma_mm=np.full((n, 3), np.nan),
-        setup=np.full(n, next(iter(model.placements))),
+        setup=np.repeat(np.array(setups), len(poses) * len(prisms)),
         session=np.full(n, ""),
         pose=np.full(n, ""),
     )
-    if not np.isfinite(model.predict(middle).position_mm).all():
-        raise ModelError("the model predicts no finite position; restore it or calibrate again")
+    try:
+        predicted = model.predict(rows)
+    except (CalibrationError, ArithmeticError, LookupError, TypeError, ValueError) as error:
+        # Infinite numbers, or parts that do not fit each other; predicting needs nothing of this machine.
+        reason = " ".join(str(error).split())
+        raise ModelError(f"the model cannot predict ({reason}); restore it or calibrate again") from error
+    if max(np.abs(predicted.position_mm).max(), predicted.sigma_mm.max()) > LARGEST:
+        raise ModelError(
+            f"the model predicts positions or deviations beyond {LARGEST:.0e} mm; restore it or calibrate again"
+        )
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import errno
 import hashlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -18,15 +19,17 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from calibration.errors import CalibrationError, ModelError
+from calibration.errors import CalibrationError, ModelError, UnsafeError
 from calibration.model import CalibratedModel
 from calibration.model_format import MANIFEST, check_manifest
+from calibration.rig import Rig
 from daemon.modelcheck import IS_NO_MODEL, encode
 
 REPORT = "report.html"
 COMPANIONS = frozenset({REPORT})  # may lie beside the model's files, outside its manifest
 CHECK_TIMEOUT_S = 120.0
 _FILE_MAX_BYTES = 256 * 2**20
+_FILE_NAME = re.compile(r"\w[\w.-]{0,99}", re.ASCII)
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
 
@@ -89,8 +92,12 @@ def write_model(directory: Path, model: CalibratedModel, companions: Mapping[str
     return _sha256(files[MANIFEST])
 
 
-def read_model(directory: Path) -> CalibratedModel:
+def read_model(directory: Path, manifest_sha256: str | None = None) -> CalibratedModel:
     """Read a model directory; the first time a process meets a model, a child process loads it first.
+
+    Args:
+        directory: the model's.
+        manifest_sha256: which model is meant; whichever is there when not given.
 
     Raises:
         ModelError: not a model, truncated, edited, of another version, or it brings down the process that loads it.
@@ -101,12 +108,30 @@ def read_model(directory: Path) -> CalibratedModel:
     if not (directory / MANIFEST).is_file():
         raise ModelError(f"{directory} is not a model directory: it has no {MANIFEST}")
     files = {name: data for name in (MANIFEST, *_listed(directory)) if (data := _read(directory, name)) is not None}
+    if manifest_sha256 is not None and _sha256(files[MANIFEST]) != manifest_sha256:
+        raise ModelError(f"{directory} does not hold the model that was written there; restore it")
     try:
         check_manifest(files)
     except ModelError as error:
         raise ModelError(f"{directory}: {error}") from error
     _check_in_child(files, directory)
     return CalibratedModel.from_files(files)
+
+
+def read_model_of_rig(directory: Path, manifest_sha256: str, rig: Rig) -> CalibratedModel:
+    """Read the model that a store knows, for use on a rig.
+
+    Raises:
+        CalibrationError: as `read_model`.
+        UnsafeError: it was made for another rig file: names, joints, rows, limits or channels differ. Comments may.
+    """
+    model = read_model(directory, manifest_sha256)
+    if model.rig != rig:
+        raise UnsafeError(
+            f"{directory} was made for another rig file (of {model.rig.name!r}) than the one in use (of {rig.name!r}), "
+            "and they differ in what they describe; calibrate with this one, or go back to that one"
+        )
+    return model
 
 
 def model_sha256(directory: Path) -> str:
@@ -121,10 +146,10 @@ def _listed(directory: Path) -> list[str]:
     """Names of the files in the manifest, which need not be sound otherwise."""
     try:
         names = list(json.loads(_read(directory, MANIFEST) or b"")["files"])
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError, MemoryError) as error:
         raise ModelError(f"{directory}: {MANIFEST} is damaged; restore the model, or remove it") from error
     for name in names:
-        if Path(str(name)).name != name:
+        if not (isinstance(name, str) and _FILE_NAME.fullmatch(name)):
             raise ModelError(f"{directory}: {MANIFEST} lists {name!r}, which is no file name; this is not a model")
     return names
 

@@ -20,14 +20,17 @@ class Order:
     """What the daemon asks for.
 
     Attributes:
-        kind: identification, residual or report.
+        kind: identification, residual, report or comparison.
         job_id: names the files that the job writes.
         store: the store, opened read-only.
         models_directory: where models go, a directory each.
-        session_ids: sessions to use: to train on (identification), to hold out (report).
-        model: the model directory to start from (residual, report).
+        session_ids: sessions to use: to train on (identification), to hold out (report, comparison).
+        model: the model directory to start from (residual, report, comparison).
+        model_sha256: of its manifest: which model is meant, whatever has come to lie there since.
         train_ids: sessions that the model was trained on (report).
         seed: of every random choice.
+        live_model, live_sha256: directory and manifest of the live model, if there is one (comparison).
+        live_id: its number in the store (comparison).
     """
 
     kind: str
@@ -36,8 +39,12 @@ class Order:
     models_directory: str
     session_ids: tuple[str, ...]
     model: str | None
+    model_sha256: str | None
     train_ids: tuple[str, ...]
     seed: int
+    live_model: str | None = None
+    live_sha256: str | None = None
+    live_id: int | None = None
 
     def to_line(self) -> bytes:
         """The line that the process reads."""

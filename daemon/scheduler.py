@@ -1,7 +1,8 @@
 """Which jobs are due: a pure function of what the store holds and of the time. It starts nothing.
 
-A closed session triggers identification, then residual training, then the report. A closed check session triggers a
-report alone: its poses are never trained on. Work waits while a session is open: acquisition comes first.
+A closed session triggers identification, then residual training, and of that model the report and the comparison with
+the live one, which do not wait for each other. A closed check session triggers report and comparison alone: its poses
+are never trained on. Work waits while a session is open: acquisition comes first.
 
 What a job covers is decided by the order of sessions, never by time: a wall clock may be wrong for whole boots.
 """
@@ -24,9 +25,11 @@ class JobKind(StrEnum):
     IDENTIFICATION = "identification"
     RESIDUAL = "residual"
     REPORT = "report"
+    COMPARISON = "comparison"
 
 
-CHAIN = (JobKind.IDENTIFICATION, JobKind.RESIDUAL, JobKind.REPORT)
+CHECKS = (JobKind.REPORT, JobKind.COMPARISON)
+CHAIN = (JobKind.IDENTIFICATION, JobKind.RESIDUAL, *CHECKS)
 
 
 @dataclass(frozen=True)
@@ -91,10 +94,10 @@ class State:
 
 @dataclass(frozen=True)
 class DueChain:
-    """Jobs to queue, each to run after the one before it is done.
+    """Jobs to queue: those that train each to run after the one before it is done, CHECKS after the last of them.
 
     Attributes:
-        kinds: what to run.
+        kinds: what to run, CHECKS last.
         session_id: the session that triggers them.
         through_id: they work on the sessions closed up to and including this one.
     """
@@ -141,7 +144,7 @@ def due_jobs(
     if training and not _is_covered(training[-1], JobKind.IDENTIFICATION, state):
         due.append(DueChain(CHAIN, training[-1].id, closed[-1].id))  # its report holds the model against the checks
     elif checks and state.has_model and not _is_covered(checks[-1], JobKind.REPORT, state):
-        due.append(DueChain((JobKind.REPORT,), checks[-1].id, closed[-1].id))
+        due.append(DueChain(CHECKS, checks[-1].id, closed[-1].id))
     return due
 
 

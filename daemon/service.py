@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import signal
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -15,11 +15,17 @@ from daemon.composition import Parts
 from daemon.config import Config
 from daemon.control import FAILED, REFUSED, CommandError, ControlServer, Handler
 from daemon.jobs import JobRunner
+from daemon.live_model import LiveModel
+from daemon.live_tip import FRESH_S, LiveTip
+from daemon.model_table import ModelTable
 from daemon.notify import Notifier
+from daemon.registry import ModelRegistry
 from daemon.sessions import SessionKeeper
 from daemon.setups import SetupBook
 from daemon.store.store import Store
+from daemon.tip_sender import TipSender
 from drivers.errors import DeviceError, TransmitForbiddenError
+from drivers.readings import Record
 
 log = logging.getLogger(__name__)
 
@@ -51,10 +57,22 @@ class Daemon:
             run_id=store.run_id,
             aim=parts.aim,
         )
-        self._acquisition = Acquisition(
-            parts.links, parts.decoders, store, parts.clock, on_records=self._sessions.on_records
+        models = ModelTable(store, parts.rig.name, parts.clock)
+        self._live_model = LiveModel(models, parts.rig)
+        prism = config.tip.prism if config.tip is not None else None
+        self._tip = LiveTip(
+            parts.rig,
+            parts.joiner,
+            self._live_model,
+            self._setups.newest_usable,
+            parts.clock,
+            prism,
+            fresh_s=FRESH_S / parts.clock.real_seconds(1.0),  # what delays readings here are computers, in real time
         )
+        self._sender = tip_sender(config, parts, self._tip)
+        self._acquisition = Acquisition(parts.links, parts.decoders, store, parts.clock, on_records=self._on_records)
         self._jobs = JobRunner(store, config, parts.rig.name, parts.clock)
+        self._models = ModelRegistry(models, parts.rig.name, self._live_model, compare=self._jobs.compare)
         self._control = ControlServer(config.socket_path, self._commands())
 
     def run(self, stop: threading.Event, notifier: Notifier) -> None:
@@ -65,7 +83,10 @@ class Daemon:
         """
         beat_s = min(BEAT_S, (notifier.watchdog_s or BEAT_S) / 2)
         try:
+            self._live_model.start()
             self._acquisition.start()
+            if self._sender is not None:
+                self._sender.start()
             if self._config.jobs.enabled:
                 self._jobs.start()
             notifier.send("READY=1", f"STATUS=acquiring rig {self._parts.rig.name}")
@@ -85,13 +106,22 @@ class Daemon:
     def close(self) -> None:
         """Stop all parts; what was captured is stored first."""
         self._control.close()
+        if self._sender is not None:
+            self._sender.stop()
+        self._live_model.stop()
         self._jobs.stop()
         self._acquisition.stop()
         self._store.end_run(self._parts.clock.now())
         log.info("stopped")
 
+    def _on_records(self, records: Sequence[Record]) -> None:
+        try:
+            self._sessions.on_records(records)  # feeds the joiner, which the tip looks at
+        finally:
+            self._tip.on_records(records)  # also when an observation cannot be stored: an encoder may have jumped
+
     def _commands(self) -> Mapping[str, Handler]:
-        sessions, jobs = self._sessions, self._jobs
+        sessions, jobs, models = self._sessions, self._jobs, self._models
         return {
             "status": self._status,
             "setup.new": self._setups.new_command,
@@ -105,6 +135,13 @@ class Daemon:
             "jobs.list": jobs.list_command,
             "jobs.cancel": jobs.cancel_command,
             "jobs.retry": jobs.retry_command,
+            "model.list": models.list_command,
+            "model.show": models.show_command,
+            "model.accept": models.accept_command,
+            "model.rollback": models.rollback_command,
+            "model.zeros-checked": models.zeros_checked_command,
+            "model.compare": models.compare_command,
+            "tip": self._tip.tip_command,
             "devices.configure": self._configure_devices,
         }
 
@@ -116,6 +153,7 @@ class Daemon:
             "acquisition": acquisition,
             "session": self._sessions.open_session(),
             "jobs": self._jobs.unfinished(),
+            "models": self._models.status(),
             "events": self._store.rows(
                 "SELECT device, utc_ns, kind, text FROM device_events ORDER BY id DESC LIMIT 12"
             ),
@@ -145,6 +183,14 @@ class Daemon:
             "links": names,
             "text": f"the nodes on {names} are being set up; `rigcal status` shows what comes of it",
         }
+
+
+def tip_sender(config: Config, parts: Parts, tip: LiveTip) -> TipSender | None:
+    """What sends the tip; None where none is to be sent, and where there is no bus, as in a replay."""
+    if config.tip is None or config.tip.can is None:
+        return None
+    link = next((link for link in parts.can_links if link.name == config.tip.can.link), None)
+    return None if link is None else TipSender(tip, config.tip, config.tip.can, link)
 
 
 def declare_channels(store: Store, rig: Rig) -> None:

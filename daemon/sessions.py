@@ -306,15 +306,15 @@ class SessionKeeper:
                 advice.append(f"a check wants {CHECK_POSES[0]} to {CHECK_POSES[1]} poses; this one has {poses}")
         return advice
 
-    def _earlier_jumps(self, session_id: str) -> dict[str, Stamp]:
-        """Encoder jumps of a session that an earlier run of the daemon has seen."""
+    def _earlier_jumps(self, session_id: str) -> list[str]:
+        """Devices whose encoders an earlier run of the daemon has seen jump in a session."""
         rows = self._store.rows(
-            "SELECT e.* FROM device_events AS e JOIN calibration_sessions AS s ON s.id = ? "
-            "WHERE e.kind = 'preset_jump' AND e.utc_ns >= s.started_utc_ns ORDER BY e.id DESC",
+            "SELECT DISTINCT e.device FROM device_events AS e JOIN calibration_sessions AS s ON s.id = ? "
+            "WHERE e.kind = 'preset_jump' "
+            "AND (e.boot_id, e.monotonic_ns) >= (s.started_boot_id, s.started_monotonic_ns)",
             (session_id,),
         )
-        stamps = {row["device"]: self._store.stamp(row) for row in rows}
-        return {device: stamp for device, stamp in stamps.items() if stamp is not None}
+        return [row["device"] for row in rows]
 
     def _summary(self, session_id: str) -> dict[str, Any]:
         row = self._store.rows(
@@ -369,5 +369,5 @@ class SessionKeeper:
         if self._aim is not None:
             self._aim(session.prism)  # what aims may have forgotten; an operator's station has kept its lock
         self._control_points = self._setups.control_points(session.setup_id)
-        self._jumped = self._earlier_jumps(session.id)
+        self._jumped = dict.fromkeys(self._earlier_jumps(session.id), self._from)  # before all of this run's fixes
         return session

@@ -54,12 +54,12 @@ class SetupBook:
         points = {str(n): _place(n, place) for n, place in _mapping(arguments, "control_points").items()}
         row = {
             "id": setup_id,
-            "instrument": _text(arguments, "instrument"),
-            "serial": _text(arguments, "serial"),
+            "instrument": text_argument(arguments, "instrument"),
+            "serial": text_argument(arguments, "serial"),
             "tilt_arcsec": _finite(arguments, "tilt_arcsec"),
             "ppm": _finite(arguments, "ppm"),
             "prism_constants_json": constants,
-            "note": _text(arguments, "note"),
+            "note": text_argument(arguments, "note"),
             "state": "ok",
             **self._store.instant(self._clock.now(), "created_"),
         }
@@ -107,6 +107,11 @@ class SetupBook:
                     )
                 return str(wanted)
         raise CommandError(f"there is no set-up {wanted!r}; known: {', '.join(s['id'] for s in setups) or 'none'}")
+
+    def newest_usable(self) -> str | None:
+        """The newest set-up that has not moved; None if there is none."""
+        found = self._store.rows("SELECT id FROM station_setups WHERE state = 'ok' ORDER BY rowid DESC LIMIT 1")
+        return str(found[0]["id"]) if found else None
 
     def store_shot(
         self, setup_id: str, session_id: str, name: str, phase: str, fixes: Sequence[Fix], places_mm: Sequence[Place]
@@ -191,7 +196,8 @@ def _mapping(arguments: Mapping[str, Any], key: str) -> dict[str, Any]:
     return value
 
 
-def _text(arguments: Mapping[str, Any], key: str) -> str:
+def text_argument(arguments: Mapping[str, Any], key: str) -> str:
+    """The short text that `arguments` gives under `key`, "" by default; CommandError if it is none."""
     value = arguments.get(key, "")
     if not isinstance(value, str) or len(value) > MOST_TEXT or not value.isprintable():
         raise CommandError(f"{key} must be a text of at most {MOST_TEXT} printable characters, not {value!r:.80}")

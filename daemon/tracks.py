@@ -146,25 +146,25 @@ class JointTrack:
         self._jumps.clear()
         self._reference = None
 
-    def at(self, at_ns: int) -> State | str:
-        """The joint at an instant, or why it is not known."""
+    def at(self, at_ns: int, of: str = "the fix") -> State | str:
+        """The joint at an instant, or why it is not known; `of` says in words which instant that is."""
         times_ns, items = self._samples.times_ns, self._samples.items
         before = self._samples.latest(at_ns)
         if before < 0:
-            return "no sample before the fix"
+            return f"no sample before {of}"
         after = before if times_ns[before] == at_ns else before + 1
         if after == len(times_ns):
-            return "no sample after the fix"
+            return f"no sample after {of}"
         start, direction = items[before]
         end, _ = items[after]
         if isinstance(start, Status) or isinstance(end, Status):
-            return f"its reading at the fix is {start if isinstance(start, Status) else end}"
+            return f"its reading at {of} is {start if isinstance(start, Status) else end}"
         span_ns = times_ns[after] - times_ns[before]
         stood = abs(self._difference(end, start)) <= self._joint.motion_threshold
         if span_ns > (max(STANDING_GAP_NS, self._max_gap_ns) if stood else self._max_gap_ns):
-            return f"its samples around the fix are more than {self._joint.max_gap_s:g} s apart"
+            return f"its samples around {of} are more than {self._joint.max_gap_s:g} s apart"
         if self._jumps.latest(times_ns[after]) != self._jumps.latest(times_ns[before]):
-            return "its encoder was preset at the fix"
+            return f"its encoder was preset at {of}"
         fraction = (at_ns - times_ns[before]) / span_ns if span_ns else 0.0
         value = start + fraction * self._difference(end, start)
         if self.unit == "deg" and fraction >= 0.5:

@@ -8,26 +8,49 @@ from drivers.canframe import Frame
 from drivers.cia301 import Service, classify
 from drivers.errors import TransmitForbiddenError
 
+FREE_IDENTIFIERS = range(0x680, 0x6E0)
 _BROADCAST = (Service.SYNC, Service.TIME)
 _TO_NODE = (Service.SDO_REQUEST, Service.RPDO)
+
+
+def is_free(arbitration_id: int) -> bool:
+    """Whether CANopen leaves an 11-bit identifier free for messages of one's own.
+
+    Source: CiA 301, the pre-defined connection set and the table of restricted CAN-IDs.
+    """
+    return arbitration_id in FREE_IDENTIFIERS
 
 
 class TransmitPermission:
     """The gate in front of a link's sender.
 
-    SYNC and TIME need `allow_transmit`; NMT, SDO requests and RPDOs also need their node to be listed. Everything else
-    is refused always: NMT to all nodes, LSS, remote and extended frames, and what only a node itself may send.
+    SYNC and TIME need `allow_transmit`; NMT, SDO requests and RPDOs also need their node to be listed, and rigcal's own
+    messages their identifier. Everything else is refused always: NMT to all nodes, LSS, remote and extended frames, and
+    what only a node itself may send.
 
     Args:
         link: name of the link, for messages.
         allow_transmit: whether anything may be sent at all.
         nodes: nodes that may be addressed.
+        own_identifiers: 11-bit identifiers of rigcal's own messages.
+
+    Raises:
+        TransmitForbiddenError: an own identifier is asked for on a link that may not transmit, or is CANopen's.
     """
 
-    def __init__(self, link: str, allow_transmit: bool, nodes: Collection[int]) -> None:
+    def __init__(
+        self, link: str, allow_transmit: bool, nodes: Collection[int], own_identifiers: Collection[int] = ()
+    ) -> None:
         self._link = link
         self._allow_transmit = allow_transmit
         self._nodes = frozenset(nodes)
+        self._own_identifiers = frozenset(own_identifiers)
+        for identifier in sorted(self._own_identifiers):
+            self.check_link()
+            if not is_free(identifier):
+                raise TransmitForbiddenError(
+                    link, f"identifier {identifier:03X}h is not free for own messages (680h to 6DFh are)"
+                )
 
     def check_link(self) -> None:
         """Raise TransmitForbiddenError unless the link may transmit."""
@@ -46,6 +69,10 @@ class TransmitPermission:
     def check(self, frame: Frame) -> None:
         """Raise TransmitForbiddenError unless `frame` may be sent."""
         self.check_link()
+        if frame.arbitration_id in self._own_identifiers and not (
+            frame.is_extended or frame.is_remote or frame.is_error
+        ):
+            return
         meaning = None if frame.is_extended or frame.is_remote or frame.is_error else classify(frame.arbitration_id)
         if meaning is not None:
             if meaning.service in _BROADCAST:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from drivers.can_ports import BATCH_MAX, OVERFLOW, CanPort, Interface, PortSettings, Received, open_port
 from drivers.can_stamps import ReceiveStamps
+from drivers.can_sync import SyncProducer
 from drivers.can_transmit import TransmitPermission
 from drivers.canframe import Frame
 from drivers.canopen_setup import NodeSetup, SetupConversation
-from drivers.cia301 import SYNC_COUNTER_MAX, encode_sync
 from drivers.clock import NS_PER_S, Clock, Stamp
 from drivers.errors import DeviceError, LinkError
 from drivers.readings import CanCapture, Capture, DeviceEvent, EventKind, Gap, GapReason
@@ -37,6 +38,7 @@ class CanLinkConfig:
         bitrate: of the bus, bit/s; set on slcan adapters, a SocketCAN interface is set up by the system.
         allow_transmit: the link may send at all; without it slcan adapters are opened listen-only.
         transmit_nodes: nodes that may be addressed.
+        own_identifiers: 11-bit identifiers that `publish` may send.
         sync_period_ms: send SYNC at this period; None: do not.
         sync_counter: SYNC carries a counter 1 to 240 (nodes whose object 1019h is 240).
         receive_buffer_bytes: of the socket; 4 MiB, doubled by the kernel for its overhead, hold over a second of a
@@ -50,34 +52,11 @@ class CanLinkConfig:
     bitrate: int | None = None
     allow_transmit: bool = False
     transmit_nodes: tuple[int, ...] = ()
+    own_identifiers: tuple[int, ...] = ()
     sync_period_ms: float | None = None
     sync_counter: bool = False
     receive_buffer_bytes: int = 4 << 20
     options: Mapping[str, Any] = field(default_factory=dict)
-
-
-class SyncProducer:
-    """When to send SYNC: on a fixed monotonic grid, without drift and without bursts after a stall.
-
-    Args:
-        period_ns: of the grid.
-        start_ns: its first instant, monotonic.
-        with_counter: the SYNC carries a counter 1 to 240.
-    """
-
-    def __init__(self, period_ns: int, start_ns: int, with_counter: bool) -> None:
-        self._period_ns = period_ns
-        self._counter = 0 if with_counter else None
-        self.next_ns = start_ns
-
-    def due(self, monotonic_ns: int) -> Frame | None:
-        """The SYNC to send now; None before `next_ns`."""
-        if monotonic_ns < self.next_ns:
-            return None
-        self.next_ns += self._period_ns * ((monotonic_ns - self.next_ns) // self._period_ns + 1)
-        if self._counter is not None:
-            self._counter = self._counter % SYNC_COUNTER_MAX + 1
-        return encode_sync(self._counter)
 
 
 class Backoff:
@@ -107,7 +86,7 @@ class CanLink:
             machines, which are always parked; on a real one an operator has to say so each time.
 
     Raises:
-        TransmitForbiddenError: SYNC or a set-up at the start is asked for where it is not allowed.
+        TransmitForbiddenError: SYNC, own identifiers or a set-up at the start are asked for where not allowed.
     """
 
     def __init__(
@@ -121,7 +100,10 @@ class CanLink:
         self.name = config.name
         self._config = config
         self._clock = clock
-        self._permission = TransmitPermission(config.name, config.allow_transmit, config.transmit_nodes)
+        self._permission = TransmitPermission(
+            config.name, config.allow_transmit, config.transmit_nodes, config.own_identifiers
+        )
+        self._published: deque[Sequence[Frame]] = deque(maxlen=1)
         if config.sync_period_ms is not None:
             self._permission.check_link()
             if config.sync_period_ms <= 0:
@@ -157,6 +139,18 @@ class CanLink:
         """
         if not self._requests.put(self._wanted(nodes)):
             raise self._not_open()
+
+    def publish(self, frames: Sequence[Frame]) -> None:
+        """Send rigcal's own frames soon; may be called from any thread.
+
+        Frames that are still waiting are replaced: what is late is never sent in a burst.
+
+        Raises:
+            TransmitForbiddenError: the link is listen-only, or an identifier is none of its own. Nothing is sent then.
+        """
+        for frame in frames:
+            self._permission.check(frame)
+        self._published.append(tuple(frames))
 
     def _wanted(self, nodes: Iterable[int] | None) -> list[NodeSetup]:
         wanted = self._permitted(self._setups if nodes is None else nodes)
@@ -211,7 +205,7 @@ class CanLink:
                     if received:
                         session.take(received)
                         backoff.reset()
-                    session.serve(self._requests.take())
+                    session.serve(self._requests.take(), self._take_published())
                     if stop.is_set():
                         return
                     received = port.receive(session.patience_s())
@@ -219,6 +213,12 @@ class CanLink:
                 cause = "rigcal was stopped" if stop.is_set() else "the link was lost"
                 session.close(self._requests.close(), cause)
                 outage.last_good = session.last_frame
+
+    def _take_published(self) -> Sequence[Frame]:
+        try:
+            return self._published.popleft()
+        except IndexError:
+            return ()
 
 
 class _SetupRequests:
@@ -326,17 +326,20 @@ class _Session:
             for (frame, _), stamp in zip(received, stamps, strict=True):
                 self._setup.feed(frame, stamp)
 
-    def serve(self, requests: Iterable[NodeSetup]) -> None:
+    def serve(self, requests: Iterable[NodeSetup], published: Iterable[Frame]) -> None:
         """Send what is due; look after lost frames.
 
         Args:
             requests: set-ups that were asked for since the last call.
+            published: own frames to send.
         """
         monotonic_ns = self._clock.monotonic_ns()
         if self._sync is not None:
             sync = self._sync.due(monotonic_ns)
             if sync is not None:
                 self._send(sync)
+        for frame in published:
+            self._send(frame)
         for request in requests:
             self._setup.add(request)
         if self._setup.is_active:

@@ -80,6 +80,9 @@ def compare(
 ) -> dict[str, object]:
     """Compare all methods on held-out observations, in a table and on a page with plots.
 
+    On the default method's kinematics and effects every residual has a row of its own: none, a table of stored
+    corrections per cell of boom reach and direction, the first paper's RBFN, and our learners one by one.
+
     A method that cannot use the data is listed with its reason. With --protocol zhou2022 the rig is calibrated from
     single-joint, multi-joint and weighted data instead, with the Pareto front of the weights, a learning curve and the
     error along the first 200 held-out points of the tip; the paper's own figures stand beside.
@@ -143,7 +146,7 @@ def compare(
 
 
 def show_comparison(console: Console, comparison: Comparison) -> None:
-    """The table of all methods, and what is to be said of it."""
+    """The table of all methods and residuals, and what is to be said of it."""
     from daemon.report.comparison import HEADER, LABELS, LOWEST, TEXT_COLUMNS, refusals, table_rows
 
     own = [result.method == "default" for result in comparison.results]

@@ -14,7 +14,9 @@ COMMANDS = {
     "demo": "demo",
     "devices": "operator",
     "evaluate": "offline",
+    "inverse": "inverse",
     "jobs": "operator",
+    "model": "model",
     "plan": "plan",
     "predict": "offline",
     "replay": "run",
@@ -22,6 +24,7 @@ COMMANDS = {
     "session": "operator",
     "setup": "operator",
     "status": "operator",
+    "tip": "tip",
 }
 
 

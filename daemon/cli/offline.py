@@ -3,46 +3,39 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import hashlib
-import io
 from collections.abc import Iterator
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-import numpy as np
 from rich.console import Console
 
 from calibration.errors import DataError
-from calibration.observations import Observations, parse_observations
+from calibration.observations import Floats, Observations, parse_observations
 from calibration.rig import Rig
+from calibration.single_thread import one_blas_thread
 from daemon.checkpoint import FileCheckpoint
-from daemon.cli.options import FILE, prior_option, rig_option, seed_option
+from daemon.cli.csv_output import check_out, deliver, with_columns
+from daemon.cli.options import DIRECTORY, data_option, model_option, prior_option, rig_option, seed_option
 from daemon.cli.output import Command, json_option, progress_display
 from daemon.cli.tables import say, show_evaluation
-from daemon.files import write_file
 from daemon.numba_cache import prepare
 from daemon.rigs import load_rig
 from drivers.clock import NS_PER_S, SystemClock
 
 if TYPE_CHECKING:
     from calibration.identification.refinement import Prior
-    from calibration.model import Prediction
+    from calibration.prediction import Prediction
+    from calibration.residual.conformal import Intervals
     from calibration.residual.hybrid import Kind
 
 METHODS = ("default", "pde-paper", "km", "skcm", "rbf-tcm")
-RESIDUALS = ("default", "none", "rbfn", "lightgbm", "chain")
+RESIDUALS = ("default", "none", "rbfn", "lightgbm", "chain", "gp")
 CONNECT_TIMEOUT_S = 5
 PREDICTED_COLUMNS = tuple(f"{name}_pred_mm" for name in ("x", "y", "z", "sigma_x", "sigma_y", "sigma_z"))
-
-_DIRECTORY = click.Path(path_type=Path)
-
-_data = click.option("--data", type=FILE, required=True, metavar="CSV", help="Observations, one row per fix.")
-_model = click.option(
-    "--model", "directory", type=_DIRECTORY, required=True, metavar="DIR", help="The directory calibrate wrote."
-)
+INTERVAL_COLUMNS = tuple(f"{name}_pred_mm" for name in ("half90_x", "half90_y", "half90_z", "radius90"))
 
 
 def read_observations(path: Path, rig: Rig, *, positions_required: bool = True) -> tuple[Observations, bytes]:
@@ -54,7 +47,9 @@ def read_observations(path: Path, rig: Rig, *, positions_required: bool = True) 
     return parse_observations(data, rig, path.name, positions_required=positions_required), data
 
 
-class _Stopwatch:
+class Stopwatch:
+    """How long a command takes, and when."""
+
     def __init__(self) -> None:
         self._clock = SystemClock()
         self._started_ns = self._clock.monotonic_ns()
@@ -70,8 +65,8 @@ class _Stopwatch:
 
 @click.command(cls=Command)
 @rig_option
-@_data
-@click.option("--out", type=_DIRECTORY, required=True, metavar="DIR", help="Where to write; replaces a model there.")
+@data_option
+@click.option("--out", type=DIRECTORY, required=True, metavar="DIR", help="Where to write; replaces a model there.")
 @click.option("--method", type=click.Choice(METHODS), default="default", show_default=True, help="How to identify.")
 @click.option(
     "--effects",
@@ -120,7 +115,7 @@ def calibrate(
     The figures are about the rows it was fitted to; `evaluate` gives those for rows it never saw. A global search keeps
     its state beside DIR (DIR.checkpoint): the same command, killed and given again, goes on where it was.
     """
-    watch = _Stopwatch()
+    watch = Stopwatch()
     prepare()
     from calibration import pipeline
     from daemon import modelfiles
@@ -162,8 +157,8 @@ def calibrate(
 
 
 @click.command(cls=Command)
-@_model
-@_data
+@model_option
+@data_option
 @click.option(
     "--refit-base",
     is_flag=True,
@@ -172,7 +167,7 @@ def calibrate(
 @json_option
 def evaluate(directory: Path, data: Path, *, refit_base: bool, as_json: bool) -> dict[str, object]:
     """Errors of a model, stage by stage, on observations that it was not fitted to."""
-    watch = _Stopwatch()
+    watch = Stopwatch()
     prepare()
     from calibration import pipeline
     from daemon.modelfiles import read_model
@@ -187,56 +182,54 @@ def evaluate(directory: Path, data: Path, *, refit_base: bool, as_json: bool) ->
 
 
 @click.command(cls=Command)
-@_model
-@_data
-@click.option("--out", type=_DIRECTORY, metavar="CSV", help="Where to write; standard output by default.")
+@model_option
+@data_option
+@click.option("--out", type=DIRECTORY, metavar="CSV", help="Where to write; standard output by default.")
+@click.option(
+    "--intervals",
+    is_flag=True,
+    help="Add half90_x_pred_mm, half90_y_pred_mm, half90_z_pred_mm (a fix is that near to x, y, z with 90 % "
+    "probability, each) and radius90_pred_mm (all three together).",
+)
 @json_option
-def predict(directory: Path, data: Path, out: Path | None, *, as_json: bool) -> dict[str, object]:
+def predict(directory: Path, data: Path, out: Path | None, *, intervals: bool, as_json: bool) -> dict[str, object]:
     """Positions and their standard deviations for joint readings; positions in the data are not needed.
 
     The result is the data's own columns and the predicted ones. With --json it goes to the file of --out, or else into
     the object as "csv".
     """
-    watch = _Stopwatch()
+    watch = Stopwatch()
     prepare()
     from daemon.modelfiles import read_model
 
-    if out is not None and out.exists() and out.samefile(data):
-        raise click.UsageError(f"{out} is the data itself; name another file with --out")
+    check_out(out, data)
     model = read_model(directory)
     observations, raw = read_observations(data, model.rig, positions_required=False)
-    table = with_predictions(raw, model.predict(observations))
+    with one_blas_thread(), ThreadPoolExecutor() as pool:
+        prediction = model.predict(observations, pool)
+    columns = _predicted_columns(prediction, model.intervals if intervals else None)
+    table = with_columns(raw, columns, {*PREDICTED_COLUMNS, *INTERVAL_COLUMNS} - set(columns))
+    doubts = model.doubts(observations)
     result: dict[str, object] = {
         "rig": model.rig.name,
         "n": len(observations),
         "seconds": watch.seconds,
-        "warnings": list(model.doubts(observations)),
+        "warnings": list(doubts),
         "ignored_columns": list(observations.ignored_columns),
     }
-    if out is not None:
-        write_file(out, table.encode("utf-8"))
-        result["out"] = str(out)
-    elif as_json:
-        result["csv"] = table
-    else:
-        click.echo(table, nl=False)
-    for warning in () if as_json else model.doubts(observations):
-        click.echo(f"Warning: {warning}", err=True)
+    deliver(table, result, doubts, out, as_json=as_json)
     return result
 
 
-def with_predictions(raw: bytes, prediction: Prediction) -> str:
-    """An observations CSV as it came, with the predicted columns added; ones that it has already are replaced."""
-    reader = csv.reader(io.StringIO(raw.decode("utf-8-sig"), newline=""), strict=True)
-    header, *rows = [row for row in reader if row]
-    keep = [i for i, name in enumerate(header) if name.strip() not in PREDICTED_COLUMNS]
-    numbers = np.hstack([prediction.position_mm, prediction.sigma_mm])
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([*(header[i].strip() for i in keep), *PREDICTED_COLUMNS])
-    for row, predicted in zip(rows, numbers, strict=True):
-        writer.writerow([*(row[i] for i in keep), *(repr(float(value)) for value in predicted)])
-    return out.getvalue()
+def _predicted_columns(prediction: Prediction, intervals: Intervals | None) -> dict[str, Floats]:
+    """What predictions add to an observations CSV, and their intervals where they are wanted."""
+    columns = {name: prediction.position_mm[:, i] for i, name in enumerate(PREDICTED_COLUMNS[:3])}
+    columns |= {name: prediction.sigma_mm[:, i] for i, name in enumerate(PREDICTED_COLUMNS[3:])}
+    if intervals is not None:
+        half_mm = intervals.half_mm(prediction.sigma_mm)
+        columns |= {name: half_mm[:, i] for i, name in enumerate(INTERVAL_COLUMNS[:3])}
+        columns[INTERVAL_COLUMNS[3]] = intervals.radius_mm(prediction.sigma_mm)
+    return columns
 
 
 def _check_effects(effects: str, method: str, rig: Rig) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,46 +11,13 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from daemon.cli.model import model_lines
 from daemon.cli.output import Command, json_option
+from daemon.cli.talk import ask, say, talks, utc
 from daemon.config import read_config
-from daemon.control import request
 from daemon.scheduler import SESSION_KINDS
 
-DEFAULT_SOCKET = Path("/run/rigcal/control.sock")
 SHOT_TIMEOUT_S = 600.0
-
-Show = Callable[[Console, Any], None]
-
-
-def socket_of(path: Path | None, config: Path | None) -> Path:
-    """Where the daemon listens: --socket, --config, $RIGCAL_SOCKET, else the service's place."""
-    if path is not None:
-        return path
-    if config is not None:
-        return read_config(config).socket_path
-    return Path(os.environ.get("RIGCAL_SOCKET", DEFAULT_SOCKET))
-
-
-def _talks(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Options that every command to the daemon has."""
-    command = json_option(command)
-    command = click.option(
-        "--config", type=click.Path(path_type=Path), help="Configuration of the daemon to talk to (gives its socket)."
-    )(command)
-    return click.option("--socket", type=click.Path(path_type=Path), help="Control socket of the daemon.")(command)
-
-
-def _ask(where: dict[str, Any], command: str, show: Show, timeout_s: float = 120.0, **arguments: Any) -> Any:
-    """Send a command; show its result to people, and return it for `--json`."""
-    given = {key: value for key, value in arguments.items() if value is not None}
-    result = request(socket_of(where["socket"], where["config"]), command, given, timeout_s=timeout_s)
-    if not where["as_json"]:
-        show(Console(), result)
-    return result if isinstance(result, dict) else {"result": result}
-
-
-def _say(console: Console, text: Any) -> None:
-    console.print(str(text), highlight=False, markup=False)
 
 
 # ---- status ----------------------------------------------------------------------------------------------------------
@@ -60,10 +25,10 @@ def _say(console: Console, text: Any) -> None:
 
 @click.command(cls=Command)
 @click.option("--frames", is_flag=True, help="Also every CAN identifier that was heard, with its rate.")
-@_talks
+@talks
 def status(frames: bool, **where: Any) -> Any:
     """How the rig's links, channels and station are, and what is going on."""
-    return _ask(where, "status", partial(_show_status, frames=frames))
+    return ask(where, "status", partial(_show_status, frames=frames))
 
 
 def _show_status(console: Console, status: dict[str, Any], *, frames: bool) -> None:
@@ -92,17 +57,19 @@ def _show_status(console: Console, status: dict[str, Any], *, frames: bool) -> N
     for station in acquisition["stations"]:
         why = f" ({station['reason']})" if station["reason"] else ""
         last = f"last fix {station['status']}{why}"
-        _say(console, f"station {station['name']}: {station['lock']}, {last}, {station['fixes']} fixes")
+        say(console, f"station {station['name']}: {station['lock']}, {last}, {station['fixes']} fixes")
     for device, n in acquisition["decode_failures"].items():
-        _say(console, f"{n} captures of {device} could not be decoded")
+        say(console, f"{n} captures of {device} could not be decoded")
     if acquisition["error"]:
         console.print(f"[red]{acquisition['error']}[/]")
     if status["session"]:
         _show_session(console, status["session"])
     for job in status["jobs"]:
-        _say(console, _job_line(job))
+        say(console, _job_line(job))
+    for sentence in model_lines(status["models"]):
+        say(console, sentence)
     for event in reversed(status["events"]):
-        _say(console, f"{_utc(event['utc_ns'])} {event['device']} {event['kind']}: {event['text']}")
+        say(console, f"{utc(event['utc_ns'])} {event['device']} {event['kind']}: {event['text']}")
 
 
 def _frame_table(frames: list[dict[str, Any]]) -> Table:
@@ -112,10 +79,6 @@ def _frame_table(frames: list[dict[str, Any]]) -> Table:
         missed = "" if frame["missed"] is None else str(frame["missed"])
         table.add_row(frame["link"], frame["identifier"], frame["names"], str(frame["count"]), rate, missed)
     return table
-
-
-def _utc(utc_ns: int) -> str:
-    return datetime.fromtimestamp(utc_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S")
 
 
 # ---- set-ups ---------------------------------------------------------------------------------------------------------
@@ -140,14 +103,14 @@ def setup() -> None:
     help="Known place of a control point in the station's frame, mm; without one its first shot defines it.",
 )
 @click.option("--note", default="")
-@_talks
+@talks
 def setup_new(prism_constant: tuple[str, ...], control_point: tuple[str, ...], **options: Any) -> Any:
     """Describe where the station stands now. A station that was moved is a new set-up."""
     where = {key: options.pop(key) for key in ("socket", "config", "as_json")}
-    return _ask(
+    return ask(
         where,
         "setup.new",
-        lambda console, result: _say(console, f"set-up {result['id']} is in use"),
+        lambda console, result: say(console, f"set-up {result['id']} is in use"),
         id=options.pop("name"),
         prism_constants_mm={k: v[0] for k, v in _assignments("--prism-constant", prism_constant, "r=-30", 1).items()},
         control_points=_assignments("--control-point", control_point, "cp1=12000,3500,1800", 3),
@@ -170,7 +133,7 @@ def _assignments(option: str, texts: tuple[str, ...], example: str, count: int) 
 
 
 @setup.command(cls=Command, name="list")
-@_talks
+@talks
 def setup_list(**where: Any) -> Any:
     """All set-ups with their control points."""
 
@@ -182,7 +145,7 @@ def setup_list(**where: Any) -> Any:
             table.add_row(s["id"], s["instrument"], s["state"], tilt, ppm, points)
         console.print(table)
 
-    return _ask(where, "setup.list", show)
+    return ask(where, "setup.list", show)
 
 
 # ---- sessions --------------------------------------------------------------------------------------------------------
@@ -200,22 +163,22 @@ def session() -> None:
 @click.option("--operator", default=lambda: os.environ.get("USER", ""), help="Who is responsible.")
 @click.option("--id", help="Name of the session.")
 @click.option("--note", default="")
-@_talks
+@talks
 def session_start(socket: Path | None, config: Path | None, as_json: bool, **about: Any) -> Any:
     """Open a session: from now on fixes on the prism become its observations."""
 
     def show(console: Console, result: dict[str, Any]) -> None:
-        _say(
+        say(
             console,
             f"session {result['id']} is open: prism {result['prism']}, {result['kind']}, set-up {result['setup']}",
         )
         _advise(console, result["advice"])
 
-    return _ask({"socket": socket, "config": config, "as_json": as_json}, "session.start", show, **about)
+    return ask({"socket": socket, "config": config, "as_json": as_json}, "session.start", show, **about)
 
 
 @session.command(cls=Command, name="stop")
-@_talks
+@talks
 def session_stop(**where: Any) -> Any:
     """Close the open session; identification, residual and report follow by themselves."""
 
@@ -223,34 +186,34 @@ def session_stop(**where: Any) -> Any:
         _show_session(console, result)
         _advise(console, result["advice"])
 
-    return _ask(where, "session.stop", show)
+    return ask(where, "session.stop", show)
 
 
 @session.command(cls=Command, name="abort")
-@_talks
+@talks
 def session_abort(**where: Any) -> Any:
     """Close the open session as unusable."""
-    return _ask(where, "session.abort", _show_session)
+    return ask(where, "session.abort", _show_session)
 
 
 @session.command(cls=Command, name="shoot")
 @click.argument("point")
-@_talks
+@talks
 def session_shoot(point: str, **where: Any) -> Any:
     """Measure control point POINT (the station is aimed at it); its first shot defines its place."""
 
     def show(console: Console, result: dict[str, Any]) -> None:
         if result["misclosure_mm"] is None:
-            _say(console, f"{result['point']} is known from now on")
+            say(console, f"{result['point']} is known from now on")
             return
         verdict = "[red]the set-up has moved[/]" if result["moved"] else "the set-up holds"
         console.print(f"{result['point']}: misclosure {result['misclosure_mm']:.1f} mm, {verdict}", highlight=False)
 
-    return _ask(where, "session.shoot", show, timeout_s=SHOT_TIMEOUT_S, point=point)
+    return ask(where, "session.shoot", show, timeout_s=SHOT_TIMEOUT_S, point=point)
 
 
 @session.command(cls=Command, name="list")
-@_talks
+@talks
 def session_list(**where: Any) -> Any:
     """All sessions."""
 
@@ -261,21 +224,21 @@ def session_list(**where: Any) -> Any:
             table.add_row(s["id"], s["kind"], s["prism"], s["setup"], s["state"], *counts, s["operator"])
         console.print(table)
 
-    return _ask(where, "session.list", show)
+    return ask(where, "session.list", show)
 
 
 @session.command(cls=Command, name="show")
 @click.argument("name")
-@_talks
+@talks
 def session_show(name: str, **where: Any) -> Any:
     """One session, with its control points and jobs."""
 
     def show(console: Console, result: dict[str, Any]) -> None:
         _show_session(console, result)
         for job in result["jobs"]:
-            _say(console, _job_line(job))
+            say(console, _job_line(job))
 
-    return _ask(where, "session.show", show, id=name)
+    return ask(where, "session.show", show, id=name)
 
 
 @session.command(cls=Command, name="export")
@@ -296,23 +259,23 @@ def session_export(name: str, config: Path, out: Path, can_format: Any, *, as_js
 
 
 def _show_session(console: Console, session: dict[str, Any]) -> None:
-    _say(
+    say(
         console,
         f"session {session['id']} ({session['kind']}, prism {session['prism']}, set-up {session['setup']}) is "
         f"{session['state']}: {session['poses']} poses, {session['observations']} observations",
     )
     for reason, n in session["excluded"].items():
-        _say(console, f"  {n} excluded: {reason}")
+        say(console, f"  {n} excluded: {reason}")
     for shot in session["control_shots"]:
         size = "defined" if shot["misclosure_mm"] is None else f"misclosure {shot['misclosure_mm']:.1f} mm"
-        _say(console, f"  control point {shot['point']} at the {shot['phase']}: {size}")
+        say(console, f"  control point {shot['point']} at the {shot['phase']}: {size}")
     if session["setup_moved"]:
         console.print("  [red]the set-up has moved: its sessions are doubtful[/]")
 
 
 def _advise(console: Console, advice: list[str]) -> None:
     for sentence in advice:
-        _say(console, f"  note: {sentence}")
+        say(console, f"  note: {sentence}")
 
 
 # ---- jobs and devices ------------------------------------------------------------------------------------------------
@@ -320,35 +283,35 @@ def _advise(console: Console, advice: list[str]) -> None:
 
 @click.group()
 def jobs() -> None:
-    """Background jobs: identification, residual training, reports."""
+    """Background jobs: identification, residual training, reports, comparisons."""
 
 
 @jobs.command(cls=Command, name="list")
-@_talks
+@talks
 def jobs_list(**where: Any) -> Any:
     """All jobs."""
 
     def show(console: Console, found: list[dict[str, Any]]) -> None:
         for job in found:
-            _say(console, _job_line(job))
+            say(console, _job_line(job))
 
-    return _ask(where, "jobs.list", show)
+    return ask(where, "jobs.list", show)
 
 
 @jobs.command(cls=Command, name="cancel")
 @click.argument("number", type=int)
-@_talks
+@talks
 def jobs_cancel(number: int, **where: Any) -> Any:
     """Cancel a queued or running job and those that wait for it."""
-    return _ask(where, "jobs.cancel", _say, id=number)
+    return ask(where, "jobs.cancel", say, id=number)
 
 
 @jobs.command(cls=Command, name="retry")
 @click.argument("number", type=int)
-@_talks
+@talks
 def jobs_retry(number: int, **where: Any) -> Any:
     """Queue a job again that did not end well."""
-    return _ask(where, "jobs.retry", _say, id=number)
+    return ask(where, "jobs.retry", say, id=number)
 
 
 def _job_line(job: dict[str, Any]) -> str:
@@ -364,14 +327,14 @@ def devices() -> None:
 
 @devices.command(cls=Command, name="configure")
 @click.option("--machine-is-parked", is_flag=True, help="The machine is parked and locked out.")
-@_talks
+@talks
 def devices_configure(machine_is_parked: bool, **where: Any) -> Any:
     """Check identity and resolution of the encoders, set their transmission, and start them.
 
     Needs a link with allow_transmit = true that lists the nodes.
     """
 
-    return _ask(where, "devices.configure", lambda c, r: _say(c, r["text"]), machine_is_parked=machine_is_parked)
+    return ask(where, "devices.configure", lambda c, r: say(c, r["text"]), machine_is_parked=machine_is_parked)
 
 
 COMMANDS = {"status": status, "setup": setup, "session": session, "jobs": jobs, "devices": devices}

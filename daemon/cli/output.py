@@ -9,6 +9,7 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import click
@@ -48,6 +49,14 @@ def error_sentence(error: BaseException) -> str:
     return f"internal error, {type(error).__name__}: {text} (RIGCAL_DEBUG=1 shows where)"
 
 
+@dataclass(frozen=True)
+class Delivered:
+    """What a command returns whose result is delivered although its exit status is not 0."""
+
+    result: Mapping[str, Any]
+    status: int
+
+
 class Command(click.Command):
     """A command whose every failure is one sentence on standard error and an exit status, never a traceback.
 
@@ -71,13 +80,16 @@ class Command(click.Command):
         try:
             # What a library prints must not end up in the result.
             with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
-                result = super().invoke(ctx)
+                returned = super().invoke(ctx)
         except (click.exceptions.Exit, click.Abort):
             raise
         except Exception as error:  # noqa: BLE001 - the last place where a failure can become a sentence
             _end_badly(error, as_json=as_json)
+        delivered = returned if isinstance(returned, Delivered) else Delivered(returned, DONE)
         if as_json:
-            print_json(result)
+            print_json(delivered.result)
+        if delivered.status != DONE:
+            raise click.exceptions.Exit(delivered.status)
         return None
 
 

@@ -45,6 +45,13 @@ def show_evaluation(console: Console, result: Mapping[str, Any], what: str) -> N
         f"{seen['rank']} of {seen['parameters']} parameters determined by the data",
         highlight=False,
     )
+    covered = result["intervals"]
+    axes = ", ".join(f"{share:.0%}" for share in covered["axis_coverage"])
+    console.print(
+        f"{covered['level']:.0%} intervals hold {axes} of the errors of x, y, z and {covered['radius_coverage']:.0%} "
+        "of the 3-D ones",
+        highlight=False,
+    )
     expected = result["expected_accuracy"]
     if expected is not None:
         place = f" at set-up {expected['setup']!r}" if expected["setup"] else ""

@@ -19,6 +19,7 @@ _EXPLAINED = 1.15  # within what a few dozen fixes can tell apart
 _OUTLIERS_SHOWN = 20
 _PARAMETERS_SHOWN = 14
 _COEFFICIENTS_SHOWN = 2
+_FEATURES_SHOWN = 10
 
 
 def build_report(report: ReportInput) -> str:
@@ -32,6 +33,7 @@ def build_report(report: ReportInput) -> str:
             _axes(report),
             _coverage(report),
             _effects(report),
+            _importance(report),
             _parameters(report),
             _outliers(report),
             _setups(report),
@@ -257,6 +259,26 @@ def _effects(report: ReportInput) -> str:
             f"Physics beyond true lengths and angles, fitted together with them: {report.effects_reason.rstrip('.')}."
         ),
         table(header, rows, text_columns=(0, 1, 3)),
+    )
+
+
+def _importance(report: ReportInput) -> str:
+    if not report.importance:
+        return ""
+    shown = min(_FEATURES_SHOWN, len(report.importance))
+    return section(
+        "What the learned residual looks at",
+        paragraph(
+            f"The {shown} most important of the {len(report.importance)} features of the trees. Features that tell "
+            "the same share what they gain, and importance is no cause."
+        ),
+        picture(
+            svg_image(
+                figures.importance(report, shown),
+                "Share of each feature in what the splits of the trees gained, the most important first",
+            ),
+            "By how much splits on each feature lower the squared error of the training rows, of all that splits gain.",
+        ),
     )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.comparison import FIGURES, NOMINAL, Comparison, MethodResult
+from calibration.residual_comparison import RESIDUALS
 from daemon.report.drawing import AFTER, BEFORE, INK, MIDDLE, new_figure, plain_log_axis, styled, svg_image
 from daemon.report.markup import escape, items, number, page, paragraph, picture, section, table
 
@@ -19,14 +20,28 @@ LABELS: Mapping[str, str] = {
     "km": "KM",
     "skcm": "SKCM",
     "rbf-tcm": "RBF-TCM",
+    "effects": "no residual",
+    "table": "table",
+    "rbfn-paper": "RBFN (2022 paper)",
+    "rbfn": "RBFN",
+    "lightgbm": "LightGBM",
+    "chain": "RBFN + LightGBM",
+    "gp": "Gaussian process",
     "default": "rigcal (default)",
     "pde-paper": "Zhou et al. 2022",
 }
-_COLOURS: Mapping[str, str] = {
+_COLOURS: Mapping[str, str] = {  # methods and residuals are drawn in two panels, where colours return
     NOMINAL: BEFORE,
     "km": "#e69f00",
     "skcm": "#009e73",
     "rbf-tcm": "#cc79a7",
+    "effects": INK,
+    "table": BEFORE,
+    "rbfn-paper": MIDDLE,
+    "rbfn": "#e69f00",
+    "lightgbm": "#009e73",
+    "chain": "#cc79a7",
+    "gp": "#56b4e9",
     "default": AFTER,
     "pde-paper": MIDDLE,
 }
@@ -34,7 +49,15 @@ HEADER = ("method", "mean", "max", "std", "rms", "mean, training", "seconds", "o
 LOWEST = "*"
 TEXT_COLUMNS = (0, len(HEADER) - 1)
 _TRAINING = "training_mean_mm"  # the lowest of these is no merit
-_PARTS = {"rbfn": "RBFN", "lightgbm": "LightGBM", "chain": "RBFN + LightGBM", "rbf-tcm": "RBF on torques"}
+_PARTS = {
+    "rbfn": "RBFN",
+    "lightgbm": "LightGBM",
+    "chain": "RBFN + LightGBM",
+    "gp": "Gaussian process",
+    "rbf-tcm": "RBF on torques",
+    "table": "table of corrections",
+    "rbfn-paper": "the paper's RBFN",
+}
 _BARS = (("mean_mm", "mean"), ("max_mm", "max"), ("std_mm", "standard deviation"))
 
 
@@ -118,21 +141,28 @@ def bars(comparison: Comparison) -> Figure:
 
 
 def curves(comparison: Comparison) -> Figure:
-    """Held-out errors of every method in rising order."""
-    figure = new_figure(3.9)
-    axes = figure.add_subplot()
-    for result in _applicable(comparison):
-        assert result.error_mm is not None
-        share = 100.0 * (np.arange(len(result.error_mm)) + 1) / len(result.error_mm)
-        width = 2.4 if result.method == "default" else 1.4
-        axes.plot(
-            share, np.sort(result.error_mm), color=_COLOURS[result.method], linewidth=width, label=LABELS[result.method]
-        )
-    plain_log_axis(axes)
-    axes.set_xlim(0, 100)
-    axes.set_xlabel("share of the held-out fixes with at most this error, %")
-    axes.set_ylabel("position error, mm")
-    figure.legend(loc="outside upper left", ncols=6)
+    """Held-out errors in rising order: of the methods, and of the residuals on the default's kinematics."""
+    results = _applicable(comparison)
+    panels = {
+        "methods": [r for r in results if r.method not in RESIDUALS],
+        "residuals on the default's kinematics": [r for r in results if r.method in (*RESIDUALS, "default")],
+    }
+    drawn = {title: part for title, part in panels.items() if len(part) > 1}
+    figure = new_figure(4.6)
+    for axes, (title, part) in zip(
+        figure.subplots(1, len(drawn), sharey=True, squeeze=False)[0], drawn.items(), strict=True
+    ):
+        for result in part:
+            assert result.error_mm is not None
+            share = 100.0 * (np.arange(len(result.error_mm)) + 1) / len(result.error_mm)
+            look = {"color": _COLOURS[result.method], "label": LABELS[result.method]}
+            axes.plot(share, np.sort(result.error_mm), linewidth=2.4 if result.method == "default" else 1.4, **look)
+        plain_log_axis(axes)
+        axes.set_xlim(0, 100)
+        axes.set_title(title)
+        axes.set_xlabel("share of the held-out fixes with at most this error, %")
+        axes.legend(loc="lower right", fontsize=8.5)
+    figure.axes[0].set_ylabel("position error, mm")
     return figure
 
 
@@ -143,7 +173,8 @@ def _applicable(comparison: Comparison) -> list[MethodResult]:
 def headline(comparison: Comparison) -> str:
     """The result in one sentence."""
     lowest = comparison.lowest("mean_mm")
-    best = next(result for result in comparison.results if result.method in lowest)
+    # Residuals that are left out tie with none.
+    best = max((r for r in comparison.results if r.method in lowest), key=lambda r: r.method == "default")
     nominal = comparison.results[0]
     assert best.error_mm is not None
     assert nominal.error_mm is not None
@@ -164,7 +195,8 @@ def _head(comparison: Comparison) -> str:
         + f'<p class="headline">{escape(headline(comparison)).replace(" mm", "&nbsp;mm")}</p>'
         + paragraph(
             "Every method was calibrated on the same training fixes and judged on the held-out ones, by its last "
-            "stage. Seconds are of the whole calibration.",
+            "stage. Rows from \u201cno residual\u201d to the default share one identification, and differ in what is "
+            "learned on top of it. Seconds are of the whole calibration.",
             "lead",
         )
         + f"</header>{notice(warnings)}"

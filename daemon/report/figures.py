@@ -144,6 +144,24 @@ def _running_median(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     return middles[keep], medians[keep]
 
 
+def importance(report: ReportInput, most: int = 10) -> Figure:
+    """Features of the learned trees by their share of what the splits gained (Zhou et al. 2022, Fig. 10)."""
+    lines = report.importance[:most]
+    figure = new_figure(0.7 + 0.27 * len(lines))
+    axes = figure.add_subplot()
+    shares = [100.0 * share for _, share in lines]
+    axes.barh(range(len(lines)), shares, height=0.62, color=AFTER, linewidth=0)
+    for place, share in enumerate(shares):
+        axes.annotate(f"{number(share, 2)} %", (share, place), (4, 0), textcoords="offset points", va="center")
+    axes.set_yticks(range(len(lines)), [name for name, _ in lines])
+    axes.tick_params(axis="y", length=0, labelcolor=INK)
+    axes.set_ylim(len(lines) - 0.4, -0.6)
+    axes.set_xlim(0.0, 1.12 * max(shares))
+    axes.set_xlabel("share of what the splits gained, %")
+    axes.grid(False, axis="y")
+    return figure
+
+
 def joint_coverage(report: ReportInput) -> Figure:
     """Which part of each joint's range the fixes cover."""
     joints: Sequence[Joint] = report.joints

@@ -14,6 +14,7 @@ from calibration.identification.samples import joint_rates, reading_covariance, 
 from calibration.model import CalibratedModel
 from calibration.observations import Observations
 from calibration.pipeline import Evaluation
+from calibration.residual.hybrid import tree_importance
 from daemon.report.inputs import (
     STAGES,
     EffectLine,
@@ -57,6 +58,7 @@ def report_input(
     """
     model = training.model
     judged = training if held_out is None else held_out
+    learner = model.residual.learner if model.residual else None
     return ReportInput(
         rig=model.rig.name,
         joints=model.rig.joints,
@@ -64,7 +66,7 @@ def report_input(
         held_out=None if held_out is None else _error_table(held_out),
         noise_mm=model.noise_mm,
         instrument_mm=_instrument_mm(judged.model, judged.observations),
-        residual=model.residual.learner.kind if model.residual else None,
+        residual=learner.kind if learner else None,
         residual_reason=model.residual_reason,
         parameters=list(_parameters(model)),
         n_parameters=model.identifiability.parameters,
@@ -79,6 +81,7 @@ def report_input(
         effects_reason=model.effects_reason,
         expected=judged.expected,
         axes=judged.axes,
+        importance=[(line.feature, line.share) for line in tree_importance(learner) or () if line.share > 0.0],
     )
 
 

@@ -175,6 +175,8 @@ class ReportInput:
         provenance: label -> value: data hashes, versions, seed, time.
         expected: how true the model expects itself to be over the work volume, where that is known.
         axes: the model held against single-joint sweeps of the judged rows.
+        importance: (feature, its share of what the learned trees' splits gained), the most important first; empty
+            without trees.
     """
 
     rig: str
@@ -198,6 +200,7 @@ class ReportInput:
     effects_reason: str = "switched off"
     expected: ExpectedAccuracy | None = None
     axes: Sequence[AxisCheck] = ()
+    importance: Sequence[tuple[str, float]] = ()
 
     @property
     def judged(self) -> ErrorTable:

@@ -166,6 +166,26 @@ def m005_jobs_cover_sessions(db: Database) -> None:
     )
 
 
+@MIGRATIONS()
+def m006_models_go_live(db: Database) -> None:
+    """Who put which model live, and when; a comparison that an operator asks for names its model."""
+    _create(
+        db,
+        # Every change of a model's state. replaced_id: the model that was live before one that went live.
+        # zeros_checked_through: no change, but an operator's word that the joints' zeros are those of the model's
+        # training, whatever jumped up to that device event. NULL in a change.
+        f"""CREATE TABLE model_states (id INTEGER PRIMARY KEY, model_id INTEGER NOT NULL REFERENCES models(id),
+            {_one_of("state", "candidate", "live", "retired")}, {_instant()}, operator TEXT NOT NULL DEFAULT '',
+            reason TEXT NOT NULL, replaced_id INTEGER REFERENCES models(id),
+            zeros_checked_through INTEGER) STRICT""",
+        "CREATE INDEX model_states_by_model ON model_states(model_id, id)",
+        "CREATE INDEX device_events_of_jumps ON device_events(boot_id, monotonic_ns) WHERE kind = 'preset_jump'",
+        """INSERT INTO model_states (model_id, state, utc_ns, monotonic_ns, boot_id, reason)
+            SELECT id, state, created_utc_ns, created_monotonic_ns, created_boot_id, 'made' FROM models ORDER BY id""",
+        "ALTER TABLE jobs ADD COLUMN model_id INTEGER REFERENCES models(id)",
+    )
+
+
 def unknown_migrations(db: Database) -> list[str]:
     """Migrations that `db` has and this program does not know: it was made by a newer one."""
     empty = Database(memory=True)

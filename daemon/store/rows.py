@@ -61,6 +61,8 @@ def _json_value(value: object) -> object:
         return {str(key): _json_value(item) for key, item in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
         return [_json_value(item) for item in value]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)  # a column has no truth values, JSON has
     return sql_value(value)
 
 

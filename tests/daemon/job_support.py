@@ -20,7 +20,7 @@ from simulators.dataset import SimulatedObservations, simulate_observations
 from simulators.truth import RigTruth
 
 SOURCE = load_rig("swdt82")
-DEADLINE_S = 60.0
+DEADLINE_S = 180.0
 START = Stamp(1_700_000_000 * NS_PER_S, 1000 * NS_PER_S, "boot-a")
 LABELS = {"prism", "setup", "session", "pose", "time_s", "dwell_s", "x_mm", "y_mm", "z_mm"}
 
@@ -33,7 +33,10 @@ with (directory / "orders.jsonl").open("a") as file:
     file.write(json.dumps(order) + "\\n")
 say = lambda message: print(json.dumps(message), flush=True)
 result = {"model": str(directory / str(order["job_id"])), "sessions": order["session_ids"]}
-if order["kind"] != "report":
+if order["kind"] in ("report", "comparison"):
+    result |= {"model": order["model"]}
+    result |= {"comparison": {"live": order["live_id"], "is_better": True}} if order["kind"] == "comparison" else {}
+else:
     result |= {"manifest_sha256": "ab" * 32, "stage": "geometric", "metrics": {"noise_mm": 1.5}}
 what = json.loads((directory / "plan.json").read_text()).get(order["kind"], "done")
 say({"progress": 0.25, "message": what})

@@ -17,7 +17,8 @@ from tests.bench.zhou2022 import sweeps, table
 from tests.calibration.simulated_ys100 import robot, stiffening
 
 TORSO = Path(__file__).parents[1] / "rigs" / "torso.toml"
-METHODS = ["nominal", "km", "skcm", "rbf-tcm", "default", "pde-paper"]
+RESIDUALS = ["effects", "table", "rbfn-paper", "rbfn", "lightgbm", "chain", "gp"]
+METHODS = ["nominal", "km", "skcm", "rbf-tcm", *RESIDUALS, "default", "pde-paper"]
 FIGURES = ["mean_mm", "max_mm", "std_mm", "rms_mm", "training_mean_mm"]
 
 

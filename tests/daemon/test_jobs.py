@@ -60,9 +60,9 @@ def test_a_chain_runs_in_order_and_leaves_its_models_and_report(rig: JobRig) -> 
     rig.measured("a", 20, prisms=["r", "s"])
     rig.measured("c", 4, kind="check", prisms=["r", "s"])
     rig.start(real=True)
-    rig.wait_for("done", "done", "done")
+    rig.wait_for("done", "done", "done", "done")
     jobs = rig.jobs()
-    assert [job["kind"] for job in jobs] == ["identification", "residual", "report"]
+    assert [job["kind"] for job in jobs] == ["identification", "residual", "report", "comparison"]
     assert all(job["progress"] == 1.0 and job["pid"] is None and job["attempts"] == 1 for job in jobs)
     assert all(a["ended_monotonic_ns"] <= b["started_monotonic_ns"] for a, b in itertools.pairwise(jobs))
     models = rig.store.rows("SELECT * FROM models ORDER BY id")
@@ -80,6 +80,8 @@ def test_a_chain_runs_in_order_and_leaves_its_models_and_report(rig: JobRig) -> 
     assert Path(report["result"]["report"]).stat().st_size > 10_000
     stages = {s["stage"]: s["rms_mm"] for s in report["result"]["evaluation"]["stages"]}
     assert stages["geometric"] < stages["nominal"] / 2
+    compared = json.loads(models[1]["metrics_json"])["comparison"]
+    assert (compared["live"], compared["sessions"], compared["is_better"]) == (None, ["c"], True)
 
 
 def test_a_job_goes_on_from_the_checkpoint_of_its_number_and_leaves_none(rig: JobRig) -> None:
@@ -89,7 +91,7 @@ def test_a_job_goes_on_from_the_checkpoint_of_its_number_and_leaves_none(rig: Jo
     checkpoint = rig.config.models_directory / "00001.checkpoint"
     checkpoint.parent.mkdir(parents=True)
     checkpoint.write_bytes(b"no state of a search")
-    order = Order("identification", 1, str(rig.config.store_path), str(checkpoint.parent), ("a",), None, (), 0)
+    order = Order("identification", 1, str(rig.config.store_path), str(checkpoint.parent), ("a",), None, None, (), 0)
     result = perform(order, lambda share, text: None)
     assert "the checkpoint cannot be read, so the search began anew" in read_model(Path(result["model"])).warnings
     assert not checkpoint.exists()
@@ -102,16 +104,16 @@ def test_data_that_determine_nothing_fail_in_a_sentence_whatever_lies_in_the_cur
     monkeypatch.chdir(tmp_path)
     rig.session("a")
     rig.start(real=True)
-    rig.wait_for("failed", "cancelled", "cancelled")
-    first, second, third = rig.jobs()
+    rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
+    first, *waiting = rig.jobs()
     assert "sessions a" in first["error"]
-    assert second["error"] == third["error"] == "job 1 before it is failed"
+    assert [job["error"] for job in waiting] == ["job 1 before it is failed"] * 3
     assert first["result_json"] is None
     assert rig.store.rows("SELECT * FROM models") == []
 
 
 def test_a_fault_inside_a_job_is_its_error(rig: JobRig) -> None:
-    order = Order("no such kind", 1, str(rig.config.store_path), "models", (), None, (), 0)
+    order = Order("no such kind", 1, str(rig.config.store_path), "models", (), None, None, (), 0)
     with JobChild(order) as child:
         message = child.next_message(60.0)
     assert message == Outcome("failed", "KeyError: 'no such kind'; the daemon's log has the whole story")
@@ -125,8 +127,24 @@ def test_a_failed_job_cancels_those_that_wait_for_it_and_says_why(rig: JobRig) -
     rig.session("a")
     rig.plan(residual="fail")
     rig.start()
-    rig.wait_for("done", "failed", "cancelled")
-    assert [job["error"] for job in rig.jobs()] == [None, "the data are too poor", "job 2 before it is failed"]
+    rig.wait_for("done", "failed", "cancelled", "cancelled")
+    assert [job["error"] for job in rig.jobs()] == [None, "the data are too poor", *["job 2 before it is failed"] * 2]
+
+
+@pytest.mark.parametrize(("kind", "other"), [("report", "comparison"), ("comparison", "report")])
+def test_a_report_that_fails_keeps_no_comparison_from_running_nor_the_other_way_round(
+    rig: JobRig, kind: str, other: str
+) -> None:
+    rig.session("a")
+    rig.plan(**{kind: "fail"})
+    rig.start()
+    rig.wait(lambda: len(rig.states()) == 4 and not set(rig.states()) & {"queued", "running"})
+    ended = {job["kind"]: job["state"] for job in rig.jobs()}
+    assert ended == {"identification": "done", "residual": "done", kind: "failed", other: "done"}
+    rig.plan()
+    rig.session("c", kind="check")
+    rig.clock.advance(3.0)
+    rig.wait(lambda: rig.states()[4:] == ["done", "done"], "the checks")
 
 
 @pytest.mark.parametrize(
@@ -141,7 +159,7 @@ def test_a_process_that_breaks_the_protocol_is_a_failed_job(rig: JobRig, what: s
     rig.session("a")
     rig.plan(identification=what)
     rig.start()
-    rig.wait_for("failed", "cancelled", "cancelled")
+    rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
     assert rig.job(1)["error"].startswith(error)
     assert rig.job(1)["pid"] is None
 
@@ -152,7 +170,7 @@ def test_a_process_that_closes_its_output_and_lives_on_is_ended(rig: JobRig, mon
     rig.plan(identification="closed")
     rig.start()
     pid = rig.running(1)["pid"]
-    rig.wait_for("failed", "cancelled", "cancelled")
+    rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
     assert rig.job(1)["error"] == "its process closed its output without a result"
     assert is_gone(pid)
 
@@ -163,7 +181,7 @@ def test_a_job_that_takes_too_long_is_ended_with_all_that_it_started(tmp_path: P
         rig.session("a")
         rig.plan(identification="deaf")
         rig.start()
-        rig.wait_for("failed", "cancelled", "cancelled")
+        rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
         job = rig.job(1)
         assert job["error"] == "took longer than its limit of 1.5 s ([jobs] time_limit_s)"
         assert job["time_limit_s"] == 1.5
@@ -178,11 +196,11 @@ def test_a_command_that_cannot_be_started_is_tried_as_often_as_allowed(tmp_path:
     try:
         rig.session("a")
         runner = rig.start(command=["/nowhere/python"])
-        rig.wait_for("interrupted", "queued", "queued")
-        assert [job["state"] for job in runner.unfinished()] == ["interrupted", "queued", "queued"]
+        rig.wait_for("interrupted", "queued", "queued", "queued")
+        assert [job["state"] for job in runner.unfinished()] == ["interrupted", "queued", "queued", "queued"]
         rig.clock.advance(6.0)
         rig.wait(lambda: rig.job(1)["attempts"] == 2, "a second attempt")
-        rig.wait_for("failed", "cancelled", "cancelled")
+        rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
         assert rig.job(1)["error"].startswith("interrupted 2 times, as often as [jobs] max_attempts allows")
         assert runner.unfinished() == []
     finally:
@@ -199,9 +217,9 @@ def test_a_running_job_is_cancelled_with_its_process_and_those_that_wait(rig: Jo
     job = rig.running(1)
     assert job["progress"] == 0.25
     assert runner.cancel_command({"id": 1}) == "job 1 (identification) is being cancelled"
-    rig.wait_for("cancelled", "cancelled", "cancelled")
+    rig.wait_for("cancelled", "cancelled", "cancelled", "cancelled")
     assert is_gone(job["pid"])
-    assert [j["error"] for j in rig.jobs()] == ["cancelled by the operator", *["job 1 before it is cancelled"] * 2]
+    assert [j["error"] for j in rig.jobs()] == ["cancelled by the operator", *["job 1 before it is cancelled"] * 3]
 
 
 def test_a_queued_job_is_cancelled_and_the_one_before_it_runs_on(rig: JobRig) -> None:
@@ -210,10 +228,10 @@ def test_a_queued_job_is_cancelled_and_the_one_before_it_runs_on(rig: JobRig) ->
     runner = rig.start()
     rig.running(1)
     assert runner.cancel_command({"id": 2}) == "job 2 (residual) is cancelled"
-    assert rig.states() == ["running", "cancelled", "cancelled"]
+    assert rig.states() == ["running", "cancelled", "cancelled", "cancelled"]
     assert rig.job(3)["error"] == "job 2 before it is cancelled"
     runner.cancel_command({"id": 1})
-    rig.wait_for("cancelled", "cancelled", "cancelled")
+    rig.wait_for("cancelled", "cancelled", "cancelled", "cancelled")
     assert rig.job(2)["error"] == "cancelled by the operator"
 
 
@@ -223,7 +241,7 @@ def test_a_job_cancelled_between_choice_and_start_does_not_start(rig: JobRig) ->
     assert chosen is not None
     jobs.cancel(1)
     assert not jobs.begin(chosen, 60.0)
-    assert rig.states() == ["cancelled", "cancelled", "cancelled"]
+    assert rig.states() == ["cancelled", "cancelled", "cancelled", "cancelled"]
 
 
 def test_a_cancellation_goes_before_a_result_that_comes_at_the_same_time(rig: JobRig) -> None:
@@ -233,7 +251,7 @@ def test_a_cancellation_goes_before_a_result_that_comes_at_the_same_time(rig: Jo
     assert jobs.begin(chosen, 60.0)
     jobs.cancel(1)
     assert jobs.end(1, Outcome("done", result={"model": "m"})).state == "cancelled"
-    assert rig.states() == ["cancelled", "cancelled", "cancelled"]
+    assert rig.states() == ["cancelled", "cancelled", "cancelled", "cancelled"]
     jobs.retry(1)
     again = next_job(jobs.state())
     assert again is not None
@@ -256,24 +274,24 @@ def test_a_retried_job_runs_again_with_those_that_waited_and_shows_no_old_error(
     rig.session("a")
     rig.plan(identification="fail")
     runner = rig.start()
-    rig.wait_for("failed", "cancelled", "cancelled")
+    rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
     rig.plan(identification="hang")
     assert runner.retry_command({"id": 1}) == "job 1 (identification) is queued again"
     job = rig.running(1)
     assert (job["error"], job["ended_utc_ns"], job["attempts"]) == (None, None, 1)
     runner.cancel_command({"id": 1})
-    rig.wait_for("cancelled", "cancelled", "cancelled")
+    rig.wait_for("cancelled", "cancelled", "cancelled", "cancelled")
     rig.plan()
     runner.retry_command({"id": 1})
-    rig.wait_for("done", "done", "done")
-    assert [job["error"] for job in rig.jobs()] == [None, None, None]
+    rig.wait_for("done", "done", "done", "done")
+    assert [job["error"] for job in rig.jobs()] == [None] * 4
 
 
 def test_what_makes_no_sense_is_refused_in_a_sentence(rig: JobRig) -> None:
     rig.session("a")
     rig.plan(residual="fail")
     runner = rig.start()
-    rig.wait_for("done", "failed", "cancelled")
+    rig.wait_for("done", "failed", "cancelled", "cancelled")
     for command, number, why in (
         (runner.retry_command, 1, "job 1 is done; only one that did not end well can be retried"),
         (runner.cancel_command, 1, "job 1 is done"),
@@ -298,15 +316,15 @@ def test_a_job_that_a_stop_interrupts_is_offered_again_until_its_attempts_are_us
             job = rig.running(1)
             assert (job["attempts"], job["error"]) == (attempt, None)
             rig.stop()
-            assert rig.states() == ["interrupted", "queued", "queued"]
+            assert rig.states() == ["interrupted", "queued", "queued", "queued"]
             assert rig.job(1)["error"] == "the daemon was stopped"
             assert is_gone(job["pid"])
         runner = rig.start()
-        rig.wait_for("failed", "cancelled", "cancelled")
+        rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
         assert rig.job(1)["error"].startswith("interrupted 2 times")
         rig.plan()
         runner.retry_command({"id": 1})
-        rig.wait_for("done", "done", "done")
+        rig.wait_for("done", "done", "done", "done")
     finally:
         rig.close()
 
@@ -320,9 +338,9 @@ def test_an_interrupted_job_waits_before_it_runs_again_and_can_be_cancelled_mean
     rig.store.update("jobs", {"id": 1}, rig.store.instant(rig.clock.now().shifted(100 * NS_PER_S), "ended_"))
     runner = rig.start()
     rig.look_on()
-    assert rig.states() == ["interrupted", "queued", "queued"]
+    assert rig.states() == ["interrupted", "queued", "queued", "queued"]
     assert runner.cancel_command({"id": 1}) == "job 1 (identification) is cancelled"
-    assert rig.states() == ["cancelled", "cancelled", "cancelled"]
+    assert rig.states() == ["cancelled", "cancelled", "cancelled", "cancelled"]
 
 
 def test_nothing_starts_while_a_session_is_open(rig: JobRig) -> None:
@@ -333,7 +351,7 @@ def test_nothing_starts_while_a_session_is_open(rig: JobRig) -> None:
     assert rig.jobs() == []
     rig.close_session("b")
     rig.clock.advance(3.0)
-    rig.wait_for("done", "done", "done")
+    rig.wait_for("done", "done", "done", "done")
     assert rig.orders()[0]["session_ids"] == ["a", "b"]
 
 
@@ -345,10 +363,10 @@ def test_queued_jobs_wait_while_a_session_is_open(rig: JobRig) -> None:
     rig.session("b", state="open")
     rig.plan()
     runner.cancel_command({"id": 1})
-    rig.wait_for("cancelled", "cancelled", "cancelled")
+    rig.wait_for("cancelled", "cancelled", "cancelled", "cancelled")
     runner.retry_command({"id": 1})
     rig.look_on()
-    assert rig.states() == ["queued", "queued", "queued"]
+    assert rig.states() == ["queued", "queued", "queued", "queued"]
 
 
 # ---- which sessions are worked on ------------------------------------------------------------------------------------
@@ -359,18 +377,18 @@ def test_a_wall_clock_that_is_wrong_after_a_reboot_changes_nothing(rig: JobRig, 
     """Neither sessions before nor after it are worked on twice, or not at all."""
     rig.session("a")
     rig.start()
-    rig.wait_for("done", "done", "done")
+    rig.wait_for("done", "done", "done", "done")
     rig.stop()
     rig.clock.set(Stamp(rig.clock.now().utc_ns + hours * 3600 * NS_PER_S, 5 * NS_PER_S, "boot-b"))
     rig.start()
     rig.look_on()
-    assert rig.states() == ["done"] * 3
+    assert rig.states() == ["done"] * 4
     rig.session("b")
     rig.clock.advance(3.0)
-    rig.wait_for(*["done"] * 6)
+    rig.wait_for(*["done"] * 8)
     rig.look_on()
-    assert rig.states() == ["done"] * 6
-    assert rig.orders()[3]["session_ids"] == ["a", "b"]
+    assert rig.states() == ["done"] * 8
+    assert rig.orders()[4]["session_ids"] == ["a", "b"]
 
 
 def test_a_session_closed_while_a_chain_runs_has_a_chain_of_its_own(rig: JobRig) -> None:
@@ -383,11 +401,11 @@ def test_a_session_closed_while_a_chain_runs_has_a_chain_of_its_own(rig: JobRig)
     rig.clock.advance(3.0)
     rig.plan()
     runner.cancel_command({"id": 1})
-    rig.wait_for(*["cancelled"] * 3, *["done"] * 3)
+    rig.wait_for(*["cancelled"] * 4, *["done"] * 4)
     runner.retry_command({"id": 1})
-    rig.wait_for(*["done"] * 6)
+    rig.wait_for(*["done"] * 8)
     told = [(o["job_id"], o["session_ids"], o["train_ids"]) for o in rig.orders() if o["kind"] == "report"]
-    assert told == [(6, ["c"], ["a", "b"]), (3, [], ["a"])], "a job works on the sessions it was queued for"
+    assert told == [(7, ["c"], ["a", "b"]), (3, [], ["a"])], "a job works on the sessions it was queued for"
 
 
 def test_a_check_is_held_against_the_newest_model(rig: JobRig) -> None:
@@ -397,28 +415,28 @@ def test_a_check_is_held_against_the_newest_model(rig: JobRig) -> None:
     assert rig.jobs() == [], "there is no model yet"
     rig.session("a")
     rig.clock.advance(3.0)
-    rig.wait_for("done", "done", "done")
+    rig.wait_for("done", "done", "done", "done")
     rig.session("c2", kind="check")
     rig.clock.advance(3.0)
-    rig.wait_for("done", "done", "done", "done")
-    last = rig.orders()[-1]
-    assert (last["kind"], last["session_ids"], last["train_ids"]) == ("report", ["c1", "c2"], ["a"])
-    assert last["model"] == str(rig.directory / "2")
+    rig.wait_for(*["done"] * 6)
+    for order, kind in zip(rig.orders()[-2:], ("report", "comparison"), strict=True):
+        assert (order["kind"], order["session_ids"], order["train_ids"]) == (kind, ["c1", "c2"], ["a"])
+        assert order["model"] == str(rig.directory / "2")
 
 
 def test_rigs_that_share_a_store_do_not_share_jobs_or_models(rig: JobRig) -> None:
     rig.session("a")
     rig.start()
-    rig.wait_for("done", "done", "done")
+    rig.wait_for("done", "done", "done", "done")
     rig.stop()
     rig.session("x", kind="check", rig="ur10")
     rig.start(rig="ur10")
     rig.look_on()
-    assert len(rig.jobs()) == 3, "the model is another rig's"
+    assert len(rig.jobs()) == 4, "the model is another rig's"
     rig.session("y", rig="ur10")
     rig.clock.advance(3.0)
-    rig.wait_for(*["done"] * 6)
-    assert rig.orders()[3]["session_ids"] == ["y"]
+    rig.wait_for(*["done"] * 8)
+    assert rig.orders()[4]["session_ids"] == ["y"]
 
 
 def test_jobs_of_an_older_store_keep_what_they_covered(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -89,6 +90,15 @@ def test_a_damaged_text_under_a_true_manifest_dies_in_the_child_and_not_here(mod
     assert "\n" not in str(refusal.value)
 
 
+def test_a_model_that_predicts_positions_off_the_earth_is_refused_by_the_child(model_directory: Path) -> None:
+    path = model_directory / "lightgbm_x.txt"
+    huge = re.sub(r"(?<=^leaf_value=)\S+", "1e299", path.read_text(), flags=re.MULTILINE)
+    path.write_text(huge)
+    reseal(model_directory)
+    with pytest.raises(ModelError, match=r"beyond 1e\+09 mm"):
+        read_model(model_directory)
+
+
 def test_a_model_that_takes_its_reader_down_is_named(model_directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # What LightGBM does to a process differs between its versions; a reader that is killed stands for all of them.
     killer = model_directory.parent / "python"
@@ -119,7 +129,14 @@ def test_a_model_is_loaded_by_a_child_once_per_process(written: Path, monkeypatc
     read_model(written)
 
 
-@pytest.mark.parametrize("manifest", ["", "[]", "{}", '{"files": {"../../etc/passwd": {}}}', '{"files": 3}'])
+@pytest.mark.parametrize(
+    "manifest",
+    [
+        *("", "[]", "{}", '{"files": 3}', '{"files": [3]}', "[" * 100_000),
+        *('{"files": {"../../etc/passwd": {}}}', '{"files": {"..": {}}}', '{"files": {"a\\u0000b": {}}}'),
+        *('{"files": {"\\ud800": {}}}', '{"files": {"' + "a" * 5000 + '": {}}}'),
+    ],
+)
 def test_a_damaged_manifest_is_refused(model_directory: Path, manifest: str) -> None:
     (model_directory / "manifest.json").write_text(manifest)
     with pytest.raises(ModelError, match=r"manifest\.json"):

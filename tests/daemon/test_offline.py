@@ -18,13 +18,13 @@ from click.testing import CliRunner, Result
 
 from calibration import methods
 from daemon.cli.main import main as rigcal
-from daemon.cli.offline import METHODS, PREDICTED_COLUMNS
+from daemon.cli.offline import INTERVAL_COLUMNS, METHODS, PREDICTED_COLUMNS
 from daemon.modelfiles import write_model
 from tests.daemon.offline_support import held_out_csv, small_calibration, train_csv
 
 KEYS = [
     "rig", "n", "seconds", "stages", "per_prism", "effects", "residual", "noise_mm", "identifiability", "warnings",
-    "ignored_columns", "expected_accuracy", "axes",
+    "ignored_columns", "expected_accuracy", "axes", "importance", "intervals",
 ]  # fmt: skip
 STAGES = ["nominal", "geometric", "effects", "hybrid"]
 STAGE_KEYS = ["stage", "mean_mm", "rms_mm", "max_mm", "std_mm"]
@@ -122,6 +122,27 @@ def test_predict_writes_the_input_columns_and_its_own(work: Path, tmp_path: Path
     sigma = np.array([[float(row[f"sigma_{c}_pred_mm"]) for c in "xyz"] for row in rows])
     assert np.linalg.norm(measured - predicted, axis=1).max() < 3.0
     assert (sigma > 0).all()
+
+
+def test_predict_gives_intervals_where_they_are_asked_for(work: Path) -> None:
+    result = run("predict", "--model", work / "model", "--data", work / "test.csv", "--intervals")
+    assert result.exit_code == 0
+    rows = list(csv.DictReader(io.StringIO(result.stdout)))
+    assert tuple(rows[0])[-10:] == (*PREDICTED_COLUMNS, *INTERVAL_COLUMNS)
+    table = {name: np.array([float(row[name]) for row in rows]) for name in rows[0] if name.endswith("_mm")}
+    error = np.column_stack([table[f"{c}_mm"] - table[f"{c}_pred_mm"] for c in "xyz"])
+    half = np.column_stack([table[f"half90_{c}_pred_mm"] for c in "xyz"])
+    assert 0.8 < (np.abs(error) <= half).mean() < 0.98
+    assert 0.75 < (np.linalg.norm(error, axis=1) <= table["radius90_pred_mm"]).mean() <= 1.0
+
+
+@pytest.mark.parametrize("command", ["predict", "evaluate"])
+def test_data_of_another_rig_is_refused_with_a_sentence(work: Path, tmp_path: Path, command: str) -> None:
+    data = tmp_path / "boom.csv"
+    data.write_text("prism,theta1_deg,theta3_deg,x_mm,y_mm,z_mm\nr,1,2,3,4,5\n")
+    result = run(command, "--model", work / "model", "--data", data)
+    assert result.exit_code == 2
+    assert "column q1_deg: column missing for rig 'ur10'" in result.output
 
 
 def test_predict_needs_no_positions_and_keeps_columns_it_does_not_know(work: Path, tmp_path: Path) -> None:

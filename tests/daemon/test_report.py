@@ -87,6 +87,16 @@ def test_named_effects_have_a_section_with_their_sizes() -> None:
         assert words in outline.text
 
 
+def test_the_features_of_trees_are_shown_by_their_importance() -> None:
+    shares = [("prism_x_mm", 0.4), *((f"valve{k}_mA", 0.05) for k in range(12))]
+    outline = Outline(build_report(report_input(importance=shares)))
+    assert "What the learned residual looks at" in outline.headings
+    assert "The 10 most important of the 13 features of the trees." in outline.text
+    assert len(outline.pictures) == 7
+    drawing = base64.b64decode(outline.pictures[-2]["src"].partition("base64,")[2], validate=True)
+    assert b"<svg" in drawing[:1000]
+
+
 def test_report_is_one_file_that_loads_nothing(document: str, outline: Outline) -> None:
     assert outline.references
     assert all(reference.startswith("data:image/") for reference in outline.references)

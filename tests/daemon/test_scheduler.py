@@ -3,6 +3,7 @@ from dataclasses import replace
 
 from daemon.scheduler import (
     CHAIN,
+    CHECKS,
     DueChain,
     DueRetry,
     JobFacts,
@@ -17,7 +18,6 @@ from drivers.clock import NS_PER_S, Stamp
 
 T0 = Stamp(1_700_000_000 * NS_PER_S, 100 * NS_PER_S, "boot")
 LATER = T0.shifted(60 * NS_PER_S)
-REPORT = (JobKind.REPORT,)
 BOTH = {JobKind.IDENTIFICATION: 1, JobKind.REPORT: 1}  # a chain was queued when the first session was closed
 
 
@@ -90,9 +90,9 @@ def test_a_step_of_the_wall_clock_changes_nothing() -> None:
     assert due_jobs(state(session(1)), stepped) == []
 
 
-def test_a_check_session_triggers_a_report_alone_and_only_with_a_model() -> None:
+def test_a_check_session_triggers_report_and_comparison_alone_and_only_with_a_model() -> None:
     sessions = (session(1), session(2, "check"))
-    assert due_jobs(state(*sessions, covered=BOTH, has_model=True), LATER) == [DueChain(REPORT, "s2", "s2")]
+    assert due_jobs(state(*sessions, covered=BOTH, has_model=True), LATER) == [DueChain(CHECKS, "s2", "s2")]
     assert due_jobs(state(session(1, "check")), LATER) == []
 
 

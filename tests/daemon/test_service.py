@@ -1,6 +1,7 @@
 """The whole daemon, as a process, on simulated devices that speak real CANopen and serial protocols."""
 
 import json
+import math
 import sqlite3
 import subprocess
 import sys
@@ -10,9 +11,20 @@ from typing import Any
 
 import pytest
 
+from daemon.store.reader import Reader
+from drivers.readings import CanCapture
 from tests.daemon.daemon_process import DaemonProcess
 
 SIM = ("--sim", "--rate", "25", "--seed", "3", "--dwell", "2.5")
+
+
+SENDS_THE_TIP = """channel = "can0"
+allow_transmit = true
+
+[tip]
+prism = "r"
+can = { link = "boom", arbitration_id = 0x680 }
+"""
 
 
 def rigcal(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -32,7 +44,7 @@ def record(daemon: DaemonProcess, prism: str, kind: str, poses: int) -> dict[str
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DaemonProcess]:
     """A daemon that has recorded sessions on three prisms and a check, and whose jobs have ended."""
-    daemon = DaemonProcess(tmp_path_factory.mktemp("rig"), *SIM)
+    daemon = DaemonProcess(tmp_path_factory.mktemp("rig"), *SIM, bus=SENDS_THE_TIP)
     try:
         daemon.wait("a fix", daemon.has_fix)
         daemon.say("setup.new", id="S1", instrument="simulated GTS-800A", tilt_arcsec=2.0)
@@ -143,6 +155,63 @@ def test_a_target_that_is_not_there_is_refused_at_once_and_the_rig_goes_on(finis
     assert "no target 'nowhere'" in refused.stderr
     finished.wait("a pose", lambda: finished.say("session.show", id="lost")["poses"] >= 2)
     finished.say("session.abort")
+
+
+def test_an_accepted_model_gives_the_live_tip_on_the_socket_and_on_the_bus(finished: DaemonProcess) -> None:
+    socket = ("--socket", str(finished.socket))
+    early, best = finished.say("model.list")
+    assert (early["comparison"], best["comparison"]["live"]) == (None, None)
+    assert best["comparison"]["is_better"], best
+    assert json.loads(rigcal("tip", *socket, "--json").stdout)["status"] == "no_model"
+    refused = rigcal("model", "accept", str(early["id"]), *socket)
+    assert refused.returncode == 3
+    assert "was not compared with held-out data yet" in refused.stderr
+    accepted = rigcal("model", "accept", str(best["id"]), "--operator", "Ada", *socket)
+    assert accepted.returncode == 0, accepted.stderr
+    assert f"model {best['id']} (hybrid) is live" in rigcal("status", *socket).stdout
+    finished.wait("the model", lambda: finished.say("tip")["status"] != "no_model")
+
+    name = finished.say("session.start", prism="r", kind="check")["id"]
+    tips: list[dict[str, Any]] = []
+
+    def seen() -> list[float]:
+        tips.append(finished.say("tip"))
+        return _errors_in_sigma(finished.directory, name, tips)
+
+    finished.wait("tips where the station measured", lambda: len(seen()) >= 5)
+    finished.say("session.abort")
+    assert max(seen()) < 5.0
+    sent = _sent(finished.directory, 0x680)
+    assert {frame.data[7] for frame in sent} >= {16, 0}, "no model at first, then positions"
+    for command in (("tip",), ("model", "show"), ("model", "list")):
+        shown = rigcal(*command, *socket)
+        assert shown.returncode == 0, shown.stderr
+        assert shown.stdout.strip()
+
+
+def _errors_in_sigma(directory: Path, session: str, tips: list[dict[str, Any]]) -> list[float]:
+    """Tip against fix, of every tip that was told while the boom stood where an observation was made."""
+    with sqlite3.connect(f"file:{directory / 'rigcal.sqlite'}?mode=ro", uri=True) as store:
+        rows = store.execute(
+            "SELECT values_json, x_mm, y_mm, z_mm FROM observations WHERE session_id = ? AND excluded IS NULL",
+            (session,),
+        ).fetchall()
+    store.close()
+    found = []
+    for tip in tips:
+        for values, *place in rows:
+            joints = json.loads(values)
+            if tip["station_mm"] and all(abs(joints[name] - value) < 0.05 for name, value in tip["joints"].items()):
+                sigma = math.hypot(tip["sigma_mm"], 5.0)  # of tip and fix
+                found.append(math.dist(tip["station_mm"], place) / sigma)
+    return found
+
+
+def _sent(directory: Path, identifier: int) -> list[CanCapture]:
+    """What rigcal sent under an identifier and the next, as its raw captures have it."""
+    with Reader(directory / "rigcal.sqlite") as reader:
+        captures = [c for c in reader.captures("boom") if isinstance(c, CanCapture) and c.is_transmitted]
+    return [c for c in captures if c.arbitration_id == identifier]
 
 
 def test_the_store_lost_nothing(finished: DaemonProcess) -> None:

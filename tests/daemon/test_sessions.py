@@ -16,7 +16,7 @@ from daemon.sessions import SessionKeeper
 from daemon.setups import SetupBook
 from daemon.store.reader import Reader
 from daemon.store.store import Store
-from drivers.clock import NS_PER_S, ManualClock
+from drivers.clock import NS_PER_S, ManualClock, Stamp
 from drivers.readings import DeviceEvent, EventKind, Fix, LockState, Reading, Record, Status
 
 SOURCE = load_rig("swdt82")
@@ -338,6 +338,24 @@ def test_after_an_encoder_jumped_nothing_of_the_session_is_used(rig: Rig) -> Non
     rig.say("start", prism="r")
     rig.live(2)
     assert rig.say("stop")["observations"] > 10
+
+
+@pytest.mark.parametrize("boot_id", ["manual", "next boot"])
+def test_a_wall_clock_that_is_set_back_hides_no_jump_from_the_next_run(rig: Rig, boot_id: str) -> None:
+    start(rig)
+    now = rig.clock.now()
+    rig.store.insert_records([DeviceEvent("theta1", now.shifted(NS_PER_S), EventKind.PRESET_JUMP, "from 22 to 33")])
+    back_ns = 86_400 * NS_PER_S
+    rig.clock.set(Stamp(now.utc_ns - back_ns, now.monotonic_ns + 2 * NS_PER_S, boot_id))
+    if boot_id == "manual":
+        late = rig.clock.now()
+        rig.store.insert_records([DeviceEvent("theta3", late, EventKind.PRESET_JUMP, "from 22 to 33")])
+    rig.keeper = rig.new_keeper()
+    rig.live(2)
+    summary = rig.say("stop")
+    jumped = 2 if boot_id == "manual" else 1
+    assert summary["observations"] == 0
+    assert sum("jumped" in sentence for sentence in summary["advice"]) == jumped
 
 
 def test_numbers_of_a_setup_must_be_numbers(rig: Rig) -> None:

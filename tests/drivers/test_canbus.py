@@ -25,7 +25,8 @@ from drivers.can_ports import (
     open_port,
 )
 from drivers.can_stamps import ReceiveStamps
-from drivers.canbus import BACKOFF_MAX_S, LOSS_CHECK_NS, Backoff, CanLink, CanLinkConfig, SyncProducer
+from drivers.can_sync import SyncProducer
+from drivers.canbus import BACKOFF_MAX_S, LOSS_CHECK_NS, Backoff, CanLink, CanLinkConfig
 from drivers.canframe import Frame
 from drivers.clock import ManualClock, ScaledClock, Stamp, SystemClock
 from drivers.errors import LinkError, TransmitForbiddenError

@@ -1,0 +1,64 @@
+"""`rigcal inverse`: what joint values to command so that the true prism is where it should be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from calibration.single_thread import one_blas_thread
+from daemon.cli.csv_output import check_out, deliver, with_columns
+from daemon.cli.offline import Stopwatch, read_observations
+from daemon.cli.options import DIRECTORY, data_option, model_option
+from daemon.cli.output import REFUSED, Command, Delivered, json_option
+from daemon.numba_cache import prepare
+
+CLOSURE_COLUMN = "closure_mm"
+
+
+@click.command(cls=Command)
+@model_option
+@data_option
+@click.option("--out", type=DIRECTORY, metavar="CSV", help="Where to write; standard output by default.")
+@json_option
+def inverse(directory: Path, data: Path, out: Path | None, *, as_json: bool) -> dict[str, object] | Delivered:
+    """Joint values to command, so that the true prisms are where x_mm, y_mm, z_mm of the data say.
+
+    The joints in the data are the nominal command: of all joint values that reach the targets, those nearest to it are
+    found, inside the limits of the joints. Rows of one pose are solved together: two prisms of a feed give its
+    attitude. The whole model counts, effects and learned residual too; columns that these need (direction of approach,
+    payload, temperature) are taken from the rows.
+
+    The result is the data's own columns with the joints replaced, and closure_mm: how far the model then has each prism
+    from its target. With --json it goes to the file of --out, or else into the object as "csv".
+
+    A target that cannot be reached to 0.01 mm is named; the joints given for it bring the prism as near as can be, and
+    the exit status is 3.
+    """
+    watch = Stopwatch()
+    prepare()
+    from calibration.inverse import inverse as solve
+    from daemon.modelfiles import read_model
+
+    check_out(out, data)
+    model = read_model(directory)
+    targets, raw = read_observations(data, model.rig)
+    with one_blas_thread():
+        found = solve(model, targets)
+    commands = {joint.column: found.observations.joints[joint.name] for joint in model.rig.joints}
+    table = with_columns(raw, {**commands, CLOSURE_COLUMN: found.closure_mm})
+    unreached = (~found.reached).nonzero()[0] + 1
+    result: dict[str, object] = {
+        "rig": model.rig.name,
+        "n": len(targets),
+        "seconds": watch.seconds,
+        "worst_closure_mm": float(found.closure_mm.max()),
+        "unreached_rows": unreached.tolist(),
+        "warnings": list(found.warnings),
+        "ignored_columns": list(targets.ignored_columns),
+    }
+    deliver(table, result, found.warnings, out, as_json=as_json)
+    return Delivered(result, REFUSED) if len(unreached) else result
+
+
+COMMANDS = {"inverse": inverse}

@@ -1,0 +1,154 @@
+"""A store with models of a simulated boom, the commands about them, and a clock that tests turn."""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration import pipeline
+from calibration.observations import parse_observations
+from calibration.rig import Rig
+from daemon.composition import joiner
+from daemon.config import Config
+from daemon.job_process import perform
+from daemon.job_table import JobTable
+from daemon.live_model import LiveModel, Loaded, Missing
+from daemon.live_tip import FRESH_S, LiveTip
+from daemon.model_table import ModelTable
+from daemon.modelfiles import model_sha256, write_model
+from daemon.order import Outcome
+from daemon.registry import ModelRegistry
+from drivers.clock import Stamp
+from drivers.readings import Reading, Record, Status
+from simulators.dataset import simulate_observations
+from simulators.truth import RigTruth
+from tests.daemon.job_support import SOURCE, JobRig
+
+TRUTH = RigTruth(SOURCE.rig, 1)
+PRISMS = ("r", "s")
+DEADLINE_S = 60.0
+
+
+@functools.cache
+def written(poses: int) -> Path:
+    """A model of the simulated boom that was trained on so many poses at set-up S1, made once."""
+    scratch = tempfile.mkdtemp(prefix="rigcal-test-")
+    atexit.register(shutil.rmtree, scratch)
+    directory = Path(scratch) / f"trained-on-{poses}"
+    data = simulate_observations(TRUTH, poses, 20, setup="S1", prisms=PRISMS)
+    observations = parse_observations(data.csv_text().encode(), SOURCE.rig, "simulated.csv")
+    write_model(directory, pipeline.identify(SOURCE.rig, SOURCE.text, observations))
+    return directory
+
+
+class ModelRig:
+    """A daemon's store with jobs and models, the live model and the tip, without links and sockets.
+
+    Args:
+        directory: for the store and the models.
+        rig: as the rig file in use describes the machine.
+    """
+
+    def __init__(self, directory: Path, rig: Rig = SOURCE.rig) -> None:
+        self.jobs = JobRig(directory)
+        self.store, self.clock, self.config = self.jobs.store, self.jobs.clock, self.jobs.config
+        self.models = ModelTable(self.store, "swdt82", self.clock)
+        self.job_table = JobTable(self.store, "swdt82", self.clock)
+        self.live = LiveModel(self.models, rig)
+        self.registry = ModelRegistry(self.models, "swdt82", self.live, compare=self.job_table.compare)
+        self.joiner = joiner(Config(rig="swdt82"), rig)
+        self.setup: str | None = None
+        self.tip = LiveTip(rig, self.joiner, self.live, lambda: self.setup, self.clock, "r", FRESH_S)
+        self.live.start()
+
+    def close(self) -> None:
+        self.live.stop()
+        self.jobs.close()
+
+    def candidate(self, poses: int = 30, sessions: tuple[str, ...] = ("a",)) -> int:
+        """A candidate in the store, as a job that was trained on these sessions leaves it."""
+        if not self.store.rows("SELECT 1 FROM calibration_sessions WHERE id = ?", (sessions[0],)):
+            self.jobs.session(sessions[0])
+        with self.store.transaction():
+            row = {"kind": "residual", "session_id": sessions[0], "through_session_id": sessions[0], "state": "running"}
+            job = self.store.insert("jobs", row | self.store.instant(self.clock.now(), "created_"))
+        directory = Path(shutil.copytree(written(poses), self.config.models_directory / f"{job:05d}-hybrid"))
+        result = {
+            "model": str(directory),
+            "manifest_sha256": model_sha256(directory),
+            "stage": "hybrid",
+            "sessions": list(sessions),
+            "metrics": {"noise_mm": 1.0},
+        }
+        self.job_table.end(job, Outcome("done", result=result))
+        return int(self.store.rows("SELECT max(id) AS id FROM models")[0]["id"])
+
+    def compared(self, model: int, *, live: int | None, is_better: bool = True) -> int:
+        """What a comparison found, written down as its job does."""
+        path = str(self.models.get(model).path)
+        self.models.note_comparison(path, {"live": live, "is_better": is_better, "sentence": "it errs by 1 mm"})
+        return model
+
+    def accepted(self, poses: int = 30) -> int:
+        """A new candidate that is live now."""
+        live = self.models.live()
+        model = self.compared(self.candidate(poses), live=live and live.id)
+        self.registry.accept_command({"id": model, "operator": "Ada"})
+        return model
+
+    def compare(self) -> dict[str, Any]:
+        """Carry out the comparison that was queued last, as a job's process does."""
+        job = next(job for job in self.job_table.state().jobs if job.kind == "comparison")
+        assert self.job_table.begin(job, 60.0)
+        result = perform(self.job_table.order(job, self.config), lambda share, text: None)
+        self.job_table.end(job.id, Outcome("done", result=result))
+        return dict(result["comparison"])
+
+    def settled(self) -> Loaded | Missing:
+        """The live model, once it is loaded or is known not to be."""
+        wait(lambda: "being loaded" not in str(getattr(self.live.now(), "reason", "")))
+        return self.live.now()
+
+    # ---- the machine -------------------------------------------------------------------------------------------------
+
+    def drive(self, joints: dict[str, float], seconds: float = 3.0, unread: str = "") -> None:
+        """Stand still for a while; every joint but one is read ten times a second, and the tip looks on."""
+        for _ in range(round(seconds * 10)):
+            self.clock.advance(0.1)
+            self.read({name: value for name, value in joints.items() if name != unread}, self.clock.now())
+
+    def read(self, joints: dict[str, float], now: Stamp, status: Status = Status.OK) -> None:
+        units = {joint.name: joint.unit for joint in SOURCE.rig.joints}
+        self.take(
+            [
+                Reading(name, now, value if status is Status.OK else None, units[name], status)
+                for name, value in joints.items()
+            ]
+        )
+
+    def take(self, records: Sequence[Record]) -> None:
+        """Store records and hand them on, as the writer does."""
+        self.store.insert_records(records)
+        self.joiner.feed(records)
+        self.tip.on_records(records)
+
+
+def wait(done: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + DEADLINE_S
+    while not done():
+        assert time.monotonic() < deadline, "waited too long"
+        time.sleep(0.005)
+
+
+def pose(seed: int) -> dict[str, float]:
+    """Joint values well inside the limits."""
+    rng = np.random.default_rng(seed)
+    return {j.name: float(j.limits[0] + rng.uniform(0.2, 0.8) * (j.limits[1] - j.limits[0])) for j in SOURCE.rig.joints}

@@ -1,0 +1,66 @@
+"""The daemon's parts hear of what was stored, whatever one of them does with it."""
+
+import sqlite3
+from pathlib import Path
+
+import pytest
+
+from daemon.composition import Parts, joiner
+from daemon.service import Daemon
+from daemon.store.store import Store
+from drivers.clock import ManualClock
+from drivers.readings import DeviceEvent, EventKind, Fix, LockState, Reading, Record, Status
+from drivers.tip_frames import TipStatus
+from tests.daemon.job_support import SOURCE
+from tests.daemon.model_support import ModelRig, pose, wait
+
+
+class RealClock(ManualClock):
+    """A clock that tests turn, with seconds as long as real ones."""
+
+    def real_seconds(self, seconds: float) -> float:
+        return seconds
+
+
+def test_the_tip_hears_of_a_jump_that_comes_with_an_observation_that_cannot_be_stored(tmp_path: Path) -> None:
+    made = ModelRig(tmp_path)
+    made.accepted()
+    clock = RealClock(made.clock.now())
+    made.close()
+    config = made.config.model_copy(update={"socket": tmp_path / "socket"})
+    store = Store(config.store_path)
+    parts = Parts("live", SOURCE.rig, SOURCE.text, clock, [], {}, joiner(config, SOURCE.rig))
+    daemon = Daemon(config, store, parts)
+
+    def read(*more: Record) -> None:
+        clock.advance(0.1)
+        now = clock.now()
+        readings = [Reading(j.name, now, pose(1)[j.name], j.unit) for j in SOURCE.rig.joints]
+        fix = Fix("station", now, now, Status.OK, LockState.LOCKED, 0.1, 1.5, 8.0)
+        records: list[Record] = [*more, *readings, fix]
+        store.insert_records(records)
+        daemon._on_records(records)
+
+    def status() -> TipStatus:
+        return daemon._tip.tip("r").status
+
+    try:
+        daemon._live_model.start()
+        wait(lambda: status() is not TipStatus.NO_MODEL)
+        daemon._setups.new_command({"id": "S1"})
+        daemon._sessions.start_command({"prism": "r"})
+        for _ in range(20):
+            read()
+        assert status() is TipStatus.OK
+        assert store.rows("SELECT count(*) AS n FROM observations")[0]["n"] > 0
+        with store.transaction() as db:
+            refuse = "BEGIN SELECT RAISE(FAIL, 'database or disk is full'); END"
+            db.execute(f"CREATE TRIGGER full BEFORE INSERT ON observations {refuse}")
+        with pytest.raises(sqlite3.DatabaseError, match="disk is full"):
+            read(DeviceEvent("theta4", clock.now(), EventKind.PRESET_JUMP, "position jumped"))
+        assert status() is not TipStatus.OK
+        wait(lambda: status() is not TipStatus.NO_MODEL)
+        assert status() is TipStatus.ZERO_LOST
+    finally:
+        daemon.close()
+        store.close()
