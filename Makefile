@@ -7,16 +7,25 @@ BOOTSTRAP := deploy/bootstrap.sh -e
 # Compiled kernels and font indexes stay in the tree, so that they are found again and no home directory is needed. Each
 # state of the sources has its own: numba does not see that a function which it compiled into another one has changed.
 COMPILED := $(sort $(shell grep -rl --include=*.py 'kernels.jit\|import numba' calibration))
-export NUMBA_CACHE_DIR := $(CURDIR)/.cache/numba/$(firstword $(shell cat $(COMPILED) | cksum))
+KERNELS := .cache/numba/$(firstword $(shell cat $(COMPILED) | cksum))
+export NUMBA_CACHE_DIR := $(CURDIR)/$(KERNELS)
 export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 
-.PHONY: help setup demo test lint bench lock clean
+.PHONY: help environment setup demo test lint bench lock clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
 
-setup: ## the virtual environment alone
+environment:
 	@$(BOOTSTRAP) .venv requirements-dev.lock
+
+setup: environment $(KERNELS)/warm ## the virtual environment, and kernels compiled ahead
+
+# Once for each state of the sources. A directory that cannot be written is said, and stops nothing.
+$(KERNELS)/warm: | environment
+	@echo "Compiling kernels ahead (half a minute, once)"
+	@$(BIN)/python -m daemon.warm_up
+	@touch $@ 2>/dev/null || true
 
 demo: setup ## a simulated rig, from bus traffic to a calibrated model and a report
 	@$(BIN)/rigcal demo
@@ -25,20 +34,21 @@ demo: setup ## a simulated rig, from bus traffic to a calibrated model and a rep
 # must be reached by the tests almost line by line.
 test: ## the whole test suite; needs no hardware
 	@$(BOOTSTRAP) -t systemd-analyze=systemd -t udevadm=udev .venv requirements-dev.lock
-	$(BIN)/python -m pytest --cov=drivers --cov=daemon.store --cov-report=term-missing:skip-covered --cov-fail-under=95
+	$(BIN)/python -m pytest -n auto --dist loadfile --cov=drivers --cov=daemon.store --cov-report=term-missing:skip-covered --cov-fail-under=95
 
-lint: setup ## style, types and import floors
+lint: environment ## style, types and import floors
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-BENCHES := acquisition kernels refinement evolution peers far_starts design ur10 table4 zhou2022
+BENCHES := acquisition kernels refinement evolution peers far_starts design ur10 table4 zhou2022 prediction gate promotion residual
 
 bench: setup ## speed and accuracy beside the peers', as ratios; an hour on two cores
 	@for name in $(BENCHES); do echo "== $$name"; $(BIN)/python -m tests.bench.$$name || exit 1; done
 	$(BIN)/python -m tests.calibration.simulated_sessions
 	$(BIN)/python -m tests.calibration.interval_coverage
+	$(BIN)/python -m tests.calibration.held_out_coverage
 
 # The rig gets requirements.lock, with the build backend that installs the project itself; requirements-dev.lock holds
 # the same versions and the tools besides. Versions stay as they are unless pyproject.toml forces a change;
@@ -46,7 +56,7 @@ bench: setup ## speed and accuracy beside the peers', as ratios; an hour on two 
 COMPILE := $(BIN)/uv pip compile --no-config --quiet --universal --python-version 3.11 --generate-hashes \
 	--custom-compile-command "make lock" $(UPGRADE)
 
-lock: setup ## write the lock files anew from pyproject.toml
+lock: environment ## write the lock files anew from pyproject.toml
 	echo 'setuptools>=77' | $(COMPILE) pyproject.toml - --output-file requirements.lock
 	$(COMPILE) pyproject.toml --extra dev --extra bench --constraints requirements.lock --output-file requirements-dev.lock
 

@@ -57,6 +57,11 @@ fi
 ln -sfn /opt/rigcal/venv/bin/rigcal /usr/local/bin/rigcal
 place_files
 systemd-sysusers rigcal.conf
+# As the service's user, whose cache it is; without it the first calibration would wait for the compiler.
+echo "Compiling kernels ahead (half a minute)"
+install -d -o rigcal -g rigcal -m 0750 /var/cache/rigcal
+runuser -u rigcal -- env -i CACHE_DIRECTORY=/var/cache/rigcal /opt/rigcal/venv/bin/python -I -m daemon.warm_up ||
+    echo "rigcal installation: compiling ahead failed; the first calibration compiles instead" >&2
 if [ -n "$booted" ]; then
     systemctl daemon-reload
     systemctl restart systemd-modules-load.service systemd-sysctl.service

@@ -49,3 +49,14 @@ def test_the_scripts_keep_to_the_posix_shell(script: str) -> None:
     result = run("sh", "-n", DEPLOY / script)
     assert (result.returncode, result.stdout) == (0, "")
     assert (DEPLOY / script).read_text(encoding="utf-8").startswith("#!/bin/sh\n")
+
+
+def test_kernels_are_compiled_ahead_as_the_service_would_and_where_it_looks(installed: Path) -> None:
+    script = (DEPLOY / "install.sh").read_text(encoding="utf-8")
+    unit = (installed / "etc/systemd/system/rigcal.service").read_text(encoding="utf-8").splitlines()
+    (line,) = [line for line in script.splitlines() if "daemon.warm_up" in line]
+    user, cache = line.split("runuser -u ")[1].split()[0], line.split("CACHE_DIRECTORY=")[1].split()[0]
+    python = line.split("daemon.warm_up")[0].split()[-3]
+    assert f"User={user}" in unit
+    assert f"CacheDirectory={cache.removeprefix('/var/cache/')}" in unit
+    assert any(setting.startswith(f"ExecStart={Path(python).parent}/rigcal ") for setting in unit)
