@@ -56,10 +56,8 @@ def _of_readings(model: CalibratedModel, observations: Observations) -> Iterator
 
 def _of_torques(model: CalibratedModel, situation: Situation) -> Iterator[str]:
     """Joints whose torque is computed where it was measured in training, or the other way round."""
-    learned = model.residual.signals if model.residual is not None else ()
-    used = {e.where for e in model.effects if e.family == "joint_compliance"}
-    used |= {joint.name for joint in model.rig.joints if f"torque_{joint.name}_Nm" in learned}
-    for name in sorted(used):
+    turning = {joint.name for joint in model.rig.joints if joint.kind == "revolute"}
+    for name in sorted(_loads_by_name(model) & turning):
         before, now = name in model.coverage.torques, situation.is_torque_measured(name)
         if before and not now:
             yield (
@@ -96,9 +94,14 @@ def _of_payload(model: CalibratedModel, situation: Situation) -> Iterator[str]:
 
 def _loads_used(model: CalibratedModel) -> set[str]:
     """Joints whose load effects or the residual use."""
-    learned = set(model.residual.signals) if model.residual is not None else set()
-    if not learned.isdisjoint(DEFLECTION):
+    if model.residual is not None and not set(DEFLECTION).isdisjoint(model.residual.signals):
         return set(model.rig.joint_names)
+    return _loads_by_name(model)
+
+
+def _loads_by_name(model: CalibratedModel) -> set[str]:
+    """Joints whose own load effects or the residual use."""
+    learned = model.residual.signals if model.residual is not None else ()
     columns = zip(model.rig.joint_names, torque_columns(model.rig), strict=True)
     used = {e.where for e in model.effects if e.family == "joint_compliance"}
     return used | {name for name, column in columns if column in learned}

@@ -26,7 +26,7 @@ from calibration.limits import turns_deg
 from calibration.methods import OWN_LEARNERS, TORQUE_NETWORK, Options, identify_by
 from calibration.model import OUTLIER_SIGMA, CalibratedModel, Coverage, LearnedResidual
 from calibration.observations import Observations, data_sha256, originals
-from calibration.residual.features import usable_loads, usable_signals, usable_torques
+from calibration.residual.features import Features, usable_loads, usable_signals, usable_torques
 from calibration.residual.folds import group_labels, standstill_labels
 from calibration.residual.hybrid import Decision, Kind, decide, torque_compensation
 from calibration.residual.region import fit_region
@@ -179,9 +179,10 @@ def train_residual(
     good = rows_to_learn_from(model, observations)
     rows = observations.select(good)
     signals = (*usable_signals(rows), *usable_loads(model.chain, model.values, model.corrected(rows)))
+    seen = model.residual_features(rows, signals)
     with _executor(executor) as pool:
         decision = decide(
-            model.residual_features(rows, signals),
+            seen,
             model.to_base(rows, rows.position_mm - model.effects_mm(rows)),
             group_labels(rows),
             standstill_labels(rows),
@@ -190,7 +191,7 @@ def train_residual(
             executor=pool,
             progress=lambda share: report(share, "learning the residual"),
         )
-    return _with_residual(model, observations, good, decision, signals, seed)
+    return _with_residual(model, observations, good, seen, decision, signals, seed)
 
 
 @one_blas_thread()
@@ -208,15 +209,16 @@ def compensate_torques(model: CalibratedModel, observations: Observations, *, se
     good = rows_to_learn_from(model, observations)
     rows = observations.select(good)
     torques = usable_torques(model.chain, model.values, rows)
+    seen = model.residual_features(rows, torques)
     decision = torque_compensation(
-        model.residual_features(rows, torques),
+        seen,
         model.to_base(rows, rows.position_mm - model.effects_mm(rows)),
         group_labels(rows),
         standstill_labels(rows),
         torques,
         seed=seed,
     )
-    return _with_residual(model, observations, good, decision, torques, seed)
+    return _with_residual(model, observations, good, seen, decision, torques, seed)
 
 
 def rows_to_learn_from(model: CalibratedModel, observations: Observations) -> Flags:
@@ -240,6 +242,7 @@ def _with_residual(
     model: CalibratedModel,
     observations: Observations,
     good: Flags,
+    seen: Features,
     decision: Decision,
     signals: tuple[str, ...],
     seed: int,
@@ -256,7 +259,7 @@ def _with_residual(
         return with_intervals(told, observations.select(distinct))
     rows = observations.select(good)
     region = fit_region(
-        model.residual_features(rows, signals),
+        seen,
         model.rig.joints,
         turns_deg(model.rig),
         signals,

@@ -36,8 +36,6 @@ from simulators.replay import ReplayLink
 SIMULATED_SYNC_MS = 200
 SIMULATED_DELAY_S = 0.02  # from a simulated measurement to its record
 
-SIMULATED_SLACK_M = 0.1  # of the target's motion, per time that simulated time runs faster than the computer
-
 Mode = Literal["live", "simulated", "replayed"]
 
 

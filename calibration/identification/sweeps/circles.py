@@ -48,7 +48,6 @@ class Axis:
         features: (8,) direction, centre in mm, radius in mm, travel (`circle_fit.Curve`): direction by the right-hand
             rule, or the way of travel, as readings grow.
         covariance: (8, 8) of the features.
-        arc: rad or mm along the curve.
         rms_mm: distance of the places from the curve.
         freedom: degrees of freedom behind the covariance.
         sweep: (n) readings of the places that count, those of the standing joints at their medians.
@@ -61,7 +60,6 @@ class Axis:
     kind: Kind
     features: Floats
     covariance: Floats
-    arc: float
     rms_mm: float
     freedom: int
     sweep: ChainData
@@ -96,11 +94,6 @@ class Axis:
     def travel(self) -> float:
         """How far it moves along the curve for each rad or mm that its reading grows; 1 for a sound encoder."""
         return float(self.features[TRAVEL])
-
-    @property
-    def arc_deg(self) -> float:
-        """How far the circle was followed; 0 for a line."""
-        return float(np.degrees(self.arc)) if self.kind == "revolute" else 0.0
 
 
 @dataclass(frozen=True)
@@ -253,7 +246,6 @@ def _axis(chain: Chain, measured: _Measured, pooled: float, freedom: int) -> Axi
         kind=measured.kind,
         features=curve.features,
         covariance=covariance,
-        arc=curve.arc,
         rms_mm=float(np.sqrt((curve.distance_mm**2).mean())),
         freedom=freedom,
         sweep=measured.sweep,
