@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import argparse
 import os
+import secrets
 import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 
+import numpy as np
+
 from calibration.errors import RigError
-from calibration.rig import Rig, parse_rig, shipped_rig, shipped_rigs
 from drivers.clock import ScaledClock, Stamp, SystemClock
 from simulators.effects import parse_effects
 from simulators.faults import parse_faults, random_faults
 from simulators.live import LiveRig, print_line
 from simulators.rig_simulator import RigSimulator, SimulatorSettings
+from simulators.rigs import load_rig
+from simulators.secret import Envelope, draw_secret
 from simulators.total_station import StationSettings
-from simulators.truth import RigTruth
+from simulators.truth import RigTruth, replace_effects
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -32,6 +36,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--can-port", type=Path, required=True, help="where the slcan port appears")
     add("--station-port", type=Path, required=True, help="where the station's port appears")
     add("--effects", default="", help="hidden effects: FAMILY@WHERE[:NAME=VALUE...],...")
+    add("--secret", type=Path, metavar="DIR", help="hide one more effect, drawn here, and seal it in an envelope there")
     add("--faults", default="", help="scripted faults: KIND@SECONDS[:NAME=VALUE...],...")
     add("--random-faults", type=float, metavar="SECONDS", help="further faults at this mean interval")
     add("--bus-master", choices=("machine", "host"), default="machine", help="who starts the nodes and sends SYNC")
@@ -52,17 +57,7 @@ def _origin(text: str) -> Stamp:
         raise argparse.ArgumentTypeError(f"{text!r} is not UTC_NS,MONOTONIC_NS,BOOT_ID") from None
 
 
-def _load_rig(name_or_path: str) -> Rig:
-    if name_or_path in shipped_rigs():
-        return shipped_rig(name_or_path)
-    try:
-        return parse_rig(Path(name_or_path).read_text(encoding="utf-8"), name_or_path)
-    except (OSError, UnicodeDecodeError) as error:
-        shipped = ", ".join(shipped_rigs())
-        raise RigError(name_or_path, "", f"no shipped rig ({shipped}) and not to be read as a file: {error}") from error
-
-
-def _build(options: argparse.Namespace) -> RigSimulator:
+def _build(options: argparse.Namespace) -> tuple[RigSimulator, Envelope | None]:
     if min(options.rate, options.sync_ms, options.signal_ms, options.baud) <= 0 or options.seed < 0:
         raise ValueError("rate, sync-ms, signal-ms and baud must be positive, seed not negative")
     if options.push_s is not None and options.push_s <= 0:
@@ -76,14 +71,19 @@ def _build(options: argparse.Namespace) -> RigSimulator:
         setup=options.setup,
     )
     effects = parse_effects(options.effects)
-    truth = RigTruth(_load_rig(options.rig), options.seed, perturbation=options.perturbation, effects=effects)
+    truth = RigTruth(load_rig(options.rig), options.seed, perturbation=options.perturbation, effects=effects)
+    envelope = None
+    if options.secret is not None:
+        secret = draw_secret(truth, np.random.default_rng([options.seed, 35]))
+        envelope = Envelope(options.secret, secret, secrets.token_bytes)
+        truth = replace_effects(truth, [*effects, secret.effect])
     faults = list(parse_faults(options.faults))
     if options.random_faults is not None:
         if options.random_faults <= 0:
             raise ValueError("random-faults must be positive")
         kinds = ("lock_loss", "prism_jump", "bad_check", "dropped_ack", "clutter", "joined_buffers")
         faults += random_faults(options.seed, 86_400.0, options.random_faults, kinds)
-    return RigSimulator(truth, options.seed, settings, faults=faults)
+    return RigSimulator(truth, options.seed, settings, faults=faults), envelope
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -100,7 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
     try:
-        simulator = _build(options)
+        simulator, envelope = _build(options)
         live = LiveRig(simulator, ScaledClock(options.rate, origin), options.can_port, options.station_port, print_line)
     except (RigError, ValueError, OSError) as error:
         sys.stderr.write(f"simulators: {error}\n")
@@ -111,6 +111,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     finally:
         live.close()
+        if envelope is not None:
+            envelope.open()
     return 0
 
 

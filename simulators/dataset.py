@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.rig import Joint, Rig, Station
-from simulators.truth import RigTruth
+from simulators.truth import RigTruth, replace_effects
 
 Floats = NDArray[np.float64]
 Strings = NDArray[np.str_]
@@ -89,11 +89,12 @@ def simulate_observations(
             reads the same at each of its fixes.
         sigma_columns: also give sigma_x_mm, sigma_y_mm, sigma_z_mm (without the joints' share).
         setup: station set-up, also decides where the machine stands; session: label.
-        columns: further columns by pose (`payload_kg`, `temperature_degC`) -> (n_poses,).
+        columns: further columns by pose (`payload_kg`, `temperature_degC`) -> (n_poses,); one that is given here takes
+            the place of the simulated one.
 
     Returns:
         Columns `prism`, the joints, x, y, z, `pose`, `time_s`, `dwell_s`, `<joint>_dir`, `<joint>_rate` (0), and
-        `setup`, `session` where given.
+        `setup`, `session` where given. Effects count time from the first row, and temperature from the mean.
 
     Raises:
         KeyError: unknown prism.
@@ -103,7 +104,8 @@ def simulate_observations(
     names = tuple(rig.prism_names if prisms is None else prisms)
     held = random_poses(rig, n_poses, rng) if poses is None else {k: np.asarray(v, float) for k, v in poses.items()}
     before = random_poses(rig, 1, rng)
-    by_pose = _approach(rig, held, before, rng) | dict(columns or {})
+    by_pose = _approach(rig, held, before, rng) | {f"{j.name}_rate": np.zeros(n_poses) for j in rig.joints}
+    by_pose |= dict(columns or {})
     read = {j.name: read_joint(j, held[j.name], rng) if joint_noise else held[j.name] for j in rig.joints}
 
     turns = len(names) if prisms_per_pose == "all" else 1
@@ -114,20 +116,21 @@ def simulate_observations(
         which = np.repeat(np.arange(n_poses) % len(names), repeats)
     shot = np.tile(np.arange(turns * repeats), n_poses)
 
-    true_mm, oracle_mm = np.empty((len(pose), 3)), np.empty((len(pose), 3))
-    for number, name in enumerate(names):
-        rows = which == number
-        if rows.any():
-            there = {k: v[pose[rows]] for k, v in by_pose.items()}
-            for out, joints in ((true_mm, held), (oracle_mm, read)):
-                out[rows] = truth.prism_mm(name, {k: v[pose[rows]] for k, v in joints.items()}, there, setup=setup)
+    prism_column: Strings = np.array(names, dtype=np.str_)[which]
+    # One fix a second in a pose; dwell counts from the end of the motion to the fix.
+    by_row = {k: v[pose] + (shot if k in ("time_s", "dwell_s") else 0.0) for k, v in by_pose.items()}
+    seen = by_row | {k: v[pose] for k, v in travel_m(rig, held).items()}
+    anchored = anchored_truth(truth, seen)
+    true_mm, oracle_mm = (
+        prisms_mm(anchored, prism_column, {k: v[pose] for k, v in joints.items()}, seen, setup=setup)
+        for joints in (held, read)
+    )
     if noise_mm is None:
         measured_mm, sigma_mm = station_noise(rig.station, true_mm, rng)
     else:
         measured_mm = true_mm + rng.normal(0, noise_mm, true_mm.shape)
         sigma_mm = np.full_like(true_mm, noise_mm)
 
-    prism_column: Strings = np.array(names, dtype=np.str_)[which]
     table: dict[str, Floats | Strings] = {"prism": prism_column}
     table |= {j.column: read[j.name][pose] for j in rig.joints}
     table |= {f"{axis}_mm": measured_mm[:, i] for i, axis in enumerate("xyz")}
@@ -137,10 +140,43 @@ def simulate_observations(
     table["pose"] = pose.astype(np.str_)
     if sigma_columns:
         table |= {f"sigma_{axis}_mm": sigma_mm[:, i] for i, axis in enumerate("xyz")}
-    # One fix a second in a pose; dwell counts from the end of the motion to the fix.
-    table |= {k: v[pose] + (shot if k in ("time_s", "dwell_s") else 0.0) for k, v in by_pose.items()}
-    table |= {f"{j.name}_rate": np.zeros(len(pose)) for j in rig.joints}
-    return SimulatedObservations(table, measured_mm, oracle_mm)
+    return SimulatedObservations(table | by_row, measured_mm, oracle_mm)
+
+
+def anchored_truth(truth: RigTruth, columns: Mapping[str, Floats]) -> RigTruth:
+    """A machine whose effects count time from the first of these rows, and temperature from their mean."""
+    if not truth.effects:
+        return truth
+    first_s = float(np.min(columns.get("time_s", np.zeros(1))))
+    mean_degC = float(np.mean(columns.get("temperature_degC", np.zeros(1))))
+    return replace_effects(truth, [effect.anchored(first_s, mean_degC) for effect in truth.effects])
+
+
+def travel_m(rig: Rig, poses: Mapping[str, Floats]) -> dict[str, Floats]:
+    """`<joint>_travel_m` of every prismatic joint -> (n,) m travelled from the first pose, visited in this order."""
+    return {
+        f"{j.name}_travel_m": np.cumsum(np.abs(np.diff(poses[j.name], prepend=poses[j.name][:1]))) / 1e3
+        for j in rig.joints
+        if j.kind == "prismatic"
+    }
+
+
+def prisms_mm(
+    truth: RigTruth, prism: Strings, joints: Mapping[str, Floats], columns: Mapping[str, Floats], *, setup: str = ""
+) -> Floats:
+    """(n, 3) true positions of a prism for each row, in the station's frame.
+
+    Args:
+        truth: the machine. What its effects leave open of time and temperature should be anchored.
+        prism: (n,) names.
+        joints, columns, setup: as for `RigTruth.prism_mm`.
+    """
+    out = np.empty((len(prism), 3))
+    for name in np.unique(prism):
+        rows = prism == name
+        values = {k: v[rows] for k, v in joints.items()}
+        out[rows] = truth.prism_mm(str(name), values, {k: v[rows] for k, v in columns.items()}, setup=setup)
+    return out
 
 
 def _approach(

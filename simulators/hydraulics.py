@@ -26,6 +26,8 @@ _WORKING_BAR = 180.0
 _RETURN_BAR = 12.0
 _UNLOADED_BAR = 20.0
 _BAR_PER_NM = 7e-4  # of the boom's lifting joint in its cylinder
+START_TEMPERATURE_DEGC = 38.0  # of the oil, when the simulation begins
+
 _WARM_DEGC = 55.0
 _WARMING_S = 1500.0
 

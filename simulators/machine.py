@@ -8,12 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulators.dataset import random_poses
-from simulators.hydraulics import VALVE_JOINTS, boom_load_bar, motion_columns
+from simulators.hydraulics import (
+    START_TEMPERATURE_DEGC,
+    VALVE_JOINTS,
+    boom_load_bar,
+    motion_columns,
+    oil_temperature_degC,
+)
 from simulators.machine_signals import MachineState
 from simulators.motion import BoomMotion
-from simulators.truth import RigTruth
+from simulators.truth import RigTruth, replace_effects
 
 Floats = NDArray[np.float64]
+
+TEMPERATE_DEGC = 45.0  # of the oil, at which the machine has the lengths that were built
 
 _LOAD_EVERY_S = 0.25  # loads change slowly and are costly to compute
 _CONTROL_POINTS = 4
@@ -28,14 +36,18 @@ class Machine:
         control_points_mm: fixed marks around the machine, in the station's frame: name -> (3,).
 
     Args:
-        truth: its geometry and effects.
+        truth: its geometry and effects. They count time from simulated second 0, and temperature from `TEMPERATE_DEGC`.
         seed: control points and reading noise.
         motion: its plan.
         setup: station set-up, decides where the machine stands.
+
+    Raises:
+        ValueError: an effect needs what this machine does not sense (a payload, a pressure in a boom cylinder).
     """
 
     def __init__(self, truth: RigTruth, seed: int, motion: BoomMotion, *, setup: str = "") -> None:
-        self.truth, self.motion, self.setup = truth, motion, setup
+        self.truth = replace_effects(truth, [effect.anchored(0.0, TEMPERATE_DEGC) for effect in truth.effects])
+        self.motion, self.setup = motion, setup
         self.rng = np.random.default_rng([seed, 30])
         self.control_points_mm = _control_points(np.random.default_rng([seed, 31]))
         self._rig = truth.rig
@@ -44,6 +56,8 @@ class Machine:
         self._load_at_s = -1e9
         self._load_bar = float(boom_load_bar(0.0))
         self._last_place: tuple[str, float, Floats] | None = None
+        for prism in self._rig.prism_names:
+            self._solve(prism, motion.values(0.0), 0.0)
 
     def joint(self, name: str, t_s: float) -> tuple[float, float]:
         """What a joint's encoder or transducer senses, random error included, and its rate: deg or mm."""
@@ -67,7 +81,7 @@ class Machine:
             prism: its name.
             pose: joint name -> value, deg or mm.
             columns: what effects need besides (`theta4_dir`, `theta4_rate`, `boom_valve_mA`, ...); where it is missing
-                the machine stands, and joints count as not having moved.
+                the machine has just come to rest at simulated second 0, and joints count as not having moved.
 
         Raises:
             ValueError: unknown prism, a joint missing or unknown.
@@ -77,17 +91,32 @@ class Machine:
             raise ValueError(f"no prism {prism!r}; this rig has {', '.join(rig.prism_names)}")
         if set(pose) != set(rig.joint_names):
             raise ValueError(f"a pose gives each of {', '.join(rig.joint_names)} once")
-        standing = self._columns(dict.fromkeys(rig.joint_names, 0.0), dict.fromkeys(rig.joint_names, 0))
+        rest = dict.fromkeys(rig.joint_names, 0.0)
+        standing = self._columns(rest, dict.fromkeys(rig.joint_names, 0), dwell_s=0.0, travel=rest, t_s=0.0)
         return self._place(prism, pose, standing | dict(columns))
 
     def _solve(self, prism: str, pose: Mapping[str, float], t_s: float) -> Floats:
-        rates = {j: self.motion.joint(j, t_s)[1] for j in self._rig.joint_names}
-        return self._place(prism, pose, self._columns(rates, self.motion.directions(t_s)))
+        motion, names = self.motion, self._rig.joint_names
+        rates = {j: motion.joint(j, t_s)[1] for j in names}
+        travel = {j: motion.travelled(j, t_s) for j in names}
+        columns = self._columns(rates, motion.directions(t_s), dwell_s=motion.standing_s(t_s), travel=travel, t_s=t_s)
+        return self._place(prism, pose, columns)
 
-    def _columns(self, rates: Mapping[str, float], directions: Mapping[str, int]) -> dict[str, float]:
+    def _columns(
+        self,
+        rates: Mapping[str, float],
+        directions: Mapping[str, int],
+        *,
+        dwell_s: float,
+        travel: Mapping[str, float],
+        t_s: float,
+    ) -> dict[str, float]:
         """What effects may depend on besides the pose, without any sensor's noise."""
         speeds = {j.name: rates[j.name] / j.max_rate for j in self._rig.joints}
         columns = {f"{j}_dir": float(d) for j, d in directions.items()} | {f"{j}_rate": r for j, r in rates.items()}
+        columns |= {f"{j.name}_travel_m": travel[j.name] / 1e3 for j in self._rig.joints if j.kind == "prismatic"}
+        columns |= {"time_s": t_s, "dwell_s": dwell_s}
+        columns["temperature_degC"] = float(oil_temperature_degC(t_s, START_TEMPERATURE_DEGC))
         return columns | {name: float(value) for name, value in motion_columns(speeds).items()}
 
     def _place(self, prism: str, pose: Mapping[str, float], columns: Mapping[str, float]) -> Floats:

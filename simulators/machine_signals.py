@@ -17,6 +17,7 @@ from simulators.frame import Frame
 from simulators.hydraulics import (
     CURRENT_DITHER_MA,
     PRESSURE_NOISE_BAR,
+    START_TEMPERATURE_DEGC,
     oil_temperature_degC,
     pump_bar,
     return_bar,
@@ -57,7 +58,7 @@ class MachineSignals:
         rng: np.random.Generator,
         *,
         period_s: float = 0.01,
-        start_temperature_degC: float = 38.0,
+        start_temperature_degC: float = START_TEMPERATURE_DEGC,
     ) -> None:
         self._state = state
         self._rng = rng

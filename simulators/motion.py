@@ -36,6 +36,10 @@ class _Ramp:
             return 0.0
         return abs(self.distance) / self.peak + self.peak / self.acceleration
 
+    def travelled(self, elapsed_s: float) -> float:
+        """Way behind it, 0 or more."""
+        return abs(self.at(elapsed_s)[0] - self.start)
+
     def at(self, elapsed_s: float) -> tuple[float, float]:
         """Value and rate."""
         total = self.duration_s
@@ -59,6 +63,8 @@ class _Leg:
     end_s: float
     ramps: Mapping[str, _Ramp]
     directions: Mapping[str, int]
+    travelled: Mapping[str, float]  # by each joint, in all legs before this one
+    rested_s: float  # when the motion before this leg ended
 
 
 class BoomMotion:
@@ -77,7 +83,8 @@ class BoomMotion:
         pose = {j.name: sum(j.limits) / 2 for j in rig.joints} | dict(start or {})
         self._check(pose)
         ramps = {j.name: _Ramp(pose[j.name], 0.0, j.max_rate, j.max_rate) for j in rig.joints}
-        self._legs = [_Leg(-math.inf, -math.inf, ramps, dict.fromkeys(pose, 0))]
+        nothing = dict.fromkeys(pose, 0.0)
+        self._legs = [_Leg(-math.inf, -math.inf, ramps, dict.fromkeys(pose, 0), nothing, 0.0)]
         self._begins = [-math.inf]
 
     def _check(self, pose: Mapping[str, float]) -> None:
@@ -117,7 +124,10 @@ class BoomMotion:
             if way:
                 directions[joint.name] = 1 if way > 0 else -1
         arrival = begin + max(r.duration_s for r in ramps.values())
-        self._legs.append(_Leg(begin, arrival + dwell_s, ramps, directions))
+        travelled = {name: last.travelled[name] + abs(ramp.distance) for name, ramp in last.ramps.items()}
+        longest = max((r.duration_s for r in last.ramps.values()), default=0.0)
+        rested = last.begin_s + longest if longest else last.rested_s
+        self._legs.append(_Leg(begin, arrival + dwell_s, ramps, directions, travelled, rested))
         self._begins.append(begin)
         return arrival
 
@@ -137,6 +147,18 @@ class BoomMotion:
     def directions(self, t_s: float) -> Mapping[str, int]:
         """Direction of each joint's last motion begun by then: -1, 1, or 0 if it has not moved."""
         return self._leg(t_s).directions
+
+    def travelled(self, name: str, t_s: float) -> float:
+        """Way that a joint has gone back and forth since the beginning, deg or mm."""
+        leg = self._leg(t_s)
+        return leg.travelled[name] + leg.ramps[name].travelled(t_s - leg.begin_s)
+
+    def standing_s(self, t_s: float) -> float:
+        """How long no joint has moved; 0 while one does. What has never moved stands since second 0."""
+        leg = self._leg(t_s)
+        longest = max(ramp.duration_s for ramp in leg.ramps.values())
+        rested = leg.begin_s + longest if longest else leg.rested_s
+        return max(0.0, t_s - rested)
 
     def moving(self, t_s: float) -> bool:
         """Whether any joint moves."""

@@ -13,7 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.rig import Rig
-from simulators.dataset import SimulatedObservations, random_poses, read_joint, station_noise
+from simulators.dataset import (
+    SimulatedObservations,
+    anchored_truth,
+    prisms_mm,
+    random_poses,
+    read_joint,
+    station_noise,
+    travel_m,
+)
 from simulators.hydraulics import (
     CURRENT_DITHER_MA,
     PRESSURE_NOISE_BAR,
@@ -87,19 +95,15 @@ def simulate_runs(
     late_s = rng.normal(0.0, _TIMING_SIGMA_S, len(run))
     fixed = {j.name: held[:, i] + rate[:, i] * late_s for i, j in enumerate(rig.joints)}
     read = {j.name: read_joint(j, joints[j.name], rng) for j in rig.joints}
-    true_mm, oracle_mm = np.empty((len(run), 3)), np.empty((len(run), 3))
-    for number, name in enumerate(names):
-        rows = run % len(names) == number
-        if rows.any():
-            there = {k: v[rows] for k, v in columns.items()}
-            for out, values in ((true_mm, fixed), (oracle_mm, read)):
-                out[rows] = truth.prism_mm(name, {k: v[rows] for k, v in values.items()}, there, setup=setup)
+    prism: Strings = np.array(names, dtype=np.str_)[run % len(names)]
+    seen = columns | travel_m(rig, joints)
+    anchored = anchored_truth(truth, seen)
+    true_mm, oracle_mm = (prisms_mm(anchored, prism, values, seen, setup=setup) for values in (fixed, read))
     if noise_mm is None:
         measured_mm, _ = station_noise(rig.station, true_mm, rng)
     else:
         measured_mm = true_mm + rng.normal(0.0, noise_mm, true_mm.shape)
 
-    prism: Strings = np.array(names, dtype=np.str_)[run % len(names)]
     table: dict[str, Floats | Strings] = {"prism": prism}
     table |= {j.column: read[j.name] for j in rig.joints}
     table |= {f"{axis}_mm": measured_mm[:, i] for i, axis in enumerate("xyz")}

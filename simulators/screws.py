@@ -208,6 +208,11 @@ class Posture:
         moved: Floats = self.rotations[k] @ at_home + self.shifts_mm[k]
         return moved
 
+    def axes(self, frame: int) -> Floats:
+        """(n, 3, 3) axes of `frame` as columns, in the base frame."""
+        turned: Floats = self.rotations[self.chain.last_screw[frame]] @ self.chain.homes[frame][:3, :3]
+        return turned
+
     def axis(self, screw: int) -> tuple[Floats, Floats]:
         """(n, 3) direction and (n, 3) point of screw number `screw` (from 0), carried along by those before it."""
         s = self.chain.screws[screw]
@@ -215,18 +220,20 @@ class Posture:
         return R @ s.axis, R @ s.point_mm + t
 
 
-def pose_chain(chain: ScrewChain, joints: Mapping[str, Floats]) -> Posture:
+def pose_chain(chain: ScrewChain, joints: Mapping[str, Floats], further: Mapping[int, Floats] | None = None) -> Posture:
     """Multiply the exponentials.
 
     Args:
         chain: the machine.
         joints: joint name -> (n,) values, rad or mm.
+        further: number of a screw (from 0) -> (n,) by how much it moves beyond what the joints say, rad or mm.
     """
+    further = further or {}
     n = len(next(iter(joints.values())))
     posture = Posture(chain, [np.broadcast_to(np.eye(3), (n, 3, 3))], [np.zeros((n, 3))])
-    for screw in chain.screws:
+    for index, screw in enumerate(chain.screws):
         R, t = posture.rotations[screw.before], posture.shifts_mm[screw.before]
-        amount = np.zeros(n)
+        amount = further.get(index, np.zeros(n))
         for name, coefficient in screw.weights.items():
             amount = amount + coefficient * joints[name]
         if screw.turns:

@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.rig import Rig, Row
-from simulators.effects.base import Beam, Bend, Effect
+from simulators.body import LoadedBody, PointMass
+from simulators.effects.base import Bend, Effect, Sight
 from simulators.screws import (
-    Posture,
     RowConstants,
-    Screw,
     nominal_constants,
     pose_chain,
     rotation_by_vector,
@@ -30,7 +29,7 @@ Floats = NDArray[np.float64]
 STANDARD_GRAVITY = 9.80665  # m/s^2
 MASS_UNCERTAINTY = 0.15  # the rig file's masses are within +-15 % of the machine's
 TILT_SIGMA_DEG = 0.5  # a carrier on its jacks
-_ROUNDS = 4  # of the fixed point load -> deflection -> load; each gains two to three digits
+_ROUNDS = 4  # at most, of the fixed point load -> deflection -> load; each gains two to three digits
 
 
 @dataclass(frozen=True)
@@ -49,14 +48,6 @@ class Placement:
         """(n, 3) points of the base frame, in the station's frame."""
         moved: Floats = points_mm @ self.rotation.T + self.position_mm
         return moved
-
-
-@dataclass(frozen=True)
-class _PointMass:
-    frame: int
-    place_mm: Floats
-    kg: float
-    is_payload: bool
 
 
 class RigTruth:
@@ -101,15 +92,15 @@ class RigTruth:
         self._masses = self._build_masses(np.random.default_rng([seed, 2]), perturbation)
         self._placements: dict[str, Placement] = {}
 
-    def _build_masses(self, rng: np.random.Generator, perturbation: float) -> tuple[_PointMass, ...]:
+    def _build_masses(self, rng: np.random.Generator, perturbation: float) -> tuple[PointMass, ...]:
         masses = []
         for mass in self.rig.masses:
             kg = mass.kg * (1.0 + perturbation * rng.uniform(-MASS_UNCERTAINTY, MASS_UNCERTAINTY))
             if mass.centre_mm is not None:
-                masses.append(_PointMass(mass.frame, np.array(mass.centre_mm), kg, mass.payload))
+                masses.append(PointMass(mass.frame, np.array(mass.centre_mm), kg, mass.payload))
             else:  # midway between two origins: half of it at each gives the same force, moment and energy
                 origins = (mass.frame, mass.frame + 1)
-                masses.extend(_PointMass(frame, np.zeros(3), kg / 2, mass.payload) for frame in origins)
+                masses.extend(PointMass(frame, np.zeros(3), kg / 2, mass.payload) for frame in origins)
         return tuple(masses)
 
     def prism_offset_mm(self, name: str) -> Floats:
@@ -155,7 +146,13 @@ class RigTruth:
         """
         frame, place = self._prisms[name]
         body = self._solve(joints, columns or {}, setup)
-        return self.placement(setup).to_station_mm(body.place_mm(frame, place))
+        placement = self.placement(setup)
+        station_mm = placement.to_station_mm(body.place_mm(frame, place))
+        if not self.effects:
+            return station_mm
+        sight = Sight(name, station_mm, placement.rotation @ body.axes(frame))
+        shifts = [shift for effect in self.effects if (shift := effect.fix_shift_mm(sight)) is not None]
+        return station_mm + np.sum(shifts, axis=0) if shifts else station_mm
 
     def gravity_load(
         self, joint: str, joints: Mapping[str, Floats], columns: Mapping[str, Floats] | None = None, *, setup: str = ""
@@ -170,111 +167,57 @@ class RigTruth:
         loose = replace_effects(self, ()) if self.effects else self
         return loose._solve(joints, columns or {}, setup).torque(joint)
 
-    def _solve(self, joints: Mapping[str, Floats], columns: Mapping[str, Floats], setup: str | None) -> _Body:
+    def _solve(self, joints: Mapping[str, Floats], columns: Mapping[str, Floats], setup: str | None) -> LoadedBody:
         read = {}
         for joint in self.rig.joints:
             values = np.atleast_1d(np.asarray(joints[joint.name], dtype=float))
             read[joint.name] = np.deg2rad(values) if joint.kind == "revolute" else values
         rotation = np.eye(3) if setup is None else self.placement(setup).rotation
         gravity = rotation.T @ np.array([0.0, 0.0, -STANDARD_GRAVITY])
-        effects = () if setup is None else self.effects
-        body = _Body(self.rig, read, columns, gravity, self._masses, self.constants, pose_chain(self._chain, read), ())
-        for _ in range(_ROUNDS if effects else 0):
-            true = dict(read)
-            bends: list[Bend] = []
-            for effect in effects:
-                change = effect.joint_change(body)
-                if change is not None:
+        n = len(next(iter(read.values())))
+        posture = pose_chain(self._chain, read)
+        body = LoadedBody(
+            self.rig, read, read, columns, gravity, self._masses, self.constants, posture, (), np.zeros(n)
+        )
+        if setup is None or not self.effects:
+            return body
+        read = self._at_the_fix(body)
+        body = replace(body, read=read, true=read)
+        before: tuple[Floats, ...] = ()
+        for _ in range(_ROUNDS):
+            true, turns, bends, growth = dict(read), dict[int, Floats](), list[Bend](), np.zeros(n)
+            for effect in self.effects:
+                if (change := effect.joint_change(body)) is not None:
                     true[effect.where] = true[effect.where] + change
+                for row, turn in effect.row_turns(body).items():
+                    turns[row] = turns.get(row, 0.0) + turn
                 bends.extend(effect.bends(body))
-            body = replace(body, posture=pose_chain(self._chain, true), bent=tuple(bends))
+                if (share := effect.growth(body)) is not None:
+                    growth = growth + share
+            now = (growth, *true.values(), *turns.values())
+            now += tuple(part for bend in bends for part in (bend.rotation_vector, bend.shift_mm, bend.about_mm))
+            if len(before) == len(now) and all(map(np.array_equal, now, before)):
+                break
+            before = now
+            bent = tuple(sorted(bends, key=lambda bend: -bend.frame))
+            posture = pose_chain(self._chain, true, self._screw_turns(turns))
+            body = replace(body, true=true, posture=posture, bent=bent, growth=growth)
         return body
 
+    def _at_the_fix(self, body: LoadedBody) -> dict[str, Floats]:
+        """What the readings, taken a little later than the fix, would have been at its own instant."""
+        delays = [delay for effect in self.effects if (delay := effect.delay_s(body)) is not None]
+        read = dict(body.read)
+        if delays:
+            for joint in self.rig.joints:
+                rate = body.column(f"{joint.name}_rate")
+                travelled = np.sum(delays, axis=0) * (np.deg2rad(rate) if joint.kind == "revolute" else rate)
+                read[joint.name] = read[joint.name] - travelled
+        return read
 
-@dataclass(frozen=True)
-class _Body:
-    """The machine at n instants: `simulators.effects.base.Body`."""
-
-    rig: Rig
-    read: Mapping[str, Floats]
-    columns: Mapping[str, Floats]
-    gravity: Floats
-    masses: tuple[_PointMass, ...]
-    constants: tuple[RowConstants, ...]
-    posture: Posture
-    bent: tuple[Bend, ...]
-
-    def column(self, name: str) -> Floats:
-        if name not in self.columns:
-            raise ValueError(f"an effect of this machine needs the column {name!r}")
-        return np.atleast_1d(np.asarray(self.columns[name], dtype=float))
-
-    def place_mm(self, frame: int, place_mm: Floats) -> Floats:
-        """(n, 3) position in the base frame of a point fixed to a frame, bends included."""
-        point = self.posture.point_mm(frame, place_mm)
-        for bend in self.bent:
-            if self._follows(frame, bend.frame):
-                point = _bent(bend, point)
-        return point
-
-    def torque(self, joint: str) -> Floats:
-        n = len(self.read[joint])
-        total = np.zeros(n)
-        places = [self.place_mm(m.frame, m.place_mm) for m in self.masses]
-        weights = [self._weight_newton(m) for m in self.masses]
-        for index, screw in enumerate(self.posture.chain.screws):
-            coefficient = screw.weights.get(joint, 0.0)
-            if coefficient == 0.0:
-                continue
-            axis, point = self._axis(index, screw)
-            for mass, place, weight in zip(self.masses, places, weights, strict=True):
-                if not self.posture.chain.carries(index, mass.frame):
-                    continue
-                motion = np.cross(axis, (place - point) / 1e3) if screw.turns else axis
-                total += coefficient * np.sum(motion * weight, axis=1)
-        return total
-
-    def beam(self, row: int) -> Beam:
-        screws = self.posture.chain.screws
-        index = next(i for i, s in enumerate(screws) if s.row == row and not s.turns)
-        axis, root = self.posture.axis(index)
-        before = self.posture.shifts_mm[screws[index].before]
-        carried = self.posture.shifts_mm[index + 1] - before  # pure translation along the axis
-        length_mm = self.constants[row - 1].a + np.sum(carried * axis, axis=1)
-        # The bent tip: loads act where the beam has come to rest.
-        tip = root + length_mm[:, None] * axis
-        for bend in self.bent:
-            if self._follows(row, bend.frame):
-                tip = tip + bend.shift_mm
-        force, moment, own = np.zeros_like(tip), np.zeros_like(tip), np.zeros_like(tip)
-        for mass in self.masses:
-            weight = self._weight_newton(mass)
-            if self._follows(mass.frame, row):
-                force += weight
-                moment += np.cross((self.place_mm(mass.frame, mass.place_mm) - tip) / 1e3, weight)
-            elif mass.frame == row - 1:
-                own += weight
-        return Beam(axis, length_mm / 1e3, root + length_mm[:, None] * axis, force, moment, own)
-
-    def _axis(self, index: int, screw: Screw) -> tuple[Floats, Floats]:
-        axis, point = self.posture.axis(index)
-        for bend in self.bent:
-            # A bend comes after its row's driven length and before its row's joint.
-            if self._follows(screw.row, bend.frame) and (screw.row != bend.frame or screw.turns):
-                axis = (rotation_by_vector(bend.rotation_vector) @ axis[:, :, None])[:, :, 0]
-                point = _bent(bend, point)
-        return axis, point
-
-    def _follows(self, frame: int, other: int) -> bool:
-        """Whether a frame is another one or beyond it."""
-        return other in (0, *self.rig.path(frame))
-
-    def _weight_newton(self, mass: _PointMass) -> Floats:
-        n = len(next(iter(self.read.values())))
-        kg = np.full(n, mass.kg)
-        if mass.is_payload and "payload_kg" in self.columns:
-            kg = self.column("payload_kg")
-        return kg[:, None] * self.gravity
+    def _screw_turns(self, turns: Mapping[int, Floats]) -> dict[int, Floats]:
+        """Row number -> angle, as number of the row's turning motion -> angle."""
+        return {i: turns[s.row] for i, s in enumerate(self._chain.screws) if s.turns and s.row in turns}
 
 
 def replace_effects(truth: RigTruth, effects: Sequence[Effect]) -> RigTruth:
@@ -284,12 +227,6 @@ def replace_effects(truth: RigTruth, effects: Sequence[Effect]) -> RigTruth:
     other = object.__new__(RigTruth)
     other.__dict__.update(truth.__dict__, effects=tuple(effects))
     return other
-
-
-def _bent(bend: Bend, point: Floats) -> Floats:
-    turned = (rotation_by_vector(bend.rotation_vector) @ (point - bend.about_mm)[:, :, None])[:, :, 0]
-    moved: Floats = bend.about_mm + turned + bend.shift_mm
-    return moved
 
 
 def _perturbed(own: RowConstants, row: Row, rig: Rig, draw: Floats) -> RowConstants:

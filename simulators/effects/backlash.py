@@ -14,6 +14,7 @@ class Backlash(Effect):
     """d_theta = width / 2 * direction of the last motion (column `<joint>_dir`)."""
 
     family: ClassVar[str] = "backlash"
+    size: ClassVar[tuple[str, ...]] = ("width_rad",)
     width_rad: float = 1.0e-3
 
     def check(self, rig: Rig) -> None:

@@ -29,6 +29,7 @@ class BoomDroop(Effect):
     """
 
     family: ClassVar[str] = "boom_droop"
+    size: ClassVar[tuple[str, ...]] = ("flexibility_per_Nm2",)
     where: str = "boom"
     flexibility_per_Nm2: float = 4e-9  # noqa: N815 - the unit is N m^2
 

@@ -21,6 +21,7 @@ class EncoderHarmonic(Effect):
     """
 
     family: ClassVar[str] = "encoder_harmonic"
+    size: ClassVar[tuple[str, ...]] = ("cosk_rad", "sink_rad")
     cosk_rad: float = 1.0e-3
     sink_rad: float = 1.0e-3
     k: int = 1

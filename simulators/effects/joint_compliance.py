@@ -18,6 +18,7 @@ class JointCompliance(Effect):
     """
 
     family: ClassVar[str] = "joint_compliance"
+    size: ClassVar[tuple[str, ...]] = ("compliance_rad_per_Nm",)
     compliance_rad_per_Nm: float = 5e-9  # noqa: N815 - the unit is N m
 
     def check(self, rig: Rig) -> None:

@@ -27,6 +27,7 @@ class LoadHysteresis(Effect):
     """
 
     family: ClassVar[str] = "load_hysteresis"
+    size: ClassVar[tuple[str, ...]] = ("rad_per_Nm",)
     rad_per_Nm: float = 4e-9  # noqa: N815 - the unit is N m
     stiction_share: float = 0.0
     stribeck_deg_per_s: float = 0.3

@@ -28,6 +28,7 @@ class StiffeningCompliance(Effect):
     """
 
     family: ClassVar[str] = "stiffening_compliance"
+    size: ClassVar[tuple[str, ...]] = ("soft_rad_per_Nm", "stiff_rad_per_Nm")
     soft_rad_per_Nm: float = 1.6e-6  # noqa: N815 - the unit is N m
     stiff_rad_per_Nm: float = 4e-7  # noqa: N815 - the same
     knee_Nm: float = 500.0  # noqa: N815 - the same

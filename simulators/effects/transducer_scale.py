@@ -14,6 +14,7 @@ class TransducerScale(Effect):
     """d_L = scale * L as read; 2e-3 is 4 mm at the end of a 2 m stroke."""
 
     family: ClassVar[str] = "transducer_scale"
+    size: ClassVar[tuple[str, ...]] = ("scale",)
     scale: float = 2.0e-3
 
     def check(self, rig: Rig) -> None:

@@ -30,6 +30,7 @@ class ValveCurrentError(Effect):
     """
 
     family: ClassVar[str] = "valve_current_error"
+    size: ClassVar[tuple[str, ...]] = ("rad_at_rated",)
     rad_at_rated: float = 2e-3
     knee_mA: float = 25.0  # noqa: N815 - the unit is mA
 

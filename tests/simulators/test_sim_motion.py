@@ -84,3 +84,20 @@ def test_the_past_can_be_asked_until_it_is_forgotten(swdt82: Rig) -> None:
 def test_an_impossible_move_is_refused(swdt82: Rig, pose: dict[str, float], speed: float, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         BoomMotion(swdt82).move(0.0, pose, speed=speed)
+
+
+def test_the_way_travelled_counts_there_and_back_and_the_rest_counts_from_the_last_arrival(swdt82: Rig) -> None:
+    motion = BoomMotion(swdt82, {"theta4": 0.0})
+    assert motion.travelled("theta4", 5.0) == 0.0
+    assert motion.standing_s(5.0) == 5.0
+    end = motion.move(10.0, {"theta4": 10.0}, dwell_s=4.0)
+    assert motion.standing_s(9.0) == 9.0
+    assert motion.standing_s((10.0 + end) / 2) == 0.0
+    assert motion.travelled("theta4", (10.0 + end) / 2) == pytest.approx(5.0)
+    assert motion.standing_s(end + 3.0) == pytest.approx(3.0)
+    again = motion.move(end, {"theta4": 4.0})
+    motion.move(again, {"theta4": 4.0})  # to where it is: no motion
+    assert motion.travelled("theta4", again) == pytest.approx(16.0)
+    assert motion.standing_s(again + 7.0) == pytest.approx(7.0)
+    motion.forget_before(again + 7.0)
+    assert motion.travelled("theta4", again + 7.0) == pytest.approx(16.0)

@@ -1,0 +1,45 @@
+"""Ground that gives way: the carrier sinks and tilts steadily."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from calibration.rig import Rig
+from simulators.effects.base import Bend, Body, Effect, check_place, hours_since
+
+
+@dataclass(frozen=True)
+class BaseSettlement(Effect):
+    """Tilts about the x and y axes of the base's frame through its origin, and z along its z axis, growing with time.
+
+    Time is that of the column `time_s`.
+
+    Attributes:
+        tilt_x_rad_per_h, tilt_y_rad_per_h, z_mm_per_h: the rates.
+        first_s: the instant from which it counts; None: the earliest of the rows given.
+    """
+
+    family: ClassVar[str] = "base_settlement"
+    size: ClassVar[tuple[str, ...]] = ("tilt_x_rad_per_h", "tilt_y_rad_per_h", "z_mm_per_h")
+    where: str = "base"
+    tilt_x_rad_per_h: float = 0.2e-3
+    tilt_y_rad_per_h: float = 0.2e-3
+    z_mm_per_h: float = 1.0
+    first_s: float | None = None
+
+    def check(self, rig: Rig) -> None:
+        del rig
+        check_place(self, "base")
+
+    def anchored(self, first_s: float, mean_degC: float) -> Effect:
+        del mean_degC
+        return replace(self, first_s=first_s if self.first_s is None else self.first_s)
+
+    def bends(self, body: Body) -> Sequence[Bend]:
+        hours = hours_since(body, self.first_s)[:, None]
+        tilt = hours * np.array([self.tilt_x_rad_per_h, self.tilt_y_rad_per_h, 0.0])
+        return (Bend(0, np.zeros_like(tilt), tilt, hours * np.array([0.0, 0.0, self.z_mm_per_h])),)

@@ -1,0 +1,36 @@
+"""Two clocks that run apart: fixes come the later the longer the data goes on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+from calibration.rig import Rig
+from simulators.effects.base import Body, Effect, Floats, check_place, hours_since
+
+
+@dataclass(frozen=True)
+class ClockDrift(Effect):
+    """A latency of ppm * 1e-6 * the time since the first row (columns `time_s` and `<joint>_rate`).
+
+    Attributes:
+        ppm: by how much the station's clock is slow.
+        first_s: the instant at which the clocks agree; None: the earliest of the rows given.
+    """
+
+    family: ClassVar[str] = "clock_drift"
+    size: ClassVar[tuple[str, ...]] = ("ppm",)
+    where: str = "clock"
+    ppm: float = 5.0
+    first_s: float | None = None
+
+    def check(self, rig: Rig) -> None:
+        del rig
+        check_place(self, "clock")
+
+    def anchored(self, first_s: float, mean_degC: float) -> Effect:
+        del mean_degC
+        return replace(self, first_s=first_s if self.first_s is None else self.first_s)
+
+    def delay_s(self, body: Body) -> Floats:
+        return self.ppm * 1e-6 * 3600.0 * hours_since(body, self.first_s)

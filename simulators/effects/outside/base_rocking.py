@@ -1,0 +1,35 @@
+"""A carrier that rocks on its jacks: it leans to the side that the boom weighs on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from calibration.rig import Rig
+from simulators.effects.base import Bend, Body, Effect, check_place
+
+
+@dataclass(frozen=True)
+class BaseRocking(Effect):
+    """Tilt about the base's origin by c times the level moment of all weights about it.
+
+    Attributes:
+        rad_per_Nm: c.
+    """
+
+    family: ClassVar[str] = "base_rocking"
+    size: ClassVar[tuple[str, ...]] = ("rad_per_Nm",)
+    where: str = "base"
+    rad_per_Nm: float = 5e-9  # noqa: N815 - the unit is N m
+
+    def check(self, rig: Rig) -> None:
+        check_place(self, "base")
+        if not rig.masses:
+            raise ValueError(f"{self.family}: rig {rig.name!r} has no masses")
+
+    def bends(self, body: Body) -> Sequence[Bend]:
+        tilt = self.rad_per_Nm * body.overturning_newton_m()
+        return (Bend(0, np.zeros_like(tilt), tilt, np.zeros_like(tilt)),)

@@ -1,0 +1,34 @@
+"""A prism whose constant is set wrong: every distance to it is off by the same length."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from calibration.rig import Rig
+from simulators.effects.base import Effect, Floats, Sight, check_place
+
+
+@dataclass(frozen=True)
+class PrismConstant(Effect):
+    """A fix is `mm` further from the station than the prism, along the line of sight.
+
+    At `station` it concerns all prisms, else the prism of that name.
+    """
+
+    family: ClassVar[str] = "prism_constant"
+    size: ClassVar[tuple[str, ...]] = ("mm",)
+    where: str = "station"
+    mm: float = 3.0
+
+    def check(self, rig: Rig) -> None:
+        check_place(self, "station", *rig.prism_names)
+
+    def fix_shift_mm(self, sight: Sight) -> Floats | None:
+        if self.where not in ("station", sight.prism):
+            return None
+        range_mm = np.linalg.norm(sight.place_mm, axis=1)[:, None]
+        shift: Floats = self.mm * sight.place_mm / range_mm
+        return shift

@@ -1,0 +1,36 @@
+"""Steel that grows with its temperature: every length of the machine by the same share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+from calibration.rig import Rig
+from simulators.effects.base import Body, Effect, Floats, check_place, warming
+
+
+@dataclass(frozen=True)
+class ThermalExpansion(Effect):
+    """All lengths x (1 + alpha (T - T0)), T of the column `temperature_degC`; the base's origin stays.
+
+    Attributes:
+        per_K: alpha; 12e-6 for steel.
+        at_degC: T0; None: the mean of the rows given.
+    """
+
+    family: ClassVar[str] = "thermal_expansion"
+    size: ClassVar[tuple[str, ...]] = ("per_K",)
+    where: str = "boom"
+    per_K: float = 12.0e-6  # noqa: N815 - the unit is K
+    at_degC: float | None = None  # noqa: N815 - the unit is degC
+
+    def check(self, rig: Rig) -> None:
+        del rig
+        check_place(self, "boom")
+
+    def anchored(self, first_s: float, mean_degC: float) -> Effect:
+        del first_s
+        return replace(self, at_degC=mean_degC if self.at_degC is None else self.at_degC)
+
+    def growth(self, body: Body) -> Floats:
+        return self.per_K * warming(body, self.at_degC)
