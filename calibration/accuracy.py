@@ -171,12 +171,13 @@ def predicted_accuracy(
     lacking = lacking_share * (joint_error_sizes(rig) * joint_error_scale) ** 2 + knowledge.unknown_variance(readings)
     rows = jacobian @ root
     shape = len(readings), len(rig.prisms), 3, 3
+    even = knowledge.unknown_mm2(readings)[:, None, None] * np.eye(3)
     return ExpectedAccuracy(
         rig,
         knowledge.chain.setups[knowledge.setup],
         readings,
         parameters_share * (rows @ rows.transpose(0, 2, 1)).reshape(shape),
-        covariance_by_joints(lin.joint_jacobian, lacking).reshape(shape),
+        (covariance_by_joints(lin.joint_jacobian, lacking) + even).reshape(shape),
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from calibration.effects.base import Situation
 from calibration.effects.fitted import left_out
+from calibration.effects.library import library
 from calibration.limits import turns_deg
 from calibration.observations import Observations
 from calibration.residual.features import DEFLECTION, missing_signals
@@ -73,10 +74,12 @@ def _of_torques(model: CalibratedModel, situation: Situation) -> Iterator[str]:
 
 def _of_payload(model: CalibratedModel, situation: Situation) -> Iterator[str]:
     """Payloads that training did not have, in rows where a load that is used is computed from them."""
-    carried, used = [mass.kg for mass in model.rig.masses if mass.payload], _loads_used(model)
-    if not carried or not used:
+    carried, used = [mass.kg for mass in model.rig.masses if mass.payload], sorted(_loads_used(model))
+    weighs = any(library()[effect.family].goes_with == "weights" for effect in model.effects)
+    if not carried or not (used or weighs):
         return
-    computed = ~np.all([np.isfinite(situation.extra(f"{name}_Nm")) for name in used], axis=0)
+    measured = [np.isfinite(situation.extra(f"{name}_Nm")) for name in used]
+    computed = np.full(len(situation), weighs) | ~np.all(measured or [np.ones(len(situation), dtype=bool)], axis=0)
     payload = situation.extra("payload_kg")
     # Where training had none, the rig file's payload was taken.
     low, high = model.coverage.payload or (min(carried), max(carried))
@@ -103,7 +106,7 @@ def _loads_by_name(model: CalibratedModel) -> set[str]:
     """Joints whose own load effects or the residual use."""
     learned = model.residual.signals if model.residual is not None else ()
     columns = zip(model.rig.joint_names, torque_columns(model.rig), strict=True)
-    used = {e.where for e in model.effects if e.family == "joint_compliance"}
+    used = {e.where for e in model.effects if library()[e.family].goes_with == "torque"}
     return used | {name for name, column in columns if column in learned}
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from calibration.doubts import doubts
 from calibration.effects.fitted import FittedEffect
-from calibration.errors import UnsafeError
+from calibration.errors import CalibrationError, UnsafeError
 from calibration.identification.identifiability import Identifiability
 from calibration.identification.refinement import Prior
 from calibration.kernels.machine import Machine
@@ -238,11 +238,21 @@ class CalibratedModel:
         return self.predictor.predict(observations, executor)
 
     def deviations(self, observations: Observations) -> Floats:
-        """(n,) errors of stage effects in sigma (Mahalanobis length)."""
+        """(n,) errors of stage effects in sigma (Mahalanobis length).
+
+        Raises:
+            UnsafeError: as `check`.
+            CalibrationError: an uncertainty that is no machine's.
+        """
         self.check(observations)
         position, known, parameters = self.predictor.covariances(observations)
         error = observations.position_mm - position
-        factor = np.linalg.cholesky(known + parameters + self.excess_sigma_mm**2 * np.eye(3))
+        try:
+            factor = np.linalg.cholesky(known + parameters + self.excess_sigma_mm**2 * np.eye(3))
+        except np.linalg.LinAlgError as failure:
+            raise CalibrationError(
+                "the model's uncertainty of a position is so large that rounding hides its noise; calibrate again"
+            ) from failure
         whitened = np.linalg.solve(factor, error[:, :, None])[:, :, 0]
         return np.asarray(np.linalg.norm(whitened, axis=1), dtype=np.float64)
 

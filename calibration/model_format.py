@@ -19,7 +19,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from calibration.effects.fitted import FittedCoefficient, FittedEffect
+from calibration.effects.base import FittedCoefficient
+from calibration.effects.fitted import FittedEffect
 from calibration.effects.library import library
 from calibration.errors import ModelError, RigError
 from calibration.identification.identifiability import Identifiability
@@ -39,9 +40,11 @@ VERSION = 3
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Bounded = Annotated[float, Field(gt=-LARGEST, lt=LARGEST, allow_inf_nan=False)]
+Setting = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]  # as `time_s`, which may count from 1970
 Size = Annotated[float, Field(ge=0.0, le=LARGEST, allow_inf_nan=False)]
 Variance = Annotated[float, Field(ge=0.0, le=LARGEST**2, allow_inf_nan=False)]
 Multiple = Annotated[float, Field(gt=0.0, le=LARGEST, allow_inf_nan=False)]
+Plausible = Annotated[float, Field(ge=1e-30, le=LARGEST, allow_inf_nan=False)]  # families divide by it
 Count = Annotated[int, Field(ge=0)]
 Triple = tuple[Bounded, Bounded, Bounded]
 
@@ -86,13 +89,13 @@ class _Coefficient(_Part):
     unit: str
     value: Bounded
     standard_error: Size
-    prior_sigma: Multiple
+    prior_sigma: Plausible
 
 
 class _Effect(_Part):
     family: str
     where: str
-    settings: dict[str, Bounded]
+    settings: dict[str, Setting]
     coefficients: tuple[_Coefficient, ...]
 
 

@@ -29,6 +29,7 @@ _MOST_MM = 1e7  # 10 km
 # What an optional column can be, by how its name ends (the first that fits); what is beyond is in another unit, or
 # noise that would drown every number it meets.
 _POSSIBLE = {
+    "dwell_s": (0.0, 1e9),
     "payload_kg": (0.0, 1e5),
     "_degC": (-100.0, 500.0),
     "_rate": (-1e5, 1e5),

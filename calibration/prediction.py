@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.effects.base import Situation
-from calibration.effects.fitted import AppliedEffects, corrected
+from calibration.effects.fitted import AppliedEffects, Columns, corrected
 from calibration.errors import CalibrationError
 from calibration.identification.samples import reading_variance
 from calibration.kernels.machine import Located, Machine
@@ -47,12 +47,19 @@ class Rows:
     Attributes:
         data: bound, with the joints where the effects have them.
         situation: the observations as read.
-        column: (n, k) deg or mm of its joint per unit of each coefficient of the effects.
+        columns: what unit coefficients of the effects do.
+        shift_mm: (n, 3) by what the effects move the prisms beside the joints, in the station's frame; None for
+            nothing.
     """
 
     data: ChainData
     situation: Situation
-    column: Floats
+    columns: Columns
+    shift_mm: Floats | None
+
+    def shifted(self, position_mm: Floats) -> Floats:
+        """(n, 3) positions of the kinematics as the effects have them."""
+        return position_mm if self.shift_mm is None else position_mm + self.shift_mm
 
 
 @dataclass(frozen=True)
@@ -105,7 +112,8 @@ class Predictor:
 
     def effects_mm(self, observations: Observations) -> Floats:
         """(n, 3) positions by kinematics and effects."""
-        position_mm = self._machine.locate(self._rows(observations).data).position_mm
+        rows = self._rows(observations)
+        position_mm = rows.shifted(self._machine.locate(rows.data).position_mm)
         _refuse_infinite(position_mm)
         return position_mm
 
@@ -115,11 +123,11 @@ class Predictor:
         if self._model.residual is None:
             located, correction = self._machine.locate(rows.data), np.zeros((len(observations), 3))
         else:
-            located = self._machine.linearise(rows.data, rows.column)
+            located = self._linearise(rows)
             correction, _ = self._learned(rows, located)
         by_joint = self._rotations(rows.data) @ located.joint_jacobian
         _refuse_infinite(located.position_mm, correction)
-        return Parts(located.position_mm + correction, rows.data.readings, by_joint, correction)
+        return Parts(rows.shifted(located.position_mm) + correction, rows.data.readings, by_joint, correction)
 
     def predict(self, observations: Observations, executor: Executor | None = None) -> Prediction:
         """Positions and the standard deviation that a fix of them has.
@@ -136,7 +144,7 @@ class Predictor:
         return found
 
     def _in_pieces(self, observations: Observations, executor: Executor | None) -> Prediction:
-        if len(observations) <= _PIECE:
+        if len(observations) <= _PIECE or self._effects.goes_by_order:
             return self._predict(observations)
         rows = np.arange(len(observations))
         pieces = [observations.select(rows[first : first + _PIECE]) for first in range(0, len(rows), _PIECE)]
@@ -148,14 +156,15 @@ class Predictor:
     def _predict(self, observations: Observations) -> Prediction:
         model, rows = self._model, self._rows(observations)
         located, of_fix, of_parameters = self._spread(rows, jacobian=model.residual is not None)
+        position_mm = rows.shifted(located.position_mm)
         known, by_parameters = _diagonals(of_fix), _diagonals(of_parameters)
         if model.residual is None:
-            return Prediction(located.position_mm, np.sqrt(known + by_parameters + model.excess_sigma_mm**2))
+            return Prediction(position_mm, np.sqrt(known + by_parameters + model.excess_sigma_mm**2))
         correction, weight = self._learned(rows, located)
         made_good = weight[:, None] * (1.0 - model.random_share(model.noise_mm**2))
         by_parameters = by_parameters - made_good * (by_parameters - self._by_refitted_base(rows, located))
         along = (self._rotations(rows.data) ** 2 @ self._excess(weight)[:, :, None])[:, :, 0]
-        return Prediction(located.position_mm + correction, np.sqrt(known + by_parameters + along))
+        return Prediction(position_mm + correction, np.sqrt(known + by_parameters + along))
 
     def correction(self, observations: Observations) -> tuple[Floats, Floats]:
         """(n, 3) what the residual learner adds, mm; (n, 3, 3) covariance of what the model lacks even so, mm^2.
@@ -166,13 +175,13 @@ class Predictor:
         rotation = self.rotations(observations)
         if self._model.residual is not None and len(observations) > 0:
             rows = self._rows(observations)
-            correction, weight = self._learned(rows, self._machine.linearise(rows.data, rows.column))
+            correction, weight = self._learned(rows, self._linearise(rows))
         return correction, (rotation * self._excess(weight)[:, None, :]) @ rotation.transpose(0, 2, 1)
 
     def features(self, observations: Observations, signals: Sequence[str]) -> Features:
         """What a residual learner sees, effects taken into account."""
         rows = self._rows(observations)
-        located = self._machine.linearise(rows.data, rows.column)
+        located = self._linearise(rows)
         residual = self._model.residual
         prepared = residual is not None and tuple(signals) == residual.signals
         extract = self._extract if prepared else Extractor(self._chain, self._model.values, signals)
@@ -180,17 +189,19 @@ class Predictor:
 
     def covariances(self, observations: Observations) -> tuple[Floats, Floats, Floats]:
         """(n, 3) positions of stage effects; (n, 3, 3) covariance of a fix, and that by parameters and coefficients."""
-        located, of_fix, of_parameters = self._spread(self._rows(observations), jacobian=False)
-        return located.position_mm, of_fix, of_parameters
+        rows = self._rows(observations)
+        located, of_fix, of_parameters = self._spread(rows, jacobian=False)
+        return rows.shifted(located.position_mm), of_fix, of_parameters
 
     def linearise(self, observations: Observations) -> tuple[Linearisation, Floats]:
         """Stage effects with derivatives, and (n, 3, p + k) those by parameters and coefficients, mm per unit."""
         rows = self._rows(observations)
-        located = self._machine.linearise(rows.data, rows.column)
+        located = self._linearise(rows)
         rotation = self._rotations(rows.data)
         jacobian = rotation @ located.jacobian
         by_parameters = jacobian[:, :, : len(self._chain)]
-        return Linearisation(located.position_mm, by_parameters, rotation @ located.joint_jacobian), jacobian
+        by_joint = rotation @ located.joint_jacobian
+        return Linearisation(rows.shifted(located.position_mm), by_parameters, by_joint), jacobian
 
     def unknown_variance(self, observations: Observations) -> Floats:
         """(n, joints) variance of the joints' values by effects left out for want of a column, deg^2 or mm^2."""
@@ -198,14 +209,22 @@ class Predictor:
 
     def situation(self, observations: Observations) -> Situation:
         """What effects may see of the observations."""
-        return Situation(self._chain, self._model.values, observations, self._loads)
+        return Situation(self._chain, self._model.values, observations, self._loads, self._machine)
 
     def _rows(self, observations: Observations) -> Rows:
         data, situation = self._chain.bind(observations), self.situation(observations)
-        column = self._effects.columns(situation)
+        columns = self._effects.columns(situation)
         if self._model.effects:
-            data = ChainData(data.readings + self._effects.change(column), data.prism, data.setup)
-        return Rows(data, situation, column)
+            data = ChainData(data.readings + self._effects.change(columns), data.prism, data.setup)
+        return Rows(data, situation, columns, self._effects.shifted_mm(columns))
+
+    def _linearise(self, rows: Rows) -> Located:
+        return self._machine.linearise(rows.data, rows.columns.column, self._shift_in_base(rows))
+
+    def _shift_in_base(self, rows: Rows) -> Floats | None:
+        """(n, 3, k) displacements by unit coefficients in the base frame."""
+        shift_mm = rows.columns.shift_mm
+        return None if shift_mm is None else self._rotations(rows.data).transpose(0, 2, 1) @ shift_mm
 
     def _rotations(self, data: ChainData) -> Floats:
         return self._machine.rotations(data)
@@ -218,7 +237,18 @@ class Predictor:
             if measured is not None:
                 rates[:, index] = measured
         variance = self._effects.unknown_variance(rows.situation) + self._reading_variance
-        return self._machine.spread(rows.data, rows.column, observations.sigma_mm, rates, variance, jacobian=jacobian)
+        located, of_fix, of_parameters = self._machine.spread(
+            rows.data,
+            rows.columns.column,
+            self._shift_in_base(rows),
+            observations.sigma_mm,
+            rates,
+            variance,
+            jacobian=jacobian,
+        )
+        if rows.shift_mm is not None:
+            of_fix += self._effects.unknown_mm2(rows.situation)[:, None, None] * np.eye(3)
+        return located, of_fix, of_parameters
 
     def _by_refitted_base(self, rows: Rows, located: Located) -> Floats:
         """(n, 3) variance by what a base's own few fixes leave uncertain of it, which no learner makes good."""

@@ -41,7 +41,7 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
     chain = Chain(model.rig, start.placements)
     free = np.arange(len(chain)) >= body
     additions = fitted_additions(model.effects, Situation(chain, extended(model.values), observations))
-    additions = replace(additions, column=samples.average(additions.column))
+    additions = additions.over(samples.average)
     moves = np.concatenate([free, np.zeros(len(additions), dtype=bool)])
     begun = np.concatenate([extended(model.values), coefficient_values(model.effects)])
     # First with the noise of a rough start: beside that of the model, all fixes would look like outliers.

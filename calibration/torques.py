@@ -18,6 +18,7 @@ from calibration.observations import Floats, Observations
 from calibration.rig import Rig
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
+MASS_SIGMA = 0.15 / math.sqrt(3.0)  # a rig file's masses and centres of gravity are within +-15 % of the machine's
 _LEAST_LOAD = 1e-6  # of the largest load; a joint with less than this in every pose carries nothing
 
 
@@ -27,16 +28,24 @@ class GravityLoads:
     Args:
         chain: kinematics; where its bases stand plays no part.
         x: (p,) its parameters.
+
+    Attributes:
+        point_frame, point_mass: (points,) of every point at which weight hangs its frame and the index of its mass.
     """
 
     def __init__(self, chain: Chain, x: Floats) -> None:
         rig = chain.rig
+        frames, offsets_mm, share = _points(rig)
+        self.point_frame = np.array(frames, dtype=np.intp)
+        self.point_mass = share.argmax(axis=0) if rig.masses else np.empty(0, dtype=np.intp)
         self._measured = [(i, f"{j.name}_Nm") for i, j in enumerate(rig.joints) if j.kind == "revolute"]
         self._carrier: Carrier | None = None
+        self._origins: Carrier | None = None
         if not rig.masses:
             return
-        frames, offsets_mm, share = _points(rig)
         self._carrier = Carrier(chain, x, frames, offsets_mm)
+        self._origins = Carrier(chain, x, frames, np.zeros_like(offsets_mm))
+        self._has_centre = [mass.centre_mm is not None and any(mass.centre_mm) for mass in rig.masses]
         self._share_newton = STANDARD_GRAVITY * share
         self._kilograms = np.array([mass.kg for mass in rig.masses])
         self._payload = np.array([mass.payload for mass in rig.masses])
@@ -44,22 +53,67 @@ class GravityLoads:
         # N mm per deg of a reading are 180 / pi N mm per rad; N mm per mm are N.
         self._unit = np.array([math.degrees(1.0) / 1e3 if j.kind == "revolute" else 1.0 for j in rig.joints])
 
-    def __call__(self, readings: Floats, extra: Mapping[str, Floats]) -> Floats:
+    def places(self, readings: Floats, extra: Mapping[str, Floats]) -> tuple[Floats, Floats]:
+        """(n, points, 3) where the weights hang, mm in the base frame; (n, points) how heavy they are, N.
+
+        No points where the rig has no masses.
+
+        Args:
+            readings, extra: as for a call.
+        """
+        if self._carrier is None:
+            return np.empty((len(readings), 0, 3)), np.empty((len(readings), 0))
+        return self._carrier.places_mm(readings), self._kilograms_of(extra, len(readings)) @ self._share_newton
+
+    def parts(self, readings: Floats, extra: Mapping[str, Floats], down: Floats | None = None) -> Floats:
+        """(n, joints, parts) change of the loads when one mass, or one centre's distance, is `MASS_SIGMA` larger.
+
+        The weights that a rig file gives are rarely weighed. Zero where the torque is measured.
+
+        Args:
+            readings, extra, down: as for a call.
+        """
+        if self._carrier is None or self._origins is None:
+            return np.empty((*readings.shape, 0))
+        along = self._direction if down is None else down
+        newton = STANDARD_GRAVITY * self._kilograms_of(extra, len(readings))
+        out = []
+        for mass, share in enumerate(self._share_newton / STANDARD_GRAVITY):
+            force = newton[:, [mass]] * share
+            whole = self._carrier.work(readings, force, along) * self._unit
+            out.append(MASS_SIGMA * whole)
+            if self._has_centre[mass]:
+                out.append(MASS_SIGMA * (whole - self._origins.work(readings, force, along) * self._unit))
+        parts = np.stack(out, axis=2)
+        for index, column in self._measured:
+            measured = extra.get(column)
+            if measured is not None:
+                parts[np.isfinite(measured), index] = 0.0
+        return parts
+
+    def _kilograms_of(self, extra: Mapping[str, Floats], rows: int) -> Floats:
+        """(n, masses) with the payload of each row."""
+        kilograms = np.empty((rows, len(self._kilograms)))
+        kilograms[:] = self._kilograms
+        payload = extra.get("payload_kg")
+        if payload is not None:
+            kilograms = np.where(self._payload & np.isfinite(payload)[:, None], payload[:, None], kilograms)
+        return kilograms
+
+    def __call__(self, readings: Floats, extra: Mapping[str, Floats], down: Floats | None = None) -> Floats:
         """(n, joints) loads, as `gravity_torques` describes them.
 
         Args:
             readings: (n, joints) deg or mm.
             extra: optional columns of the rows; `payload_kg` and `<name>_Nm` count.
+            down: (n, 3) unit vectors of gravity in the base frame; the rig file's by default.
         """
         if self._carrier is None:
             load = np.full(readings.shape, np.nan)
         else:
-            kilograms = np.empty((len(readings), len(self._kilograms)))
-            kilograms[:] = self._kilograms
-            payload = extra.get("payload_kg")
-            if payload is not None:
-                kilograms = np.where(self._payload & np.isfinite(payload)[:, None], payload[:, None], kilograms)
-            load = self._carrier.work(readings, kilograms @ self._share_newton, self._direction) * self._unit
+            kilograms = self._kilograms_of(extra, len(readings))
+            along = self._direction if down is None else down
+            load = self._carrier.work(readings, kilograms @ self._share_newton, along) * self._unit
         for index, column in self._measured:
             measured = extra.get(column)
             if measured is not None:

@@ -5,33 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
+from typing import NamedTuple
 
 import numpy as np
 
-from calibration.effects.base import Settings, Situation
+from calibration.effects.base import Family, FittedCoefficient, JointFamily, PrismFamily, Settings, Situation
 from calibration.effects.library import library
-from calibration.identification.additions import Additions
+from calibration.identification.additions import NO_JOINT, Additions
 from calibration.kinematics import Chain
 from calibration.observations import Floats, Observations
 
 _CHANCE = 2.0  # standard errors
-
-
-@dataclass(frozen=True)
-class FittedCoefficient:
-    """One number that a fit found.
-
-    Attributes:
-        name, unit: as the family's `Coefficient`.
-        value, standard_error: posterior.
-        prior_sigma: plausible size the fit used.
-    """
-
-    name: str
-    unit: str
-    value: float
-    standard_error: float
-    prior_sigma: float
 
 
 @dataclass(frozen=True)
@@ -55,29 +39,46 @@ class FittedEffect:
             "family": self.family,
             "where": self.where,
             "coefficients": {
-                c.name: {"value": c.value, "unit": c.unit, "standard_error": c.standard_error}
-                for c in self.coefficients
+                c.name: {"value": c.value, "unit": c.unit, "standard_error": c.standard_error} for c in self.reported
             },
             "settings": dict(self.settings),
         }
 
+    @property
+    def reported(self) -> tuple[FittedCoefficient, ...]:
+        """What outputs list of the coefficients."""
+        return library()[self.family].reported(self.settings, self.coefficients)
+
 
 @dataclass(frozen=True)
 class Choice:
-    """One variant of an effect at one place, before a fit."""
+    """One variant of an effect at one place, before a fit.
+
+    Attributes:
+        family, where: which effect, and the place it is at.
+        settings: the numbers of its variant.
+        scale: of the plausible sizes of its coefficients, where the data say that they are larger or smaller.
+    """
 
     family: str
     where: str
     settings: Settings
+    scale: float = 1.0
 
     def __str__(self) -> str:
         return f"{self.family}@{self.where}"
 
     def additions(self, situation: Situation) -> Additions:
         """Its coefficients, for the observations of a situation."""
-        found = library()[self.family].coefficients(situation, self.where, self.settings)
-        return _additions(
-            self.family, self.where, self.settings, [c.name for c in found], [c.sigma for c in found], situation
+        family = library()[self.family]
+        found = family.coefficients(situation, self.where, self.settings)
+        column, shift = _moves(family, situation, self.where, self.settings)
+        return Additions(
+            tuple(f"{self}:{c.name}" for c in found),
+            np.full(len(found), _joint(family, situation.chain, self.where)),
+            column,
+            np.array([c.sigma * self.scale for c in found]),
+            shift,
         )
 
     def fitted(self, situation: Situation, values: Floats, standard_errors: Floats) -> FittedEffect:
@@ -90,23 +91,33 @@ class Choice:
         return FittedEffect(self.family, self.where, coefficients, dict(self.settings))
 
     def beyond(self, situation: Situation, values: Floats, standard_errors: Floats) -> tuple[str, ...]:
-        """Names of the coefficients (k,) that are beyond their hard limits by more than chance."""
+        """Names of the coefficients (k,) that are beyond their hard limits by more than chance.
+
+        Those that only shape an effect, and are not reported, have none; see `strained`.
+        """
         found = library()[self.family].coefficients(situation, self.where, self.settings)
+        reported = {c.name for c in self.fitted(situation, values, standard_errors).reported}
         return tuple(
             c.name
             for c, value, error in zip(found, values, standard_errors, strict=True)
-            if not c.lower - _CHANCE * error <= value <= c.upper + _CHANCE * error
+            if c.name in reported and not c.lower - _CHANCE * error <= value <= c.upper + _CHANCE * error
         )
 
+    def strained(self, values: Floats, standard_errors: Floats) -> bool:
+        """Whether coefficients (k,) have what only shapes the effect beyond its limits by more than chance."""
+        return library()[self.family].strained(self.settings, values, standard_errors)
 
-def joined(parts: Sequence[Additions], rows: int) -> Additions:
-    """All coefficients of several effects, for `rows` observations."""
-    return Additions(
-        tuple(name for part in parts for name in part.names),
-        np.concatenate([np.empty(0, dtype=np.intp), *(part.joint for part in parts)]),
-        np.hstack([np.empty((rows, 0)), *(part.column for part in parts)]),
-        np.concatenate([np.empty(0), *(part.prior_sigma for part in parts)]),
-    )
+
+class Columns(NamedTuple):
+    """What the k coefficients of a model's effects do in n rows.
+
+    Attributes:
+        column: (n, k) deg or mm of its joint per unit of each; zero for those that change none.
+        shift_mm: (n, 3, k) displacement of the prism in the station's frame beside that; None where none does.
+    """
+
+    column: Floats
+    shift_mm: Floats | None
 
 
 class AppliedEffects:
@@ -119,16 +130,21 @@ class AppliedEffects:
         chain: whose joints they are at.
 
     Attributes:
-        joint: (k,) index of the joint that each coefficient changes.
+        joint: (k,) index of the joint that each coefficient changes, -1 for none.
+        goes_by_order: whether what they do in a row depends on the rows before it.
     """
 
     def __init__(self, effects: Sequence[FittedEffect], chain: Chain) -> None:
         ends = list(accumulate((len(effect.coefficients) for effect in effects), initial=0))
         self._parts = [(library()[effect.family], effect, slice(*ends[i : i + 2])) for i, effect in enumerate(effects)]
-        at = [chain.joint_index[effect.where] for effect in effects]
+        at = [_joint(family, chain, effect.where) for family, effect, _ in self._parts]
         self.joint = np.repeat(np.array(at, dtype=np.intp), np.diff(ends))
+        self.goes_by_order = any(family.goes_by_order(effect.settings) for family, effect, _ in self._parts)
+        self._value = coefficient_values(effects)
         self._by_joint = np.zeros((ends[-1], len(chain.joint_index)))
-        self._by_joint[np.arange(ends[-1]), self.joint] = coefficient_values(effects)
+        moving = np.flatnonzero(self.joint != NO_JOINT)
+        self._by_joint[moving, self.joint[moving]] = self._value[moving]
+        self._shifts = bool((self.joint == NO_JOINT).any())
         # Most effects lack nothing ever; what the others leave open does not depend on the rows.
         self._unknown = [
             (family, effect.where, joint, _left_open(effect))
@@ -136,36 +152,54 @@ class AppliedEffects:
             if family.needs(effect.where)
         ]
 
-    def columns(self, situation: Situation) -> Floats:
-        """(n, k) change of each coefficient's joint, deg or mm, per unit of the coefficient."""
-        out = np.empty((len(situation), len(self.joint)))
+    def columns(self, situation: Situation) -> Columns:
+        """What unit coefficients do."""
+        column = np.zeros((len(situation), len(self.joint)))
+        shift_mm = np.zeros((len(situation), 3, len(self.joint))) if self._shifts else None
         for family, effect, own in self._parts:
-            out[:, own] = family.columns(situation, effect.where, effect.settings)
-        return out
+            moved, shifted = _moves(family, situation, effect.where, effect.settings)
+            column[:, own] = moved
+            if shift_mm is not None and shifted is not None:
+                shift_mm[:, :, own] = shifted
+        return Columns(column, shift_mm)
 
-    def change(self, columns: Floats) -> Floats:
+    def change(self, columns: Columns) -> Floats:
         """(n, joints) by what the coefficients with these columns change the joints, deg or mm."""
-        change: Floats = columns @ self._by_joint
+        change: Floats = columns.column @ self._by_joint
         return change
+
+    def shifted_mm(self, columns: Columns) -> Floats | None:
+        """(n, 3) by what they move the prism beside that, in the station's frame; None where none does."""
+        return None if columns.shift_mm is None else columns.shift_mm @ self._value
 
     def unknown_variance(self, situation: Situation) -> Floats:
         """(n, joints) variance of the joints' values in rows that lack what an effect needs, deg^2 or mm^2."""
         out = np.zeros((len(situation), self._by_joint.shape[1]))
         for family, where, joint, variance in self._unknown:
             known = family.known(situation, where)
-            if not known.all():
+            if joint != NO_JOINT and not known.all():
                 out[~known, joint] += variance
+        return out
+
+    def unknown_mm2(self, situation: Situation) -> Floats:
+        """(n,) variance of each coordinate in rows that lack what an effect that moves the prism needs, mm^2."""
+        out = np.zeros(len(situation))
+        for family, where, joint, variance in self._unknown:
+            if joint == NO_JOINT:
+                out[~family.known(situation, where)] += variance
         return out
 
 
 def fitted_additions(effects: Sequence[FittedEffect], situation: Situation) -> Additions:
     """The coefficients of a model's effects, for other observations."""
     applied = AppliedEffects(effects, situation.chain)
+    columns = applied.columns(situation)
     return Additions(
         tuple(f"{effect.family}@{effect.where}:{c.name}" for effect in effects for c in effect.coefficients),
         applied.joint,
-        applied.columns(situation),
+        columns.column,
         np.array([c.prior_sigma for effect in effects for c in effect.coefficients]),
+        columns.shift_mm,
     )
 
 
@@ -201,12 +235,14 @@ def _left_open(effect: FittedEffect) -> float:
     return library()[effect.family].unknown_variance(values, plausible, effect.settings)
 
 
-def _additions(
-    family: str, where: str, settings: Settings, names: Sequence[str], sigma: Sequence[float], situation: Situation
-) -> Additions:
-    return Additions(
-        tuple(f"{family}@{where}:{name}" for name in names),
-        np.full(len(names), situation.rig.joint_names.index(where)),
-        library()[family].columns(situation, where, settings),
-        np.array(sigma),
-    )
+def _joint(family: Family, chain: Chain, where: str) -> int:
+    return chain.joint_index[where] if isinstance(family, JointFamily) else NO_JOINT
+
+
+def _moves(family: Family, situation: Situation, where: str, settings: Settings) -> tuple[Floats, Floats | None]:
+    """(n, k) columns at the joint; (n, 3, k) displacements beside that, None for effects at a joint."""
+    if isinstance(family, JointFamily):
+        return family.columns(situation, where, settings), None
+    assert isinstance(family, PrismFamily)  # there are these two
+    shift = family.shift_mm(situation, where, settings)
+    return np.zeros((len(situation), shift.shape[2])), shift

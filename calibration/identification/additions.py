@@ -1,8 +1,9 @@
-"""Effects as linear columns: what a coefficient of each does to the joint values of each row."""
+"""Effects as linear columns: what a coefficient of each does to the joint values and to the prism of each row."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,24 +12,29 @@ from calibration.observations import Floats
 
 Integers = NDArray[np.intp]
 
+NO_JOINT = -1
+
 
 @dataclass(frozen=True)
 class Additions:
     """k coefficients that a fit estimates along with the parameters of the chain, for m rows.
 
-    The true value of joint `joint[i]` is its reading plus `column[:, i]` times coefficient i, before couplings.
+    The true value of joint `joint[i]` is its reading plus `column[:, i]` times coefficient i, before couplings; and the
+    prism is `shift_mm[:, :, i]` times coefficient i away from where the kinematics have it then.
 
     Attributes:
         names: of the coefficients, `family@where:name`.
-        joint: (k,) index of the joint that each changes.
-        column: (m, k) deg or mm of that joint per unit of the coefficient.
+        joint: (k,) index of the joint that each changes, `NO_JOINT` for none.
+        column: (m, k) deg or mm of that joint per unit of the coefficient; zero where there is none.
         prior_sigma: (k,) plausible size of each coefficient, 1 sigma, in its unit.
+        shift_mm: (m, 3, k) in the station's frame, per unit of the coefficient; None where none moves a prism itself.
     """
 
     names: tuple[str, ...]
     joint: Integers
     column: Floats
     prior_sigma: Floats
+    shift_mm: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -37,14 +43,45 @@ class Additions:
         """(m, joints) by what coefficients (k,) change the readings, deg or mm."""
         out = np.zeros((len(self.column), joints))
         for i, joint in enumerate(self.joint):
-            out[:, joint] += self.column[:, i] * coefficients[i]
+            if joint != NO_JOINT:
+                out[:, joint] += self.column[:, i] * coefficients[i]
         return out
+
+    def shifted_mm(self, coefficients: Floats) -> Floats:
+        """(m, 3) by what coefficients (k,) move the prism beside that, in the station's frame."""
+        if self.shift_mm is None:
+            return np.zeros((len(self.column), 3))
+        shifted: Floats = self.shift_mm @ coefficients
+        return shifted
 
     def moved_mm(self, joint_jacobian: Floats) -> Floats:
         """(m, 3, k) what unit coefficients move, for the (m, 3, joints) Jacobian by readings in mm per deg or mm."""
-        moved: Floats = joint_jacobian[:, :, self.joint] * self.column[:, None, :]
+        moved = np.zeros((len(self.column), 3, len(self.joint))) if self.shift_mm is None else self.shift_mm.copy()
+        for joint in np.unique(self.joint[self.joint != NO_JOINT]).tolist():
+            own = self.joint == joint
+            moved[:, :, own] += joint_jacobian[:, :, joint, None] * self.column[:, None, own]
         return moved
+
+    def over(self, rows: Callable[[Floats], Floats]) -> Additions:
+        """The same coefficients for other rows, `rows` making theirs (m', ...) of what these have (m, ...)."""
+        shift = None if self.shift_mm is None else rows(self.shift_mm)
+        return replace(self, column=rows(self.column), shift_mm=shift)
 
     def select(self, rows: NDArray[np.bool_] | Integers) -> Additions:
         """The same coefficients for the given rows, by mask or by index."""
-        return Additions(self.names, self.joint, self.column[rows], self.prior_sigma)
+        return self.over(lambda values: values[rows])
+
+
+def joined(parts: Sequence[Additions], rows: int) -> Additions:
+    """All coefficients of several effects, for `rows` observations."""
+    shift = None
+    if any(part.shift_mm is not None for part in parts):
+        zero = [np.zeros((rows, 3, len(part))) if part.shift_mm is None else part.shift_mm for part in parts]
+        shift = np.concatenate(zero, axis=2)
+    return Additions(
+        tuple(name for part in parts for name in part.names),
+        np.concatenate([np.empty(0, dtype=np.intp), *(part.joint for part in parts)]),
+        np.hstack([np.empty((rows, 0)), *(part.column for part in parts)]),
+        np.concatenate([np.empty(0), *(part.prior_sigma for part in parts)]),
+        shift,
+    )

@@ -77,6 +77,7 @@ def identifiability(
     *,
     free: NDArray[np.bool_] | None = None,
     additions: Additions | None = None,
+    listed: NDArray[np.bool_] | None = None,
 ) -> Identifiability:
     """Rank and null space.
 
@@ -86,11 +87,12 @@ def identifiability(
         x: (p,) parameters at which to look, (p + k,) where coefficients are not zero.
         excess_variance: what the scatter of the data adds to their covariance, mm^2 per axis.
         free: (p,) which parameters are asked for, the others being known (base and prisms, say); all by default.
-        additions: k coefficients of effects that are fitted along; all of them are asked for.
+        additions: k coefficients of effects that are fitted along.
+        listed: (k,) which of them are asked for, all by default; the others only shape a curve and count as known.
     """
     coefficients = 0 if additions is None else len(additions)
     at = np.concatenate([x, np.zeros(len(chain) + coefficients - len(x))])
-    asked = _asked(chain, free, additions)
+    asked = _asked(chain, free, additions, np.ones(coefficients, dtype=bool) if listed is None else listed)
     whitened = _whitened(chain, samples, at, excess_variance, additions, asked)
     count = len(asked.names)
     # The triangle has the singular values of the whole, at a fraction of the cost.
@@ -154,7 +156,9 @@ def observability_indices(singular: Floats, measurements: int) -> dict[str, floa
 # -- the Jacobian ----------------------------------------------------------------------------------------------------
 
 
-def _asked(chain: Chain, free: NDArray[np.bool_] | None, additions: Additions | None) -> _Asked:
+def _asked(
+    chain: Chain, free: NDArray[np.bool_] | None, additions: Additions | None, listed: NDArray[np.bool_]
+) -> _Asked:
     asked = np.ones(len(chain), dtype=bool) if free is None else free
     names = [p.name for p in chain.parameters]
     sigma = np.where(np.isinf(chain.prior_sigma), [_FLAT_SIGMA[p.unit] for p in chain.parameters], chain.prior_sigma)
@@ -163,7 +167,7 @@ def _asked(chain: Chain, free: NDArray[np.bool_] | None, additions: Additions | 
         names += additions.names
         words += [(text := _words_of_coefficient(name), text) for name in additions.names]
         sigma = np.concatenate([sigma, additions.prior_sigma])
-    columns = np.concatenate([np.flatnonzero(asked), np.arange(len(chain), len(names))])
+    columns = np.concatenate([np.flatnonzero(asked), len(chain) + np.flatnonzero(listed)])
     return _Asked(
         tuple(names[i] for i in columns),
         tuple(words[i][0] for i in columns),

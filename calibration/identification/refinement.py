@@ -11,6 +11,7 @@ prior's scale, where asked for, by MacKay's evidence update.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -147,6 +148,77 @@ def information(
 
 
 @dataclass(frozen=True)
+class WhitenedRows:
+    """m samples about a fit, in units of their noise; rows are sample-major, x, y, z of the first sample first.
+
+    Attributes:
+        error_mm: (m, 3) measured minus modelled.
+        error: (3 m,) the same in units of the noise.
+        jacobian: (3 m, q) by parameters and coefficients, in prior sigmas of each.
+        value: (q,) where the fit has these, in prior sigmas.
+        precision_root: (q,) one over the prior sigmas.
+        joint_jacobian: (m, 3, joints) by reading, station's frame, mm per deg or mm.
+        parameter_jacobian: (m, 3, p) by parameter, mm per mm or rad.
+        whiten: (m, 3, k) displacements in mm -> (3 m, k).
+    """
+
+    error_mm: Floats
+    error: Floats
+    jacobian: Floats
+    value: Floats
+    precision_root: Floats
+    joint_jacobian: Floats
+    parameter_jacobian: Floats
+    whiten: Callable[[Floats], Floats]
+
+
+def whitened_rows(
+    chain: Chain,
+    samples: Samples,
+    fit: Fit,
+    *,
+    excess_variance: float,
+    weight: Floats,
+    additions: Additions | None = None,
+) -> WhitenedRows:
+    """The linear model about a fit, its noise whitened.
+
+    Args:
+        chain, samples, fit, additions: the fit and what it was of.
+        excess_variance: s^2, mm^2 per axis.
+        weight: (m,) probability that a sample is no outlier.
+    """
+    problem = _Problem(chain, samples, None, additions)
+    state = problem.at(fit.x)
+    of_rows = problem.marginals(state, excess_variance)
+    own = weight[problem.order]
+    whitening = problem.whitening(state, of_rows, own)
+    rows = (3 * problem.order[:, None] + np.arange(3)).ravel()
+
+    def back(whitened: Floats) -> Floats:
+        out = np.empty_like(whitened)
+        out[rows] = whitened
+        return out
+
+    def of_samples(values: Floats) -> Floats:
+        out = np.empty_like(values)
+        out[problem.order] = values
+        return out
+
+    root = problem.precision(fit.prior_scale) ** 0.5
+    return WhitenedRows(
+        of_samples(state.error),
+        back(whitening.whiten(state.error))[:, 0],
+        back(whitening.whiten(state.jacobian)) / root,
+        fit.x * root,
+        root,
+        of_samples(state.by_joint),
+        of_samples(state.jacobian[:, :, : len(chain)]),
+        lambda moved_mm: back(whitening.whiten(moved_mm[problem.order])),
+    )
+
+
+@dataclass(frozen=True)
 class _State:
     x: Floats
     error: Floats  # (m, 3) measured minus modelled
@@ -203,6 +275,7 @@ class _Problem:
             data = ChainData(data.readings + added.change(x[p:], data.readings.shape[1]), data.prism, data.setup)
         position, jacobian, by_joint = self._linearise(x[:p], data)
         if added is not None:
+            position = position + added.shifted_mm(x[p:])
             jacobian = np.concatenate([jacobian, added.moved_mm(by_joint)], axis=2)
         return _State(x, self._position_mm - position, jacobian, by_joint)
 

@@ -49,7 +49,7 @@ def _marginals(block: Floats, error: Floats, square: Floats, log_det: Floats, tr
         a, b, c, d, e, f = v[0, 0], v[1, 0], v[2, 0], v[1, 1], v[2, 1], v[2, 2]
         inverse[0, 0], inverse[1, 1], inverse[2, 2] = d * f - e * e, a * f - c * c, a * d - b * b
         inverse[0, 1], inverse[0, 2], inverse[1, 2] = c * e - b * f, b * e - c * d, b * c - a * e
-        determinant = a * inverse[0, 0] + b * inverse[0, 1] + c * inverse[0, 2]
+        determinant = max(a * inverse[0, 0] + b * inverse[0, 1] + c * inverse[0, 2], _ROUNDING * a * d * f)
         i00, i11, i22 = inverse[0, 0] / determinant, inverse[1, 1] / determinant, inverse[2, 2] / determinant
         i01, i02, i12 = inverse[0, 1] / determinant, inverse[0, 2] / determinant, inverse[1, 2] / determinant
         x, y, z = error[m, 0], error[m, 1], error[m, 2]

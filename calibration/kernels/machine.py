@@ -45,6 +45,18 @@ class Located(NamedTuple):
     jacobian: Floats
 
 
+class Facing(NamedTuple):
+    """Which way prisms face, and what each drive of a row does to them, n rows; all in the base frame.
+
+    Attributes:
+        axes: (n, 3, 3) of the prism's frame, as rows.
+        by_drive: (n, 3, drives) mm per deg or mm of the reading, through one drive of `Machine.drives` alone.
+    """
+
+    axes: Floats
+    by_drive: Floats
+
+
 class Machine:
     """A chain at parameters that stay; build it once and ask for any rows.
 
@@ -52,8 +64,11 @@ class Machine:
         chain: kinematics.
         x: (p,) its parameters.
         covariance: (p + k, p + k) of them and of coefficients of effects; by default all is certain.
-        coefficient_joint: (k,) the joint whose value each coefficient changes.
+        coefficient_joint: (k,) the joint whose value each coefficient changes, -1 for none.
         repeat_sigma_mm: what repeats of a fix scatter beyond the station's own sigma, each axis.
+
+    Attributes:
+        drives: (row number from 1, index of the joint) of everything that drives a row; a coupled joint has several.
     """
 
     def __init__(
@@ -70,9 +85,15 @@ class Machine:
         bases = [_base(chain, x, setup) for setup in range(len(chain.setups))]
         self._bases: Floats = np.array(bases, dtype=np.float64).reshape(-1, 7, 3)
         self._rows, self._joints, self._size = len(chain.rig.rows), len(chain.rig.joints), len(root)
-        self._tables = (
+        self.drives = tuple(
+            (number, joint) for number, ops in enumerate(chain.row_ops, 1) for op in ops for joint, _ in op.drive
+        )
+        self._kinematics = (
             *_transforms(chain, x),
             *_points(chain, [prism.frame for prism in chain.rig.prisms], offsets),
+        )
+        self._tables = (
+            *self._kinematics,
             self._bases,
             *Uncertainty(
                 root,
@@ -94,27 +115,43 @@ class Machine:
         """(n, 3, 3) from the base frame to the station's."""
         return self._bases[data.setup, :3]
 
+    def face(self, data: ChainData) -> Facing:
+        """Which way the prisms of n rows face, and what each drive does to them."""
+        out = Facing(np.empty((len(data), 3, 3)), np.empty((len(data), 3, len(self.drives))))
+        readings = np.ascontiguousarray(data.readings, dtype=np.float64)
+        machine_loops.face(readings, data.prism, *self._kinematics, *out)
+        return out
+
     def locate(self, data: ChainData) -> Located:
         """Where the prisms of n rows are, without the Jacobian by parameters."""
-        return self._locate(data, _NOTHING, _NOTHING, _NOTHING, _NOTHING, wanted=False)[0]
+        return self._locate(data, _NOTHING, None, _NOTHING, _NOTHING, _NOTHING, wanted=False)[0]
 
-    def linearise(self, data: ChainData, column: Floats | None = None) -> Located:
+    def linearise(self, data: ChainData, column: Floats | None = None, shift_mm: Floats | None = None) -> Located:
         """The same with the Jacobian by parameters and coefficients.
 
         Args:
             data: n rows, with the joints where the effects have them.
             column: (n, k) deg or mm of its joint per unit of each coefficient; may be left out where there are none.
+            shift_mm: (n, 3, k) displacement in the base frame per unit of each coefficient, on top of that.
         """
         column = np.empty((len(data), 0)) if column is None else column
-        return self._locate(data, column, _NOTHING, _NOTHING, _NOTHING, wanted=True)[0]
+        return self._locate(data, column, shift_mm, _NOTHING, _NOTHING, _NOTHING, wanted=True)[0]
 
     def spread(
-        self, data: ChainData, column: Floats, sigma_mm: Floats, rates: Floats, variance: Floats, *, jacobian: bool
+        self,
+        data: ChainData,
+        column: Floats,
+        shift_mm: Floats | None,
+        sigma_mm: Floats,
+        rates: Floats,
+        variance: Floats,
+        *,
+        jacobian: bool,
     ) -> tuple[Located, Floats, Floats]:
         """Where the prisms of n rows are, and how far from there a fix may be found.
 
         Args:
-            data, column: as for `linearise`.
+            data, column, shift_mm: as for `linearise`.
             sigma_mm: (n, 3) of the fix, in place of the station's where given.
             rates: (n, joints) deg/s or mm/s, NaN where not measured.
             variance: (n, joints) of each joint's value, deg^2 or mm^2.
@@ -124,10 +161,18 @@ class Machine:
             The places; (n, 3, 3) covariance of the fix (station, repeats, readings, instant) and (n, 3, 3) that by
             parameters and coefficients, mm^2, both in the station's frame.
         """
-        return self._locate(data, column, sigma_mm, rates, variance, wanted=jacobian)
+        return self._locate(data, column, shift_mm, sigma_mm, rates, variance, wanted=jacobian)
 
     def _locate(
-        self, data: ChainData, column: Floats, sigma_mm: Floats, rates: Floats, variance: Floats, *, wanted: bool
+        self,
+        data: ChainData,
+        column: Floats,
+        shift_mm: Floats | None,
+        sigma_mm: Floats,
+        rates: Floats,
+        variance: Floats,
+        *,
+        wanted: bool,
     ) -> tuple[Located, Floats, Floats]:
         n, m = len(data), len(variance)
         out = Located(
@@ -144,6 +189,7 @@ class Machine:
             data.setup,
             *self._tables,
             np.ascontiguousarray(column),
+            np.empty((n, 3, 0)) if shift_mm is None else np.ascontiguousarray(shift_mm),
             np.ascontiguousarray(sigma_mm),
             np.ascontiguousarray(rates),
             np.ascontiguousarray(variance),
@@ -174,10 +220,16 @@ class Carrier:
         Args:
             readings: (n, joints) deg or mm.
             force: (n, m) at the points.
-            direction: (3,) along which the forces act, in the base frame.
+            direction: (n, 3) or (3,) along which the forces act, unit vectors of the base frame.
         """
-        out = np.empty(readings.shape)
-        machine_loops.work(np.ascontiguousarray(readings), np.ascontiguousarray(force), direction, *self._tables, out)
+        out, along = np.empty(readings.shape), np.ascontiguousarray(np.broadcast_to(direction, (len(readings), 3)))
+        machine_loops.work(np.ascontiguousarray(readings), np.ascontiguousarray(force), along, *self._tables, out)
+        return out
+
+    def places_mm(self, readings: Floats) -> Floats:
+        """(n, m, 3) where the points are, in the base frame, for readings (n, joints)."""
+        out = np.empty((len(readings), len(self._tables[-1]), 3))
+        machine_loops.places(np.ascontiguousarray(readings), *self._tables, out)
         return out
 
 

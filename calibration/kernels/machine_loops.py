@@ -58,7 +58,7 @@ class Uncertainty(NamedTuple):
         root: (q, q) lower triangular; root @ root' is the covariance of parameters and coefficients of effects.
         prism_parameter: (prisms,) the first of the three of each prism's offset.
         base_start: the first of the bases' parameters.
-        coefficient_joint: (k,) the joint that each coefficient changes; they are the last of the q.
+        coefficient_joint: (k,) the joint that each coefficient changes, -1 for none; they are the last of the q.
         station: distance in mm and ppm, circles in rad, centring in mm, repeats in mm, instant in s: 1 sigma each.
     """
 
@@ -144,6 +144,7 @@ def _by_parameters(
     place: Floats,
     arm: Floats,
     column: Floats,
+    shift: Floats,
     point: int,
     setup: int,
     axes: Floats,
@@ -160,6 +161,7 @@ def _by_parameters(
     Args:
         place, arm: the point in the base frame, and from the base's origin in the station's.
         column: (k,) what unit coefficients do to their joints.
+        shift: (3, k) what they do to the point beside that; none where no coefficient does.
         axes: of the point's frame, as rows.
         base: (7, 3) of the set-up: rotation, origin and three axes, as `Machine` has them.
         others: as everywhere here.
@@ -180,8 +182,12 @@ def _by_parameters(
             out[j, first + 3 + i] = base[0, j] * m0 + base[1, j] * m1 + base[2, j] * m2
     first = out.shape[1] - len(column)
     for c in range(len(column)):
+        if unknown.coefficient_joint[c] >= 0:
+            for j in range(3):
+                out[j, first + c] = column[c] * by_joint[j, unknown.coefficient_joint[c]]
+    for c in range(shift.shape[1]):
         for j in range(3):
-            out[j, first + c] = column[c] * by_joint[j, unknown.coefficient_joint[c]]
+            out[j, first + c] += shift[j, c]
 
 
 @compiled
@@ -283,6 +289,7 @@ def locate(
     coefficient_joint: Integers,
     station: tuple[float, float, float, float, float, float],
     column: Floats,
+    shift: Floats,
     sigma_mm: Floats,
     rates: Floats,
     variance: Floats,
@@ -319,6 +326,7 @@ def locate(
                 place[n],
                 arm,
                 column[n],
+                shift[n],
                 point,
                 setup[n],
                 ends[at],
@@ -354,7 +362,7 @@ def work(
     offset: Floats,
     out: Floats,
 ) -> None:
-    """Fill `out` (n, joints) with the work that forces (n, points) along `direction` do, per unit of each reading.
+    """Fill `out` (n, joints) with the work of forces (n, points) along `direction` (n, 3), per unit of each reading.
 
     From the last row back to the base, each transform moves all the points beyond it: their sum and moment suffice.
     """
@@ -362,8 +370,8 @@ def work(
     rows = len(frame_before)
     ends, kept, frames = np.empty((rows + 1, 3, 3)), np.empty((len(kind), 6)), np.empty((rows + 1, 3))
     place, beyond = np.empty(3), np.empty((rows + 1, 4))
-    d0, d1, d2 = direction[0], direction[1], direction[2]
     for n in range(len(readings)):
+        d0, d1, d2 = direction[n, 0], direction[n, 1], direction[n, 2]
         out[n] = 0.0
         beyond[:] = 0.0
         _walk(readings[n], transforms, ends, kept, frames)
@@ -388,3 +396,67 @@ def work(
                     out[n, drive_joint[i]] += drive_size[i] * done
             for i in range(4):
                 beyond[frame_before[row - 1], i] += beyond[row, i]
+
+
+@compiled
+def places(
+    readings: Floats,
+    kind: Integers,
+    amount: Floats,
+    drive_start: Integers,
+    drive_joint: Integers,
+    drive_size: Floats,
+    row_start: Integers,
+    frame_before: Integers,
+    frame: Integers,
+    offset: Floats,
+    out: Floats,
+) -> None:
+    """Fill `out` (n, points, 3) with where points fixed to frames are, in the base frame."""
+    transforms = Transforms(kind, amount, drive_start, drive_joint, drive_size, row_start, frame_before)
+    rows = len(frame_before)
+    ends, kept, frames = np.empty((rows + 1, 3, 3)), np.empty((len(kind), 6)), np.empty((rows + 1, 3))
+    for n in range(len(readings)):
+        _walk(readings[n], transforms, ends, kept, frames)
+        for m in range(len(frame)):
+            _place(offset[m], ends[frame[m]], frames[frame[m]], out[n, m])
+
+
+@compiled
+def face(
+    readings: Floats,
+    prism: Integers,
+    kind: Integers,
+    amount: Floats,
+    drive_start: Integers,
+    drive_joint: Integers,
+    drive_size: Floats,
+    row_start: Integers,
+    frame_before: Integers,
+    frame: Integers,
+    offset: Floats,
+    path_start: Integers,
+    path: Integers,
+    axes: Floats,
+    by_drive: Floats,
+) -> None:
+    """Fill `axes` (n, 3, 3; as rows) of the prisms' frames and `by_drive` (n, 3, drives), both in the base frame."""
+    transforms = Transforms(kind, amount, drive_start, drive_joint, drive_size, row_start, frame_before)
+    rows = len(frame_before)
+    ends, kept, frames = np.empty((rows + 1, 3, 3)), np.empty((len(kind), 6)), np.empty((rows + 1, 3))
+    place = np.empty(3)
+    for n in range(len(prism)):
+        point = prism[n]
+        at = frame[point]
+        _walk(readings[n], transforms, ends, kept, frames)
+        _place(offset[point], ends[at], frames[at], place)
+        axes[n] = ends[at]
+        by_drive[n] = 0.0
+        for entry in range(path_start[point], path_start[point + 1]):
+            k = path[entry]
+            if drive_start[k + 1] > drive_start[k]:
+                m0, m1, m2 = _moved(k, place, transforms, kept)
+                for i in range(drive_start[k], drive_start[k + 1]):
+                    by_drive[n, 0, i] = drive_size[i] * m0
+                    by_drive[n, 1, i] = drive_size[i] * m1
+                    by_drive[n, 2, i] = drive_size[i] * m2

@@ -17,11 +17,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.effects.adoption import Adopted
 from calibration.effects.base import Situation
-from calibration.effects.fitted import Choice, joined
+from calibration.effects.fitted import Choice
 from calibration.errors import CalibrationError, DataError, UnsafeError
-from calibration.identification.additions import Additions
+from calibration.gap.adopt import Adopted
+from calibration.identification.additions import Additions, joined
 from calibration.identification.identifiability import identifiability
 from calibration.identification.judgement import refuse_mirrored, rms_left_mm, rms_tolerated_mm
 from calibration.identification.refinement import Fit, prior_precision, refine
@@ -152,7 +152,7 @@ class _Compliances:
         """Columns of the samples at kinematic parameters x (p,)."""
         situation = replace(self.situation, x=x)
         found = joined([choice.additions(situation) for choice in self.choices], len(situation))
-        return replace(found, column=self.samples.average(found.column))
+        return found.over(self.samples.average)
 
 
 def _iterated(chain: Chain, samples: Samples, start: Floats, compliances: _Compliances) -> tuple[Fit, int]:

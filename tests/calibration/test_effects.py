@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pkgutil
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -11,12 +10,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from calibration.effects import families
-from calibration.effects.adoption import Adopted, adopt, with_effects
-from calibration.effects.base import Family, Situation
-from calibration.effects.fitted import Choice, coefficient_values, corrected, fitted_additions
-from calibration.effects.library import library, parse_effects
+from calibration.effects.base import Situation
+from calibration.effects.fitted import coefficient_values, fitted_additions
+from calibration.effects.library import library
 from calibration.errors import DataError, ModelError
+from calibration.gap.adopt import Adopted, adopt, with_effects
+from calibration.gap.search import search
 from calibration.identification.solve import Solution, solve
 from calibration.kinematics import Chain, Placement
 from calibration.model import CalibratedModel
@@ -31,8 +30,6 @@ from simulators.truth import RigTruth
 from tests.calibration.conftest import Session, rig_text, rms
 from tests.calibration.simulated_ys100 import robot, stiffening
 from tests.calibration.test_model import edited
-
-FAMILIES = sorted(library().items())
 
 
 def measured(rig: Rig, effects: str, n: int, seed: int, *, noise_mm: float, perturbation: float = 1.0) -> Observations:
@@ -51,72 +48,7 @@ def solved(rig: Rig, observations: Observations) -> Solution:
         return solve(rig, observations, prior="recalibration", seed=0, executor=pool, progress=lambda *_: None)
 
 
-# -- the library -------------------------------------------------------------------------------------------------------
-
-
-def test_every_file_of_the_library_is_a_family_of_its_name() -> None:
-    assert list(library()) == sorted(module.name for module in pkgutil.iter_modules(families.__path__))
-
-
-@pytest.mark.parametrize(("name", "family"), FAMILIES)
-def test_a_family_says_what_it_is(name: str, family: Family) -> None:
-    assert family.name == name
-    assert len(family.equation) > 10
-    assert len(family.source) > 10
-    assert type(family).__doc__
-
-
-@pytest.mark.parametrize(("name", "family"), FAMILIES)
-def test_a_family_has_sane_numbers_wherever_it_may_be_on_the_boom(name: str, family: Family) -> None:
-    rig = shipped_rig("swdt82")
-    situation = nominal_situation(rig, measured(rig, "", 40, 1, noise_mm=3.0))
-    assert family.places(rig)
-    for where in family.places(rig):
-        for settings in family.variants(situation, where):
-            coefficients = family.coefficients(situation, where, settings)
-            assert tuple(c.name for c in coefficients) == family.names(settings)
-            for c in coefficients:
-                assert 0.0 < c.sigma < c.upper
-                assert c.lower in (0.0, -c.upper)
-                assert c.unit == "1" or c.unit.split("/")[0] in c.name
-            columns = family.columns(situation, where, settings)
-            assert columns.shape == (40, len(coefficients))
-            assert np.isfinite(columns).all()
-            # Plausible sizes move a joint by up to a degree or a few cm, and by no less than the encoders notice.
-            moved = np.abs(columns * [c.sigma for c in coefficients]).max()
-            assert 1e-4 < moved < (1.0 if rig.joint(where).kind == "revolute" else 30.0), (where, settings)
-        with pytest.raises(ValueError, match="setting"):
-            family.names({"surprise": 1.0})
-
-
-@pytest.mark.parametrize(
-    ("simulated", "choice", "values"),
-    [
-        ("joint_compliance@theta4:compliance_rad_per_Nm=5e-9", Choice("joint_compliance", "theta4", {}), (5e-9,)),
-        ("joint_compliance@theta5:compliance_rad_per_Nm=2e-8", Choice("joint_compliance", "theta5", {}), (2e-8,)),
-        ("backlash@theta1:width_rad=2e-3", Choice("backlash", "theta1", {}), (2e-3,)),
-        ("transducer_scale@L2:scale=2e-3", Choice("transducer_scale", "L2", {}), (2e-3,)),
-        (
-            "encoder_harmonic@theta5:cosk_rad=1e-3:sink_rad=-2e-3:k=2",
-            Choice("encoder_harmonic", "theta5", {"k": 2.0}),
-            (1e-3, -2e-3),
-        ),
-    ],
-)
-def test_columns_move_the_boom_as_the_simulator_does(simulated: str, choice: Choice, values: tuple[float, ...]) -> None:
-    """Units, signs and couplings, against effects and kinematics that share no code with these."""
-    rig = shipped_rig("swdt82")
-    truth = RigTruth(rig, 5, perturbation=0.0, effects=simulated_effects(simulated))
-    observations = measured(rig, simulated, 60, 2, noise_mm=0.0, perturbation=0.0)
-    placement = truth.placement()
-    chain = Chain(rig, {"": Placement(placement.rotation, placement.position_mm)})
-    situation = Situation(chain, np.zeros(len(chain)), observations)
-    change = choice.additions(situation).change(np.array(values), len(rig.joints))
-    true = corrected(observations, change, rig.joint_names)
-    without = chain.positions_mm(situation.x, chain.bind(observations)) - observations.position_mm
-    with_effect = chain.positions_mm(situation.x, chain.bind(true)) - observations.position_mm
-    assert rms(without) > 1.0
-    assert rms(with_effect) < 0.03 * rms(without)  # the carrier's tilt changes the loads by a percent
+# -- curves of stiffness -----------------------------------------------------------------------------------------------
 
 
 def test_a_curve_of_stiffness_is_symmetric_or_not_and_straight_beyond_its_data() -> None:
@@ -133,23 +65,6 @@ def test_a_curve_of_stiffness_is_symmetric_or_not_and_straight_beyond_its_data()
         outside = (torque[1:-1] < -1050.0) | (torque[1:-1] > 1050.0)
         assert np.abs(second[outside]).max() < 1e-9 * np.abs(second).max()
         assert (np.abs(second[:, 1:]).max(axis=0) > 0.0).all()
-
-
-def test_places_and_names_that_do_not_exist_are_refused_in_a_sentence() -> None:
-    rig = shipped_rig("swdt82")
-    assert parse_effects("backlash@theta1, angle_scale@theta4", rig) == (
-        ("backlash", "theta1"),
-        ("angle_scale", "theta4"),
-    )
-    for text, message in (
-        ("gremlins@theta1", "effect 'gremlins' is unknown; there are angle_scale, backlash"),
-        ("", "effect '' is unknown"),
-        ("backlash@L2", "backlash@L2: rig 'swdt82' has theta1, theta3"),
-        ("backlash", "backlash@: rig 'swdt82' has theta1"),
-        ("backlash@theta1,backlash@theta1", "named twice"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            parse_effects(text, rig)
 
 
 def test_loads_that_are_not_measured_everywhere_act_where_they_are() -> None:
@@ -180,7 +95,7 @@ class Fitted:
 @pytest.fixture(scope="module")
 def stiff() -> Fitted:
     rig, training, held_out = robot(3, stiffening(3))
-    adopted = adopt(solved(rig, training), training)
+    adopted = search(solved(rig, training), training, library()).adopted
     kinematics = identify(rig, rig_text("ys100"), training, effects="none")
     return Fitted(rig, training, held_out, adopted, kinematics, with_effects(kinematics, adopted))
 
@@ -205,13 +120,13 @@ def test_what_a_prediction_with_effects_says_of_its_own_error_holds(stiff: Fitte
 def test_robots_without_effects_get_none() -> None:
     for seed in range(4):
         rig, training, _ = robot(seed, ())
-        adopted = adopt(solved(rig, training), training)
+        adopted = search(solved(rig, training), training, library()).adopted
         assert adopted.effects == ()
         assert adopted.solution.fit is adopted.geometric
 
 
 def test_a_boom_without_effects_gets_none(session: Session) -> None:
-    assert adopt(solved(session.rig, session.training), session.training).effects == ()
+    assert search(solved(session.rig, session.training), session.training, library()).adopted.effects == ()
 
 
 @pytest.mark.parametrize("name", ["swdt82", "ys100"])
@@ -220,14 +135,14 @@ def test_data_without_any_noise_get_no_effect_and_no_failure(name: str) -> None:
     observations = measured(rig, "", 80, 4, noise_mm=0.0)
     exact = replace(observations, sigma_mm=np.full((80, 3), 1e-4))
     for table in (observations, exact):
-        assert adopt(solved(rig, table), table).effects == ()
+        assert search(solved(rig, table), table, library()).adopted.effects == ()
 
 
 def test_a_few_gross_outliers_do_not_hide_a_compliance(stiff: Fitted) -> None:
     moved = stiff.training.position_mm.copy()
     moved[[5, 25]] += [80.0, -50.0, 60.0]
     training = replace(stiff.training, position_mm=moved)
-    adopted = adopt(solved(stiff.rig, training), training)
+    adopted = search(solved(stiff.rig, training), training, library()).adopted
     assert {e.where for e in adopted.effects} >= {"theta2", "theta3"}
     assert adopted.solution.fit.weight[[5, 25]].max() < 0.01
     assert adopted.solution.fit.excess_variance < 0.1 * adopted.geometric.excess_variance
@@ -293,7 +208,7 @@ def test_signed_effects_that_this_program_would_compute_otherwise_are_refused(
     stiff: Fitted, changes: Mapping[str, object], message: str
 ) -> None:
     files = stiff.model.to_files()
-    first, *others = json.loads(files["model.json"])["effects"]
+    first, *others = sorted(json.loads(files["model.json"])["effects"], key=lambda e: str(e["where"]))
     with pytest.raises(ModelError, match=message):
         CalibratedModel.from_files(edited(files, effects=[{**first, **changes}, *others]))
 

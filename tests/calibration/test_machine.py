@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calibration.identification.additions import NO_JOINT
 from calibration.identification.samples import covariance_by_joints, reading_covariance, station_covariance
 from calibration.kernels.machine import Machine
 from calibration.kinematics import Chain, ChainData, Placement, X, Y, Z, rotation_about
@@ -18,7 +19,7 @@ from tests.calibration.conftest import Session
 
 RIGS = Path(__file__).parent.parent / "rigs"
 ROWS, COEFFICIENTS = 60, 3
-COEFFICIENT_JOINT = np.array([0, 1, 0])
+COEFFICIENT_JOINT = np.array([0, 1, NO_JOINT])
 
 
 def rig(name: str) -> Rig:
@@ -42,6 +43,8 @@ class Case:
         root[0] = 0.0
         self.covariance: Floats = root @ root.T
         self.column = rng.normal(size=(ROWS, COEFFICIENTS))
+        self.column[:, COEFFICIENT_JOINT == NO_JOINT] = 0.0
+        self.shift_mm = rng.normal(size=(ROWS, 3, COEFFICIENTS))
         self.sigma_mm = np.where(np.arange(ROWS)[:, None] % 3 == 0, rng.uniform(1.0, 2.0, (ROWS, 3)), np.nan)
         self.rates = rng.normal(size=readings.shape)
         self.variance = rng.uniform(1e-5, 1e-3, readings.shape)
@@ -55,7 +58,7 @@ def case(request: pytest.FixtureRequest) -> Case:
 
 def test_places_and_derivatives_are_those_of_the_chain(case: Case) -> None:
     expected = case.chain.linearise(case.x, case.data)
-    found = case.machine.linearise(case.data, case.column)
+    found = case.machine.linearise(case.data, case.column, case.shift_mm)
     turn = case.machine.rotations(case.data)
     origin = np.array([case.chain.base(case.x, setup).translation_mm for setup in case.data.setup.tolist()])
     np.testing.assert_allclose(found.position_mm, expected.position_mm, rtol=0.0, atol=1e-9)
@@ -64,7 +67,7 @@ def test_places_and_derivatives_are_those_of_the_chain(case: Case) -> None:
     np.testing.assert_allclose(turn @ found.joint_jacobian, expected.joint_jacobian, rtol=0.0, atol=1e-9)
     jacobian = turn @ found.jacobian
     np.testing.assert_allclose(jacobian[:, :, :-COEFFICIENTS], expected.jacobian, rtol=0.0, atol=1e-9)
-    by_coefficient = expected.joint_jacobian[:, :, COEFFICIENT_JOINT] * case.column[:, None, :]
+    by_coefficient = expected.joint_jacobian[:, :, COEFFICIENT_JOINT] * case.column[:, None, :] + turn @ case.shift_mm
     np.testing.assert_allclose(jacobian[:, :, -COEFFICIENTS:], by_coefficient, rtol=0.0, atol=1e-9)
     np.testing.assert_array_equal(case.machine.locate(case.data).position_mm, found.position_mm)
 
@@ -72,9 +75,10 @@ def test_places_and_derivatives_are_those_of_the_chain(case: Case) -> None:
 def test_covariances_are_those_of_the_formulas(case: Case) -> None:
     lin = case.chain.linearise(case.x, case.data)
     by_coefficient = lin.joint_jacobian[:, :, COEFFICIENT_JOINT] * case.column[:, None, :]
+    by_coefficient = by_coefficient + case.machine.rotations(case.data) @ case.shift_mm
     jacobian = np.concatenate([lin.jacobian, by_coefficient], axis=2)
     located, of_fix, of_parameters = case.machine.spread(
-        case.data, case.column, case.sigma_mm, case.rates, case.variance, jacobian=False
+        case.data, case.column, case.shift_mm, case.sigma_mm, case.rates, case.variance, jacobian=False
     )
     np.testing.assert_allclose(located.position_mm, lin.position_mm, rtol=0.0, atol=1e-9)
     expected = jacobian @ case.covariance @ jacobian.transpose(0, 2, 1)
@@ -89,7 +93,7 @@ def test_covariances_are_those_of_the_formulas(case: Case) -> None:
 def test_a_rate_that_was_not_measured_is_none(case: Case) -> None:
     unmeasured, standing = np.full_like(case.rates, np.nan), np.zeros_like(case.rates)
     found = [
-        case.machine.spread(case.data, case.column, case.sigma_mm, rates, case.variance, jacobian=False)[1]
+        case.machine.spread(case.data, case.column, None, case.sigma_mm, rates, case.variance, jacobian=False)[1]
         for rates in (unmeasured, standing)
     ]
     np.testing.assert_array_equal(*found)

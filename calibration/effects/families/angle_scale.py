@@ -14,6 +14,8 @@ class AngleScale(JointFamily):
     name: ClassVar[str] = "angle_scale"
     equation: ClassVar[str] = "d_theta = scale * theta, theta as read"
     source: ClassVar[str] = "gear or scaling error of an encoder, first order of its calibration curve"
+    confused_with: ClassVar[tuple[str, ...]] = ("encoder_harmonic", "joint_error_map", "joint_compliance")
+    revealed_by: ClassVar[str] = "the joint alone over its whole range, from stop to stop"
     kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
 
     def names(self, settings: Settings) -> tuple[str, ...]:

@@ -17,6 +17,8 @@ class Backlash(JointFamily):
     name: ClassVar[str] = "backlash"
     equation: ClassVar[str] = "d_theta = width / 2 * direction of the last motion (column <joint>_dir)"
     source: ClassVar[str] = "gear play; the approach from the other side shows it"
+    confused_with: ClassVar[tuple[str, ...]] = ("load_hysteresis", "gravity_flip_play")
+    revealed_by: ClassVar[str] = "coming to the same pose from both sides"
     kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
 
     def needs(self, where: str) -> str:

@@ -18,6 +18,8 @@ class EncoderHarmonic(JointFamily):
     name: ClassVar[str] = "encoder_harmonic"
     equation: ClassVar[str] = "d_theta = cosk cos(k theta) + sink sin(k theta), k = 1 or 2"
     source: ClassVar[str] = "eccentricity of a rotary encoder's disc: e / r = error in rad, once a turn"
+    confused_with: ClassVar[tuple[str, ...]] = ("angle_scale", "joint_error_map", "joint_compliance")
+    revealed_by: ClassVar[str] = "the joint alone over its whole range, in even steps"
     kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:

@@ -8,7 +8,17 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.effects.base import Coefficient, JointFamily, Settings, Situation
+from calibration.effects.base import Coefficient, FittedCoefficient, JointFamily, Settings, Situation
+from calibration.effects.load_shapes import (
+    UNIT,
+    gravity_shapes,
+    load_variants,
+    part_coefficients,
+    part_names,
+    shape_columns,
+    strained_weights,
+    with_load_sigma,
+)
 from calibration.kernels.jit import compiled
 from calibration.observations import Floats
 
@@ -16,11 +26,13 @@ _LINEAR = "compliance_rad_per_Nm"
 _SIGMA_RAD = 1e-3  # at the largest torque
 _BOUND_RAD = 20e-3
 _KNOTS = 7
-_BENDS_RAD = (0.05e-3, 0.15e-3, 0.5e-3, 1.5e-3, 5e-3)
+_BENDS_RAD = (0.15e-3, 0.5e-3, 1.5e-3)
 _BEND_BOUND_RAD = 50e-3
 _KNOT_POWERS = (1.0, 2.0)
 _SYMMETRIC, _ASYMMETRIC = {"torque_Nm", "knot_power", "bend_rad"}, {"low_Nm", "high_Nm", "bend_rad"}
-_ASYMMETRIC_ODDS = 0.01
+_LOAD_SIGMA = "load_sigma"  # a curve of a computed load holds it, as the straight variants do
+_ASYMMETRIC_ODDS = 0.01  # beside the symmetric
+_CURVED_ODDS = 0.2  # of all curves of a computed load beside the straight variants
 _UNKNOWN_LOADS = 101
 
 
@@ -32,6 +44,9 @@ class JointCompliance(JointFamily):
     coefficients are the changes of slope about its knots, in rad per s, independent of each other beforehand: the
     prior of a smoothing spline (Wahba 1978), of size `bend_rad`. Beyond the last knot it goes on straight.
 
+    Where the load is computed, the straight variants also have what uncertain masses leave open about its course, and a
+    curve is the last resort: what masses and other joints leave over often looks like one. A measured load says more.
+
     A symmetric curve gives way to both sides alike, g(-s) = -g(s): what is learned on one side holds on the other. Its
     knots are spread evenly (`knot_power` 1) or towards zero (2). An asymmetric curve has s from the lowest to the
     highest torque, and even knots; gears are rarely so.
@@ -40,6 +55,11 @@ class JointCompliance(JointFamily):
     name: ClassVar[str] = "joint_compliance"
     equation: ClassVar[str] = "d_theta = compliance * torque [+ g(s), g a spline, s the torque over the largest]"
     source: ClassVar[str] = "ICIC 2020, Eqs. 16, 17; curve: stiffness of harmonic drives (Tuttle and Seering 1996)"
+    confused_with: ClassVar[tuple[str, ...]] = ("boom_droop", "encoder_harmonic", "payload_change")
+    revealed_by: ClassVar[str] = (
+        "the same readings of the joint under little and great load: near and far, with a payload and without"
+    )
+    goes_with: ClassVar[Literal["", "torque", "weights"]] = "torque"
     kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
 
     def needs(self, where: str) -> str:
@@ -49,32 +69,39 @@ class JointCompliance(JointFamily):
         return np.isfinite(situation.torque(where))
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
-        if situation.greatest_torque(where) == 0.0:
+        torque = situation.greatest_torque(where)
+        if torque == 0.0:
             return ()
+        measured = situation.is_torque_measured(where)
+        straight = ({},) if measured else load_variants(gravity_shapes(situation, where), _SIGMA_RAD / torque)
         known = situation.torque(where)[self.known(situation, where)]
         low, high = float(known.min(initial=np.inf)), float(known.max(initial=-np.inf))
         if high <= low:
-            return ({},)
+            return straight
         most = max(-low, high)
-        return (
-            {},
+        curves: tuple[Settings, ...] = (
             *({"torque_Nm": most, "knot_power": power, "bend_rad": b} for power in _KNOT_POWERS for b in _BENDS_RAD),
             *({"low_Nm": low, "high_Nm": high, "bend_rad": b} for b in _BENDS_RAD),
         )
+        return (*straight, *({**straight[0], **curve} for curve in curves))
 
     def odds(self, settings: Settings) -> float:
-        return _ASYMMETRIC_ODDS if "low_Nm" in settings else 1.0
+        if "bend_rad" not in settings:
+            return 1.0
+        odds = _CURVED_ODDS / (len(_KNOT_POWERS) * len(_BENDS_RAD)) if _LOAD_SIGMA in settings else 1.0
+        return odds * (_ASYMMETRIC_ODDS if "low_Nm" in settings else 1.0)
 
     def names(self, settings: Settings) -> tuple[str, ...]:
-        if not settings:
-            return (_LINEAR,)
-        if set(settings) == _SYMMETRIC:
+        if "bend_rad" not in settings:
+            return (_LINEAR, *part_names(settings))
+        curve = {name: value for name, value in settings.items() if name != _LOAD_SIGMA}
+        if set(curve) == _SYMMETRIC:
             sound = settings["torque_Nm"] > 0.0 and settings["knot_power"] in _KNOT_POWERS
         else:
-            sound = set(settings) == _ASYMMETRIC and settings["low_Nm"] < settings["high_Nm"]
-        if not sound:
+            sound = set(curve) == _ASYMMETRIC and settings["low_Nm"] < settings["high_Nm"]
+        if not sound or settings.get(_LOAD_SIGMA, 0.0) < 0.0:
             raise ValueError(
-                "the settings are bend_rad with torque_Nm and knot_power 1 or 2, or with low_Nm and high_Nm"
+                "the settings of a curve are bend_rad with torque_Nm and knot_power 1 or 2, or with low_Nm and high_Nm"
             )
         return (_LINEAR, *(f"bend{knot}_rad" for knot in range(1, _KNOTS + 1)))
 
@@ -84,14 +111,32 @@ class JointCompliance(JointFamily):
         most = _BOUND_RAD / torque
         # A drive may report the torque that holds the load in place of the load: the same curve, the other way round.
         least = -most if situation.is_torque_measured(where) else 0.0
+        own = Coefficient(linear, UNIT, _SIGMA_RAD / torque, least, most)
+        if "bend_rad" not in settings:
+            return (own, *part_coefficients(settings, most))
         return (
-            Coefficient(linear, "rad/(N m)", _SIGMA_RAD / torque, least, most),
+            own,
             *(Coefficient(name, "rad", settings["bend_rad"], -_BEND_BOUND_RAD, _BEND_BOUND_RAD) for name in bends),
         )
 
+    def reported(
+        self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
+    ) -> tuple[FittedCoefficient, ...]:
+        return with_load_sigma(settings, coefficients)
+
+    def strained(self, settings: Settings, values: Floats, standard_errors: Floats) -> bool:
+        return "bend_rad" not in settings and strained_weights(values, standard_errors)
+
     def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
-        known = self.known(situation, where)
-        return np.degrees(known[:, None] * _columns(np.where(known, situation.torque(where), 0.0), settings))
+        load = situation.torque(where)
+        torque = np.nan_to_num(load)
+        if "bend_rad" in settings:
+            return np.degrees(np.isfinite(load)[:, None] * _curved(torque, settings))
+        columns = [torque[:, None]]
+        if part_names(settings):
+            shapes = gravity_shapes(situation, where)
+            columns.append(shape_columns(shapes, torque, situation.torque_parts(where), settings))
+        return np.degrees(np.hstack(columns))
 
     def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
         """Of a link that may point anywhere up or down: its load goes as the sine between those of training."""
@@ -99,12 +144,14 @@ class JointCompliance(JointFamily):
         low, high = (settings["low_Nm"], settings["high_Nm"]) if "low_Nm" in settings else (-most, most)
         turns = np.sin(np.linspace(-0.5, 0.5, _UNKNOWN_LOADS) * np.pi)
         torque = 0.5 * (low + high) + 0.5 * (high - low) * turns
-        return float(np.mean(np.degrees(_columns(torque, settings) @ values) ** 2))
+        # What shapes a straight one is small beside it.
+        change = _curved(torque, settings) @ values if "bend_rad" in settings else torque * values[0]
+        return float(np.mean(np.degrees(change) ** 2))
 
 
-def _columns(torque: Floats, settings: Settings) -> Floats:
-    """(n, k) deflection in rad per unit of each coefficient."""
-    return np.hstack([torque[:, None], _curves(torque, settings)]) if settings else torque[:, None]
+def _curved(torque: Floats, settings: Settings) -> Floats:
+    """(n, k) deflection in rad per unit of each coefficient of a curve."""
+    return np.hstack([torque[:, None], _curves(torque, settings)])
 
 
 def _curves(torque: Floats, settings: Settings) -> Floats:

@@ -14,6 +14,8 @@ class TransducerQuadratic(JointFamily):
     name: ClassVar[str] = "transducer_quadratic"
     equation: ClassVar[str] = "d_L = k (L - L_mid)^2, L as read"
     source: ClassVar[str] = "linearity of length transducers (Zhou et al. 2022: 0.1 % of the stroke), second order"
+    confused_with: ClassVar[tuple[str, ...]] = ("transducer_scale", "boom_droop")
+    revealed_by: ClassVar[str] = "the joint alone over its whole stroke, with its middle and both ends"
     kind: ClassVar[Literal["revolute", "prismatic"]] = "prismatic"
 
     def names(self, settings: Settings) -> tuple[str, ...]:

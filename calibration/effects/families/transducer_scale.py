@@ -14,6 +14,8 @@ class TransducerScale(JointFamily):
     name: ClassVar[str] = "transducer_scale"
     equation: ClassVar[str] = "d_L = scale * L, L as read"
     source: ClassVar[str] = "linearity of length transducers (Zhou et al. 2022: 0.1 % of the stroke), first order"
+    confused_with: ClassVar[tuple[str, ...]] = ("transducer_quadratic", "boom_droop", "thermal_expansion")
+    revealed_by: ClassVar[str] = "the joint alone from one end of its stroke to the other"
     kind: ClassVar[Literal["revolute", "prismatic"]] = "prismatic"
 
     def names(self, settings: Settings) -> tuple[str, ...]:

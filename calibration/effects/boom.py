@@ -1,0 +1,113 @@
+"""The telescoping boom of a machine: the row whose length `a` a transducer drives, and what it carries."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.effects.base import Situation
+from calibration.observations import Floats
+from calibration.rig import Rig
+
+_LEAST_MM = 1e-6
+
+
+def boom_of(rig: Rig) -> tuple[int, str] | None:
+    """Number of the row that is the boom and the joint that extends it; None where a rig has no such row.
+
+    Of several the first: it carries the others.
+    """
+    return next(((number, joint) for number, driven, joint, _ in rig.couplings() if driven == "a"), None)
+
+
+@dataclass(frozen=True)
+class Boom:
+    """The boom in n rows; vectors are of the base frame.
+
+    Attributes:
+        situation: the rows.
+        row: number of the boom's row. Its root is the origin of the frame before, its tip that of its own.
+        joint: name of what extends it.
+    """
+
+    situation: Situation
+    row: int
+    joint: str
+
+    @cached_property
+    def _root(self) -> int:
+        path = self.situation.rig.path(self.row)
+        return path[-2] if len(path) > 1 else 0
+
+    @cached_property
+    def root_mm(self) -> Floats:
+        """(n, 3)."""
+        return self.situation.located.frames_mm[:, self._root]
+
+    @cached_property
+    def tip_mm(self) -> Floats:
+        """(n, 3)."""
+        return self.situation.located.frames_mm[:, self.row]
+
+    @cached_property
+    def length_mm(self) -> Floats:
+        """(n,) from root to tip."""
+        length: Floats = np.sqrt(((self.tip_mm - self.root_mm) ** 2).sum(axis=1))
+        return length
+
+    @cached_property
+    def axis(self) -> Floats:
+        """(n, 3) unit vectors from root to tip; zero where it has no length."""
+        return (self.tip_mm - self.root_mm) / np.maximum(self.length_mm, _LEAST_MM)[:, None]
+
+    @property
+    def down(self) -> Floats:
+        """(n, 3) unit vectors of gravity."""
+        return self.situation.down
+
+    def lowered(self, arm: Floats) -> Floats:
+        """(n, 3) what a point at `arm` (n, 3) does as the boom turns down about the level axis across it.
+
+        Per rad, less by the cosine of the boom's elevation: (axis x down) x arm.
+        """
+        along, below = (self.axis * arm).sum(axis=1), (self.down * arm).sum(axis=1)
+        moved: Floats = along[:, None] * self.down - below[:, None] * self.axis
+        return moved
+
+    @cached_property
+    def _beyond(self) -> NDArray[np.bool_]:
+        """(rows + 1,) which frames move with the tip."""
+        rig = self.situation.rig
+        return np.array([self.row in rig.path(frame) for frame in range(len(rig.rows) + 1)])
+
+    @cached_property
+    def carries_prism(self) -> NDArray[np.bool_]:
+        """(n,) whether the prism moves with the tip."""
+        frames = np.array([prism.frame for prism in self.situation.rig.prisms])
+        carried: NDArray[np.bool_] = self._beyond[frames[self.situation.data.prism]]
+        return carried
+
+    @cached_property
+    def hanging(self) -> NDArray[np.bool_]:
+        """(points,) which of the machine's weights the tip carries."""
+        return self._beyond[self.situation.loads.point_frame]
+
+    @cached_property
+    def own(self) -> NDArray[np.bool_]:
+        """(points,) which of the weights are fixed to the boom's root section."""
+        own: NDArray[np.bool_] = self.situation.loads.point_frame == self._root
+        return own
+
+    @cached_property
+    def weights(self) -> tuple[Floats, Floats]:
+        """(n, points, 3) mm where the machine's weights are, and (n, points) N how heavy."""
+        return self.situation.loads.places(self.situation.data.readings, self.situation.observations.extra)
+
+
+def boom_in(situation: Situation) -> Boom | None:
+    """The boom of a situation's machine; None where it has none."""
+    found = boom_of(situation.rig)
+    return None if found is None else Boom(situation, *found)

@@ -1,0 +1,84 @@
+"""A carrier that shifted at once: a jack slipped, something struck it, it was set down anew."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.effects.base import Coefficient, FittedCoefficient, PrismFamily, Settings, Situation
+from calibration.effects.base_motion import base_motion_mm
+from calibration.effects.step_times import STEP_SETTINGS, check_step, refined_steps, settled_step, step_grid, step_time
+from calibration.effects.trained import check_settings, size_variance, sizes
+from calibration.observations import Floats
+from calibration.rig import Rig
+
+_NAMES = ("tilt_x_rad", "tilt_y_rad", "z_mm")
+
+
+class BaseStep(PrismFamily):
+    """The base stands otherwise, as a rigid body, in all rows after one instant."""
+
+    name: ClassVar[str] = "base_step"
+    equation: ClassVar[str] = "tilts about the base's x and y axes and rise along its z axis, for t > time_s"
+    source: ClassVar[str] = "rigid motion of the set-up at one instant: a jack that slips, a knock"
+    confused_with: ClassVar[tuple[str, ...]] = ("base_settlement", "payload_change", "transducer_index_jump")
+    revealed_by: ClassVar[str] = "fixed control points, or one pose again and again all through the session"
+
+    def places(self, rig: Rig) -> tuple[str, ...]:
+        del rig
+        return ("base",)
+
+    def needs(self, where: str) -> str:
+        del where
+        return "the column time_s"
+
+    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
+        del where
+        return np.isfinite(situation.extra("time_s"))
+
+    def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
+        return self._sized(situation, where, step_grid(situation.extra("time_s")))
+
+    def refined(self, situation: Situation, where: str, settings: Settings) -> tuple[Settings, ...]:
+        return self._sized(situation, where, refined_steps(situation.extra("time_s"), settings))
+
+    def settled(self, forms: Sequence[Settings], probability: Floats) -> Settings:
+        return settled_step(forms, probability)
+
+    def reported(
+        self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
+    ) -> tuple[FittedCoefficient, ...]:
+        return (*coefficients, step_time(settings))
+
+    def names(self, settings: Settings) -> tuple[str, ...]:
+        check_settings(settings, STEP_SETTINGS, len(_NAMES))
+        check_step(settings)
+        return _NAMES
+
+    def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
+        del situation, where, settings
+        tilts = (Coefficient(name, "rad", 1e-3, -5e-3, 5e-3) for name in _NAMES[:2])
+        return (*tilts, Coefficient(_NAMES[2], "mm", 3.0, -20.0, 20.0))
+
+    def shift_mm(self, situation: Situation, where: str, settings: Settings) -> Floats:
+        del where
+        # A comparison with NaN is false: rows without a time stand as before.
+        return base_motion_mm(situation, (situation.extra("time_s") > settings["time_s"]).astype(np.float64))
+
+    def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
+        del plausible
+        return size_variance(values, settings)
+
+    def _sized(self, situation: Situation, where: str, steps: tuple[Settings, ...]) -> tuple[Settings, ...]:
+        if not steps:
+            return ()
+        known = self.known(situation, where)
+        squares = base_motion_mm(situation, np.ones(len(situation)))[known] ** 2
+        time_s = situation.extra("time_s")[known]
+        return tuple({**s, **sizes(np.sqrt(squares) * (time_s > s["time_s"])[:, None, None])} for s in steps)
+
+
+FAMILY = BaseStep()

@@ -1,0 +1,195 @@
+"""A boom that bends under what hangs on it."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.effects.base import Coefficient, FittedCoefficient, PrismFamily, Settings, Situation
+from calibration.effects.boom import Boom, boom_in, boom_of
+from calibration.effects.load_shapes import LoadShapes, shapes_by_design, strained_weights, with_load_sigma
+from calibration.errors import ModelError
+from calibration.observations import Floats
+from calibration.rig import Rig
+from calibration.torques import MASS_SIGMA
+
+_FLEXIBILITY = "flexibility_per_Nm2"
+_UNIT = "1/(N m^2)"
+_SIGMA_MM = 20.0  # of the tip at full reach
+_BOUND_MM = 300.0
+_OWN_SIGMA = 1.0 / math.sqrt(3.0)  # of the boom's own weight: nobody says how it is spread, +-100 %
+_AHEAD_MM = 3000.0  # of the tip: a second place that shows the slope beside the shift
+_MOST_PARTS = 100
+
+
+class BoomDroop(PrismFamily):
+    """An Euler-Bernoulli cantilever from the boom's root to its tip, longer as it extends.
+
+    The tip carries the weights F of all that is beyond, with their moment M about it; weights W that are fixed to the
+    root section are spread evenly over the length. All that is beyond the tip moves with it as one.
+
+    Weights and centres of gravity are known to +-15 % only, and how the boom's own weight is spread not at all. What
+    that leaves open of the droop's course over the work volume are the shapes of `load_shapes`, which the variants with
+    `about_per_Nm2` add; what makes all of it larger or smaller is no shape and counts in the standard error.
+    """
+
+    name: ClassVar[str] = "boom_droop"
+    equation: ClassVar[str] = "shift = (F L^3/3 + M L^2/2 + W L^3/8) / EI, slope = (F L^2/2 + M L + W L^2/6) / EI"
+    source: ClassVar[str] = "Euler-Bernoulli beam theory: cantilever with a load and a moment at its end"
+    confused_with: ClassVar[tuple[str, ...]] = ("joint_compliance", "transducer_quadratic", "pad_play")
+    revealed_by: ClassVar[str] = "the same attitude of the boom drawn in and run out, once with a load and once without"
+    goes_with: ClassVar[Literal["", "torque", "weights"]] = "weights"
+
+    def places(self, rig: Rig) -> tuple[str, ...]:
+        return ("boom",) if boom_of(rig) is not None else ()
+
+    def needs(self, where: str) -> str:
+        del where
+        return "masses in the rig file"
+
+    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
+        del where
+        return np.full(len(situation), bool(situation.rig.masses))
+
+    def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
+        boom = boom_in(situation)
+        if boom is None or not boom.carries_prism.any() or _greatest_mm(situation) == 0.0:
+            return ()
+        shapes = _shapes(situation)
+        plain = {"load_sigma": shapes.load_sigma}
+        sigma = self.coefficients(situation, where, plain)[0].sigma
+        return (plain, {**plain, "about_per_Nm2": sigma, "parts": float(len(shapes))}) if len(shapes) else (plain,)
+
+    def names(self, settings: Settings) -> tuple[str, ...]:
+        shaped = settings.keys() - {"load_sigma"}
+        sound = settings.get("load_sigma", -1.0) >= 0.0
+        if shaped:
+            sound = sound and shaped == {"about_per_Nm2", "parts"} and settings["about_per_Nm2"] > 0.0
+            sound = sound and 1.0 <= settings["parts"] <= _MOST_PARTS
+        if not sound:
+            raise ValueError("the settings are load_sigma, and about_per_Nm2 with parts, the number of shapes")
+        return (_FLEXIBILITY, *(f"part{number}_per_Nm2" for number in range(1, int(settings.get("parts", 0.0)) + 1)))
+
+    def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
+        del where
+        most = _greatest_mm(situation)
+        first, *others = self.names(settings)
+        bound = _BOUND_MM / most
+        return (
+            Coefficient(first, _UNIT, _SIGMA_MM / most, 0.0, bound),
+            *(Coefficient(name, _UNIT, settings["about_per_Nm2"], -bound, bound) for name in others),
+        )
+
+    def reported(
+        self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
+    ) -> tuple[FittedCoefficient, ...]:
+        return with_load_sigma(settings, coefficients)
+
+    def strained(self, settings: Settings, values: Floats, standard_errors: Floats) -> bool:
+        del settings
+        return strained_weights(values, standard_errors)
+
+    def shift_mm(self, situation: Situation, where: str, settings: Settings) -> Floats:
+        del where
+        boom, (_, *shaped) = boom_in(situation), self.names(settings)
+        if boom is None or not situation.rig.masses:
+            return np.zeros((len(situation), 3, 1 + len(shaped)))
+        loads = _whole(boom)
+        if shaped:
+            shapes = _shapes(situation)
+            if len(shapes) != len(shaped):
+                raise ModelError(
+                    f"the model has {len(shaped)} shapes of a droop that has {len(shapes)}; calibrate again"
+                )
+            loads = np.hstack([loads, (_parts(boom) - loads * shapes.share) @ shapes.mixing])
+        moved = _moved_mm(boom, situation.located.prism_mm - boom.tip_mm, loads)
+        return situation.to_station(moved * boom.carries_prism[:, None, None])
+
+
+def _greatest_mm(situation: Situation) -> float:
+    """The greatest droop of the tip in the work volume, mm per unit of flexibility; 0 where nothing bends it."""
+    boom = boom_in(situation.work_volume)
+    if boom is None or not situation.rig.masses:
+        return 0.0
+    moved = _moved_mm(boom, np.zeros((len(boom.situation), 3)), _whole(boom))
+    return float(np.linalg.norm(moved[:, :, 0], axis=1).max())
+
+
+def _shapes(situation: Situation) -> LoadShapes:
+    """What uncertain weights do to the droop beside making it larger."""
+    return shapes_by_design(situation, BoomDroop.name, _in_volume)
+
+
+def _in_volume(volume: Situation) -> tuple[Floats, Floats]:
+    """(m,) how far the tip, and a place ahead of it, sink per unit of flexibility, and (m, parts) by parts, mm."""
+    boom = boom_in(volume)
+    assert boom is not None  # who asks for its shapes has one
+    loads = np.hstack([_whole(boom), _parts(boom)])
+    sunk = [
+        np.einsum("ni,nik->nk", boom.down, _moved_mm(boom, ahead_mm * boom.axis, loads))
+        for ahead_mm in (0.0, _AHEAD_MM)
+    ]
+    both = np.concatenate(sunk)
+    return both[:, 0], both[:, 1:]
+
+
+def _whole(boom: Boom) -> Floats:
+    """(4 * points, 1) how far each weight counts at the tip, with its moment, with its centre's, and along the boom."""
+    none = np.zeros(len(boom.hanging))
+    return np.concatenate([boom.hanging, boom.hanging, none, boom.own])[:, None]
+
+
+def _parts(boom: Boom) -> Floats:
+    """(4 * points, parts) the same for what is uncertain of the weights, one sigma of each."""
+    mass_of = boom.situation.loads.point_mass
+    none = np.zeros(len(mass_of))
+    parts = []
+    for index, mass in enumerate(boom.situation.rig.masses):
+        hangs = MASS_SIGMA * (boom.hanging & (mass_of == index))
+        if mass.kg > 0.0 and hangs.any():
+            parts.append(np.concatenate([hangs, hangs, none, none]))
+            if mass.centre_mm is not None and any(mass.centre_mm):
+                parts.append(np.concatenate([none, none, hangs, none]))
+    if boom.own.any():
+        parts.append(np.concatenate([none, none, none, _OWN_SIGMA * boom.own]))
+    return np.array(parts).reshape(-1, 4 * len(none)).T
+
+
+def _moved_mm(boom: Boom, arm_mm: Floats, loads: Floats) -> Floats:
+    """(n, 3, k) displacement in the base frame at `arm_mm` (n, 3) from the tip, mm per unit of 1 / EI.
+
+    With the boom's axis e, gravity's direction g and a point at s from the tip: a weight w at the tip bends by the part
+    of w g across e and turns about e x g; one at r from it adds the moment m = w r x g, less its part along e.
+    """
+    places_mm, newton = boom.weights
+    tip, moment, centre, own = np.split(loads, 4)
+    weighed = newton[:, :, None] * 1e-3
+    first = (weighed * (places_mm - boom.tip_mm[:, None, :])).transpose(0, 2, 1) @ moment
+    if centre.any():
+        origins_mm = boom.situation.located.frames_mm[:, boom.situation.loads.point_frame]
+        first += (weighed * (places_mm - origins_mm)).transpose(0, 2, 1) @ centre
+    e, g, s = boom.axis, boom.down, arm_mm * 1e-3
+    length = boom.length_mm[:, None] * 1e-3
+    across, turning = g - (e * g).sum(axis=1)[:, None] * e, boom.lowered(s)
+    at_tip = across * length**3 / 3.0 + turning * length**2 / 2.0
+    along = across * length**3 / 8.0 + turning * length**2 / 6.0
+    # The moment's shift is m x e L^2 / 2 and its slope (m - (m e) e) L, so that s moves by
+    # m x (e L^2 / 2 + s L) - (m e) e x s L, with m = -g x (w r).
+    twist = _crossing(e) @ (s * length)[:, :, None]
+    by_moment = _crossing(e * length**2 / 2.0 + s * length) + twist * e[:, None, :]
+    moved: Floats = (by_moment @ _crossing(g)) @ first
+    moved += at_tip[:, :, None] * (newton @ tip)[:, None, :] + along[:, :, None] * (newton @ own)[:, None, :]
+    return 1e3 * moved
+
+
+def _crossing(v: Floats) -> Floats:
+    """(n, 3, 3) matrices of the cross products v x with vectors (n, 3)."""
+    out = np.zeros((len(v), 3, 3))
+    out[:, 1, 0], out[:, 2, 1], out[:, 0, 2] = v[:, 2], v[:, 0], v[:, 1]
+    return out - out.transpose(0, 2, 1)
+
+
+FAMILY = BoomDroop()

@@ -1,0 +1,147 @@
+"""A joint whose error is a curve of its own angle: what a gear, an encoder's code disc and a bearing make together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import cache
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from calibration.effects.base import Coefficient, FittedCoefficient, JointFamily, Settings, Situation
+from calibration.kernels.jit import compiled
+from calibration.observations import Floats
+
+_RMS, _RMS_RAD, _RMS_BOUND_RAD = "rms_rad", 1e-3, 5e-3
+_SIGMAS_RAD = (0.4e-3, 0.7e-3)  # of a weight; a curve has an RMS of about 0.7 of it
+_LEAST_PIECES, _MOST_PIECES, _PIECE_RATIO = 9, 360, 1.5
+_LEAST_PIECE_DEG = 1.25
+_POSES_PER_PIECE = 2
+_SAME_DEG = 0.1  # angles closer than this are one pose's
+_WHOLE_TURN_DEG = 300.0  # who covers more has met himself at the other end, or nearly
+_GRID = 16  # points in a piece
+_ON_RANGE, _ON_TURN = {"low_deg", "high_deg", "pieces", "sigma_rad"}, {"pieces", "sigma_rad"}
+
+
+class JointErrorMap(JointFamily):
+    """A sum of cubic B-splines, evenly spaced over the range of the training data or over the turn.
+
+    With independent weights of one size this is a stationary Gaussian process whose waves are longer than about two
+    pieces (Higdon 2002, process convolutions): the number of pieces says how fine the curve may be, `sigma_rad` how
+    large, and the data choose both. An angle touches four splines however many there are, which is what keeps
+    predictions fast.
+
+    The curve is not rid of the slow parts that encoder_harmonic and angle_scale have: where one of these explains the
+    data, it does so with two coefficients or one, and its evidence is the greater. Beyond the trained range a curve
+    stays at its end. A range of more than 300 deg is a turn, and the curve closes.
+    """
+
+    name: ClassVar[str] = "joint_error_map"
+    equation: ClassVar[str] = "d_theta = sum of c_i B_i(theta), B_i even cubic B-splines, theta as read"
+    source: ClassVar[str] = "P-splines (Eilers and Marx 1996) with independent weights (Higdon 2002)"
+    kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
+    confused_with: ClassVar[tuple[str, ...]] = ("encoder_harmonic", "angle_scale")
+    revealed_by: ClassVar[str] = "poses that fill the joint's range densely, several in each wave of the curve"
+
+    def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
+        reading = situation.reading(where)
+        poses = len(np.unique(np.rint(reading / _SAME_DEG)))
+        range_deg = float(np.ptp(reading)) if len(reading) else 0.0
+        span: dict[str, float] = {}
+        if range_deg > _WHOLE_TURN_DEG:
+            range_deg = 360.0
+        else:
+            span = {"low_deg": float(reading.min(initial=np.inf)), "high_deg": float(reading.max(initial=-np.inf))}
+        most = min(poses / _POSES_PER_PIECE, range_deg / _LEAST_PIECE_DEG)
+        found, pieces = [], float(_LEAST_PIECES)
+        while pieces <= most:
+            found += [{**span, "pieces": float(round(pieces)), "sigma_rad": sigma} for sigma in _SIGMAS_RAD]
+            pieces *= _PIECE_RATIO
+        return tuple(found)
+
+    def names(self, settings: Settings) -> tuple[str, ...]:
+        sound = set(settings) in (_ON_RANGE, _ON_TURN) and all(map(math.isfinite, settings.values()))
+        sound = sound and settings["sigma_rad"] > 0.0
+        sound = sound and settings["pieces"] in range(_LEAST_PIECES, _MOST_PIECES + 1)
+        if not sound or settings.get("low_deg", -math.inf) >= settings.get("high_deg", math.inf):
+            raise ValueError(
+                f"the settings are pieces (a whole number from {_LEAST_PIECES} to {_MOST_PIECES}) and sigma_rad, with "
+                "low_deg and high_deg where it is no whole turn"
+            )
+        return tuple(f"basis{number}_rad" for number in range(1, _count(settings) + 1))
+
+    def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
+        """Weights; a wave of the greatest RMS is within their bounds."""
+        del situation, where
+        bound = math.sqrt(2.0) * _RMS_BOUND_RAD
+        return tuple(Coefficient(name, "rad", settings["sigma_rad"], -bound, bound) for name in self.names(settings))
+
+    def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
+        return _splines(situation.reading(where), settings, math.degrees(1.0))
+
+    def reported_limits(self) -> Mapping[str, tuple[float, float]]:
+        return {_RMS: (0.0, _RMS_BOUND_RAD)}
+
+    def reported(
+        self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
+    ) -> tuple[FittedCoefficient, ...]:
+        """The RMS of the curve about its mean over its range: the mean is as well an offset of the joint.
+
+        Its standard error takes those of the weights for independent.
+        """
+        weights = np.array([c.value for c in coefficients])
+        errors = np.array([c.standard_error for c in coefficients])
+        moved = _squares(int(settings["pieces"]), "low_deg" not in settings) @ weights
+        rms = math.sqrt(max(float(weights @ moved), 0.0))
+        error = float(np.linalg.norm(moved * errors)) / rms if rms > 0.0 else float(np.linalg.norm(errors))
+        return (FittedCoefficient(_RMS, "rad", rms, error, _RMS_RAD),)
+
+
+def _count(settings: Settings) -> int:
+    """How many splines there are; those at the ends of a range reach over it."""
+    return int(settings["pieces"]) + (3 if "low_deg" in settings else 0)
+
+
+def _splines(angle_deg: Floats, settings: Settings, unit: float = 1.0) -> Floats:
+    """(n, k) values of all splines, times `unit`."""
+    is_turn = "low_deg" not in settings
+    low, high = (0.0, 360.0) if is_turn else (settings["low_deg"], settings["high_deg"])
+    out = np.zeros((len(angle_deg), _count(settings)))
+    _fill(np.ascontiguousarray(angle_deg), low, high, int(settings["pieces"]), is_turn, unit, out)
+    return out
+
+
+@cache
+def _squares(pieces: int, is_turn: bool) -> Floats:
+    """(k, k) covariance of the splines over the range: w' S w is the mean square of a curve about its mean."""
+    settings = {"pieces": float(pieces), "sigma_rad": 1.0} | ({} if is_turn else {"low_deg": 0.0, "high_deg": 360.0})
+    middle_deg = np.asarray((np.arange(_GRID * pieces) + 0.5) * (360.0 / (_GRID * pieces)), dtype=np.float64)
+    values = _splines(middle_deg, settings)
+    from_mean = values - values.mean(axis=0)
+    return np.asarray(from_mean.T @ from_mean / len(middle_deg))
+
+
+@compiled
+def _fill(angle_deg: Floats, low: float, high: float, pieces: int, is_turn: bool, unit: float, out: Floats) -> None:
+    """Put the four splines that each angle touches, times `unit`, into its row of zeros."""
+    for n in range(len(angle_deg)):
+        if not math.isfinite(angle_deg[n]):
+            out[n] = math.nan  # in sight; as an index it would not be
+            continue
+        at = (angle_deg[n] - low) / (high - low)
+        at = pieces * (at - np.floor(at) if is_turn else min(1.0, max(0.0, at)))
+        piece = min(int(at), pieces - 1)
+        u = at - piece
+        v = 1.0 - u
+        weights = (
+            v * v * v / 6.0,
+            (4.0 + 3.0 * u * u * (u - 2.0)) / 6.0,
+            (4.0 + 3.0 * v * v * (v - 2.0)) / 6.0,
+            u * u * u / 6.0,
+        )
+        for i in range(4):
+            out[n, (piece + i) % out.shape[1]] = unit * weights[i]
+
+
+FAMILY = JointErrorMap()

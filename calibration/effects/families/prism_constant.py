@@ -1,0 +1,60 @@
+"""A prism's constant that is not the one the station was told."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+
+from calibration.effects.base import Coefficient, PrismFamily, Settings, Situation
+from calibration.effects.sight import of_prism, sight
+from calibration.observations import Floats
+from calibration.rig import Rig
+
+_SHARED = "station"
+_USUAL_MM = 30.0  # what one confuses: 0, 30 and 34.4 mm are the makers' constants
+_USUAL_ODDS = 0.2
+
+
+class PrismConstant(PrismFamily):
+    """Every distance to a prism is off by the same, or that to all prisms where the station has the wrong setting.
+
+    The error is small, or it is the difference of two makers' constants: the variant that has `sigma_mm`.
+    """
+
+    name: ClassVar[str] = "prism_constant"
+    equation: ClassVar[str] = "shift = mm * (unit vector from the station to the prism)"
+    source: ClassVar[str] = "additive constant of reflectors (ISO 17123-4); makers' usual ones are 0, 30 and 34.4 mm"
+    confused_with: ClassVar[tuple[str, ...]] = ("prism_incidence", "station_scale")
+    revealed_by: ClassVar[str] = "the same poses from a second set-up that sees the prism from another side"
+
+    def places(self, rig: Rig) -> tuple[str, ...]:
+        return (*rig.prism_names, _SHARED) if len(rig.prisms) > 1 else rig.prism_names
+
+    def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
+        seen = np.unique(situation.data.prism)
+        # With a single prism in the data its own constant and that of all are the same.
+        possible = len(seen) > 1 if where == _SHARED else situation.rig.prism_names.index(where) in seen
+        return ({}, {"sigma_mm": _USUAL_MM}) if possible else ()
+
+    def odds(self, settings: Settings) -> float:
+        return _USUAL_ODDS if settings else 1.0
+
+    def names(self, settings: Settings) -> tuple[str, ...]:
+        if settings and (set(settings) != {"sigma_mm"} or settings["sigma_mm"] <= 0.0):
+            raise ValueError("the only setting is sigma_mm, above 0")
+        return ("mm",)
+
+    def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
+        del situation, where
+        return (Coefficient("mm", "mm", settings.get("sigma_mm", 3.0), -40.0, 40.0),)
+
+    def shift_mm(self, situation: Situation, where: str, settings: Settings) -> Floats:
+        del settings
+        away = sight(situation)
+        if where != _SHARED:
+            away = away * of_prism(situation, where)[:, None]
+        return away[:, :, None]
+
+
+FAMILY = PrismConstant()

@@ -1,0 +1,104 @@
+"""A link that the sun bends."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.effects.base import Coefficient, JointFamily, Settings, Situation
+from calibration.errors import ModelError
+from calibration.observations import Floats
+from calibration.rig import Rig
+
+_COLUMN = "temperature_degC"
+_SETTINGS = ("mean_degC", "change_degC", "frame")
+_LEAST_LINK_MM = 500.0  # shorter offsets are brackets, no links
+
+
+class SolarBow(JointFamily):
+    """The sun-side flange of a link gets longer: the link bows, most where it lies flat under the sun.
+
+    The link is what the joint moves: from its axis to the origin of the next frame that is half a metre away or more.
+    """
+
+    name: ClassVar[str] = "solar_bow"
+    equation: ClassVar[str] = "d_theta = k (T - mean T of the training data) cos(elevation of the link)"
+    source: ClassVar[str] = "temperature gradient over a beam's height h: slope alpha dT L / h (EN 1991-1-5)"
+    confused_with: ClassVar[tuple[str, ...]] = ("thermal_expansion", "base_settlement", "joint_compliance")
+    revealed_by: ClassVar[str] = "the same flat and steep poses of the link, cold in the morning and warm at noon"
+    kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
+
+    def needs(self, where: str) -> str:
+        del where
+        return f"the column {_COLUMN}"
+
+    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
+        del where
+        return np.isfinite(situation.extra(_COLUMN))
+
+    def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
+        known, frame = self.known(situation, where), _link_end(situation, where)
+        carries = situation.greatest_torque(where) > 0.0 or not situation.rig.masses
+        if frame is None or not carries or not known.any():
+            return ()
+        mean = float(situation.extra(_COLUMN)[known].mean())
+        settings = {"mean_degC": mean, "frame": float(frame)}
+        usual = float(np.sqrt(np.mean(_change_K(situation, where, settings)[known] ** 2)))
+        return ({**settings, "change_degC": usual},) if usual > 0.0 else ()
+
+    def names(self, settings: Settings) -> tuple[str, ...]:
+        if set(settings) != set(_SETTINGS) or settings["change_degC"] <= 0.0 or settings["frame"] < 1.0:
+            raise ValueError(f"the settings are {', '.join(_SETTINGS)}")
+        return ("rad_per_K",)
+
+    def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
+        del situation, where, settings
+        return (Coefficient("rad_per_K", "rad/K", 1e-4, -5e-4, 5e-4),)
+
+    def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
+        return np.degrees(_change_K(situation, where, settings))[:, None]
+
+    def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
+        del plausible
+        return float(np.degrees(values[0] * settings["change_degC"])) ** 2
+
+
+def _axis_frame(rig: Rig, where: str) -> tuple[int, int]:
+    """The row that a revolute joint turns first, and the frame whose origin lies on the joint's axis."""
+    row = next(number for number, driven, joint, _ in rig.couplings() if joint == where and driven == "theta")
+    if rig.convention != "dh":
+        return row, row
+    before = rig.path(row)[:-1]
+    return row, before[-1] if before else 0
+
+
+def _link_end(situation: Situation, where: str) -> int | None:
+    """The frame at which the link ends that a joint moves; None where it moves none."""
+    rig, frames_mm = situation.rig, situation.located.frames_mm
+    row, own = _axis_frame(rig, where)
+    for frame in range(own + 1, len(rig.rows) + 1):
+        if row in rig.path(frame):
+            length_mm = np.linalg.norm(frames_mm[:, frame] - frames_mm[:, own], axis=1)
+            if length_mm.min(initial=np.inf) >= _LEAST_LINK_MM:
+                return frame
+    return None
+
+
+def _change_K(situation: Situation, where: str, settings: Settings) -> Floats:  # noqa: N802 - the unit is K
+    """(n,) how much warmer it is, times the cosine of the link's elevation."""
+    rig, frames_mm = situation.rig, situation.located.frames_mm
+    _, own = _axis_frame(rig, where)
+    end = int(settings["frame"])
+    if end >= frames_mm.shape[1]:
+        raise ModelError(f"the model has a link that ends at frame {end}, which its rig lacks; calibrate again")
+    link = frames_mm[:, end] - frames_mm[:, own]
+    along = (link * situation.down).sum(axis=1)
+    square = (link**2).sum(axis=1)
+    flat = np.sqrt(np.clip(1.0 - along**2 / np.maximum(square, np.finfo(np.float64).tiny), 0.0, 1.0))
+    warmer: Floats = np.nan_to_num(situation.extra(_COLUMN) - settings["mean_degC"]) * flat
+    return warmer
+
+
+FAMILY = SolarBow()

@@ -1,0 +1,1 @@
+"""The gap workflow: where simulation and measurement disagree, which effect is missing, and what it closes."""

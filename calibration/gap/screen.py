@@ -1,0 +1,323 @@
+"""Every effect of the library at every place, weighed by what the data say for it.
+
+An effect's evidence is a closed form in the projected space (`projection`), averaged over its variants. Beforehand all
+families are as likely, and all places of a family: an effect that a rig may have at seven joints is tried seven times
+and must not win by that. One at a time, and the best in pairs: of two effects that are there, a third that looks like
+their sum may beat each alone.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+from scipy.special import logsumexp
+
+from calibration.effects.base import FittedCoefficient, Situation
+from calibration.effects.fitted import Choice
+from calibration.effects.library import library
+from calibration.gap.projection import Projection, from_products
+from calibration.identification.additions import Additions
+from calibration.observations import Floats
+
+LEAST_KNOWN = 0.5  # share of the rows that have what an effect needs
+_PAIRED = 10
+_SECOND = math.log(0.05)  # that another effect is there as well, beforehand
+_SEEN = 1e-6  # least singular value of columns, of their largest
+SCALES = (1 / 3, 1.0, 3.0, 10.0)  # of plausible sizes: what is plausible is not known better than that
+_SQUARED_SCALES = np.square(SCALES)[:, None]
+LOG_SCALE_ODDS = dict(zip(SCALES, np.log([0.2, 0.5, 0.25, 0.05]).tolist(), strict=True))
+
+
+@dataclass(frozen=True)
+class Place:
+    """An effect where it may be.
+
+    Attributes:
+        family, where: which and where.
+        options: its variants here.
+        additions: what each of them does to the samples.
+        log_odds: (o,) of the variants beside each other.
+        log_prior: of this place of this family among all.
+    """
+
+    family: str
+    where: str
+    options: tuple[Choice, ...]
+    additions: tuple[Additions, ...]
+    log_odds: Floats
+    log_prior: float
+
+    def __str__(self) -> str:
+        return f"{self.family}@{self.where}"
+
+
+@dataclass(frozen=True)
+class Possible:
+    """All places, and what the data lack.
+
+    Attributes:
+        places: where effects may be.
+        disabled: family -> what the data or the rig lack for it.
+    """
+
+    places: tuple[Place, ...]
+    disabled: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """One place, weighed.
+
+    Attributes:
+        place: which.
+        option: index of its best variant.
+        scale: of that variant's plausible sizes.
+        estimate, standard_error: (k,) of its coefficients in the linear model.
+        log_bayes_factor: of the place against nothing, all its variants together.
+        p: of the squares that the best variant explains, by chance, for one look.
+        posterior: of the place, among all places, pairs and nothing.
+        beside: the other of the pair, where the most probable model that has this place is a pair.
+    """
+
+    place: Place
+    option: int
+    scale: float
+    estimate: Floats
+    standard_error: Floats
+    log_bayes_factor: float
+    p: float
+    posterior: float = 0.0
+    beside: Weighed | None = None
+
+    @property
+    def choice(self) -> Choice:
+        """The best variant, of the scale that the data ask for."""
+        return replace(self.place.options[self.option], scale=self.scale)
+
+    @property
+    def scaled_additions(self) -> Additions:
+        """What it does to the samples, of the size that the data ask for."""
+        return replace(self.additions, prior_sigma=self.additions.prior_sigma * self.scale)
+
+    @property
+    def size(self) -> int:
+        """How many of its coefficients outputs list; the others only shape it."""
+        choice, names = self.choice, [name.partition(":")[2] for name in self.additions.names]
+        fitted = [FittedCoefficient(name, "", 0.0, 1.0, 1.0) for name in names]
+        listed = {c.name for c in library()[choice.family].reported(choice.settings, tuple(fitted))}
+        return sum(name in listed for name in names) or len(names)
+
+    @property
+    def additions(self) -> Additions:
+        """What it does to the samples."""
+        return self.place.additions[self.option]
+
+
+def possible(
+    situation: Situation, over: Projection, families: Collection[str], without: Collection[str] = ()
+) -> Possible:
+    """All that may be missing.
+
+    Args:
+        situation: of the observations.
+        over: whose samples the columns are for.
+        families: that may be named.
+        without: `family@where` of what is in the model already.
+    """
+    found: list[tuple[str, str, tuple[Choice, ...]]] = []
+    disabled: dict[str, str] = {}
+    for name in sorted(families):
+        family = library()[name]
+        places = family.places(situation.rig)
+        known = [where for where in places if family.known(situation, where).mean() >= LEAST_KNOWN]
+        here = [(name, where, _choices(situation, name, where)) for where in known if f"{name}@{where}" not in without]
+        if not places:
+            disabled[name] = f"rig {situation.rig.name!r} has no place for it"
+        elif not known:
+            disabled[name] = f"needs {family.needs(places[0])}"
+        elif here and not any(choices for _, _, choices in here):
+            disabled[name] = "these poses show nothing of it"
+        found += [place for place in here if place[2]]
+    log_prior = _log_priors([name for name, _, _ in found], {name.partition("@")[0] for name in without})
+    return Possible(
+        tuple(place_of(situation, over, name, where, choices, log_prior[name]) for name, where, choices in found),
+        disabled,
+    )
+
+
+def _log_priors(names: Sequence[str], again: Collection[str]) -> dict[str, float]:
+    """Of one place of each family, by the family of every place; those that are there `again` have half of it all."""
+    count = {name: names.count(name) for name in names}
+    twice = sum(name in again for name in count)
+    once = len(count) - twice
+    share = {
+        name: (0.5 / twice if name in again else 0.5 / once) if twice and once else 1.0 / len(count) for name in count
+    }
+    return {name: math.log(share[name] / number) for name, number in count.items()}
+
+
+def place_of(
+    situation: Situation, over: Projection, family: str, where: str, choices: Sequence[Choice], log_prior: float = 0.0
+) -> Place:
+    """A place with the given variants."""
+    odds = np.array([library()[family].odds(choice.settings) for choice in choices])
+    return Place(
+        family,
+        where,
+        tuple(choices),
+        tuple(choice.additions(situation).over(over.samples.average) for choice in choices),
+        np.log(odds / odds.sum()),
+        log_prior,
+    )
+
+
+def _choices(situation: Situation, family: str, where: str) -> tuple[Choice, ...]:
+    return tuple(Choice(family, where, settings) for settings in library()[family].variants(situation, where))
+
+
+class Screen:
+    """Columns of all places in the projected space, as products, so that any selection of them is weighed at once.
+
+    Args:
+        projection: where.
+        places: what.
+    """
+
+    def __init__(self, projection: Projection, places: Sequence[Place]) -> None:
+        self.projection, self.places = projection, tuple(places)
+        self._number = {id(place): number for number, place in enumerate(self.places)}
+        self._columns: list[Floats] = []
+        self._block: dict[tuple[int, int], int] = {}
+        for number, place in enumerate(self.places):
+            own: list[tuple[Additions, int]] = []
+            for option, additions in enumerate(place.additions):
+                block = next((index for other, index in own if _same(other, additions)), None)
+                if block is None:
+                    block = len(self._columns)
+                    self._columns.append(projection.columns(projection.moved_mm(additions)))
+                own.append((additions, block))
+                self._block[number, option] = block
+        self._along = [columns.T @ projection.residual for columns in self._columns]
+        self._gram: dict[tuple[int, int], Floats] = {}
+
+    def columns(self, place: int, option: int) -> Floats:
+        """(3 m, k) of a variant."""
+        return self._columns[self._block[place, option]]
+
+    def log_bayes_factor(self, chosen: Sequence[tuple[int, int]], scales: Sequence[float] | None = None) -> float:
+        """Of several variants together, (place, option) each, against nothing.
+
+        Args:
+            chosen: the variants.
+            scales: of the plausible sizes of each; 1 by default.
+        """
+        blocks = [self._block[which] for which in chosen]
+        gram = np.block([[self._product(a, b) for b in blocks] for a in blocks])
+        along = np.concatenate([self._along[block] for block in blocks])
+        sigma = np.concatenate(
+            [
+                self.places[place].additions[option].prior_sigma * scale
+                for (place, option), scale in zip(chosen, scales or [1.0] * len(chosen), strict=True)
+            ]
+        )
+        return from_products(gram, along, sigma)
+
+    def together(self, weighed: Sequence[Weighed]) -> float:
+        """Log evidence of several places together, in their best variants."""
+        chosen = [(self._number[id(w.place)], w.option) for w in weighed]
+        return self.log_bayes_factor(chosen, [w.scale for w in weighed])
+
+    def weigh(self, without: Collection[str] = ()) -> tuple[Weighed, ...]:
+        """All places but those called so (`family@where`), the most probable first."""
+        each = {n: self._weigh(n) for n, place in enumerate(self.places) if str(place) not in without}
+        best = sorted(each, key=lambda n: -(each[n].log_bayes_factor + each[n].place.log_prior))[:_PAIRED]
+        models: list[tuple[tuple[int, ...], float]] = [((), 0.0)]
+        models += [((n,), w.log_bayes_factor + w.place.log_prior) for n, w in each.items()]
+        for i, k in itertools.combinations(best, 2):
+            pair = [each[i], each[k]]
+            spread = sum(w.log_bayes_factor - self.together([w]) for w in pair)
+            prior = sum(w.place.log_prior for w in pair) + math.log(2.0) + _SECOND
+            models.append(((i, k), self.together(pair) + spread + prior))
+        total = logsumexp([value for _, value in models])
+        share, top = dict.fromkeys(each, 0.0), dict.fromkeys(each, -math.inf)
+        beside: dict[int, Weighed | None] = dict.fromkeys(each)
+        for members, value in models:
+            for number in members:
+                share[number] += math.exp(value - total)
+                if value > top[number]:
+                    top[number] = value
+                    beside[number] = next((each[other] for other in members if other != number), None)
+        weighed = [replace(w, posterior=share[n], beside=beside[n]) for n, w in each.items()]
+        return tuple(sorted(weighed, key=lambda w: (-w.posterior, -w.log_bayes_factor, str(w.place))))
+
+    def _weigh(self, number: int) -> Weighed:
+        """One place; its strained variants are left out, as long as they would be the best."""
+        place = self.places[number]
+        values = np.array([self._at_scales(number, option) for option in range(len(place.options))])
+        values += place.log_odds[:, None] + np.array(list(LOG_SCALE_ODDS.values()))
+        while True:
+            found = self._weigh_best(number, values)
+            left_out = np.isneginf(values).all(axis=1)
+            if left_out.sum() == len(values) - 1 or not found.choice.strained(found.estimate, found.standard_error):
+                return found
+            values[found.option] = -math.inf
+
+    def _weigh_best(self, number: int, values: Floats) -> Weighed:
+        """One place by its best variant and scale, for the log evidence (options, scales) of all."""
+        place = self.places[number]
+        option, best = np.unravel_index(int(np.argmax(values)), values.shape)
+        prior = place.additions[option].prior_sigma * SCALES[best]
+        columns = self.columns(number, int(option))
+        scaled = columns * prior
+        left, size, right = np.linalg.svd(scaled, full_matrices=False)
+        seen = size > _SEEN * max(size[0], 1e-300)
+        along = left.T @ self.projection.residual
+        p = float(stats.chi2.sf(float((along[seen] ** 2).sum()), int(seen.sum())))
+        looks = len({self._block[number, o] for o in range(len(values))})
+        return Weighed(
+            place,
+            int(option),
+            SCALES[best],
+            prior * (right.T @ (along * size / (1.0 + size**2))),
+            prior * np.sqrt(np.clip(1.0 - (right.T**2) @ (size**2 / (1.0 + size**2)), 0.0, 1.0)),
+            float(logsumexp(values)),
+            min(p * looks, 1.0),
+        )
+
+    def _at_scales(self, number: int, option: int) -> Floats:
+        """(scales,) log Bayes factors of a variant by itself."""
+        block = self._block[number, option]
+        sigma = self.places[number].additions[option].prior_sigma
+        size, axes = np.linalg.eigh(self._product(block, block) * sigma * sigma[:, None])
+        size = np.maximum(size, 0.0) * _SQUARED_SCALES
+        along = (axes.T @ (self._along[block] * sigma)) ** 2 * _SQUARED_SCALES
+        values: Floats = 0.5 * (along / (1.0 + size) - np.log1p(size)).sum(axis=1)
+        return values
+
+    def _product(self, a: int, b: int) -> Floats:
+        if (a, b) not in self._gram:
+            self._gram[a, b] = self._columns[a].T @ self._columns[b]
+        return self._gram[a, b]
+
+
+def by_family(weighed: Iterable[Weighed]) -> dict[str, float]:
+    """Family -> posterior, the greatest first; a family at several places at once counts once."""
+    found: dict[str, float] = {}
+    for w in weighed:
+        found[w.place.family] = min(1.0, found.get(w.place.family, 0.0) + w.posterior)
+    return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+def _same(a: Additions, b: Additions) -> bool:
+    """Whether two variants differ in their prior alone."""
+    shifts = (a.shift_mm, b.shift_mm)
+    if not np.array_equal(a.column, b.column):
+        return False
+    return shifts[0] is shifts[1] or (
+        shifts[0] is not None and shifts[1] is not None and np.array_equal(shifts[0], shifts[1])
+    )
