@@ -97,27 +97,36 @@ class Separation:
         return gained
 
 
-def choose(blocks: Floats, count: int, criterion: Criterion) -> Integers:
+def choose(blocks: Floats, count: int, criterion: Criterion, before: Floats | None = None) -> Integers:
     """Indices of `count` different blocks of (n, r, q), in the order in which they were added or exchanged.
+
+    `before` (q, q) is the information of what has been measured already, W'W in prior units; nothing by default.
 
     Greedy: gains are looked at anew only where an old one is still among the largest. For the determinant they never
     grow as the set does, so this finds exactly the best candidate each time (Minoux 1978).
     """
-    chosen = _greedy(blocks, count, criterion)
+    known = _known(blocks, before)
+    chosen = _greedy(blocks, count, criterion, known)
     for _ in range(_SWEEPS):
-        if not _sweep(blocks, chosen, criterion):
+        if not _sweep(blocks, chosen, criterion, known):
             break
     return np.array(chosen, dtype=np.intp)
 
 
-def covariance_of(blocks: Floats) -> Floats:
-    """(q, q) posterior covariance in prior units when all blocks (n, r, q) are measured."""
+def covariance_of(blocks: Floats, before: Floats | None = None) -> Floats:
+    """(q, q) posterior covariance in prior units when all blocks (n, r, q) are measured, `before` as for `choose`."""
     rows = blocks.reshape(-1, blocks.shape[2])
-    return _inverse(np.eye(blocks.shape[2]) + rows.T @ rows)
+    return _inverse(_known(blocks, before) + rows.T @ rows)
 
 
-def _greedy(blocks: Floats, count: int, criterion: Criterion) -> list[int]:
-    information = np.eye(blocks.shape[2])
+def _known(blocks: Floats, before: Floats | None) -> Floats:
+    """(q, q) the prior's information, and that of what has been measured."""
+    prior: Floats = np.eye(blocks.shape[2])
+    return prior if before is None else prior + before
+
+
+def _greedy(blocks: Floats, count: int, criterion: Criterion, known: Floats) -> list[int]:
+    information = known.copy()
     chosen: list[int] = []
     bound = _gains(blocks, np.arange(len(blocks)), _inverse(information), criterion)
     for _ in range(count):
@@ -139,11 +148,11 @@ def _greedy(blocks: Floats, count: int, criterion: Criterion) -> list[int]:
     return chosen
 
 
-def _sweep(blocks: Floats, chosen: list[int], criterion: Criterion) -> bool:
+def _sweep(blocks: Floats, chosen: list[int], criterion: Criterion, known: Floats) -> bool:
     """Try to exchange every chosen block for a better one, in place; whether that was worthwhile."""
     q = blocks.shape[2]
     rows = blocks[chosen].reshape(-1, q)
-    information = np.eye(q) + rows.T @ rows
+    information = known + rows.T @ rows
     covariance = _inverse(information)
     before = criterion.value(covariance)
     gains = _gains(blocks, np.arange(len(blocks)), covariance, criterion)

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from calibration.design.conditions import Conditions
 from calibration.effects.base import Situation
 from calibration.effects.fitted import AppliedEffects, FittedEffect
 from calibration.errors import UnsafeError
+from calibration.identification.additions import Additions
 from calibration.identification.refinement import prior_precision
 from calibration.kernels.lineariser import Lineariser
+from calibration.kernels.machine import Machine
 from calibration.kinematics import Chain, ChainData, Linearisation
 from calibration.model import CalibratedModel
 from calibration.observations import Floats, Observations
-from calibration.rig import Rig
+from calibration.torques import GravityLoads
 
 _BASE = 6  # parameters of a set-up's base
 
@@ -44,6 +47,13 @@ class Knowledge:
     def of_rig(cls, chain: Chain) -> Knowledge:
         """Build tolerances alone, at the first set-up of the chain."""
         return cls(chain, np.zeros(len(chain)), 0, np.diag(prior_precision(chain, 1.0) ** -0.5))
+
+    @classmethod
+    def before(cls, model: CalibratedModel, setup: int) -> Knowledge:
+        """What was known before the data of a calibration, with its noise; the model is where to linearise."""
+        effects = [c.prior_sigma for effect in model.effects for c in effect.coefficients]
+        sigma = np.append(prior_precision(model.chain, model.prior_scale) ** -0.5, effects)
+        return replace(cls.of_model(model, setup), root=np.diag(sigma))
 
     @classmethod
     def of_model(cls, model: CalibratedModel, setup: int) -> Knowledge:
@@ -80,35 +90,64 @@ class Knowledge:
         rows = self.root[kept]
         return replace(self, root=root_of(rows @ rows.T), effects=kept_effects)
 
-    def linearise(self, readings: Floats, direction: Floats | None = None) -> tuple[Linearisation, Floats]:
+    def linearise(self, readings: Floats, conditions: Conditions | None = None) -> tuple[Linearisation, Floats]:
         """All prisms in every pose: the linearisation of the n * prisms fixes, prism by prism in each pose, and
         (n * prisms, 3, p + k) the derivatives by parameters and coefficients.
 
         Args:
             readings: (n, joints) deg or mm.
-            direction: (n, joints) from which side each joint comes, -1 or 1; nothing is known of it by default.
+            conditions: under which the poses are taken, (n,) each; nothing is known of them by default.
         """
         prisms = len(self.chain.rig.prisms)
-        columns = self._applied.columns(self._situation(readings, direction))
-        true = readings + self._applied.change(columns)
-        data = ChainData(
-            np.repeat(true, prisms, axis=0),
-            np.tile(np.arange(prisms), len(readings)),
-            np.full(len(readings) * prisms, self.setup, dtype=np.intp),
-        )
-        lin = self._lineariser(self.x, data)
+        true = np.repeat(readings, prisms, axis=0)
         if not self.effects:
+            lin = self._lineariser(self.x, self._bound(true))
             return lin, lin.jacobian
-        by_coefficient = lin.joint_jacobian[:, :, self._applied.joint] * np.repeat(columns, prisms, axis=0)[:, None, :]
-        return lin, np.concatenate([lin.jacobian, by_coefficient], axis=2)
+        columns = self._applied.columns(self.situation(readings, conditions))
+        lin = self._lineariser(self.x, self._bound(true + self._applied.change(columns)))
+        shift = self._applied.shifted_mm(columns)
+        if shift is not None:
+            lin = lin._replace(position_mm=lin.position_mm + shift)
+        moves = Additions((), self._applied.joint, columns.column, np.empty(0), columns.shift_mm)
+        return lin, np.concatenate([lin.jacobian, moves.moved_mm(lin.joint_jacobian)], axis=2)
 
-    def unknown_variance(self, readings: Floats, direction: Floats | None = None) -> Floats:
+    def unknown_variance(self, readings: Floats, conditions: Conditions | None = None) -> Floats:
         """(n * prisms, joints) variance of the joints' values by effects that lack what they need, deg^2 or mm^2.
 
         Arguments as for `linearise`.
         """
-        variance = self._applied.unknown_variance(self._situation(readings, direction))
-        return np.repeat(variance, len(self.chain.rig.prisms), axis=0)
+        if not self.effects:
+            return np.zeros((len(readings) * len(self.chain.rig.prisms), readings.shape[1]))
+        return self._applied.unknown_variance(self.situation(readings, conditions))
+
+    def unknown_mm2(self, readings: Floats, conditions: Conditions | None = None) -> Floats:
+        """(n * prisms,) variance of each coordinate by effects that move the prism and lack what they need, mm^2.
+
+        Arguments as for `linearise`.
+        """
+        if not self.effects:
+            return np.zeros(len(readings) * len(self.chain.rig.prisms))
+        return self._applied.unknown_mm2(self.situation(readings, conditions))
+
+    def situation(self, readings: Floats, conditions: Conditions | None = None) -> Situation:
+        """What effects may see of the poses (n, joints): a row for every prism in each, not measured yet."""
+        rig = self.chain.rig
+        n, prisms = len(readings), len(rig.prisms)
+        rows = n * prisms
+        nothing, empty = np.full((rows, 3), np.nan), np.full(rows, "")
+        joints = dict(zip(rig.joint_names, np.repeat(readings, prisms, axis=0).T, strict=True))
+        extra = {name: np.repeat(values, prisms) for name, values in (conditions or {}).items()}
+        setup = np.full(rows, self.chain.setups[self.setup])
+        fixes = Observations(np.tile(rig.prism_names, n), joints, nothing, nothing, setup, empty, empty, extra)
+        return Situation(self.chain, self.x, fixes, self._loads, self._machine)
+
+    def _bound(self, readings: Floats) -> ChainData:
+        prisms = len(self.chain.rig.prisms)
+        return ChainData(
+            readings,
+            np.tile(np.arange(prisms), len(readings) // prisms),
+            np.full(len(readings), self.setup, dtype=np.intp),
+        )
 
     @cached_property
     def _applied(self) -> AppliedEffects:
@@ -118,10 +157,13 @@ class Knowledge:
     def _lineariser(self) -> Lineariser:
         return Lineariser(self.chain)
 
-    def _situation(self, readings: Floats, direction: Floats | None) -> Situation:
-        rig = self.chain.rig
-        columns = {} if direction is None else directions(rig, direction)
-        return Situation(self.chain, self.x, observations_at(rig, readings, columns))
+    @cached_property
+    def _loads(self) -> GravityLoads:
+        return GravityLoads(self.chain, self.x)
+
+    @cached_property
+    def _machine(self) -> Machine:
+        return Machine(self.chain, self.x)
 
 
 def setup_of(model: CalibratedModel, name: str | None = None) -> int:
@@ -139,21 +181,6 @@ def setup_of(model: CalibratedModel, name: str | None = None) -> int:
         known = ", ".join(repr(s) for s in setups)
         raise UnsafeError(f"set-up {name!r} is unknown to the model (known: {known}); name one of these")
     return setups.index(name)
-
-
-def directions(rig: Rig, direction: Floats) -> dict[str, Floats]:
-    """From which side every joint comes (n, joints), as columns of observations."""
-    return {f"{name}_dir": direction[:, i] for i, name in enumerate(rig.joint_names)}
-
-
-def observations_at(rig: Rig, readings: Floats, extra: Mapping[str, Floats] | None = None) -> Observations:
-    """Poses (n, joints) as observations of the rig's first prism, not measured yet."""
-    n = len(readings)
-    nothing, empty = np.full((n, 3), np.nan), np.full(n, "")
-    joints = dict(zip(rig.joint_names, readings.T, strict=True))
-    return Observations(
-        np.full(n, rig.prism_names[0]), joints, nothing, nothing, empty, empty, empty, dict(extra or {})
-    )
 
 
 def root_of(covariance: Floats) -> Floats:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from calibration.accuracy import VOLUME_POSES, ExpectedAccuracy, predicted_accuracy, shares_left
+from calibration.design.conditions import instructions
 from calibration.design.knowledge import Knowledge, setup_of
-from calibration.design.poses import CANDIDATES, Plan, draw, plan, volume_root, work_volume
+from calibration.design.poses import CANDIDATES, Candidates, Plan, draw, plan, volume_root, work_volume
 from calibration.design.visibility import Site, placement, site
 from calibration.errors import UnsafeError
 from calibration.kinematics import Chain, Placement
@@ -35,18 +36,18 @@ class PoseRow:
     Attributes:
         pose: from 1.
         joints: column of each joint -> value, deg or mm.
-        sides: `<joint>_dir` of the joints whose approach matters -> -1 or 1.
+        conditions: column of each condition that matters -> value; -1 or 1 for a direction of approach.
         prisms: in view.
     """
 
     pose: int
     joints: Mapping[str, float]
-    sides: Mapping[str, int]
+    conditions: Mapping[str, float]
     prisms: tuple[str, ...]
 
     def as_dict(self) -> dict[str, object]:
-        """`pose`, a column for each joint, `<joint>_dir` where the approach matters, `prisms`."""
-        return {"pose": self.pose, **self.joints, **self.sides, "prisms": list(self.prisms)}
+        """`pose`, a column for each joint, one for each condition that matters (`<joint>_dir` ...), `prisms`."""
+        return {"pose": self.pose, **self.joints, **self.conditions, "prisms": list(self.prisms)}
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class PosePlan:
         station: where the station's place is from, a sentence.
         before: accuracy expected of the model as it is; None where only the rig file is known.
         after: accuracy expected of the model once the poses are measured.
-        advice: what is poorly known and what the poses bring; sentences.
+        advice: what the conditions ask for, what is poorly known and what the poses bring; sentences.
         warnings: sentences.
     """
 
@@ -84,16 +85,7 @@ class PosePlan:
     @cached_property
     def rows(self) -> tuple[PoseRow, ...]:
         """The poses in the order of the motion."""
-        poses, joints = self.plan.poses, self.rig.joint_names
-        return tuple(
-            PoseRow(
-                number + 1,
-                {j.column: round(float(poses.readings[number, i]), _DIGITS) for i, j in enumerate(self.rig.joints)},
-                {f"{name}_dir": int(poses.direction[number, joints.index(name)]) for name in self.plan.approached},
-                tuple(name for name, seen in zip(self.rig.prism_names, poses.seen[number], strict=True) if seen),
-            )
-            for number in range(len(poses))
-        )
+        return pose_rows(self.rig, self.plan.poses)
 
     def as_dict(self) -> dict[str, object]:
         """The JSON object of `rigcal plan`."""
@@ -115,6 +107,23 @@ class PosePlan:
         }
 
 
+def pose_rows(rig: Rig, poses: Candidates) -> tuple[PoseRow, ...]:
+    """Poses as they are printed."""
+    conditions = {name: values.round(_DIGITS).tolist() for name, values in poses.conditions.items()}
+    return tuple(
+        PoseRow(
+            number + 1,
+            {j.column: round(float(poses.readings[number, i]), _DIGITS) for i, j in enumerate(rig.joints)},
+            {
+                name: int(values[number]) if name.endswith("_dir") else values[number] + 0.0
+                for name, values in conditions.items()
+            },
+            tuple(name for name, seen in zip(rig.prism_names, poses.seen[number], strict=True) if seen),
+        )
+        for number in range(len(poses))
+    )
+
+
 def plan_poses(
     rig: Rig,
     poses: int,
@@ -124,13 +133,13 @@ def plan_poses(
     station_mm: Floats | None = None,
     setup: str | None = None,
     floor_mm: float | None = None,
-    separate: tuple[str, str] | None = None,
+    separate: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> PosePlan:
     """Plan a session, or what to measure after one.
 
     Without a model the poses make the parameters best determined; with one they lower most what it is expected to err
-    over the work volume; with `separate` they tell two effects apart.
+    over the work volume; with `separate` they tell effects apart.
 
     Args:
         rig: the rig description.
@@ -140,7 +149,7 @@ def plan_poses(
         station_mm: (3,) place of a new station set-up in the base frame.
         setup: which of the model's set-ups; by default the one whose base is known best.
         floor_mm: height of the floor over the base's origin.
-        separate: two effects, each the `family@where` of one in the library.
+        separate: two effects or more, each the `family@where` of one in the library.
         progress: told (share done, what is going on).
 
     Raises:
@@ -160,13 +169,13 @@ def plan_poses(
     chosen = plan(knowledge, candidates, poses, volume=None if model is None else volume, separate=separate)
     report(0.9, "predicting the accuracy")
     before: ExpectedAccuracy | None = None
-    advice: tuple[str, ...] = ()
+    advice = instructions(rig, chosen.poses.conditions)
     if model is None or present is None:
         after = predicted_accuracy(knowledge, chosen.root, volume)
     else:
         before = _of_model(model, present, present.root, volume)
         after = _of_model(model, knowledge, chosen.root, volume)
-        advice = tuple(_advice(model, present, chosen, before, after, moved=station_mm is not None))
+        advice += tuple(_advice(model, present, chosen, before, after, moved=station_mm is not None))
     return PosePlan(rig, chosen, at, station, before, after, advice, tuple(_warnings(rig, chosen, model)))
 
 

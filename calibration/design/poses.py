@@ -7,12 +7,13 @@ or a model's covariance. With such a prior a redundant parameter is no obstacle:
 
 from __future__ import annotations
 
-import math
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from calibration.design.conditions import Conditions, drawn, slow, under
 from calibration.design.exchange import (
     Accuracy,
     Criterion,
@@ -22,25 +23,24 @@ from calibration.design.exchange import (
     choose,
     covariance_of,
 )
-from calibration.design.knowledge import Knowledge, directions, observations_at, root_of
+from calibration.design.knowledge import Knowledge, root_of
+from calibration.design.rivals import Rival, conditions_of, name_of, rival_of, together
 from calibration.design.tour import length_s, short_tour, travel_s
 from calibration.design.visibility import Bodies, Flags, Site, in_view, is_reachable, limits
 from calibration.effects.base import Situation
-from calibration.effects.fitted import Choice, joined
-from calibration.effects.library import library
+from calibration.effects.fitted import FittedEffect, coefficient_values, fitted_additions
 from calibration.errors import DataError, UnsafeError
-from calibration.identification.additions import Additions
+from calibration.identification.additions import Additions, joined
 from calibration.identification.identifiability import observability_indices
-from calibration.identification.refinement import prior_precision
-from calibration.identification.samples import reading_variance, station_covariance
+from calibration.identification.refinement import information, prior_precision
+from calibration.identification.samples import averaged, reading_variance, station_covariance
 from calibration.kinematics import Linearisation
-from calibration.observations import Floats
+from calibration.observations import Floats, Observations
 
 CANDIDATES = 10_000
 _BATCHES = 10
 _MARGIN = 0.01  # of a joint's range, kept from its limits
 _SEEN = 0.1  # as in identifiability: the data alone determine a direction within ten prior sigmas
-_SAME = 1e-3  # of the plausible size of an effect's largest curve; smaller ones no fix shows
 _LINEARISED_AT_ONCE = 2000
 
 
@@ -50,12 +50,12 @@ class Candidates:
 
     Attributes:
         readings: (n, joints) deg or mm.
-        direction: (n, joints) from which side each joint is to come, -1 or 1.
+        conditions: under which each is to be measured.
         seen: (n, prisms) prisms in view.
     """
 
     readings: Floats
-    direction: Floats
+    conditions: Conditions
     seen: Flags
 
     def __len__(self) -> int:
@@ -63,7 +63,12 @@ class Candidates:
 
     def select(self, which: Integers) -> Candidates:
         """The given poses."""
-        return Candidates(self.readings[which], self.direction[which], self.seen[which])
+        conditions = {name: values[which] for name, values in self.conditions.items()}
+        return Candidates(self.readings[which], conditions, self.seen[which])
+
+    def under(self, names: Collection[str]) -> Candidates:
+        """The same poses, with nothing said of other conditions."""
+        return replace(self, conditions=under(self.conditions, names))
 
 
 @dataclass(frozen=True)
@@ -71,31 +76,40 @@ class Plan:
     """Poses to measure, in the order of a short motion.
 
     Attributes:
-        poses: what to drive to and what is in view there.
-        approached: joints whose direction of approach matters.
+        poses: what to drive to, under which conditions where these matter, and what is in view there.
         seconds_of_motion: from the first to the last, every joint at its full rate.
         parameters, determined: how many the set-up can show, and how many directions of them the poses alone determine.
         observability: `O1` .. `O5` of the poses alone.
         root: (p + k, p + k) covariance of parameters and coefficients after the poses = root @ root'.
-        stands_out: `family@where` of the effects to be told apart -> by how many sigma one of plausible size stands
-            out from all else, the other effect included, in these poses alone.
+        stood_out: `family@where` of the effects to be told apart -> by how many sigma one of plausible size, or of the
+            size found, stands out from all else, the other effects included, in what was measured already.
+        stands_out: the same once these poses are measured as well.
     """
 
     poses: Candidates
-    approached: tuple[str, ...]
     seconds_of_motion: float
     parameters: int
     determined: int
     observability: dict[str, float]
     root: Floats
+    stood_out: dict[str, float]
     stands_out: dict[str, float]
 
 
-def draw(knowledge: Knowledge, at: Site, rng: np.random.Generator, count: int = CANDIDATES) -> Candidates:
+def draw(
+    knowledge: Knowledge, at: Site, rng: np.random.Generator, count: int = CANDIDATES, *, begin_s: float = 0.0
+) -> Candidates:
     """Random poses that the rig can take and in which the station sees a prism.
 
     Half of them are drawn evenly between the joint limits, half lean to the limits (arcsine law), where errors show
     most.
+
+    Args:
+        knowledge: of the rig.
+        at: what stands around it.
+        rng: draws.
+        count: how many poses.
+        begin_s: `time_s` at which they can be measured, at the earliest.
 
     Raises:
         UnsafeError: there is none.
@@ -107,11 +121,11 @@ def draw(knowledge: Knowledge, at: Site, rng: np.random.Generator, count: int = 
     for _ in range(_BATCHES):
         share = rng.random((count, len(low)))
         share[::2] = np.sin(0.5 * np.pi * share[::2]) ** 2
-        drawn = low + margin + (high - low - 2.0 * margin) * share
-        bodies = Bodies.of(chain, knowledge.x, drawn)
+        tried = low + margin + (high - low - 2.0 * margin) * share
+        bodies = Bodies.of(chain, knowledge.x, tried)
         view = in_view(bodies, at)
         good = is_reachable(bodies, at) & view.any(axis=1)
-        readings, seen = np.concatenate([readings, drawn[good]]), np.concatenate([seen, view[good]])
+        readings, seen = np.concatenate([readings, tried[good]]), np.concatenate([seen, view[good]])
         if len(readings) >= count:
             break
     if len(readings) == 0:
@@ -121,7 +135,7 @@ def draw(knowledge: Knowledge, at: Site, rng: np.random.Generator, count: int = 
             f"check the station's place and the floor"
         )
     readings, seen = readings[:count], seen[:count]
-    return Candidates(readings, rng.choice([-1.0, 1.0], readings.shape), seen)
+    return Candidates(readings, drawn(chain.rig, len(readings), rng, begin_s=begin_s), seen)
 
 
 def work_volume(knowledge: Knowledge, at: Site, rng: np.random.Generator, count: int) -> Floats:
@@ -151,7 +165,8 @@ def plan(
     count: int,
     *,
     volume: Floats | None = None,
-    separate: tuple[str, str] | None = None,
+    separate: Sequence[str | FittedEffect] = (),
+    measured: Observations | None = None,
 ) -> Plan:
     """Choose poses.
 
@@ -161,8 +176,9 @@ def plan(
         count: how many poses.
         volume: (v, joints) poses of the work volume: choose for the accuracy of predictions there (V-optimal) and not
             for the parameters (D-optimal).
-        separate: two effects, each the `family@where` of one in the library: choose to tell them apart, as if neither
-            had been found yet.
+        separate: effects, each the `family@where` of one in the library, of plausible size, or one as it was found:
+            choose to tell them apart (D_s-optimal), as if none were known yet.
+        measured: rows that were measured already and are no part of what is known.
 
     Raises:
         DataError: fewer candidates than poses; an effect that no choice of poses shows.
@@ -170,69 +186,77 @@ def plan(
     if len(candidates) < count:
         raise DataError("poses", f"only {len(candidates)} reachable poses in view were found, {count} are asked for")
     rig = knowledge.chain.rig
-    before = knowledge.without(separate or ())
+    before = knowledge.without([name_of(effect) for effect in separate])
     known = len(before.root)
-    columns: Additions | None = None
-    approached = _approached(knowledge, candidates)
-    groups: list[Integers] = []
+    matters = _sides(knowledge, candidates)
+    few = candidates.select(np.arange(1))
+    for effect in separate:
+        matters |= set(conditions_of(before, name_of(effect), few.readings, few.conditions))
+    candidates = candidates.under(matters)
     with threadpool_limits(1, user_api="blas"):  # the blocks are small: threads would wait for each other
-        if separate is not None:
-            columns, needed, sizes = _columns(before, candidates, separate)
-            approached |= needed
-            ends = known + np.cumsum(sizes)
-            groups = [np.arange(end - size, end) for end, size in zip(ends, sizes, strict=True)]
-        blocks = whitened(before, candidates, columns)
+        rivals = tuple(rival_of(before, e, candidates.readings, candidates.conditions) for e in separate)
+        blocks = whitened(before, candidates, rivals)
         criterion: Criterion = Determinant()
-        if separate is not None:
-            criterion = Separation(tuple(groups))
+        begin = np.cumsum([known, *(rival.size for rival in rivals)])
+        groups = tuple(first + np.arange(rival.size) for first, rival in zip(begin[:-1], rivals, strict=True))
+        if separate:
+            criterion = Separation(groups)
         elif volume is not None:
             criterion = Accuracy(volume_root(knowledge, volume))
-        which = choose(blocks, count, criterion)
-        seconds = travel_s(rig, candidates.readings[which])
-        order = short_tour(seconds)
-        poses = candidates.select(which[order])
-        covariance = covariance_of(blocks[which])
+        told = None if measured is None else _told(before, measured, rivals)
+        chosen = candidates.select(choose(blocks, count, criterion, told))
+        seconds = travel_s(rig, chosen.readings)
+        order = _order(seconds, chosen)
+        poses = chosen.select(order)
+        # Once more in their order: some effects depend on what was before.
+        own = whitened(before, poses, rivals)
+        stood, stands = (_stand_out(rivals, groups, covariance_of(some, told)) for some in (own[:0], own))
         after = covariance_of(whitened(knowledge, poses))
         alone = _alone(knowledge, poses)
     seen = alone[alone > _SEEN]
     return Plan(
         poses,
-        tuple(name for name in rig.joint_names if name in approached),
         length_s(seconds, order),
         knowledge.parameters,
         len(seen),
         observability_indices(seen, int(poses.seen.sum())),
         knowledge.root @ root_of(after),
-        {
-            name: math.sqrt(float(np.trace(np.linalg.inv(covariance[np.ix_(group, group)]))) - len(group))
-            for name, group in zip(separate or (), groups, strict=True)
-        },
+        stood,
+        stands,
     )
 
 
-def whitened(knowledge: Knowledge, candidates: Candidates, columns: Additions | None = None) -> Floats:
+def _stand_out(rivals: tuple[Rival, ...], groups: tuple[Integers, ...], covariance: Floats) -> dict[str, float]:
+    return {
+        rival.name: rival.stands_out(covariance[np.ix_(group, group)])
+        for rival, group in zip(rivals, groups, strict=True)
+    }
+
+
+def whitened(knowledge: Knowledge, candidates: Candidates, rivals: tuple[Rival, ...] = ()) -> Floats:
     """(n, 3 prisms, p + k) Jacobian of each pose's fixes in their sigmas, the parameters in prior units.
 
-    Rows of prisms out of view are zero. `columns` have the coefficients of further effects for the candidates' rows;
-    they come last.
+    Rows of prisms out of view are zero. The coefficients of `rivals` come last.
     """
     prisms, known = len(knowledge.chain.rig.prisms), len(knowledge.root)
+    columns: Additions | None = None
+    if rivals:  # of all poses at once: what an effect does may depend on those before
+        columns = together(rivals, knowledge.situation(candidates.readings, candidates.conditions))
     total = known + (0 if columns is None else len(columns))
     out = np.empty((len(candidates), 3 * prisms, total))
     for first in range(0, len(candidates), _LINEARISED_AT_ONCE):
-        rows = slice(first, min(first + _LINEARISED_AT_ONCE, len(candidates)))
-        n = rows.stop - rows.start
-        lin, by_known = knowledge.linearise(candidates.readings[rows], candidates.direction[rows])
-        unknown = knowledge.unknown_variance(candidates.readings[rows], candidates.direction[rows])
-        covariance = _noise(knowledge, lin, unknown, n)
-        hidden = np.repeat(~candidates.seen[rows], 3, axis=1)
+        rows = np.arange(first, min(first + _LINEARISED_AT_ONCE, len(candidates)))
+        some, n = candidates.select(rows), len(rows)
+        lin, by_known = knowledge.linearise(some.readings, some.conditions)
+        covariance = _noise(knowledge, lin, some)
+        hidden = np.repeat(~some.seen, 3, axis=1)
         covariance[hidden[:, :, None] | hidden[:, None, :]] = 0.0
         covariance[hidden[:, :, None] & np.eye(3 * prisms, dtype=bool)] = 1.0
         jacobian = np.empty((n * prisms, 3, total))
         jacobian[:, :, :known] = by_known @ knowledge.root
         if columns is not None:
-            shift = np.repeat(columns.column[rows] * columns.prior_sigma, prisms, axis=0)
-            jacobian[:, :, known:] = replace(columns, column=shift).moved_mm(lin.joint_jacobian)
+            fixes = np.arange(prisms * rows[0], prisms * (rows[-1] + 1))
+            jacobian[:, :, known:] = columns.select(fixes).moved_mm(lin.joint_jacobian)
         stacked = jacobian.reshape(n, 3 * prisms, total)
         stacked[hidden] = 0.0
         out[rows] = np.linalg.solve(np.linalg.cholesky(covariance), stacked)
@@ -246,17 +270,25 @@ def volume_root(knowledge: Knowledge, volume: Floats) -> Floats:
     return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64).T
 
 
-def _noise(knowledge: Knowledge, lin: Linearisation, unknown: Floats, n: int) -> Floats:
+def _noise(knowledge: Knowledge, lin: Linearisation, poses: Candidates) -> Floats:
     """(n, 3 prisms, 3 prisms) covariance of the fixes of each standstill; the readings' errors are common to them.
 
-    So is what is `unknown` of the joints' values, variances (n * prisms, joints).
+    So is what is unknown of the joints' values. On the move, every fix has its own error of the instant.
     """
-    rig = knowledge.chain.rig
+    rig, n = knowledge.chain.rig, len(poses)
     size = 3 * len(rig.prisms)
+    unknown = knowledge.unknown_variance(poses.readings, poses.conditions)
     common = (lin.joint_jacobian * np.sqrt(reading_variance(rig) + unknown)[:, None, :]).reshape(n, size, -1)
     covariance: Floats = common @ common.transpose(0, 2, 1)
     own = station_covariance(rig, lin.position_mm, np.full(lin.position_mm.shape, np.nan))
-    own = (own + knowledge.excess_variance * np.eye(3)).reshape(n, -1, 3, 3)
+    even = knowledge.excess_variance + knowledge.unknown_mm2(poses.readings, poses.conditions)
+    own = own + even[:, None, None] * np.eye(3)
+    still = np.zeros(n)
+    rates = np.column_stack([poses.conditions.get(f"{name}_rate", still) for name in rig.joint_names])
+    if rates.any():
+        velocity = lin.joint_jacobian @ np.repeat(rates, len(rig.prisms), axis=0)[:, :, None]
+        own = own + rig.station.timing_sigma_s**2 * velocity @ velocity.transpose(0, 2, 1)
+    own = own.reshape(n, -1, 3, 3)
     for prism in range(len(rig.prisms)):
         block = slice(3 * prism, 3 * prism + 3)
         covariance[:, block, block] += own[:, prism]
@@ -270,49 +302,36 @@ def _alone(knowledge: Knowledge, poses: Candidates) -> Floats:
     return np.asarray(np.linalg.svd(rows.reshape(-1, rows.shape[2]), compute_uv=False), dtype=np.float64)
 
 
-# -- effects ---------------------------------------------------------------------------------------------------------
+def _told(knowledge: Knowledge, measured: Observations, rivals: tuple[Rival, ...]) -> Floats:
+    """(q, q) what rows that were measured say of parameters and coefficients, in prior units."""
+    chain = knowledge.chain
+    samples = averaged(chain, measured)
+    situation = Situation(chain, knowledge.x, measured)
+    parts = [fitted_additions(knowledge.effects, situation), together(rivals, situation)]
+    additions = joined(parts, len(measured)).over(samples.average)
+    known, total = len(knowledge.root), len(chain) + len(additions)
+    x = np.zeros(total)
+    x[:known] = np.concatenate([knowledge.x, coefficient_values(knowledge.effects)])
+    root = np.eye(total)
+    root[:known, :known] = knowledge.root
+    said = information(chain, samples, x, excess_variance=knowledge.excess_variance, additions=additions)
+    in_units: Floats = root.T @ said @ root
+    return in_units
 
 
-def _approached(knowledge: Knowledge, candidates: Candidates) -> set[str]:
-    """Joints at which the model has an effect that asks from which side they came."""
-    poses = candidates.select(np.arange(1))
+def _order(seconds: Floats, poses: Candidates) -> Integers:
+    """(n,) a short way through the poses, those under the same slow conditions together."""
+    names = slow(poses.conditions)
+    levels = np.column_stack([np.zeros(len(poses)), *(poses.conditions[name] for name in names)])
+    _, block = np.unique(levels, axis=0, return_inverse=True)
+    parts = [np.flatnonzero(block == number) for number in range(block.max() + 1)]
+    return np.concatenate([own[short_tour(seconds[np.ix_(own, own)])] for own in parts])
+
+
+def _sides(knowledge: Knowledge, candidates: Candidates) -> set[str]:
+    """The directions of approach that effects of the model ask for."""
+    joints = knowledge.chain.rig.joint_names
+    poses = candidates.select(np.arange(1)).under([f"{name}_dir" for name in joints])
     blank = knowledge.unknown_variance(poses.readings)[0]
-    told = knowledge.unknown_variance(poses.readings, poses.direction)[0]
-    return {name for name, more, less in zip(knowledge.chain.rig.joint_names, blank, told, strict=True) if more > less}
-
-
-def _columns(
-    knowledge: Knowledge, candidates: Candidates, effects: tuple[str, str]
-) -> tuple[Additions, set[str], tuple[int, ...]]:
-    """Columns of both effects in all their variants, the joints whose approach matters, columns of each effect."""
-    rig = knowledge.chain.rig
-    parts: list[Additions] = []
-    approached: set[str] = set()
-    blank = Situation(knowledge.chain, knowledge.x, observations_at(rig, candidates.readings))
-    sides = directions(rig, candidates.direction)
-    told = replace(blank, observations=observations_at(rig, candidates.readings, sides))
-    for effect in effects:
-        name, _, where = effect.partition("@")
-        family = library()[name]
-        situation = blank
-        if not family.known(blank, where).all():
-            situation = told
-            approached.add(where)
-        if not family.known(situation, where).all():
-            raise DataError(effect, f"needs {family.needs(where)}, which poses alone do not give")
-        variants = family.variants(situation, where)
-        if not variants:
-            raise DataError(effect, f"does nothing at {where} of rig {rig.name!r} in any pose")
-        choices = [Choice(name, where, settings).additions(situation) for settings in variants]
-        parts.append(_independent(joined(choices, len(candidates))))
-    together = joined(parts, len(candidates))
-    return together, approached, (len(parts[0]), len(parts[1]))
-
-
-def _independent(additions: Additions) -> Additions:
-    """The same curves with the same prior, as few columns at one joint: variants of an effect repeat each other."""
-    scaled = additions.column * additions.prior_sigma
-    _, size, directions = np.linalg.svd(np.linalg.qr(scaled, mode="r"), full_matrices=False)
-    kept = size > _SAME * size[0]
-    names = tuple(f"{additions.names[0].partition(':')[0]}:{i}" for i in range(int(kept.sum())))
-    return Additions(names, additions.joint[: len(names)], scaled @ directions[kept].T, np.ones(len(names)))
+    told = knowledge.unknown_variance(poses.readings, poses.conditions)[0]
+    return {f"{name}_dir" for name, more, less in zip(joints, blank, told, strict=True) if more > less}

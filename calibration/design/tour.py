@@ -49,6 +49,8 @@ def _nearest_neighbour(seconds: Floats, start: int) -> Integers:
 def _two_opt(seconds: Floats, order: Integers) -> Integers:
     """Turn parts of the way round while that shortens it; a step to or from nowhere takes no time."""
     n = len(order)
+    if n < 2:
+        return order
     first, last = np.triu_indices(n, 1)
     padded = np.zeros((n + 1, n + 1))  # index n: nowhere
     padded[:n, :n] = seconds

@@ -62,7 +62,7 @@ def at_random(here: Ground, poses: int, seed: int) -> Candidates:
     drawn = work_volume(here.knowledge, here.at, np.random.default_rng([seed, 2]), 10 * poses)
     seen = in_view(Bodies.of(chain, here.knowledge.x, drawn), here.at)
     which = np.flatnonzero(seen.any(axis=1))[:poses]
-    return Candidates(drawn[which], np.ones((len(which), len(chain.rig.joints))), seen[which])
+    return Candidates(drawn[which], {}, seen[which])
 
 
 def measured(here: Ground, poses: Candidates, seed: int) -> Observations:
@@ -134,6 +134,13 @@ def _time(rig: Rig) -> None:
         plan(here.knowledge, here.candidates, 50)
         seconds.append(time.perf_counter() - began)
     print(f"{rig.name:7s} 50 poses from {CANDIDATES} candidates: {min(seconds):.2f} s", flush=True)
+    here = ground(rig, 0)
+    joint = rig.joints[1].name
+    for effects in ((f"backlash@{joint}", f"encoder_harmonic@{joint}"), ("base_settlement@base", "latency@clock")):
+        began = time.perf_counter()
+        found = plan(here.knowledge, here.candidates, 20, separate=effects).stands_out
+        sigma = ", ".join(f"{name} {value:.1f} sigma" for name, value in found.items())
+        print(f"{rig.name:7s} 20 poses that separate: {time.perf_counter() - began:.2f} s ({sigma})", flush=True)
 
 
 if __name__ == "__main__":

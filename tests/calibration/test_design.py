@@ -213,7 +213,7 @@ def test_poses_that_separate_two_effects_show_them_better_than_others() -> None:
     effects = ("joint_compliance@theta4", "angle_scale@theta4")
     separating = plan(knowledge, candidates, 15, separate=effects)
     random = plan(knowledge, candidates.select(np.arange(1, 1500, 100)), 15, separate=effects)
-    assert separating.approached == ()
+    assert separating.poses.conditions == {}
     assert list(separating.stands_out) == list(effects)
     for effect in effects:
         assert separating.stands_out[effect] > 1.2 * random.stands_out[effect]
@@ -223,7 +223,7 @@ def test_an_effect_of_direction_is_planned_with_the_side_to_come_from() -> None:
     planned = plan_poses(
         shipped_rig("ys100"), 10, np.random.default_rng(0), separate=("backlash@theta2", "encoder_harmonic@theta2")
     )
-    directions = [row.sides["theta2_dir"] for row in planned.rows]
+    directions = [row.conditions["theta2_dir"] for row in planned.rows]
     assert set(directions) == {-1, 1}
     assert planned.plan.stands_out["backlash@theta2"] > 5.0
 

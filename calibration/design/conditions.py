@@ -1,0 +1,147 @@
+"""Under which conditions a pose can be measured: approached from which side, on the move, after which stand ...
+
+Some effects show only where these differ. A plan varies the ones that the effects in question need, between levels
+that an operator can bring about.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+
+import numpy as np
+
+from calibration.observations import Floats
+from calibration.rig import Rig
+
+Conditions = Mapping[str, Floats]
+"""Columns of observations beside the joints' readings -> (n,) of each pose."""
+
+DWELLS_S = (10.0, 120.0)
+TEMPERATURES_DEGC = (5.0, 25.0)
+PRESSURES_BAR = (50.0, 150.0)
+ROUNDS_S = (0.0, 3600.0, 7200.0, 10800.0)
+_MOVING = 0.5  # share of poses that may be measured on the move
+_PACE = 0.5  # of a joint's greatest rate, at most
+_LOAD = 0.05  # of the machine's weight, where the rig file names no payload
+_SLOW = ("time_s", "temperature_degC", "payload_kg")  # nobody changes these from pose to pose
+
+
+def drawn(rig: Rig, count: int, rng: np.random.Generator, *, begin_s: float = 0.0) -> Conditions:
+    """All conditions of `count` poses, each between its levels.
+
+    Args:
+        rig: the rig description.
+        count: how many poses.
+        rng: draws.
+        begin_s: `time_s` of the first round.
+    """
+    sides = rng.choice([-1.0, 1.0], (count, len(rig.joints)))
+    pace = _PACE * rng.random(sides.shape) * (rng.random(count) < _MOVING)[:, None]
+    out = {f"{joint.name}_dir": sides[:, i] for i, joint in enumerate(rig.joints)}
+    out |= {f"{joint.name}_rate": (pace * sides)[:, i] * joint.max_rate for i, joint in enumerate(rig.joints)}
+    levels: dict[str, Sequence[float]] = {
+        "time_s": [begin_s + after_s for after_s in ROUNDS_S],
+        "temperature_degC": TEMPERATURES_DEGC,
+        "dwell_s": DWELLS_S,
+        **dict.fromkeys(_pressures(rig), PRESSURES_BAR),
+    }
+    if any(mass.payload for mass in rig.masses):
+        levels["payload_kg"] = (0.0, _payload_kg(rig))
+    return out | {column: rng.choice(values, count) for column, values in levels.items()}
+
+
+def under(conditions: Conditions, names: Collection[str]) -> Conditions:
+    """Those of some names; what moves has not stood."""
+    out = {name: values for name, values in conditions.items() if name in names}
+    rates = [values for name, values in out.items() if name.endswith("_rate")]
+    if rates and "dwell_s" in out:
+        out["dwell_s"] = np.where(np.any(rates, axis=0), 0.0, out["dwell_s"])
+    return out
+
+
+def kinds_of(rig: Rig) -> tuple[tuple[str, ...], ...]:
+    """The conditions of a rig, those together that change together."""
+    joints = rig.joint_names
+    payload = [("payload_kg",)] if any(mass.payload for mass in rig.masses) else []
+    return (
+        *payload,
+        ("temperature_degC",),
+        ("time_s",),
+        ("dwell_s",),
+        *((column,) for column in _pressures(rig)),
+        tuple(f"{name}_rate" for name in joints),
+        *((f"{name}_dir",) for name in joints),
+    )
+
+
+def needed(rig: Rig, is_known: Callable[[Collection[str]], bool]) -> tuple[str, ...] | None:
+    """The fewest conditions with which an effect knows what it needs; None if no condition gives it that.
+
+    Args:
+        rig: the rig description.
+        is_known: whether the effect knows what it needs under conditions of these names.
+    """
+    kinds = kinds_of(rig)
+    kept = [name for kind in kinds for name in kind]
+    if not is_known(kept):
+        return None
+    for kind in kinds:
+        rest = [name for name in kept if name not in kind]
+        if is_known(rest):
+            kept = rest
+    return tuple(kept)
+
+
+def changed(conditions: Conditions, kind: Collection[str]) -> Conditions:
+    """The same with those of one kind as different as a plan can have them."""
+    out = dict(conditions)
+    for name in kind:
+        values = conditions[name]
+        if name.endswith(("_dir", "_rate")):
+            out[name] = -values
+        elif name == "time_s":
+            out[name] = values + ROUNDS_S[-1]
+        else:
+            out[name] = values.min() + values.max() - values
+    return out
+
+
+def slow(names: Collection[str]) -> tuple[str, ...]:
+    """Those conditions by which a plan is divided into blocks, the slowest to change first."""
+    return (*(name for name in _SLOW if name in names), *sorted(name for name in names if name.endswith("_bar")))
+
+
+def instructions(rig: Rig, names: Collection[str]) -> tuple[str, ...]:
+    """What an operator has to do for each condition, in sentences."""
+    out = []
+    sides = [joint.name for joint in rig.joints if f"{joint.name}_dir" in names]
+    if sides:
+        out.append(
+            f"come to the pose with {' and '.join(sides)} from below where the column of its direction has 1, and from "
+            f"above where it has -1"
+        )
+    if any(name.endswith("_rate") for name in names):
+        out.append("where rates are given, take the fix on the move, as the boom passes the pose at these rates")
+    if "dwell_s" in names:
+        out.append("let the boom stand for dwell_s before the fix")
+    if "payload_kg" in names:
+        out.append(f"carry payload_kg: nothing, or {_payload_kg(rig):.0f} kg")
+    if "temperature_degC" in names:
+        out.append("measure the cold poses and the warm ones at about temperature_degC, in the morning and at noon")
+    if "time_s" in names:
+        out.append(f"measure in {len(ROUNDS_S)} rounds an hour apart, as time_s says, without moving the station")
+    out += [
+        f"bring the cylinder to about {name}, by what the boom carries or pushes against"
+        for name in sorted(names)
+        if name.endswith("_bar")
+    ]
+    return tuple(out)
+
+
+def _pressures(rig: Rig) -> tuple[str, ...]:
+    return tuple(f"{joint.name}_bar" for joint in rig.joints if joint.kind == "prismatic")
+
+
+def _payload_kg(rig: Rig) -> float:
+    named = sum(mass.kg for mass in rig.masses if mass.payload)
+    return named or _LOAD * sum(mass.kg for mass in rig.masses)

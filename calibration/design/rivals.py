@@ -1,0 +1,181 @@
+"""Effects that a plan is to tell apart: the columns of each, as few as have the same prior over what it can do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.design.conditions import Conditions, needed
+from calibration.design.knowledge import Knowledge
+from calibration.effects.base import Situation
+from calibration.effects.fitted import Choice, FittedEffect
+from calibration.effects.library import library
+from calibration.errors import DataError
+from calibration.identification.additions import Additions, joined
+from calibration.observations import Floats
+
+_LEFT = 1e-3  # of the mean square of what an effect may do; no fix shows the curves that make up less
+_MOST = 12  # coefficients: a curve of many has its broad features in the first
+_ROWS = 1000  # that its coefficients are found from
+_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
+
+
+@dataclass(frozen=True)
+class Rival:
+    """One effect at one place.
+
+    Attributes:
+        name: `family@where`.
+        choices: the variants that it may take; they have c coefficients together.
+        weights: of the variants beforehand, their sum 1.
+        mixing: (c, k) what these do is that of k <= c coefficients, independent and of size 1: `mixing` takes unit
+            directions of the c in prior sigmas onto them.
+        squares: (k, k) expected products of the k: of plausible sizes, or of those that were found.
+    """
+
+    name: str
+    choices: tuple[Choice, ...]
+    weights: tuple[float, ...]
+    mixing: Floats
+    squares: Floats
+
+    @classmethod
+    def of(cls, name: str, choices: tuple[Choice, ...], situation: Situation, found: Floats | None = None) -> Rival:
+        """With as few coefficients as matter in these observations: variants of an effect repeat each other.
+
+        Args:
+            name: `family@where`.
+            choices: the variants that it may take.
+            situation: the observations.
+            found: (c,) values of the coefficients, where there are any.
+
+        Raises:
+            DataError: it does nothing in any of them.
+        """
+        odds = [library()[choice.family].odds(choice.settings) for choice in choices]
+        weights = tuple(value / sum(odds) for value in odds)
+        few = replace(situation, observations=situation.observations.select(_spread(len(situation))))
+        parts = [_scaled(choice, few, weight) for choice, weight in zip(choices, weights, strict=True)]
+        rows = np.hstack([np.concatenate([part.column, _flat(part)]) for part in parts])
+        _, size, directions = np.linalg.svd(np.linalg.qr(rows, mode="r"), full_matrices=False)
+        if not size.max(initial=0.0) > 0.0:
+            raise DataError(name, f"does nothing in any pose of rig {situation.rig.name!r}")
+        left = 1.0 - np.cumsum(size**2) / (size**2).sum()
+        mixing = directions[: min(_MOST, int((left > _LEFT).sum()) + 1)].T
+        squares = np.eye(mixing.shape[1])
+        if found is not None:
+            own = mixing.T @ (found / _prior_sigma(choices[0], few))
+            squares = np.outer(own, own)
+        return cls(name, choices, weights, mixing, squares)
+
+    @property
+    def size(self) -> int:
+        """How many coefficients."""
+        return int(self.mixing.shape[1])
+
+    def stands_out(self, covariance: Floats) -> float:
+        """By how many sigma an effect of the expected size differs from none.
+
+        Args:
+            covariance: (k, k) posterior of the coefficients, whatever all else may be.
+        """
+        beyond_prior = np.linalg.inv(covariance) - np.eye(self.size)
+        return math.sqrt(max(0.0, float((beyond_prior * self.squares).sum())))
+
+    def additions(self, situation: Situation) -> Additions:
+        """Its k coefficients, of size 1, for the observations of a situation."""
+        column, shift = np.zeros((len(situation), self.size)), np.zeros((0, self.size))
+        first = 0
+        for choice, weight in zip(self.choices, self.weights, strict=True):
+            part = _scaled(choice, situation, weight)
+            own = self.mixing[first : first + len(part)]
+            first += len(part)
+            column += part.column @ own
+            if part.shift_mm is not None:
+                shift = part.shift_mm @ own if len(shift) == 0 else shift + part.shift_mm @ own
+        names = tuple(f"{self.name}:{i}" for i in range(self.size))
+        joint = np.repeat(part.joint[:1], self.size)
+        return Additions(names, joint, column, np.ones(self.size), shift if len(shift) else None)
+
+
+def name_of(effect: str | FittedEffect) -> str:
+    """`family@where`."""
+    return effect if isinstance(effect, str) else f"{effect.family}@{effect.where}"
+
+
+def conditions_of(knowledge: Knowledge, effect: str, readings: Floats, conditions: Conditions) -> tuple[str, ...]:
+    """Names of the conditions without which an effect is not known.
+
+    Args:
+        knowledge: of the rig.
+        effect: `family@where`.
+        readings: (n, joints) poses.
+        conditions: all that may be chosen for them.
+
+    Raises:
+        DataError: it needs something that no condition gives.
+    """
+    name, _, where = effect.partition("@")
+    family = library()[name]
+
+    def is_known(names: Collection[str]) -> bool:
+        situation = knowledge.situation(readings, {key: conditions[key] for key in names})
+        return bool(family.known(situation, where).all())
+
+    found = needed(knowledge.chain.rig, is_known)
+    if found is None:
+        raise DataError(effect, f"needs {family.needs(where)}, which poses alone do not give")
+    return found
+
+
+def rival_of(knowledge: Knowledge, effect: str | FittedEffect, readings: Floats, conditions: Conditions) -> Rival:
+    """An effect in all its variants, or as it was found, prepared for poses (n, joints).
+
+    Raises:
+        DataError: no pose shows it.
+    """
+    situation = knowledge.situation(readings, conditions)
+    if isinstance(effect, FittedEffect):
+        choice = Choice(effect.family, effect.where, effect.settings)
+        return Rival.of(name_of(effect), (choice,), situation, np.array([c.value for c in effect.coefficients]))
+    name, _, where = effect.partition("@")
+    variants = library()[name].variants(situation, where)
+    if not variants:
+        raise DataError(effect, f"does nothing at {where} of rig {knowledge.chain.rig.name!r} in any pose")
+    return Rival.of(effect, tuple(Choice(name, where, settings) for settings in variants), situation)
+
+
+def together(rivals: tuple[Rival, ...], situation: Situation) -> Additions:
+    """The coefficients of all rivals, one after the other."""
+    return joined([rival.additions(situation) for rival in rivals], len(situation))
+
+
+def _scaled(choice: Choice, situation: Situation, weight: float) -> Additions:
+    """A variant with coefficients of size 1, as plausible as it is among the others."""
+    raw = choice.additions(situation)
+    sigma = raw.prior_sigma * math.sqrt(weight)
+    shift = None if raw.shift_mm is None else raw.shift_mm * sigma
+    return replace(raw, column=raw.column * sigma, prior_sigma=np.ones(len(raw)), shift_mm=shift)
+
+
+def _prior_sigma(choice: Choice, situation: Situation) -> Floats:
+    found = library()[choice.family].coefficients(situation, choice.where, choice.settings)
+    return np.array([c.sigma for c in found])
+
+
+def _spread(rows: int) -> NDArray[np.intp]:
+    """Rows spread evenly, in their order, in no step with the prisms."""
+    if rows <= _ROWS:
+        return np.arange(rows)
+    return np.unique((rows * (np.arange(_ROWS) * _GOLDEN % 1.0)).astype(np.intp))
+
+
+def _flat(additions: Additions) -> Floats:
+    """(3 n, k) displacements; no rows where there are none."""
+    if additions.shift_mm is None:
+        return np.empty((0, len(additions)))
+    return additions.shift_mm.reshape(-1, len(additions))
