@@ -6,7 +6,9 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
-from calibration.effects.adoption import Adopted, adopt
+from calibration.effects.library import library
+from calibration.gap.adopt import Adopted, adopt
+from calibration.gap.search import search
 from calibration.identification.refinement import Prior
 from calibration.identification.search.checkpoint import Checkpoint
 from calibration.identification.solve import solve
@@ -92,4 +94,6 @@ def identify_by(method: str, rig: Rig, observations: Observations, options: Opti
         checkpoint=options.checkpoint,
     )
     options.progress(0.8, "asking for effects")
-    return adopt(solution, observations, options.effects, prior=options.prior, seed=options.seed)
+    if options.effects == "auto":
+        return search(solution, observations, library(), prior=options.prior, seed=options.seed).adopted
+    return adopt(solution, observations, options.effects, prior=options.prior)

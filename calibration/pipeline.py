@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.accuracy import joint_error_scale
-from calibration.effects.adoption import Adopted, with_effects
 from calibration.effects.base import Situation
 from calibration.evaluation import Evaluation, evaluate, require_positions
+from calibration.gap.adopt import Adopted, with_effects
 from calibration.identification.refinement import Prior
 from calibration.identification.samples import reading_covariance, station_covariance
 from calibration.identification.search.checkpoint import Checkpoint
@@ -86,14 +86,14 @@ def identify(
         ValueError: an unknown method or effect.
     """
     require_positions(observations)
-    with _executor(executor) as pool:
+    with executor_or_threads(executor) as pool:
         options = Options(prior, effects, seed, pool, progress or _silent, should_stop, checkpoint)
         adopted = identify_by(method, rig, observations, options)
-        model = _model(rig, rig_text, observations, adopted, prior, {"seed": seed, "method": method})
+        model = model_of(rig, rig_text, observations, adopted, prior, {"seed": seed, "method": method})
     return model
 
 
-def _model(
+def model_of(
     rig: Rig,
     rig_text: str,
     observations: Observations,
@@ -101,6 +101,15 @@ def _model(
     prior: Prior,
     provenance: Mapping[str, str | int | float],
 ) -> CalibratedModel:
+    """The model that kinematics and effects make, before any residual is learned.
+
+    Args:
+        rig, rig_text: the rig description and the TOML it was read from.
+        observations: training rows.
+        adopted: what was fitted to them.
+        prior: how the build tolerances were used.
+        provenance: of the fit, beside what is known here.
+    """
     # What the kinematics alone found stays in the model; effects are put on top.
     kinematics = replace(adopted.solution, fit=adopted.geometric, additions=None)
     fit, samples = kinematics.fit, kinematics.samples
@@ -180,7 +189,7 @@ def train_residual(
     rows = observations.select(good)
     signals = (*usable_signals(rows), *usable_loads(model.chain, model.values, model.corrected(rows)))
     seen = model.residual_features(rows, signals)
-    with _executor(executor) as pool:
+    with executor_or_threads(executor) as pool:
         decision = decide(
             seen,
             model.to_base(rows, rows.position_mm - model.effects_mm(rows)),
@@ -345,7 +354,7 @@ def _noise_mm(solution: Solution, observations: Observations) -> float:
 
 
 @contextmanager
-def _executor(executor: Executor | None) -> Iterator[Executor]:
+def executor_or_threads(executor: Executor | None) -> Iterator[Executor]:
     """The executor, or threads of our own; here and in the workers each call into BLAS keeps to its thread."""
     with one_blas_thread():
         if executor is not None:

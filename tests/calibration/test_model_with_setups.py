@@ -82,7 +82,7 @@ def test_accuracy_and_plan_are_of_the_same_setup(model: CalibratedModel) -> None
 def test_only_what_the_setup_can_show_counts_among_the_parameters(model: CalibratedModel) -> None:
     planned = plan_poses(RIG, 15, np.random.default_rng(0), model=model).plan
     assert (planned.parameters, planned.determined) == (32, 27)
-    assert planned.approached == ("theta2",)
+    assert list(planned.poses.conditions) == ["theta2_dir"]
 
 
 def test_an_effect_that_the_model_has_is_told_apart_as_if_it_were_new(model: CalibratedModel) -> None:

@@ -1,0 +1,87 @@
+"""Whether a candidate may be named: stable under resampling, better on held-out groups, within its limits.
+
+The posterior alone is conditional on the library, the noise and the linear model; these ask the data themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import stats
+
+from calibration.effects.base import Situation
+from calibration.gap.projection import Integers, Projection, Softly, log_bayes_factor, rows_of, without_folds
+from calibration.gap.screen import Weighed
+from calibration.observations import Floats
+from calibration.residual.folds import folds
+
+HALF_SAMPLES = 25
+_FOLDS = 10
+_CHANCE = 2.0  # standard errors
+
+
+def wins(projection: Projection, rivals: Sequence[Weighed], seed: int) -> float:
+    """Share of half-samples, drawn by group, in which the first of the rivals has the greatest evidence.
+
+    Where another effect is likely beside the first, it is there beside each of them.
+
+    Args:
+        projection: about the fit.
+        rivals: the candidate, and then those of other families that come near; nothing is a rival too.
+        seed: of the halves.
+    """
+    whitened = [_columns(projection, w) for w in rivals]
+    kinematics = _with_beside(projection, rivals[0])
+    labels, group = np.unique(projection.groups, return_inverse=True)
+    rng = np.random.default_rng(seed)
+    won = 0
+    for _ in range(HALF_SAMPLES):
+        half = np.isin(group, rng.permutation(len(labels))[: (len(labels) + 1) // 2])
+        rows = rows_of(np.flatnonzero(half))
+        softly = Softly(kinematics[rows])
+        residual = softly(projection.rows.target[rows])
+        values = [log_bayes_factor(softly(w[rows]), residual, np.ones(w.shape[1])) for w in whitened]
+        won += values[0] >= max(values) and values[0] > 0.0
+    return won / HALF_SAMPLES
+
+
+def chance_of_gain(projection: Projection, candidate: Weighed, seed: int) -> float:
+    """p that a candidate lowers the errors of held-out groups no more than chance would (Wilcoxon, one-sided).
+
+    Both models are fitted without the groups, kinematics with their priors. By ranks: single fixes far from all
+    others, where neither knows anything, would decide about a mean.
+    """
+    kinematics, fold = _with_beside(projection, candidate), folds(projection.groups, _FOLDS, seed)
+    before = _held_out(kinematics, projection.rows.target, fold)
+    after = _held_out(np.hstack([kinematics, _columns(projection, candidate)]), projection.rows.target, fold)
+    _, group, size = np.unique(projection.groups, return_inverse=True, return_counts=True)
+    lowered = np.bincount(group, before - after) / size
+    return float(stats.wilcoxon(lowered, alternative="greater").pvalue) if np.any(lowered) else 1.0
+
+
+def beyond(situation: Situation, candidate: Weighed) -> tuple[str, ...]:
+    """Names of the coefficients that the linear estimate has beyond their hard limits by more than chance."""
+    return candidate.choice.beyond(situation, candidate.estimate, candidate.standard_error)
+
+
+def _columns(projection: Projection, weighed: Weighed) -> Floats:
+    """(3 m, k) whitened, in prior sigmas."""
+    whitened = projection.whitened(projection.moved_mm(weighed.additions))
+    return whitened * (weighed.additions.prior_sigma * weighed.scale)
+
+
+def _with_beside(projection: Projection, weighed: Weighed) -> Floats:
+    """(3 m, q) kinematics, and the effect that is likely beside a candidate."""
+    if weighed.beside is None:
+        return projection.rows.kinematics
+    return np.hstack([projection.rows.kinematics, _columns(projection, weighed.beside)])
+
+
+def _held_out(design: Floats, target: Floats, fold: Integers) -> Floats:
+    """(m,) squares of every sample's whitened error, by fits with unit priors without its fold (m,)."""
+    squares = np.empty(len(fold))
+    for number, x in without_folds(design, target, fold):
+        rows = rows_of(np.flatnonzero(fold == number))
+        squares[fold == number] = ((target[rows] - design[rows] @ x) ** 2).reshape(-1, 3).sum(axis=1)
+    return squares

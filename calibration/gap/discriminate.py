@@ -1,0 +1,218 @@
+"""What would tell effects apart that these data cannot: poses, and experiments that are no poses.
+
+Which experiment separates two effects follows from what they do. A condition (the side a joint comes from, the load,
+the dwell ...) is tried on paper: the effects whose displacements change with it stand apart from those that it leaves
+as they are. So do effects that sit before and behind a place on the boom where a prism can be put.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from calibration.design.conditions import Conditions, changed, instructions, kinds_of
+from calibration.design.knowledge import Knowledge, setup_of
+from calibration.design.planning import pose_rows
+from calibration.design.poses import Candidates, Plan, draw, plan
+from calibration.design.rivals import conditions_of, name_of, rival_of
+from calibration.design.visibility import site
+from calibration.effects.fitted import Choice, FittedEffect
+from calibration.effects.library import library
+from calibration.errors import DataError, UnsafeError
+from calibration.gap.result import Experiment
+from calibration.model import CalibratedModel
+from calibration.observations import Floats, Observations
+from calibration.rig import Rig
+
+POSES = 20
+_CANDIDATES = 1000
+_TRIED = 64  # poses in which the conditions are tried
+_CHANGES = 0.05  # of what an effect moves, RMS
+_PAUSE_S = 600.0  # between the last fix and the first new one
+_KINDS = {
+    "payload_kg": "payload",
+    "temperature_degC": "temperature",
+    "time_s": "repeat",
+    "dwell_s": "dwell",
+    "_bar": "pressure",
+    "_rate": "motion",
+    "_dir": "approach",
+}
+_ORDERS = {
+    "payload": "Go to the same poses with and without a payload",
+    "temperature": "Go to the same poses when it is cold and when it is warm",
+    "repeat": "Come back to the first poses hours later, with nothing moved but the boom",
+    "dwell": "Stand in one pose and measure again and again for some minutes",
+    "motion": "Take fixes on the move, there and back along one path, and then with the boom stopped on it",
+}
+
+
+def experiments(
+    model: CalibratedModel,
+    observations: Observations,
+    rivals: Sequence[FittedEffect],
+    rng: np.random.Generator,
+    *,
+    poses: int = POSES,
+) -> tuple[Experiment, ...]:
+    """What to measure next for a set of effects.
+
+    Args:
+        model: kinematics, and effects that are beyond doubt; the rivals are none of these.
+        observations: the rows that it was calibrated with.
+        rivals: two or three, each as it was found by itself.
+        rng: draws the poses among which the best are chosen.
+        poses: how many to propose.
+
+    Returns:
+        The poses first, for the prisms that were measured before; none where the rig can take too few, or where poses
+        show none of the rivals.
+    """
+    knowledge = Knowledge.before(model, setup_of(model))
+    try:
+        at = site(model.chain, model.values, setup=knowledge.setup)
+        drawn = draw(knowledge, at, rng, max(_CANDIDATES, poses), begin_s=_end_s(observations))
+    except UnsafeError:
+        return (*_by_place(model.rig, rivals), *_as_the_library_says(rivals))
+    candidates = _with_prisms(drawn, [bool(model.coverage.fixes.get(n)) for n in model.rig.prism_names])
+    tried = drawn.select(np.arange(min(_TRIED, len(drawn))))
+    return (
+        *_poses(knowledge, candidates, observations, rivals, poses),
+        *_by_condition(knowledge, tried, rivals),
+        *_by_place(model.rig, rivals),
+        *_as_the_library_says(rivals),
+    )
+
+
+def _with_prisms(candidates: Candidates, measured: Sequence[bool]) -> Candidates:
+    """Those candidates in which a prism that is there is in view; the others are not."""
+    seen = candidates.seen & np.array(measured)
+    return replace(candidates, seen=seen).select(np.flatnonzero(seen.any(axis=1)))
+
+
+def _poses(
+    knowledge: Knowledge,
+    candidates: Candidates,
+    observations: Observations,
+    rivals: Sequence[FittedEffect],
+    count: int,
+) -> Iterator[Experiment]:
+    few = candidates.select(np.arange(min(_TRIED, len(candidates))))
+    shown = [rival for rival in rivals if len(candidates) >= count and _is_shown(knowledge, few, rival)]
+    if not shown:
+        return
+    chosen = plan(knowledge, candidates, count, separate=shown, measured=observations)
+    rows = tuple(row.as_dict() for row in pose_rows(knowledge.chain.rig, chosen.poses))
+    orders = "".join(f"; {order}" for order in instructions(knowledge.chain.rig, chosen.poses.conditions))
+    yield Experiment("poses", f"Measure {count} poses chosen for it: {_promise(chosen)}{orders}", rows)
+
+
+def _is_shown(knowledge: Knowledge, poses: Candidates, rival: FittedEffect) -> bool:
+    """Whether poses, and conditions that an operator can bring about, show anything of an effect."""
+    try:
+        names = conditions_of(knowledge, name_of(rival), poses.readings, poses.conditions)
+        there = poses.under(names)
+        rival_of(knowledge, rival, there.readings, there.conditions)
+    except DataError:
+        return False
+    return True
+
+
+def _promise(chosen: Plan) -> str:
+    return ", ".join(
+        f"{name} of the size found would stand out from all else by {sigma:.1f} sigma after them "
+        f"({chosen.stood_out[name]:.1f} now)"
+        for name, sigma in chosen.stands_out.items()
+    )
+
+
+def _by_condition(knowledge: Knowledge, poses: Candidates, rivals: Sequence[FittedEffect]) -> Iterator[Experiment]:
+    """The conditions that change what some of the rivals do and not what the others do."""
+    before = [_moved_mm(knowledge, poses.readings, poses.conditions, rival) for rival in rivals]
+    size = [float(np.sqrt((moved**2).mean())) for moved in before]
+    for kind in kinds_of(knowledge.chain.rig):
+        there = changed(poses.conditions, kind)
+        concerned = []
+        for rival, moved, rms in zip(rivals, before, size, strict=True):
+            change = _moved_mm(knowledge, poses.readings, there, rival) - moved
+            if float(np.sqrt((change**2).mean())) > _CHANGES * rms:
+                concerned.append(name_of(rival))
+        if 0 < len(concerned) < len(rivals):
+            others = [name for name in map(name_of, rivals) if name not in concerned]
+            name = next(value for end, value in _KINDS.items() if kind[0].endswith(end))
+            order, changes, leaves = _order(name, kind[0]), _listed(concerned), _listed(others)
+            yield Experiment(name, f"{order}: what {changes} does changes by it, what {leaves} does not")
+
+
+def _moved_mm(knowledge: Knowledge, readings: Floats, conditions: Conditions, rival: FittedEffect) -> Floats:
+    """(n * prisms, 3) by what an effect as found moves the prisms."""
+    situation = knowledge.situation(readings, conditions)
+    additions = Choice(rival.family, rival.where, rival.settings).additions(situation)
+    by_joint = situation.to_station(situation.located.joint_jacobian)
+    values = np.array([c.value for c in rival.coefficients])
+    moved: Floats = additions.moved_mm(by_joint) @ values
+    return moved
+
+
+def _by_place(rig: Rig, rivals: Sequence[FittedEffect]) -> Iterator[Experiment]:
+    """What does not move with the boom, for effects of the station and of the base; a prism between two places."""
+    names = [name_of(rival) for rival in rivals]
+    station = [name_of(r) for r in rivals if r.where == "station" or r.where in rig.prism_names]
+    base = [name_of(r) for r in rivals if r.where == "base"]
+    if 0 < len(station) < len(names):
+        yield Experiment(
+            "control_points",
+            f"Measure control points on the ground, near and far and all round: {_listed(station)} shows there if the "
+            f"target is the same, {_listed([n for n in names if n not in station])} does not",
+        )
+    if 0 < len(base) < len(names):
+        yield Experiment(
+            "control_points",
+            f"Measure control points and a prism on the carrier before, between and after the poses: {_listed(base)} "
+            f"moves the one and not the others, {_listed([n for n in names if n not in base])} moves neither",
+        )
+    rows = sorted((row, r.where, name_of(r)) for r in rivals if (row := _row(rig, r.where)) is not None)
+    if rows and rows[0][0] < rows[-1][0]:
+        (first, _, before), (last, where, behind) = rows[0], rows[-1]
+        boom = _row(rig, "boom")
+        frame, place = last - 1, f"on the link before {where}"
+        if where == "boom":
+            place = "at the root of the boom"
+        elif boom is not None and first <= boom < last:
+            frame, place = boom, "at the head of the boom"
+        yield Experiment(
+            "prism",
+            f"Put a prism {place} (frame {frame}) and measure it in the same poses: {before} moves it, {behind} does "
+            f"not",
+        )
+
+
+def _row(rig: Rig, where: str) -> int | None:
+    """Number of the first row that an effect at a joint value or the boom moves; None for all others."""
+    if where == "boom":
+        return next((number for number, driven, _, _ in rig.couplings() if driven == "a"), None)
+    return next((number for number, _, name, _ in rig.couplings() if name == where), None)
+
+
+def _as_the_library_says(rivals: Sequence[FittedEffect]) -> Iterator[Experiment]:
+    for rival in rivals:
+        yield Experiment("procedure", f"To see {name_of(rival)} by itself: {library()[rival.family].revealed_by}")
+
+
+def _order(kind: str, column: str) -> str:
+    if kind == "approach":
+        return f"Come to the same poses with {column.removesuffix('_dir')} once from below and once from above"
+    if kind == "pressure":
+        return f"Go to the same poses with {column} high and low, by the load or by what the boom pushes against"
+    return _ORDERS[kind]
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join(names)
+
+
+def _end_s(observations: Observations) -> float:
+    times = observations.extra.get("time_s", np.empty(0))
+    return float(np.nanmax(times)) + _PAUSE_S if np.isfinite(times).any() else 0.0

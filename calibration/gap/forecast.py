@@ -1,0 +1,226 @@
+"""What these data could show of every effect, whether it is there or not.
+
+Calibration hides physics: of what an effect moves, a refit absorbs most, and another effect may imitate the rest. Both
+follow from the poses alone. With G (r, k) what one prior sigma of each coefficient moves in the projected space and
+G'G = V diag(l) V', an effect c makes the expected log Bayes factor of a candidate H with eigenvalues l and basis U
+
+    1/2 sum_i (|U_i' G c|^2 + 1) l_i / (1 + l_i) - 1/2 sum_i ln(1 + l_i),
+
+so how large c must be for the effect to stand out, from nothing and from every rival, is a closed form. A curve that is
+free enough to imitate anything is no rival: its evidence pays for the freedom.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibration.effects.base import Coefficient, FittedCoefficient
+from calibration.effects.fitted import Choice
+from calibration.effects.library import library
+from calibration.gap.projection import Integers
+from calibration.gap.result import Forecast
+from calibration.gap.screen import Screen
+from calibration.observations import Floats
+
+_NAMED = 5.0  # log Bayes factor over nothing, and over any rival
+_SURE = math.log(0.95 / 0.05)  # log odds, its share of the prior taken into account
+_FREE = 4  # coefficients; variants of another effect with more are no rivals
+_SEEN = 1e-9  # eigenvalue of what is visible, of the largest
+
+
+@dataclass(frozen=True)
+class _Variant:
+    """One variant of a place as a candidate.
+
+    Attributes:
+        place: index of its place.
+        basis: (r, k) orthonormal, of what it can move.
+        kept: (k,) l / (1 + l): share of a residual along the basis that the prior lets it take.
+        chance: expected log Bayes factor of it where there is noise alone.
+    """
+
+    place: int
+    basis: Floats
+    kept: Floats
+    chance: float
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """A place as the truth, in the variant that shows most.
+
+    Attributes:
+        option: index of that among the place's.
+        leading: its first coefficient.
+        main: (r, k) what one prior sigma of each coefficient moves, without those that only shape it.
+        visible: share of it, RMS, that the kinematics cannot absorb.
+        visible_mm: RMS of that.
+    """
+
+    option: int
+    leading: Coefficient
+    main: Floats
+    visible: float
+    visible_mm: float
+
+
+def forecasts(screen: Screen) -> tuple[Forecast, ...]:
+    """One for each place, in the order of the screen's."""
+    variants: list[_Variant] = []
+    shown: list[_Shown] = []
+    own: list[int] = []
+    for number, place in enumerate(screen.places):
+        first = len(variants)
+        options = _distinct(screen, number)
+        truth = _truth(screen, number, options)
+        options = [o for o in options if o == truth.option or len(place.additions[o]) <= _FREE]
+        variants += [
+            _variant(number, screen.columns(number, option) * place.additions[option].prior_sigma) for option in options
+        ]
+        shown.append(truth)
+        own.append(first + options.index(truth.option))
+    if not variants:
+        return ()
+    rivals = _Rivals(variants, [screen.places[v.place].family for v in variants])
+    explained, evidence = rivals.of([truth.main for truth in shown])
+    return tuple(
+        _forecast(screen, number, truth, rivals, own[number], explained[number], evidence[number])
+        for number, truth in enumerate(shown)
+    )
+
+
+class _Rivals:
+    """All variants as candidates, for many truths at once.
+
+    Args:
+        variants: v of them.
+        families: (v) of each.
+
+    Attributes:
+        variants: as above.
+        chance: (v,) expected log Bayes factor of noise alone.
+    """
+
+    def __init__(self, variants: list[_Variant], families: list[str]) -> None:
+        self.variants = variants
+        self.chance = np.array([v.chance for v in variants])
+        self._family = np.array(families)
+        self._is_rival = np.array([v.basis.shape[1] <= _FREE for v in variants])
+
+    def against(self, family: str) -> Integers:
+        """Indices of those of other families that are not free to imitate anything."""
+        return np.flatnonzero(self._is_rival & (self._family != family))
+
+    def of(self, truths: list[Floats]) -> tuple[Floats, Floats]:
+        """For truths (r, k), each coefficient its share: what of their squares every variant can take, (t, v), and by
+        what a square of their size raises its expected log Bayes factor, (t, v).
+        """
+        basis, kept = np.hstack([v.basis for v in self.variants]), np.concatenate([v.kept for v in self.variants])
+        begin = np.cumsum([0, *(v.basis.shape[1] for v in self.variants)])[:-1]
+        first = np.cumsum([0, *(truth.shape[1] for truth in truths)])[:-1]
+        along = np.add.reduceat((np.hstack(truths).T @ basis) ** 2, first, axis=0)
+        along /= np.array([truth.shape[1] for truth in truths])[:, None]
+        return np.add.reduceat(along, begin, axis=1), 0.5 * np.add.reduceat(along * kept, begin, axis=1)
+
+
+def _forecast(
+    screen: Screen, number: int, truth: _Shown, rivals: _Rivals, own: int, explained: Floats, evidence: Floats
+) -> Forecast:
+    place = screen.places[number]
+    others = rivals.against(place.family)
+    value = truth.leading.sigma * _least_size(own, others, evidence, rivals.chance, place.log_prior)
+    rival, separation = "", 1.0
+    if len(others) > 0:
+        total = float((truth.main**2).sum()) / truth.main.shape[1]
+        closest = int(others[np.argmax(explained[others])])
+        rival = str(screen.places[rivals.variants[closest].place])
+        separation = math.sqrt(max(0.0, 1.0 - float(explained[closest]) / total)) if total > 0.0 else 0.0
+    return Forecast(
+        place.family,
+        place.where,
+        truth.leading.unit,
+        truth.visible,
+        truth.visible_mm,
+        value if value <= max(-truth.leading.lower, truth.leading.upper) else math.inf,
+        rival,
+        separation,
+    )
+
+
+def _least_size(own: int, others: Integers, evidence: Floats, chance: Floats, log_prior: float) -> float:
+    """How many prior sigmas an effect must have, each coefficient its share, to be named.
+
+    Args:
+        own: index of its variant.
+        others: indices of its rivals' variants.
+        evidence: (v,) by what its square raises the expected log Bayes factor of each variant.
+        chance: (v,) that of noise alone.
+        log_prior: of the effect.
+    """
+    wanted = [max(_NAMED, _SURE - log_prior) - chance[own], *(_NAMED - chance[own] + chance[others])]
+    gained = [evidence[own], *(evidence[own] - evidence[others])]
+    squares = [
+        max(w, 0.0) / g if g > 0.0 else (math.inf if w > 0.0 else 0.0) for w, g in zip(wanted, gained, strict=True)
+    ]
+    return math.sqrt(max(squares))
+
+
+def _distinct(screen: Screen, place: int) -> list[int]:
+    """Variants that move differently; of those that differ in their prior alone the one with the widest."""
+    found: dict[int, int] = {}
+    sigma = [additions.prior_sigma for additions in screen.places[place].additions]
+    for option in range(len(sigma)):
+        same = id(screen.columns(place, option))
+        if same not in found or sigma[option].sum() > sigma[found[same]].sum():
+            found[same] = option
+    return list(found.values())
+
+
+def _variant(place: int, columns: Floats) -> _Variant:
+    value, vector = np.linalg.eigh(columns.T @ columns)
+    if not value[-1] > 0.0:  # nothing of it is left: it can take nothing
+        return _Variant(place, np.zeros((len(columns), 1)), np.zeros(1), 0.0)
+    seen = value > _SEEN * value[-1]
+    value, vector = value[seen], vector[:, seen]
+    kept = value / (1.0 + value)
+    return _Variant(place, columns @ (vector / np.sqrt(value)), kept, 0.5 * float((kept - np.log1p(value)).sum()))
+
+
+def _truth(screen: Screen, number: int, options: list[int]) -> _Shown:
+    """The variant that shows most, of those with the coefficients of the first."""
+    place, projection = screen.places[number], screen.projection
+    names = place.additions[options[0]].names
+    best: tuple[float, int, Floats, list[int], tuple[Coefficient, ...]] | None = None
+    for option in options:
+        if place.additions[option].names != names:
+            continue
+        coefficients = _coefficients(screen, place.options[option])
+        main = _leading(place.options[option], coefficients)
+        sigma = place.additions[option].prior_sigma[main]
+        moved = screen.columns(number, option)[:, main] * sigma
+        power = float((moved**2).sum())
+        if best is None or power > best[0]:
+            best = power, option, moved, main, coefficients
+    assert best is not None  # the first has its own names
+    power, option, moved, main, coefficients = best
+    additions = place.additions[option]
+    raw_mm = projection.moved_mm(additions)[:, :, main] * additions.prior_sigma[main]
+    whole = float((projection.whitened(raw_mm) ** 2).sum())
+    visible = math.sqrt(power / whole) if whole > 0.0 else 0.0
+    raw = math.sqrt(float((raw_mm**2).sum()) / (len(raw_mm) * len(main)))
+    return _Shown(option, coefficients[main[0]], moved, visible, visible * raw)
+
+
+def _coefficients(screen: Screen, choice: Choice) -> tuple[Coefficient, ...]:
+    return library()[choice.family].coefficients(screen.projection.situation, choice.where, choice.settings)
+
+
+def _leading(choice: Choice, coefficients: tuple[Coefficient, ...]) -> list[int]:
+    """Indices of the coefficients that outputs list; all where these list something else."""
+    fitted = tuple(FittedCoefficient(c.name, c.unit, 0.0, 0.0, c.sigma) for c in coefficients)
+    listed = {c.name for c in library()[choice.family].reported(choice.settings, fitted)}
+    found = [i for i, c in enumerate(coefficients) if c.name in listed]
+    return found or list(range(len(coefficients)))

@@ -1,0 +1,186 @@
+"""What the gap workflow found, as its report, the command line and the daemon take it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from calibration.effects.base import FittedCoefficient
+from calibration.effects.fitted import FittedEffect
+from calibration.model import CalibratedModel
+from calibration.observations import Floats, Observations
+
+Verdict = Literal["named", "none", "indistinguishable", "unidentified"]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect at one place, weighed against the others of its round.
+
+    Attributes:
+        family, where: which.
+        posterior: probability that it is the one, among all of the library and nothing.
+        log_bayes_factor: of it against nothing, natural logarithm.
+        coefficients: as the linearised fit has them.
+        bounds: name of a coefficient -> its hard limits.
+        reason: why it was not named, a clause; empty where it was.
+    """
+
+    family: str
+    where: str
+    posterior: float
+    log_bayes_factor: float
+    coefficients: tuple[FittedCoefficient, ...]
+    bounds: Mapping[str, tuple[float, float]]
+    reason: str = ""
+
+    def as_dict(self) -> dict[str, object]:
+        """The contract's object of a set."""
+        return {"family": self.family, "where": self.where, "posterior": self.posterior}
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """Where simulation and measurement disagree beyond chance.
+
+    Attributes:
+        where: joint, prism, `boom`, `base`, `station`, `clock`.
+        variable: on what the disagreement depends there: `direction`, `torque`, `sin 2 theta4`, `time` ...
+        p: corrected for all that was looked at.
+    """
+
+    where: str
+    variable: str
+    p: float
+
+    def as_dict(self) -> dict[str, object]:
+        """The contract's object."""
+        return {"where": self.where, "variable": self.variable, "p": self.p}
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What would tell more.
+
+    Attributes:
+        kind: `poses`, `approach`, `dwell`, `payload`, `prism`, `control_points`, `motion` ...
+        text: what to do, a sentence.
+        poses: a plan's rows as `rigcal plan` prints them, where it is poses.
+    """
+
+    kind: str
+    text: str
+    poses: tuple[Mapping[str, object], ...] = ()
+
+    def as_dict(self) -> dict[str, object]:
+        """The contract's object, with the poses where there are any."""
+        return {"kind": self.kind, "text": self.text, **({"poses": list(self.poses)} if self.poses else {})}
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What this data could show of one effect.
+
+    Attributes:
+        family, where: which.
+        unit: of its first coefficient.
+        visible: share of what it moves, RMS, that refitted kinematics cannot absorb.
+        visible_mm: RMS of that at the plausible size.
+        nameable: smallest value of the first coefficient that this data could name; infinity for none within bounds.
+        rival: `family@where` of the effect most like it; empty for none.
+        separation: share of what is visible that the rival cannot imitate either.
+    """
+
+    family: str
+    where: str
+    unit: str
+    visible: float
+    visible_mm: float
+    nameable: float
+    rival: str
+    separation: float
+
+
+@dataclass(frozen=True)
+class Round:
+    """One turn of the workflow.
+
+    Attributes:
+        held_out_mm: RMS of held-out groups before anything of this round was adopted.
+        adopted: `family@where` of what this round took in; none in the last.
+        candidates: weighed in this round, the most probable first.
+    """
+
+    held_out_mm: float
+    adopted: tuple[str, ...]
+    candidates: tuple[Candidate, ...]
+
+
+@dataclass(frozen=True)
+class Gap:
+    """The answer of the workflow.
+
+    Attributes:
+        verdict: one of four.
+        effects: all that were adopted, with their coefficients from the joint refit.
+        posterior: `family@where` of each adopted one -> probability of its family, when it was adopted.
+        indistinguishable: the set that is pending, at most three families.
+        description: on what the structure depends that no effect of the library explains.
+        remaining_significant, remaining_mm: whether structure is left over, and the RMS of what is.
+        disabled: family -> what this data lacks for it.
+        before_mm, after_mm: RMS over the rows of calibrated kinematics, and with the effects.
+        noise_mm: the noise floor; `noise_source` says where it is from, a clause.
+        held_out: RMS before and after on held-out rows, mm; None where none were given.
+        disagreements: most significant first.
+        experiments: what would tell more.
+        rounds: in their order.
+        forecasts: of every effect that this data has the columns for.
+        model: kinematics and adopted effects, no residual.
+        observations, error_before_mm, error_after_mm: the rows with (n, 3) errors, station's frame.
+        warnings: sentences.
+    """
+
+    verdict: Verdict
+    effects: tuple[FittedEffect, ...]
+    posterior: Mapping[str, float]
+    indistinguishable: tuple[Candidate, ...]
+    description: str | None
+    remaining_significant: bool
+    remaining_mm: float
+    disabled: Mapping[str, str]
+    before_mm: float
+    after_mm: float
+    noise_mm: float
+    noise_source: str
+    held_out: tuple[float, float] | None
+    disagreements: tuple[Disagreement, ...]
+    experiments: tuple[Experiment, ...]
+    rounds: tuple[Round, ...]
+    forecasts: tuple[Forecast, ...]
+    model: CalibratedModel
+    observations: Observations
+    error_before_mm: Floats
+    error_after_mm: Floats
+    warnings: tuple[str, ...] = ()
+
+    def as_dict(self) -> dict[str, object]:
+        """The contract's JSON object, without `seconds`."""
+        return {
+            "verdict": self.verdict,
+            "effects": [{**e.as_dict(), "posterior": self.posterior[f"{e.family}@{e.where}"]} for e in self.effects],
+            "indistinguishable": [c.as_dict() for c in self.indistinguishable],
+            "description": self.description,
+            "remaining": {"significant": self.remaining_significant, "rms_mm": self.remaining_mm},
+            "disabled": dict(self.disabled),
+            "rms_before_mm": self.before_mm,
+            "rms_after_mm": self.after_mm,
+            "noise_mm": self.noise_mm,
+            "noise_source": self.noise_source,
+            "holdout": None
+            if self.held_out is None
+            else {"rms_before_mm": self.held_out[0], "rms_after_mm": self.held_out[1]},
+            "disagreements": [d.as_dict() for d in self.disagreements],
+            "experiments": [e.as_dict() for e in self.experiments],
+            "warnings": list(self.warnings),
+        }

@@ -1,0 +1,102 @@
+"""What else may be in the place of the most probable effect, and what is there beside it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from calibration.effects.base import Situation
+from calibration.effects.fitted import Choice
+from calibration.gap.projection import Projection
+from calibration.gap.screen import Place, Screen, Weighed
+
+_ODDS = math.log(99.0)  # that something is there
+_CHANCE = 0.01  # of anything at all, corrected for all that was looked at
+NEAR = 5.0  # in log evidence: families this near are not told apart
+PLAIN = 100.0  # log evidence of what no half of the data can miss, where no rival comes near
+_POSSIBLE = 0.02  # posterior of a rival
+BOTH = 1.1  # posterior of two places together that cannot each be in place of the other
+_BESIDE = 0.1  # of the leading log evidence: less is neither like it nor seen beside it
+_COMPARED = 30  # places at least
+
+
+def with_a_chance(weighed: Sequence[Weighed]) -> list[Place]:
+    """The places that may matter to the leading one: what is like it, or beside it, stands out as well."""
+    order = sorted(weighed, key=lambda w: -w.log_bayes_factor)
+    least = _BESIDE * weighed[0].log_bayes_factor
+    return [w.place for i, w in enumerate(order) if i < _COMPARED or w.log_bayes_factor > least or w is weighed[0]]
+
+
+def further_places(screen: Screen, weighed: Sequence[Weighed]) -> list[Weighed]:
+    """Where the leading family is as well beyond any doubt, given that it is at the leading place."""
+    leading, found = weighed[0], list[Weighed]()
+    for w in sorted(weighed[1:], key=lambda w: -w.log_bayes_factor):
+        if w.place.family != leading.place.family or w.log_bayes_factor < PLAIN:
+            continue
+        there = [leading, *found]
+        gain = screen.together([*there, w]) - screen.together(there)
+        others = [v for v in weighed if v.place.where == w.place.where and v.place.family != w.place.family]
+        rival = max((screen.together([*there, v]) - screen.together(there) for v in others), default=-math.inf)
+        if gain > max(PLAIN, rival + 2 * NEAR):
+            found.append(w)
+    return found
+
+
+def together(screen: Screen, chosen: Mapping[int, tuple[int, float]]) -> float:
+    """Log evidence of several places (number: variant, scale) together; none at all is 0."""
+    if not chosen:
+        return 0.0
+    options = [(number, option) for number, (option, _) in chosen.items()]
+    return screen.log_bayes_factor(options, [scale for _, scale in chosen.values()])
+
+
+def stands_out(weighed: Sequence[Weighed], looks: int) -> bool:
+    """Whether anything is there: by the evidence of all together, and by the chance of the most striking."""
+    best = max(w.log_bayes_factor + w.place.log_prior for w in weighed)
+    return best > _ODDS and min(w.p for w in weighed) * looks < _CHANCE
+
+
+def best_of_each_family(weighed: Sequence[Weighed]) -> list[Weighed]:
+    """The best place of each family, the leading one first, then by evidence."""
+    found: dict[str, Weighed] = {}
+    for w in sorted(weighed, key=lambda w: -w.log_bayes_factor):
+        found.setdefault(w.place.family, w)
+    leading = weighed[0]
+    return [leading, *(w for family, w in found.items() if family != leading.place.family)]
+
+
+def near_rivals(weighed: Sequence[Weighed]) -> list[Weighed]:
+    """The leading place, and the best of each other family that may be there in its place: none that is beside it."""
+    leading, found = weighed[0], {weighed[0].place.family: weighed[0]}
+    for w in sorted(weighed[1:], key=lambda w: -w.log_bayes_factor):
+        is_near = w.log_bayes_factor > leading.log_bayes_factor - NEAR or w.posterior > _POSSIBLE
+        if is_near and w.posterior + leading.posterior < BOTH:
+            found.setdefault(w.place.family, w)
+    return list(found.values())
+
+
+def as_simple(leading: Weighed, rival: Weighed) -> bool:
+    """Whether a rival explains the data nearly as well with no more coefficients: what is likelier beforehand is no
+    evidence, but that something simpler explains as much as a part of it is."""
+    near = rival.log_bayes_factor > leading.log_bayes_factor - NEAR
+    return near and rival.size <= leading.size
+
+
+def with_option(place: Place, choice: Choice, over: Projection, situation: Situation) -> Place:
+    """A place with one variant more."""
+    choice = replace(choice, scale=1.0)
+    additions = choice.additions(situation).over(over.samples.average)
+    odds = np.append(place.log_odds, place.log_odds.max())
+    return replace(place, options=(*place.options, choice), additions=(*place.additions, additions), log_odds=odds)
+
+
+def odds_text(best: Weighed, other: Weighed) -> str:
+    """How much better the best explains the data than another, a clause."""
+    return f"{best.place} explains the data {_times(best.log_bayes_factor - other.log_bayes_factor)} better"
+
+
+def _times(log_odds: float) -> str:
+    return f"e^{log_odds:.0f} times" if log_odds > math.log(1000.0) else f"{math.exp(max(log_odds, 0.0)):.0f} times"

@@ -1,0 +1,97 @@
+"""The terms of the grammar: an error at a place, proportional to one variable or to the product of two."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from calibration.gap.projection import Projection
+from calibration.gap.variables import Place, Variable, Variables
+from calibration.observations import Floats
+
+Kind = Literal["single", "crossing", "product"]
+
+_SHARES: Mapping[Kind, float] = {"single": 0.8, "crossing": 0.1, "product": 0.1}  # of the terms' odds beforehand
+_SAME = 0.9995  # correlation of two variables that one place tells apart in no data
+_COMPARED = 1500  # samples are enough to see that
+_ROUNDING = 1e-9
+_AT_ONCE = 2e6  # numbers of a block of columns
+_TINY = float(np.finfo(np.float64).tiny)
+
+
+@dataclass(frozen=True)
+class Term:
+    """A formula of one coefficient.
+
+    Attributes:
+        place: what is off.
+        variable: what it is proportional to.
+        kind: a variable of the place itself, one of another joint, or two together.
+        log_prior: beforehand, among all terms.
+    """
+
+    place: Place
+    variable: Variable
+    kind: Kind
+    log_prior: float
+
+    def __str__(self) -> str:
+        return f"{self.variable.text} at {self.place.where}"
+
+    @property
+    def moved_mm(self) -> Floats:
+        """(m, 3) displacement of the prism per unit of the coefficient, station's frame."""
+        moved: Floats = self.place.moved_mm * self.variable.values[:, None]
+        return moved
+
+
+def candidates(variables: Variables) -> tuple[Term, ...]:
+    """All terms but those that are another one of the same place in these data.
+
+    Single variables share most of the odds beforehand, what happens at other joints and products the rest.
+    """
+    found: list[tuple[Place, Variable, Kind]] = []
+    for place in variables.places():
+        words: tuple[tuple[Kind, Iterable[Variable]], ...] = (
+            ("single", variables.singles(place)),
+            ("crossing", variables.crossings(place)),
+            ("product", variables.products(place)),
+        )
+        own = [(variable, kind) for kind, some in words for variable in some]
+        different = _different(np.column_stack([v.values for v, _ in own]), place.constant is None) if own else ()
+        found += [(place, *own[i]) for i in different]
+    count = Counter(kind for _, _, kind in found)
+    return tuple(Term(place, variable, kind, math.log(_SHARES[kind] / count[kind])) for place, variable, kind in found)
+
+
+def _different(values: Floats, has_offset: bool) -> list[int]:
+    """Columns of (m, k) that are none of those before them, beside a constant where the kinematics have that."""
+    values = values[:: max(len(values) // _COMPARED, 1)]
+    least = _ROUNDING * np.linalg.norm(values, axis=0)
+    values = values - values.mean(axis=0) if has_offset else values
+    length = np.linalg.norm(values, axis=0)
+    varies = length > least
+    unit = values / np.where(varies, length, 1.0)
+    same = np.triu(np.abs(unit.T @ unit) > _SAME, 1).any(axis=0)
+    different: list[int] = np.flatnonzero(varies & ~same).tolist()
+    return different
+
+
+def chunks(terms: Sequence[Term], samples: int) -> Iterator[Sequence[Term]]:
+    """The terms, as many at a time as columns of so many samples fit into the caches and memory of a small machine."""
+    step = max(int(_AT_ONCE) // (3 * samples), 1)
+    for start in range(0, len(terms), step):
+        yield terms[start : start + step]
+
+
+def columns_of(projection: Projection, terms: Sequence[Term]) -> tuple[Floats, Floats, Floats]:
+    """What terms move, (m, 3, k) mm; (3 m, k) the same in the projected space, of length 1; (k,) their lengths."""
+    moved = np.stack([term.moved_mm for term in terms], axis=2)
+    columns = projection.columns(moved)
+    length = np.linalg.norm(columns, axis=0)
+    return moved, columns / np.maximum(length, _TINY), length

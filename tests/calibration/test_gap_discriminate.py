@@ -1,0 +1,294 @@
+"""What data could show, and what would tell effects apart that they cannot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from importlib.resources import files
+
+import numpy as np
+import pytest
+
+from calibration.design.conditions import DWELLS_S, ROUNDS_S
+from calibration.design.knowledge import Knowledge
+from calibration.design.poses import draw, plan
+from calibration.design.visibility import placement, site
+from calibration.effects.base import Situation
+from calibration.effects.fitted import Choice, FittedEffect
+from calibration.effects.library import library
+from calibration.gap.adopt import Adopted
+from calibration.gap.discriminate import POSES, experiments
+from calibration.gap.forecast import forecasts
+from calibration.gap.projection import Projection, log_bayes_factor
+from calibration.gap.result import Experiment, Forecast
+from calibration.gap.screen import Screen, Weighed, possible
+from calibration.identification.identifiability import identifiability
+from calibration.identification.refinement import refine
+from calibration.identification.solve import Solution, place
+from calibration.kinematics import Chain, Placement
+from calibration.model import CalibratedModel
+from calibration.observations import Floats, Observations, parse_observations
+from calibration.pipeline import model_of
+from calibration.rig import Rig, shipped_rig
+from simulators.dataset import random_poses, simulate_observations
+from simulators.effects import parse_effects
+from simulators.truth import RigTruth
+
+SHORT_DEG = 8.0
+PAIR = ("encoder_harmonic", "angle_scale")
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A machine and what was measured of it."""
+
+    truth: RigTruth
+    observations: Observations
+    solution: Solution
+
+    @property
+    def situation(self) -> Situation:
+        chain = self.solution.chain
+        return Situation(chain, self.solution.fit.x[: len(chain)], self.observations)
+
+    @cached_property
+    def model(self) -> CalibratedModel:
+        text = (files("calibration") / "rigs" / "swdt82.toml").read_text()
+        adopted = Adopted(self.solution, self.solution.fit)
+        return model_of(self.truth.rig, text, self.observations, adopted, "recalibration", {"seed": 0})
+
+    def screen(self, *families: str) -> Screen:
+        projection = Projection(self.solution, self.situation)
+        return Screen(projection, possible(self.situation, projection, families).places)
+
+    def evidence(self, *effects: str) -> dict[str, Weighed]:
+        weighed = self.screen(*{effect.partition("@")[0] for effect in effects}).weigh()
+        return {str(w.place): w for w in weighed if str(w.place) in effects}
+
+    def found(self, *effects: str) -> list[FittedEffect]:
+        by_name = self.evidence(*effects)
+        return [w.choice.fitted(self.situation, w.estimate, w.standard_error) for w in map(by_name.get, effects) if w]
+
+
+def measure(truth: RigTruth, poses: dict[str, Floats], seed: int) -> Observations:
+    data = simulate_observations(truth, len(next(iter(poses.values()))), seed, poses=poses, prisms=("r", "b"))
+    return parse_observations(data.csv_text().encode(), truth.rig, "simulated.csv")
+
+
+def settled(truth: RigTruth, observations: Observations) -> Measured:
+    """With the nominal machine as the start, which needs no search."""
+    chain, samples, start = place(truth.rig, observations)
+    nominal = refine(chain, samples, start.x, free=np.isinf(chain.prior_sigma))
+    fit = refine(chain, samples, nominal.x)
+    seen = identifiability(chain, samples, fit.x, fit.excess_variance)
+    return Measured(truth, observations, Solution(chain, samples, nominal, fit, seen, "", 0.0))
+
+
+def hidden(effect: str, seed: int, poses: int = 60) -> Measured:
+    """A machine that was measured with theta4 in a short range."""
+    rig = shipped_rig("swdt82")
+    truth = RigTruth(rig, seed, effects=parse_effects(effect))
+    drawn = random_poses(rig, poses, np.random.default_rng([seed, 5]))
+    middle = sum(rig.joint("theta4").limits) / 2.0
+    drawn["theta4"] = middle + SHORT_DEG * (np.random.default_rng([seed, 6]).random(poses) - 0.5)
+    return settled(truth, measure(truth, drawn, seed))
+
+
+def more(case: Measured, experiment: Experiment, seed: int) -> Measured:
+    """The same with proposed poses measured as well."""
+    rig = case.truth.rig
+    poses = {j.name: np.array([float(str(row[j.column])) for row in experiment.poses]) for j in rig.joints}
+    extra = measure(case.truth, poses, seed)
+    offset = len(case.observations)
+    extra = replace(extra, pose=np.array([f"{int(p) + offset}" for p in extra.pose]))
+    return settled(case.truth, together(case.observations, extra))
+
+
+def together(one: Observations, other: Observations) -> Observations:
+    def both(a: Floats, b: Floats) -> Floats:
+        joined: Floats = np.concatenate([a, b])
+        return joined
+
+    return Observations(
+        np.concatenate([one.prism, other.prism]),
+        {name: both(one.joints[name], other.joints[name]) for name in one.joints},
+        both(one.position_mm, other.position_mm),
+        both(one.sigma_mm, other.sigma_mm),
+        np.concatenate([one.setup, other.setup]),
+        np.concatenate([one.session, other.session]),
+        np.concatenate([one.pose, other.pose]),
+        {name: both(one.extra[name], other.extra[name]) for name in one.extra},
+    )
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return shipped_rig("swdt82")
+
+
+@pytest.fixture(scope="module")
+def short() -> Measured:
+    return hidden("encoder_harmonic@theta4:k=1:cosk_rad=1e-3:sink_rad=5e-3", 3)
+
+
+# -- poses -------------------------------------------------------------------------------------------------------------
+
+
+def test_proposed_poses_tell_apart_what_the_data_could_not(short: Measured) -> None:
+    truth, rival = "encoder_harmonic@theta4", "angle_scale@theta4"
+    before = short.evidence(truth, rival)
+    assert min(w.log_bayes_factor for w in before.values()) > 5.0
+    assert abs(before[truth].log_bayes_factor - before[rival].log_bayes_factor) < 5.0
+    proposed, *_ = experiments(short.model, short.observations, short.found(truth, rival), np.random.default_rng(0))
+    assert proposed.kind == "poses"
+    assert len(proposed.poses) == POSES
+    assert "stand out from all else by" in proposed.text
+    after = more(short, proposed, 11).evidence(truth, rival)
+    assert after[truth].log_bayes_factor > after[rival].log_bayes_factor + 5.0
+
+
+def test_what_was_measured_counts_when_poses_are_chosen(short: Measured) -> None:
+    model, rivals = short.model, short.found("encoder_harmonic@theta4", "angle_scale@theta4")
+    knowledge = Knowledge.before(model, 0)
+    at = site(model.chain, model.values, setup=0)
+    candidates = draw(knowledge, at, np.random.default_rng(0), 300)
+    alone = plan(knowledge, candidates, 10, separate=rivals)
+    with_data = plan(knowledge, candidates, 10, separate=rivals, measured=short.observations)
+    assert set(alone.stood_out.values()) == {0.0}
+    for name, sigma in with_data.stands_out.items():
+        assert 0.0 < with_data.stood_out[name] < sigma
+        assert sigma > alone.stands_out[name]
+
+
+def test_every_effect_of_the_library_can_be_planned_for(rig: Rig) -> None:
+    blank = Chain(rig, {"": Placement.identity()})
+    at = site(blank, np.zeros(len(blank)))
+    knowledge = Knowledge.of_rig(Chain(rig, {"": placement(at)}))
+    candidates = draw(knowledge, at, np.random.default_rng(0), 60)
+    needed: dict[str, set[str]] = {}
+    for name, family in library().items():
+        where = family.places(rig)[-1]
+        other = "angle_scale@theta5"
+        separate = (f"{name}@{where}",) if name == "angle_scale" else (f"{name}@{where}", other)
+        planned = plan(knowledge, candidates, 4, separate=separate)
+        assert all(np.isfinite(sigma) and sigma >= 0.0 for sigma in planned.stands_out.values()), name
+        needed[name] = set(planned.poses.conditions)
+    assert needed["backlash"] == {"theta8_dir"}
+    assert needed["latency"] == {f"{name}_rate" for name in rig.joint_names}
+    assert needed["clock_drift"] == {"time_s"} | needed["latency"]
+    assert needed["leak_down"] == {"dwell_s"}
+    assert needed["payload_change"] == {"payload_kg"}
+    assert needed["thermal_expansion"] == {"temperature_degC"}
+    assert needed["boom_droop"] == needed["prism_constant"] == set()
+
+
+def test_poses_that_need_a_slow_condition_are_measured_in_blocks(rig: Rig) -> None:
+    blank = Chain(rig, {"": Placement.identity()})
+    at = site(blank, np.zeros(len(blank)))
+    knowledge = Knowledge.of_rig(Chain(rig, {"": placement(at)}))
+    candidates = draw(knowledge, at, np.random.default_rng(0), 200, begin_s=500.0)
+    rivals = ("base_settlement@base", "leak_down@theta4", "angle_scale@theta4")
+    planned = plan(knowledge, candidates, 12, separate=rivals)
+    assert list(planned.stands_out) == list(rivals)
+    times, dwells = planned.poses.conditions["time_s"], planned.poses.conditions["dwell_s"]
+    assert (np.diff(times) >= 0.0).all()
+    assert {500.0 + ROUNDS_S[0], 500.0 + ROUNDS_S[-1]} <= set(times)
+    assert set(dwells) == set(DWELLS_S)
+
+
+def test_a_boom_on_the_move_has_not_stood(rig: Rig) -> None:
+    blank = Chain(rig, {"": Placement.identity()})
+    at = site(blank, np.zeros(len(blank)))
+    knowledge = Knowledge.of_rig(Chain(rig, {"": placement(at)}))
+    candidates = draw(knowledge, at, np.random.default_rng(0), 200)
+    planned = plan(knowledge, candidates, 12, separate=("latency@clock", "leak_down@theta4")).poses
+    moves = np.any([planned.conditions[f"{name}_rate"] for name in rig.joint_names], axis=0)
+    assert 0 < moves.sum() < 12
+    assert ((planned.conditions["dwell_s"] == 0.0) == moves).all()
+
+
+# -- experiments that are no poses -------------------------------------------------------------------------------------
+
+
+def by_kind(case: Measured, *effects: FittedEffect) -> dict[str, str]:
+    found = experiments(case.model, case.observations, effects, np.random.default_rng(0), poses=3)
+    return {experiment.kind: experiment.text for experiment in found}
+
+
+def of_plausible_size(case: Measured, effect: str) -> FittedEffect:
+    name, _, where = effect.partition("@")
+    knowledge = Knowledge.before(case.model, 0)
+    at = site(case.model.chain, case.model.values, setup=0)
+    poses = draw(knowledge, at, np.random.default_rng(1), 30)
+    situation = knowledge.situation(poses.readings, poses.conditions)
+    settings = library()[name].variants(situation, where)[0]
+    sigma = np.array([c.sigma for c in library()[name].coefficients(situation, where, settings)])
+    return Choice(name, where, settings).fitted(situation, sigma, 0.1 * sigma)
+
+
+@pytest.mark.parametrize(
+    ("rivals", "kind", "changed", "left"),
+    [
+        (("load_hysteresis@theta4", "backlash@theta4"), "payload", "load_hysteresis@theta4", "backlash@theta4"),
+        (("backlash@theta4", "encoder_harmonic@theta4"), "approach", "backlash@theta4", "encoder_harmonic@theta4"),
+        (("leak_down@theta4", "joint_compliance@theta4"), "dwell", "leak_down@theta4", "joint_compliance@theta4"),
+        (("latency@clock", "backlash@theta4"), "motion", "latency@clock", "backlash@theta4"),
+        (("thermal_expansion@boom", "station_scale@station"), "temperature", "thermal_expansion@boom", "station"),
+        (("base_settlement@base", "joint_compliance@theta4"), "repeat", "base_settlement@base", "joint_compliance"),
+        (
+            ("station_scale@station", "transducer_scale@L2"),
+            "control_points",
+            "station_scale@station",
+            "transducer_scale",
+        ),
+        (
+            ("joint_compliance@theta4", "joint_compliance@theta6"),
+            "prism",
+            "joint_compliance@theta4",
+            "compliance@theta6",
+        ),
+    ],
+)
+def test_experiments_follow_from_what_the_rivals_do(
+    short: Measured, rivals: tuple[str, str], kind: str, changed: str, left: str
+) -> None:
+    found = by_kind(short, *(of_plausible_size(short, rival) for rival in rivals))
+    assert kind in found
+    assert changed in found[kind]
+    assert left in found[kind].split(changed)[1]
+    assert library()[rivals[1].partition("@")[0]].revealed_by in found["procedure"]
+
+
+# -- forecast ----------------------------------------------------------------------------------------------------------
+
+
+def forecast_of(screen: Screen) -> dict[str, Forecast]:
+    return {f"{f.family}@{f.where}": f for f in forecasts(screen)}
+
+
+def test_a_forecast_tells_what_calibration_and_rivals_leave_of_an_effect(short: Measured) -> None:
+    found = forecast_of(short.screen(*PAIR, "backlash", "transducer_scale", "gravity_flip_play"))
+    assert all(0.0 <= f.visible <= 1.0 and 0.0 <= f.separation <= 1.0 for f in found.values())
+    # Half the poses come from either side, which no constant of the machine imitates.
+    assert found["backlash@theta4"].visible > 0.7
+    assert found["angle_scale@theta4"].visible < 0.3
+    assert found["angle_scale@theta4"].rival == "encoder_harmonic@theta4"
+    assert found["angle_scale@theta4"].separation < 0.1 < found["backlash@theta4"].separation
+    assert found["angle_scale@theta4"].nameable == np.inf
+    assert found["backlash@theta4"].nameable < 5e-3
+    assert found["backlash@theta4"].unit == "rad"
+
+
+def test_an_effect_of_the_forecast_size_stands_out_and_one_of_half_the_size_does_not(short: Measured) -> None:
+    screen = short.screen("backlash", *PAIR)
+    names = [str(p) for p in screen.places]
+    own = names.index("backlash@theta3")
+    size = forecast_of(screen)["backlash@theta3"].nameable
+    columns, sigma = screen.columns(own, 0), screen.places[own].additions[0].prior_sigma
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal((400, len(columns)))
+    needed = max(5.0, np.log(19.0) - screen.places[own].log_prior)
+    for share, above in ((1.0, True), (0.5, False)):
+        residuals = share * size * columns[:, 0] + noise
+        mean = np.mean([log_bayes_factor(columns, residual, sigma) for residual in residuals])
+        assert mean == pytest.approx(needed, rel=0.1) if above else mean < 0.5 * needed
