@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from calibration.channels import Cia404Analogue, Cia406Encoder, Cia406Linear
 from calibration.rig import Rig
@@ -22,7 +22,7 @@ from daemon.control import CommandError
 from daemon.joiner import ObservationJoiner, joint_inputs, signal_inputs
 from daemon.replay import captures_of, first_captures
 from daemon.rigs import RigSource
-from daemon.simulation import SimulatedRig, SimulationError
+from daemon.simulation import SimulatedRig, SimulationError, stops_of
 from drivers.can_channel import ChannelDecoder
 from drivers.can_decoder import CanDecoder
 from drivers.can_ports import Interface
@@ -56,6 +56,8 @@ class Parts:
         joiner: joins fixes with joints.
         aim: turns the station to a target, where something can.
         can_links: those that can be asked for active set-up.
+        visit: drives the boom to the rows of a pose plan, and tells how many stops are to come; None where only an
+            operator does.
         is_over: whether there is nothing more to come (a replay has ended).
     """
 
@@ -67,6 +69,7 @@ class Parts:
     decoders: Mapping[str, Callable[[], Decoder]]
     joiner: ObservationJoiner
     aim: Callable[[str], None] | None = None
+    visit: Callable[[Sequence[Mapping[str, Any]]], int] | None = None
     can_links: Sequence[CanLink] = ()
     is_over: Callable[[], bool] = _never
 
@@ -78,7 +81,14 @@ def live(config: Config, source: RigSource) -> Parts:
 
 @contextlib.contextmanager
 def simulated(
-    config: Config, source: RigSource, *, rate: float, seed: int, effects: tuple[str, ...], dwell_s: float
+    config: Config,
+    source: RigSource,
+    *,
+    rate: float,
+    seed: int,
+    effects: tuple[str, ...],
+    secret: Path | None = None,
+    dwell_s: float,
 ) -> Iterator[Parts]:
     """A simulated rig behind real protocols, in a process of its own, on the configured links' names.
 
@@ -86,6 +96,7 @@ def simulated(
         rate: simulated seconds per second.
         seed: which machine, which noise, which poses.
         effects: hidden effects, as the simulator spells them.
+        secret: where the simulator leaves the sealed envelope of one more, which it draws; none by default.
         dwell_s: how long the boom stands at each pose, simulated seconds.
     """
     now = SystemClock().now()
@@ -95,7 +106,7 @@ def simulated(
     if len(config.can) > 1 or len(config.station) > 1:
         raise ConfigError("a simulated rig has one CAN link and one station; configure one [[can]] and one [[station]]")
     rates = {joint.name: joint.max_rate for joint in source.rig.joints}
-    simulation = SimulatedRig(config.rig, rates, ports, clock, seed=seed, effects=effects)
+    simulation = SimulatedRig(config.rig, rates, ports, clock, seed=seed, effects=effects, secret=secret)
     try:
         nodes = [c.node for c in source.rig.channels if isinstance(c, Cia406Encoder | Cia406Linear | Cia404Analogue)]
         bus = {
@@ -114,6 +125,7 @@ def simulated(
         )
         rewired = config.model_copy(update={"can": can, "station": station})
         parts = _parts("simulated", rewired, source, clock, aim=partial(_aim, simulation), time_scale=rate)
+        parts = replace(parts, visit=partial(_visit, simulation, source.rig, dwell_s))
         simulation.drive_around(dwell_s)
         yield parts
     finally:
@@ -124,6 +136,13 @@ def _aim(simulation: SimulatedRig, target: str) -> None:
     try:
         simulation.aim(target)
     except SimulationError as error:
+        raise CommandError(str(error)) from error
+
+
+def _visit(simulation: SimulatedRig, rig: Rig, dwell_s: float, rows: Sequence[Mapping[str, Any]]) -> int:
+    try:
+        return simulation.visit(stops_of(rig, rows, dwell_s))
+    except ValueError as error:
         raise CommandError(str(error)) from error
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.errors import CalibrationError, ModelError
+from calibration.errors import CalibrationError, DataError, ModelError, UnsafeError
 from calibration.model import CalibratedModel
 from calibration.observations import Observations, parse_observations
 from calibration.rig import Rig
@@ -28,6 +28,9 @@ from daemon.order import Order
 from daemon.session_data import sessions_csv, setup_lines
 from daemon.store.errors import StoreError
 from daemon.store.reader import Reader
+from drivers.clock import NS_PER_S, SystemClock
+
+_LEAST_FIXES = 4  # three place a base and say nothing more
 
 Progress = Callable[[float, str], None]
 
@@ -63,43 +66,103 @@ def perform(order: Order, progress: Progress) -> dict[str, Any]:
     """Carry out an order with the functions that the offline commands use.
 
     Returns:
-        What the store keeps: `model` (its directory), `manifest_sha256`, `stage`, `metrics`, `sessions`; for a
-        report `report` (the file) and `evaluation` (the contract's object); for a comparison `comparison`.
+        What the store keeps: of a model that is made `model` (its directory), `manifest_sha256`, `stage`, `metrics`,
+        `sessions`, and for one of the gap workflow `gap` (the contract's object), `sentence` and `report` (the file);
+        for a report `report` (the file) and `evaluation` (the contract's object); for a comparison `comparison`; for
+        drift `drift`.
 
     Raises:
         CalibrationError: in a sentence, what is wrong with data or result.
     """
     prepare()
     work = {
-        "identification": _identify,
+        "gap": _find_gap,
         "residual": _train_residual,
         "report": _report,
         "comparison": _compare,
+        "drift": _check_drift,
     }[order.kind]
     return work(order, progress)
 
 
-def _identify(order: Order, progress: Progress) -> dict[str, Any]:
-    from calibration import pipeline
+def _find_gap(order: Order, progress: Progress) -> dict[str, Any]:
+    """Identify the kinematics, and what the simulation lacks; of the checks only those it was not found in judge it."""
+    from calibration.gap.workflow import find_gap
     from calibration.rig import parse_rig
+    from daemon.gap_files import MODEL, REPORT, gap_answer, write_gap
+    from daemon.report.from_model import provenance
+    from daemon.report.gap import gap_report
+    from daemon.report.gap_words import gap_headline
 
+    clock = SystemClock()
+    started_ns = clock.monotonic_ns()
     text = _rig_text(order)
     rig = parse_rig(text, "the sessions' rig")
-    observations = _observations(order, rig, order.session_ids)
+    observations = _placing(_observations(order, rig, order.session_ids))
+    held_out = _held_out(order, rig, observations)
+    models = Path(order.models_directory)
     # The job keeps its number when it runs again, so it goes on where the daemon was killed.
-    with FileCheckpoint(Path(order.models_directory) / f"{order.job_id:05d}.checkpoint") as checkpoint:
-        model = pipeline.identify(rig, text, observations, seed=order.seed, progress=progress, checkpoint=checkpoint)
-        stage = "effects" if model.effects else "geometric"
-        return _write(order, model, stage, observations, order.session_ids)
+    with FileCheckpoint(models / f"{order.job_id:05d}.checkpoint") as checkpoint:
+        found = find_gap(
+            rig,
+            text,
+            observations,
+            holdout=held_out,
+            seed=order.seed,
+            progress=progress,
+            checkpoint=checkpoint,
+        )
+        directory = models / f"{order.job_id:05d}-gap"
+        answer = gap_answer(found, (clock.monotonic_ns() - started_ns) / NS_PER_S)
+        checks = ", ".join(np.unique(held_out.session).tolist()) if held_out else "none"
+        sources = {"sessions": ", ".join(order.session_ids), "held-out sessions": checks}
+        sha256 = write_gap(directory, found, answer, gap_report(found, provenance(found.model, None, sources)))
+    made = _made(directory / MODEL, sha256, found.model, "effects" if found.effects else "geometric", observations)
+    return made | {
+        "sessions": list(order.session_ids),
+        "gap": found.as_dict(),
+        "sentence": gap_headline(found),
+        "report": str(directory / REPORT),
+    }
+
+
+def _placing(observations: Observations) -> Observations:
+    """The rows at set-ups with enough fixes to place a base beside what they tell of the machine: checks may have few.
+
+    All rows where no set-up has: what is wrong with them is for the calibration to say.
+    """
+    _, at, fixes = np.unique(observations.setup, return_inverse=True, return_counts=True)
+    enough = fixes[at] >= _LEAST_FIXES
+    return observations.select(enough) if enough.any() else observations
+
+
+def _held_out(order: Order, rig: Rig, training: Observations) -> Observations | None:
+    """What the checks hold at the set-ups of the training; None where that is nothing."""
+    if not order.held_out_ids:
+        return None
+    try:
+        checks = _observations(order, rig, order.held_out_ids)
+    except DataError as error:
+        print(f"the check sessions judge nothing: {error}", file=sys.stderr)  # the daemon's log
+        return None
+    return checks.select(np.isin(checks.setup, training.setup)) or None
+
+
+def _trained_on(order: Order, model: CalibratedModel) -> Observations:
+    """The training rows of a model: those at the set-ups that it was placed at."""
+    observations = _observations(order, model.rig, order.train_ids)
+    return observations.select(np.isin(observations.setup, list(model.placements)))
 
 
 def _train_residual(order: Order, progress: Progress) -> dict[str, Any]:
     from calibration import pipeline
 
     model = read_model(Path(str(order.model)), order.model_sha256)
-    observations = _observations(order, model.rig, order.train_ids)
+    observations = _trained_on(order, model)
     model = pipeline.train_residual(model, observations, seed=order.seed, progress=progress)
-    return _write(order, model, "hybrid", observations, order.train_ids)
+    directory = Path(order.models_directory) / f"{order.job_id:05d}-hybrid"
+    made = _made(directory, write_model(directory, model), model, "hybrid", observations)
+    return made | {"sessions": list(order.train_ids)}
 
 
 def _report(order: Order, progress: Progress) -> dict[str, Any]:
@@ -110,7 +173,7 @@ def _report(order: Order, progress: Progress) -> dict[str, Any]:
     progress(0.0, "evaluating")
     directory = Path(str(order.model))
     model = read_model(directory, order.model_sha256)
-    training = pipeline.evaluate(model, _observations(order, model.rig, order.train_ids))
+    training = pipeline.evaluate(model, _trained_on(order, model))
     held_out = None
     if order.session_ids:
         checks = _observations(order, model.rig, order.session_ids)
@@ -159,6 +222,29 @@ def _compare(order: Order, progress: Progress) -> dict[str, Any]:
     return result | {"comparison": about | compared | {"sentence": f"{note}{compared['sentence']}"}}
 
 
+def _check_drift(order: Order, progress: Progress) -> dict[str, Any]:
+    """The live model on check sessions that it was not trained on, one by one."""
+    from calibration.drift import check
+
+    checks: list[dict[str, Any]] = []
+    if order.session_ids:
+        live = read_model(Path(str(order.live_model)), order.live_sha256)
+        for done, name in enumerate(order.session_ids):
+            progress(done / len(order.session_ids), f"holding check session {name} against the live model")
+            try:
+                found = check(live, _observations(order, live.rig, (name,)))
+            except (DataError, UnsafeError) as error:
+                nothing = {"fixes": 0, "scores": [], "ratio": None, "reason": str(error)}
+                checks.append({"session": name, **nothing})
+                continue
+            fitted = (
+                f"the base at set-up {', '.join(found.refitted)} was fitted on these fixes" if found.refitted else ""
+            )
+            about = {"fixes": found.fixes, "scores": list(found.scores), "ratio": found.ratio, "reason": fitted}
+            checks.append({"session": name, **about})
+    return {"drift": {"live": order.live_id, "live_since": order.live_since, "checks": checks}}
+
+
 def _rig_text(order: Order) -> str:
     """The rig file of the newest session: the sessions carry what they were recorded with."""
     with Reader(Path(order.store)) as reader:
@@ -172,19 +258,17 @@ def _observations(order: Order, rig: Rig, session_ids: tuple[str, ...]) -> Obser
     return parse_observations(data, rig, f"sessions {', '.join(session_ids)}")
 
 
-def _write(
-    order: Order, model: CalibratedModel, stage: str, observations: Observations, session_ids: tuple[str, ...]
+def _made(
+    directory: Path, sha256: str, model: CalibratedModel, stage: str, observations: Observations
 ) -> dict[str, Any]:
+    """What the store keeps of a model that was trained on these observations."""
     from calibration import pipeline
 
-    directory = Path(order.models_directory) / f"{order.job_id:05d}-{stage}"
-    sha256 = write_model(directory, model)
     evaluation = pipeline.evaluate(model, observations)
     return {
         "model": str(directory),
         "manifest_sha256": sha256,
         "stage": stage,
-        "sessions": list(session_ids),
         "metrics": {"training": evaluation.stages(), "noise_mm": model.noise_mm},
     }
 

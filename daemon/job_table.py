@@ -11,6 +11,7 @@ from typing import Any
 
 from daemon.config import Config
 from daemon.control import REFUSED, CommandError
+from daemon.drift_table import DriftTable
 from daemon.model_table import ModelRow, ModelTable, trained_on
 from daemon.order import Order, Outcome, Progress
 from daemon.scheduler import CHECK, CHECKS, DueChain, JobFacts, JobKind, SessionFacts, State
@@ -36,15 +37,15 @@ _JOBS = """SELECT job.id, job.kind, job.session_id, job.state, job.attempts,
     FROM jobs AS job CROSS JOIN calibration_sessions AS session ON session.id = job.session_id
         LEFT JOIN jobs AS before ON before.id = job.depends_on
     WHERE job.state IN ('queued', 'running', 'interrupted') AND session.rig = ? ORDER BY job.id"""
-# Walks back from the newest session; the first that a job of this kind was queued through ends the walk.
+# Walks back from the newest session to one that a job of this kind was queued through, or that no longer matters.
 _COVERED = """SELECT session.rowid AS number FROM calibration_sessions AS session NOT INDEXED
-    WHERE session.rig = ?
+    WHERE session.rig = ? AND session.rowid > ?
         AND EXISTS (SELECT 1 FROM jobs WHERE jobs.through_session_id = session.id AND jobs.kind = ?)
     ORDER BY session.rowid DESC LIMIT 1"""
 _NEWEST_MODEL = """SELECT job.result_json FROM jobs AS job
     JOIN calibration_sessions AS session ON session.id = job.session_id
     WHERE job.state = 'done' AND job.kind = 'residual' AND session.rig = ? ORDER BY job.id DESC LIMIT 1"""
-_WORKED_ON = """SELECT id, kind FROM calibration_sessions WHERE rig = ? AND state = 'closed'
+_WORKED_ON = """SELECT rowid AS number, id, kind FROM calibration_sessions WHERE rig = ? AND state = 'closed'
         AND rowid <= (SELECT rowid FROM calibration_sessions WHERE id = ?)
     ORDER BY rowid"""
 _CHAIN = """WITH RECURSIVE chain(id) AS (VALUES (?) UNION SELECT jobs.id FROM jobs JOIN chain ON depends_on = chain.id)
@@ -65,16 +66,19 @@ class JobTable:
         self._rig = rig_name
         self._clock = clock
         self._models = ModelTable(store, rig_name, clock)
+        self._drift = DriftTable(store, rig_name, clock)
         self._cancelled: set[int] = set()  # running jobs that the operator wants to end
 
     # ---- what is there -----------------------------------------------------------------------------------------------
 
     def state(self) -> State:
         """What scheduling needs to know."""
+        run = self._drift.run()
+        back_to = {JobKind.GAP: 0, JobKind.REPORT: 0} | ({JobKind.DRIFT: run.after_session} if run else {})
         covered = {
             kind: rows[0]["number"]
-            for kind in (JobKind.IDENTIFICATION, JobKind.REPORT)
-            if (rows := self._store.rows(_COVERED, (self._rig, kind)))
+            for kind, after in back_to.items()
+            if (rows := self._store.rows(_COVERED, (self._rig, after, kind)))
         }
         return State(
             [
@@ -95,6 +99,8 @@ class JobTable:
             ],
             covered,
             has_model=bool(self._store.rows(_NEWEST_MODEL, (self._rig,))),
+            live_from=run.after_session if run else None,
+            drifted=self._drift.drifted(run) if run else None,
         )
 
     def all(self) -> list[dict[str, Any]]:
@@ -117,6 +123,13 @@ class JobTable:
         checks = tuple(s["id"] for s in sessions if s["kind"] == CHECK)
         if row["model_id"] is not None:
             return self._comparison(job, config, self._models.get(row["model_id"]), checks)
+        if job.kind is JobKind.GAP:
+            # Drifted checks trigger it to find the reason in them; after a training session they are held out.
+            if job.session_id in checks:
+                return self._order(job, config, tuple(s["id"] for s in sessions))
+            return self._order(job, config, training, held_out_ids=checks)
+        if job.kind is JobKind.DRIFT:
+            return self._drift_order(job, config, [(s["number"], s["id"]) for s in sessions if s["kind"] == CHECK])
         if row["depends_on"] is None:
             before = self._store.rows(_NEWEST_MODEL, (self._rig,))
         else:
@@ -124,16 +137,14 @@ class JobTable:
         result = json.loads(before[0]["result_json"]) if before else {}
         if job.kind is JobKind.COMPARISON:
             return self._comparison(job, config, self._models.at(result["model"]), checks)
-        return Order(
-            kind=job.kind.value,
-            job_id=job.id,
-            store=str(config.store_path),
-            models_directory=str(config.models_directory),
-            session_ids=checks if job.kind is JobKind.REPORT else training,
+        train_ids = tuple(result.get("sessions", training))
+        return self._order(
+            job,
+            config,
+            tuple(name for name in checks if name not in train_ids) if job.kind is JobKind.REPORT else training,
             model=result.get("model"),
             model_sha256=result.get("manifest_sha256"),
-            train_ids=tuple(result.get("sessions", training)),
-            seed=config.jobs.seed,
+            train_ids=train_ids,
         )
 
     def _comparison(self, job: JobFacts, config: Config, model: ModelRow, checks: tuple[str, ...]) -> Order:
@@ -142,19 +153,50 @@ class JobTable:
         if live is not None and live.id == model.id:
             live = None  # it is live already, and only the nominal model is left to compare it with
         seen = trained_on([model, live])
+        return self._order(
+            job,
+            config,
+            tuple(name for name in checks if name not in seen),
+            model=str(model.path),
+            model_sha256=model.manifest_sha256,
+            train_ids=model.sessions,
+            live=live,
+        )
+
+    def _drift_order(self, job: JobFacts, config: Config, checks: list[tuple[int, str]]) -> Order:
+        """The live model on the check sessions since it went live that it was not held against yet."""
+        run = self._drift.run()
+        if run is None:
+            return self._order(job, config, ())
+        live = self._models.get(run.model_id)
+        return self._order(job, config, self._drift.unseen(run, checks, live.sessions), live=live, live_since=run.since)
+
+    def _order(
+        self,
+        job: JobFacts,
+        config: Config,
+        session_ids: tuple[str, ...],
+        *,
+        model: str | None = None,
+        model_sha256: str | None = None,
+        train_ids: tuple[str, ...] = (),
+        live: ModelRow | None = None,
+        **more: Any,
+    ) -> Order:
         return Order(
             kind=job.kind.value,
             job_id=job.id,
             store=str(config.store_path),
             models_directory=str(config.models_directory),
-            session_ids=tuple(name for name in checks if name not in seen),
-            model=str(model.path),
-            model_sha256=model.manifest_sha256,
-            train_ids=model.sessions,
+            session_ids=session_ids,
+            model=model,
+            model_sha256=model_sha256,
+            train_ids=train_ids,
             seed=config.jobs.seed,
             live_model=str(live.path) if live else None,
             live_sha256=live.manifest_sha256 if live else None,
             live_id=live.id if live else None,
+            **more,
         )
 
     # ---- what the runner does ----------------------------------------------------------------------------------------
@@ -233,6 +275,8 @@ class JobTable:
                 self._models.add(job_id, outcome.result)
             if outcome.result is not None and "comparison" in outcome.result:
                 self._models.note_comparison(outcome.result["model"], outcome.result["comparison"])
+            if outcome.result is not None and "drift" in outcome.result:
+                self._drift.note(outcome.result["drift"])
             if outcome.state in {"failed", "cancelled"}:
                 for waiting in self._chain(job_id)[1:]:
                     if waiting["state"] in {"queued", "interrupted"}:

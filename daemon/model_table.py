@@ -200,7 +200,11 @@ class ModelTable:
                 self._store.update("models", {"id": replaced.id}, {"state": "retired"})
                 self._note(replaced.id, "retired", f"model {model.id} took its place", operator)
             self._store.update("models", {"id": model.id}, {"state": "live"})
-            self._note(model.id, "live", reason, operator, replaced.id if replaced else None)
+            (newest,) = self._store.rows(
+                "SELECT coalesce(max(rowid), 0) AS number FROM calibration_sessions WHERE rig = ?", (self._rig,)
+            )
+            found = {"replaced_id": replaced.id if replaced else None, "after_session": newest["number"]}
+            self._note(model.id, "live", reason, operator, **found)
 
     def note_zeros_checked(self, model: ModelRow, operator: str, through: int) -> None:
         """An operator has made sure that the joints' zeros are those that the live model was trained with.
@@ -214,8 +218,8 @@ class ModelTable:
         checked = {"zeros_checked_through": through}
         self._store.insert("model_states", row | checked | self._store.instant(self._clock.now()))
 
-    def _note(self, model_id: int, state: str, reason: str, operator: str = "", replaced_id: int | None = None) -> None:
-        row = {"model_id": model_id, "state": state, "operator": operator, "reason": reason, "replaced_id": replaced_id}
+    def _note(self, model_id: int, state: str, reason: str, operator: str = "", **more: int | None) -> None:
+        row: dict[str, Any] = {"model_id": model_id, "state": state, "operator": operator, "reason": reason, **more}
         self._store.insert("model_states", row | self._store.instant(self._clock.now()))
 
 

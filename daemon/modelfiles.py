@@ -40,9 +40,13 @@ def check_target(directory: Path) -> None:
     """Whether a model may be written to `directory`: nothing there, an empty directory, or a model to be replaced.
 
     Raises:
-        ModelError: something else is there that would be lost.
+        ModelError: something else is there that would be lost, or no directory can be made there.
     """
     if not directory.exists():
+        nearest = next(path for path in directory.resolve().parents if path.exists())
+        if not nearest.is_dir() or not os.access(nearest, os.W_OK):
+            reason = "may not be written to" if nearest.is_dir() else "is a file"
+            raise ModelError(f"{directory} cannot be made, as {nearest} {reason}; name another directory")
         return
     if not directory.is_dir():
         raise ModelError(f"{directory} is a file; name a directory for the model")

@@ -20,17 +20,19 @@ class Order:
     """What the daemon asks for.
 
     Attributes:
-        kind: identification, residual, report or comparison.
+        kind: gap, residual, report, comparison or drift.
         job_id: names the files that the job writes.
         store: the store, opened read-only.
         models_directory: where models go, a directory each.
-        session_ids: sessions to use: to train on (identification), to hold out (report, comparison).
+        session_ids: sessions to use: to train on (gap), to hold out (report, comparison, drift).
         model: the model directory to start from (residual, report, comparison).
         model_sha256: of its manifest: which model is meant, whatever has come to lie there since.
         train_ids: sessions that the model was trained on (report).
         seed: of every random choice.
-        live_model, live_sha256: directory and manifest of the live model, if there is one (comparison).
-        live_id: its number in the store (comparison).
+        live_model, live_sha256: directory and manifest of the live model, if there is one (comparison, drift).
+        live_id: its number in the store (comparison, drift).
+        live_since: number of the change by which it went live (drift).
+        held_out_ids: sessions that nothing is fitted to, to judge by (gap).
     """
 
     kind: str
@@ -45,6 +47,8 @@ class Order:
     live_model: str | None = None
     live_sha256: str | None = None
     live_id: int | None = None
+    live_since: int | None = None
+    held_out_ids: tuple[str, ...] = ()
 
     def to_line(self) -> bytes:
         """The line that the process reads."""
@@ -54,7 +58,7 @@ class Order:
     def from_line(cls, line: str) -> Order:
         """The order in a line that `to_line` made."""
         order = json.loads(line)
-        return cls(**order | {key: tuple(order[key]) for key in ("session_ids", "train_ids")})
+        return cls(**order | {key: tuple(order[key]) for key in ("session_ids", "train_ids", "held_out_ids")})
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,10 @@
 """Which jobs are due: a pure function of what the store holds and of the time. It starts nothing.
 
-A closed session triggers identification, then residual training, and of that model the report and the comparison with
-the live one, which do not wait for each other. A closed check session triggers report and comparison alone: its poses
-are never trained on. Work waits while a session is open: acquisition comes first.
+A closed session triggers the gap workflow, which identifies the kinematics and adds what the simulation lacks, then
+residual training, and of that model the report and the comparison with the live one, which do not wait for each other.
+A closed check session triggers report and comparison alone, its poses are not trained on, and the live model is held
+against it. Once the checks have drifted from the live model, the chain runs on all that was measured, checks included.
+Work waits while a session is open: acquisition comes first.
 
 What a job covers is decided by the order of sessions, never by time: a wall clock may be wrong for whole boots.
 """
@@ -22,14 +24,16 @@ SESSION_KINDS = ("single_joint", "multi_joint", "static_poses", CHECK)
 class JobKind(StrEnum):
     """What a job does."""
 
-    IDENTIFICATION = "identification"
+    GAP = "gap"
     RESIDUAL = "residual"
     REPORT = "report"
     COMPARISON = "comparison"
+    DRIFT = "drift"
 
 
 CHECKS = (JobKind.REPORT, JobKind.COMPARISON)
-CHAIN = (JobKind.IDENTIFICATION, JobKind.RESIDUAL, *CHECKS)
+CHAIN = (JobKind.GAP, JobKind.RESIDUAL, *CHECKS)
+DRIFT = (JobKind.DRIFT,)
 
 
 @dataclass(frozen=True)
@@ -84,12 +88,17 @@ class State:
         covered: kind of job -> number of the newest session that was closed when the newest job of the kind was
             queued: that job works on it and on all before it. No entry where there is no such job.
         has_model: a model exists that a check session could be held against.
+        live_from: number of the newest session when the live model went live; None without one. Checks after it count
+            for drift.
+        drifted: number and id of the check session with which the live model was found to have drifted; None before.
     """
 
     sessions: Sequence[SessionFacts]
     jobs: Sequence[JobFacts]
     covered: Mapping[JobKind, int]
     has_model: bool
+    live_from: int | None = None
+    drifted: tuple[int, str] | None = None
 
 
 @dataclass(frozen=True)
@@ -97,8 +106,8 @@ class DueChain:
     """Jobs to queue: those that train each to run after the one before it is done, CHECKS after the last of them.
 
     Attributes:
-        kinds: what to run, CHECKS last.
-        session_id: the session that triggers them.
+        kinds: what to run.
+        session_id: the session that triggers them; a check session triggers CHAIN because it has drifted.
         through_id: they work on the sessions closed up to and including this one.
     """
 
@@ -141,10 +150,14 @@ def due_jobs(
         return due
     training = [s for s in closed if s.kind != CHECK]
     checks = [s for s in closed if s.kind == CHECK]
-    if training and not _is_covered(training[-1], JobKind.IDENTIFICATION, state):
+    if training and not _is_covered(training[-1], JobKind.GAP, state):
         due.append(DueChain(CHAIN, training[-1].id, closed[-1].id))  # its report holds the model against the checks
+    elif state.drifted is not None and state.covered.get(JobKind.GAP, 0) < state.drifted[0]:
+        due.append(DueChain(CHAIN, state.drifted[1], closed[-1].id))
     elif checks and state.has_model and not _is_covered(checks[-1], JobKind.REPORT, state):
         due.append(DueChain(CHECKS, checks[-1].id, closed[-1].id))
+    if checks and _counts_for_drift(checks[-1], state) and not _is_covered(checks[-1], JobKind.DRIFT, state):
+        due.append(DueChain(DRIFT, checks[-1].id, closed[-1].id))
     return due
 
 
@@ -170,6 +183,10 @@ def _is_open(state: State) -> bool:
 def _is_covered(session: SessionFacts, kind: JobKind, state: State) -> bool:
     """Whether a job of this kind was queued after the session had been closed, and so works on it."""
     return kind in state.covered and state.covered[kind] >= session.number
+
+
+def _counts_for_drift(check: SessionFacts, state: State) -> bool:
+    return state.live_from is not None and check.number > state.live_from
 
 
 def _passed(since: Stamp | None, now: Stamp, seconds: float) -> bool:

@@ -14,6 +14,8 @@ from daemon.acquisition import Acquisition
 from daemon.composition import Parts
 from daemon.config import Config
 from daemon.control import FAILED, REFUSED, CommandError, ControlServer, Handler
+from daemon.drift_table import DriftTable
+from daemon.gap_status import GapStatus
 from daemon.jobs import JobRunner
 from daemon.live_model import LiveModel
 from daemon.live_tip import FRESH_S, LiveTip
@@ -72,6 +74,7 @@ class Daemon:
         self._sender = tip_sender(config, parts, self._tip)
         self._acquisition = Acquisition(parts.links, parts.decoders, store, parts.clock, on_records=self._on_records)
         self._jobs = JobRunner(store, config, parts.rig.name, parts.clock)
+        self._gap = GapStatus(store, parts.rig.name, DriftTable(store, parts.rig.name, parts.clock))
         self._models = ModelRegistry(models, parts.rig.name, self._live_model, compare=self._jobs.compare)
         self._control = ControlServer(config.socket_path, self._commands())
 
@@ -143,6 +146,7 @@ class Daemon:
             "model.compare": models.compare_command,
             "tip": self._tip.tip_command,
             "devices.configure": self._configure_devices,
+            **({} if self._parts.visit is None else {"simulation.visit": self._visit}),
         }
 
     def _status(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -154,11 +158,20 @@ class Daemon:
             "session": self._sessions.open_session(),
             "jobs": self._jobs.unfinished(),
             "models": self._models.status(),
+            "gap": self._gap.now(),
             "events": self._store.rows(
                 "SELECT device, utc_ns, kind, text FROM device_events ORDER BY id DESC LIMIT 12"
             ),
             "store": str(self._config.store_path),
         }
+
+    def _visit(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Where the simulated boom drives next: the rows of a pose plan; `left` tells how many stops are to come."""
+        rows = arguments.get("poses", [])
+        if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+            raise CommandError("poses: the rows of a plan, as `rigcal plan --json` prints them")
+        assert self._parts.visit is not None  # else there is no such command
+        return {"left": self._parts.visit(rows)}
 
     def _configure_devices(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Active set-up of CANopen devices: only when the operator says that the machine is parked."""

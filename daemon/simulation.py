@@ -12,15 +12,56 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from calibration.rig import Rig
 from drivers.clock import ScaledClock
 
 BOOM_SPEED = 0.45  # of the joints' greatest rates
+APPROACH = {"deg": 3.0, "mm": 50.0}  # from how far a joint comes to a pose that says from which side
 POSES_AHEAD = 30  # drawn at a time, and visited by the short way
+
+
+Stop = tuple[Mapping[str, float], float]  # joint -> deg or mm; how long to stand there, s
+
+
+def stops_of(rig: Rig, rows: Iterable[Mapping[str, Any]], dwell_s: float) -> list[Stop]:
+    """Where to drive for the rows of a pose plan.
+
+    Where a row says from which side a joint comes, the boom first goes to that side of the pose, without a stop.
+
+    Args:
+        rig: whose poses they are.
+        rows: as `rigcal plan` has them.
+        dwell_s: how long to stand at each, unless a row says longer.
+
+    Raises:
+        ValueError: a row without a number for each joint, or with one beyond its limits.
+    """
+    stops: list[Stop] = []
+    for row in rows:
+        try:
+            pose = {joint.name: float(row[joint.column]) for joint in rig.joints}
+            sides = {joint.name: float(row.get(f"{joint.name}_dir", 0.0)) for joint in rig.joints}
+            stand_s = max(dwell_s, float(row.get("dwell_s", 0.0)))
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"a pose has a number for each of {', '.join(j.column for j in rig.joints)}") from error
+        before = {
+            joint.name: min(
+                max(pose[joint.name] - sides[joint.name] * APPROACH[joint.unit], joint.limits[0]), joint.limits[1]
+            )
+            for joint in rig.joints
+        }
+        beyond = next((j for j in rig.joints if not j.limits[0] <= pose[j.name] <= j.limits[1]), None)
+        if beyond is not None:
+            raise ValueError(f"{beyond.name} = {pose[beyond.name]:g} {beyond.unit} is beyond its limits")
+        if before != pose:
+            stops.append((before, 0.0))
+        stops.append((pose, stand_s))
+    return stops
 
 
 class SimulationError(Exception):
@@ -37,6 +78,7 @@ class SimulatedRig:
         clock: shared with the process; its rate is the simulation's speed.
         seed: of the machine's imperfections, of all noise and of the poses.
         effects: hidden effects, as the simulator spells them.
+        secret: where the simulator leaves the sealed envelope of one more, which it draws; none by default.
     """
 
     def __init__(
@@ -48,6 +90,7 @@ class SimulatedRig:
         *,
         seed: int = 1,
         effects: tuple[str, ...] = (),
+        secret: Path | None = None,
     ) -> None:
         self.can_port = directory / "can"
         self.station_port = directory / "station"
@@ -61,9 +104,11 @@ class SimulatedRig:
         command = [sys.executable, "-m", "simulators", "--rig", rig, "--seed", str(seed), "--rate", str(clock.rate)]
         command += ["--origin", origin, "--can-port", str(self.can_port), "--station-port", str(self.station_port)]
         command += ["--bus-master", "host", "--signal-ms", "200", "--effects", ",".join(effects)]
+        command += [] if secret is None else ["--secret", str(secret)]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self._reader = threading.Thread(target=self._read, name="simulation", daemon=True)
         self._reader.start()
+        self._stops: deque[Stop] = deque()
         self._stopping = threading.Event()
         self._autopilot: threading.Thread | None = None
         self._expect("ready")
@@ -80,6 +125,11 @@ class SimulatedRig:
     def poses(self, number: int, seed: int) -> list[dict[str, float]]:
         """Random poses inside the joints' limits."""
         return list(self._do("poses", "poses", n=number, seed=seed)["poses"])
+
+    def visit(self, stops: Iterable[Stop]) -> int:
+        """Drive to these poses next, in this order; returns how many are still to come."""
+        self._stops.extend(stops)
+        return len(self._stops)
 
     def drive_around(self, dwell_s: float) -> None:
         """Keep moving from one random pose to the next, standing `dwell_s` at each, until closed."""
@@ -104,15 +154,21 @@ class SimulatedRig:
 
     def _drive(self, dwell_s: float) -> None:
         try:
-            here: dict[str, float] = {}
+            here: Mapping[str, float] = {}
             for seed in itertools.count(self._seed):
                 ahead = self.poses(POSES_AHEAD, seed)
                 while ahead:
-                    here = min(ahead, key=partial(self._way, here))
-                    ahead.remove(here)
+                    stand_s = dwell_s
+                    if self._stops:
+                        here, stand_s = self._stops[0]
+                    else:
+                        ahead.sort(key=partial(self._way, here), reverse=True)
+                        here = ahead.pop()
                     self.move(here)
-                    if self._clock.wait(self._stopping, dwell_s):
+                    if stand_s > 0.0 and self._clock.wait(self._stopping, stand_s):
                         return
+                    if self._stops and self._stops[0][0] is here:
+                        self._stops.popleft()
         except SimulationError:
             if not self._stopping.is_set():
                 raise

@@ -8,12 +8,15 @@ import click
 
 # Command -> where it is defined. Imported when used: status must not wait for what only calibration needs.
 COMMANDS = {
+    "bench": "bench",
     "calibrate": "offline",
     "compare": "compare",
     "config": "run",
     "demo": "demo",
     "devices": "operator",
+    "effects": "effects",
     "evaluate": "offline",
+    "gap": "gap",
     "inverse": "inverse",
     "jobs": "operator",
     "model": "model",

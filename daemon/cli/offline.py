@@ -73,7 +73,8 @@ class Stopwatch:
     default="auto",
     show_default=True,
     metavar="auto|none|FAMILY@WHERE,...",
-    help="Named physics to add to the kinematics.",
+    help="Named physics to add to the kinematics: `auto` what the data ask for, found as `rigcal gap` does; `rigcal "
+    "effects` lists the families and where they may be.",
 )
 @click.option(
     "--residual",

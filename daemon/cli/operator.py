@@ -11,6 +11,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from daemon.cli.gap_lines import gap_lines
 from daemon.cli.model import model_lines
 from daemon.cli.output import Command, json_option
 from daemon.cli.talk import ask, say, talks, utc
@@ -66,7 +67,7 @@ def _show_status(console: Console, status: dict[str, Any], *, frames: bool) -> N
         _show_session(console, status["session"])
     for job in status["jobs"]:
         say(console, _job_line(job))
-    for sentence in model_lines(status["models"]):
+    for sentence in (*model_lines(status["models"]), *gap_lines(status["gap"])):
         say(console, sentence)
     for event in reversed(status["events"]):
         say(console, f"{utc(event['utc_ns'])} {event['device']} {event['kind']}: {event['text']}")
@@ -180,7 +181,7 @@ def session_start(socket: Path | None, config: Path | None, as_json: bool, **abo
 @session.command(cls=Command, name="stop")
 @talks
 def session_stop(**where: Any) -> Any:
-    """Close the open session; identification, residual and report follow by themselves."""
+    """Close the open session; identification with missing effects, residual and report follow by themselves."""
 
     def show(console: Console, result: dict[str, Any]) -> None:
         _show_session(console, result)
@@ -283,7 +284,7 @@ def _advise(console: Console, advice: list[str]) -> None:
 
 @click.group()
 def jobs() -> None:
-    """Background jobs: identification, residual training, reports, comparisons."""
+    """Background jobs: gap workflow, residual training, reports, comparisons, drift of checks."""
 
 
 @jobs.command(cls=Command, name="list")

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
-import math
 import os
 import sys
 import traceback
@@ -18,6 +16,7 @@ from rich.console import Console
 from calibration.errors import DataError, ModelError, RigError, UnsafeError
 from daemon.config import ConfigError
 from daemon.control import CommandError
+from daemon.plain_json import json_line
 from drivers.errors import DescriptionError
 
 DONE, FAILED, WRONG_INPUT, REFUSED = 0, 1, 2, 3
@@ -110,17 +109,7 @@ def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def print_json(result: Mapping[str, Any]) -> None:
     """One JSON object on one line; numbers that JSON does not know (NaN, infinity) become null."""
-    click.echo(json.dumps(_plain(result), allow_nan=False))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return value
+    click.echo(json_line(result))
 
 
 @contextlib.contextmanager

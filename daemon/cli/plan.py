@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from calibration.design.planning import PosePlan, PoseRow
 
 _MOST_POSES = 1000
+_MOST_EFFECTS = 3
 _WIDEST = 1000
 _LIST_SEPARATOR = " "
 
@@ -43,8 +44,8 @@ _LIST_SEPARATOR = " "
 )
 @click.option(
     "--separate",
-    metavar="FAMILY@WHERE,FAMILY@WHERE",
-    help="Tell these two effects apart, e.g. joint_compliance@theta4,encoder_harmonic@theta4.",
+    metavar="FAMILY@WHERE,FAMILY@WHERE[,...]",
+    help="Tell these effects apart, two or three, e.g. joint_compliance@theta4,encoder_harmonic@theta4.",
 )
 @click.option("--poses", type=click.IntRange(1, _MOST_POSES), required=True, metavar="N", help="How many poses.")
 @click.option(
@@ -85,14 +86,15 @@ def plan(
 
     They are inside the joint limits, in view of the station, ordered for short motion, and chosen so that the rig's
     parameters come out best determined; with --model so that the model's expected error over the work volume falls
-    most; with --separate so that two effects can be told apart.
+    most; with --separate so that two or three effects can be told apart. Where these need it, a pose also says from
+    which side to come, how long to stand, what to carry, whether to measure on the move, or when.
     """
     prepare()
     from calibration.design.planning import plan_poses
     from daemon.modelfiles import read_model
 
     source = load_rig(rig)
-    pair = _effects(separate, source.rig)
+    effects = _effects(separate, source.rig)
     place = _station(station)
     if floor_mm is not None and not np.isfinite(floor_mm):
         raise click.BadParameter(f"{floor_mm} is no height in mm", param_hint="--floor")
@@ -108,7 +110,7 @@ def plan(
             station_mm=place,
             setup=setup,
             floor_mm=floor_mm,
-            separate=pair,
+            separate=effects,
             progress=progress,
         )
     result = planned.as_dict()
@@ -121,7 +123,7 @@ def plan(
 
 
 def as_csv(rows: Sequence[PoseRow]) -> str:
-    """The poses as a table: `pose`, a column for each joint, `<joint>_dir` where it matters, `prisms` by spaces."""
+    """The poses as a table: `pose`, a column for each joint and for each condition that matters, `prisms` by spaces."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0].as_dict()), lineterminator="\n")
     writer.writeheader()
@@ -129,18 +131,19 @@ def as_csv(rows: Sequence[PoseRow]) -> str:
     return text.getvalue()
 
 
-def _effects(text: str | None, rig: Rig) -> tuple[str, str] | None:
+def _effects(text: str | None, rig: Rig) -> tuple[str, ...]:
     from calibration.effects.library import parse_effects
 
     if text is None:
-        return None
+        return ()
     try:
         found = [f"{family}@{where}" for family, where in parse_effects(text, rig)]
     except ValueError as error:
         raise click.BadParameter(str(error), param_hint="--separate") from error
-    if len(found) != 2:
-        raise click.BadParameter(f"{text!r} is not two effects, as FAMILY@WHERE,FAMILY@WHERE", param_hint="--separate")
-    return found[0], found[1]
+    if not 2 <= len(found) <= _MOST_EFFECTS:
+        wanted = "two or three effects, as FAMILY@WHERE,FAMILY@WHERE"
+        raise click.BadParameter(f"{text!r} is not {wanted}", param_hint="--separate")
+    return tuple(found)
 
 
 def _station(text: str | None) -> np.ndarray[Any, np.dtype[np.float64]] | None:
@@ -165,14 +168,14 @@ def _show(console: Console, planned: PosePlan, result: Mapping[str, Any]) -> Non
         padding=(0, 1, 0, 0),
     )
     first = planned.rows[0]
-    headings = ["pose", *(units[c].name for c in first.joints), *(c.replace("_dir", " from") for c in first.sides)]
+    headings = ["pose", *(units[c].name for c in first.joints), *(c.replace("_dir", " from") for c in first.conditions)]
     for heading in headings:
         table.add_column(heading, justify="right", no_wrap=True)
     table.add_column("prisms", no_wrap=True)
     for row in planned.rows:
         values = [f"{v:.{1 if units[c].kind == 'revolute' else 0}f}" for c, v in row.joints.items()]
-        sides = ["below" if side == 1 else "above" for side in row.sides.values()]
-        table.add_row(str(row.pose), *values, *sides, _LIST_SEPARATOR.join(row.prisms))
+        conditions = [_condition(name, value) for name, value in row.conditions.items()]
+        table.add_row(str(row.pose), *values, *conditions, _LIST_SEPARATOR.join(row.prisms))
     # A number that is cut short is no number: on a narrow terminal the lines wrap.
     needed = Measurement.get(console, console.options.update(max_width=_WIDEST), table).maximum
     Console(width=max(needed, console.width)).print(table)
@@ -202,6 +205,12 @@ def _show(console: Console, planned: PosePlan, result: Mapping[str, Any]) -> Non
             say(console, f"  - {sentence}")
     if "out" in result:
         say(console, f"Poses: {result['out']}")
+
+
+def _condition(name: str, value: float) -> str:
+    if name.endswith("_dir"):
+        return "below" if value == 1 else "above"
+    return f"{value:g}"
 
 
 COMMANDS = {"plan": plan}

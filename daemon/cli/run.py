@@ -57,6 +57,12 @@ _DWELL = click.FloatRange(1, 600)
 @click.option("--rate", type=_RATE, default=1.0, show_default=True, help="Speed of the simulation or replay.")
 @click.option("--seed", type=int, default=1, show_default=True, help="Which simulated machine.")
 @click.option("--effect", "effects", multiple=True, help="A hidden effect of the simulated machine; may be repeated.")
+@click.option(
+    "--secret",
+    type=click.Path(file_okay=False, path_type=Path),
+    metavar="DIR",
+    help="Hide one more effect, which the simulated machine draws and seals in an envelope there.",
+)
 @click.option("--dwell", "dwell_s", type=_DWELL, default=4.0, show_default=True, help="Simulated stand at a pose, s.")
 @click.option("-v", "--verbose", is_flag=True, help="Log more.")
 @json_option
@@ -66,6 +72,7 @@ def run(
     rate: float,
     seed: int,
     effects: tuple[str, ...],
+    secret: Path | None,
     dwell_s: float,
     *,
     sim: bool,
@@ -91,7 +98,7 @@ def run(
         # The store first: it is what keeps a second daemon from touching anything of the first one's.
         store = stack.enter_context(contextlib.closing(Store(settings.store_path)))
         if sim:
-            rig = simulated(settings, source, rate=rate, seed=seed, effects=effects, dwell_s=dwell_s)
+            rig = simulated(settings, source, rate=rate, seed=seed, effects=effects, secret=secret, dwell_s=dwell_s)
             parts = stack.enter_context(rig)
         elif is_replay:
             parts = replayed(settings, source, files, rate)

@@ -252,7 +252,14 @@ def _effects(report: ReportInput) -> str:
         more = len(effect.coefficients) - _COEFFICIENTS_SHOWN
         if more > 0:
             rows.append([*head, f"and {more} more, which bend its curve", "", ""])
-    header = ["effect", "where", "changes the joint by up to", "coefficient", "value", "95 % interval"]
+    header = [
+        "effect",
+        "where",
+        "changes the joint, or moves the prism, by up to",
+        "coefficient",
+        "value",
+        "95 % interval",
+    ]
     return section(
         "Named effects",
         paragraph(

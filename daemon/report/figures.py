@@ -23,11 +23,13 @@ _DOTS_MAX = 4000
 _BEFORE_AND_AFTER: tuple[tuple[Stage, str, float], ...] = (("nominal", BEFORE, -0.2), ("hybrid", AFTER, 0.2))
 
 
-def _norms(errors_mm: Floats) -> Floats:
+def sizes_mm(errors_mm: Floats) -> Floats:
+    """(n,) lengths of (n, 3) errors."""
     return np.asarray(np.linalg.norm(errors_mm, axis=1))
 
 
-def _scatter(axes: Axes, x: Floats, y: Floats, colour: str, *, size: float = 7.0, alpha: float = 0.55) -> None:
+def scatter(axes: Axes, x: Floats, y: Floats, colour: str, *, size: float = 7.0, alpha: float = 0.55) -> None:
+    """Dots without edges."""
     # Many dots are drawn as a picture inside the SVG, a few as shapes.
     axes.scatter(x, y, s=size, c=colour, alpha=alpha, linewidths=0, rasterized=len(x) > 200)
 
@@ -39,7 +41,7 @@ def draw_errors_by_prism(axes: Axes, report: ReportInput) -> None:
     for place, prism in enumerate(table.prisms):
         rows = table.prism == prism
         for stage, colour, shift in _BEFORE_AND_AFTER:
-            norms = np.maximum(_norms(table.errors_mm[stage][rows]), _FLOOR_MM)
+            norms = np.maximum(sizes_mm(table.errors_mm[stage][rows]), _FLOOR_MM)
             _strip(axes, norms, place + shift, colour)
         labels.append(f"{prism}\n{int(rows.sum())} fixes")
     plain_log_axis(axes)
@@ -60,7 +62,7 @@ def _strip(axes: Axes, norms: Floats, centre: float, colour: str) -> None:
     spread = (
         np.arange(len(logs)) * 0.618034 + 0.5
     ) % 1.0 * 2.0 - 1.0  # golden-ratio steps: even, and the same on every run
-    _scatter(axes, centre + spread * widths[which], norms[order], colour, size=6, alpha=0.5)
+    scatter(axes, centre + spread * widths[which], norms[order], colour, size=6, alpha=0.5)
     rms = float(np.sqrt(np.mean(norms**2)))
     axes.plot([centre - 0.18, centre + 0.18], [rms, rms], color=INK, linewidth=1.6, solid_capstyle="butt")
     axes.annotate(number(rms), (centre + 0.19, rms), va="center", ha="left", fontsize=8, fontweight="bold")
@@ -73,8 +75,8 @@ def errors_by_prism(report: ReportInput) -> Figure:
     draw_errors_by_prism(axes, report)
     figure.legend(
         handles=[
-            _key(BEFORE, "before: drawings (nominal)"),
-            _key(AFTER, "after: calibrated (hybrid)"),
+            key(BEFORE, "before: drawings (nominal)"),
+            key(AFTER, "after: calibrated (hybrid)"),
             _line_key("root mean square", "-", 1.6),
             _line_key("what the instruments' noise explains", "--", 1.0),
         ],
@@ -84,7 +86,8 @@ def errors_by_prism(report: ReportInput) -> Figure:
     return figure
 
 
-def _key(colour: str, label: str) -> Line2D:
+def key(colour: str, label: str) -> Line2D:
+    """A dot for a legend."""
     from matplotlib.lines import Line2D
 
     return Line2D([], [], marker="o", linestyle="", color=colour, markersize=5, label=label)
@@ -102,7 +105,7 @@ def residual_by_joint(report: ReportInput) -> Figure:
     stages: list[tuple[Stage, str, str]] = [("geometric", MIDDLE, "geometric")]
     if not np.array_equal(table.errors_mm["geometric"], table.errors_mm["hybrid"]):
         stages.append(("hybrid", AFTER, "hybrid"))
-    limit = max(_robust_reach(table.errors_mm[stage]) for stage, _, _ in stages)
+    limit = max(robust_reach(table.errors_mm[stage]) for stage, _, _ in stages)
     joints = [joint for joint in report.joints if joint.name in table.joints]
     figure = new_figure(0.75 + 1.25 * len(joints))
     grid = figure.subplots(len(joints), 3, sharey=True, squeeze=False)
@@ -112,9 +115,9 @@ def residual_by_joint(report: ReportInput) -> Figure:
             axes = grid[line, column]
             for stage, colour, _ in stages:
                 errors = table.errors_mm[stage][:, column]
-                _scatter(axes, values, np.clip(errors, -limit, limit), colour, size=7, alpha=0.35)
+                scatter(axes, values, np.clip(errors, -limit, limit), colour, size=7, alpha=0.35)
             for stage, colour, _ in stages:
-                line_xy = _running_median(values, table.errors_mm[stage][:, column])
+                line_xy = running_median(values, table.errors_mm[stage][:, column])
                 axes.plot(*line_xy, color="white", linewidth=3.2)
                 axes.plot(*line_xy, color=colour, linewidth=1.6)
             axes.axhline(0, color=SOFT, linewidth=0.7)
@@ -124,17 +127,19 @@ def residual_by_joint(report: ReportInput) -> Figure:
             if column == 0:
                 axes.set_ylabel("mm")
             axes.set_xlabel(f"{joint.name}, {joint.unit}", labelpad=1, color=INK)
-    figure.legend(handles=[_key(colour, label) for _, colour, label in stages], loc="outside upper left", ncols=2)
+    figure.legend(handles=[key(colour, label) for _, colour, label in stages], loc="outside upper left", ncols=2)
     return figure
 
 
-def _robust_reach(errors_mm: Floats) -> float:
+def robust_reach(errors_mm: Floats) -> float:
+    """How far an axis of errors goes."""
     # Five standard deviations of the bulk: a few gross errors must not flatten everything else.
     reach = 5 * 1.4826 * float(np.median(np.abs(errors_mm)))
     return max(min(reach, 1.05 * float(np.max(np.abs(errors_mm)))), _FLOOR_MM)
 
 
-def _running_median(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+def running_median(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """Places along x, rising, and the median of y about each."""
     # Medians of groups with equally many fixes; a joint that did not move has one.
     order = np.argsort(x, kind="stable")
     groups = np.array_split(order, max(1, min(40, len(x) // 12)))
@@ -198,9 +203,9 @@ def _sets(report: ReportInput) -> list[tuple[ErrorTable, str, float]]:
 
 
 def _set_keys(report: ReportInput) -> list[Line2D]:
-    keys = [_key(AFTER, f"fitted ({len(report.training)} fixes)")]
+    keys = [key(AFTER, f"fitted ({len(report.training)} fixes)")]
     if report.held_out is not None:
-        keys.append(_key(MIDDLE, f"held out ({len(report.held_out)} fixes)"))
+        keys.append(key(MIDDLE, f"held out ({len(report.held_out)} fixes)"))
     return keys
 
 
@@ -208,23 +213,27 @@ def workspace(report: ReportInput) -> Figure:
     """Where the prisms were: plan and side view, in the base frame."""
     figure = new_figure(4.3)
     plan, side = figure.subplots(1, 2)
-    forward = _forward(report)
+    forward = forward_axis(report.training.position_mm)
     for table, colour, _ in reversed(_sets(report)):
         x, y, z = table.position_mm.T / 1000.0
-        _scatter(plan, x, y, colour, size=8)
-        _scatter(side, (x, y)[forward], z, colour, size=8)
-    _views(plan, side, forward)
+        scatter(plan, x, y, colour, size=8)
+        scatter(side, (x, y)[forward], z, colour, size=8)
+    views(plan, side, forward)
     figure.legend(handles=_set_keys(report), loc="outside upper left", ncols=2)
     return figure
 
 
-def _forward(report: ReportInput) -> int:
-    # A machine reaches forward along x (0) or y (1); seen from the side that direction runs across the page.
-    x, y, _ = np.abs(np.median(report.training.position_mm, axis=0))
+def forward_axis(position_mm: Floats) -> int:
+    """Whether a machine with its prisms at (n, 3), base frame, reaches forward along x (0) or y (1).
+
+    Seen from the side that direction runs across the page.
+    """
+    x, y, _ = np.abs(np.median(position_mm, axis=0))
     return int(y > x)
 
 
-def _views(plan: Axes, side: Axes, forward: int) -> None:
+def views(plan: Axes, side: Axes, forward: int) -> None:
+    """Titles, labels and the base of a plan and a side view, m."""
     for axes, title, horizontal, vertical in ((plan, "Plan view", "x", "y"), (side, "Side view", "xy"[forward], "z")):
         axes.set_title(title)
         axes.set_xlabel(f"{horizontal}, m")
@@ -238,14 +247,14 @@ def draw_error_map(figure: Figure | SubFigure, report: ReportInput) -> None:
     from matplotlib.colors import Normalize
 
     table = report.judged
-    norms = _norms(table.errors_mm["hybrid"])
+    norms = sizes_mm(table.errors_mm["hybrid"])
     order = np.argsort(norms, kind="stable")[-_DOTS_MAX:]  # the largest on top
     top = min(float(norms.max()), 3 * float(np.median(norms)))  # gross errors must not flatten the rest
     scale = Normalize(0.0, max(top, _FLOOR_MM))
     x, y, z = table.position_mm[order].T / 1000.0
     plan, side = figure.subplots(1, 2)
 
-    forward = _forward(report)
+    forward = forward_axis(report.training.position_mm)
 
     def dots(axes: Axes, horizontal: Floats, vertical: Floats) -> PathCollection:
         return axes.scatter(
@@ -263,7 +272,7 @@ def draw_error_map(figure: Figure | SubFigure, report: ReportInput) -> None:
     bar = figure.colorbar(dots(side, (x, y)[forward], z), ax=[plan, side], shrink=0.85, pad=0.01, extend="max")
     bar.set_label("error left, mm")
     bar.outline.set_visible(False)
-    _views(plan, side, forward)
+    views(plan, side, forward)
 
 
 def error_map(report: ReportInput) -> Figure:

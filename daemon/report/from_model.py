@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np
 
-from calibration.effects.fitted import FittedCoefficient
+from calibration.effects.base import FittedCoefficient
+from calibration.effects.fitted import AppliedEffects
 from calibration.identification.samples import joint_rates, reading_covariance, station_covariance
 from calibration.model import CalibratedModel
 from calibration.observations import Observations
@@ -25,6 +25,7 @@ from daemon.report.inputs import (
     ReportInput,
     SetupLine,
 )
+from daemon.report.units import readable_unit
 from drivers.clock import NS_PER_S
 
 _LIBRARIES = ("rigcal", "numpy", "scipy", "numba", "lightgbm")
@@ -75,7 +76,7 @@ def report_input(
         outliers=list(_outliers(training)),
         warnings=judged.warnings,
         ignored_columns=judged.observations.ignored_columns,
-        provenance=_provenance(model, made_utc_ns, sources or {}),
+        provenance=provenance(model, made_utc_ns, sources or {}),
         setups=setups,
         effects=list(_effects(training)),
         effects_reason=model.effects_reason,
@@ -122,21 +123,28 @@ def _parameters(model: CalibratedModel) -> Iterator[ParameterLine]:
 
 def _effects(training: Evaluation) -> Iterator[EffectLine]:
     model, observations = training.model, training.observations
+    situation = model.predictor.situation(observations)
     for effect in model.effects:
-        alone = replace(model, effects=(effect,)).corrected(observations).joints[effect.where]
+        alone = AppliedEffects((effect,), model.chain)
+        columns = alone.columns(situation)
+        shifted_mm = alone.shifted_mm(columns)
+        if shifted_mm is None:
+            change, unit = np.abs(alone.change(columns)).max(), model.rig.joint(effect.where).unit
+        else:
+            change, unit = np.linalg.norm(shifted_mm, axis=1).max(), "mm"
         yield EffectLine(
             family=effect.family,
             where=effect.where,
-            change=float(np.abs(alone - observations.joints[effect.where]).max()),
-            unit=model.rig.joint(effect.where).unit,
-            coefficients=[_readable(c) for c in effect.coefficients],
+            change=float(change),
+            unit=unit,
+            coefficients=[_readable(c) for c in effect.reported],
         )
 
 
 def _readable(coefficient: FittedCoefficient) -> tuple[str, float, float, str]:
     """Name, value, standard error and unit, without long rows of zeros."""
     suffix, scale, unit = _SMALL_UNITS.get(
-        coefficient.unit, ("", 1.0, "" if coefficient.unit == "1" else coefficient.unit)
+        coefficient.unit, ("", *readable_unit(coefficient.unit, abs(coefficient.value)))
     )
     name = coefficient.name.removesuffix(suffix)
     return name, coefficient.value * scale, coefficient.standard_error * scale, unit
@@ -152,7 +160,8 @@ def _outliers(training: Evaluation) -> Iterator[OutlierLine]:
         )
 
 
-def _provenance(model: CalibratedModel, made_utc_ns: int | None, sources: Mapping[str, str]) -> dict[str, str]:
+def provenance(model: CalibratedModel, made_utc_ns: int | None, sources: Mapping[str, str]) -> dict[str, str]:
+    """Label -> text: when, from what and by which versions; `sources` are further lines, before those of the model."""
     lines = {"rig": model.rig.name, **sources}
     if made_utc_ns is not None:
         made = datetime.fromtimestamp(made_utc_ns // NS_PER_S, UTC)

@@ -110,7 +110,8 @@ class EffectLine:
 
     Attributes:
         family, where: as the library spells them.
-        change, unit: by how much it changes the joint at most, over the rows it was fitted to, `deg` or `mm`.
+        change, unit: by how much it changes the joint's value, `deg` or `mm`, at most over the rows it was fitted to;
+            by how much it moves the prism, `mm`, where it is at no joint.
         coefficients: of each its name, value, standard deviation and unit.
     """
 

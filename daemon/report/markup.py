@@ -38,6 +38,7 @@ caption { text-align: left; color: var(--soft); font-size: .9rem; padding-bottom
 th, td { padding: .34rem .9rem .34rem 0; text-align: right; border-bottom: 1px solid var(--line); vertical-align: top; }
 th { font-weight: 600; color: var(--soft); font-size: .86rem; }
 th:first-child, td:first-child, td.text, th.text { text-align: left; }
+td:not(.text) { white-space: nowrap; }
 td.text { font-variant-numeric: normal; overflow-wrap: anywhere; }
 tr.best td { font-weight: 650; color: var(--blue); }
 tr.flag td:last-child { color: var(--warn); font-weight: 600; }

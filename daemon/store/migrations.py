@@ -186,6 +186,27 @@ def m006_models_go_live(db: Database) -> None:
     )
 
 
+@MIGRATIONS()
+def m007_checks_show_drift(db: Database) -> None:
+    """Every check session held against the live model, and how its sums of errors stand after it."""
+    _create(
+        db,
+        # Number of the rig's newest session when a model went live: checks after it count. NULL in other changes, and
+        # in those from before this migration.
+        "ALTER TABLE model_states ADD COLUMN after_session INTEGER",
+        # live_since: the change by which the model went live; with each new one the sums begin anew. ratio: RMS of the
+        # errors over their predicted sigma, NULL where the session could not be used, as reason says. upper, lower: as
+        # calibration.cusum has them.
+        f"""CREATE TABLE drift_checks (id INTEGER PRIMARY KEY, live_since INTEGER NOT NULL REFERENCES model_states(id),
+            session_id TEXT NOT NULL REFERENCES calibration_sessions(id), {_instant()}, fixes INTEGER NOT NULL,
+            standstills INTEGER NOT NULL, ratio REAL, reason TEXT NOT NULL DEFAULT '', upper REAL NOT NULL,
+            lower REAL NOT NULL, {_one_of("alarm", "none", "worse", "better")},
+            UNIQUE (live_since, session_id)) STRICT""",
+        # Identification is part of the gap workflow now; what has not run yet, or may be retried, runs as that.
+        "UPDATE jobs SET kind = 'gap' WHERE kind = 'identification'",
+    )
+
+
 def unknown_migrations(db: Database) -> list[str]:
     """Migrations that `db` has and this program does not know: it was made by a newer one."""
     empty = Database(memory=True)

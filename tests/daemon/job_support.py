@@ -24,7 +24,8 @@ DEADLINE_S = 180.0
 START = Stamp(1_700_000_000 * NS_PER_S, 1000 * NS_PER_S, "boot-a")
 LABELS = {"prism", "setup", "session", "pose", "time_s", "dwell_s", "x_mm", "y_mm", "z_mm"}
 
-# Writes down each order, then does what the file `plan.json` says for the order's kind.
+# Writes down each order, then does what the file `plan.json` says for the order's kind; `scores 1 2` for a drift job is
+# done as well, with a check of two standstills that score 1 and 2.
 SCRIPT = """
 import json, os, pathlib, subprocess, sys, time
 directory = pathlib.Path(sys.argv[1])
@@ -32,13 +33,21 @@ order = json.loads(sys.stdin.readline())
 with (directory / "orders.jsonl").open("a") as file:
     file.write(json.dumps(order) + "\\n")
 say = lambda message: print(json.dumps(message), flush=True)
-result = {"model": str(directory / str(order["job_id"])), "sessions": order["session_ids"]}
+sessions = order["train_ids"] if order["kind"] == "residual" else order["session_ids"]
+result = {"model": str(directory / str(order["job_id"])), "sessions": sessions}
+what = json.loads((directory / "plan.json").read_text()).get(order["kind"], "done")
 if order["kind"] in ("report", "comparison"):
     result |= {"model": order["model"]}
     result |= {"comparison": {"live": order["live_id"], "is_better": True}} if order["kind"] == "comparison" else {}
-else:
+if order["kind"] == "gap":
+    result |= {"gap": {"verdict": "none", "effects": [], "experiments": []}, "sentence": "they agree", "report": "r"}
+if order["kind"] == "drift":
+    scores = [float(word) for word in what.split()[1:]] or [0.0]
+    check = {"fixes": 8, "scores": scores, "ratio": 1.0, "reason": ""}
+    checks = [{"session": name, **check} for name in order["session_ids"]]
+    result = {"drift": {"live": order["live_id"], "live_since": order["live_since"], "checks": checks}}
+if order["kind"] in ("gap", "residual"):
     result |= {"manifest_sha256": "ab" * 32, "stage": "geometric", "metrics": {"noise_mm": 1.5}}
-what = json.loads((directory / "plan.json").read_text()).get(order["kind"], "done")
 say({"progress": 0.25, "message": what})
 if what == "hang":
     sys.stdin.read()
@@ -122,9 +131,10 @@ class JobRig:
             self.store.insert("station_setups", {**setup, **self.store.instant(self.clock.now(), "created_")})
         self.store.update("calibration_sessions", {"id": name}, {"setup_id": "S1"})
         truth, seed = RigTruth(SOURCE.rig, 1), 20 + kind.count(CHECK)
-        self._observations(name, simulate_observations(truth, poses, seed, setup="S1", prisms=prisms))
+        self.observed(name, simulate_observations(truth, poses, seed, setup="S1", prisms=prisms))
 
-    def _observations(self, session: str, data: SimulatedObservations) -> None:
+    def observed(self, session: str, data: SimulatedObservations) -> None:
+        """Observations of a session."""
         columns = {name: values.tolist() for name, values in data.columns.items()}
         numeric = [name for name in columns if name not in LABELS]
         with self.store.transaction():

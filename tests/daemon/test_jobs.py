@@ -37,9 +37,9 @@ def rig(tmp_path: Path) -> Iterator[JobRig]:
 
 
 def table(rig: JobRig) -> JobTable:
-    """The table, with a chain of three queued for one session, and nobody to run it."""
+    """The table, with a chain queued for one session, and nobody to run it."""
     rig.session("a")
-    rig.plan(identification="hang")
+    rig.plan(gap="hang")
     rig.start()
     rig.running(1)
     rig.stop()
@@ -62,7 +62,7 @@ def test_a_chain_runs_in_order_and_leaves_its_models_and_report(rig: JobRig) -> 
     rig.start(real=True)
     rig.wait_for("done", "done", "done", "done")
     jobs = rig.jobs()
-    assert [job["kind"] for job in jobs] == ["identification", "residual", "report", "comparison"]
+    assert [job["kind"] for job in jobs] == ["gap", "residual", "report", "comparison"]
     assert all(job["progress"] == 1.0 and job["pid"] is None and job["attempts"] == 1 for job in jobs)
     assert all(a["ended_monotonic_ns"] <= b["started_monotonic_ns"] for a, b in itertools.pairwise(jobs))
     models = rig.store.rows("SELECT * FROM models ORDER BY id")
@@ -91,7 +91,7 @@ def test_a_job_goes_on_from_the_checkpoint_of_its_number_and_leaves_none(rig: Jo
     checkpoint = rig.config.models_directory / "00001.checkpoint"
     checkpoint.parent.mkdir(parents=True)
     checkpoint.write_bytes(b"no state of a search")
-    order = Order("identification", 1, str(rig.config.store_path), str(checkpoint.parent), ("a",), None, None, (), 0)
+    order = Order("gap", 1, str(rig.config.store_path), str(checkpoint.parent), ("a",), None, None, (), 0)
     result = perform(order, lambda share, text: None)
     assert "the checkpoint cannot be read, so the search began anew" in read_model(Path(result["model"])).warnings
     assert not checkpoint.exists()
@@ -140,7 +140,7 @@ def test_a_report_that_fails_keeps_no_comparison_from_running_nor_the_other_way_
     rig.start()
     rig.wait(lambda: len(rig.states()) == 4 and not set(rig.states()) & {"queued", "running"})
     ended = {job["kind"]: job["state"] for job in rig.jobs()}
-    assert ended == {"identification": "done", "residual": "done", kind: "failed", other: "done"}
+    assert ended == {"gap": "done", "residual": "done", kind: "failed", other: "done"}
     rig.plan()
     rig.session("c", kind="check")
     rig.clock.advance(3.0)
@@ -157,7 +157,7 @@ def test_a_report_that_fails_keeps_no_comparison_from_running_nor_the_other_way_
 )
 def test_a_process_that_breaks_the_protocol_is_a_failed_job(rig: JobRig, what: str, error: str) -> None:
     rig.session("a")
-    rig.plan(identification=what)
+    rig.plan(gap=what)
     rig.start()
     rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
     assert rig.job(1)["error"].startswith(error)
@@ -167,7 +167,7 @@ def test_a_process_that_breaks_the_protocol_is_a_failed_job(rig: JobRig, what: s
 def test_a_process_that_closes_its_output_and_lives_on_is_ended(rig: JobRig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("daemon.job_child.END_TIMEOUT_S", 0.3)
     rig.session("a")
-    rig.plan(identification="closed")
+    rig.plan(gap="closed")
     rig.start()
     pid = rig.running(1)["pid"]
     rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
@@ -179,7 +179,7 @@ def test_a_job_that_takes_too_long_is_ended_with_all_that_it_started(tmp_path: P
     rig = JobRig(tmp_path, time_limit_s=1.5)
     try:
         rig.session("a")
-        rig.plan(identification="deaf")
+        rig.plan(gap="deaf")
         rig.start()
         rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
         job = rig.job(1)
@@ -212,11 +212,11 @@ def test_a_command_that_cannot_be_started_is_tried_as_often_as_allowed(tmp_path:
 
 def test_a_running_job_is_cancelled_with_its_process_and_those_that_wait(rig: JobRig) -> None:
     rig.session("a")
-    rig.plan(identification="hang")
+    rig.plan(gap="hang")
     runner = rig.start()
     job = rig.running(1)
     assert job["progress"] == 0.25
-    assert runner.cancel_command({"id": 1}) == "job 1 (identification) is being cancelled"
+    assert runner.cancel_command({"id": 1}) == "job 1 (gap) is being cancelled"
     rig.wait_for("cancelled", "cancelled", "cancelled", "cancelled")
     assert is_gone(job["pid"])
     assert [j["error"] for j in rig.jobs()] == ["cancelled by the operator", *["job 1 before it is cancelled"] * 3]
@@ -224,7 +224,7 @@ def test_a_running_job_is_cancelled_with_its_process_and_those_that_wait(rig: Jo
 
 def test_a_queued_job_is_cancelled_and_the_one_before_it_runs_on(rig: JobRig) -> None:
     rig.session("a")
-    rig.plan(identification="hang")
+    rig.plan(gap="hang")
     runner = rig.start()
     rig.running(1)
     assert runner.cancel_command({"id": 2}) == "job 2 (residual) is cancelled"
@@ -272,11 +272,11 @@ def test_a_cancellation_after_the_end_is_refused_and_forgotten(rig: JobRig) -> N
 
 def test_a_retried_job_runs_again_with_those_that_waited_and_shows_no_old_error(rig: JobRig) -> None:
     rig.session("a")
-    rig.plan(identification="fail")
+    rig.plan(gap="fail")
     runner = rig.start()
     rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
-    rig.plan(identification="hang")
-    assert runner.retry_command({"id": 1}) == "job 1 (identification) is queued again"
+    rig.plan(gap="hang")
+    assert runner.retry_command({"id": 1}) == "job 1 (gap) is queued again"
     job = rig.running(1)
     assert (job["error"], job["ended_utc_ns"], job["attempts"]) == (None, None, 1)
     runner.cancel_command({"id": 1})
@@ -310,7 +310,7 @@ def test_a_job_that_a_stop_interrupts_is_offered_again_until_its_attempts_are_us
     rig = JobRig(tmp_path, max_attempts=2)
     try:
         rig.session("a")
-        rig.plan(identification="hang")
+        rig.plan(gap="hang")
         for attempt in (1, 2):
             rig.start()
             job = rig.running(1)
@@ -331,7 +331,7 @@ def test_a_job_that_a_stop_interrupts_is_offered_again_until_its_attempts_are_us
 
 def test_an_interrupted_job_waits_before_it_runs_again_and_can_be_cancelled_meanwhile(rig: JobRig) -> None:
     rig.session("a")
-    rig.plan(identification="hang")
+    rig.plan(gap="hang")
     rig.start()
     rig.running(1)
     rig.stop()
@@ -339,7 +339,7 @@ def test_an_interrupted_job_waits_before_it_runs_again_and_can_be_cancelled_mean
     runner = rig.start()
     rig.look_on()
     assert rig.states() == ["interrupted", "queued", "queued", "queued"]
-    assert runner.cancel_command({"id": 1}) == "job 1 (identification) is cancelled"
+    assert runner.cancel_command({"id": 1}) == "job 1 (gap) is cancelled"
     assert rig.states() == ["cancelled", "cancelled", "cancelled", "cancelled"]
 
 
@@ -357,7 +357,7 @@ def test_nothing_starts_while_a_session_is_open(rig: JobRig) -> None:
 
 def test_queued_jobs_wait_while_a_session_is_open(rig: JobRig) -> None:
     rig.session("a")
-    rig.plan(identification="hang")
+    rig.plan(gap="hang")
     runner = rig.start()
     rig.running(1)
     rig.session("b", state="open")
@@ -393,7 +393,7 @@ def test_a_wall_clock_that_is_wrong_after_a_reboot_changes_nothing(rig: JobRig, 
 
 def test_a_session_closed_while_a_chain_runs_has_a_chain_of_its_own(rig: JobRig) -> None:
     rig.session("a")
-    rig.plan(identification="hang")
+    rig.plan(gap="hang")
     runner = rig.start()
     rig.running(1)
     rig.session("c", kind="check")
@@ -458,6 +458,7 @@ def test_jobs_of_an_older_store_keep_what_they_covered(tmp_path: Path) -> None:
         rig.start()
         rig.look_on()
         assert rig.states() == ["failed"]
+        assert rig.job(1)["kind"] == "gap", "what identification did is part of that job now"
     finally:
         rig.close()
 
@@ -502,7 +503,7 @@ def test_looking_for_work_stays_cheap_after_years(rig: JobRig) -> None:
         jobs.unfinished()
         db.conn.set_progress_handler(None, 0)
         db.conn.set_trace_callback(None)
-    assert len(statements) <= 6
+    assert len(statements) <= 7
     assert not any("FROM boots" in statement for statement in statements)
     assert steps < 15_000
 

@@ -1,9 +1,13 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from calibration import pipeline
+from calibration.effects.base import FittedCoefficient
+from calibration.effects.fitted import FittedEffect
 from calibration.observations import parse_observations
 from daemon.report import build_report
 from daemon.report.from_model import report_input
@@ -42,3 +46,13 @@ def test_corrections_are_in_degrees_and_millimetres_with_their_tolerance() -> No
     assert lines["row3.alpha"].tolerance == pytest.approx(model.rig.tolerances.angle_deg)
     assert lines["row2.a"].determined
     assert not any(name.startswith("base") for name in lines)
+
+
+def test_an_effect_at_no_joint_is_listed_with_how_far_it_moves_the_prism() -> None:
+    model, training = small_calibration()
+    scale = FittedEffect("station_scale", "station", (FittedCoefficient("ppm", "ppm", 20.0, 5.0, 10.0),))
+    (line,) = report_input(replace(training, model=replace(model, effects=(scale,))), None).effects
+    range_mm = np.linalg.norm(training.observations.position_mm, axis=1)
+    assert line.unit == "mm"
+    assert line.change == pytest.approx(20e-6 * range_mm.max(), rel=1e-2)
+    assert line.coefficients == [("ppm", 20.0, 5.0, "ppm")]

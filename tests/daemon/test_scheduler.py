@@ -4,6 +4,7 @@ from dataclasses import replace
 from daemon.scheduler import (
     CHAIN,
     CHECKS,
+    DRIFT,
     DueChain,
     DueRetry,
     JobFacts,
@@ -18,7 +19,7 @@ from drivers.clock import NS_PER_S, Stamp
 
 T0 = Stamp(1_700_000_000 * NS_PER_S, 100 * NS_PER_S, "boot")
 LATER = T0.shifted(60 * NS_PER_S)
-BOTH = {JobKind.IDENTIFICATION: 1, JobKind.REPORT: 1}  # a chain was queued when the first session was closed
+BOTH = {JobKind.GAP: 1, JobKind.REPORT: 1}  # a chain was queued when the first session was closed
 
 
 def session(number: int, kind: str = "static_poses", state: str = "closed", ended: Stamp = T0) -> SessionFacts:
@@ -34,8 +35,10 @@ def state(
     jobs: Sequence[JobFacts] = (),
     covered: Mapping[JobKind, int] | None = None,
     has_model: bool = False,
+    live_from: int | None = None,
+    drifted: tuple[int, str] | None = None,
 ) -> State:
-    return State(sessions, jobs, covered or {}, has_model)
+    return State(sessions, jobs, covered or {}, has_model, live_from, drifted)
 
 
 def test_a_closed_session_triggers_the_whole_chain() -> None:
@@ -99,8 +102,27 @@ def test_a_check_session_triggers_report_and_comparison_alone_and_only_with_a_mo
 def test_a_chain_covers_the_checks_that_were_closed_before_it() -> None:
     sessions = (session(1), session(2, "check"))
     assert due_jobs(state(*sessions, has_model=True), LATER) == [DueChain(CHAIN, "s1", "s2")]
-    covered = {JobKind.IDENTIFICATION: 2, JobKind.REPORT: 2}
+    covered = {JobKind.GAP: 2, JobKind.REPORT: 2}
     assert due_jobs(state(*sessions, covered=covered, has_model=True), LATER) == []
+
+
+def test_a_check_since_the_model_went_live_is_held_against_it_once() -> None:
+    sessions = (session(1), session(2, "check"))
+    covered = {**BOTH, JobKind.REPORT: 2}
+    assert due_jobs(state(*sessions, covered=covered, live_from=1), LATER) == [DueChain(DRIFT, "s2", "s2")]
+    assert due_jobs(state(*sessions, covered=covered, live_from=2), LATER) == []
+    assert due_jobs(state(*sessions, covered={**covered, JobKind.DRIFT: 2}, live_from=1), LATER) == []
+
+
+def test_drifted_checks_trigger_one_recalibration() -> None:
+    sessions = (session(1), session(2, "check"), session(3, "check"))
+    covered = {JobKind.GAP: 1, JobKind.REPORT: 3, JobKind.DRIFT: 3}
+    drifted = state(*sessions, covered=covered, live_from=1, drifted=(2, "s2"))
+    assert due_jobs(drifted, LATER) == [DueChain(CHAIN, "s2", "s3")]
+    assert due_jobs(replace(drifted, covered={**covered, JobKind.GAP: 3}), LATER) == []
+    assert due_jobs(replace(drifted, sessions=(*sessions, session(4, state="open"))), LATER) == []
+    measured_since = replace(drifted, sessions=(*sessions, session(4)))
+    assert due_jobs(measured_since, LATER) == [DueChain(CHAIN, "s4", "s4")], "a new session is calibrated by itself"
 
 
 def test_an_interrupted_job_is_offered_again_after_a_pause_until_its_attempts_are_used() -> None:

@@ -63,7 +63,7 @@ def _ended(jobs: list[dict[str, Any]]) -> bool:
 
 def test_closed_sessions_become_a_model_and_a_report(finished: DaemonProcess) -> None:
     jobs = {job["kind"]: job for job in finished.say("jobs.list")}
-    assert [jobs[kind]["state"] for kind in ("identification", "residual", "report")] == ["done"] * 3, jobs
+    assert [jobs[kind]["state"] for kind in ("gap", "residual", "report")] == ["done"] * 3, jobs
     result = jobs["report"]["result"]
     assert result["held_out"]
     stages = {stage["stage"]: stage["rms_mm"] for stage in result["evaluation"]["stages"]}

@@ -1,0 +1,206 @@
+"""`rigcal demo --hidden`: an effect that nobody knows, behind real protocols; its name, and then the truth.
+
+The simulated machine draws the effect and seals it before the first fix. The analysis sees observations as they are
+exported from the store, and answers before the simulation ends and the envelope can be opened.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from rich.console import Console
+from rich.table import Table
+
+from daemon.cli.simulated_operator import DEADLINE_S, PRISMS, RIG, Advance, DemoError, Operator
+from daemon.cli.tables import say
+from daemon.rigs import load_rig
+from daemon.session_data import sessions_csv
+from daemon.store.reader import Reader
+
+NO_JOBS = "\n[jobs]\nenabled = false  # the workflow is asked by rigcal gap, before and after the poses it proposes\n"
+TRAINING_POSES = 22  # of each prism
+CHECKED = ("r", "b")  # prisms of the checks, and of the poses that are proposed
+CHECK_POSES = 4
+PROPOSED = 20
+ENVELOPE, SEALED, COMMITMENT, PAD = "envelope", "envelope.sealed", "envelope.sha256", "envelope.pad"
+
+Outcome = Literal["right", "set", "missed"]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What was hidden.
+
+    Attributes:
+        family, where: the effect.
+        coefficients: name -> value, as the simulator has it.
+        visible_over_noise: RMS of what calibration cannot absorb, in units of a fix's noise.
+    """
+
+    family: str
+    where: str
+    coefficients: Mapping[str, float]
+    visible_over_noise: float
+
+
+def steps() -> int:
+    """How many steps of progress there are, without poses that a set may ask for."""
+    return len(PRISMS) * TRAINING_POSES + len(CHECKED) * CHECK_POSES
+
+
+def play(out: Path, rate: float, seed: int, advance: Advance, tell: Console) -> dict[str, Any]:
+    """The whole game; everything is left in `out`.
+
+    Args:
+        out: a new directory, absolute.
+        rate: simulated seconds per second.
+        seed: which machine, and which secret.
+        advance: told of progress.
+        tell: where the commitment is printed before anything is measured.
+
+    Raises:
+        DemoError: it did not come to its end.
+    """
+    envelope = out / ENVELOPE
+    envelope.mkdir()
+    operator = Operator(out, rate, seed, ["--secret", str(envelope)], NO_JOBS)
+    try:
+        operator.begin()
+        commitment = (envelope / COMMITMENT).read_text(encoding="utf-8").strip()
+        say(tell, f"An effect is hidden in the machine. Sealed envelope, SHA-256 {commitment}")
+        training = [operator.record(prism, "static_poses", TRAINING_POSES, advance) for prism in PRISMS]
+        checks = [operator.record(prism, "check", CHECK_POSES, advance) for prism in CHECKED]
+        advance("finding the gap", 0)
+        found = [_find_gap(out, "gap", training, checks, seed)]
+        poses = _proposed(found[0])
+        if poses:
+            say(tell, f"The data cannot tell {_set_of(found[0])} apart. Measuring {len(poses)} poses that can.")
+            training += [operator.record(prism, "static_poses", len(poses), advance, poses) for prism in CHECKED]
+            advance("finding the gap again", 0)
+            found.append(_find_gap(out, "gap-again", training, checks, seed))
+    finally:
+        operator.close()
+    truth = opened(envelope, commitment)
+    answer = found[-1]
+    return {
+        "seed": seed,
+        "commitment": commitment,
+        "outcome": outcome(answer, truth),
+        "truth": {"family": truth.family, "where": truth.where, "coefficients": dict(truth.coefficients)},
+        "visible_over_noise": truth.visible_over_noise,
+        "verdicts": [told["verdict"] for told in found],
+        "poses_measured_for_a_set": len(poses),
+        "gap": answer,
+    }
+
+
+def opened(envelope: Path, commitment: str) -> Truth:
+    """What an open envelope holds.
+
+    Raises:
+        DemoError: it is not open, or not what was sealed.
+    """
+    try:
+        sealed, pad = (envelope / SEALED).read_bytes(), (envelope / PAD).read_bytes()
+    except OSError as error:
+        raise DemoError(f"the envelope cannot be opened: {error.filename}: {error.strerror}") from error
+    text = bytes(a ^ b for a, b in zip(sealed, pad, strict=False))
+    if hashlib.sha256(text).hexdigest() != commitment:
+        raise DemoError(f"{envelope} does not hold what was sealed: its SHA-256 is another than {commitment}")
+    content = json.loads(text)
+    return Truth(content["family"], content["where"], content["coefficients"], content["visible_over_noise"])
+
+
+def outcome(gap: Mapping[str, Any], truth: Truth) -> Outcome:
+    """How an answer of the workflow, the contract's object, stands beside the truth.
+
+    `right` names it and nothing else; `set` has it among those that the data cannot tell apart, and named nothing that
+    is not there.
+    """
+    effects = {(effect["family"], effect["where"]) for effect in gap["effects"]}
+    pending = {(one["family"], one["where"]) for one in gap["indistinguishable"]}
+    hidden = {(truth.family, truth.where)}
+    if effects == hidden and not pending:
+        return "right"
+    if hidden <= pending and effects <= hidden:
+        return "set"
+    return "missed"
+
+
+def show(console: Console, result: Mapping[str, Any]) -> None:
+    """Truth beside verdict, for people."""
+    gap, truth = result["gap"], result["truth"]
+    console.print(_verdict(gap), style="bold", highlight=False, markup=False)
+    if gap["description"]:
+        say(console, f"On what it depends: {gap['description']}")
+    table = Table(
+        title="The envelope is open", title_justify="left", title_style="bold", box=None, padding=(0, 2, 0, 0)
+    )
+    for heading in ("", "hidden", "found", "+-"):
+        table.add_column(heading, justify="left" if heading == "" else "right", no_wrap=True)
+    own = next((e for e in gap["effects"] if (e["family"], e["where"]) == (truth["family"], truth["where"])), None)
+    for name, value in truth["coefficients"].items():
+        told = (own or {"coefficients": {}})["coefficients"].get(name)
+        cells = ("", "") if told is None else (f"{told['value']:.4g}", f"{told['standard_error']:.2g} {told['unit']}")
+        table.add_row(name, f"{value:.4g}", *cells)
+    console.print(table)
+    name = _name(truth["family"], truth["where"])
+    sizes = f"visible at {result['visible_over_noise']:.1f} times the noise of a fix"
+    lines = {
+        "right": f"Right: it is {name}, {sizes}.",
+        "set": f"A set that contains it: it is {name}, {sizes}.",
+        "missed": f"Missed: it is {name}, {sizes}.",
+    }
+    console.print(lines[result["outcome"]], style="bold", highlight=False, markup=False)
+
+
+def _name(family: str, where: str) -> str:
+    from daemon.report.gap_words import place_name
+
+    return place_name(family, where)
+
+
+def _verdict(gap: Mapping[str, Any]) -> str:
+    if gap["verdict"] == "named":
+        return f"The verdict: {' and '.join(_name(e['family'], e['where']) for e in gap['effects'])}."
+    if gap["verdict"] == "indistinguishable":
+        return f"The verdict: one of {_set_of(gap)}."
+    return "The verdict: " + {
+        "none": "simulation and measurement agree within the noise.",
+        "unidentified": "something is missing that no effect of the library explains.",
+    }.get(gap["verdict"], str(gap["verdict"]))
+
+
+def _set_of(gap: Mapping[str, Any]) -> str:
+    return " and ".join(_name(one["family"], one["where"]) for one in gap["indistinguishable"])
+
+
+def _proposed(gap: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The poses that an answer asks for."""
+    if gap["verdict"] != "indistinguishable":
+        return []
+    return [row for experiment in gap["experiments"] for row in experiment.get("poses", ())][:PROPOSED]
+
+
+def _find_gap(out: Path, name: str, training: Sequence[str], checks: Sequence[str], seed: int) -> dict[str, Any]:
+    """Ask `rigcal gap` about sessions of the store, by the files it reads of anyone."""
+    rig = load_rig(RIG).rig
+    files = {}
+    with Reader(out / "rigcal.sqlite") as reader:
+        for kind, sessions in (("observations", training), ("checks", checks)):
+            files[kind] = out / f"{name}-{kind}.csv"
+            files[kind].write_bytes(sessions_csv(reader, rig, sessions))
+    command = [sys.executable, "-m", "daemon.cli.main", "gap", "--rig", RIG, "--data", str(files["observations"])]
+    command += ["--holdout", str(files["checks"]), "--out", str(out / name), "--seed", str(seed), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    if done.returncode != 0:
+        raise DemoError(f"rigcal gap ended with status {done.returncode}: {done.stderr.strip()[-500:]}")
+    told: dict[str, Any] = json.loads(done.stdout)
+    return told

@@ -1,0 +1,141 @@
+"""An operator's hands at a simulated rig: starts the daemon, and holds sessions with the commands of any operator."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from daemon.control import CommandError, request
+
+RIG = "swdt82"
+CONFIG = """# Written by rigcal demo. The simulated rig takes the place of the two ports.
+rig = "swdt82"
+state_directory = "."
+
+[[can]]
+channel = "can0"
+
+[[station]]
+serial.path = "/dev/rigcal-station"
+poll_interval_s = 0.25
+
+[sessions]
+settle_s = 2.0  # simulated time runs fast: the computer's own delays are this much longer in it
+"""
+PRISMS = ("r", "s", "b", "w")
+CONTROL_POINTS = ("cp1", "cp2")
+DWELL_S = 3.5
+DEADLINE_S = 600.0
+
+Advance = Callable[[str, int], None]
+"""Told what is going on, and how many steps it has come further."""
+
+
+class DemoError(Exception):
+    """The demonstration did not come to its end; the message says where it stopped."""
+
+
+class Operator:
+    """Talks to the demonstration's daemon as an operator would, with the same commands.
+
+    Args:
+        directory: where configuration, store, models and report go.
+        rate: simulated seconds per second.
+        seed: of the simulated machine.
+        options: further ones of `rigcal run --sim`.
+        settings: further lines of the configuration.
+    """
+
+    def __init__(
+        self, directory: Path, rate: float, seed: int, options: Sequence[str] = (), settings: str = ""
+    ) -> None:
+        self._socket = directory / "control.sock"
+        config = directory / "rigcal.toml"
+        config.write_text(CONFIG + settings, encoding="utf-8")
+        command = [sys.executable, "-m", "daemon.cli.main", "run", "--sim", "--config", str(config)]
+        command += ["--rate", str(rate), "--seed", str(seed), "--dwell", str(DWELL_S), *options]
+        self._log = (directory / "daemon.log").open("w", encoding="utf-8")
+        self._daemon = subprocess.Popen(command, stdout=self._log, stderr=self._log)
+
+    def say(self, command: str, **arguments: Any) -> Any:
+        """Send a command to the daemon."""
+        return request(self._socket, command, arguments)
+
+    def wait(self, what: str, done: Callable[[], bool]) -> None:
+        """Wait until `done`, looking five times a second.
+
+        Raises:
+            DemoError: the daemon ended, or it took too long.
+        """
+        deadline = time.monotonic() + DEADLINE_S
+        while not done():
+            if self._daemon.poll() is not None:
+                raise DemoError(f"the daemon ended while waiting for {what}; see {self._log.name}")
+            if time.monotonic() > deadline:
+                raise DemoError(f"waited {DEADLINE_S:g} s for {what}; see {self._log.name}")
+            time.sleep(0.2)
+
+    def begin(self) -> None:
+        """Wait for the first fix, and set the station up."""
+        self.wait("the first fix", self._is_ready)
+        self.say("setup.new", id="demo", instrument="simulated Topcon GTS-800A", tilt_arcsec=3.0, ppm=0.0)
+
+    def record(
+        self, prism: str, kind: str, poses: int, advance: Advance, planned: Sequence[dict[str, Any]] = ()
+    ) -> str:
+        """One session: control points first and last, poses in between.
+
+        Args:
+            prism: which the station is aimed at.
+            kind: of the session.
+            poses: how many at least.
+            advance: told of each.
+            planned: rows of a pose plan that the boom is driven to; the session lasts until it has been at all.
+
+        Returns:
+            The session's name.
+        """
+        name = str(self.say("session.start", prism=prism, kind=kind, operator="demo")["id"])
+        self._shoot_control_points()
+        if planned:
+            self.say("simulation.visit", poses=list(planned))
+        seen = 0
+
+        def enough() -> bool:
+            nonlocal seen
+            now = min(int(self.say("session.show", id=name)["poses"]), poses)
+            if now > seen:
+                advance(f"{kind.replace('_', ' ')} of prism {prism}: {now} of {poses}", now - seen)
+                seen = now
+            return now >= poses and not (planned and self.say("simulation.visit")["left"])
+
+        self.wait(f"{poses} poses of prism {prism}", enough)
+        self._shoot_control_points()
+        self.say("session.stop")
+        return name
+
+    def close(self) -> None:
+        """Stop the daemon, which stops the simulated rig."""
+        self._daemon.terminate()
+        try:
+            self._daemon.wait(timeout=30)
+        except subprocess.TimeoutExpired:
+            self._daemon.kill()
+            self._daemon.wait()
+        self._log.close()
+
+    def _shoot_control_points(self) -> None:
+        for point in CONTROL_POINTS:
+            self.say("session.shoot", point=point)
+
+    def _is_ready(self) -> bool:
+        """Whether the daemon answers and the station is locked to a prism."""
+        try:
+            stations = self.say("status")["acquisition"]["stations"]
+        except CommandError:
+            return False
+        return any(station["fixes"] > 0 for station in stations)

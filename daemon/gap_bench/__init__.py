@@ -1,0 +1,1 @@
+"""The benchmark of the gap workflow: blind data from a keeper process, answers from workers, scores after unsealing."""

@@ -1,0 +1,144 @@
+from __future__ import annotations
+
+import json
+import time
+import uuid
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from calibration.rig import Rig, shipped_rig
+from daemon.cli.hidden import ENVELOPE, PAD, SEALED, Truth, opened, outcome, show
+from daemon.cli.simulated_operator import DemoError
+from daemon.simulation import APPROACH, SimulatedRig, stops_of
+from drivers.clock import ScaledClock, Stamp, SystemClock
+from simulators.effects.spec import FAMILIES
+from simulators.secret import COMMITMENT
+
+RATE = 50.0
+HIDDEN = Truth("backlash", "theta4", {"width_rad": 2e-3}, 2.0)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return shipped_rig("swdt82")
+
+
+def middle(rig: Rig) -> dict[str, float]:
+    return {joint.column: sum(joint.limits) / 2.0 for joint in rig.joints}
+
+
+def simulated(rig: Rig, directory: Path) -> SimulatedRig:
+    now = SystemClock().now()
+    clock = ScaledClock(RATE, Stamp(now.utc_ns, now.monotonic_ns, f"simulated-{uuid.uuid4()}"))
+    rates = {joint.name: joint.max_rate for joint in rig.joints}
+    return SimulatedRig("swdt82", rates, directory, clock, seed=4, secret=directory / ENVELOPE)
+
+
+@pytest.fixture(scope="module")
+def played(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, bool, int]:
+    """A simulated rig's envelope after its end, what was committed to, whether it was open before, stops left."""
+    directory = tmp_path_factory.mktemp("rig")
+    envelope = directory / ENVELOPE
+    envelope.mkdir()
+    simulation = simulated(rig, directory)
+    try:
+        commitment = (envelope / COMMITMENT).read_text().strip()
+        was_open = (envelope / PAD).exists()
+        simulation.drive_around(dwell_s=1.0)
+        left = simulation.visit(stops_of(rig, [middle(rig) | {"theta4_dir": 1}], dwell_s=1.0))
+        while left:
+            time.sleep(0.02)
+            left = simulation.visit([])
+    finally:
+        simulation.close()
+    return envelope, commitment, was_open, left
+
+
+def test_the_envelope_opens_when_the_simulation_is_over_and_holds_what_was_sealed(
+    played: tuple[Path, str, bool, int],
+) -> None:
+    envelope, commitment, was_open, _ = played
+    assert not was_open
+    truth = opened(envelope, commitment)
+    assert truth.family in FAMILIES
+    assert truth.family.encode() not in (envelope / SEALED).read_bytes()
+    assert truth.coefficients
+    assert 1.0 <= truth.visible_over_noise <= 3.0
+
+
+def test_another_content_than_what_was_sealed_is_refused(played: tuple[Path, str, bool, int], tmp_path: Path) -> None:
+    envelope, commitment, _, _ = played
+    for name in (SEALED, PAD):
+        data = bytearray((envelope / name).read_bytes())
+        data[-5] ^= name == SEALED
+        (tmp_path / name).write_bytes(data)
+    with pytest.raises(DemoError, match="does not hold what was sealed"):
+        opened(tmp_path, commitment)
+    (tmp_path / PAD).unlink()
+    with pytest.raises(DemoError, match=r"cannot be opened: .*envelope\.pad"):
+        opened(tmp_path, commitment)
+
+
+def test_the_simulated_boom_drives_to_the_poses_of_a_plan(played: tuple[Path, str, bool, int]) -> None:
+    assert played[3] == 0
+
+
+def test_a_pose_that_says_from_which_side_is_reached_from_there(rig: Rig) -> None:
+    row = middle(rig) | {"theta4_dir": 1, "L2_dir": -1, "dwell_s": 30.0}
+    (before, passing_s), (pose, standing_s) = stops_of(rig, [row], dwell_s=4.0)
+    assert before["theta4"] == pytest.approx(pose["theta4"] - APPROACH["deg"])
+    assert before["L2"] == pytest.approx(pose["L2"] + APPROACH["mm"])
+    assert before["theta3"] == pose["theta3"]
+    assert (passing_s, standing_s) == (0.0, 30.0)
+    assert len(stops_of(rig, [middle(rig)], dwell_s=4.0)) == 1
+    at_the_end = middle(rig) | {"theta4_deg": rig.joint("theta4").limits[0], "theta4_dir": 1}
+    assert len(stops_of(rig, [at_the_end], dwell_s=4.0)) == 1  # there is no way from below
+    with pytest.raises(ValueError, match="theta4 = 1000 deg is beyond its limits"):
+        stops_of(rig, [middle(rig) | {"theta4_deg": 1000.0}], dwell_s=4.0)
+    with pytest.raises(ValueError, match="a pose has a number for each of theta1_deg"):
+        stops_of(rig, [{"theta1_deg": 1.0}], dwell_s=4.0)
+
+
+def answer(effects: list[tuple[str, str]], pending: list[tuple[str, str]]) -> dict[str, Any]:
+    verdict = "indistinguishable" if pending else "named" if effects else "none"
+    told = {"width_rad": {"value": 2.1e-3, "unit": "rad", "standard_error": 1e-4}}
+    return {
+        "verdict": verdict,
+        "effects": [{"family": family, "where": where, "coefficients": told} for family, where in effects],
+        "indistinguishable": [{"family": family, "where": where, "posterior": 0.5} for family, where in pending],
+        "description": None,
+    }
+
+
+BACKLASH, HYSTERESIS, SCALE = ("backlash", "theta4"), ("load_hysteresis", "theta4"), ("angle_scale", "theta3")
+
+
+@pytest.mark.parametrize(
+    ("effects", "pending", "expected", "line"),
+    [
+        ([BACKLASH], [], "right", "Right: it is backlash at theta4"),
+        ([], [BACKLASH, HYSTERESIS], "set", "A set that contains it: it is backlash at theta4"),
+        ([], [], "missed", "Missed: it is backlash at theta4"),
+        ([HYSTERESIS], [], "missed", "Missed"),
+        ([BACKLASH, SCALE], [], "missed", "Missed"),
+        ([SCALE], [BACKLASH, HYSTERESIS], "missed", "Missed"),
+        ([], [SCALE, HYSTERESIS], "missed", "Missed"),
+        ([("backlash", "theta3")], [], "missed", "Missed"),
+    ],
+)
+def test_an_answer_is_right_or_a_set_with_the_truth_or_missed(
+    effects: list[tuple[str, str]],
+    pending: list[tuple[str, str]],
+    expected: str,
+    line: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    gap = answer(effects, pending)
+    assert outcome(gap, HIDDEN) == expected
+    truth = {"family": HIDDEN.family, "where": HIDDEN.where, "coefficients": dict(HIDDEN.coefficients)}
+    result = {"gap": gap, "truth": truth, "outcome": expected, "visible_over_noise": 2.0}
+    show(Console(width=120), json.loads(json.dumps(result)))
+    assert line in capsys.readouterr().out

@@ -1,0 +1,318 @@
+"""The benchmark of the gap workflow: what counts as right, and that nobody sees a label before answering."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from calibration.observations import parse_observations
+from daemon.cli.main import main as rigcal
+from daemon.gap_bench.keeper import LABELS, Keeper, KeeperError
+from daemon.gap_bench.score import Score, scores, tallies
+from daemon.gap_bench.trial import Floats, Trial, trial
+from daemon.rigs import load_rig
+
+TWIN_MM = np.array([[0.0, 0.0, 0.0], [90.0, 0.0, 0.0]])  # without the effect
+TRUTH_MM = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0]])
+
+
+def label(kind: str = "single", *families: str, **more: Any) -> dict[str, Any]:
+    effects = [
+        {
+            "family": family,
+            "where": "theta4",
+            "places": ["theta4"],
+            "coefficients": {"size": 2.0},
+            "scale": {"size": 1.0},
+        }
+        for family in families
+    ]
+    cell = {"case": "case-1", "kind": kind, "poses": "wide", "noise": "station", "size": 1.0, "seed": 7}
+    judged = {
+        "separable": True,
+        "rival": "",
+        "general": [],
+        "aliases": [],
+        "truth_mm": TRUTH_MM.tolist(),
+        "twin_mm": TWIN_MM.tolist(),
+    }
+    return {**cell, **judged, "effects": effects, **more}
+
+
+def named(*families: str, where: str = "theta4", value: float = 2.0, error: float = 0.1) -> dict[str, Any]:
+    coefficients = {"size": {"value": value, "unit": "1", "standard_error": error}}
+    effects = [{"family": family, "where": where, "coefficients": coefficients} for family in families]
+    return {"case": "case-1", "verdict": "named", "effects": effects, "indistinguishable": [], "seconds": 0.5}
+
+
+def pending(*families: str) -> dict[str, Any]:
+    candidates = [{"family": family, "where": "theta4", "posterior": 0.5} for family in families]
+    return {**named(), "verdict": "indistinguishable", "indistinguishable": candidates}
+
+
+def silent(verdict: str = "none", **more: Any) -> dict[str, Any]:
+    return {**named(), "verdict": verdict, **more}
+
+
+def judged(
+    of: Mapping[str, Any], told: Mapping[str, Any], measured: Mapping[str, Any] | None = None, oracle: Any = None
+) -> Trial:
+    return trial(of, told, measured, oracle)
+
+
+def score(trials: list[Trial], what: str) -> Score:
+    return next(s for s in scores(trials) if s.what == what)
+
+
+RIGHT = "named right at >= 1x, separable"
+
+
+def test_a_case_is_right_only_if_all_that_is_hidden_was_named_and_nothing_else() -> None:
+    trials = [
+        judged(label("single", "backlash"), named("backlash")),
+        judged(label("single", "backlash"), named("latency")),
+        judged(label("single", "backlash"), named("backlash", "latency")),
+        judged(label("single", "backlash"), pending("backlash", "latency")),
+        judged(label("single", "backlash"), silent()),
+    ]
+
+    found = score(trials, RIGHT)
+
+    assert (found.value, found.n, found.met) == (0.2, 5, False)
+    assert [t.outcome for t in trials] == ["right", "wrong", "wrong", "set", "none"]
+    assert score(trials, "wrong name among all named").value == pytest.approx(2 / 3)
+
+
+def test_the_right_family_at_another_joint_is_right_but_out_of_place() -> None:
+    trials = [judged(label("single", "backlash"), named("backlash", where="theta3"))]
+
+    assert score(trials, RIGHT).value == 1.0
+    assert score(trials, "  at the right place too").value == 0.0
+
+
+def test_what_nobody_could_tell_apart_does_not_count_as_separable() -> None:
+    trials = [judged(label("single", "backlash", separable=False), pending("backlash", "latency"))]
+
+    assert score(trials, RIGHT).n == 0
+    assert score(trials, RIGHT).met is None
+    assert score(trials, "  of all, separable or not").value == 0.0
+    assert score(trials, "truth inside a reported set").value == 1.0
+
+
+@pytest.mark.parametrize(
+    ("of", "told"),
+    [
+        pytest.param({"separable": True}, ("backlash", "latency"), id="could have been named"),
+        pytest.param({"separable": False}, ("leak_down", "latency"), id="truth is not in it"),
+        pytest.param({"separable": False}, ("backlash", "latency", "leak_down", "base_step"), id="four families"),
+    ],
+)
+def test_a_set_is_a_miss(of: dict[str, Any], told: tuple[str, ...]) -> None:
+    trials = [judged(label("single", "backlash", **of), pending(*told))]
+
+    assert score(trials, "truth inside a reported set").value == 0.0
+
+
+def test_a_set_is_resolved_when_the_proposed_poses_lead_to_the_right_name() -> None:
+    of = label("single", "backlash", separable=False)
+    trials = [
+        judged(of, pending("backlash", "latency"), measured) for measured in (named("backlash"), named("latency"))
+    ]
+
+    assert score(trials, "set resolved after 20 proposed poses").value == 0.5
+
+
+def test_an_exact_alias_must_be_answered_with_both_families() -> None:
+    of = label("alias", "backlash", aliases=["backlash", "latency"])
+    trials = [judged(of, told) for told in (pending("latency", "backlash"), named("backlash"), pending("backlash"))]
+
+    assert score(trials, "exact aliases: set with the truth and its alias").value == pytest.approx(1 / 3)
+
+
+def test_any_verdict_but_none_is_an_alarm_where_nothing_is_hidden() -> None:
+    trials = [judged(label("null"), told) for told in (silent(), silent("unidentified"), named("backlash"), silent())]
+
+    assert score(trials, "no effect: falsely named").value == 0.25
+    assert score(trials, "no effect: any alarm").value == 0.5
+
+
+def test_shares_come_with_wilsons_interval() -> None:
+    trials = [judged(label("null"), silent()) for _ in range(300)]
+
+    found = score(trials, "no effect: any alarm")
+
+    # No event in 300: Wilson's upper end is z^2 / (n + z^2).
+    z2 = 1.959964**2
+    assert found.interval == pytest.approx((0.0, z2 / (300 + z2)), abs=1e-9)
+    assert found.met
+
+
+def test_the_gap_closed_is_measured_between_the_kinematics_and_their_oracle() -> None:
+    def off(place_mm: Floats, error_mm: float) -> list[list[float]]:
+        return (place_mm + np.array([error_mm, 0.0, 0.0])).tolist()
+
+    told = {**named("backlash"), "before_mm": off(TRUTH_MM, 5.0), "after_mm": off(TRUTH_MM, 3.0)}
+    trials = [judged(label("single", "backlash"), told, oracle={"oracle_mm": off(TWIN_MM, 1.0)})]
+
+    assert score(trials, "held-out gap closed at >= 1x, median").value == pytest.approx((25 - 9) / (25 - 1))
+
+
+def test_an_effect_that_does_not_show_on_held_out_poses_leaves_no_gap_to_close() -> None:
+    told = {**named("backlash"), "before_mm": TRUTH_MM.tolist(), "after_mm": TRUTH_MM.tolist()}
+    trials = [judged(label("single", "backlash"), told, oracle={"oracle_mm": TWIN_MM + 1.0})]
+
+    assert score(trials, "held-out gap closed at >= 1x, median").n == 0
+
+
+def test_coefficients_are_held_against_the_truth_and_their_intervals() -> None:
+    trials = [
+        judged(label("single", "backlash"), named("backlash", value=2.1, error=0.1)),
+        judged(label("single", "backlash"), named("backlash", value=2.1, error=0.01)),
+    ]
+
+    assert score(trials, "coefficient error at 1x, median of relative errors").value == pytest.approx(0.05)
+    assert score(trials, "90 % intervals of coefficients cover").value == 0.5
+
+
+def test_an_effect_outside_the_library_is_located_by_what_is_said_of_it() -> None:
+    of = label("outside", "gear_mesh")
+    trials = [
+        judged(of, silent("unidentified", description="theta4 angle error = 1e-4 sin 9 theta4; not in the library")),
+        judged(of, silent("unidentified", disagreements=[{"where": "theta4", "variable": "time", "p": 1e-5}])),
+        judged(of, silent("unidentified", description="theta5 angle error = 1e-4 sin 9 theta4; not in the library")),
+        judged(of, named("encoder_harmonic", where="theta5")),
+    ]
+
+    assert score(trials, "outside the library: right location").value == 0.5
+    assert score(trials, "outside the library: misnamed").value == 0.25
+
+
+def test_a_more_general_family_is_no_misnaming_where_the_particular_one_is_left_out() -> None:
+    of = label("left_out", "encoder_harmonic", general=["joint_error_map"])
+    trials = [judged(of, told) for told in (named("joint_error_map"), named("angle_scale"), silent("unidentified"))]
+
+    assert score(trials, "one family left out, its data shown: misnamed").value == pytest.approx(1 / 3)
+    assert score(trials, "  or given the name of a more general family").value == pytest.approx(2 / 3)
+
+
+def test_a_case_that_failed_is_a_miss_and_is_counted() -> None:
+    failed = {"case": "case-1", "verdict": "failed", "error": "no base", "seconds": 0.1}
+    trials = [judged(label("single", "backlash"), failed), judged(label("null"), failed)]
+
+    assert score(trials, RIGHT).value == 0.0
+    assert score(trials, "no effect: any alarm").value == 1.0
+    assert score(trials, "cases that ended in an error").value == 1.0
+
+
+def test_families_are_tallied_with_what_they_were_taken_for() -> None:
+    trials = [
+        judged(label("single", "backlash"), named("backlash")),
+        judged(label("single", "backlash"), named("latency")),
+        judged(label("single", "leak_down", size=3.0), silent()),
+    ]
+
+    first, second = tallies(trials)
+
+    assert (first.family, first.size, dict(first.outcomes)) == ("backlash", 1.0, {"right": 1, "wrong": 1})
+    assert dict(first.mistaken) == {"latency": 1}
+    assert (second.family, second.size, dict(second.outcomes)) == ("leak_down", 3.0, {"none": 1})
+
+
+def test_what_analyses_a_case_knows_nothing_of_the_simulators() -> None:
+    program = (
+        "import sys, daemon.gap_bench.analyse, calibration.gap.workflow\n"
+        "sys.exit(any(name.partition('.')[0] == 'simulators' for name in sys.modules))"
+    )
+
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+@contextmanager
+def keeper(directory: Path) -> Iterator[Keeper]:
+    options = ["--rig", "swdt82", "--short", "--cells", "triple,decoy", "--first", "7", "--workers", "1"]
+    with Keeper(options, directory) as running:
+        yield running
+
+
+def test_labels_are_handed_out_against_answers_and_are_those_committed_to(tmp_path: Path) -> None:
+    answers = tmp_path / "answers.json"
+    with keeper(tmp_path) as keeps:
+        # Nothing readable lies about before: neither the pad, nor a word of any label in any file.
+        assert not list(tmp_path.glob("*.pad"))
+        assert not any(b"triple" in path.read_bytes() for path in tmp_path.iterdir())
+        with pytest.raises(KeeperError, match="labels are handed out against answers"):
+            keeps.unseal(answers)
+        with pytest.raises(KeeperError, match="unseal first"):
+            keeps.twins()
+
+        answers.write_text("[]")
+        labels = keeps.unseal(answers)["labels"]
+        twins = keeps.twins()
+
+    assert {label["case"] for label in labels} == {case.name for case in keeps.cases}
+    triples = {label["case"]: label for label in labels if label["kind"] == "triple"}
+    assert all(len(label["effects"]) == 3 for label in triples.values())
+    assert set(twins) == set(triples)
+    rig = load_rig("swdt82").rig
+    for case in keeps.cases:
+        if case.name in twins:
+            own, twin = (parse_observations(path.read_bytes(), rig, "csv") for path in (case.train, twins[case.name]))
+            assert np.array_equal(own.joints["theta4"], twin.joints["theta4"])
+            assert not np.allclose(own.position_mm, twin.position_mm, atol=1.0)
+
+
+def test_labels_that_were_changed_after_the_commitment_are_found_out(tmp_path: Path) -> None:
+    answers = tmp_path / "answers.json"
+    answers.write_text("[]")
+    with keeper(tmp_path) as keeps:
+        sealed = bytearray((tmp_path / LABELS).read_bytes())
+        sealed[100] ^= 1
+        (tmp_path / LABELS).write_bytes(sealed)
+
+        with pytest.raises(KeeperError, match="does not hold the labels that were committed to"):
+            keeps.unseal(answers)
+
+
+def test_further_poses_are_measured_of_the_same_machine_and_only_before_unsealing(tmp_path: Path) -> None:
+    answers = tmp_path / "answers.json"
+    answers.write_text("[]")
+    rig = load_rig("swdt82").rig
+    pose = {joint.column: sum(joint.limits) / 2 for joint in rig.joints}
+    with keeper(tmp_path) as keeps:
+        case = keeps.cases[0]
+        header = case.held_out.read_text().splitlines()[0].split(",")
+        before = parse_observations(case.train.read_bytes(), rig, "train.csv")
+        after = parse_observations(keeps.measure(case.name, [pose, pose]).read_bytes(), rig, "measured.csv")
+        keeps.unseal(answers)
+        with pytest.raises(KeeperError, match="nothing is measured after"):
+            keeps.measure(case.name, [pose])
+
+    assert len(after) == len(before) + 2
+    assert np.array_equal(after.position_mm[: len(before)], before.position_mm)
+    assert after.joints["theta4"][-1] == pytest.approx(22.5, abs=0.2)
+    # What is to be predicted comes without its answer.
+    assert "theta4_deg" in header
+    assert not {"x_mm", "y_mm", "z_mm", "sigma_x_mm"} & set(header)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("--effects", "rust", "rust: known are joint_compliance"),
+        ("--first", "999000", "run into those to report"),  # seeds to tune on and seeds to report never meet
+    ],
+)
+def test_cases_that_there_are_not_are_refused(option: str, value: str, said: str) -> None:
+    result = CliRunner().invoke(rigcal, ["bench", "gap", "--json", option, value])
+
+    assert result.exit_code == 2
+    assert said in json.loads(result.stdout)["error"]
