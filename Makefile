@@ -11,7 +11,7 @@ KERNELS := .cache/numba/$(firstword $(shell cat $(COMPILED) | cksum))
 export NUMBA_CACHE_DIR := $(CURDIR)/$(KERNELS)
 export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 
-.PHONY: help environment setup demo test lint bench lock clean
+.PHONY: help environment setup demo test lint blind bench lock clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -42,13 +42,17 @@ lint: environment ## style, types and import floors
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-BENCHES := acquisition kernels refinement evolution peers far_starts design ur10 table4 zhou2022 prediction gate promotion residual
+blind: setup ## a few blind cases of every kind for the gap workflow; two minutes on two cores
+	$(BIN)/rigcal bench gap --short
+
+BENCHES := acquisition kernels refinement evolution peers far_starts design ur10 table4 zhou2022 prediction gate promotion drift residual
 
 bench: setup ## speed and accuracy beside the peers', as ratios; an hour on two cores
 	@for name in $(BENCHES); do echo "== $$name"; $(BIN)/python -m tests.bench.$$name || exit 1; done
 	$(BIN)/python -m tests.calibration.simulated_sessions
 	$(BIN)/python -m tests.calibration.interval_coverage
 	$(BIN)/python -m tests.calibration.held_out_coverage
+	$(BIN)/rigcal bench gap
 
 # The rig gets requirements.lock, with the build backend that installs the project itself; requirements-dev.lock holds
 # the same versions and the tools besides. Versions stay as they are unless pyproject.toml forces a change;

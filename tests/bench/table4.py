@@ -12,9 +12,9 @@ import argparse
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from calibration.effects.adoption import Adopted
 from calibration.effects.base import Situation
 from calibration.effects.fitted import coefficient_values, corrected, fitted_additions
+from calibration.gap.adopt import Adopted
 from calibration.identification.solve import Solution
 from calibration.observations import Floats, Observations
 from calibration.pipeline import calibrate, evaluate
