@@ -235,6 +235,8 @@ class Family(ABC):
         revealed_by: the motion or experiment that shows it apart from those, a phrase.
         goes_with: the load that it depends on: `torque` of its own joint, measured or computed, `weights`, which are
             always computed, or nothing.
+        column: the optional column that it needs, `{where}` in it for its place; empty for none. Families that need
+            anything else say so in `needs` and `known`.
     """
 
     name: ClassVar[str]
@@ -243,6 +245,7 @@ class Family(ABC):
     confused_with: ClassVar[tuple[str, ...]]
     revealed_by: ClassVar[str]
     goes_with: ClassVar[Literal["", "torque", "weights"]] = ""
+    column: ClassVar[str] = ""
 
     @abstractmethod
     def places(self, rig: Rig) -> tuple[str, ...]:
@@ -250,13 +253,13 @@ class Family(ABC):
 
     def needs(self, where: str) -> str:
         """What it needs beside the readings of the joints, as a noun phrase; empty for nothing."""
-        del where
-        return ""
+        return f"the column {self.column.format(where=where)}" if self.column else ""
 
     def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
         """(n,) rows that have what it needs."""
-        del where
-        return np.ones(len(situation), dtype=bool)
+        if not self.column:
+            return np.ones(len(situation), dtype=bool)
+        return np.isfinite(situation.extra(self.column.format(where=where)))
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
         """The forms it may take, of which the data choose one: numbers that hold from training to prediction.
@@ -347,7 +350,17 @@ class JointFamily(Family):
 
 
 class PrismFamily(Family):
-    """An effect that moves the prism, or its fix, where no joint value errs: a beam, the base, the station, a clock."""
+    """An effect that moves the prism, or its fix, where no joint value errs: a beam, the base, the station, a clock.
+
+    Attributes:
+        place: where it is, on every rig; those that a rig has none or several places for say so in `places`.
+    """
+
+    place: ClassVar[str]
+
+    def places(self, rig: Rig) -> tuple[str, ...]:
+        del rig
+        return (self.place,)
 
     @abstractmethod
     def shift_mm(self, situation: Situation, where: str, settings: Settings) -> Floats:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.effects.base import Situation
+from calibration.effects.base import PrismFamily, Situation
 from calibration.observations import Floats
 from calibration.rig import Rig
 
@@ -21,6 +22,23 @@ def boom_of(rig: Rig) -> tuple[int, str] | None:
     Of several the first: it carries the others.
     """
     return next(((number, joint) for number, driven, joint, _ in rig.couplings() if driven == "a"), None)
+
+
+class BoomFamily(PrismFamily):
+    """An effect of what a telescoping boom carries; only rigs that have one have a place for it."""
+
+    goes_with: ClassVar[Literal["", "torque", "weights"]] = "weights"
+
+    def places(self, rig: Rig) -> tuple[str, ...]:
+        return ("boom",) if boom_of(rig) is not None else ()
+
+    def needs(self, where: str) -> str:
+        del where
+        return "masses in the rig file"
+
+    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
+        del where
+        return np.full(len(situation), bool(situation.rig.masses))
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from numpy.typing import NDArray
 
-from calibration.effects.base import Coefficient, FittedCoefficient, Settings, Situation
+from calibration.effects.base import Coefficient, Family, FittedCoefficient, JointFamily, Settings, Situation
 from calibration.errors import ModelError
 from calibration.kinematics import Chain
 from calibration.observations import Floats
@@ -162,17 +164,32 @@ def part_coefficients(settings: Settings, bound: float) -> tuple[Coefficient, ..
     return tuple(Coefficient(name, UNIT, settings[_ABOUT], -bound, bound) for name in part_names(settings))
 
 
-def strained_weights(values: Floats, standard_errors: Floats) -> bool:
-    """Whether the shapes of an effect, its coefficients (k,) but the first, ask for weights that no machine has.
+class OfUncertainLoad(Family):
+    """An effect in proportion to a load: its own coefficient, and after it those of what is uncertain of the load."""
 
-    By more than chance; a fit that needs them follows another effect with them.
-    """
-    most = _MOST_SIGMAS * (abs(values[0]) + _CHANCE * standard_errors[0])
-    return bool((np.abs(values[1:]) > most + _CHANCE * standard_errors[1:]).any())
+    def reported(
+        self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
+    ) -> tuple[FittedCoefficient, ...]:
+        """The effect's own coefficient alone, the uncertainty of the whole load in its standard error."""
+        own = coefficients[0]
+        error = math.hypot(own.standard_error, settings.get(_LOAD_SIGMA, 0.0) * own.value)
+        return (replace(own, standard_error=error),)
+
+    def strained(self, settings: Settings, values: Floats, standard_errors: Floats) -> bool:
+        """Whether the shapes ask for weights that no machine has; a fit that needs them follows another effect."""
+        del settings
+        most = _MOST_SIGMAS * (abs(values[0]) + _CHANCE * standard_errors[0])
+        return bool((np.abs(values[1:]) > most + _CHANCE * standard_errors[1:]).any())
 
 
-def with_load_sigma(settings: Settings, coefficients: tuple[FittedCoefficient, ...]) -> tuple[FittedCoefficient, ...]:
-    """The effect's own coefficient alone, the uncertainty of the whole load in its standard error."""
-    own = coefficients[0]
-    error = math.hypot(own.standard_error, settings.get(_LOAD_SIGMA, 0.0) * own.value)
-    return (replace(own, standard_error=error),)
+class TorqueFamily(JointFamily):
+    """An effect at a revolute joint in whose load it lies alone."""
+
+    goes_with: ClassVar[Literal["", "torque", "weights"]] = "torque"
+    kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
+
+    def needs(self, where: str) -> str:
+        return f"masses in the rig file or the column {where}_Nm"
+
+    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
+        return np.isfinite(situation.torque(where))

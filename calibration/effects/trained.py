@@ -9,8 +9,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.effects.base import Settings
+from calibration.effects.base import PrismFamily, Settings
 from calibration.observations import Floats
+
+
+class TrainedFamily(PrismFamily):
+    """A prism family whose settings have the `sizes` of its columns in the training rows."""
+
+    def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
+        del plausible
+        return sum((float(v) * settings[name]) ** 2 for v, name in zip(values, size_names(len(values)), strict=True))
 
 
 def sizes(shift_mm: Floats) -> dict[str, float]:
@@ -22,11 +30,6 @@ def sizes(shift_mm: Floats) -> dict[str, float]:
 def size_names(coefficients: int) -> tuple[str, ...]:
     """Names of the settings that `sizes` makes."""
     return tuple(f"size{number}_mm" for number in range(1, coefficients + 1))
-
-
-def size_variance(values: Floats, settings: Settings) -> float:
-    """Mean square of each coordinate, mm^2, for coefficients (k,): what the effect was in training."""
-    return sum((float(v) * settings[name]) ** 2 for v, name in zip(values, size_names(len(values)), strict=True))
 
 
 def check_settings(settings: Settings, names: Sequence[str], coefficients: int) -> None:

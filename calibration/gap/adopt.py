@@ -15,7 +15,7 @@ from calibration.effects.fitted import Choice, FittedEffect
 from calibration.effects.library import library, parse_effects
 from calibration.errors import DataError
 from calibration.gap.projection import Projection
-from calibration.gap.screen import LEAST_KNOWN, LOG_SCALE_ODDS, SCALES, Screen, place_of
+from calibration.gap.screen import LEAST_KNOWN, LOG_SCALE_ODDS, SCALES, Screen, place_of, variants_at
 from calibration.identification.additions import Additions, joined
 from calibration.identification.identifiability import identifiability
 from calibration.identification.refinement import Fit, Prior, refine
@@ -189,13 +189,23 @@ def refined_choice(joint: JointFit, number: int, over: Projection) -> Choice:
         over: the projection about that fit, in which the effect is no part of what is taken out.
     """
     choice = joint.choices[number]
-    finer = library()[choice.family].refined(joint.situation, choice.where, choice.settings)
-    if len(finer) < 2:
+    finer = finer_forms(joint.situation, choice)
+    if not finer:
         return choice
-    choices = [replace(choice, settings=settings) for settings in finer]
-    screen = Screen(over, [place_of(joint.situation, over, choice.family, choice.where, choices)])
-    probability = softmax([screen.log_bayes_factor([(0, option)]) for option in range(len(choices))])
-    return replace(choice, settings=library()[choice.family].settled(finer, probability))
+    probability = softmax(evidence_of_forms(joint.situation, finer, over))
+    return replace(choice, settings=library()[choice.family].settled([c.settings for c in finer], probability))
+
+
+def finer_forms(situation: Situation, choice: Choice) -> tuple[Choice, ...]:
+    """Finer forms about one of an effect, that one among them; none where there is nothing finer."""
+    finer = library()[choice.family].refined(situation, choice.where, choice.settings)
+    return tuple(replace(choice, settings=settings) for settings in finer) if len(finer) > 1 else ()
+
+
+def evidence_of_forms(situation: Situation, forms: Sequence[Choice], over: Projection) -> Floats:
+    """(m,) log evidence of each of the forms of one effect by itself."""
+    screen = Screen(over, [place_of(situation, over, forms[0].family, forms[0].where, forms)])
+    return np.array([screen.log_bayes_factor([(0, option)]) for option in range(len(forms))])
 
 
 def projected(solution: Solution, joint: JointFit, *, without_last: bool = False) -> Projection:
@@ -209,7 +219,7 @@ def projected(solution: Solution, joint: JointFit, *, without_last: bool = False
 def _in_finest_forms(solution: Solution, joint: JointFit, prior: Prior) -> JointFit:
     """The fit with each effect in its finest form beside the others."""
     for choice in joint.choices:
-        if not library()[choice.family].refined(joint.situation, choice.where, choice.settings):
+        if not finer_forms(joint.situation, choice):
             continue
         observations = joint.situation.observations
         others = [c for c in joint.choices if c != choice]
@@ -226,10 +236,7 @@ def _best_variants(
 ) -> JointFit:
     """The effects in the variants of the greatest evidence together: changed one at a time, until none is better."""
     observations = situation.observations
-    variants = [
-        [Choice(name, where, settings) for settings in library()[name].variants(situation, where)]
-        for name, where in names
-    ]
+    variants = [variants_at(situation, name, where) for name, where in names]
     chosen = [(0, 1.0)] * len(names)
     joint = joint_fit(solution, observations, _scaled(variants, chosen), prior)
     for _ in range(_CHOICES):

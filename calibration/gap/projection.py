@@ -126,7 +126,7 @@ class Projection:
             moved.append(self._additions.moved_mm(found.joint_jacobian))
         design = np.concatenate(moved, axis=2) / found.precision_root
         errors = np.empty_like(found.error_mm)
-        for number, x in without_folds(found.jacobian, found.error + found.jacobian @ found.value, fold):
+        for number, x in without_folds(found.jacobian, self.rows.target, fold):
             rows = fold == number
             errors[rows] = found.error_mm[rows] - design[rows] @ (x - found.value)
         return errors

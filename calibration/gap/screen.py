@@ -135,7 +135,9 @@ def possible(
         family = library()[name]
         places = family.places(situation.rig)
         known = [where for where in places if family.known(situation, where).mean() >= LEAST_KNOWN]
-        here = [(name, where, _choices(situation, name, where)) for where in known if f"{name}@{where}" not in without]
+        here = [
+            (name, where, variants_at(situation, name, where)) for where in known if f"{name}@{where}" not in without
+        ]
         if not places:
             disabled[name] = f"rig {situation.rig.name!r} has no place for it"
         elif not known:
@@ -176,7 +178,8 @@ def place_of(
     )
 
 
-def _choices(situation: Situation, family: str, where: str) -> tuple[Choice, ...]:
+def variants_at(situation: Situation, family: str, where: str) -> tuple[Choice, ...]:
+    """The forms that an effect may take at a place; none where it cannot be there."""
     return tuple(Choice(family, where, settings) for settings in library()[family].variants(situation, where))
 
 

@@ -12,9 +12,17 @@ from numpy.typing import NDArray
 
 from calibration.effects.base import Situation
 from calibration.effects.fitted import Choice
-from calibration.effects.library import library
 from calibration.gap.adequacy import closes
-from calibration.gap.adopt import Adopted, JointFit, adopted, joint_fit, projected, refined_choice
+from calibration.gap.adopt import (
+    Adopted,
+    JointFit,
+    adopted,
+    evidence_of_forms,
+    finer_forms,
+    joint_fit,
+    projected,
+    refined_choice,
+)
 from calibration.gap.decide import beyond, chance_of_gain, wins
 from calibration.gap.detect import detect
 from calibration.gap.grammar import Found as Formula
@@ -34,7 +42,7 @@ from calibration.gap.rivals import (
     with_a_chance,
     with_option,
 )
-from calibration.gap.screen import Place, Possible, Screen, Weighed, by_family, place_of, possible
+from calibration.gap.screen import Place, Possible, Screen, Weighed, by_family, place_of, possible, variants_at
 from calibration.identification.additions import joined
 from calibration.identification.refinement import Fit, Prior
 from calibration.identification.solve import Solution
@@ -90,8 +98,7 @@ class Found:
         rivals: of the set that is pending, the most probable first; none where nothing is.
         formulas: of the grammar, where they explain better than all of the library what is left.
         certain: `family@where` of what is adopted -> posterior of its family when it was.
-        disabled: family -> what the data lack for it.
-        screen: all places at the beginning.
+        possible: all places at the beginning, and what the data lack for others.
         first, last: what the kinematics alone leave, and what is left in the end.
     """
 
@@ -101,8 +108,7 @@ class Found:
     rivals: tuple[Weighed, ...]
     formulas: tuple[Formula, ...]
     certain: Mapping[str, float]
-    disabled: Mapping[str, str]
-    screen: Screen
+    possible: Possible
     first: Projection
     last: Projection
 
@@ -112,7 +118,6 @@ class _Decision:
     kind: Literal["take", "set", "outside", "nothing"]
     weighed: tuple[Weighed, ...]
     posterior: Mapping[str, float]
-    leading: Weighed | None = None
     joint: JointFit | None = None
     rivals: tuple[Weighed, ...] = ()
     formulas: tuple[Formula, ...] = ()
@@ -155,9 +160,9 @@ class _Search:
         projection = self._project(joint)
         alone = joint, projection
         first = possible(situation, projection, self.families)
-        steps = 0
+        there, steps = first.places, 0
         while True:
-            decision = self._decide(joint, projection, self._possible(joint, projection))
+            decision = self._decide(joint, projection, there)
             steps += 1
             is_set = decision.kind == "set" and len(pending) < _PENDING
             taken = () if decision.joint is None else decision.joint.choices[len(joint.choices) :]
@@ -167,8 +172,9 @@ class _Search:
             settled = self._settled(joint, again) if steps < _STEPS else joint
             if settled is not joint:
                 joint, projection = settled, self._project(settled)
+                there = self._possible(joint, projection)
                 continue
-            if decision.kind == "take" or not is_set:
+            if not is_set:
                 own = taken if decision.kind == "take" else ()
                 turns.append(Turn(joint, projection, decision.weighed, decision.posterior, own, decision.reasons))
             if decision.joint is None or steps > _STEPS or not (is_set or decision.kind == "take"):
@@ -179,6 +185,7 @@ class _Search:
             certain |= {str(c): decision.posterior[c.family] for c in taken}
             joint = decision.joint
             projection = self._project(joint)
+            there = self._possible(joint, projection)
         rivals = decision.rivals
         for name in pending:
             joint, turn, left = self._judged_again(joint, name)
@@ -191,7 +198,6 @@ class _Search:
         turns = self._as_they_count(turns, alone, joint)
         turns[-1] = replace(turns[-1], fit=joint, projection=projection)
         certain = {str(c): certain[str(c)] for c in joint.choices}
-        decision = replace(decision, rivals=rivals)
         if joint.choices and not rivals:
             structured = bool(decision.formulas) or detect(Grammar(projection), self._rng()).significant
             if not closes(turns[0].projection, projection, is_structured=structured):
@@ -203,11 +209,10 @@ class _Search:
             adopted(solution, joint, reason) if joint.choices else Adopted(solution, solution.fit, reason=reason),
             joint,
             tuple(turns),
-            decision.rivals,
+            rivals,
             decision.formulas,
             certain,
-            first.disabled,
-            Screen(turns[0].projection, first.places),
+            first,
             turns[0].projection,
             projection,
         )
@@ -262,8 +267,7 @@ class _Search:
             (),
             Grammar(start).found() or decision.formulas,
             {},
-            first.disabled,
-            Screen(start, first.places),
+            first,
             start,
             start,
         )
@@ -319,7 +323,7 @@ class _Search:
             columns = [sharp.columns(sharp.moved_mm(w.additions)) for w in weighed[:_PAIRED]]
             if not any(strongest[0].alike(c) for c in columns):
                 reasons |= {str(w.place): f"{strongest[0].term} explains it better" for w in near}
-                return _Decision("outside", weighed, posterior, leading, formulas=grammar.found(), reasons=reasons)
+                return _Decision("outside", weighed, posterior, formulas=grammar.found(), reasons=reasons)
         rivals = [w for w in best if w.log_bayes_factor > leading.log_bayes_factor - 6 * NEAR][:6]
         against = ""
         # The name of a family that is there already is earned; one more place of it needs less than a new name.
@@ -344,11 +348,11 @@ class _Search:
                 taken = [leading, *more]
                 start = sharp.solved(joined([w.scaled_additions for w in taken], len(sharp.samples)))
                 tried = self._fit([*joint.choices, *(w.choice for w in taken)], start)
-            return _Decision("take", weighed, posterior, leading, tried, reasons=reasons)
+            return _Decision("take", weighed, posterior, tried, reasons=reasons)
         reasons |= {str(w.place): against for w in near}
         if len(near) < 2:
-            return _Decision("nothing", weighed, posterior, leading, reasons=reasons)
-        return _Decision("set", weighed, posterior, leading, tried, tuple(near[:MOST_OF_A_SET]), reasons=reasons)
+            return _Decision("nothing", weighed, posterior, reasons=reasons)
+        return _Decision("set", weighed, posterior, tried, tuple(near[:MOST_OF_A_SET]), reasons=reasons)
 
     def _sharpened(
         self, joint: JointFit, over: Projection, places: Sequence[Place], leading: Weighed
@@ -356,7 +360,7 @@ class _Search:
         """All places weighed with the noise that the best of them leaves, about the fit that has it."""
         for _ in range(_SHARPER):
             tried = self._fit([*joint.choices, leading.choice], over.solved(leading.scaled_additions))
-            if library()[leading.place.family].refined(tried.situation, leading.place.where, leading.choice.settings):
+            if finer_forms(tried.situation, leading.choice):
                 # Which fixes are outliers depends on the form: those beside a step in a wrong place look like some.
                 counted = replace(tried, fit=replace(tried.fit, weight=over.fit.weight))
                 finer = refined_choice(tried, len(tried.choices) - 1, self._project(counted, without_last=True))
@@ -384,12 +388,10 @@ class _Search:
         own = next(w for w in weighed if w.place is place)
         if own is weighed[0] or own.log_bayes_factor < _LOOKED_AT * weighed[0].log_bayes_factor:
             return place
-        finer = library()[place.family].refined(joint.situation, place.where, own.choice.settings)
-        if len(finer) < 2:
+        finer = finer_forms(joint.situation, replace(own.choice, scale=1.0))
+        if not finer:
             return place
-        choices = [Choice(place.family, place.where, settings) for settings in finer]
-        screen = Screen(sharp, [place_of(joint.situation, sharp, place.family, place.where, choices)])
-        best = choices[int(np.argmax([screen.log_bayes_factor([(0, i)]) for i in range(len(choices))]))]
+        best = finer[int(np.argmax(evidence_of_forms(joint.situation, finer, sharp)))]
         return with_option(place, best, sharp, joint.situation)
 
     def _settled(self, joint: JointFit, again: Sequence[Choice]) -> JointFit:
@@ -431,8 +433,8 @@ class _Search:
         """The place of an effect as it is, and with its other variants where it is open which it has."""
         options = [replace(choice, scale=1.0)]
         if is_open:
-            variants = library()[choice.family].variants(joint.situation, choice.where)
-            options += [Choice(choice.family, choice.where, v) for v in variants if v != choice.settings]
+            variants = variants_at(joint.situation, choice.family, choice.where)
+            options += [v for v in variants if v.settings != choice.settings]
         return place_of(joint.situation, over, choice.family, choice.where, options)
 
     # -- pieces -----------------------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from calibration.gap.forecast import forecasts
 from calibration.gap.grammar import Found as Formula
 from calibration.gap.grammar import Grammar, describe
 from calibration.gap.result import Candidate, Gap, Round, Verdict
-from calibration.gap.screen import Weighed
+from calibration.gap.screen import Screen, Weighed
 from calibration.gap.search import Found, Turn, search
 from calibration.identification.refinement import Prior
 from calibration.identification.samples import Samples, reading_covariance, station_covariance
@@ -153,7 +153,7 @@ def _answer(
         description=description,
         remaining_significant=is_left,
         remaining_mm=float(np.sqrt(max(rms(error_after[is_counted]) ** 2 - noise_mm**2, 0.0))),
-        disabled=found.disabled,
+        disabled=found.possible.disabled,
         before_mm=rms(error_before),
         after_mm=rms(error_after),
         noise_mm=noise_mm,
@@ -162,7 +162,7 @@ def _answer(
         disagreements=before.disagreements,
         experiments=proposed,
         rounds=tuple(_rounds(found, observations, holdout, seed)),
-        forecasts=forecasts(found.screen),
+        forecasts=forecasts(Screen(found.first, found.possible.places)),
         model=model,
         observations=observations,
         error_before_mm=error_before,

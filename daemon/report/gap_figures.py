@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.gap.result import Gap
+from calibration.gap.workflow import rms
 from calibration.observations import Floats
 from calibration.rig import Joint
 from daemon.report.drawing import AFTER, INK, MIDDLE, SOFT, WARN, new_figure
@@ -257,7 +258,7 @@ def by_prism(gap: Gap) -> Figure:
     figure = new_figure(0.85 + 0.42 * max(len(masks), 3))
     left, right = figure.subplots(1, 2)
     labels = [f"{prism} ({int(rows.sum())} fixes)" for prism, rows in masks.items()]
-    _bars(left, gap, labels, [[_rms(stage.error_mm[rows]) for rows in masks.values()] for stage in stages(gap)])
+    _bars(left, gap, labels, [[rms(stage.error_mm[rows]) for rows in masks.values()] for stage in stages(gap)])
     left.set_title("By prism")
     components = [np.sqrt((stage.error_mm**2).mean(axis=0)).tolist() for stage in stages(gap)]
     _bars(right, gap, ["x (east)", "y (north)", "z (up)"], components)
@@ -353,7 +354,3 @@ def _legend(figure: Figure, gap: Gap) -> None:
 
 def _unit(joint: Joint) -> str:
     return "mrad" if joint.kind == "revolute" else "mm"
-
-
-def _rms(error_mm: Floats) -> float:
-    return float(np.sqrt((error_mm**2).sum(axis=1).mean()))

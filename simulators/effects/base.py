@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,8 +132,9 @@ class Effect:
 
         Left open, they are those of the rows that a call gives: the earliest time and the mean temperature.
         """
-        del first_s, mean_degC
-        return self
+        origins = {"first_s": first_s, "at_degC": mean_degC}
+        left_open: dict[str, Any] = {name: at for name, at in origins.items() if getattr(self, name, at) is None}
+        return replace(self, **left_open) if left_open else self
 
     def delay_s(self, body: Body) -> Floats | None:
         """(n,) how much earlier than the readings the fix was; None when it is of their instant."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -34,10 +34,6 @@ class BaseSettlement(Effect):
     def check(self, rig: Rig) -> None:
         del rig
         check_place(self, "base")
-
-    def anchored(self, first_s: float, mean_degC: float) -> Effect:
-        del mean_degC
-        return replace(self, first_s=first_s if self.first_s is None else self.first_s)
 
     def bends(self, body: Body) -> Sequence[Bend]:
         hours = hours_since(body, self.first_s)[:, None]

@@ -9,12 +9,19 @@ from typing import ClassVar
 import numpy as np
 
 from calibration.rig import Rig
-from simulators.effects.base import Bend, Body, Effect, Floats
+from simulators.effects.base import Bend, Body, Effect, Floats, check_place
 
 
 def boom_row(rig: Rig) -> int | None:
     """Number of the row whose length `a` a transducer drives (the telescoping boom); None if there is none."""
     return next((n for n, driven, _, _ in rig.couplings() if driven == "a"), None)
+
+
+def check_boom(effect: Effect, rig: Rig) -> None:
+    """ValueError unless the effect is at `boom` and the rig has one."""
+    check_place(effect, "boom")
+    if boom_row(rig) is None:
+        raise ValueError(f"{effect.family}: rig {rig.name!r} has no row with a driven length a")
 
 
 @dataclass(frozen=True)
@@ -34,10 +41,7 @@ class BoomDroop(Effect):
     flexibility_per_Nm2: float = 4e-9  # noqa: N815 - the unit is N m^2
 
     def check(self, rig: Rig) -> None:
-        if self.where != "boom":
-            raise ValueError(f"boom_droop@{self.where}: it acts at boom")
-        if boom_row(rig) is None:
-            raise ValueError(f"boom_droop: rig {rig.name!r} has no row with a driven length a")
+        check_boom(self, rig)
 
     def bends(self, body: Body) -> Sequence[Bend]:
         row = boom_row(body.rig)

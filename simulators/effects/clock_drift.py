@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 from calibration.rig import Rig
@@ -27,10 +27,6 @@ class ClockDrift(Effect):
     def check(self, rig: Rig) -> None:
         del rig
         check_place(self, "clock")
-
-    def anchored(self, first_s: float, mean_degC: float) -> Effect:
-        del mean_degC
-        return replace(self, first_s=first_s if self.first_s is None else self.first_s)
 
     def delay_s(self, body: Body) -> Floats:
         return self.ppm * 1e-6 * 3600.0 * hours_since(body, self.first_s)

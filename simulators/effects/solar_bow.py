@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -33,10 +33,6 @@ class SolarBow(Effect):
     def check(self, rig: Rig) -> None:
         super().check(rig)
         check_kind(self, rig, "revolute")
-
-    def anchored(self, first_s: float, mean_degC: float) -> Effect:
-        del first_s
-        return replace(self, at_degC=mean_degC if self.at_degC is None else self.at_degC)
 
     def joint_change(self, body: Body) -> Floats:
         return self.rad_per_K * warming(body, self.at_degC) * self._flatness(body)

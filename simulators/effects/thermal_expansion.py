@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 from calibration.rig import Rig
@@ -27,10 +27,6 @@ class ThermalExpansion(Effect):
     def check(self, rig: Rig) -> None:
         del rig
         check_place(self, "boom")
-
-    def anchored(self, first_s: float, mean_degC: float) -> Effect:
-        del first_s
-        return replace(self, at_degC=mean_degC if self.at_degC is None else self.at_degC)
 
     def growth(self, body: Body) -> Floats:
         return self.per_K * warming(body, self.at_degC)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.effects.base import Coefficient, JointFamily, Settings, Situation, refuse_settings
 from calibration.observations import Floats
@@ -19,13 +18,8 @@ class Backlash(JointFamily):
     source: ClassVar[str] = "gear play; the approach from the other side shows it"
     confused_with: ClassVar[tuple[str, ...]] = ("load_hysteresis", "gravity_flip_play")
     revealed_by: ClassVar[str] = "coming to the same pose from both sides"
+    column: ClassVar[str] = "{where}_dir"
     kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
-
-    def needs(self, where: str) -> str:
-        return f"the column {where}_dir"
-
-    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
-        return np.isfinite(situation.extra(f"{where}_dir"))
 
     def names(self, settings: Settings) -> tuple[str, ...]:
         refuse_settings(settings)

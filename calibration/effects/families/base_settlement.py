@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
-from calibration.effects.base import Coefficient, PrismFamily, Settings, Situation
+from calibration.effects.base import Coefficient, Settings, Situation
 from calibration.effects.base_motion import base_motion_mm
 from calibration.effects.elapsed import ELAPSED_SETTINGS, check_elapsed, elapsed_s, elapsed_settings
-from calibration.effects.trained import check_settings, size_variance, sizes
+from calibration.effects.trained import TrainedFamily, check_settings, sizes
 from calibration.observations import Floats
-from calibration.rig import Rig
 
 _NAMES = ("tilt_x_rad_per_h", "tilt_y_rad_per_h", "z_mm_per_h")
 
 
-class BaseSettlement(PrismFamily):
+class BaseSettlement(TrainedFamily):
     """The base drifts as a rigid body at a steady rate from the first row of the training on."""
 
     name: ClassVar[str] = "base_settlement"
@@ -27,18 +23,8 @@ class BaseSettlement(PrismFamily):
     revealed_by: ClassVar[str] = (
         "the same few poses at the start, in the middle and at the end, or fixed control points"
     )
-
-    def places(self, rig: Rig) -> tuple[str, ...]:
-        del rig
-        return ("base",)
-
-    def needs(self, where: str) -> str:
-        del where
-        return "the column time_s"
-
-    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
-        del where
-        return np.isfinite(situation.extra("time_s"))
+    place: ClassVar[str] = "base"
+    column: ClassVar[str] = "time_s"
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
         known = self.known(situation, where)
@@ -58,10 +44,6 @@ class BaseSettlement(PrismFamily):
     def shift_mm(self, situation: Situation, where: str, settings: Settings) -> Floats:
         del where
         return _shift_mm(situation, settings)
-
-    def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
-        del plausible
-        return size_variance(values, settings)
 
 
 def _shift_mm(situation: Situation, elapsed: Settings) -> Floats:

@@ -6,19 +6,17 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.effects.base import Coefficient, FittedCoefficient, PrismFamily, Settings, Situation
+from calibration.effects.base import Coefficient, FittedCoefficient, Settings, Situation
 from calibration.effects.base_motion import base_motion_mm
 from calibration.effects.step_times import STEP_SETTINGS, check_step, refined_steps, settled_step, step_grid, step_time
-from calibration.effects.trained import check_settings, size_variance, sizes
+from calibration.effects.trained import TrainedFamily, check_settings, sizes
 from calibration.observations import Floats
-from calibration.rig import Rig
 
 _NAMES = ("tilt_x_rad", "tilt_y_rad", "z_mm")
 
 
-class BaseStep(PrismFamily):
+class BaseStep(TrainedFamily):
     """The base stands otherwise, as a rigid body, in all rows after one instant."""
 
     name: ClassVar[str] = "base_step"
@@ -26,18 +24,8 @@ class BaseStep(PrismFamily):
     source: ClassVar[str] = "rigid motion of the set-up at one instant: a jack that slips, a knock"
     confused_with: ClassVar[tuple[str, ...]] = ("base_settlement", "payload_change", "transducer_index_jump")
     revealed_by: ClassVar[str] = "fixed control points, or one pose again and again all through the session"
-
-    def places(self, rig: Rig) -> tuple[str, ...]:
-        del rig
-        return ("base",)
-
-    def needs(self, where: str) -> str:
-        del where
-        return "the column time_s"
-
-    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
-        del where
-        return np.isfinite(situation.extra("time_s"))
+    place: ClassVar[str] = "base"
+    column: ClassVar[str] = "time_s"
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
         return self._sized(situation, where, step_grid(situation.extra("time_s")))
@@ -67,10 +55,6 @@ class BaseStep(PrismFamily):
         del where
         # A comparison with NaN is false: rows without a time stand as before.
         return base_motion_mm(situation, (situation.extra("time_s") > settings["time_s"]).astype(np.float64))
-
-    def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
-        del plausible
-        return size_variance(values, settings)
 
     def _sized(self, situation: Situation, where: str, steps: tuple[Settings, ...]) -> tuple[Settings, ...]:
         if not steps:

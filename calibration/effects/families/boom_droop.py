@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.effects.base import Coefficient, FittedCoefficient, PrismFamily, Settings, Situation
-from calibration.effects.boom import Boom, boom_in, boom_of
-from calibration.effects.load_shapes import LoadShapes, shapes_by_design, strained_weights, with_load_sigma
+from calibration.effects.base import Coefficient, Settings, Situation
+from calibration.effects.boom import Boom, BoomFamily, boom_in
+from calibration.effects.load_shapes import LoadShapes, OfUncertainLoad, shapes_by_design
 from calibration.errors import ModelError
 from calibration.observations import Floats
-from calibration.rig import Rig
 from calibration.torques import MASS_SIGMA
 
 _FLEXIBILITY = "flexibility_per_Nm2"
@@ -25,7 +23,7 @@ _AHEAD_MM = 3000.0  # of the tip: a second place that shows the slope beside the
 _MOST_PARTS = 100
 
 
-class BoomDroop(PrismFamily):
+class BoomDroop(OfUncertainLoad, BoomFamily):
     """An Euler-Bernoulli cantilever from the boom's root to its tip, longer as it extends.
 
     The tip carries the weights F of all that is beyond, with their moment M about it; weights W that are fixed to the
@@ -41,18 +39,6 @@ class BoomDroop(PrismFamily):
     source: ClassVar[str] = "Euler-Bernoulli beam theory: cantilever with a load and a moment at its end"
     confused_with: ClassVar[tuple[str, ...]] = ("joint_compliance", "transducer_quadratic", "pad_play")
     revealed_by: ClassVar[str] = "the same attitude of the boom drawn in and run out, once with a load and once without"
-    goes_with: ClassVar[Literal["", "torque", "weights"]] = "weights"
-
-    def places(self, rig: Rig) -> tuple[str, ...]:
-        return ("boom",) if boom_of(rig) is not None else ()
-
-    def needs(self, where: str) -> str:
-        del where
-        return "masses in the rig file"
-
-    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
-        del where
-        return np.full(len(situation), bool(situation.rig.masses))
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
         boom = boom_in(situation)
@@ -82,15 +68,6 @@ class BoomDroop(PrismFamily):
             Coefficient(first, _UNIT, _SIGMA_MM / most, 0.0, bound),
             *(Coefficient(name, _UNIT, settings["about_per_Nm2"], -bound, bound) for name in others),
         )
-
-    def reported(
-        self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
-    ) -> tuple[FittedCoefficient, ...]:
-        return with_load_sigma(settings, coefficients)
-
-    def strained(self, settings: Settings, values: Floats, standard_errors: Floats) -> bool:
-        del settings
-        return strained_weights(values, standard_errors)
 
     def shift_mm(self, situation: Situation, where: str, settings: Settings) -> Floats:
         del where

@@ -7,15 +7,14 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.effects.base import Coefficient, PrismFamily, Settings, Situation
+from calibration.effects.base import Coefficient, Settings, Situation
 from calibration.effects.elapsed import ELAPSED_SETTINGS, check_elapsed, elapsed_s, elapsed_settings
 from calibration.effects.motion import has_rates, velocity_mm_per_s
-from calibration.effects.trained import check_settings, size_variance, sizes
+from calibration.effects.trained import TrainedFamily, check_settings, sizes
 from calibration.observations import Floats
-from calibration.rig import Rig
 
 
-class ClockDrift(PrismFamily):
+class ClockDrift(TrainedFamily):
     """A latency that grows steadily from the first row of the training on; nothing where the boom stands."""
 
     name: ClassVar[str] = "clock_drift"
@@ -23,10 +22,7 @@ class ClockDrift(PrismFamily):
     source: ClassVar[str] = "frequency error of quartz clocks that nothing disciplines: some ppm, 50 at the worst"
     confused_with: ClassVar[tuple[str, ...]] = ("latency",)
     revealed_by: ClassVar[str] = "fixes of a moving boom at the start and at the end of a long session"
-
-    def places(self, rig: Rig) -> tuple[str, ...]:
-        del rig
-        return ("clock",)
+    place: ClassVar[str] = "clock"
 
     def needs(self, where: str) -> str:
         del where
@@ -56,10 +52,6 @@ class ClockDrift(PrismFamily):
     def shift_mm(self, situation: Situation, where: str, settings: Settings) -> Floats:
         del where
         return _shift_mm(situation, settings)
-
-    def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
-        del plausible
-        return size_variance(values, settings)
 
 
 def _shift_mm(situation: Situation, elapsed: Settings) -> Floats:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.effects.base import Coefficient, JointFamily, Settings, Situation
 from calibration.observations import Floats
@@ -19,13 +18,8 @@ class CylinderCompression(JointFamily):
     source: ClassVar[str] = "bulk modulus of hydraulic oil, about 14 000 bar, and the stretch of barrel and rod"
     confused_with: ClassVar[tuple[str, ...]] = ("joint_compliance", "boom_droop", "transducer_scale")
     revealed_by: ClassVar[str] = "the same length under another pressure: against a stop, or with a payload and without"
+    column: ClassVar[str] = "{where}_bar"
     kind: ClassVar[Literal["revolute", "prismatic"]] = "prismatic"
-
-    def needs(self, where: str) -> str:
-        return f"the column {where}_bar"
-
-    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
-        return np.isfinite(situation.extra(f"{where}_bar"))
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
         pressure_bar = situation.extra(f"{where}_bar")[self.known(situation, where)]

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 from scipy.stats import norm, qmc
 
-from calibration.effects.base import Coefficient, FittedCoefficient, JointFamily, Settings, Situation
-from calibration.effects.load_shapes import gravity_shapes
+from calibration.effects.base import Coefficient, FittedCoefficient, Settings, Situation
+from calibration.effects.load_shapes import TorqueFamily, gravity_shapes
 from calibration.errors import ModelError
 from calibration.observations import Floats
 
@@ -27,7 +26,7 @@ _MOST_SHAPES = 3  # of a load that finer forms take; more hardly move its zero
 _CLOUD, _FINER = 128, 0.15  # finer forms, and what is open between them
 
 
-class GravityFlipPlay(JointFamily):
+class GravityFlipPlay(TorqueFamily):
     """The joint gives way by half the play in the direction of its load, and flips over where the load does.
 
     The load is known from the rig file's masses, to +-15 %, so where it changes its sign is known to some tenths of a
@@ -43,14 +42,6 @@ class GravityFlipPlay(JointFamily):
     source: ClassVar[str] = "clearance of pins and gears under a load that changes sides"
     confused_with: ClassVar[tuple[str, ...]] = ("joint_compliance", "backlash", "encoder_harmonic")
     revealed_by: ClassVar[str] = "poses close to either side of where the joint's load changes its sign"
-    goes_with: ClassVar[Literal["", "torque", "weights"]] = "torque"
-    kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
-
-    def needs(self, where: str) -> str:
-        return f"masses in the rig file or the column {where}_Nm"
-
-    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
-        return np.isfinite(situation.torque(where))
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
         largest = situation.greatest_torque(where)

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.effects.base import Coefficient, FittedCoefficient, JointFamily, Settings, Situation
+from calibration.effects.base import Coefficient, Settings, Situation
 from calibration.effects.load_shapes import (
     UNIT,
+    OfUncertainLoad,
+    TorqueFamily,
     gravity_shapes,
     load_variants,
     part_coefficients,
     part_names,
     shape_columns,
-    strained_weights,
-    with_load_sigma,
 )
 from calibration.kernels.jit import compiled
 from calibration.observations import Floats
@@ -36,7 +35,7 @@ _CURVED_ODDS = 0.2  # of all curves of a computed load beside the straight varia
 _UNKNOWN_LOADS = 101
 
 
-class JointCompliance(JointFamily):
+class JointCompliance(OfUncertainLoad, TorqueFamily):
     """Deflection by the gravity torque; its stiffness is constant, or changes smoothly with the torque.
 
     Gears stiffen as they wind up: harmonic drives in three steps, bearings and teeth with a soft zone about zero. The
@@ -59,14 +58,6 @@ class JointCompliance(JointFamily):
     revealed_by: ClassVar[str] = (
         "the same readings of the joint under little and great load: near and far, with a payload and without"
     )
-    goes_with: ClassVar[Literal["", "torque", "weights"]] = "torque"
-    kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
-
-    def needs(self, where: str) -> str:
-        return f"masses in the rig file or the column {where}_Nm"
-
-    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
-        return np.isfinite(situation.torque(where))
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
         torque = situation.greatest_torque(where)
@@ -119,13 +110,8 @@ class JointCompliance(JointFamily):
             *(Coefficient(name, "rad", settings["bend_rad"], -_BEND_BOUND_RAD, _BEND_BOUND_RAD) for name in bends),
         )
 
-    def reported(
-        self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
-    ) -> tuple[FittedCoefficient, ...]:
-        return with_load_sigma(settings, coefficients)
-
     def strained(self, settings: Settings, values: Floats, standard_errors: Floats) -> bool:
-        return "bend_rad" not in settings and strained_weights(values, standard_errors)
+        return "bend_rad" not in settings and super().strained(settings, values, standard_errors)
 
     def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
         load = situation.torque(where)

@@ -7,14 +7,13 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.effects.base import Coefficient, PrismFamily, Settings, Situation
+from calibration.effects.base import Coefficient, Settings, Situation
 from calibration.effects.motion import has_rates, velocity_mm_per_s
-from calibration.effects.trained import check_settings, size_variance, sizes
+from calibration.effects.trained import TrainedFamily, check_settings, sizes
 from calibration.observations import Floats
-from calibration.rig import Rig
 
 
-class Latency(PrismFamily):
+class Latency(TrainedFamily):
     """The fix stamped t shows the boom where it was at t - latency; nothing where it stands."""
 
     name: ClassVar[str] = "latency"
@@ -22,10 +21,7 @@ class Latency(PrismFamily):
     source: ClassVar[str] = "delay of a total station's fixes against other sensors (Thalmann and Neuner 2021)"
     confused_with: ClassVar[tuple[str, ...]] = ("clock_drift", "backlash", "load_hysteresis")
     revealed_by: ClassVar[str] = "the same path driven through without a stop at two speeds, and stopped on"
-
-    def places(self, rig: Rig) -> tuple[str, ...]:
-        del rig
-        return ("clock",)
+    place: ClassVar[str] = "clock"
 
     def needs(self, where: str) -> str:
         del where
@@ -51,10 +47,6 @@ class Latency(PrismFamily):
     def shift_mm(self, situation: Situation, where: str, settings: Settings) -> Floats:
         del where, settings
         return _shift_mm(situation)
-
-    def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
-        del plausible
-        return size_variance(values, settings)
 
 
 def _shift_mm(situation: Situation) -> Floats:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.effects.base import Coefficient, JointFamily, Settings, Situation
 from calibration.observations import Floats
@@ -19,15 +18,8 @@ class LeakDown(JointFamily):
     source: ClassVar[str] = "internal leakage of cylinders and load-holding valves, a drift test of lifting machines"
     confused_with: ClassVar[tuple[str, ...]] = ("base_settlement", "joint_compliance")
     revealed_by: ClassVar[str] = "standing still in one pose and measuring at once, after a minute and after ten"
+    column: ClassVar[str] = "dwell_s"
     kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
-
-    def needs(self, where: str) -> str:
-        del where
-        return "the column dwell_s"
-
-    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
-        del where
-        return np.isfinite(situation.extra("dwell_s"))
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
         dwell_s = situation.extra("dwell_s")[self.known(situation, where)]

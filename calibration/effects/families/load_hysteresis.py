@@ -7,16 +7,15 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.effects.base import Coefficient, FittedCoefficient, JointFamily, Settings, Situation
+from calibration.effects.base import Coefficient, JointFamily, Settings, Situation
 from calibration.effects.load_shapes import (
     UNIT,
+    OfUncertainLoad,
     gravity_shapes,
     load_variants,
     part_coefficients,
     part_names,
     shape_columns,
-    strained_weights,
-    with_load_sigma,
 )
 from calibration.observations import Floats
 
@@ -24,7 +23,7 @@ _SIGMA_RAD = 0.5e-3  # at the largest torque
 _BOUND_RAD = 5e-3
 
 
-class LoadHysteresis(JointFamily):
+class LoadHysteresis(OfUncertainLoad, JointFamily):
     """Friction holds the encoder's side back by the load, so that the joint is further along its last motion.
 
     As for a compliance, variants have what uncertain masses leave open about the load.
@@ -62,15 +61,6 @@ class LoadHysteresis(JointFamily):
             Coefficient("rad_per_Nm", UNIT, _SIGMA_RAD / torque, 0.0, most),
             *part_coefficients(settings, most),
         )
-
-    def reported(
-        self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
-    ) -> tuple[FittedCoefficient, ...]:
-        return with_load_sigma(settings, coefficients)
-
-    def strained(self, settings: Settings, values: Floats, standard_errors: Floats) -> bool:
-        del settings
-        return strained_weights(values, standard_errors)
 
     def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
         load = np.nan_to_num(situation.torque(where))

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.effects.base import Coefficient, PrismFamily, Settings, Situation, refuse_settings
-from calibration.effects.boom import boom_in, boom_of
+from calibration.effects.base import Coefficient, Settings, Situation, refuse_settings
+from calibration.effects.boom import BoomFamily, boom_in
 from calibration.observations import Floats
-from calibration.rig import Rig
 
 _LEAST = 1e-6  # cosine of an elevation
 _OVERLAP_LEFT = 0.4  # of the stroke: what the sections overlap when the boom is run out
 
 
-class PadPlay(PrismFamily):
+class PadPlay(BoomFamily):
     """The inner section tilts about the mouth of the outer one until its pads touch.
 
     The shorter the overlap, the more. To which side says the moment of what it carries about the mouth.
@@ -27,18 +25,6 @@ class PadPlay(PrismFamily):
     source: ClassVar[str] = "geometry of telescopic booms: clearance of the slide pads over their distance"
     confused_with: ClassVar[tuple[str, ...]] = ("boom_droop", "transducer_quadratic", "gravity_flip_play")
     revealed_by: ClassVar[str] = "the same attitude of the boom at many extensions, the last tenth of the stroke too"
-    goes_with: ClassVar[Literal["", "torque", "weights"]] = "weights"
-
-    def places(self, rig: Rig) -> tuple[str, ...]:
-        return ("boom",) if boom_of(rig) is not None else ()
-
-    def needs(self, where: str) -> str:
-        del where
-        return "masses in the rig file"
-
-    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
-        del where
-        return np.full(len(situation), bool(situation.rig.masses))
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
         return ({},) if self.shift_mm(situation, where, {}).any() else ()

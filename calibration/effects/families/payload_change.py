@@ -8,17 +8,16 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.effects.base import Coefficient, FittedCoefficient, JointFamily, Settings, Situation
+from calibration.effects.base import Coefficient, JointFamily, Settings, Situation
 from calibration.effects.load_shapes import (
     UNIT,
     LoadShapes,
+    OfUncertainLoad,
     load_variants,
     part_coefficients,
     part_names,
     shape_columns,
     shapes_by_design,
-    strained_weights,
-    with_load_sigma,
 )
 from calibration.observations import Floats
 
@@ -29,7 +28,7 @@ _PAYLOAD_KG = 100.0  # whose load has the shapes
 _COLLINEAR = 1e-9
 
 
-class PayloadChange(JointFamily):
+class PayloadChange(OfUncertainLoad, JointFamily):
     """Deflection by what the payload adds to the joint's load, and by nothing else.
 
     How heavy the payload is has been measured; variants have what its centre of gravity leaves open.
@@ -74,15 +73,6 @@ class PayloadChange(JointFamily):
             Coefficient("compliance_rad_per_Nm", UNIT, _SIGMA_RAD / torque, 0.0, most),
             *part_coefficients(_of_parts(settings), most),
         )
-
-    def reported(
-        self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
-    ) -> tuple[FittedCoefficient, ...]:
-        return with_load_sigma(settings, coefficients)
-
-    def strained(self, settings: Settings, values: Floats, standard_errors: Floats) -> bool:
-        del settings
-        return strained_weights(values, standard_errors)
 
     def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
         load, own = situation.payload_torque(where), _of_parts(settings)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.effects.base import Coefficient, JointFamily, Settings, Situation
 from calibration.errors import ModelError
@@ -28,15 +27,8 @@ class SolarBow(JointFamily):
     source: ClassVar[str] = "temperature gradient over a beam's height h: slope alpha dT L / h (EN 1991-1-5)"
     confused_with: ClassVar[tuple[str, ...]] = ("thermal_expansion", "base_settlement", "joint_compliance")
     revealed_by: ClassVar[str] = "the same flat and steep poses of the link, cold in the morning and warm at noon"
+    column: ClassVar[str] = _COLUMN
     kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
-
-    def needs(self, where: str) -> str:
-        del where
-        return f"the column {_COLUMN}"
-
-    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
-        del where
-        return np.isfinite(situation.extra(_COLUMN))
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
         known, frame = self.known(situation, where), _link_end(situation, where)

@@ -6,7 +6,6 @@ from typing import ClassVar
 
 from calibration.effects.base import Coefficient, PrismFamily, Settings, Situation, refuse_settings
 from calibration.observations import Floats
-from calibration.rig import Rig
 
 
 class StationScale(PrismFamily):
@@ -19,10 +18,7 @@ class StationScale(PrismFamily):
     )
     confused_with: ClassVar[tuple[str, ...]] = ("thermal_expansion", "prism_constant", "transducer_scale")
     revealed_by: ClassVar[str] = "the same poses from a second set-up at another distance, or control points"
-
-    def places(self, rig: Rig) -> tuple[str, ...]:
-        del rig
-        return ("station",)
+    place: ClassVar[str] = "station"
 
     def names(self, settings: Settings) -> tuple[str, ...]:
         refuse_settings(settings)

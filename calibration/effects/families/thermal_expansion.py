@@ -5,17 +5,15 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.effects.base import Coefficient, PrismFamily, Settings, Situation
-from calibration.effects.trained import check_settings, size_variance, sizes
+from calibration.effects.base import Coefficient, Settings, Situation
+from calibration.effects.trained import TrainedFamily, check_settings, sizes
 from calibration.observations import Floats
-from calibration.rig import Rig
 
 _COLUMN = "temperature_degC"
 
 
-class ThermalExpansion(PrismFamily):
+class ThermalExpansion(TrainedFamily):
     """All lengths grow alike, from the base's origin: the kinematics hold at the mean temperature of the training."""
 
     name: ClassVar[str] = "thermal_expansion"
@@ -23,18 +21,8 @@ class ThermalExpansion(PrismFamily):
     source: ClassVar[str] = "linear expansion of steel, 12e-6 per K +-30 % with what is not steel (EN 1993-1-1)"
     confused_with: ClassVar[tuple[str, ...]] = ("station_scale", "base_settlement", "solar_bow")
     revealed_by: ClassVar[str] = "the same far poses at another temperature, cold in the morning and warm at noon"
-
-    def places(self, rig: Rig) -> tuple[str, ...]:
-        del rig
-        return ("boom",)  # the whole machine, whatever it is
-
-    def needs(self, where: str) -> str:
-        del where
-        return f"the column {_COLUMN}"
-
-    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
-        del where
-        return np.isfinite(situation.extra(_COLUMN))
+    place: ClassVar[str] = "boom"  # the whole machine, whatever it is
+    column: ClassVar[str] = _COLUMN
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
         known = self.known(situation, where)
@@ -55,10 +43,6 @@ class ThermalExpansion(PrismFamily):
     def shift_mm(self, situation: Situation, where: str, settings: Settings) -> Floats:
         del where
         return _shift_mm(situation, settings["mean_degC"])
-
-    def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
-        del plausible
-        return size_variance(values, settings)
 
 
 def _shift_mm(situation: Situation, mean: float) -> Floats:

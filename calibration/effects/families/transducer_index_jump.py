@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.effects.base import Coefficient, FittedCoefficient, JointFamily, Settings, Situation
 from calibration.effects.step_times import STEP_SETTINGS, check_step, refined_steps, settled_step, step_grid, step_time
@@ -21,15 +20,8 @@ class TransducerIndexJump(JointFamily):
     source: ClassVar[str] = "lost counts or a wrong reference mark of an incremental length transducer"
     confused_with: ClassVar[tuple[str, ...]] = ("transducer_cumulative", "base_step", "base_settlement")
     revealed_by: ClassVar[str] = "returning to a pose measured before, and driving the transducer over its reference"
+    column: ClassVar[str] = "time_s"
     kind: ClassVar[Literal["revolute", "prismatic"]] = "prismatic"
-
-    def needs(self, where: str) -> str:
-        del where
-        return "the column time_s"
-
-    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
-        del where
-        return np.isfinite(situation.extra("time_s"))
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
         del where

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -31,10 +31,6 @@ class ThermalCross(Effect):
         check_kind(self, rig, "revolute")
         if boom_stroke(rig) is None:
             raise ValueError(f"{self.family}@{self.where}: rig {rig.name!r} has no stroke")
-
-    def anchored(self, first_s: float, mean_degC: float) -> Effect:
-        del first_s
-        return replace(self, at_degC=mean_degC if self.at_degC is None else self.at_degC)
 
     def joint_change(self, body: Body) -> Floats:
         stroke = boom_stroke(body.rig)

@@ -9,8 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 from calibration.rig import Rig
-from simulators.effects.base import Bend, Body, Effect, check_place
-from simulators.effects.boom_droop import boom_row
+from simulators.effects.base import Bend, Body, Effect
+from simulators.effects.boom_droop import boom_row, check_boom
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,7 @@ class TwistByReach(Effect):
     flexibility_per_Nm2: float = 1e-7  # noqa: N815 - the unit is N m^2
 
     def check(self, rig: Rig) -> None:
-        check_place(self, "boom")
-        if boom_row(rig) is None:
-            raise ValueError(f"{self.family}: rig {rig.name!r} has no row with a driven length a")
+        check_boom(self, rig)
 
     def bends(self, body: Body) -> Sequence[Bend]:
         row = boom_row(body.rig)
