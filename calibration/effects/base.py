@@ -237,6 +237,8 @@ class Family(ABC):
             always computed, or nothing.
         column: the optional column that it needs, `{where}` in it for its place; empty for none. Families that need
             anything else say so in `needs` and `known`.
+        limit_sigma: by what share the hard limits may be off, where they are not numbers but what a load makes of them.
+        goes_by_travel: whether it grows with the path that its joint travels.
     """
 
     name: ClassVar[str]
@@ -246,6 +248,8 @@ class Family(ABC):
     revealed_by: ClassVar[str]
     goes_with: ClassVar[Literal["", "torque", "weights"]] = ""
     column: ClassVar[str] = ""
+    limit_sigma: ClassVar[float] = 0.0
+    goes_by_travel: ClassVar[bool] = False
 
     @abstractmethod
     def places(self, rig: Rig) -> tuple[str, ...]:
@@ -301,6 +305,11 @@ class Family(ABC):
         """How plausible a variant is beforehand beside the others; they share the odds of the effect."""
         del settings
         return 1.0
+
+    def form(self, settings: Settings) -> str:
+        """Which of several forms a variant has, a phrase for people; empty where that is no news to them."""
+        del settings
+        return ""
 
     def goes_by_order(self, settings: Settings) -> bool:
         """Whether what it does in a row depends on the rows before it, so that they must be given together."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
@@ -34,15 +35,21 @@ class FittedEffect:
     settings: Settings = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, object]:
-        """The contract's JSON object, with the numbers of the variant added."""
+        """The contract's JSON object, with the form and the numbers of the variant added."""
         return {
             "family": self.family,
             "where": self.where,
             "coefficients": {
                 c.name: {"value": c.value, "unit": c.unit, "standard_error": c.standard_error} for c in self.reported
             },
+            "form": self.form,
             "settings": dict(self.settings),
         }
+
+    @property
+    def form(self) -> str:
+        """Which of several forms it has, a phrase; empty where that is no news."""
+        return library()[self.family].form(self.settings)
 
     @property
     def reported(self) -> tuple[FittedCoefficient, ...]:
@@ -95,13 +102,17 @@ class Choice:
 
         Those that only shape an effect, and are not reported, have none; see `strained`.
         """
-        found = library()[self.family].coefficients(situation, self.where, self.settings)
-        reported = {c.name for c in self.fitted(situation, values, standard_errors).reported}
-        return tuple(
-            c.name
-            for c, value, error in zip(found, values, standard_errors, strict=True)
-            if c.name in reported and not c.lower - _CHANCE * error <= value <= c.upper + _CHANCE * error
-        )
+        family = library()[self.family]
+        limits = {c.name: c for c in family.coefficients(situation, self.where, self.settings)}
+        out = []
+        for c in self.fitted(situation, values, standard_errors).reported:
+            limit = limits.get(c.name)
+            if limit is None:
+                continue
+            over, at = max((limit.lower - c.value, limit.lower), (c.value - limit.upper, limit.upper))
+            if over > _CHANCE * math.hypot(c.standard_error, family.limit_sigma * at):
+                out.append(c.name)
+        return tuple(out)
 
     def strained(self, values: Floats, standard_errors: Floats) -> bool:
         """Whether coefficients (k,) have what only shapes the effect beyond its limits by more than chance."""

@@ -22,6 +22,7 @@ from calibration.effects.base import Coefficient, Family, FittedCoefficient, Joi
 from calibration.errors import ModelError
 from calibration.kinematics import Chain
 from calibration.observations import Floats
+from calibration.torques import MASS_SIGMA
 
 UNIT = "rad/(N m)"
 _LOAD_SIGMA, _ABOUT, _PARTS = "load_sigma", "about_rad_per_Nm", "parts"
@@ -166,6 +167,8 @@ def part_coefficients(settings: Settings, bound: float) -> tuple[Coefficient, ..
 
 class OfUncertainLoad(Family):
     """An effect in proportion to a load: its own coefficient, and after it those of what is uncertain of the load."""
+
+    limit_sigma: ClassVar[float] = MASS_SIGMA  # limits are what it may do at the largest load
 
     def reported(
         self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]

@@ -17,7 +17,7 @@ class BaseSettlement(TrainedFamily):
     """The base drifts as a rigid body at a steady rate from the first row of the training on."""
 
     name: ClassVar[str] = "base_settlement"
-    equation: ClassVar[str] = "tilts about the base's x and y axes and rise along its z axis = rates * (t - t_first)"
+    equation: ClassVar[str] = "tilts about the base's level x and y axes and rise = rates * (t - t_first)"
     source: ClassVar[str] = "rigid motion of the set-up, constant rate: settlement under a load, creep of jacks"
     confused_with: ClassVar[tuple[str, ...]] = ("base_step", "thermal_expansion", "payload_change")
     revealed_by: ClassVar[str] = (

@@ -20,7 +20,7 @@ class BaseStep(TrainedFamily):
     """The base stands otherwise, as a rigid body, in all rows after one instant."""
 
     name: ClassVar[str] = "base_step"
-    equation: ClassVar[str] = "tilts about the base's x and y axes and rise along its z axis, for t > time_s"
+    equation: ClassVar[str] = "tilts about the base's level x and y axes and rise, for t > time_s"
     source: ClassVar[str] = "rigid motion of the set-up at one instant: a jack that slips, a knock"
     confused_with: ClassVar[tuple[str, ...]] = ("base_settlement", "payload_change", "transducer_index_jump")
     revealed_by: ClassVar[str] = "fixed control points, or one pose again and again all through the session"

@@ -26,6 +26,9 @@ class EncoderHarmonic(JointFamily):
         del situation, where
         return tuple({"k": k} for k in _CYCLES)
 
+    def form(self, settings: Settings) -> str:
+        return f"k = {settings['k']:g}"
+
     def names(self, settings: Settings) -> tuple[str, ...]:
         if set(settings) != {"k"} or settings["k"] not in _CYCLES:
             raise ValueError("the only setting is k, 1 or 2")

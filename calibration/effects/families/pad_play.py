@@ -2,35 +2,71 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 
-from calibration.effects.base import Coefficient, Settings, Situation, refuse_settings
+from calibration.effects.base import Coefficient, FittedCoefficient, Settings, Situation
 from calibration.effects.boom import BoomFamily, boom_in
 from calibration.observations import Floats
 
 _LEAST = 1e-6  # cosine of an elevation
-_OVERLAP_LEFT = 0.4  # of the stroke: what the sections overlap when the boom is run out
+_LEFT, _SPREAD = "left", "left_spread"
+# Of the stroke: what the sections may overlap when the boom is run out, half an octave apart, the usual one first.
+_OVERLAPS = tuple((0.4 * 2.0 ** (np.array([0, -1, 1, -2, 2, -3, -4]) / 2.0)).tolist())
+_STEP = 0.5 * math.log(2.0)
 
 
 class PadPlay(BoomFamily):
     """The inner section tilts about the mouth of the outer one until its pads touch.
 
-    The shorter the overlap, the more. To which side says the moment of what it carries about the mouth.
+    The shorter the overlap, the more. To which side says the moment of what it carries about the mouth. How much
+    overlap is left when the boom is run out no rig file says; the data choose, and leave it open by a standard
+    deviation of its logarithm.
     """
 
     name: ClassVar[str] = "pad_play"
-    equation: ClassVar[str] = "tilt = clearance / overlap * sign(M), overlap = L_max + 0.4 stroke - L"
+    equation: ClassVar[str] = "tilt = clearance / overlap * sign(M), overlap = L_max + left stroke - L"
     source: ClassVar[str] = "geometry of telescopic booms: clearance of the slide pads over their distance"
     confused_with: ClassVar[tuple[str, ...]] = ("boom_droop", "transducer_quadratic", "gravity_flip_play")
     revealed_by: ClassVar[str] = "the same attitude of the boom at many extensions, the last tenth of the stroke too"
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
-        return ({},) if self.shift_mm(situation, where, {}).any() else ()
+        forms = tuple({_LEFT: share, _SPREAD: _STEP / math.sqrt(12.0)} for share in _OVERLAPS)
+        return forms if self.shift_mm(situation, where, forms[0]).any() else ()
+
+    def refined(self, situation: Situation, where: str, settings: Settings) -> tuple[Settings, ...]:
+        """All of them: what is settled is between them."""
+        del settings
+        return self.variants(situation, where)
+
+    def settled(self, forms: Sequence[Settings], probability: Floats) -> Settings:
+        """The mean of the logarithm, and what all of the forms leave open about it."""
+        left = np.log([form[_LEFT] for form in forms])
+        own = np.array([form[_SPREAD] for form in forms])
+        mean = float(probability @ left)
+        return {_LEFT: math.exp(mean), _SPREAD: math.sqrt(float(probability @ ((left - mean) ** 2 + own**2)))}
+
+    def reported(
+        self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
+    ) -> tuple[FittedCoefficient, ...]:
+        """What the data fix is by how much more the boom tilts run out than drawn in, clearance / (left (1 + left))."""
+        clearance = coefficients[0]
+        share = settings[_SPREAD] * (1.0 + settings[_LEFT] / (1.0 + settings[_LEFT]))
+        return (replace(clearance, standard_error=math.hypot(clearance.standard_error, share * clearance.value)),)
+
+    def form(self, settings: Settings) -> str:
+        return f"{settings[_LEFT]:.2g} of the stroke overlap when run out"
 
     def names(self, settings: Settings) -> tuple[str, ...]:
-        refuse_settings(settings)
+        if set(settings) != {_LEFT, _SPREAD} or not settings[_LEFT] > 0.0 or settings[_SPREAD] < 0.0:
+            raise ValueError(
+                f"the settings are {_LEFT}, the overlap of the boom run out as a share of the stroke, and {_SPREAD}, "
+                "the standard deviation of its logarithm"
+            )
         return ("clearance_mm",)
 
     def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
@@ -38,12 +74,12 @@ class PadPlay(BoomFamily):
         return (Coefficient("clearance_mm", "mm", 2.0, 0.0, 8.0),)
 
     def shift_mm(self, situation: Situation, where: str, settings: Settings) -> Floats:
-        del where, settings
+        del where
         boom = boom_in(situation)
         if boom is None or not situation.rig.masses:
             return np.zeros((len(situation), 3, 1))
         low, high = situation.rig.joint(boom.joint).limits
-        overlap_mm = np.maximum(high - situation.reading(boom.joint), 0.0) + _OVERLAP_LEFT * (high - low)
+        overlap_mm = np.maximum(high - situation.reading(boom.joint), 0.0) + settings[_LEFT] * (high - low)
         mouth_mm = boom.root_mm + boom.axis * situation.rig.rows[boom.row - 1].a_mm
         places_mm, newton = boom.weights
         hanging = newton * boom.hanging

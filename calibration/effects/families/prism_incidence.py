@@ -6,16 +6,22 @@ from typing import ClassVar
 
 import numpy as np
 
-from calibration.effects.base import Coefficient, PrismFamily, Settings, Situation, refuse_settings
+from calibration.effects.base import Coefficient, PrismFamily, Settings, Situation
 from calibration.effects.sight import of_prism, sight
 from calibration.observations import Floats
 from calibration.rig import Rig
 
 _LEAST = 1e-9  # cosine of a line of sight that is along the prism's own axis
+_AXIS = "axis"
+_AXES = (3.0, 1.0, 2.0)  # z, x, y
 
 
 class PrismIncidence(PrismFamily):
-    """The first harmonic of the azimuth at which the station is seen about the z axis of the prism's frame."""
+    """The first harmonic of the azimuth psi at which the station is seen about the prism's own axis.
+
+    A rig file does not say how a prism stands on its frame, so that the axis is one of the frame's three, as the data
+    have it: 1 for x, 2 for y, 3 for z. psi is 0 along the axis that follows it (x after z), 90 deg along the next.
+    """
 
     name: ClassVar[str] = "prism_incidence"
     equation: ClassVar[str] = "shift = (cos1 cos psi + sin1 sin psi) * (unit vector from the station to the prism)"
@@ -27,10 +33,14 @@ class PrismIncidence(PrismFamily):
         return rig.prism_names
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
-        return ({},) if of_prism(situation, where).any() else ()
+        return tuple({_AXIS: axis} for axis in _AXES) if of_prism(situation, where).any() else ()
+
+    def form(self, settings: Settings) -> str:
+        return f"about {' xyz'[int(settings[_AXIS])]} of the prism's frame"
 
     def names(self, settings: Settings) -> tuple[str, ...]:
-        refuse_settings(settings)
+        if set(settings) != {_AXIS} or settings[_AXIS] not in _AXES:
+            raise ValueError("the only setting is the prism's axis: 1, 2 or 3 for x, y or z of its frame")
         return "cos1_mm", "sin1_mm"
 
     def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
@@ -38,10 +48,10 @@ class PrismIncidence(PrismFamily):
         return tuple(Coefficient(name, "mm", 1.0, -8.0, 8.0) for name in self.names(settings))
 
     def shift_mm(self, situation: Situation, where: str, settings: Settings) -> Floats:
-        del settings
+        across = [int(settings[_AXIS]) % 3, (int(settings[_AXIS]) + 1) % 3]
         away = sight(situation)
         back = -(situation.rotation.transpose(0, 2, 1) @ away[:, :, None])
-        level = (situation.facing.axes @ back)[:, :2, 0]  # towards the station, along the frame's x and y axes
+        level = (situation.facing.axes @ back)[:, across, 0]  # towards the station, along the axes across the prism's
         size = np.sqrt((level**2).sum(axis=1))[:, None]
         harmonic = np.where(size > _LEAST, level / np.maximum(size, _LEAST), 0.0)
         return (away * of_prism(situation, where)[:, None])[:, :, None] * harmonic[:, None, :]

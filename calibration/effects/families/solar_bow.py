@@ -14,12 +14,14 @@ from calibration.rig import Rig
 _COLUMN = "temperature_degC"
 _SETTINGS = ("mean_degC", "change_degC", "frame")
 _LEAST_LINK_MM = 500.0  # shorter offsets are brackets, no links
+_JOINT_ANGLE = 0  # in place of a frame: the joint's own angle is the elevation
 
 
 class SolarBow(JointFamily):
     """The sun-side flange of a link gets longer: the link bows, most where it lies flat under the sun.
 
     The link is what the joint moves: from its axis to the origin of the next frame that is half a metre away or more.
+    Where a link is level when its joint reads zero, the joint's angle is taken for the elevation; that is a variant.
     """
 
     name: ClassVar[str] = "solar_bow"
@@ -33,15 +35,21 @@ class SolarBow(JointFamily):
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
         known, frame = self.known(situation, where), _link_end(situation, where)
         carries = situation.greatest_torque(where) > 0.0 or not situation.rig.masses
-        if frame is None or not carries or not known.any():
+        if not carries or not known.any():
             return ()
         mean = float(situation.extra(_COLUMN)[known].mean())
-        settings = {"mean_degC": mean, "frame": float(frame)}
-        usual = float(np.sqrt(np.mean(_change_K(situation, where, settings)[known] ** 2)))
-        return ({**settings, "change_degC": usual},) if usual > 0.0 else ()
+        found = []
+        for end in (_JOINT_ANGLE,) if frame is None else (frame, _JOINT_ANGLE):
+            settings = {"mean_degC": mean, "frame": float(end)}
+            usual = float(np.sqrt(np.mean(_change_K(situation, where, settings)[known] ** 2)))
+            found += [{**settings, "change_degC": usual}] if usual > 0.0 else []
+        return tuple(found)
+
+    def form(self, settings: Settings) -> str:
+        return "the joint's angle is the elevation" if settings["frame"] == _JOINT_ANGLE else "elevation of the link"
 
     def names(self, settings: Settings) -> tuple[str, ...]:
-        if set(settings) != set(_SETTINGS) or settings["change_degC"] <= 0.0 or settings["frame"] < 1.0:
+        if set(settings) != set(_SETTINGS) or settings["change_degC"] <= 0.0 or settings["frame"] < 0.0:
             raise ValueError(f"the settings are {', '.join(_SETTINGS)}")
         return ("rad_per_K",)
 
@@ -80,16 +88,19 @@ def _link_end(situation: Situation, where: str) -> int | None:
 
 def _change_K(situation: Situation, where: str, settings: Settings) -> Floats:  # noqa: N802 - the unit is K
     """(n,) how much warmer it is, times the cosine of the link's elevation."""
-    rig, frames_mm = situation.rig, situation.located.frames_mm
+    warmer: Floats = np.nan_to_num(situation.extra(_COLUMN) - settings["mean_degC"])
+    rig, end = situation.rig, int(settings["frame"])
+    if end == _JOINT_ANGLE:
+        warmer *= np.cos(np.radians(situation.reading(where)))
+        return warmer
+    frames_mm = situation.located.frames_mm
     _, own = _axis_frame(rig, where)
-    end = int(settings["frame"])
     if end >= frames_mm.shape[1]:
         raise ModelError(f"the model has a link that ends at frame {end}, which its rig lacks; calibrate again")
     link = frames_mm[:, end] - frames_mm[:, own]
     along = (link * situation.down).sum(axis=1)
     square = (link**2).sum(axis=1)
-    flat = np.sqrt(np.clip(1.0 - along**2 / np.maximum(square, np.finfo(np.float64).tiny), 0.0, 1.0))
-    warmer: Floats = np.nan_to_num(situation.extra(_COLUMN) - settings["mean_degC"]) * flat
+    warmer *= np.sqrt(np.clip(1.0 - along**2 / np.maximum(square, np.finfo(np.float64).tiny), 0.0, 1.0))
     return warmer
 
 

@@ -29,6 +29,7 @@ class TransducerCumulative(JointFamily):
     confused_with: ClassVar[tuple[str, ...]] = ("transducer_index_jump", "base_settlement", "base_step")
     revealed_by: ClassVar[str] = "returning to a pose measured before, after running the joint to and fro many times"
     kind: ClassVar[Literal["revolute", "prismatic"]] = "prismatic"
+    goes_by_travel: ClassVar[bool] = True
 
     def needs(self, where: str) -> str:
         del where
