@@ -20,8 +20,9 @@ DWELLS_S = (10.0, 120.0)
 TEMPERATURES_DEGC = (5.0, 25.0)
 PRESSURES_BAR = (50.0, 150.0)
 ROUNDS_S = (0.0, 3600.0, 7200.0, 10800.0)
+_POSE_S = 60.0  # from one fix of a round to the next
 _MOVING = 0.5  # share of poses that may be measured on the move
-_PACE = 0.5  # of a joint's greatest rate, at most
+_PACE = 0.1  # of a joint's greatest rate, at most: faster, an unsure instant hides as much as speed shows
 _LOAD = 0.05  # of the machine's weight, where the rig file names no payload
 _SLOW = ("time_s", "temperature_degC", "payload_kg")  # nobody changes these from pose to pose
 
@@ -109,6 +110,16 @@ def changed(conditions: Conditions, kind: Collection[str]) -> Conditions:
 def slow(names: Collection[str]) -> tuple[str, ...]:
     """Those conditions by which a plan is divided into blocks, the slowest to change first."""
     return (*(name for name in _SLOW if name in names), *sorted(name for name in names if name.endswith("_bar")))
+
+
+def one_after_another(conditions: Conditions) -> Conditions:
+    """The same for poses that are measured in this order: those of a round at instants of their own."""
+    if "time_s" not in conditions:
+        return conditions
+    times: list[float] = []
+    for begin_s in conditions["time_s"].tolist():
+        times.append(max(begin_s, times[-1] + _POSE_S) if times else begin_s)
+    return {**conditions, "time_s": np.array(times)}
 
 
 def instructions(rig: Rig, names: Collection[str]) -> tuple[str, ...]:

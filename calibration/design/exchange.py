@@ -1,6 +1,6 @@
 """Choosing rows of a linear model: greedy additions, then exchanges, under a criterion of the posterior covariance.
 
-Every candidate is a block of r rows W of a whitened Jacobian in prior units, so that the covariance before is the
+Every candidate is a block of r rows W of a whitened Jacobian in prior units, so that the information before is the
 identity and a set has the covariance C = (I + sum W'W)^-1. Adding a block lowers it by C W' G^-1 W C with
 G = I + W C W' (Sherman, Morrison and Woodbury), so no candidate needs an inverse of the whole. The exchange is
 Fedorov's (1972), restricted to the candidates that gain most, as the KL-exchange of Atkinson, Donev and Tobias
@@ -14,6 +14,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from calibration.observations import Floats
 
@@ -23,32 +24,27 @@ _AT_ONCE = 256  # candidates looked at anew in one go
 _SHORTLIST = 400
 _SWEEPS = 6
 _WORTHWHILE = 1e-4
+_TOGETHER = 1000  # candidates, so that the work arrays stay small
 
 
 class Criterion(Protocol):
     """What a design is chosen for."""
 
-    def value(self, covariance: Floats) -> float:
-        """How good a covariance (q, q) is; larger is better."""
+    def value(self, information: Floats) -> float:
+        """How good an information (q, q), the prior's included, is; larger is better."""
 
-    def gain(self, covariance: Floats, grown: Floats, projected: Floats) -> Floats:
-        """(m,) how much `value` grows by each of m blocks W.
-
-        Args:
-            covariance: (q, q) C, before.
-            grown: (m, r, r) G = I + W C W'.
-            projected: (m, r, q) W C.
-        """
+    def gain(self, information: Floats, blocks: Floats) -> Floats:
+        """(m,) how much `value` grows by each of m blocks (m, r, q)."""
 
 
 class Determinant:
     """D-optimal: the volume of the confidence ellipsoid of all parameters, as -log det."""
 
-    def value(self, covariance: Floats) -> float:
-        return -float(np.linalg.slogdet(covariance)[1])
+    def value(self, information: Floats) -> float:
+        return float(np.linalg.slogdet(information)[1])
 
-    def gain(self, covariance: Floats, grown: Floats, projected: Floats) -> Floats:
-        del covariance, projected
+    def gain(self, information: Floats, blocks: Floats) -> Floats:
+        grown = _grown(_times(blocks, _inverse(information)), blocks)
         diagonal = np.diagonal(np.linalg.cholesky(grown), axis1=1, axis2=2)
         return np.asarray(2.0 * np.log(diagonal).sum(axis=1), dtype=np.float64)
 
@@ -63,38 +59,110 @@ class Accuracy:
 
     root: Floats
 
-    def value(self, covariance: Floats) -> float:
-        return -float(np.log(np.sum((covariance @ self.root) * self.root)))
+    def value(self, information: Floats) -> float:
+        return -float(np.log(np.sum((_inverse(information) @ self.root) * self.root)))
 
-    def gain(self, covariance: Floats, grown: Floats, projected: Floats) -> Floats:
-        m, r, q = projected.shape
+    def gain(self, information: Floats, blocks: Floats) -> Floats:
+        covariance = _inverse(information)
         total = float(np.sum((covariance @ self.root) * self.root))
-        seen = (projected.reshape(-1, q) @ self.root).reshape(m, r, -1)
+        projected = _times(blocks, covariance)
+        seen = _times(projected, self.root)
+        grown = _grown(projected, blocks)
         taken = (np.linalg.inv(grown) * (seen @ seen.transpose(0, 2, 1))).sum(axis=(1, 2))
         return np.asarray(-np.log1p(-np.minimum(taken / total, 1.0 - 1e-12)), dtype=np.float64)
 
 
 @dataclass(frozen=True)
-class Separation:
-    """D_s-optimal both ways: each group's determinant when all the rest, the other group too, is unknown.
+class Hypothesis:
+    """One of several models, as what is known already leaves it.
 
     Attributes:
-        groups: columns of each group.
+        mean: (q,) of all parameters; zero for those that it has not.
+        free: (f,) indices of those that it has, whose covariance is the inverse of their information.
     """
 
-    groups: tuple[Integers, ...]
+    mean: Floats
+    free: Integers
 
-    def value(self, covariance: Floats) -> float:
-        return -sum(float(np.linalg.slogdet(covariance[np.ix_(g, g)])[1]) for g in self.groups)
 
-    def gain(self, covariance: Floats, grown: Floats, projected: Floats) -> Floats:
-        gained = np.zeros(len(grown))
-        for group in self.groups:
-            part = projected[:, :, group]
-            before = covariance[np.ix_(group, group)]
-            after = before - part.transpose(0, 2, 1) @ np.linalg.solve(grown, part)
-            gained += np.linalg.slogdet(before)[1] - np.linalg.slogdet(after)[1]
-        return gained
+@dataclass(frozen=True)
+class Discrimination:
+    """The log odds that a design is expected to bring for the true model, whichever it is and against whichever other.
+
+    They are the Kullback-Leibler divergence of what the one predicts from what the other predicts (Box and Hill,
+    Technometrics 9, 1967),
+
+        1/2 (E |d|^2 - tr(C A) + ln|before + A| / |before| - ln|before_i + A_i| / |before_i|)
+
+    with d the parameters of the true model less those that the other fits in the end, C = (before + A)^-1 of the other,
+    A what the design tells, and the index i for the true one: the other predicts something else, and it has freedom
+    that it has no need of. The least of them counts, softly.
+
+    Attributes:
+        models: two or more.
+        before: (q, q) information of the prior and of all that is known already.
+    """
+
+    models: tuple[Hypothesis, ...]
+    before: Floats
+
+    def value(self, information: Floats) -> float:
+        return -float(logsumexp(-self._of_pairs(self.log_odds(information))))
+
+    def gain(self, information: Floats, blocks: Floats) -> Floats:
+        own = [np.ascontiguousarray(blocks[:, :, model.free]) for model in self.models]
+        covariance = [_inverse(_block(information, model.free)) for model in self.models]
+        projected = [_times(*pair) for pair in zip(own, covariance, strict=True)]
+        scatter = [_grown(*pair) for pair in zip(projected, own, strict=True)]
+        freedom = [2.0 * np.log(np.diagonal(np.linalg.cholesky(g), axis1=1, axis2=2)).sum(axis=1) for g in scatter]
+        now = self.log_odds(information)
+        grown = np.zeros((len(self.models), len(self.models), len(blocks)))
+        for j, other in enumerate(self.models):
+            known = _times(projected[j], _block(self.before, other.free)) @ projected[j].transpose(0, 2, 1)
+            for i, true in enumerate(self.models):
+                if i != j:
+                    moved = _times(blocks, self._left(true, other, information))
+                    squares = moved @ moved.transpose(0, 2, 1) - known
+                    off = np.trace(np.linalg.solve(scatter[j], squares), axis1=1, axis2=2)
+                    grown[i, j] = now[i, j] + 0.5 * (off + freedom[j] - freedom[i])
+        values: Floats = -logsumexp(-self._of_pairs(grown), axis=0) - self.value(information)
+        return values
+
+    def log_odds(self, information: Floats) -> Floats:
+        """(models, models) expected log odds of the one, if it is true, over the other; 0 over itself."""
+        added = information - self.before
+        freedom = [
+            float(np.linalg.slogdet(_block(information, m.free))[1] - np.linalg.slogdet(_block(self.before, m.free))[1])
+            for m in self.models
+        ]
+        found = np.zeros((len(self.models), len(self.models)))
+        for j, other in enumerate(self.models):
+            noise = float((_inverse(_block(information, other.free)) * _block(added, other.free)).sum())
+            for i, true in enumerate(self.models):
+                if i != j:
+                    difference, left = self._difference(true, other), self._left(true, other, information)
+                    off = float((difference * (added @ left)).sum())
+                    found[i, j] = 0.5 * (off - noise + freedom[j] - freedom[i])
+        return found
+
+    def _of_pairs(self, of_models: Floats) -> Floats:
+        """(pairs, ...) those off the diagonal of (models, models, ...)."""
+        pairs: Floats = of_models[~np.eye(len(self.models), dtype=bool)]
+        return pairs
+
+    def _difference(self, true: Hypothesis, other: Hypothesis) -> Floats:
+        """(q, 1 + f) the parameters of a true model less those of another: their means, and what is unknown of them."""
+        root = np.zeros((len(self.before), 1 + len(true.free)))
+        root[:, 0] = true.mean - other.mean
+        root[true.free, 1:] = np.linalg.cholesky(_inverse(_block(self.before, true.free)))
+        return root
+
+    def _left(self, true: Hypothesis, other: Hypothesis, information: Floats) -> Floats:
+        """(q, 1 + f) the same once the other is fitted to what the design tells."""
+        left = self._difference(true, other)
+        told = (information - self.before)[other.free] @ left
+        left[other.free] -= np.linalg.solve(_block(information, other.free), told)
+        return left
 
 
 def choose(blocks: Floats, count: int, criterion: Criterion, before: Floats | None = None) -> Integers:
@@ -115,8 +183,14 @@ def choose(blocks: Floats, count: int, criterion: Criterion, before: Floats | No
 
 def covariance_of(blocks: Floats, before: Floats | None = None) -> Floats:
     """(q, q) posterior covariance in prior units when all blocks (n, r, q) are measured, `before` as for `choose`."""
+    return _inverse(information_of(blocks, before))
+
+
+def information_of(blocks: Floats, before: Floats | None = None) -> Floats:
+    """(q, q) the inverse of that covariance."""
     rows = blocks.reshape(-1, blocks.shape[2])
-    return _inverse(_known(blocks, before) + rows.T @ rows)
+    information: Floats = _known(blocks, before) + rows.T @ rows
+    return information
 
 
 def _known(blocks: Floats, before: Floats | None) -> Floats:
@@ -128,9 +202,8 @@ def _known(blocks: Floats, before: Floats | None) -> Floats:
 def _greedy(blocks: Floats, count: int, criterion: Criterion, known: Floats) -> list[int]:
     information = known.copy()
     chosen: list[int] = []
-    bound = _gains(blocks, np.arange(len(blocks)), _inverse(information), criterion)
+    bound = _gains(blocks, np.arange(len(blocks)), information, criterion)
     for _ in range(count):
-        covariance = _inverse(information)
         fresh = np.zeros(len(blocks), dtype=bool)
         while True:
             # The likeliest first; what has been looked at in this round is not looked at again.
@@ -140,7 +213,7 @@ def _greedy(blocks: Floats, count: int, criterion: Criterion, known: Floats) -> 
             stale = np.flatnonzero(~fresh & np.isfinite(bound))
             if len(stale) > _AT_ONCE:
                 stale = stale[np.argpartition(-bound[stale], _AT_ONCE)[:_AT_ONCE]]
-            bound[stale] = _gains(blocks, stale, covariance, criterion)
+            bound[stale] = _gains(blocks, stale, information, criterion)
             fresh[stale] = True
         chosen.append(best)
         bound[best] = -np.inf
@@ -150,36 +223,47 @@ def _greedy(blocks: Floats, count: int, criterion: Criterion, known: Floats) -> 
 
 def _sweep(blocks: Floats, chosen: list[int], criterion: Criterion, known: Floats) -> bool:
     """Try to exchange every chosen block for a better one, in place; whether that was worthwhile."""
-    q = blocks.shape[2]
-    rows = blocks[chosen].reshape(-1, q)
+    rows = blocks[chosen].reshape(-1, blocks.shape[2])
     information = known + rows.T @ rows
-    covariance = _inverse(information)
-    before = criterion.value(covariance)
-    gains = _gains(blocks, np.arange(len(blocks)), covariance, criterion)
+    before = criterion.value(information)
+    gains = _gains(blocks, np.arange(len(blocks)), information, criterion)
     gains[chosen] = -np.inf
     shortlist = np.argsort(-gains, kind="stable")[: min(_SHORTLIST, len(blocks) - len(chosen))]
     for place, old in enumerate(chosen):
         without = information - blocks[old].T @ blocks[old]
         rivals = np.append(shortlist[~np.isin(shortlist, chosen)], old)
-        gained = _gains(blocks, rivals, _inverse(without), criterion)
+        gained = _gains(blocks, rivals, without, criterion)
         best = int(rivals[int(np.argmax(gained))])
         if best != old and gained.max() > gained[-1] + _WORTHWHILE:
             chosen[place] = best
             information = without + blocks[best].T @ blocks[best]
-    return criterion.value(_inverse(information)) > before + _WORTHWHILE * len(chosen)
+    return criterion.value(information) > before + _WORTHWHILE * len(chosen)
 
 
-def _gains(blocks: Floats, which: Integers, covariance: Floats, criterion: Criterion) -> Floats:
-    gains = np.empty(len(which))
-    for first in range(0, len(which), 1000):  # so that the work arrays stay small
-        part = blocks[which[first : first + 1000]]
-        m, r, q = part.shape
-        projected: Floats = (part.reshape(-1, q) @ covariance).reshape(m, r, q)
-        grown = np.eye(r) + projected @ part.transpose(0, 2, 1)
-        gains[first : first + 1000] = criterion.gain(covariance, grown, projected)
-    return gains
+def _gains(blocks: Floats, which: Integers, information: Floats, criterion: Criterion) -> Floats:
+    parts = [which[first : first + _TOGETHER] for first in range(0, len(which), _TOGETHER)]
+    return np.concatenate([criterion.gain(information, blocks[part]) for part in parts])
+
+
+def _times(blocks: Floats, matrix: Floats) -> Floats:
+    """(m, r, k) blocks (m, r, q) times a matrix (q, k), in one product."""
+    m, r, q = blocks.shape
+    product: Floats = (blocks.reshape(-1, q) @ matrix).reshape(m, r, -1)
+    return product
+
+
+def _grown(projected: Floats, blocks: Floats) -> Floats:
+    """(m, r, r) G = I + W C W' of W C and W, each (m, r, q)."""
+    grown: Floats = np.eye(blocks.shape[1]) + projected @ blocks.transpose(0, 2, 1)
+    return grown
 
 
 def _inverse(information: Floats) -> Floats:
     inverse = np.asarray(np.linalg.inv(information), dtype=np.float64)
     return 0.5 * (inverse + inverse.T)
+
+
+def _block(matrix: Floats, which: Integers) -> Floats:
+    """(f, f) of a matrix (q, q)."""
+    block: Floats = matrix[np.ix_(which, which)]
+    return block

@@ -300,8 +300,8 @@ def _warnings(rig: Rig, chosen: Plan, model: CalibratedModel | None) -> Iterator
     for effect, sigma in chosen.stands_out.items():
         if sigma < _CERTAIN_SIGMA:
             yield (
-                f"{effect} of plausible size would stand out from all else by {sigma:.1f} sigma only: plan more poses, "
-                f"or look for another experiment"
+                f"{effect} of plausible size would stand out from the others by {sigma:.1f} sigma only: plan more "
+                f"poses, or look for another experiment"
             )
 
 

@@ -7,21 +7,24 @@ or a model's covariance. With such a prior a redundant parameter is no obstacle:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from calibration.design.conditions import Conditions, drawn, slow, under
+from calibration.design.conditions import Conditions, drawn, one_after_another, slow, under
 from calibration.design.exchange import (
     Accuracy,
     Criterion,
     Determinant,
+    Discrimination,
+    Hypothesis,
     Integers,
-    Separation,
     choose,
     covariance_of,
+    information_of,
 )
 from calibration.design.knowledge import Knowledge, root_of
 from calibration.design.rivals import Rival, conditions_of, name_of, rival_of, together
@@ -29,6 +32,7 @@ from calibration.design.tour import length_s, short_tour, travel_s
 from calibration.design.visibility import Bodies, Flags, Site, in_view, is_reachable, limits
 from calibration.effects.base import Situation
 from calibration.effects.fitted import FittedEffect, coefficient_values, fitted_additions
+from calibration.effects.library import library
 from calibration.errors import DataError, UnsafeError
 from calibration.identification.additions import Additions, joined
 from calibration.identification.identifiability import observability_indices
@@ -36,6 +40,7 @@ from calibration.identification.refinement import information, prior_precision
 from calibration.identification.samples import averaged, reading_variance, station_covariance
 from calibration.kinematics import Linearisation
 from calibration.observations import Floats, Observations
+from calibration.rig import Rig
 
 CANDIDATES = 10_000
 _BATCHES = 10
@@ -73,7 +78,7 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Plan:
-    """Poses to measure, in the order of a short motion.
+    """Poses to measure, in the order of a short motion; of a long one where an effect in question grows with travel.
 
     Attributes:
         poses: what to drive to, under which conditions where these matter, and what is in view there.
@@ -81,9 +86,9 @@ class Plan:
         parameters, determined: how many the set-up can show, and how many directions of them the poses alone determine.
         observability: `O1` .. `O5` of the poses alone.
         root: (p + k, p + k) covariance of parameters and coefficients after the poses = root @ root'.
-        stood_out: `family@where` of the effects to be told apart -> by how many sigma one of plausible size, or of the
-            size found, stands out from all else, the other effects included, in what was measured already.
-        stands_out: the same once these poses are measured as well.
+        stands_out: `family@where` of the effects to be told apart -> by how many sigma one of plausible size, or of the
+            size found, stands out in these poses from what the most alike of the others can explain: half the square
+            are the log odds that they are expected to bring, if it is there.
     """
 
     poses: Candidates
@@ -92,7 +97,6 @@ class Plan:
     determined: int
     observability: dict[str, float]
     root: Floats
-    stood_out: dict[str, float]
     stands_out: dict[str, float]
 
 
@@ -177,7 +181,7 @@ def plan(
         volume: (v, joints) poses of the work volume: choose for the accuracy of predictions there (V-optimal) and not
             for the parameters (D-optimal).
         separate: effects, each the `family@where` of one in the library, of plausible size, or one as it was found:
-            choose to tell them apart (D_s-optimal), as if none were known yet.
+            choose to tell each from the others, one of them being there and none known yet.
         measured: rows that were measured already and are no part of what is known.
 
     Raises:
@@ -195,22 +199,26 @@ def plan(
     candidates = candidates.under(matters)
     with threadpool_limits(1, user_api="blas"):  # the blocks are small: threads would wait for each other
         rivals = tuple(rival_of(before, e, candidates.readings, candidates.conditions) for e in separate)
+        told = None if measured is None else _told(before, measured, rivals)
         blocks = whitened(before, candidates, rivals)
         criterion: Criterion = Determinant()
-        begin = np.cumsum([known, *(rival.size for rival in rivals)])
-        groups = tuple(first + np.arange(rival.size) for first, rival in zip(begin[:-1], rivals, strict=True))
-        if separate:
-            criterion = Separation(groups)
+        if rivals:
+            nothing = information_of(blocks[:0], told)
+            criterion = Discrimination(_hypotheses(known, rivals, nothing), nothing)
         elif volume is not None:
             criterion = Accuracy(volume_root(knowledge, volume))
-        told = None if measured is None else _told(before, measured, rivals)
-        chosen = candidates.select(choose(blocks, count, criterion, told))
+        in_view = np.repeat(candidates.seen.any(axis=0), 3)
+        chosen = candidates.select(choose(blocks[:, in_view], count, criterion, told))
         seconds = travel_s(rig, chosen.readings)
-        order = _order(seconds, chosen)
+        order = _order(rig, seconds, chosen, [name_of(effect) for effect in separate])
         poses = chosen.select(order)
-        # Once more in their order: some effects depend on what was before.
-        own = whitened(before, poses, rivals)
-        stood, stands = (_stand_out(rivals, groups, covariance_of(some, told)) for some in (own[:0], own))
+        poses = replace(poses, conditions=one_after_another(poses.conditions))
+        stands_out: dict[str, float] = {}
+        if isinstance(criterion, Discrimination):
+            # Once more in their order: some effects depend on what was before.
+            log_odds = criterion.log_odds(information_of(whitened(before, poses, rivals), told))
+            for number, rival in enumerate(rivals):
+                stands_out[rival.name] = math.sqrt(2.0 * max(0.0, float(np.delete(log_odds[number], number).min())))
         after = covariance_of(whitened(knowledge, poses))
         alone = _alone(knowledge, poses)
     seen = alone[alone > _SEEN]
@@ -221,16 +229,31 @@ def plan(
         len(seen),
         observability_indices(seen, int(poses.seen.sum())),
         knowledge.root @ root_of(after),
-        stood,
-        stands,
+        stands_out,
     )
 
 
-def _stand_out(rivals: tuple[Rival, ...], groups: tuple[Integers, ...], covariance: Floats) -> dict[str, float]:
-    return {
-        rival.name: rival.stands_out(covariance[np.ix_(group, group)])
-        for rival, group in zip(rivals, groups, strict=True)
-    }
+def _hypotheses(known: int, rivals: Sequence[Rival], before: Floats) -> tuple[Hypothesis, ...]:
+    """Each effect by itself beside the kinematics; where there is one, also the kinematics alone.
+
+    Args:
+        known: how many parameters and coefficients there are beside those of the rivals.
+        rivals: the effects.
+        before: (q, q) information of the prior and of what was measured already.
+    """
+    kinematics, found = np.arange(known), list[Hypothesis]()
+    first = known
+    for rival in rivals:
+        own = first + np.arange(rival.size)
+        first += rival.size
+        mean = np.zeros(len(before))
+        mean[own] = rival.found
+        # Beside it, the kinematics explain the rest of what was measured.
+        mean[:known] = -np.linalg.solve(before[:known, :known], before[:known, own] @ rival.found)
+        found.append(Hypothesis(mean, np.concatenate([kinematics, own])))
+    if len(found) == 1:
+        found.append(Hypothesis(np.zeros(len(before)), kinematics))
+    return tuple(found)
 
 
 def whitened(knowledge: Knowledge, candidates: Candidates, rivals: tuple[Rival, ...] = ()) -> Floats:
@@ -319,13 +342,30 @@ def _told(knowledge: Knowledge, measured: Observations, rivals: tuple[Rival, ...
     return in_units
 
 
-def _order(seconds: Floats, poses: Candidates) -> Integers:
-    """(n,) a short way through the poses, those under the same slow conditions together."""
+def _order(rig: Rig, seconds: Floats, poses: Candidates, separate: Sequence[str]) -> Integers:
+    """(n,) a short way through the poses, those under the same slow conditions together.
+
+    To and fro where one of the effects to be told apart grows with the path of its joint.
+    """
     names = slow(poses.conditions)
     levels = np.column_stack([np.zeros(len(poses)), *(poses.conditions[name] for name in names)])
     _, block = np.unique(levels, axis=0, return_inverse=True)
     parts = [np.flatnonzero(block == number) for number in range(block.max() + 1)]
+    places = [effect.partition("@") for effect in separate]
+    travelling = [rig.joint_names.index(where) for name, _, where in places if library()[name].goes_by_travel]
+    if travelling:
+        low, high = limits(rig)
+        share = ((poses.readings - low) / (high - low))[:, travelling].sum(axis=1)
+        return np.concatenate([own[_to_and_fro(share[own])] for own in parts])
     return np.concatenate([own[short_tour(seconds[np.ix_(own, own)])] for own in parts])
+
+
+def _to_and_fro(values: Floats) -> Integers:
+    """(n,) the lower and the upper half of some values in turn."""
+    rising = np.argsort(values, kind="stable")
+    order = np.empty(len(values), dtype=np.intp)
+    order[0::2], order[1::2] = np.split(rising, [(len(values) + 1) // 2])
+    return order
 
 
 def _sides(knowledge: Knowledge, candidates: Candidates) -> set[str]:

@@ -34,14 +34,14 @@ class Rival:
         weights: of the variants beforehand, their sum 1.
         mixing: (c, k) what these do is that of k <= c coefficients, independent and of size 1: `mixing` takes unit
             directions of the c in prior sigmas onto them.
-        squares: (k, k) expected products of the k: of plausible sizes, or of those that were found.
+        found: (k,) their values; zero where none were found.
     """
 
     name: str
     choices: tuple[Choice, ...]
     weights: tuple[float, ...]
     mixing: Floats
-    squares: Floats
+    found: Floats
 
     @classmethod
     def of(cls, name: str, choices: tuple[Choice, ...], situation: Situation, found: Floats | None = None) -> Rival:
@@ -66,25 +66,13 @@ class Rival:
             raise DataError(name, f"does nothing in any pose of rig {situation.rig.name!r}")
         left = 1.0 - np.cumsum(size**2) / (size**2).sum()
         mixing = directions[: min(_MOST, int((left > _LEFT).sum()) + 1)].T
-        squares = np.eye(mixing.shape[1])
-        if found is not None:
-            own = mixing.T @ (found / _prior_sigma(choices[0], few))
-            squares = np.outer(own, own)
-        return cls(name, choices, weights, mixing, squares)
+        values = np.zeros(len(mixing)) if found is None else found / _prior_sigma(choices[0], few)
+        return cls(name, choices, weights, mixing, mixing.T @ values)
 
     @property
     def size(self) -> int:
         """How many coefficients."""
         return int(self.mixing.shape[1])
-
-    def stands_out(self, covariance: Floats) -> float:
-        """By how many sigma an effect of the expected size differs from none.
-
-        Args:
-            covariance: (k, k) posterior of the coefficients, whatever all else may be.
-        """
-        beyond_prior = np.linalg.inv(covariance) - np.eye(self.size)
-        return math.sqrt(max(0.0, float((beyond_prior * self.squares).sum())))
 
     def additions(self, situation: Situation) -> Additions:
         """Its k coefficients, of size 1, for the observations of a situation."""

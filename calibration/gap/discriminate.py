@@ -22,12 +22,13 @@ from calibration.effects.fitted import Choice, FittedEffect
 from calibration.effects.library import library
 from calibration.errors import DataError, UnsafeError
 from calibration.gap.result import Experiment
+from calibration.gap.rivals import NEAR
 from calibration.model import CalibratedModel
 from calibration.observations import Floats, Observations
 from calibration.rig import Rig
 
 POSES = 20
-_CANDIDATES = 1000
+_CANDIDATES = 4000
 _TRIED = 64  # poses in which the conditions are tried
 _CHANGES = 0.05  # of what an effect moves, RMS
 _PAUSE_S = 600.0  # between the last fix and the first new one
@@ -105,8 +106,12 @@ def _poses(
         return
     chosen = plan(knowledge, candidates, count, separate=shown, measured=observations)
     rows = tuple(row.as_dict() for row in pose_rows(knowledge.chain.rig, chosen.poses))
+    setups = knowledge.chain.setups
+    here = f" at set-up {setups[knowledge.setup]!r}" if len(setups) > 1 else ""
     orders = "".join(f"; {order}" for order in instructions(knowledge.chain.rig, chosen.poses.conditions))
-    yield Experiment("poses", f"Measure {count} poses chosen for it: {_promise(chosen)}{orders}", rows)
+    yield Experiment(
+        "poses", f"Measure {count} poses{here} chosen for it: {_promise(chosen)}{orders}", rows, chosen.stands_out
+    )
 
 
 def _is_shown(knowledge: Knowledge, poses: Candidates, rival: FittedEffect) -> bool:
@@ -121,11 +126,13 @@ def _is_shown(knowledge: Knowledge, poses: Candidates, rival: FittedEffect) -> b
 
 
 def _promise(chosen: Plan) -> str:
-    return ", ".join(
-        f"{name} of the size found would stand out from all else by {sigma:.1f} sigma after them "
-        f"({chosen.stood_out[name]:.1f} now)"
-        for name, sigma in chosen.stands_out.items()
-    )
+    """By how much each is expected to stand out, and whether that is enough to name it."""
+    each = [f"{name} by {sigma:.1f} sigma" for name, sigma in chosen.stands_out.items()]
+    text = f"if it is there, what is left of it that the others cannot explain will stand out: {', '.join(each)}"
+    unsure = [name for name, sigma in chosen.stands_out.items() if 0.5 * sigma**2 < NEAR]
+    if unsure:
+        text += f"; that may be too little to name {_listed(unsure)}, and takes more such poses or another experiment"
+    return text
 
 
 def _by_condition(knowledge: Knowledge, poses: Candidates, rivals: Sequence[FittedEffect]) -> Iterator[Experiment]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from calibration.effects.base import FittedCoefficient
@@ -67,15 +67,21 @@ class Experiment:
         kind: `poses`, `approach`, `dwell`, `payload`, `prism`, `control_points`, `motion` ...
         text: what to do, a sentence.
         poses: a plan's rows as `rigcal plan` prints them, where it is poses.
+        stands_out_sigma: `family@where` of what the poses are to tell apart -> by how many sigma it is expected to
+            stand out from the others in them, if it is there.
     """
 
     kind: str
     text: str
     poses: tuple[Mapping[str, object], ...] = ()
+    stands_out_sigma: Mapping[str, float] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, object]:
-        """The contract's object, with the poses where there are any."""
-        return {"kind": self.kind, "text": self.text, **({"poses": list(self.poses)} if self.poses else {})}
+        """The contract's object, with the poses and what they promise where there are any."""
+        told: dict[str, object] = {"kind": self.kind, "text": self.text}
+        if self.poses:
+            told |= {"poses": list(self.poses), "stands_out_sigma": dict(self.stands_out_sigma)}
+        return told
 
 
 @dataclass(frozen=True)

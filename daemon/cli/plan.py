@@ -193,7 +193,7 @@ def _show(console: Console, planned: PosePlan, result: Mapping[str, Any]) -> Non
         f"{number(spread.p99_mm)}; {planned.after.where}",
     )
     for effect, sigma in result["stands_out_sigma"].items():
-        say(console, f"{effect} of plausible size stands out from all else by {sigma:.1f} sigma")
+        say(console, f"{effect} of plausible size stands out from the others by {sigma:.1f} sigma")
     for title, sentences in (
         ("What else", result["advice"]),
         ("Please note", result["warnings"]),

@@ -4,8 +4,17 @@ import itertools
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from calibration.design.exchange import Accuracy, Criterion, Determinant, Separation, choose, covariance_of
+from calibration.design.exchange import (
+    Accuracy,
+    Criterion,
+    Determinant,
+    Discrimination,
+    Hypothesis,
+    choose,
+    information_of,
+)
 from calibration.design.knowledge import Knowledge
 from calibration.design.planning import plan_poses
 from calibration.design.poses import Candidates, draw, plan
@@ -134,33 +143,52 @@ def blocks_of(n: int, r: int, q: int, seed: int) -> Floats:
     return np.random.default_rng(seed).normal(size=(n, r, q)) * np.logspace(0.5, -1.5, q)
 
 
+KNOWN = np.diag(np.linspace(1.0, 2.0, 6)) + 0.05
+MODELS = (
+    Hypothesis(np.array([0.3, -0.2, 0.0, 0.1, 1.0, 0.0]), np.array([0, 1, 2, 3, 4])),
+    Hypothesis(np.array([0.1, 0.2, 0.3, -0.4, 0.0, -1.0]), np.array([0, 1, 2, 3, 5])),
+    Hypothesis(np.array([0.0, 0.2, 0.0, 0.0, 0.0, 0.0]), np.array([0, 1, 2, 3])),
+)
 CRITERIA = [
-    Determinant(),
-    Accuracy(np.random.default_rng(9).normal(size=(6, 4))),
-    Separation((np.array([4]), np.array([2, 5]))),
+    (Determinant(), None),
+    (Accuracy(np.random.default_rng(9).normal(size=(6, 4))), None),
+    (Discrimination(MODELS, KNOWN), KNOWN - np.eye(6)),
 ]
 
 
-@pytest.mark.parametrize("criterion", CRITERIA)
-def test_a_gain_is_what_the_value_grows_by(criterion: Criterion) -> None:
+@pytest.mark.parametrize(("criterion", "told"), CRITERIA)
+def test_a_gain_is_what_the_value_grows_by(criterion: Criterion, told: Floats | None) -> None:
     blocks = blocks_of(5, 3, 6, 0)
-    before = covariance_of(blocks[:2])
-    grown = np.eye(3) + blocks[2:] @ before @ blocks[2:].transpose(0, 2, 1)
-    gains = criterion.gain(before, grown, blocks[2:] @ before)
-    for block, gain in zip(blocks[2:], gains, strict=True):
-        after = covariance_of(np.concatenate([blocks[:2], block[None]]))
+    before = information_of(blocks[:2], told)
+    for block, gain in zip(blocks[2:], criterion.gain(before, blocks[2:]), strict=True):
+        after = information_of(np.concatenate([blocks[:2], block[None]]), told)
         assert criterion.value(after) - criterion.value(before) == pytest.approx(gain, rel=1e-9)
 
 
-@pytest.mark.parametrize("criterion", CRITERIA)
-def test_the_exchange_comes_close_to_the_best_of_all_subsets(criterion: Criterion) -> None:
+@pytest.mark.parametrize(("criterion", "told"), CRITERIA)
+def test_the_exchange_comes_close_to_the_best_of_all_subsets(criterion: Criterion, told: Floats | None) -> None:
     for seed in range(5):
         blocks = blocks_of(12, 2, 6, seed)
-        values = [criterion.value(covariance_of(blocks[list(s)])) for s in itertools.combinations(range(12), 4)]
-        chosen = choose(blocks, 4, criterion)
+        subsets = itertools.combinations(range(12), 4)
+        values = [criterion.value(information_of(blocks[list(s)], told)) for s in subsets]
+        chosen = choose(blocks, 4, criterion, told)
         assert len(set(chosen.tolist())) == 4
-        reached = criterion.value(covariance_of(blocks[chosen]))
+        reached = criterion.value(information_of(blocks[chosen], told))
         assert reached > max(values) - 0.03 * (max(values) - np.median(values))
+
+
+def test_the_log_odds_that_a_design_brings_are_those_of_data_that_one_of_the_models_makes() -> None:
+    criterion, rows = Discrimination(MODELS, KNOWN), blocks_of(4, 3, 6, 1).reshape(-1, 6)
+    expected = criterion.log_odds(KNOWN + rows.T @ rows)
+    rng, predicted = np.random.default_rng(0), []
+    for model in MODELS:
+        own = rows[:, model.free]
+        spread = own @ np.linalg.inv(KNOWN[np.ix_(model.free, model.free)]) @ own.T
+        predicted.append(stats.multivariate_normal(rows @ model.mean, spread + np.eye(len(rows))))
+    for (i, true), (j, other) in itertools.permutations(enumerate(predicted), 2):
+        data = true.rvs(20_000, rng)
+        brought = true.logpdf(data) - other.logpdf(data)
+        assert expected[i, j] == pytest.approx(brought.mean(), abs=4.0 * brought.std() / np.sqrt(len(data)))
 
 
 def test_a_way_through_poses_on_a_line_goes_along_it() -> None:

@@ -96,7 +96,7 @@ def test_two_effects_are_told_apart_and_the_approach_is_part_of_the_plan(tmp_pat
     assert result.exit_code == 0, result.stderr
     assert "theta3 from" in result.stdout
     assert "below" in result.stdout
-    assert "backlash@theta3 of plausible size stands out from all else by" in result.stdout
+    assert "backlash@theta3 of plausible size stands out from the others by" in result.stdout
     rows = list(csv.DictReader(io.StringIO(out.read_text())))
     assert {row["theta3_dir"] for row in rows} == {"-1", "1"}
 
