@@ -168,7 +168,7 @@ def format_observations(
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(columns)
-    writer.writerows(zip(*([_cell(v) for v in values] for values in columns.values()), strict=True))
+    writer.writerows(zip(*(_cells(values) for values in columns.values()), strict=True))
     return out.getvalue()
 
 
@@ -186,6 +186,12 @@ def originals(observations: Observations) -> NDArray[np.intp]:
         seen.setdefault((*label, *values), row) for row, (label, values) in enumerate(zip(labels, numbers, strict=True))
     ]
     return np.array(first, dtype=np.intp)
+
+
+def _cells(values: Sequence[object] | Floats | Strings) -> list[str]:
+    if isinstance(values, np.ndarray) and values.dtype == np.float64:
+        return ["" if math.isnan(v) else repr(v) for v in values.tolist()]
+    return [_cell(value) for value in values]
 
 
 def _cell(value: object) -> str:

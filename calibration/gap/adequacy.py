@@ -11,12 +11,18 @@ import math
 
 import numpy as np
 
-from calibration.gap.projection import Projection
+from calibration.gap.adopt import JointFit
+from calibration.gap.detect import detect
+from calibration.gap.grammar import Grammar
+from calibration.gap.projection import Projection, Softly
+from calibration.gap.terms import modulations
+from calibration.gap.variables import Place, Variables
 from calibration.identification.samples import reading_covariance
 from calibration.observations import Floats
 from calibration.rig import Rig
 
 _CLOSED = 0.8  # of the gap, at least
+_LEFT = 0.05  # of what an effect explains together with what is left of it, at most
 _HIGH = 6.0  # standard errors of the variance that the gap must have to be judged
 _MISJUDGED = 0.1  # share by which a sigma may be off
 _FAR_MISJUDGED = 0.5  # the same where nothing says that it is anything but noise
@@ -40,6 +46,30 @@ def closes(first: Projection, last: Projection, *, is_structured: bool) -> bool:
     gap, left = first.fit.excess_variance - allowed, last.fit.excess_variance - allowed
     standard_error = (noise + allowed) * math.sqrt(2.0 / (3.0 * float(last.fit.weight.sum())))
     return gap < _HIGH * standard_error or left < (1.0 - _CLOSED) * gap + standard_error
+
+
+def depends(joint: JointFit, number: int, projection: Projection, rng: np.random.Generator) -> str:
+    """What the coefficient of an effect depends on, though it is to be a constant; empty where it is one.
+
+    Something else was taken for an effect where what is left is the same, but larger in some poses or at some times
+    than in others: a beam for an elastic joint, friction for play, a knock for a drift.
+
+    Args:
+        joint: kinematics and effects.
+        number: of the effect.
+        projection: about that fit.
+        rng: draws signs, as detection does.
+    """
+    choice, own = joint.choices[number], joint.own(number)
+    moved_mm = projection.moved_mm(joint.parts[number]) @ joint.found(number)[0]
+    others = Softly(np.delete(projection.rows.kinematics, np.r_[own], axis=1))
+    explained = float((others(projection.whitened(moved_mm[:, :, None])) ** 2).sum())
+    place = Place(choice.where, str(choice), {}, moved_mm)
+    grammar = Grammar(projection, modulations(Variables(projection), place))
+    left = float((grammar.score**2).max(initial=0.0))
+    if left < _LEFT * (explained + left) or not detect(grammar, rng).significant:
+        return ""
+    return grammar.terms[int(np.abs(grammar.score).argmax())].variable.text
 
 
 def _noise_mm2(projection: Projection) -> float:

@@ -16,14 +16,13 @@ from calibration.effects.library import library, parse_effects
 from calibration.errors import DataError
 from calibration.gap.projection import Projection
 from calibration.gap.screen import LEAST_KNOWN, LOG_SCALE_ODDS, SCALES, Screen, place_of, variants_at
-from calibration.identification.additions import Additions, joined
+from calibration.identification.additions import Additions, joined, same_columns
 from calibration.identification.identifiability import identifiability
 from calibration.identification.refinement import Fit, Prior, refine
 from calibration.identification.solve import Solution
 from calibration.model import CalibratedModel
 from calibration.observations import Floats, Observations
 
-_ROUNDS = 2  # loads and lever arms depend on the kinematics: the second fit has those of the first one's
 _CHOICES = 4  # of variants: the noise that they are weighed with depends on which are in
 
 
@@ -67,16 +66,31 @@ class JointFit:
         """All coefficients; None where there are no effects."""
         return joined(self.parts, len(self.parts[0].column)) if self.parts else None
 
+    def own(self, number: int) -> slice:
+        """Which of the fit's parameters are the coefficients of one of the effects."""
+        first = len(self.situation.chain) + sum(len(part) for part in self.parts[:number])
+        return slice(first, first + len(self.parts[number]))
+
     def found(self, number: int) -> tuple[Floats, Floats]:
         """Values and standard errors of the coefficients of one of the effects."""
-        first = len(self.situation.chain) + sum(len(part) for part in self.parts[:number])
-        own = slice(first, first + len(self.parts[number]))
+        own = self.own(number)
         return self.fit.x[own], np.sqrt(np.diag(self.fit.covariance)[own])
 
     def start(self, choices: Sequence[Choice]) -> Floats:
         """(p + k,) where a fit of these effects, all of them in this one, begins."""
         coefficients = [self.found(self.choices.index(choice))[0] for choice in choices]
         return np.concatenate([self.fit.x[: len(self.situation.chain)], *coefficients])
+
+    def error_mm(self, solution: Solution) -> Floats:
+        """(m, 3) what the fit leaves of the samples of a solution of its chain, mm."""
+        chain, data, additions = solution.chain, solution.samples.data, self.additions
+        x, coefficients = self.fit.x[: len(chain)], self.fit.x[len(chain) :]
+        left = solution.samples.position_mm
+        if additions is not None:
+            data = replace(data, readings=data.readings + additions.change(coefficients, data.readings.shape[1]))
+            left = left - additions.shifted_mm(coefficients)
+        error: Floats = left - chain.positions_mm(x, data)
+        return error
 
     def beyond(self, number: int) -> tuple[str, ...]:
         """Names of its coefficients that are beyond their hard limits by more than chance."""
@@ -93,6 +107,8 @@ def joint_fit(
 ) -> JointFit:
     """Refit the kinematics with effects.
 
+    Loads and lever arms depend on the kinematics: where effects do, a second fit has those of the first one's.
+
     Args:
         solution: of the kinematics, for its chain and samples.
         observations: n rows that the samples are of.
@@ -102,12 +118,21 @@ def joint_fit(
     """
     chain, samples = solution.chain, solution.samples
     x = solution.fit.x[: len(chain)] if start is None else start
-    for _ in range(_ROUNDS):
-        situation = Situation(chain, x[: len(chain)], observations)
-        parts = tuple(c.additions(situation).over(samples.average) for c in choices)
-        fit = refine(chain, samples, x, prior=prior, additions=joined(parts, len(samples)))
-        x = fit.x
+    situation, parts = _parts(solution, observations, choices, x)
+    fit = refine(chain, samples, x, prior=prior, additions=joined(parts, len(samples)))
+    again = _parts(solution, observations, choices, fit.x)
+    if not all(same_columns(a, b) for a, b in zip(parts, again[1], strict=True)):
+        situation, parts = again
+        fit = refine(chain, samples, fit.x, prior=prior, additions=joined(parts, len(samples)))
     return JointFit(situation, tuple(choices), parts, fit)
+
+
+def _parts(
+    solution: Solution, observations: Observations, choices: Sequence[Choice], x: Floats
+) -> tuple[Situation, tuple[Additions, ...]]:
+    """What effects do to the samples, with the loads and lever arms of parameters (p,) or more."""
+    situation = Situation(solution.chain, x[: len(solution.chain)], observations)
+    return situation, tuple(c.additions(situation).over(solution.samples.average) for c in choices)
 
 
 def adopt(solution: Solution, observations: Observations, effects: str, *, prior: Prior = "recalibration") -> Adopted:

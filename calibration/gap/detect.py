@@ -17,6 +17,7 @@ import numpy as np
 from scipy import stats
 
 from calibration.gap.grammar import Grammar
+from calibration.gap.neighbours import neighbours
 from calibration.gap.result import Disagreement
 from calibration.gap.terms import Kind
 from calibration.observations import Floats
@@ -26,9 +27,11 @@ _ENOUGH = 10  # draws beyond a score, of which a share is a probability; with fe
 _ALARM = 0.005  # half of what false alarms may be: the library may raise some too
 _LISTED = 0.05
 _MOST = 10
-# Of the chance of a false alarm: what the largest score of each kind of term has, and what all scores together have.
-_LARGEST: Mapping[Kind, float] = {"single": 0.5, "crossing": 0.15, "product": 0.15}
-_TOGETHER = 0.2
+# Of the chance of a false alarm: what the largest score of each kind of term has, what all scores together have, and
+# what neighbours share along each of three variables.
+_LARGEST: Mapping[Kind, float] = {"single": 0.4, "crossing": 0.15, "product": 0.15}
+_TOGETHER = 0.15
+_NEIGHBOURS = 0.05
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,15 @@ def detect(grammar: Grammar, rng: np.random.Generator) -> Detection:
         key = term.place.where, term.variable.topic
         if p[i] < _LISTED and len(listed) < _MOST:
             listed.setdefault(key, Disagreement(*key, float(p[i])))
-    return Detection(min(float(p.min()), together), tuple(listed.values()))
+    alarm = min(float(p.min()), together)
+    if alarm < _ALARM:
+        return Detection(alarm, tuple(listed.values()))
+    for along in neighbours(grammar.projection, rng, _DRAWS):  # for what no term has words for
+        alike = max(_of_sum(along.shared, along.chance * _lost(grammar) ** 2) / _NEIGHBOURS, least)
+        alarm = min(alarm, alike)
+        if alike < _LISTED:
+            listed.setdefault((along.where, along.variable), Disagreement(along.where, along.variable, alike))
+    return Detection(alarm, tuple(sorted(listed.values(), key=lambda d: d.p)[:_MOST]))
 
 
 def _lost(grammar: Grammar) -> float:

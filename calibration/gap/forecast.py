@@ -170,13 +170,8 @@ def _least_size(own: int, others: Integers, evidence: Floats, chance: Floats, lo
 
 def _distinct(screen: Screen, place: int) -> list[int]:
     """Variants that move differently; of those that differ in their prior alone the one with the widest."""
-    found: dict[int, int] = {}
-    sigma = [additions.prior_sigma for additions in screen.places[place].additions]
-    for option in range(len(sigma)):
-        same = id(screen.columns(place, option))
-        if same not in found or sigma[option].sum() > sigma[found[same]].sum():
-            found[same] = option
-    return list(found.values())
+    sigma = [additions.prior_sigma.sum() for additions in screen.places[place].additions]
+    return [max(same, key=sigma.__getitem__) for same in screen.distinct(place)]
 
 
 def _variant(place: int, columns: Floats) -> _Variant:

@@ -14,10 +14,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import orth
 from scipy.special import logsumexp
 
-from calibration.gap.projection import Projection
+from calibration.gap.projection import Projection, Softly
 from calibration.gap.terms import Term, candidates, chunks, columns_of
 from calibration.gap.variables import Variables
 from calibration.observations import Floats
@@ -30,7 +29,6 @@ _MOST = 3  # terms of a description
 _BEGINNINGS = 12
 _WORTH = math.log(99.0)  # odds for a term, to be in it
 _NEARLY = math.log(10.0)
-_ALIKE = 0.98  # cosine with a library's effect
 _LEAST_OWN = 1e-3  # share of a term's square that those before it do not have
 _TINY = float(np.finfo(np.float64).tiny)
 
@@ -53,11 +51,17 @@ class Found:
     log_evidence: float
     column: Floats
 
-    def alike(self, columns: Floats) -> bool:
-        """Whether an effect with columns (3 m, k) in the projected space can stand for the term."""
-        length = np.linalg.norm(columns, axis=0)
-        basis = orth(columns[:, length > 0.0] / length[length > 0.0])
-        return bool(np.linalg.norm(basis.T @ self.column) >= _ALIKE)
+    def shows_beside(self, columns: Floats, residual: Floats) -> bool:
+        """Whether the data ask for the term beside an effect too: it has more than what the effect explains as well.
+
+        Args:
+            columns: (3 m, k) of the effect in the projected space, of one prior sigma each.
+            residual: (3 m,) there.
+        """
+        beside = Softly(columns)
+        column = beside(self.column)
+        square = (column @ beside(residual)) ** 2 / max(float(column @ column), _TINY)
+        return bool(_log_bayes_factor(np.array([square]))[0] > _WORTH)
 
 
 @dataclass(frozen=True)
@@ -92,6 +96,7 @@ class Grammar:
 
     Args:
         projection: the fit.
+        possible: terms; all that may be off by default.
 
     Attributes:
         projection: the same.
@@ -100,9 +105,9 @@ class Grammar:
         by_group: (blocks, k) parts of the scores by groups of samples that no fold separates.
     """
 
-    def __init__(self, projection: Projection) -> None:
+    def __init__(self, projection: Projection, possible: Sequence[Term] | None = None) -> None:
         self.projection = projection
-        possible = candidates(Variables(projection))
+        possible = candidates(Variables(projection)) if possible is None else possible
         block = np.unique(projection.groups, return_inverse=True)[1] % _BLOCKS
         order = np.argsort(block, kind="stable")
         first = np.flatnonzero(np.diff(block[order], prepend=-1))

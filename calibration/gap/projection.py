@@ -45,23 +45,28 @@ class Rows:
 
 
 class Softly:
-    """Takes the kinematics out of whitened rows.
+    """Takes the kinematics out of whitened rows: the symmetric root of (I + K K')^-1.
 
     Args:
-        kinematics: (r, q).
+        kinematics: (r, q) K.
     """
 
     def __init__(self, kinematics: Floats) -> None:
-        orthogonal, triangle = np.linalg.qr(kinematics)
-        left, size, _ = np.linalg.svd(triangle)
-        self._left: Floats = orthogonal @ left
-        self._taken = 1.0 - 1.0 / np.sqrt(1.0 + size**2)
+        _, size, axes = np.linalg.svd(np.linalg.qr(kinematics, mode="r"), full_matrices=False)
+        root = np.sqrt(1.0 + size**2)
+        self._kinematics = kinematics
+        self._half = axes.T / root
+        self._middle: Floats = axes.T / (root * (1.0 + root)) @ axes
 
     def __call__(self, whitened: Floats) -> Floats:
         """(r, k) or (r,) in units of noise and kinematics together."""
-        along = self._left.T @ whitened
-        out: Floats = whitened - self._left @ (self._taken.reshape(-1, *([1] * (whitened.ndim - 1))) * along)
+        out: Floats = whitened - self._kinematics @ (self._middle @ (self._kinematics.T @ whitened))
         return out
+
+    def taken(self, whitened: Floats) -> Floats:
+        """(q, k) of rows (r, k), or (q,): a'b less the product of what is taken of both is that of what is left."""
+        taken: Floats = self._half.T @ (self._kinematics.T @ whitened)
+        return taken
 
 
 class Projection:

@@ -10,11 +10,12 @@ import numpy as np
 
 from calibration.effects.base import Situation
 from calibration.effects.fitted import Choice
+from calibration.gap.grammar import Found as Formula
 from calibration.gap.projection import Projection
 from calibration.gap.screen import Place, Screen, Weighed
 
-_ODDS = math.log(99.0)  # that something is there
-_CHANCE = 0.01  # of anything at all, corrected for all that was looked at
+_ODDS = math.log(999.0)  # that something is there
+_CHANCE = 0.003  # of anything at all, corrected for all that was looked at
 NEAR = 5.0  # in log evidence: families this near are not told apart
 PLAIN = 100.0  # log evidence of what no half of the data can miss, where no rival comes near
 _POSSIBLE = 0.02  # posterior of a rival
@@ -57,6 +58,19 @@ def stands_out(weighed: Sequence[Weighed], looks: int) -> bool:
     """Whether anything is there: by the evidence of all together, and by the chance of the most striking."""
     best = max(w.log_bayes_factor + w.place.log_prior for w in weighed)
     return best > _ODDS and min(w.p for w in weighed) * looks < _CHANCE
+
+
+def stands_for(weighed: Weighed, formula: Formula, over: Projection) -> bool:
+    """Whether an effect does what a formula says, though the formula explains the data better.
+
+    It may explain as much with more coefficients than these data ask for, at the same place: an error of another place
+    that is simpler and explains more is something else.
+    """
+    if weighed.place.where != formula.term.place.where:
+        return False
+    additions = weighed.scaled_additions
+    columns = over.columns(over.moved_mm(additions)) * additions.prior_sigma
+    return not formula.shows_beside(columns, over.residual)
 
 
 def best_of_each_family(weighed: Sequence[Weighed]) -> list[Weighed]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,13 +21,16 @@ from calibration.effects.base import FittedCoefficient, Situation
 from calibration.effects.fitted import Choice
 from calibration.effects.library import library
 from calibration.gap.projection import Projection, from_products
-from calibration.identification.additions import Additions
+from calibration.identification.additions import Additions, joined, same_columns
 from calibration.observations import Floats
 
 LEAST_KNOWN = 0.5  # share of the rows that have what an effect needs
 _PAIRED = 10
 _SECOND = math.log(0.05)  # that another effect is there as well, beforehand
-_SEEN = 1e-6  # least singular value of columns, of their largest
+_AT_ONCE = 128  # columns
+_SEEN = 1e-10  # least eigenvalue of products of columns, of their largest
+_TINY = float(np.finfo(np.float64).tiny)
+_AS_WELL = 5.0  # ln of a Bayes factor; less is no difference
 SCALES = (1 / 3, 1.0, 3.0, 10.0)  # of plausible sizes: what is plausible is not known better than that
 _SQUARED_SCALES = np.square(SCALES)[:, None]
 LOG_SCALE_ODDS = dict(zip(SCALES, np.log([0.2, 0.5, 0.25, 0.05]).tolist(), strict=True))
@@ -81,7 +84,8 @@ class Weighed:
         log_bayes_factor: of the place against nothing, all its variants together.
         p: of the squares that the best variant explains, by chance, for one look.
         posterior: of the place, among all places, pairs and nothing.
-        beside: the other of the pair, where the most probable model that has this place is a pair.
+        log_evidence: of the most probable model that has this place, the odds beforehand in it, against nothing.
+        beside: the other of the pair, where that model is a pair.
     """
 
     place: Place
@@ -92,6 +96,7 @@ class Weighed:
     log_bayes_factor: float
     p: float
     posterior: float = 0.0
+    log_evidence: float = -math.inf
     beside: Weighed | None = None
 
     @property
@@ -194,23 +199,42 @@ class Screen:
     def __init__(self, projection: Projection, places: Sequence[Place]) -> None:
         self.projection, self.places = projection, tuple(places)
         self._number = {id(place): number for number, place in enumerate(self.places)}
-        self._columns: list[Floats] = []
         self._block: dict[tuple[int, int], int] = {}
+        blocks: list[Additions] = []
         for number, place in enumerate(self.places):
             own: list[tuple[Additions, int]] = []
             for option, additions in enumerate(place.additions):
-                block = next((index for other, index in own if _same(other, additions)), None)
+                block = next((index for other, index in own if same_columns(other, additions)), None)
                 if block is None:
-                    block = len(self._columns)
-                    self._columns.append(projection.columns(projection.moved_mm(additions)))
+                    block = len(blocks)
+                    blocks.append(additions)
                 own.append((additions, block))
                 self._block[number, option] = block
-        self._along = [columns.T @ projection.residual for columns in self._columns]
+        target = projection.rows.target
+        taken = projection.softly.taken(target)
+        self._whitened: list[Floats] = []
+        self._taken: list[Floats] = []
+        self._along: list[Floats] = []
+        for together in _several(blocks):
+            whitened = projection.whitened(projection.moved_mm(joined(together, len(projection.samples))))
+            of_kinematics = projection.softly.taken(whitened)
+            along = whitened.T @ target - of_kinematics.T @ taken
+            edges = np.cumsum([len(additions) for additions in together])[:-1]
+            self._whitened += np.split(whitened, edges, axis=1)
+            self._taken += np.split(of_kinematics, edges, axis=1)
+            self._along += np.split(along, edges)
         self._gram: dict[tuple[int, int], Floats] = {}
 
     def columns(self, place: int, option: int) -> Floats:
         """(3 m, k) of a variant."""
-        return self._columns[self._block[place, option]]
+        return self.projection.softly(self._whitened[self._block[place, option]])
+
+    def distinct(self, place: int) -> tuple[tuple[int, ...], ...]:
+        """The variants of a place, those together that differ in their prior alone."""
+        found: dict[int, list[int]] = {}
+        for option in range(len(self.places[place].options)):
+            found.setdefault(self._block[place, option], []).append(option)
+        return tuple(map(tuple, found.values()))
 
     def log_bayes_factor(self, chosen: Sequence[tuple[int, int]], scales: Sequence[float] | None = None) -> float:
         """Of several variants together, (place, option) each, against nothing.
@@ -239,13 +263,13 @@ class Screen:
         """All places but those called so (`family@where`), the most probable first."""
         each = {n: self._weigh(n) for n, place in enumerate(self.places) if str(place) not in without}
         best = sorted(each, key=lambda n: -(each[n].log_bayes_factor + each[n].place.log_prior))[:_PAIRED]
+        spread = {n: each[n].log_bayes_factor - self.together([each[n]]) for n in best}
         models: list[tuple[tuple[int, ...], float]] = [((), 0.0)]
         models += [((n,), w.log_bayes_factor + w.place.log_prior) for n, w in each.items()]
         for i, k in itertools.combinations(best, 2):
             pair = [each[i], each[k]]
-            spread = sum(w.log_bayes_factor - self.together([w]) for w in pair)
             prior = sum(w.place.log_prior for w in pair) + math.log(2.0) + _SECOND
-            models.append(((i, k), self.together(pair) + spread + prior))
+            models.append(((i, k), self.together(pair) + spread[i] + spread[k] + prior))
         total = logsumexp([value for _, value in models])
         share, top = dict.fromkeys(each, 0.0), dict.fromkeys(each, -math.inf)
         beside: dict[int, Weighed | None] = dict.fromkeys(each)
@@ -255,57 +279,78 @@ class Screen:
                 if value > top[number]:
                     top[number] = value
                     beside[number] = next((each[other] for other in members if other != number), None)
-        weighed = [replace(w, posterior=share[n], beside=beside[n]) for n, w in each.items()]
+        weighed = [replace(w, posterior=share[n], log_evidence=top[n], beside=beside[n]) for n, w in each.items()]
         return tuple(sorted(weighed, key=lambda w: (-w.posterior, -w.log_bayes_factor, str(w.place))))
 
     def _weigh(self, number: int) -> Weighed:
-        """One place; its strained variants are left out, as long as they would be the best."""
+        """One place; its strained variants are left out, as long as they would be the best.
+
+        And so are those whose coefficients are beyond their limits, where another explains the data as well: of forms
+        that mirror or outgrow each other, data alone say which only by the sign and the size that they ask for.
+        """
         place = self.places[number]
         values = np.array([self._at_scales(number, option) for option in range(len(place.options))])
         values += place.log_odds[:, None] + np.array(list(LOG_SCALE_ODDS.values()))
         while True:
             found = self._weigh_best(number, values)
-            left_out = np.isneginf(values).all(axis=1)
-            if left_out.sum() == len(values) - 1 or not found.choice.strained(found.estimate, found.standard_error):
+            estimate, error = found.estimate, found.standard_error
+            is_strained = found.choice.strained(estimate, error)
+            if not is_strained and not found.choice.beyond(self.projection.situation, estimate, error):
                 return found
-            values[found.option] = -math.inf
+            rest = values.copy()
+            rest[found.option] = -math.inf
+            if rest.max() < (-math.inf if is_strained else values.max() - _AS_WELL) or np.isneginf(rest).all():
+                return found
+            values = rest
 
     def _weigh_best(self, number: int, values: Floats) -> Weighed:
         """One place by its best variant and scale, for the log evidence (options, scales) of all."""
         place = self.places[number]
         option, best = np.unravel_index(int(np.argmax(values)), values.shape)
         prior = place.additions[option].prior_sigma * SCALES[best]
-        columns = self.columns(number, int(option))
-        scaled = columns * prior
-        left, size, right = np.linalg.svd(scaled, full_matrices=False)
-        seen = size > _SEEN * max(size[0], 1e-300)
-        along = left.T @ self.projection.residual
-        p = float(stats.chi2.sf(float((along[seen] ** 2).sum()), int(seen.sum())))
+        size, axes, along = self._eigen(number, int(option))
+        size, along = size * SCALES[best] ** 2, along * SCALES[best]
+        seen = size > _SEEN * max(float(size[-1]), _TINY)
+        p = float(stats.chi2.sf(float((along[seen] ** 2 / size[seen]).sum()), int(seen.sum())))
         looks = len({self._block[number, o] for o in range(len(values))})
         return Weighed(
             place,
             int(option),
             SCALES[best],
-            prior * (right.T @ (along * size / (1.0 + size**2))),
-            prior * np.sqrt(np.clip(1.0 - (right.T**2) @ (size**2 / (1.0 + size**2)), 0.0, 1.0)),
+            prior * (axes @ (along / (1.0 + size))),
+            prior * np.sqrt(np.clip(1.0 - axes**2 @ (size / (1.0 + size)), 0.0, 1.0)),
             float(logsumexp(values)),
             min(p * looks, 1.0),
         )
 
     def _at_scales(self, number: int, option: int) -> Floats:
         """(scales,) log Bayes factors of a variant by itself."""
+        size, _, along = self._eigen(number, option)
+        size, squares = size * _SQUARED_SCALES, along**2 * _SQUARED_SCALES
+        values: Floats = 0.5 * (squares / (1.0 + size) - np.log1p(size)).sum(axis=1)
+        return values
+
+    def _eigen(self, number: int, option: int) -> tuple[Floats, Floats, Floats]:
+        """Of a variant's G'G with the coefficients in prior sigmas: eigenvalues (k,), axes (k, k), G'r along these."""
         block = self._block[number, option]
         sigma = self.places[number].additions[option].prior_sigma
         size, axes = np.linalg.eigh(self._product(block, block) * sigma * sigma[:, None])
-        size = np.maximum(size, 0.0) * _SQUARED_SCALES
-        along = (axes.T @ (self._along[block] * sigma)) ** 2 * _SQUARED_SCALES
-        values: Floats = 0.5 * (along / (1.0 + size) - np.log1p(size)).sum(axis=1)
-        return values
+        return np.maximum(size, 0.0), axes, axes.T @ (self._along[block] * sigma)
 
     def _product(self, a: int, b: int) -> Floats:
         if (a, b) not in self._gram:
-            self._gram[a, b] = self._columns[a].T @ self._columns[b]
+            self._gram[a, b] = self._whitened[a].T @ self._whitened[b] - self._taken[a].T @ self._taken[b]
         return self._gram[a, b]
+
+
+def _several(blocks: Sequence[Additions]) -> Iterator[Sequence[Additions]]:
+    """The blocks, as many at a time as have some columns together: one pass over the rows serves them all."""
+    first, width = 0, 0
+    for number, additions in enumerate(blocks, 1):
+        width += len(additions)
+        if width >= _AT_ONCE or number == len(blocks):
+            yield blocks[first:number]
+            first, width = number, 0
 
 
 def by_family(weighed: Iterable[Weighed]) -> dict[str, float]:
@@ -314,13 +359,3 @@ def by_family(weighed: Iterable[Weighed]) -> dict[str, float]:
     for w in weighed:
         found[w.place.family] = min(1.0, found.get(w.place.family, 0.0) + w.posterior)
     return dict(sorted(found.items(), key=lambda item: -item[1]))
-
-
-def _same(a: Additions, b: Additions) -> bool:
-    """Whether two variants differ in their prior alone."""
-    shifts = (a.shift_mm, b.shift_mm)
-    if not np.array_equal(a.column, b.column):
-        return False
-    return shifts[0] is shifts[1] or (
-        shifts[0] is not None and shifts[1] is not None and np.array_equal(shifts[0], shifts[1])
-    )

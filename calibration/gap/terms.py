@@ -63,13 +63,22 @@ def candidates(variables: Variables) -> tuple[Term, ...]:
             ("product", variables.products(place)),
         )
         own = [(variable, kind) for kind, some in words for variable in some]
-        different = _different(np.column_stack([v.values for v, _ in own]), place.constant is None) if own else ()
+        different = (
+            _different(np.column_stack([v.values for v, _ in own]), has_offset=place.constant is None) if own else ()
+        )
         found += [(place, *own[i]) for i in different]
     count = Counter(kind for _, _, kind in found)
     return tuple(Term(place, variable, kind, math.log(_SHARES[kind] / count[kind])) for place, variable, kind in found)
 
 
-def _different(values: Floats, has_offset: bool) -> list[int]:
+def modulations(variables: Variables, place: Place) -> tuple[Term, ...]:
+    """An error of which what it does is known, times each of the things that its size may depend on."""
+    own = variables.conditions(place.where)
+    different = _different(np.column_stack([v.values for v in own]), has_offset=True)
+    return tuple(Term(place, own[i], "single", -math.log(len(different))) for i in different)
+
+
+def _different(values: Floats, *, has_offset: bool) -> list[int]:
     """Columns of (m, k) that are none of those before them, beside a constant where the kinematics have that."""
     values = values[:: max(len(values) // _COMPARED, 1)]
     least = _ROUNDING * np.linalg.norm(values, axis=0)

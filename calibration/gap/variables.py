@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.effects.base_motion import base_motion_mm
+from calibration.effects.base_motion import base_motion_mm, level_axes
 from calibration.effects.boom import boom_in
 from calibration.effects.motion import velocity_mm_per_s
 from calibration.effects.sight import of_prism, sight
@@ -93,9 +93,10 @@ class Variables:
 
     Args:
         projection: the fit.
+        instants_s: after which something may have jumped, as `time_s` has it, beside the sixteenths of the fixes.
     """
 
-    def __init__(self, projection: Projection) -> None:
+    def __init__(self, projection: Projection, instants_s: Collection[float] = ()) -> None:
         self._samples, self._situation = projection.samples, projection.situation
         self._joint_jacobian = projection.joint_jacobian
         joints = self._situation.rig.joints
@@ -105,8 +106,11 @@ class Variables:
         self._reading = {name: readings[:, index] for name, index in self._situation.chain.joint_index.items()}
         self._slow = tuple(self._environment())
         self._signals = tuple(self._machine_signals())
-        self._course = tuple(v for w in self._slow if w.topic == "time" for v in (_squared(w), *_steps(w)))
+        self._course = tuple(
+            v for w in self._slow if w.topic == "time" for v in (_squared(w), *_steps(w), *self._jumps(instants_s))
+        )
         self._incidence = tuple(self._incidences())
+        self._boom_length = tuple(self._lengths())
         self._shape = {j.name: _shapes(j, self._reading[j.name]) for j in joints}
         self._load = {j.name: tuple(self._loads(j)) for j in joints}
 
@@ -156,6 +160,13 @@ class Variables:
             own = tuple(v for text, unit, x in loads for v in self._measured(text, "torque", unit, x))
             yield Place("boom", f"{name} of the boom", {"rad": 1}, self._samples.average(moved), own=own)
 
+    def _lengths(self) -> Iterator[Variable]:
+        """How long a boom is: what a load does to a beam grows with it."""
+        boom = boom_in(self._situation)
+        if boom is not None:
+            length = self._samples.average(boom.length_mm) / 1e3
+            yield Variable("length of the boom", f"{boom.joint} extension", {"m": 1}, length)
+
     def _base_places(self) -> Iterator[Place]:
         """What jacks and weather do to the whole machine; turning about the vertical is the first joint's."""
         situation, average = self._situation, self._samples.average
@@ -165,9 +176,9 @@ class Variables:
         yield Place("base", "base height error", {"mm": 1}, average(moved[:, :, 2]))
         if situation.rig.masses:
             lever_mm, newton = situation.loads.places(situation.data.readings, situation.observations.extra)
-            down = np.array(situation.rig.gravity) / np.linalg.norm(situation.rig.gravity)
-            moment = np.cross((newton[:, :, None] * lever_mm).sum(axis=1) / 1e3, down)
-            leaning = (moved[:, :, :2] @ moment[:, :2, None])[:, :, 0]
+            axes = level_axes(situation.rig.gravity)
+            moment = np.cross((newton[:, :, None] * lever_mm).sum(axis=1) / 1e3, -axes[2])
+            leaning = (moved[:, :, :2] @ (moment @ axes[:2].T)[:, :, None])[:, :, 0]
             soft: Unit = {"rad": 1, "N": -1, "m": -1}
             yield Place("base", "base tilt", soft, average(leaning), constant=("moment of all weights", "torque"))
         grown = situation.to_station(situation.located.prism_mm[:, :, None])[:, :, 0]
@@ -231,12 +242,20 @@ class Variables:
         pairs = itertools.chain(
             itertools.product(shapes, (*loads, *slow)),
             itertools.combinations((*loads, *slow), 2),
+            itertools.product(loads, self._boom_length),
         )
         yield from (first.times(second) for first, second in pairs if first.topic != second.topic)
         for joint in self._angles:
             if joint.name != place.where:
                 waves = _harmonics(joint, self._reading[joint.name], _CROSS_HARMONICS, f"{joint.name} angle")
                 yield from (wave.times(_from_mean(stroke)) for wave, stroke in itertools.product(waves, strokes))
+
+    def conditions(self, where: str) -> tuple[Variable, ...]:
+        """All that the size of an effect at a place may depend on, one thing at a time."""
+        strokes = [v for joint in self._strokes for v in self._shape[joint.name]]
+        shapes = [v for own in self._shape.values() for v in own]
+        around = (*self._slow, *map(_squared, (*self._slow, *strokes)))
+        return (*shapes, *self._load.get(where, ()), *around, *self._course, *self._signals)
 
     def _extensions(self, place: Place) -> tuple[Variable, ...]:
         """Strokes of other joints."""
@@ -289,6 +308,13 @@ class Variables:
         yield from self._measured("dwell", "dwell", {"s": 1}, dwell)
         yield from self._measured("log(1 + dwell/s)", "dwell", _NOTHING, np.log1p(dwell))
         yield from self._measured("payload", "payload", {"kg": 1}, extra("payload_kg"))
+
+    def _jumps(self, instants_s: Collection[float]) -> Iterator[Variable]:
+        """What jumps once, after each of the instants."""
+        time_s = self._situation.extra("time_s")
+        for instant_s in sorted(instants_s):
+            text = _after((instant_s - float(np.nanmin(time_s))) / 3600.0)
+            yield from self._measured(text, "time", _NOTHING, np.where(time_s > instant_s, 1.0, 0.0))
 
     def _machine_signals(self) -> Iterator[Variable]:
         """Pressures, currents and whatever else was recorded."""
@@ -358,7 +384,11 @@ def _from_mean(variable: Variable) -> Variable:
 def _steps(time: Variable) -> Iterator[Variable]:
     """What jumps once, after each sixteenth of the fixes."""
     for after in np.unique(np.quantile(time.values, np.arange(1, _STEPS) / _STEPS)).tolist():
-        yield Variable(f"({time.text} > {after:.2g} h)", time.topic, _NOTHING, np.where(time.values > after, 1.0, 0.0))
+        yield Variable(_after(after), time.topic, _NOTHING, np.where(time.values > after, 1.0, 0.0))
+
+
+def _after(hours: float) -> str:
+    return f"(t > {hours:.2g} h)"
 
 
 def _less(name: str, middle: float) -> str:

@@ -38,6 +38,7 @@ Progress = Callable[[float, str], None]
 _FOLDS = 10
 _LISTED = 12  # candidates of a round
 _EXCESS_SEEN = 0.2  # of the known noise's standard deviation; less is none
+_FAR_NOISIER = 2.0  # times what is known of the noise
 
 
 def find_gap(
@@ -116,9 +117,9 @@ def _answer(
     seed: int,
 ) -> Gap:
     rng = np.random.default_rng([seed, 1])
-    before = detect(Grammar(found.first), rng)
-    left = Grammar(found.last)
-    after = detect(left, rng) if found.joint.choices else before
+    left = found.left
+    after = detect(left, rng)
+    before = detect(Grammar(found.first), rng) if found.joint.choices else after
     formulas = found.formulas or (left.found() if after.significant and not found.rivals else ())
     description = None
     if formulas:
@@ -131,12 +132,13 @@ def _answer(
         verdict = "named"
     elif after.significant or found.formulas:
         verdict = "unidentified"
-        description = description or "the errors depend on what no formula of the grammar says"
+        on = [f"{d.variable} ({d.where})" for d in after.disagreements[:1]] or ["something"]
+        description = description or f"the errors depend on {on[0]} in a way that no formula of the grammar says"
     error_before = observations.position_mm - model.geometric_mm(observations)
     error_after = observations.position_mm - model.effects_mm(observations)
     is_left = bool(after.significant or found.rivals or found.formulas)
     is_counted = found.joint.fit.weight[solution.samples.of_row] > 0.5  # gross outliers are no structure
-    noise_mm, source = _noise(solution.samples, found, observations, scatter_is_noise=not is_left)
+    noise_mm, source, too_noisy = _noise(solution.samples, found, observations, scatter_is_noise=not is_left)
     held_out = None
     if holdout is not None:
         measured = holdout.position_mm
@@ -167,16 +169,17 @@ def _answer(
         observations=observations,
         error_before_mm=error_before,
         error_after_mm=error_after,
-        warnings=tuple(_warnings(found, model, holdout)),
+        warnings=(*_warnings(found, model, holdout), *([too_noisy] if too_noisy else [])),
     )
 
 
 def _of_library(found: Found, formula: Formula) -> str:
     """Whether an effect that was weighed and not named does what a formula says, a clause."""
-    turn, projection = found.turns[-1], found.last
+    turn, projection = found.turns[-1], found.left.projection
     for weighed in turn.weighed[:_LISTED]:
-        columns = projection.columns(projection.moved_mm(weighed.additions))
-        if weighed.log_bayes_factor > 0.0 and formula.alike(columns):
+        additions = weighed.scaled_additions
+        columns = projection.columns(projection.moved_mm(additions)) * additions.prior_sigma
+        if weighed.log_bayes_factor > 0.0 and not formula.shows_beside(columns, projection.residual):
             reason = turn.reasons.get(str(weighed.place), "it does not stand out enough to be named")
             return f"{weighed.place} would do this, but {reason}"
     return "not in the library"
@@ -238,14 +241,16 @@ def _candidate(turn: Turn, weighed: Weighed) -> Candidate:
     )
 
 
-def _noise(samples: Samples, found: Found, observations: Observations, *, scatter_is_noise: bool) -> tuple[float, str]:
-    """RMS 3-D noise of one fix and where it is known from, a clause.
+def _noise(
+    samples: Samples, found: Found, observations: Observations, *, scatter_is_noise: bool
+) -> tuple[float, str, str]:
+    """RMS 3-D noise of one fix, where it is known from, a clause, and a warning where it is far too large.
 
     What the data scatter beyond what is known is noise only where nothing says that it depends on anything.
     """
     rig, fit = found.joint.situation.rig, found.joint.fit
     station = station_covariance(rig, observations.position_mm, observations.sigma_mm)
-    readings = reading_covariance(rig, found.last.joint_jacobian, samples.rates)
+    readings = reading_covariance(rig, found.left.projection.joint_jacobian, samples.rates)
     known = sum(float(np.trace(c, axis1=1, axis2=2).mean()) for c in (station, readings))
     given = np.isfinite(observations.sigma_mm).all(axis=1).mean() > 0.5
     source = "the sigma columns of the data" if given else "the station's and the readings' noise in the rig file"
@@ -253,9 +258,16 @@ def _noise(samples: Samples, found: Found, observations: Observations, *, scatte
         known += 3.0 * samples.repeat_variance
         source += ", raised to the scatter of repeats"
     excess = 3.0 * fit.excess_variance if scatter_is_noise else 0.0
+    noise_mm, warning = float(np.sqrt(known + excess)), ""
+    if noise_mm > _FAR_NOISIER * np.sqrt(known):
+        warning = (
+            f"the fixes scatter by {noise_mm:.2g} mm RMS where {source} say {np.sqrt(known):.2g} mm, and nothing that "
+            "was looked at says on what it depends; see whether the columns are there that effects need, whether the "
+            "prism sits tight, and whether readings and fixes are of the same instant"
+        )
     if excess > _EXCESS_SEEN**2 * known:
         source += f", and {np.sqrt(excess):.2g} mm that the data scatter beyond it"
-    return float(np.sqrt(known + excess)), source
+    return noise_mm, source, warning
 
 
 def _warnings(found: Found, model: CalibratedModel, holdout: Observations | None) -> Iterator[str]:

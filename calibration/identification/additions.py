@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,9 +44,8 @@ class Additions:
     def change(self, coefficients: Floats, joints: int) -> Floats:
         """(m, joints) by what coefficients (k,) change the readings, deg or mm."""
         out = np.zeros((len(self.column), joints))
-        for i, joint in enumerate(self.joint):
-            if joint != NO_JOINT:
-                out[:, joint] += self.column[:, i] * coefficients[i]
+        for joint, own in self._runs:
+            out[:, joint] += self.column[:, own] @ coefficients[own]
         return out
 
     def shifted_mm(self, coefficients: Floats) -> Floats:
@@ -57,10 +58,16 @@ class Additions:
     def moved_mm(self, joint_jacobian: Floats) -> Floats:
         """(m, 3, k) what unit coefficients move, for the (m, 3, joints) Jacobian by readings in mm per deg or mm."""
         moved = np.zeros((len(self.column), 3, len(self.joint))) if self.shift_mm is None else self.shift_mm.copy()
-        for joint in np.unique(self.joint[self.joint != NO_JOINT]).tolist():
-            own = self.joint == joint
+        for joint, own in self._runs:
             moved[:, :, own] += joint_jacobian[:, :, joint, None] * self.column[:, None, own]
         return moved
+
+    @cached_property
+    def _runs(self) -> tuple[tuple[int, slice], ...]:
+        """Joints with the coefficients at each that follow one another: slices, which copy nothing."""
+        edges = [0, *(np.flatnonzero(np.diff(self.joint)) + 1).tolist(), len(self)]
+        runs = ((int(self.joint[a]), slice(a, b)) for a, b in itertools.pairwise(edges) if a < b)
+        return tuple((joint, own) for joint, own in runs if joint != NO_JOINT)
 
     def over(self, rows: Callable[[Floats], Floats]) -> Additions:
         """The same coefficients for other rows, `rows` making theirs (m', ...) of what these have (m, ...)."""
@@ -84,4 +91,14 @@ def joined(parts: Sequence[Additions], rows: int) -> Additions:
         np.hstack([np.empty((rows, 0)), *(part.column for part in parts)]),
         np.concatenate([np.empty(0), *(part.prior_sigma for part in parts)]),
         shift,
+    )
+
+
+def same_columns(a: Additions, b: Additions) -> bool:
+    """Whether two sets of coefficients differ in their names and priors alone."""
+    shifts = (a.shift_mm, b.shift_mm)
+    if not (np.array_equal(a.joint, b.joint) and np.array_equal(a.column, b.column)):
+        return False
+    return shifts[0] is shifts[1] or (
+        shifts[0] is not None and shifts[1] is not None and np.array_equal(shifts[0], shifts[1])
     )

@@ -17,6 +17,7 @@ from calibration.rig import Rig
 
 _NOISE = 2.0  # times the sigma of instruments and repeats: what is left is theirs
 _CHANCE = 4.0  # standard deviations of the chi-square of the corrections
+_GOOD = 2  # fixes a parameter, from which on build tolerances matter little
 _FEW = 0.02  # share of the fixes left out
 _FAR_RAD = math.radians(75.0)  # from the rig file: no assembly is off so much, a reading may be
 _TILTED_DEG = 30.0  # no carrier works on such a slope
@@ -42,15 +43,22 @@ def rms_left_mm(chain: Chain, samples: Samples, x: Floats) -> float:
 def require_enough(rig: Rig, observations: Observations, samples: int | None = None) -> None:
     """UnsafeError if there are fewer fixes, or `samples` different ones, than could determine the parameters."""
     parameters = len(Chain(rig, {})) + 6 * len(set(observations.setup.tolist()))
-    needed = math.ceil(parameters / 3)
     fixes = len(observations)
-    if fixes < needed:
-        raise UnsafeError(f"{fixes} fixes cannot determine {parameters} parameters; measure at least {needed}")
-    if samples is not None and samples < needed:
+    different = fixes if samples is None else samples
+    if 3 * different < parameters:
+        repeats = f", repeats counted once of {fixes}," if different < fixes else ""
         raise UnsafeError(
-            f"{fixes} fixes are repeats of {samples} different ones, which cannot determine {parameters} parameters; "
-            f"measure at least {needed} different ones"
+            f"{different} different fixes{repeats} are {3 * different} coordinates, which cannot determine "
+            f"{parameters} parameters; {_how_many(parameters)}"
         )
+
+
+def _how_many(parameters: int) -> str:
+    """How many fixes to measure: a sentence's last clause, the same wherever there are too few."""
+    return (
+        f"measure {_GOOD * parameters} or more in poses all over the work volume ({math.ceil(parameters / 3)} are the "
+        "least that are taken)"
+    )
 
 
 def doubts(observations: Observations, chain: Chain, samples: Samples) -> Iterator[str]:
@@ -63,8 +71,8 @@ def doubts(observations: Observations, chain: Chain, samples: Samples) -> Iterat
         )
     if len(samples) < len(chain):
         yield (
-            f"{len(samples)} different fixes for {len(chain)} parameters: much of the model rests on build tolerances "
-            f"alone; measure {2 * len(chain)} or more, in poses all over the work volume"
+            f"{len(samples)} different fixes are few for {len(chain)} parameters: much of the model rests on build "
+            f"tolerances alone; {_how_many(len(chain))}"
         )
 
 

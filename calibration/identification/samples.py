@@ -142,10 +142,12 @@ def averaged(chain: Chain, observations: Observations) -> Samples:
 
 
 def _averages(of_row: Integers, values: Floats) -> Floats:
-    count = np.bincount(of_row)
-    out = np.zeros((len(count), *values.shape[1:]))
-    np.add.at(out, of_row, values)
-    averages: Floats = out / count.reshape(-1, *([1] * (values.ndim - 1)))
+    order = np.argsort(of_row, kind="stable")
+    first = np.flatnonzero(np.diff(of_row[order], prepend=-1))
+    if len(first) == len(order):
+        return values[order]
+    count = np.diff(first, append=len(order)).reshape(-1, *([1] * (values.ndim - 1)))
+    averages: Floats = np.add.reduceat(values[order], first, axis=0) / count
     return averages
 
 

@@ -121,7 +121,8 @@ def on_a_line(position_mm: Floats) -> bool:
 def _check_spread(setup: str, position_mm: Floats) -> None:
     name = f"set-up {setup!r}" if setup else "the data"
     if len(position_mm) < 3:
-        raise UnsafeError(f"{name}: {len(position_mm)} fixes cannot place the base; at least 3 in different places")
+        fixes = "1 fix" if len(position_mm) == 1 else f"{len(position_mm)} fixes"
+        raise UnsafeError(f"{name}: {fixes} cannot place the base; at least 3 in different places")
     if on_a_line(position_mm):
         raise UnsafeError(f"{name}: all fixes lie on a line, so the base may turn about it; measure other poses")
 

@@ -164,18 +164,20 @@ def test_two_effects_are_two_terms_with_their_sizes() -> None:
         assert abs(f.coefficient - size) < 4.0 * f.standard_error < 0.5 * size
 
 
-def test_a_term_is_alike_with_the_effect_of_the_library_behind_it_and_with_no_other() -> None:
+def test_a_term_shows_no_more_beside_the_effect_of_the_library_behind_it_but_beside_any_other() -> None:
     words = grammar("backlash@theta4:width_rad=4e-3")
     (first, *_) = words.found()
     projection = words.projection
 
-    def columns(family: str, where: str) -> Floats:
-        additions = Choice(family, where, {}).additions(projection.situation).over(projection.samples.average)
-        return projection.columns(projection.moved_mm(additions))
+    def shows_beside(family: str, where: str) -> bool:
+        additions = Choice(family, where, {}, scale=10.0).additions(projection.situation)
+        additions = additions.over(projection.samples.average)
+        columns = projection.columns(projection.moved_mm(additions)) * additions.prior_sigma
+        return first.shows_beside(columns, projection.residual)
 
-    assert first.alike(columns("backlash", "theta4"))
-    assert not first.alike(columns("backlash", "theta5"))
-    assert not first.alike(columns("angle_scale", "theta4"))
+    assert not shows_beside("backlash", "theta4")
+    assert shows_beside("backlash", "theta5")
+    assert shows_beside("angle_scale", "theta4")
 
 
 # -- words -------------------------------------------------------------------------------------------------------------

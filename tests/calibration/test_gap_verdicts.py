@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+from calibration.effects.library import library
 from calibration.gap.adequacy import step_of
 from calibration.gap.projection import Softly, log_bayes_factor, without_folds
 from calibration.gap.result import Gap
@@ -14,7 +18,7 @@ from calibration.observations import parse_observations
 from daemon.rigs import load_rig
 from simulators.aliases import alias_scene
 from simulators.cases import Drawn, draw
-from simulators.cells import Cell
+from simulators.cells import Cell, Poses
 from simulators.hidden import hide
 from simulators.scene import SceneSettings, draw_scene
 from simulators.visible import Visibility
@@ -39,6 +43,30 @@ def test_two_effects_are_both_named_where_they_are_and_the_gap_closes() -> None:
     assert [len(round_.adopted) for round_ in gap.rounds] == [1, 1, 0]
     assert not gap.remaining_significant
     assert gap.rounds[-1].held_out_mm < gap.rounds[0].held_out_mm
+
+
+def test_an_effect_that_shows_in_a_few_fixes_only_is_found_beside_another() -> None:
+    """Beside the first, a fit takes the fixes that show the second, nine of 250, for outliers."""
+    drawn, gap = answered(Cell("pair", ("gravity_flip_play", "joint_error_map"), 1.0, "wide", "fine", 400002))
+    assert {(effect.family, effect.where) for effect in gap.effects} == hidden(drawn)
+
+
+def test_a_payload_is_no_less_a_payload_where_the_machine_is_lighter_than_its_rig_file() -> None:
+    """Its compliance is just beyond the hard limit, which is as uncertain as the masses that it comes from."""
+    drawn, gap = answered(Cell("pair", ("base_step", "payload_change"), 1.0, "wide", "fine", 400021))
+    assert {(effect.family, effect.where) for effect in gap.effects} == hidden(drawn)
+
+
+def test_scatter_far_beyond_the_instruments_is_no_effect_but_not_passed_over_in_silence() -> None:
+    drawn = draw(SOURCE.rig, Cell("null", (), 0.0, "wide", "fine", 42))
+    assert drawn is not None
+    quiet = parse_observations(drawn.train.encode(), SOURCE.rig, "case.csv")
+    shaken = np.random.default_rng(7).normal(scale=6.0, size=quiet.position_mm.shape)
+    loud = find_gap(SOURCE.rig, SOURCE.text, replace(quiet, position_mm=quiet.position_mm + shaken))
+    assert (loud.verdict, loud.effects) == ("none", ())
+    assert any("the fixes scatter by" in warning for warning in loud.warnings)
+    silent = find_gap(SOURCE.rig, SOURCE.text, quiet)
+    assert not any("the fixes scatter by" in warning for warning in silent.warnings)
 
 
 def test_a_set_beside_a_named_effect_leaves_the_errors_of_every_round_as_they_are_without_it() -> None:
@@ -73,6 +101,36 @@ def test_an_effect_that_no_library_has_is_described_and_gets_no_name() -> None:
     assert gap.description.endswith("not in the library")
 
 
+@pytest.mark.parametrize(
+    ("family", "poses", "seed", "lookalike", "formula"),
+    [
+        ("base_step", "wide", 310064, "base_settlement@base", r"base"),
+        ("transducer_index_jump", "face", 330045, "base_step@base", r"L3 length error = .* \(t > "),
+        (
+            "load_hysteresis",
+            "face",
+            310021,
+            "backlash@theta5",
+            r"theta5 angle error = .* dir\(theta5\) torque\(theta5\)",
+        ),
+        ("boom_droop", "face", 310005, "joint_compliance@theta4", r"theta4 angle error = .* torque\(theta4\) length"),
+    ],
+)
+def test_what_the_library_lacks_is_not_given_the_name_of_something_like_it(
+    family: str, poses: Poses, seed: int, lookalike: str, formula: str
+) -> None:
+    drawn = draw(SOURCE.rig, Cell("left_out", (family,), 1.0, poses, "fine", seed))
+    assert drawn is not None
+    observations = parse_observations(drawn.train.encode(), SOURCE.rig, "case.csv")
+    gap = find_gap(SOURCE.rig, SOURCE.text, observations, families=set(library()) - {family})
+    assert gap.verdict == "unidentified"
+    assert not gap.effects
+    (candidate, *_) = (c for round_ in gap.rounds for c in round_.candidates if f"{c.family}@{c.where}" == lookalike)
+    assert re.match(".* explains it better|its size would depend on .*", candidate.reason)
+    assert gap.description is not None
+    assert re.search(formula, gap.description)
+
+
 def test_evidence_in_the_projected_space_is_that_of_effect_and_kinematics_together() -> None:
     rng = np.random.default_rng(3)
     kinematics, columns = rng.normal(0.0, 3.0, (40, 5)), rng.normal(0.0, 1.0, (40, 2))
@@ -84,6 +142,17 @@ def test_evidence_in_the_projected_space_is_that_of_effect_and_kinematics_togeth
     expected = [multivariate_normal(np.zeros(40), matrix).logpdf(target) for matrix in (with_effect, nothing)]
     found = log_bayes_factor(softly(columns), softly(target), sigma)
     assert found == pytest.approx(expected[0] - expected[1], abs=1e-8)
+
+
+@pytest.mark.parametrize("parameters", [5, 60])
+def test_products_in_the_projected_space_follow_from_what_is_taken_out(parameters: int) -> None:
+    rng = np.random.default_rng(6)
+    kinematics = rng.normal(size=(40, parameters)) * 10.0 ** rng.uniform(-3.0, 4.0, parameters)
+    a, b = rng.normal(size=(40, 3)), rng.normal(size=(40, 2))
+    softly = Softly(kinematics)
+    expected = a.T @ np.linalg.solve(np.eye(40) + kinematics @ kinematics.T, b)
+    np.testing.assert_allclose(softly(a).T @ softly(b), expected, atol=1e-6)
+    np.testing.assert_allclose(a.T @ b - softly.taken(a).T @ softly.taken(b), expected, atol=1e-6)
 
 
 def test_a_fit_without_a_fold_is_that_of_the_other_rows() -> None:

@@ -1,0 +1,61 @@
+"""What every step of the search goes by: the data, how they are fitted, and what is looked at about a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.effects.fitted import Choice
+from calibration.gap.adopt import JointFit, joint_fit, projected
+from calibration.gap.projection import Projection
+from calibration.identification.refinement import Prior
+from calibration.identification.solve import Solution
+from calibration.observations import Floats, Observations
+
+OUTLIER = 0.5  # probability of being none
+_GROSS = 8.0  # times the median error
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The data of a search.
+
+    Attributes:
+        solution: the kinematics alone, fitted to `observations`.
+        observations: the rows.
+        prior: as the solution was found with.
+        seed: of everything random.
+    """
+
+    solution: Solution
+    observations: Observations
+    prior: Prior
+    seed: int
+
+    def rng(self) -> np.random.Generator:
+        """Draws the signs of detection, the same every time."""
+        return np.random.default_rng([self.seed, 2])
+
+    def fit(self, choices: Sequence[Choice], start: Floats) -> JointFit:
+        """Kinematics with effects, from a start as `joint_fit` takes it."""
+        return joint_fit(self.solution, self.observations, choices, self.prior, start)
+
+    def open(self, joint: JointFit) -> Projection:
+        """About a fit, for what it lacks, which may show in a few fixes only: those that are not far off all count."""
+        off = far_off(joint.error_mm(self.solution), joint.fit.weight)
+        counted = replace(joint.fit, weight=np.where(off, joint.fit.weight, 1.0))
+        return self.project(replace(joint, fit=counted))
+
+    def project(self, joint: JointFit, *, without_last: bool = False) -> Projection:
+        """About a fit; its last effect is no part of what is taken out, if so asked."""
+        return projected(self.solution, joint, without_last=without_last)
+
+
+def far_off(error_mm: Floats, weight: Floats) -> NDArray[np.bool_]:
+    """(m,) samples that are far off, by errors (m, 3) and what they count (m,)."""
+    size = np.linalg.norm(error_mm, axis=1)
+    off: NDArray[np.bool_] = (weight < OUTLIER) & (size > _GROSS * np.median(size))
+    return off

@@ -1,0 +1,203 @@
+"""One turn of the search: what to make of all places where an effect may be, given what is adopted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from calibration.gap.adopt import (
+    JointFit,
+    evidence_of_forms,
+    finer_forms,
+    refined_choice,
+)
+from calibration.gap.decide import beyond, chance_of_gain, wins
+from calibration.gap.grammar import Found as Formula
+from calibration.gap.grammar import Grammar
+from calibration.gap.problem import Problem
+from calibration.gap.projection import Projection
+from calibration.gap.rivals import (
+    BOTH,
+    NEAR,
+    PLAIN,
+    as_simple,
+    best_of_each_family,
+    further_places,
+    near_rivals,
+    odds_text,
+    stands_for,
+    stands_out,
+    with_a_chance,
+    with_option,
+)
+from calibration.gap.screen import Place, Screen, Weighed, by_family
+from calibration.gap.terms import candidates
+from calibration.gap.variables import Variables
+from calibration.identification.additions import joined
+
+MOST_OF_A_SET = 3
+_CERTAIN = 0.95  # posterior of the family
+_LOOKED_AT = 0.5  # of the leading log evidence, for a rival to be looked at more closely
+_STABLE = 0.8  # of half-samples
+_STABLE_AGAIN = 0.5  # the same for one more place of a family whose name is earned already
+_GAIN = 0.05  # p of no gain on held-out groups
+_SHARPER = 3  # times the noise is taken anew from the best hypothesis
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What to make of all places.
+
+    Attributes:
+        kind: an effect to take, a set of several that are not told apart, a formula that beats the library, or nothing.
+        weighed: all places, the most probable first.
+        posterior: family -> probability that it is there.
+        joint: the fit with what is taken, or with the most probable of a set; None without either.
+        rivals: of the set, the most probable first.
+        formulas: that beat the library.
+        reasons: `family@where` -> why it is not named, a clause.
+    """
+
+    kind: Literal["take", "set", "outside", "nothing"]
+    weighed: tuple[Weighed, ...]
+    posterior: Mapping[str, float]
+    joint: JointFit | None = None
+    rivals: tuple[Weighed, ...] = ()
+    formulas: tuple[Formula, ...] = ()
+    reasons: Mapping[str, str] = field(default_factory=dict)
+
+
+def decide(problem: Problem, joint: JointFit, projection: Projection, places: Sequence[Place]) -> Decision:
+    """What to make of the places, given what is adopted.
+
+    Args:
+        problem: the data.
+        joint: kinematics and effects, as adopted so far.
+        projection: about that fit.
+        places: where something may be missing.
+    """
+    reasons: dict[str, str] = {}
+    first = Screen(projection, places)
+    while True:
+        weighed = first.weigh(without=reasons)
+        if not weighed or not stands_out(weighed, len(weighed)):
+            return Decision("nothing", weighed, by_family(weighed), reasons=reasons)
+        screen, weighed, tried = _sharpened(problem, joint, projection, with_a_chance(weighed), weighed[0])
+        if not stands_out(weighed, len(places)):
+            # What stood out was the tail of fixes that the fit now takes for outliers.
+            return Decision("nothing", weighed, by_family(weighed), reasons=reasons)
+        leading = weighed[0]
+        near = [w for w in weighed if w.log_bayes_factor > leading.log_bayes_factor - 2 * NEAR]
+        out = {
+            str(w.place): f"{', '.join(names)} would be beyond what is physical"
+            for w in near
+            if (names := beyond(joint.situation, w))
+        }
+        if names := tried.beyond(len(tried.choices) - 1):
+            out[str(leading.place)] = f"{', '.join(names)} would be beyond what is physical"
+        reasons |= out
+        if str(leading.place) not in out:
+            break
+    weighed = screen.weigh(without=out)
+    if str(weighed[0].place) != str(tried.choices[-1]):  # another one leads without those that are out
+        start = screen.projection.solved(weighed[0].scaled_additions)
+        tried = problem.fit([*joint.choices, weighed[0].choice], start)
+    return _judged(problem, joint, screen, weighed, by_family(weighed), tried, reasons)
+
+
+def _judged(
+    problem: Problem,
+    joint: JointFit,
+    screen: Screen,
+    weighed: tuple[Weighed, ...],
+    posterior: Mapping[str, float],
+    tried: JointFit,
+    reasons: dict[str, str],
+) -> Decision:
+    leading, sharp = weighed[0], screen.projection
+    best = best_of_each_family(weighed)
+    near = near_rivals(weighed)
+    # A step is when those of the library are, wherever it is.
+    steps = {w.choice.settings["time_s"] for w in near if "time_s" in w.choice.settings}
+    grammar = Grammar(sharp, candidates(Variables(sharp, steps)))
+    strongest = grammar.found(1)
+    most = max(weighed, key=lambda w: w.log_evidence)
+    # One term that explains as much as two effects together is simpler.
+    margin = NEAR if most.beside is None else -NEAR
+    is_beaten = bool(strongest) and strongest[0].log_evidence > most.log_evidence + margin
+    if is_beaten and not any(stands_for(w, strongest[0], sharp) for w in near):
+        beaten = near if most.beside is None else [*near, most, most.beside]
+        reasons |= {str(w.place): f"{strongest[0].term} explains it better" for w in beaten}
+        return Decision("outside", weighed, posterior, formulas=grammar.found(), reasons=reasons)
+    rivals = [w for w in best if w.log_bayes_factor > leading.log_bayes_factor - 6 * NEAR][:6]
+    against = ""
+    # The name of a family that is there already is earned; one more place of it needs less than a new name.
+    is_known = leading.place.family in {c.family for c in joint.choices}
+    has_equal = not is_known and any(as_simple(leading, w) for w in near[1:])
+    stable = _STABLE_AGAIN if is_known else _STABLE
+    if posterior[leading.place.family] < _CERTAIN or has_equal:
+        against = "another family is nearly as likely"
+    elif (len(rivals) > 1 or leading.log_bayes_factor < PLAIN) and (
+        share := wins(sharp, rivals, problem.seed)
+    ) < stable:
+        against = f"it wins in {share:.0%} of half-samples only"
+        near = near if len(near) > 1 else [w for w in rivals if w.posterior + leading.posterior < BOTH or w is leading]
+    elif (p := chance_of_gain(sharp, leading, problem.seed)) > _GAIN:
+        against = f"it lowers no errors of held-out groups beyond chance (p {p:.2g})"
+    if not against:
+        reasons |= {str(w.place): odds_text(leading, w) for w in best[1:]}
+        more = further_places(screen, weighed)
+        if more:
+            taken = [leading, *more]
+            start = sharp.solved(joined([w.scaled_additions for w in taken], len(sharp.samples)))
+            tried = problem.fit([*joint.choices, *(w.choice for w in taken)], start)
+        return Decision("take", weighed, posterior, tried, reasons=reasons)
+    reasons |= {str(w.place): against for w in near}
+    if len(near) < 2:
+        return Decision("nothing", weighed, posterior, reasons=reasons)
+    return Decision("set", weighed, posterior, tried, tuple(near[:MOST_OF_A_SET]), reasons=reasons)
+
+
+def _sharpened(
+    problem: Problem, joint: JointFit, over: Projection, places: Sequence[Place], leading: Weighed
+) -> tuple[Screen, tuple[Weighed, ...], JointFit]:
+    """All places weighed with the noise that the best of them leaves, about the fit that has it."""
+    for _ in range(_SHARPER):
+        tried = problem.fit([*joint.choices, leading.choice], over.solved(leading.scaled_additions))
+        if finer_forms(tried.situation, leading.choice):
+            # Which fixes are outliers depends on the form: those beside a step in a wrong place look like some.
+            counted = replace(tried, fit=replace(tried.fit, weight=over.fit.weight))
+            finer = refined_choice(tried, len(tried.choices) - 1, problem.project(counted, without_last=True))
+            if finer.settings != leading.choice.settings:
+                tried = problem.fit([*joint.choices, finer], tried.fit.x)
+                places = [with_option(p, finer, over, joint.situation) if p is leading.place else p for p in places]
+        sharp = problem.project(tried, without_last=True)
+        screen = Screen(sharp, places)
+        weighed = screen.weigh()
+        finer_places = [_finer(joint, sharp, place, weighed) for place in places]
+        if any(a is not b for a, b in zip(finer_places, places, strict=True)):
+            places = finer_places
+            screen = Screen(sharp, places)
+            weighed = screen.weigh()
+        if (weighed[0].choice.family, weighed[0].choice.where) == (leading.choice.family, leading.choice.where):
+            break
+        leading, over = weighed[0], sharp
+    best, last = weighed[0].choice, tried.choices[-1]
+    if (str(best), best.settings) != (str(last), last.settings):
+        tried = problem.fit([*joint.choices, weighed[0].choice], sharp.solved(weighed[0].scaled_additions))
+    return screen, weighed, tried
+
+
+def _finer(joint: JointFit, sharp: Projection, place: Place, weighed: Sequence[Weighed]) -> Place:
+    """A rival with the finest form about its best one: no step shall lose for want of a look at its instant."""
+    own = next(w for w in weighed if w.place is place)
+    if own is weighed[0] or own.log_bayes_factor < _LOOKED_AT * weighed[0].log_bayes_factor:
+        return place
+    finer = finer_forms(joint.situation, replace(own.choice, scale=1.0))
+    if not finer:
+        return place
+    best = finer[int(np.argmax(evidence_of_forms(joint.situation, finer, sharp)))]
+    return with_option(place, best, sharp, joint.situation)
