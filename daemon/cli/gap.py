@@ -132,7 +132,9 @@ def _effect_table(found: Gap) -> Table:
         for c in effect.reported:
             half = _INTERVAL * c.standard_error
             table.add_row(*head, c.name, f"{c.value:.4g}", f"\N{PLUS-MINUS SIGN} {half:.2g}", c.unit)
-            head = ["", ""]
+            head = [f"  {effect.form}" if head[0] and effect.form else "", ""]
+        if head[0].startswith("  "):
+            table.add_row(*head, "", "", "", "")
     return table
 
 

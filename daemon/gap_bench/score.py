@@ -115,6 +115,9 @@ def _sets(single: Sequence[Trial], alias: Sequence[Trial]) -> Iterable[Score]:
         lambda t: t.is_resolved,
         least=0.80,
     )
+    promised = [t for t in measured if t.is_promised]
+    yield _share("  where the poses were expected to resolve it", promised, lambda t: t.is_resolved)
+    yield _share("  sets that 20 poses were not expected to resolve", measured, lambda t: not t.is_promised)
 
 
 def _alias_told(trial: Trial) -> bool:

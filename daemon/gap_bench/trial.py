@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 Floats = NDArray[np.float64]
 
 HALF_90 = 1.645  # half width of a 90 % interval, standard errors
+_TOLD_APART = 5.0  # log odds: what is nearer is a set
 _SHOWS = 1.02  # an effect that makes held-out errors of kinematics smaller than this many oracles' is no gap to close
 
 
@@ -136,6 +137,12 @@ class Trial:
         """After the poses that were proposed, named what is hidden and nothing else."""
         told = self.measured or {"verdict": "", "effects": ()}
         return told["verdict"] == "named" and {effect["family"] for effect in told["effects"]} == self.families
+
+    @property
+    def is_promised(self) -> bool:
+        """Whether the poses that were proposed were expected to tell all of the set apart."""
+        promised = [e["stands_out_sigma"] for e in self.answer.get("experiments", ()) if "poses" in e]
+        return bool(promised) and all(0.5 * sigma**2 >= _TOLD_APART for each in promised for sigma in each.values())
 
     @property
     def closed(self) -> float | None:

@@ -172,7 +172,8 @@ def _found(gap: Gap) -> str:
     rows = []
     for effect in gap.effects:
         certain = probability(gap.posterior[f"{effect.family}@{effect.where}"])
-        head = [effect.family.replace("_", " "), effect.where, certain]
+        name = effect.family.replace("_", " ")
+        head = [f"{name} ({effect.form})" if effect.form else name, effect.where, certain]
         bounds = coefficient_bounds(gap, effect)
         for c in effect.reported:
             ends = bounds.get(c.name)

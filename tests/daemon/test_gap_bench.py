@@ -131,6 +131,16 @@ def test_a_set_is_resolved_when_the_proposed_poses_lead_to_the_right_name() -> N
     assert score(trials, "set resolved after 20 proposed poses").value == 0.5
 
 
+def test_what_poses_promised_is_held_against_what_they_brought() -> None:
+    of, trials = label("single", "backlash", separable=False), []
+    for sigma, after in ((6.0, "backlash"), (6.0, "latency"), (2.0, "latency")):
+        promised = {"kind": "poses", "text": "", "poses": [{}], "stands_out_sigma": {"backlash": 9.0, "latency": sigma}}
+        trials.append(judged(of, {**pending("backlash", "latency"), "experiments": [promised]}, named(after)))
+
+    assert score(trials, "  where the poses were expected to resolve it").value == 0.5
+    assert score(trials, "  sets that 20 poses were not expected to resolve").value == pytest.approx(1 / 3)
+
+
 def test_an_exact_alias_must_be_answered_with_both_families() -> None:
     of = label("alias", "backlash", aliases=["backlash", "latency"])
     trials = [judged(of, told) for told in (pending("latency", "backlash"), named("backlash"), pending("backlash"))]

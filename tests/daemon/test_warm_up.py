@@ -12,17 +12,16 @@ import pytest
 from daemon.warm_up import main, place_of_caches
 
 # What numba has of every function that it keeps on disk: after the warm-up, and after work on another machine's data.
+DATA = Path(__file__).parents[1] / "data" / "ur10_random_poses.csv"
 COMPILED_LATER = """
 import sys
+from pathlib import Path
 from daemon.warm_up import main
 status = main()
 import numba
 from calibration.observations import parse_observations
 from calibration.pipeline import calibrate
-from calibration.rig import shipped_rig
 from daemon.rigs import load_rig
-from simulators.dataset import simulate_observations
-from simulators.truth import RigTruth
 
 def compiled():
     return {
@@ -33,17 +32,18 @@ def compiled():
     }
 
 before = compiled()
-rig, text = shipped_rig("ys100"), load_rig("ys100").text
-table = simulate_observations(RigTruth(rig, 0, perturbation=3.0), 60, 0).csv_text()
-model, _ = calibrate(rig, text, parse_observations(table.encode(), rig, "simulated.csv"), prior="as-built")
-model.predict(parse_observations(table.encode(), rig, "simulated.csv"))
+source = load_rig("ur10")
+lines = Path(sys.argv[1]).read_bytes().splitlines(keepends=True)[:250]
+table = parse_observations(b"".join(lines), source.rig, "ur10.csv")
+model, _ = calibrate(source.rig, source.text, table)
+model.predict(table)
 after = compiled()
 print(status, len(before) > 20, sorted(name for name in after if after[name] != before.get(name)))
 """
 
 
 def test_a_calibration_after_the_warm_up_waits_for_no_compiler() -> None:
-    command = [sys.executable, "-c", COMPILED_LATER]
+    command = [sys.executable, "-c", COMPILED_LATER, str(DATA)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
     assert done.stdout == "0 True []\n", done.stdout + done.stderr
 
