@@ -44,6 +44,7 @@ class CorrectionGrid:
         reachable: (g,) whether the rig touches neither itself nor the floor.
         rms_mm, p95_mm, max_mm: how far the interpolated corrections are from the model's own, in random poses on the
             grid, all prisms taken together.
+        correction_rms_mm: how large the model's own corrections are there.
     """
 
     nodes: Mapping[str, Floats]
@@ -54,6 +55,12 @@ class CorrectionGrid:
     rms_mm: float
     p95_mm: float
     max_mm: float
+    correction_rms_mm: float
+
+    @property
+    def is_coarse(self) -> bool:
+        """Whether interpolating leaves more than half of the error that the table is there to take away."""
+        return self.rms_mm > 0.5 * self.correction_rms_mm
 
     def correction_mm(self, prism: str, readings: Floats) -> Floats:
         """(n, 3) what to add to the nominal place of a prism at (n, joints) readings inside the grid."""
@@ -152,14 +159,19 @@ def correction_grid(
                 for start in range(0, len(readings), _CHUNK)
             ]
         ),
-        *(math.nan, math.nan, math.nan),  # told below, once it can be interpolated
+        *(math.nan,) * 4,  # told below, once it can be interpolated
     )
     poses = rng.uniform(low, high, (_PROOF_POSES, len(joints)))
-    off = np.concatenate(
-        [np.linalg.norm(grid.correction_mm(p, poses) - places.difference_mm(p, poses), axis=1) for p in prisms]
+    wanted = [places.difference_mm(prism, poses) for prism in prisms]
+    given = [grid.correction_mm(prism, poses) for prism in prisms]
+    off_mm = np.linalg.norm(np.concatenate(given) - np.concatenate(wanted), axis=1)
+    return replace(
+        grid,
+        rms_mm=float(np.sqrt((off_mm**2).mean())),
+        p95_mm=float(np.quantile(off_mm, 0.95)),
+        max_mm=float(off_mm.max()),
+        correction_rms_mm=float(np.sqrt((np.concatenate(wanted) ** 2).sum(axis=1).mean())),
     )
-    rms_mm, p95_mm, max_mm = float(np.sqrt((off**2).mean())), float(np.quantile(off, 0.95)), float(off.max())
-    return replace(grid, rms_mm=rms_mm, p95_mm=p95_mm, max_mm=max_mm)
 
 
 def _range(model: CalibratedModel, joint: Joint) -> tuple[float, float]:

@@ -27,6 +27,7 @@ class PairedTest:
         p: probability of such a gain by chance; 1 where fewer than two groups, or groups without any spread, allow
             no test.
         rows, groups: how many there were.
+        no_worse: share of the groups in which the second estimate is no worse.
     """
 
     before_mm: float
@@ -34,6 +35,7 @@ class PairedTest:
     p: float
     rows: int
     groups: int
+    no_worse: float
 
     @property
     def is_better(self) -> bool:
@@ -54,5 +56,10 @@ def paired_test(before_mm2: Floats, after_mm2: Floats, groups: NDArray[np.str_] 
     if len(gain) > 1 and (spread := float(gain.std(ddof=1))) > 0.0:
         p = float(stats.t.sf(gain.mean() / (spread / np.sqrt(len(gain))), len(gain) - 1))
     return PairedTest(
-        float(np.sqrt(before_mm2.mean())), float(np.sqrt(after_mm2.mean())), p, len(before_mm2), len(gain)
+        before_mm=float(np.sqrt(before_mm2.mean())),
+        after_mm=float(np.sqrt(after_mm2.mean())),
+        p=p,
+        rows=len(before_mm2),
+        groups=len(gain),
+        no_worse=float((gain >= 0.0).mean()),
     )

@@ -21,6 +21,8 @@ RowParameter = Literal["alpha", "a", "d", "theta", "beta", "b"]
 Driven = Literal["theta", "d", "a"]
 Convention = Literal["mdh_beta_after", "mdh_beta_before", "dh"]
 
+BEYOND_BUILDING = 4.0  # build tolerances: no correction by building alone is larger
+
 
 class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)

@@ -9,11 +9,11 @@ from calibration.identification.solve import Solution
 from calibration.limits import beyond_limits
 from calibration.model import CalibratedModel
 from calibration.observations import Observations
+from calibration.rig import BEYOND_BUILDING
 
 _LISTED = 10
 _BADLY = 0.3  # of what build tolerances explain
 _FAR_RAD = math.radians(10.0)
-_PULLED = 4.0  # build tolerances
 _IMMOBILE = 0.01  # of the span between a joint's limits
 _BEYOND_LIMITS = 0.05  # of the same
 _TOO_SMALL = 0.3  # of the expected scatter
@@ -108,7 +108,8 @@ def _of_result(model: CalibratedModel) -> Iterator[str]:
                 f"{parameter.name} came out {math.degrees(parameter.value):+.1f} deg from the rig file; "
                 f"check how the joint and its encoder are mounted, and correct the file"
             )
-    pulled = sorted((p for p in model.parameters if abs(p.pull) > _PULLED), key=lambda p: -abs(p.pull))
+    pulled = sorted((p for p in model.parameters if abs(p.pull) > BEYOND_BUILDING), key=lambda p: -abs(p.pull))
     if pulled and model.prior == "recalibration":
         names = ", ".join(f"{p.name} ({p.pull:+.1f})" for p in pulled[:_LISTED])
-        yield f"corrected by more than {_PULLED:g} build tolerances: {names}; an unmodelled effect may hide there"
+        size = f"{BEYOND_BUILDING:g} build tolerances"
+        yield f"corrected by more than {size}: {names}; an unmodelled effect may hide there"

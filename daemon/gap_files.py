@@ -11,7 +11,7 @@ from pathlib import Path
 from calibration.errors import ModelError
 from calibration.gap.result import Gap
 from daemon.files import write_file
-from daemon.modelfiles import check_target, write_model
+from daemon.modelfiles import check_target, replaced_whole, require_place, write_model
 from daemon.plain_json import json_line
 
 MODEL = "model"
@@ -28,6 +28,7 @@ def check_gap_target(directory: Path) -> None:
     Raises:
         ModelError: something else is there that would be lost, or no directory can be made there.
     """
+    require_place(directory)
     if directory.exists():
         if not directory.is_dir():
             raise ModelError(f"{directory} is a file; name a directory for the report and the model")
@@ -36,7 +37,7 @@ def check_gap_target(directory: Path) -> None:
             raise ModelError(
                 f"{directory} holds {foreign[0]!r}, which is no part of a gap report; name another directory"
             )
-    check_target(directory / MODEL)
+        check_target(directory / MODEL)
 
 
 def gap_answer(gap: Gap, seconds: float) -> dict[str, object]:
@@ -53,7 +54,9 @@ def gap_answer(gap: Gap, seconds: float) -> dict[str, object]:
 
 
 def write_gap(directory: Path, gap: Gap, answer: Mapping[str, object], report: str) -> str:
-    """Write model, report, answer and, where poses are asked for, the plan; what an earlier answer left goes.
+    """Write model, report, answer and, where poses are asked for, the plan, in place of an earlier answer.
+
+    A reader sees the earlier answer or the new one, also where the disk is full in between.
 
     Args:
         directory: where to; parents are made.
@@ -69,17 +72,14 @@ def write_gap(directory: Path, gap: Gap, answer: Mapping[str, object], report: s
         OSError: the file system refuses.
     """
     check_gap_target(directory)
-    sha256 = write_model(directory / MODEL, gap.model)
+    texts = {REPORT: report, ANSWER: json_line(answer) + "\n"}
     poses = next_poses(gap)
-    plan = {
-        PLAN_CSV: poses_csv(poses).encode() if poses else None,
-        PLAN_JSON: (json_line({"rig": gap.model.rig.name, "poses": poses}) + "\n").encode() if poses else None,
-    }
-    for name, data in {REPORT: report.encode(), **plan, ANSWER: (json_line(answer) + "\n").encode()}.items():
-        if data is None:
-            (directory / name).unlink(missing_ok=True)
-        else:
-            write_file(directory / name, data)
+    if poses:
+        texts |= {PLAN_CSV: poses_csv(poses), PLAN_JSON: json_line({"rig": gap.model.rig.name, "poses": poses}) + "\n"}
+    with replaced_whole(directory) as new:
+        sha256 = write_model(new / MODEL, gap.model)
+        for name, text in texts.items():
+            write_file(new / name, text.encode())
     return sha256
 
 

@@ -268,6 +268,7 @@ class JobTable:
                 error=outcome.error,
                 result_json=outcome.result,
                 progress=1.0 if is_done else 0.0,
+                message="",  # what it was doing is no news any more
                 pid=None,
                 **ended,
             )

@@ -118,10 +118,12 @@ class LiveModel:
                 return Missing(NO_MODEL)
             jumped = tuple(name for name in self._table.jumped(row) if name in self._rig.joint_names)
             loaded = Loaded(row.id, self.load(row), jumped)
-        except CalibrationError as error:
-            log.error("the live model cannot be used: %s", error)
-            return Missing(f"the live model cannot be used: {error}", is_defect=True)
         except Exception as error:
+            if self._stopping:
+                return Missing(LOADING)  # store and processes are going away under it: no defect of the model
+            if isinstance(error, CalibrationError):
+                log.error("the live model cannot be used: %s", error)
+                return Missing(f"the live model cannot be used: {error}", is_defect=True)
             log.exception("the live model could not be loaded")
             return Missing(f"the live model could not be loaded ({error}); the daemon's log tells", is_defect=True)
         log.info("model %d is live", row.id)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ def exported(directory: Path, prisms: Sequence[str], most_poses: int) -> tuple[d
 
     Returns:
         file name -> content; `rows`, `poses`, `nodes` (joint -> how many), `rms_mm`, `p95_mm`, `max_mm` of the
-        interpolation.
+        interpolation, `correction_rms_mm` of what is interpolated, and `warnings`, sentences.
 
     Raises:
         ModelError: not a model, or a damaged one.
@@ -45,10 +45,21 @@ def exported(directory: Path, prisms: Sequence[str], most_poses: int) -> tuple[d
         "rms_mm": grid.rms_mm,
         "p95_mm": grid.p95_mm,
         "max_mm": grid.max_mm,
+        "correction_rms_mm": grid.correction_rms_mm,
+        "warnings": list(_warnings(grid)),
     }
     about = document(model) | {"manifest_sha256": model_sha256(directory), "grid": {"file": GRID, **summary}}
     text = json.dumps(about, indent=1, allow_nan=False) + "\n"
     return {DOCUMENT: text.encode(), GRID: grid_csv(grid, model.rig).encode()}, summary
+
+
+def _warnings(grid: CorrectionGrid) -> Iterator[str]:
+    if grid.is_coarse:
+        yield (
+            f"between the nodes of {GRID}, interpolated corrections are wrong by {grid.rms_mm:.2g} mm RMS, more than "
+            f"half of the {grid.correction_rms_mm:.2g} mm that they are: the table mends little; allow more rows "
+            "(--rows), or use `rigcal predict`"
+        )
 
 
 def grid_csv(grid: CorrectionGrid, rig: Rig) -> str:

@@ -6,6 +6,7 @@ truncated or hostile text, so no process of value parses a model that a child ha
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import errno
 import hashlib
@@ -16,13 +17,14 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from calibration.errors import CalibrationError, ModelError, UnsafeError
 from calibration.model import CalibratedModel
 from calibration.model_format import MANIFEST, check_manifest
 from calibration.rig import Rig
+from daemon.files import write_file
 from daemon.modelcheck import IS_NO_MODEL, encode
 
 REPORT = "report.html"
@@ -42,11 +44,8 @@ def check_target(directory: Path) -> None:
     Raises:
         ModelError: something else is there that would be lost, or no directory can be made there.
     """
+    require_place(directory)
     if not directory.exists():
-        nearest = next(path for path in directory.resolve().parents if path.exists())
-        if not nearest.is_dir() or not os.access(nearest, os.W_OK):
-            reason = "may not be written to" if nearest.is_dir() else "is a file"
-            raise ModelError(f"{directory} cannot be made, as {nearest} {reason}; name another directory")
         return
     if not directory.is_dir():
         raise ModelError(f"{directory} is a file; name a directory for the model")
@@ -58,6 +57,14 @@ def check_target(directory: Path) -> None:
     foreign = sorted(found - set(_listed(directory)) - COMPANIONS - {MANIFEST})
     if foreign:
         raise ModelError(f"{directory} holds {foreign[0]!r}, which is no part of the model there; move it away first")
+
+
+def require_place(directory: Path) -> None:
+    """Raise ModelError where no directory can be made, or put in the place of one that is there."""
+    nearest = next(path for path in directory.resolve().parents if path.exists())
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK):
+        reason = "may not be written to" if nearest.is_dir() else "is a file"
+        raise ModelError(f"{directory} cannot be made, as {nearest} {reason}; name another directory")
 
 
 def write_model(directory: Path, model: CalibratedModel, companions: Mapping[str, bytes] | None = None) -> str:
@@ -81,19 +88,28 @@ def write_model(directory: Path, model: CalibratedModel, companions: Mapping[str
     check_target(directory)
     files = model.to_files()
     _check_in_child(files, directory)
+    with replaced_whole(directory) as new:
+        for name, data in {**files, **(companions or {})}.items():
+            write_file(new / name, data)
+    return _sha256(files[MANIFEST])
+
+
+@contextlib.contextmanager
+def replaced_whole(directory: Path) -> Iterator[Path]:
+    """A new directory beside `directory`, which takes its place in one step when the block ends well.
+
+    Raises:
+        OSError: the file system refuses; `directory` is as it was.
+    """
+    directory = directory.resolve()
     directory.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".rigcal-", dir=directory.parent) as scratch:
         new = Path(scratch) / "new"
         new.mkdir()
-        for name, data in {**files, **(companions or {})}.items():
-            with (new / name).open("xb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
+        yield new
         _sync_directory(new)
         _put_in_place(new, directory)
         _sync_directory(directory.parent)
-    return _sha256(files[MANIFEST])
 
 
 def read_model(directory: Path, manifest_sha256: str | None = None) -> CalibratedModel:
@@ -186,7 +202,15 @@ def _check_in_child(files: Mapping[str, bytes], directory: Path) -> None:
     # -P keeps the current directory off the child's path: what lies there is no code of ours.
     command = [sys.executable, "-P", "-m", "daemon.modelcheck"]
     try:
-        child = subprocess.run(command, input=encode(files), capture_output=True, timeout=CHECK_TIMEOUT_S, check=False)
+        # In a session of its own: a Ctrl-C that is meant for this process would look like a model that kills the child.
+        child = subprocess.run(
+            command,
+            input=encode(files),
+            capture_output=True,
+            timeout=CHECK_TIMEOUT_S,
+            check=False,
+            start_new_session=True,
+        )
     except subprocess.TimeoutExpired as error:
         raise ModelError(f"{directory}: loading the model did not end within {CHECK_TIMEOUT_S:g} s") from error
     if child.returncode < 0:

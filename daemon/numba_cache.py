@@ -41,6 +41,11 @@ def prepare(environ: MutableMapping[str, str] = os.environ) -> Path:
     return Path(environ["NUMBA_CACHE_DIR"])
 
 
+def is_compiled(environ: MutableMapping[str, str] = os.environ) -> bool:
+    """Whether anything was compiled before into the directory that `prepare` chooses."""
+    return any(prepare(environ).rglob("*.nbi"))
+
+
 def _candidates(environ: MutableMapping[str, str]) -> Iterator[Path]:
     if service := environ.get("CACHE_DIRECTORY"):
         yield Path(service.split(":")[0])

@@ -64,7 +64,7 @@ class ModelRegistry:
         live = self._table.live()
         reason = _reason_to_accept(model, live)
         self._make_live(model, live, arguments, f"accepted: {reason}")
-        return self._changed(model, live)
+        return self._changed(model, live) | {"reason": reason}
 
     def rollback_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Put back the model that the live one replaced, or any other that was live."""

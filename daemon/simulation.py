@@ -6,8 +6,10 @@ does what people do at a real rig: aim the station at a prism, and drive the boo
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
+import logging
 import subprocess
 import sys
 import threading
@@ -18,10 +20,14 @@ from pathlib import Path
 from typing import Any
 
 from calibration.rig import Rig
+from daemon.config import ConfigError
 from drivers.clock import ScaledClock
+
+log = logging.getLogger(__name__)
 
 BOOM_SPEED = 0.45  # of the joints' greatest rates
 APPROACH = {"deg": 3.0, "mm": 50.0}  # from how far a joint comes to a pose that says from which side
+_REFUSES = 2  # exit status of a simulator that was asked for what there is not
 POSES_AHEAD = 30  # drawn at a time, and visited by the short way
 
 
@@ -31,7 +37,8 @@ Stop = tuple[Mapping[str, float], float]  # joint -> deg or mm; how long to stan
 def stops_of(rig: Rig, rows: Iterable[Mapping[str, Any]], dwell_s: float) -> list[Stop]:
     """Where to drive for the rows of a pose plan.
 
-    Where a row says from which side a joint comes, the boom first goes to that side of the pose, without a stop.
+    Where a row says from which side a joint comes, the boom first goes to that side of the pose, without a stop. Other
+    conditions than that and the dwell are nothing that driving could bring about.
 
     Args:
         rig: whose poses they are.
@@ -79,6 +86,10 @@ class SimulatedRig:
         seed: of the machine's imperfections, of all noise and of the poses.
         effects: hidden effects, as the simulator spells them.
         secret: where the simulator leaves the sealed envelope of one more, which it draws; none by default.
+
+    Raises:
+        ConfigError: no such effect, or none that this rig can have; the process has said why on standard error.
+        SimulationError: it does not start.
     """
 
     def __init__(
@@ -105,13 +116,22 @@ class SimulatedRig:
         command += ["--origin", origin, "--can-port", str(self.can_port), "--station-port", str(self.station_port)]
         command += ["--bus-master", "host", "--signal-ms", "200", "--effects", ",".join(effects)]
         command += [] if secret is None else ["--secret", str(secret)]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        # In a session of its own: a Ctrl-C ends the daemon, which ends the rig when it is done with it.
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+        )
         self._reader = threading.Thread(target=self._read, name="simulation", daemon=True)
         self._reader.start()
         self._stops: deque[Stop] = deque()
         self._stopping = threading.Event()
         self._autopilot: threading.Thread | None = None
-        self._expect("ready")
+        try:
+            self._expect("ready")
+        except SimulationError as error:
+            self.close()
+            if self._process.returncode == _REFUSES:
+                raise ConfigError("the simulated rig refuses what it was asked for, as it says above") from error
+            raise
 
     def aim(self, target: str) -> None:
         """Turn the station to a prism or a control point."""
@@ -140,7 +160,8 @@ class SimulatedRig:
         """End the process."""
         self._stopping.set()
         if self._process.stdin is not None and not self._process.stdin.closed:
-            self._process.stdin.close()
+            with contextlib.suppress(BrokenPipeError):  # it has ended with a command unread
+                self._process.stdin.close()
         try:
             self._process.wait(timeout=10)
         except subprocess.TimeoutExpired:
@@ -169,9 +190,9 @@ class SimulatedRig:
                         return
                     if self._stops and self._stops[0][0] is here:
                         self._stops.popleft()
-        except SimulationError:
+        except SimulationError as error:
             if not self._stopping.is_set():
-                raise
+                log.error("the simulated boom stands still: %s", error)
 
     def _way(self, here: Mapping[str, float], there: Mapping[str, float]) -> float:
         """How long the slowest joint takes from one pose to another, in units of the boom's speed."""
@@ -210,6 +231,7 @@ class SimulatedRig:
             with self._arrived:
                 self._events.append(json.loads(line))
                 self._arrived.notify_all()
+        self._process.wait()
         with self._arrived:
             self._events.append({"event": "ended"})
             self._arrived.notify_all()

@@ -105,6 +105,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (RigError, ValueError, OSError) as error:
         sys.stderr.write(f"simulators: {error}\n")
         return 2
+    if envelope is not None:
+        envelope.begin(live.begin.utc_ns)
     try:
         live.run(sys.stdin.fileno(), wake_read)
     except BrokenPipeError:  # nobody listens to the answers any more

@@ -23,6 +23,9 @@ _LONGEST_LINE = 65536
 class LiveRig:
     """The rig's two links, and its commands as JSON lines.
 
+    Attributes:
+        begin: the clock at simulated second 0.
+
     Args:
         simulator: the rig.
         clock: the time that it shares with whoever listens.
@@ -42,7 +45,7 @@ class LiveRig:
         send: Callable[[Mapping[str, object]], None],
     ) -> None:
         self._simulator, self._clock, self._send = simulator, clock, send
-        self._begin_ns = clock.monotonic_ns()
+        self.begin = clock.now()
         self._adapter = SlcanAdapter()
         self._can = PtyPort(can_port)
         try:
@@ -60,7 +63,7 @@ class LiveRig:
         self._station.unplug()
 
     def _now_s(self) -> float:
-        return (self._clock.monotonic_ns() - self._begin_ns) / NS_PER_S
+        return (self._clock.monotonic_ns() - self.begin.monotonic_ns) / NS_PER_S
 
     def run(self, commands: int, wake: int) -> None:
         """Run until the commands end (`quit`, end of file) or a byte arrives at `wake`.

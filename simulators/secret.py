@@ -2,6 +2,7 @@
 
 envelope.sealed   what is hidden, JSON, XORed with random bytes that are in this process's memory alone
 envelope.sha256   of the JSON, so that it cannot be changed later; its salt keeps it from being guessed
+envelope.begin    UTC in ns of simulated second 0, from which the effect counts time
 envelope.pad      those random bytes, written when the simulation ends: the envelope is open
 """
 
@@ -26,7 +27,7 @@ from simulators.visible import Visibility, reading_covariance_mm2
 
 Floats = NDArray[np.float64]
 
-SEALED, COMMITMENT, PAD = "envelope.sealed", "envelope.sha256", "envelope.pad"
+SEALED, COMMITMENT, BEGIN, PAD = "envelope.sealed", "envelope.sha256", "envelope.begin", "envelope.pad"
 SESSIONS_S = 900.0  # what a live rig is measured for, at least
 SIZES = (1.0, 3.0)  # that show, RMS in units of a fix's noise
 _POSES = 60
@@ -70,6 +71,10 @@ class Envelope:
         sealed = bytes(a ^ b for a, b in zip(text, self._pad, strict=True))
         (directory / SEALED).write_bytes(sealed)
         (directory / COMMITMENT).write_text(hashlib.sha256(text).hexdigest() + "\n", encoding="utf-8")
+
+    def begin(self, utc_ns: int) -> None:
+        """Say when simulated second 0 is."""
+        (self._directory / BEGIN).write_text(f"{utc_ns}\n", encoding="utf-8")
 
     def open(self) -> None:
         """Let it be read."""

@@ -80,8 +80,9 @@ def compare(
 ) -> dict[str, object]:
     """Compare all methods on held-out observations, in a table and on a page with plots.
 
-    On the default method's kinematics and effects every residual has a row of its own: none, a table of stored
-    corrections per cell of boom reach and direction, the first paper's RBFN, and our learners one by one.
+    Rows have the names of `calibrate --method` and `--residual`. On the default method's kinematics and effects every
+    residual has a row of its own; `table` are stored corrections per cell of boom reach and direction, `rbfn-paper` is
+    a published network.
 
     A method that cannot use the data is listed with its reason. With --protocol zhou2022 the rig is calibrated from
     single-joint, multi-joint and weighted data instead, with the Pareto front of the weights, a learning curve and the
@@ -147,13 +148,13 @@ def compare(
 
 def show_comparison(console: Console, comparison: Comparison) -> None:
     """The table of all methods and residuals, and what is to be said of it."""
-    from daemon.report.comparison import HEADER, LABELS, LOWEST, TEXT_COLUMNS, refusals, table_rows
+    from daemon.report.comparison import HEADER, LOWEST, TEXT_COLUMNS, label, refusals, table_rows
 
     own = [result.method == "default" for result in comparison.results]
     title = f"Position error in mm on {comparison.held_out} held-out fixes ({LOWEST} the lowest)"
     _table(console, title, HEADER, table_rows(comparison), text_columns=TEXT_COLUMNS, bold=own)
     _sentences(console, "Not applicable", refusals(comparison))
-    notes = [f"{LABELS[r.method]}: {note}" for r in comparison.results for note in r.notes]
+    notes = [f"{label(r.method)}: {note}" for r in comparison.results for note in r.notes]
     _sentences(console, "Please note", [*comparison.warnings, *notes])
 
 

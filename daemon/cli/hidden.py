@@ -11,25 +11,30 @@ import json
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from rich.console import Console
 from rich.table import Table
 
+from calibration.rig import Rig
 from daemon.cli.simulated_operator import DEADLINE_S, PRISMS, RIG, Advance, DemoError, Operator
 from daemon.cli.tables import say
 from daemon.rigs import load_rig
 from daemon.session_data import sessions_csv
 from daemon.store.reader import Reader
+from drivers.clock import NS_PER_S
 
 NO_JOBS = "\n[jobs]\nenabled = false  # the workflow is asked by rigcal gap, before and after the poses it proposes\n"
 TRAINING_POSES = 22  # of each prism
 CHECKED = ("r", "b")  # prisms of the checks, and of the poses that are proposed
 CHECK_POSES = 4
 PROPOSED = 20
-ENVELOPE, SEALED, COMMITMENT, PAD = "envelope", "envelope.sealed", "envelope.sha256", "envelope.pad"
+STORE = "rigcal.sqlite"
+LONGEST_S = 1800.0  # simulated, that the rounds of the proposed poses may be apart, first to last
+ENVELOPE, SEALED, COMMITMENT = "envelope", "envelope.sealed", "envelope.sha256"
+BEGIN, PAD = "envelope.begin", "envelope.pad"
 
 Outcome = Literal["right", "set", "missed"]
 
@@ -68,6 +73,7 @@ def play(out: Path, rate: float, seed: int, advance: Advance, tell: Console) -> 
     Raises:
         DemoError: it did not come to its end.
     """
+    rig = load_rig(RIG).rig
     envelope = out / ENVELOPE
     envelope.mkdir()
     operator = Operator(out, rate, seed, ["--secret", str(envelope)], NO_JOBS)
@@ -78,16 +84,21 @@ def play(out: Path, rate: float, seed: int, advance: Advance, tell: Console) -> 
         training = [operator.record(prism, "static_poses", TRAINING_POSES, advance) for prism in PRISMS]
         checks = [operator.record(prism, "check", CHECK_POSES, advance) for prism in CHECKED]
         advance("finding the gap", 0)
-        found = [_find_gap(out, "gap", training, checks, seed)]
+        found = [_find_gap(out, rig, "gap", training, checks, seed)]
         poses = _proposed(found[0])
         if poses:
             say(tell, f"The data cannot tell {_set_of(found[0])} apart. Measuring {len(poses)} poses that can.")
-            training += [operator.record(prism, "static_poses", len(poses), advance, poses) for prism in CHECKED]
+            for sentence in concessions(rig, poses):
+                say(tell, sentence)
+            for pause_s, rows in rounds(poses):
+                advance("waiting for the next round", 0)
+                operator.pause(pause_s)
+                training += [operator.record(prism, "static_poses", len(rows), advance, rows) for prism in CHECKED]
             advance("finding the gap again", 0)
-            found.append(_find_gap(out, "gap-again", training, checks, seed))
+            found.append(_find_gap(out, rig, "gap-again", training, checks, seed))
     finally:
         operator.close()
-    truth = opened(envelope, commitment)
+    truth = _timed_as(opened(envelope, commitment), envelope, out / STORE, training)
     answer = found[-1]
     return {
         "seed": seed,
@@ -116,6 +127,21 @@ def opened(envelope: Path, commitment: str) -> Truth:
         raise DemoError(f"{envelope} does not hold what was sealed: its SHA-256 is another than {commitment}")
     content = json.loads(text)
     return Truth(content["family"], content["where"], content["coefficients"], content["visible_over_noise"])
+
+
+def _timed_as(truth: Truth, envelope: Path, store: Path, training: Sequence[str]) -> Truth:
+    """The truth with instants counted as the observations of these sessions are, and not from simulated second 0."""
+    if "time_s" not in truth.coefficients:
+        return truth
+    marks = ",".join("?" * len(training))
+    with Reader(store) as reader:
+        (row,) = reader.rows(
+            f"SELECT min(utc_ns) AS first FROM observations WHERE excluded IS NULL AND session_id IN ({marks})",
+            training,
+        )
+    later_s = (row["first"] - int((envelope / BEGIN).read_text(encoding="utf-8"))) / NS_PER_S
+    time_s = truth.coefficients["time_s"] - later_s
+    return replace(truth, coefficients={**truth.coefficients, "time_s": time_s})
 
 
 def outcome(gap: Mapping[str, Any], truth: Truth) -> Outcome:
@@ -189,11 +215,41 @@ def _proposed(gap: Mapping[str, Any]) -> list[dict[str, Any]]:
     return [row for experiment in gap["experiments"] for row in experiment.get("poses", ())][:PROPOSED]
 
 
-def _find_gap(out: Path, name: str, training: Sequence[str], checks: Sequence[str], seed: int) -> dict[str, Any]:
+def rounds(rows: Sequence[Mapping[str, Any]]) -> list[tuple[float, list[dict[str, Any]]]]:
+    """Rows of a plan by the round that they are measured in, each with the pause before it, simulated seconds.
+
+    Rounds are as far apart as the rows say, or as a demonstration can wait for.
+    """
+    by_time: dict[float, list[dict[str, Any]]] = {}
+    for row in rows:
+        by_time.setdefault(float(row.get("time_s", 0.0)), []).append(dict(row))
+    times = sorted(by_time)
+    share = min(1.0, LONGEST_S / (times[-1] - times[0])) if len(times) > 1 else 1.0
+    pauses_s = [share * (time_s - before_s) for before_s, time_s in zip([times[0], *times], times, strict=False)]
+    return [(pause_s, by_time[time_s]) for pause_s, time_s in zip(pauses_s, times, strict=True)]
+
+
+def concessions(rig: Rig, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """In which respects the simulated boom does less than the rows of a plan ask for, in sentences."""
+    times = [float(row["time_s"]) for row in rows if "time_s" in row]
+    out = []
+    if times and max(times) - min(times) > LONGEST_S:
+        asked_h = (max(times) - min(times)) / 3600.0
+        out.append(f"The plan asks for rounds over {asked_h:.0f} h; here they are over {LONGEST_S / 60.0:.0f} min.")
+    done = {"pose", "prisms", "time_s", "dwell_s", *(joint.column for joint in rig.joints)}
+    done |= {f"{name}_dir" for name in rig.joint_names}
+    left = sorted({name for row in rows for name in row} - done)
+    if left:
+        out.append(f"What the simulated boom cannot do, and leaves: {', '.join(left)}.")
+    return out
+
+
+def _find_gap(
+    out: Path, rig: Rig, name: str, training: Sequence[str], checks: Sequence[str], seed: int
+) -> dict[str, Any]:
     """Ask `rigcal gap` about sessions of the store, by the files it reads of anyone."""
-    rig = load_rig(RIG).rig
     files = {}
-    with Reader(out / "rigcal.sqlite") as reader:
+    with Reader(out / STORE) as reader:
         for kind, sessions in (("observations", training), ("checks", checks)):
             files[kind] = out / f"{name}-{kind}.csv"
             files[kind].write_bytes(sessions_csv(reader, rig, sessions))

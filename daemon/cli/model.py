@@ -67,8 +67,10 @@ def model_compare(number: int, **where: Any) -> Any:
 def model_accept(number: int, operator: str, **where: Any) -> Any:
     """Make candidate NUMBER the live model.
 
-    Refused (exit status 3) unless it is better than the live model on held-out check sessions beyond chance; a first
-    model must not be worse there than the nominal one. Also refused: damaged files, a model of another rig file.
+    It must have been compared on check sessions that it was not trained on, and must have shown there a smaller error
+    than the live model, by more than chance; the first model that goes live must show no larger error than its own
+    nominal stage (the drawings). Else it is refused (exit status 3), as are damaged files and a model of another rig
+    file. `rigcal model list` shows how each compared.
     """
     return ask(where, "model.accept", _changed, id=number, operator=operator)
 
@@ -140,9 +142,12 @@ def model_export(
         for file in result["files"]:
             click.echo(file)
         click.echo(
-            f"{summary['rows']} rows; interpolated between them, corrections are within {summary['p95_mm']:.2g} mm of "
-            f"the model's in 95 % of random poses ({summary['max_mm']:.2g} mm at most)"
+            f"{summary['rows']} rows; interpolated between them, corrections of {summary['correction_rms_mm']:.2g} mm "
+            f"RMS are within {summary['p95_mm']:.2g} mm of the model's in 95 % of random poses "
+            f"({summary['max_mm']:.2g} mm at most)"
         )
+        for sentence in summary["warnings"]:
+            click.echo(f"Warning: {sentence}", err=True)
     return result
 
 
@@ -178,7 +183,8 @@ def _show(console: Console, shown: dict[str, Any]) -> None:
 
 def _changed(console: Console, result: dict[str, Any]) -> None:
     before = f"; model {result['retired']} is retired" if result["retired"] is not None else ""
-    say(console, f"model {result['live']} is live{before}")
+    why = f": {result['reason']}" if "reason" in result else ""
+    say(console, f"model {result['live']} is live{before}{why}")
 
 
 COMMANDS = {"model": model}

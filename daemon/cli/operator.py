@@ -316,9 +316,9 @@ def jobs_retry(number: int, **where: Any) -> Any:
 
 
 def _job_line(job: dict[str, Any]) -> str:
-    detail = job.get("error") or job.get("message") or ""
-    share = f" {100 * job['progress']:.0f} %" if job["state"] == "running" else ""
-    return f"job {job['id']} {job['kind']}: {job['state']}{share} {detail}".rstrip()
+    if job["state"] == "running":
+        return f"job {job['id']} {job['kind']}: running, {100 * job['progress']:.0f} %, {job['message'] or 'starting'}"
+    return f"job {job['id']} {job['kind']}: {job['state']}" + (f", {job['error']}" if job["error"] else "")
 
 
 @click.group()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -16,10 +17,12 @@ from rich.console import Console
 from calibration.errors import DataError, ModelError, RigError, UnsafeError
 from daemon.config import ConfigError
 from daemon.control import CommandError
+from daemon.numba_cache import is_compiled
 from daemon.plain_json import json_line
 from drivers.errors import DescriptionError
 
 DONE, FAILED, WRONG_INPUT, REFUSED = 0, 1, 2, 3
+LINE_S = 15.0  # between two lines of progress where no person is watching
 
 Progress = Callable[[float, str], None]
 
@@ -114,18 +117,52 @@ def print_json(result: Mapping[str, Any]) -> None:
 
 @contextlib.contextmanager
 def progress_display(*, as_json: bool) -> Iterator[Progress]:
-    """A progress bar on standard error where a person is watching; silence elsewhere."""
+    """How far long work is, on standard error: a bar where a person is watching, else a line now and then.
+
+    The first calibration of a computer compiles what it runs, which is said beforehand.
+    """
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
+    if not is_compiled():
+        click.echo("Compiling kernels first, once on this computer: half a minute or more", err=True)
     console = Console(stderr=True)
+    if as_json or not console.is_terminal:
+        with _lines() as progress:
+            yield progress
+        return
     with Bar(
         BarColumn(),
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         TimeElapsedColumn(),
         console=console,
         transient=True,
-        disable=as_json or not console.is_terminal,
     ) as bar:
-        task = bar.add_task("", total=1.0)
+        task = bar.add_task("starting", total=1.0)
         yield lambda share, text: bar.update(task, completed=share, description=text)
+
+
+@contextlib.contextmanager
+def _lines() -> Iterator[Progress]:
+    """What is going on, as a line on standard error every `LINE_S` seconds: short work says nothing."""
+    now = (0.0, "starting")
+    over = threading.Event()
+
+    def note(share: float, text: str) -> None:
+        nonlocal now
+        now = share, text
+
+    def tell() -> None:
+        seconds = 0.0
+        while not over.wait(LINE_S):
+            seconds += LINE_S
+            share, text = now
+            click.echo(f"{seconds:.0f} s: {text} ({share:.0%})", err=True)
+
+    teller = threading.Thread(target=tell, name="progress", daemon=True)
+    teller.start()
+    try:
+        yield note
+    finally:
+        over.set()
+        teller.join()

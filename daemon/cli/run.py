@@ -56,7 +56,14 @@ _DWELL = click.FloatRange(1, 600)
 @click.option("--replay", "is_replay", is_flag=True, help="The captured logs FILE... in place of the configured links.")
 @click.option("--rate", type=_RATE, default=1.0, show_default=True, help="Speed of the simulation or replay.")
 @click.option("--seed", type=int, default=1, show_default=True, help="Which simulated machine.")
-@click.option("--effect", "effects", multiple=True, help="A hidden effect of the simulated machine; may be repeated.")
+@click.option(
+    "--effect",
+    "effects",
+    multiple=True,
+    metavar="FAMILY@WHERE[:NAME=VALUE...]",
+    help="A hidden effect of the simulated machine, which else has build errors alone, such as "
+    "backlash@theta4:width_rad=4e-3; may be repeated.",
+)
 @click.option(
     "--secret",
     type=click.Path(file_okay=False, path_type=Path),

@@ -54,6 +54,7 @@ class Operator:
         self, directory: Path, rate: float, seed: int, options: Sequence[str] = (), settings: str = ""
     ) -> None:
         self._socket = directory / "control.sock"
+        self._rate = rate
         config = directory / "rigcal.toml"
         config.write_text(CONFIG + settings, encoding="utf-8")
         command = [sys.executable, "-m", "daemon.cli.main", "run", "--sim", "--config", str(config)]
@@ -65,19 +66,25 @@ class Operator:
         """Send a command to the daemon."""
         return request(self._socket, command, arguments)
 
-    def wait(self, what: str, done: Callable[[], bool]) -> None:
-        """Wait until `done`, looking five times a second.
+    def wait(self, what: str, done: Callable[[], bool], *, simulated_s: float = 0.0) -> None:
+        """Wait until `done`, looking five times a second; `simulated_s` is what the plan itself waits for.
 
         Raises:
             DemoError: the daemon ended, or it took too long.
         """
-        deadline = time.monotonic() + DEADLINE_S
+        limit_s = DEADLINE_S + simulated_s / self._rate
+        deadline = time.monotonic() + limit_s
         while not done():
             if self._daemon.poll() is not None:
                 raise DemoError(f"the daemon ended while waiting for {what}; see {self._log.name}")
             if time.monotonic() > deadline:
-                raise DemoError(f"waited {DEADLINE_S:g} s for {what}; see {self._log.name}")
+                raise DemoError(f"waited {limit_s:.0f} s for {what}; see {self._log.name}")
             time.sleep(0.2)
+
+    def pause(self, simulated_s: float) -> None:
+        """Let simulated time pass with no session open; the boom goes on moving."""
+        over = time.monotonic() + simulated_s / self._rate
+        self.wait("the next round", lambda: time.monotonic() >= over, simulated_s=simulated_s)
 
     def begin(self) -> None:
         """Wait for the first fix, and set the station up."""
@@ -101,19 +108,26 @@ class Operator:
         """
         name = str(self.say("session.start", prism=prism, kind=kind, operator="demo")["id"])
         self._shoot_control_points()
-        if planned:
-            self.say("simulation.visit", poses=list(planned))
         seen = 0
+
+        def recorded() -> int:
+            return int(self.say("session.show", id=name)["poses"])
+
+        if planned:
+            # Back from the control points, the station's first fixes count only once they are known to be of the prism.
+            self.wait(f"a pose of prism {prism}", lambda: recorded() > 0)
+            self.say("simulation.visit", poses=list(planned))
 
         def enough() -> bool:
             nonlocal seen
-            now = min(int(self.say("session.show", id=name)["poses"]), poses)
+            now = min(recorded(), poses)
             if now > seen:
                 advance(f"{kind.replace('_', ' ')} of prism {prism}: {now} of {poses}", now - seen)
                 seen = now
             return now >= poses and not (planned and self.say("simulation.visit")["left"])
 
-        self.wait(f"{poses} poses of prism {prism}", enough)
+        stands_s = sum(float(row.get("dwell_s", 0.0)) for row in planned)
+        self.wait(f"{poses} poses of prism {prism}", enough, simulated_s=stands_s)
         self._shoot_control_points()
         self.say("session.stop")
         return name

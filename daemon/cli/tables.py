@@ -40,7 +40,7 @@ def show_evaluation(console: Console, result: Mapping[str, Any], what: str) -> N
     seen = result["identifiability"]
     effects = ", ".join(f"{e['family']}@{e['where']}" for e in result["effects"])
     console.print(
-        f"noise {number(result['noise_mm'])} mm; effects: {effects or 'none'}; "
+        f"scatter of a fix {number(result['noise_mm'])} mm; effects: {effects or 'none'}; "
         f"learned residual: {result['residual'] or 'none'}; "
         f"{seen['rank']} of {seen['parameters']} parameters determined by the data",
         highlight=False,

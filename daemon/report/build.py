@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from calibration.rig import BEYOND_BUILDING
 from daemon.report import figures
 from daemon.report.drawing import styled, svg_image
-from daemon.report.inputs import STAGES, ErrorTable, ReportInput, SetupLine, Stage
+from daemon.report.inputs import STAGES, USUAL, ErrorTable, ReportInput, SetupLine, Stage
 from daemon.report.markup import escape, items, number, page, paragraph, picture, section, signed, table
 
 _STAGE_WORDS: dict[Stage, str] = {
@@ -56,10 +57,10 @@ def headline(report: ReportInput) -> str:
 def _meaning(report: ReportInput) -> str:
     after = report.judged.stage("hybrid").rms_mm
     if after <= _EXPLAINED * report.instrument_mm:
-        judgement = "What is left is what the noise of the instruments explains."
+        judgement = "What is left is what the instrument noise explains."
     else:
         judgement = (
-            f"The instruments' noise explains {number(report.instrument_mm)} mm of it: the rest is physics that the "
+            f"The instrument noise explains {number(report.instrument_mm)} mm of it: the rest is physics that the "
             "model lacks, or measurements noisier than the rig file says."
         )
     where = (
@@ -77,7 +78,7 @@ def _head(report: ReportInput) -> str:
         ("", "before, root mean square", before.rms_mm),
         ("after", "after, root mean square", after.rms_mm),
         ("after", "after, worst fix", after.max_mm),
-        ("", "noise of the instruments", report.instrument_mm),
+        ("", "instrument noise", report.instrument_mm),
     ]
     tiles = "".join(
         f'<div class="{kind}"><dt>{escape(label)}</dt><dd>{number(value)} <small>mm</small></dd></div>'
@@ -140,7 +141,7 @@ def _stage_notes(report: ReportInput) -> str:
             f"No named effect is part of this model ({report.effects_reason}), so that stage repeats the one before it."
         )
     sentences.append(f"Learned residual: {report.residual_reason.rstrip('.')}.")
-    sentences.append(f"Noise of a single fix as the fit found it: {number(report.noise_mm)} mm.")
+    sentences.append(f"Scatter of a single fix about the fitted model: {number(report.noise_mm)} mm.")
     return " ".join(sentences)
 
 
@@ -291,15 +292,15 @@ def _importance(report: ReportInput) -> str:
 
 def _parameters(report: ReportInput) -> str:
     lines = sorted(report.parameters, key=lambda p: -abs(p.in_tolerances))
-    flagged = sum(abs(p.in_tolerances) > 2 for p in lines)
+    unusual = sum(p.is_unusual for p in lines)
+    beyond = sum(p.is_beyond_building for p in lines)
     content = [paragraph(_identifiability_words(report))]
     if report.unidentifiable:
         content.append(items(report.unidentifiable))
     if lines:
         rows, classes = [], []
         for p in lines[:_PARAMETERS_SHOWN]:
-            size = abs(p.in_tolerances)
-            remark = "beyond building: check the drawing" if size > 3 else "unusual" if size > 2 else ""
+            remark = "beyond building: check the drawing" if p.is_beyond_building else "unusual" if p.is_unusual else ""
             remark = remark or ("" if p.determined else "not determined")
             rows.append(
                 [
@@ -311,16 +312,14 @@ def _parameters(report: ReportInput) -> str:
                     remark,
                 ]
             )
-            classes.append("flag" if size > 2 else "")
+            classes.append("flag" if p.is_unusual else "")
         header = ["constant", "correction", "95 % interval", "tolerance", "in tolerances", "remark"]
         content += [
             paragraph(
                 f"The {min(len(lines), _PARAMETERS_SHOWN)} largest of {len(lines)} corrections. "
-                + (
-                    "None is more than building explains (3 tolerances)."
-                    if not flagged
-                    else f"{flagged} of them {'is' if flagged == 1 else 'are'} larger than twice the build tolerance."
-                )
+                f"{unusual or 'None'} of all {'is' if unusual < 2 else 'are'} larger than {USUAL:g} build tolerances, "
+                f"as one in twenty is by chance; {beyond or 'none'} than {BEYOND_BUILDING:g}, which building does not "
+                "explain."
             ),
             picture(
                 svg_image(figures.corrections(report, _PARAMETERS_SHOWN), "Largest corrections in build tolerances"),

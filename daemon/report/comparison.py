@@ -8,28 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.comparison import FIGURES, NOMINAL, Comparison, MethodResult
-from calibration.residual_comparison import RESIDUALS
+from calibration.residual_comparison import EFFECTS, RESIDUALS
 from daemon.report.drawing import AFTER, BEFORE, INK, MIDDLE, new_figure, plain_log_axis, styled, svg_image
 from daemon.report.markup import escape, items, number, page, paragraph, picture, section, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-LABELS: Mapping[str, str] = {
-    NOMINAL: "nominal",
-    "km": "KM",
-    "skcm": "SKCM",
-    "rbf-tcm": "RBF-TCM",
-    "effects": "no residual",
-    "table": "table",
-    "rbfn-paper": "RBFN (2022 paper)",
-    "rbfn": "RBFN",
-    "lightgbm": "LightGBM",
-    "chain": "RBFN + LightGBM",
-    "gp": "Gaussian process",
-    "default": "rigcal (default)",
-    "pde-paper": "Zhou et al. 2022",
-}
 _COLOURS: Mapping[str, str] = {  # methods and residuals are drawn in two panels, where colours return
     NOMINAL: BEFORE,
     "km": "#e69f00",
@@ -49,15 +34,6 @@ HEADER = ("method", "mean", "max", "std", "rms", "mean, training", "seconds", "o
 LOWEST = "*"
 TEXT_COLUMNS = (0, len(HEADER) - 1)
 _TRAINING = "training_mean_mm"  # the lowest of these is no merit
-_PARTS = {
-    "rbfn": "RBFN",
-    "lightgbm": "LightGBM",
-    "chain": "RBFN + LightGBM",
-    "gp": "Gaussian process",
-    "rbf-tcm": "RBF on torques",
-    "table": "table of corrections",
-    "rbfn-paper": "the paper's RBFN",
-}
 _BARS = (("mean_mm", "mean"), ("max_mm", "max"), ("std_mm", "standard deviation"))
 
 
@@ -90,13 +66,18 @@ def comparison_page(comparison: Comparison, sources: Mapping[str, str]) -> str:
     return page(f"Methods compared: {comparison.rig}", "".join(content))
 
 
+def label(method: str) -> str:
+    """A row's name: a method by the name that `calibrate --method` takes, a residual by that of `--residual`."""
+    return f"residual {'none' if method == EFFECTS else method}" if method in RESIDUALS else method
+
+
 def table_rows(comparison: Comparison) -> list[list[str]]:
     """Cells as in `HEADER`, the lowest of each column of held-out errors marked."""
     lowest = {figure: comparison.lowest(figure) for figure in FIGURES if figure != _TRAINING}
     rows = []
     for result in comparison.results:
         row = result.as_dict()
-        cells = [LABELS[result.method]]
+        cells = [label(result.method)]
         if result.reason is not None:
             rows.append([*cells, "not applicable", *[""] * (len(HEADER) - 2)])
             continue
@@ -106,14 +87,14 @@ def table_rows(comparison: Comparison) -> list[list[str]]:
             assert isinstance(value, float)
             cells.append(number(value) + mark)
         cells.append("" if result.seconds is None else number(result.seconds))
-        cells.append(", ".join(_PARTS.get(part, part.replace("_", " ")) for part in result.adds))
+        cells.append(", ".join(part.replace("_", " ") for part in result.adds))
         rows.append(cells)
     return rows
 
 
 def refusals(comparison: Comparison) -> list[str]:
     """A sentence for every method that does not apply."""
-    return [f"{LABELS[r.method]}: not applicable: {r.reason}" for r in comparison.results if r.reason is not None]
+    return [f"{label(r.method)}: not applicable: {r.reason}" for r in comparison.results if r.reason is not None]
 
 
 def bars(comparison: Comparison) -> Figure:
@@ -135,7 +116,7 @@ def bars(comparison: Comparison) -> Figure:
         axes.set_xlabel("mm")
         axes.grid(False, axis="y")
         axes.tick_params(axis="y", length=0, labelcolor=INK)
-        axes.set_yticks(range(len(results)), [LABELS[r.method] for r in results])
+        axes.set_yticks(range(len(results)), [label(r.method) for r in results])
     figure.axes[0].invert_yaxis()
     return figure
 
@@ -155,7 +136,7 @@ def curves(comparison: Comparison) -> Figure:
         for result in part:
             assert result.error_mm is not None
             share = 100.0 * (np.arange(len(result.error_mm)) + 1) / len(result.error_mm)
-            look = {"color": _COLOURS[result.method], "label": LABELS[result.method]}
+            look = {"color": _COLOURS[result.method], "label": label(result.method)}
             axes.plot(share, np.sort(result.error_mm), linewidth=2.4 if result.method == "default" else 1.4, **look)
         plain_log_axis(axes)
         axes.set_xlim(0, 100)
@@ -179,7 +160,7 @@ def headline(comparison: Comparison) -> str:
     assert best.error_mm is not None
     assert nominal.error_mm is not None
     return (
-        f"{LABELS[best.method]} has the lowest mean error on {comparison.held_out} held-out fixes: "
+        f"{label(best.method)} has the lowest mean error on {comparison.held_out} held-out fixes: "
         f"{number(float(best.error_mm.mean()))} mm, where the nominal model has "
         f"{number(float(nominal.error_mm.mean()))} mm."
     )
@@ -195,8 +176,9 @@ def _head(comparison: Comparison) -> str:
         + f'<p class="headline">{escape(headline(comparison)).replace(" mm", "&nbsp;mm")}</p>'
         + paragraph(
             "Every method was calibrated on the same training fixes and judged on the held-out ones, by its last "
-            "stage. Rows from \u201cno residual\u201d to the default share one identification, and differ in what is "
-            "learned on top of it. Seconds are of the whole calibration.",
+            "stage. Names are those of `calibrate --method` and `--residual`. Rows from \u201cresidual none\u201d to "
+            "the default share one identification, and differ in what is learned on top of it; `table` is a table of "
+            "corrections and `rbfn-paper` a published network. Seconds are of the whole calibration.",
             "lead",
         )
         + f"</header>{notice(warnings)}"

@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.rig import Joint
 from daemon.report.drawing import AFTER, BEFORE, INK, MIDDLE, SOFT, WARN, WIDTH_IN, new_figure, plain_log_axis
-from daemon.report.inputs import ErrorTable, Floats, ReportInput, Stage
+from daemon.report.inputs import USUAL, ErrorTable, Floats, ReportInput, Stage
 from daemon.report.markup import number
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def errors_by_prism(report: ReportInput) -> Figure:
             key(BEFORE, "before: drawings (nominal)"),
             key(AFTER, "after: calibrated (hybrid)"),
             _line_key("root mean square", "-", 1.6),
-            _line_key("what the instruments' noise explains", "--", 1.0),
+            _line_key("instrument noise", "--", 1.0),
         ],
         loc="outside upper left",
         ncols=4,
@@ -288,10 +288,10 @@ def corrections(report: ReportInput, most: int = 14) -> Figure:
     figure = new_figure(0.75 + 0.26 * len(lines), WIDTH_IN)
     axes = figure.add_subplot()
     reach = max(3.4, *(abs(p.in_tolerances) + 2 * p.sigma / p.tolerance for p in lines)) * 1.05
-    axes.axvspan(-2, 2, color="#eef4f8", linewidth=0)
+    axes.axvspan(-USUAL, USUAL, color="#eef4f8", linewidth=0)
     axes.axvline(0, color=SOFT, linewidth=0.8)
     for place, line in enumerate(lines):
-        colour = WARN if abs(line.in_tolerances) > 3 else MIDDLE if abs(line.in_tolerances) > 2 else AFTER
+        colour = WARN if line.is_beyond_building else MIDDLE if line.is_unusual else AFTER
         half = 2 * line.sigma / line.tolerance
         axes.plot([line.in_tolerances - half, line.in_tolerances + half], [place, place], color=colour, linewidth=2)
         axes.plot(line.in_tolerances, place, "o" if line.determined else "D", color=colour, markersize=5)
@@ -299,6 +299,8 @@ def corrections(report: ReportInput, most: int = 14) -> Figure:
     axes.tick_params(axis="y", length=0, labelcolor=INK)
     axes.set_ylim(len(lines) - 0.4, -0.6)
     axes.set_xlim(-reach, reach)
-    axes.set_xlabel("correction, in build tolerances (the band is what building explains)")
+    axes.set_xlabel(
+        f"correction, in build tolerances (the band, {USUAL:g} tolerances, holds 95 % of what building does)"
+    )
     axes.grid(False, axis="y")
     return figure

@@ -32,8 +32,8 @@ _LIBRARIES = ("rigcal", "numpy", "scipy", "numba", "lightgbm")
 # Unit of a coefficient -> how its name ends, what to multiply by, and the unit that people read.
 _SMALL_UNITS = {"rad": ("_rad", 1e3, "mrad"), "rad/(N m)": ("_rad_per_Nm", 1e6, "mrad/(kN m)")}
 _LABELS = {
-    "fixes": "fixes fitted",
-    "data_sha256": "their SHA-256",
+    "fixes": "observations fitted",
+    "data_sha256": "SHA-256 of the observations fitted",
     "rig_sha256": "SHA-256 of the rig file",
     "search": "global search",
     "residual_seed": "seed of the residual",

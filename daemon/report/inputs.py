@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.rig import Joint
+from calibration.rig import BEYOND_BUILDING, Joint
 
 if TYPE_CHECKING:  # both bring numba, which `status` and `--help` must not wait for
     from calibration.accuracy import ExpectedAccuracy
@@ -23,6 +23,7 @@ Floats = NDArray[np.float64]
 Strings = NDArray[np.str_]
 Stage = Literal["nominal", "geometric", "effects", "hybrid"]
 STAGES: tuple[Stage, ...] = get_args(Stage)
+USUAL = 2.0  # build tolerances, within which 95 % of the corrections are that building asks for
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,16 @@ class ParameterLine:
         """The correction in units of the build tolerance."""
         return self.correction / self.tolerance
 
+    @property
+    def is_unusual(self) -> bool:
+        """Whether it is larger than 95 % of the corrections that building asks for."""
+        return abs(self.in_tolerances) > USUAL
+
+    @property
+    def is_beyond_building(self) -> bool:
+        """Whether it is larger than building can explain."""
+        return abs(self.in_tolerances) > BEYOND_BUILDING
+
 
 @dataclass(frozen=True)
 class EffectLine:
@@ -160,8 +171,8 @@ class ReportInput:
         joints: its joints, for limits and units.
         training: the rows the model was fitted to.
         held_out: rows the fit never saw; None if there were none.
-        noise_mm: RMS 3-D noise of a fix as the fit found it: all that the model does not explain.
-        instrument_mm: RMS 3-D error that the station's and the encoders' own noise explains on the judged rows.
+        noise_mm: scatter of a fix: RMS 3-D, as the fit found it, all that the model does not explain.
+        instrument_mm: instrument noise: RMS 3-D error that station and encoders explain on the judged rows.
         residual: name of the learned residual, or None.
         residual_reason: why there is one or none, a sentence.
         effects: named effects of the model.

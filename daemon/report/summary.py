@@ -27,7 +27,7 @@ def summary_png(report: ReportInput) -> bytes:
         stages.invert_yaxis()
         stages.set_xlim(0, max(values) * 1.28)
         stages.grid(False, axis="y")
-        stages.set_xlabel(f"mm; dashed: noise of the instruments, {number(report.instrument_mm)} mm")
+        stages.set_xlabel(f"mm; dashed: instrument noise, {number(report.instrument_mm)} mm")
         stages.set_title("Root mean square error, stage by stage")
         draw_errors_by_prism(prisms, report)
         prisms.set_title("Every fix before (grey) and after (blue)")

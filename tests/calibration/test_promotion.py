@@ -1,5 +1,6 @@
 """Whether a model may take another's place, and the paired test that decides it."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,10 +15,11 @@ from calibration.promotion import compare_held_out
 from tests.calibration.conftest import Session, simulated
 
 
-def worse(model: CalibratedModel, by_mm: float) -> CalibratedModel:
-    """The model with a prism's place off."""
+def worse(model: CalibratedModel, by_mm: float, prisms: Sequence[str] = ("r",)) -> CalibratedModel:
+    """The model with the places of prisms off."""
     values = model.values.copy()
-    values[model.chain.index("prism.r.z")] += by_mm
+    for prism in prisms:
+        values[model.chain.index(f"prism.{prism}.z")] += by_mm
     return replace(model, values=values)
 
 
@@ -89,11 +91,13 @@ def test_a_gain_on_too_few_standstills_asks_for_more_check_sessions(session: Ses
 def test_a_first_model_may_go_live_unless_it_is_worse_than_the_nominal_one(session: Session) -> None:
     first = compare_held_out(session.model, None, few(session, 2))
     assert (first.against, first.standstills, first.is_better) == ("nominal", 2, True)
-    assert first.sentence.endswith("): no worse")
+    assert first.sentence.endswith("mm: enough, as there is no live model to beat")
     for count in (3, 40):
         spoilt = compare_held_out(worse(session.model, 500.0), None, few(session, count))
         assert not spoilt.is_better
-        assert spoilt.sentence.endswith("worse; more check fixes must show that it is no worse")
+        assert spoilt.sentence.endswith(
+            "larger, in all or at most standstills; more check fixes must show that it is no larger"
+        )
 
 
 @pytest.mark.parametrize("by_mm", [0.0, 500.0])
@@ -101,14 +105,27 @@ def test_a_first_model_does_not_go_live_on_one_standstill(session: Session, by_m
     rows = few(session).select(np.zeros(4, dtype=int))
     found = compare_held_out(worse(session.model, by_mm), None, rows)
     assert (found.standstills, found.p, found.is_better) == (1, 1.0, False)
-    assert found.sentence.endswith("more check fixes must show that it is no worse")
+    assert found.sentence.endswith("more check fixes must show that it is no larger")
 
 
 def test_the_probability_that_is_told_is_that_of_the_gain(session: Session) -> None:
     assert compare_held_out(session.model, None, few(session)).p < 0.01
-    spoilt = compare_held_out(worse(session.model, 500.0), None, few(session))
+    spoilt = compare_held_out(worse(session.model, 500.0), session.model, few(session))
     assert spoilt.p > 0.99
-    assert "(p = 1)" in spoilt.sentence
+    assert "(a gain by chance: p = 1)" in spoilt.sentence
+
+
+def test_shots_at_something_else_do_not_let_a_worse_first_model_go_live(session: Session) -> None:
+    """Their errors are nearly the same by any model, and hide all others in an RMS."""
+    rows = few(session)
+    spoilt, refused = worse(session.model, 150.0, session.rig.prism_names), 0
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        stray = np.where(rng.random(len(rows)) < 0.3, 5000.0, 0.0)[:, None] * rng.standard_normal((len(rows), 3))
+        shots = replace(rows, position_mm=rows.position_mm + stray)
+        assert compare_held_out(session.model, None, shots).before_mm > 1000.0
+        refused += not compare_held_out(spoilt, None, shots).is_better
+    assert refused == 8
 
 
 def test_a_live_model_of_a_machine_with_other_prisms_is_not_compared_with(session: Session) -> None:

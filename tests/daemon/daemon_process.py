@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -24,7 +25,7 @@ serial.path = "/dev/rigcal-station"
 [jobs]
 enabled = {jobs}
 """
-DEADLINE_S = 120.0
+DEADLINE_S = 300.0
 
 
 class DaemonProcess:
@@ -37,7 +38,7 @@ class DaemonProcess:
         self.config.write_text(CONFIG.format(jobs=str(jobs).lower(), bus=bus), encoding="utf-8")
         command = [sys.executable, "-m", "daemon.cli.main", "run", "--config", str(self.config), *options]
         self._log = (directory / "daemon.log").open("a", encoding="utf-8")
-        self.process = subprocess.Popen(command, stdout=self._log, stderr=self._log)
+        self.process = subprocess.Popen(command, stdout=self._log, stderr=self._log, start_new_session=True)
 
     def say(self, command: str, **arguments: Any) -> Any:
         return request(self.socket, command, arguments)
@@ -69,10 +70,13 @@ class DaemonProcess:
         self._log.close()
 
     def stop(self) -> int:
-        """As the service manager does."""
-        self.process.send_signal(signal.SIGTERM)
+        """As a terminal does with Ctrl-C: the signal reaches all that the daemon has not set apart."""
+        if self.process.poll() is None:
+            os.killpg(self.process.pid, signal.SIGINT)
         try:
-            return self.process.wait(timeout=60)
+            status = self.process.wait(timeout=60)
+            assert "Traceback" not in self.log_text(), self.log_text()
+            return status
         finally:
             if self.process.poll() is None:
                 self.process.kill()

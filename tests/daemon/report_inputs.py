@@ -41,7 +41,7 @@ def report_input(
         "residual": "rbfn" if learned else None,
         "residual_reason": "rbfn halves the error of held-out groups" if learned else "none helps on held-out groups",
         "parameters": [
-            ParameterLine("row1.alpha", "deg", 0.7, 0.02, 0.2, True),
+            ParameterLine("row1.alpha", "deg", 0.9, 0.02, 0.2, True),
             ParameterLine("row2.a", "mm", -3.0, 1.0, 5.0, True),
             ParameterLine("row9.theta", "deg", 0.0, 0.2, 0.2, False),
         ],

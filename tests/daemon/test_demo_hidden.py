@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import time
 import uuid
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,11 @@ import pytest
 from rich.console import Console
 
 from calibration.rig import Rig, shipped_rig
-from daemon.cli.hidden import ENVELOPE, PAD, SEALED, Truth, opened, outcome, show
+from daemon.cli.hidden import BEGIN, ENVELOPE, PAD, SEALED, Truth, concessions, opened, outcome, rounds, show
 from daemon.cli.simulated_operator import DemoError
+from daemon.config import ConfigError
 from daemon.simulation import APPROACH, SimulatedRig, stops_of
-from drivers.clock import ScaledClock, Stamp, SystemClock
+from drivers.clock import NS_PER_S, ScaledClock, Stamp, SystemClock
 from simulators.effects.spec import FAMILIES
 from simulators.secret import COMMITMENT
 
@@ -30,20 +32,32 @@ def middle(rig: Rig) -> dict[str, float]:
     return {joint.column: sum(joint.limits) / 2.0 for joint in rig.joints}
 
 
-def simulated(rig: Rig, directory: Path) -> SimulatedRig:
-    now = SystemClock().now()
-    clock = ScaledClock(RATE, Stamp(now.utc_ns, now.monotonic_ns, f"simulated-{uuid.uuid4()}"))
-    rates = {joint.name: joint.max_rate for joint in rig.joints}
-    return SimulatedRig("swdt82", rates, directory, clock, seed=4, secret=directory / ENVELOPE)
+@dataclass(frozen=True)
+class Played:
+    """A simulated rig after its end.
+
+    Attributes:
+        envelope: its directory.
+        commitment: to what is in it.
+        was_open: before the end.
+        left: stops that the boom had not been at.
+    """
+
+    envelope: Path
+    commitment: str
+    was_open: bool
+    left: int
 
 
 @pytest.fixture(scope="module")
-def played(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, bool, int]:
-    """A simulated rig's envelope after its end, what was committed to, whether it was open before, stops left."""
+def played(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> Played:
     directory = tmp_path_factory.mktemp("rig")
     envelope = directory / ENVELOPE
     envelope.mkdir()
-    simulation = simulated(rig, directory)
+    now = SystemClock().now()
+    clock = ScaledClock(RATE, Stamp(now.utc_ns, now.monotonic_ns, f"simulated-{uuid.uuid4()}"))
+    rates = {joint.name: joint.max_rate for joint in rig.joints}
+    simulation = SimulatedRig("swdt82", rates, directory, clock, seed=4, secret=envelope)
     try:
         commitment = (envelope / COMMITMENT).read_text().strip()
         was_open = (envelope / PAD).exists()
@@ -54,23 +68,24 @@ def played(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, st
             left = simulation.visit([])
     finally:
         simulation.close()
-    return envelope, commitment, was_open, left
+    return Played(envelope, commitment, was_open, left)
 
 
-def test_the_envelope_opens_when_the_simulation_is_over_and_holds_what_was_sealed(
-    played: tuple[Path, str, bool, int],
-) -> None:
-    envelope, commitment, was_open, _ = played
-    assert not was_open
-    truth = opened(envelope, commitment)
+def test_the_envelope_opens_when_the_simulation_is_over_and_holds_what_was_sealed(played: Played) -> None:
+    assert not played.was_open
+    envelope = played.envelope
+    truth = opened(envelope, played.commitment)
     assert truth.family in FAMILIES
     assert truth.family.encode() not in (envelope / SEALED).read_bytes()
     assert truth.coefficients
+    assert (
+        int((envelope / BEGIN).read_text()) < SystemClock().now().utc_ns + 3600 * NS_PER_S
+    )  # simulated time runs fast
     assert 1.0 <= truth.visible_over_noise <= 3.0
 
 
-def test_another_content_than_what_was_sealed_is_refused(played: tuple[Path, str, bool, int], tmp_path: Path) -> None:
-    envelope, commitment, _, _ = played
+def test_another_content_than_what_was_sealed_is_refused(played: Played, tmp_path: Path) -> None:
+    envelope, commitment = played.envelope, played.commitment
     for name in (SEALED, PAD):
         data = bytearray((envelope / name).read_bytes())
         data[-5] ^= name == SEALED
@@ -82,8 +97,15 @@ def test_another_content_than_what_was_sealed_is_refused(played: tuple[Path, str
         opened(tmp_path, commitment)
 
 
-def test_the_simulated_boom_drives_to_the_poses_of_a_plan(played: tuple[Path, str, bool, int]) -> None:
-    assert played[3] == 0
+def test_the_simulated_boom_drives_to_the_poses_of_a_plan(played: Played) -> None:
+    assert played.left == 0
+
+
+@pytest.mark.parametrize("effect", ["foo@bar", "payload_change@theta4"])
+def test_an_effect_that_the_simulated_machine_cannot_have_is_wrong_use(rig: Rig, tmp_path: Path, effect: str) -> None:
+    clock = ScaledClock(RATE, Stamp(0, 0, "simulated"))
+    with pytest.raises(ConfigError, match="refuses what it was asked for"):
+        SimulatedRig("swdt82", {}, tmp_path, clock, effects=(effect,))
 
 
 def test_a_pose_that_says_from_which_side_is_reached_from_there(rig: Rig) -> None:
@@ -100,6 +122,28 @@ def test_a_pose_that_says_from_which_side_is_reached_from_there(rig: Rig) -> Non
         stops_of(rig, [middle(rig) | {"theta4_deg": 1000.0}], dwell_s=4.0)
     with pytest.raises(ValueError, match="a pose has a number for each of theta1_deg"):
         stops_of(rig, [{"theta1_deg": 1.0}], dwell_s=4.0)
+
+
+def test_what_the_simulated_boom_does_less_than_a_plan_asks_is_said(rig: Rig) -> None:
+    can = middle(rig) | {"pose": 1, "prisms": ["r"], "theta4_dir": 1.0, "dwell_s": 120.0, "time_s": 900.0}
+    assert concessions(rig, [can]) == []
+    later = can | {"time_s": 900.0 + 3 * 3600.0, "temperature_degC": 5.0, "L2_rate": 20.0}
+    assert concessions(rig, [can, later]) == [
+        "The plan asks for rounds over 3 h; here they are over 30 min.",
+        "What the simulated boom cannot do, and leaves: L2_rate, temperature_degC.",
+    ]
+
+
+def test_a_plan_is_measured_round_by_round_no_further_apart_than_half_an_hour() -> None:
+    def plan(*times: float) -> list[dict[str, Any]]:
+        return [{"pose": number, "time_s": time_s} for number, time_s in enumerate(times)]
+
+    def told(rows: list[dict[str, Any]]) -> list[tuple[float, list[int]]]:
+        return [(pause_s, [row["pose"] for row in part]) for pause_s, part in rounds(rows)]
+
+    assert told(plan(900.0, 900.0, 1500.0)) == [(0.0, [0, 1]), (600.0, [2])]
+    assert told(plan(900.0, 4500.0, 8100.0)) == [(0.0, [0]), (900.0, [1]), (900.0, [2])]
+    assert told([{"pose": 0}, {"pose": 1}]) == [(0.0, [0, 1])]
 
 
 def answer(effects: list[tuple[str, str]], pending: list[tuple[str, str]]) -> dict[str, Any]:

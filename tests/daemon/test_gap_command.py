@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import json
 from dataclasses import replace
@@ -15,6 +16,7 @@ from calibration.effects.library import library
 from calibration.errors import ModelError
 from daemon.cli.gap import show_gap
 from daemon.cli.main import main as rigcal
+from daemon.files import write_file
 from daemon.gap_files import check_gap_target, gap_answer, write_gap
 from daemon.modelfiles import read_model
 from tests.daemon import gap_support as support
@@ -128,6 +130,24 @@ def test_the_poses_asked_for_are_a_plan_that_goes_when_none_are_asked_for(tmp_pa
     sha256 = write_gap(tmp_path / "out", named, gap_answer(named, 1.5), "<html>")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == FILES
     assert [e.family for e in read_model(tmp_path / "out" / "model", sha256).effects] == ["backlash"]
+
+
+def test_an_answer_that_cannot_be_written_whole_leaves_the_earlier_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    named = support.named()
+    write_gap(tmp_path / "out", named, gap_answer(named, 1.5), "<html>")
+    earlier = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()}
+
+    def full(path: Path, data: bytes) -> None:
+        if data == b"<html> too large":
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        write_file(path, data)
+
+    monkeypatch.setattr("daemon.gap_files.write_file", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_gap(tmp_path / "out", named, gap_answer(named, 2.5), "<html> too large")
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == earlier
 
 
 # ---- the library -----------------------------------------------------------------------------------------------------

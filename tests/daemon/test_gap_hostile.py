@@ -64,6 +64,39 @@ def test_a_cell_that_no_machine_has_is_refused_with_its_place(tmp_path: Path, na
     assert not (tmp_path / "out").exists()
 
 
+def rows(columns: Table, count: int) -> Table:
+    return {name: cells[:count] for name, cells in columns.items()}
+
+
+OTHER_RIG = {"prism": ["tmac"], "q1_deg": ["1"], "x_mm": ["1"], "y_mm": ["1"], "z_mm": ["1"]}
+
+
+@pytest.mark.parametrize(
+    ("data", "holdout", "expected", "words"),
+    [
+        (rows(table(5), 0), None, 2, "data.csv: no observations below the header"),
+        (rows(table(5), 3), None, 3, "3 different fixes are 9 coordinates, which cannot determine 56 parameters"),
+        ({name: cells * 20 for name, cells in rows(table(5), 1).items()}, None, 3, "cannot place the base"),
+        (table(20), OTHER_RIG, 2, "holdout.csv, line 1, column theta1_deg: column missing for rig 'swdt82'"),
+        (table(20), rows(table(5), 0), 2, "holdout.csv: no observations below the header"),
+        (
+            table(20),
+            table(5) | {"prism": ["q"] * 10},
+            2,
+            "holdout.csv, line 2, column prism: rig 'swdt82' has no prism",
+        ),
+        (table(20), table(5) | {"z_mm": [""] * 10}, 2, "holdout.csv, line 2, column z_mm: empty"),
+    ],
+)
+def test_a_file_that_allows_no_answer_is_refused_with_the_reason(
+    tmp_path: Path, data: Table, holdout: Table | None, expected: int, words: str
+) -> None:
+    status, answer = gap(tmp_path, data, holdout)
+    assert (status, set(answer)) == (expected, {"error", "kind"})
+    assert words in answer["error"]
+    assert not (tmp_path / "out").exists()
+
+
 def test_held_out_rows_of_an_unknown_setup_are_refused_with_what_to_do(tmp_path: Path) -> None:
     status, answer = gap(tmp_path, table(20), table(5, 6, "S2"))
     assert status == 3

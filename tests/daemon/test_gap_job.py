@@ -265,6 +265,19 @@ def test_status_says_verdict_next_measurements_and_drift(rig: JobRig) -> None:
     )
 
 
+def test_status_says_why_nothing_came_of_the_newest_session_until_something_does(rig: JobRig) -> None:
+    rig.session("a")
+    rig.plan(gap="fail")
+    rig.start()
+    rig.wait(lambda: rig.states() == ["failed", *["cancelled"] * 3])
+    assert lines(rig) == ["gap: nothing came of session a (job 1): the data are too poor"]
+    rig.plan()
+    rig.session("b")
+    rig.clock.advance(3.0)
+    rig.wait(lambda: rig.states()[4:] == ["done"] * 4)
+    assert lines(rig)[0] == "gap (none, after session b): they agree"
+
+
 def test_what_makes_no_sense_in_the_table_is_refused_by_the_store(rig: JobRig) -> None:
     with_live_model(rig)
     row = {"live_since": 1, "session_id": "a", "fixes": 1, "standstills": 1, "upper": 0.0, "lower": 0.0}

@@ -129,6 +129,7 @@ def test_a_failed_job_cancels_those_that_wait_for_it_and_says_why(rig: JobRig) -
     rig.start()
     rig.wait_for("done", "failed", "cancelled", "cancelled")
     assert [job["error"] for job in rig.jobs()] == [None, "the data are too poor", *["job 2 before it is failed"] * 2]
+    assert {job["message"] for job in rig.jobs()} == {""}, "what an ended job was doing is no news"
 
 
 @pytest.mark.parametrize(("kind", "other"), [("report", "comparison"), ("comparison", "report")])

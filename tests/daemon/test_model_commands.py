@@ -20,7 +20,7 @@ from daemon.cli.main import main
 from daemon.composition import decoders, live
 from daemon.config import Config, ConfigError, parse_config
 from daemon.control import ControlServer
-from daemon.modelfiles import read_model
+from daemon.modelfiles import read_model, write_model
 from daemon.rigs import load_rig
 from daemon.service import tip_sender
 from drivers.errors import TransmitForbiddenError
@@ -70,6 +70,26 @@ def test_an_exported_model_gives_the_models_corrections_without_rigcal(tmp_path:
     size = np.linalg.norm(table.reshape(-1, 3), axis=1)
     assert np.sqrt((off**2).mean()) < 0.25 * np.sqrt((size**2).mean())
     assert off.max() < 2.0 * told["max_mm"]
+    assert told["warnings"] == []
+
+
+def test_a_grid_too_coarse_to_mend_much_is_exported_with_a_warning(tmp_path: Path) -> None:
+    """A prism beside its place is the same correction in every pose, turned with the boom: straight lines miss it."""
+    model = read_model(written(30))
+    values = model.nominal_values.copy()
+    values[model.chain.index("prism.r.x")] += 10.0
+    write_model(tmp_path / "turned", replace(model, values=values))
+    command = ("model", "export", "--model", str(tmp_path / "turned"), "--out", str(tmp_path / "x"), "--prism", "r")
+    command = (*command, "--rows", "512")
+    done = CliRunner().invoke(main, [*command, "--json"])
+    assert done.exit_code == 0, done.stderr
+    told = json.loads(done.stdout)
+    grid = json.loads((tmp_path / "x" / "calibration.json").read_text(encoding="utf-8"))["grid"]
+    assert grid["rms_mm"] > 0.5 * grid["correction_rms_mm"]
+    assert [text.partition(" mm RMS")[0] for text in told["warnings"]] == [
+        f"between the nodes of corrections.csv, interpolated corrections are wrong by {grid['rms_mm']:.2g}"
+    ]
+    assert f"Warning: {told['warnings'][0]}" in CliRunner().invoke(main, command).stderr
 
 
 def _multilinear(axes: list[np.ndarray], table: np.ndarray, pose: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.numba_cache import prepare
+from daemon.numba_cache import is_compiled, prepare
 
 
 def test_a_directory_the_user_set_is_kept(tmp_path: Path) -> None:
@@ -41,3 +41,12 @@ def test_a_temporary_directory_that_others_can_write_is_not_trusted(
     first = prepare({}).parent
     first.chmod(0o777)
     assert prepare({}).parent != first
+
+
+def test_what_was_compiled_before_is_found(tmp_path: Path) -> None:
+    environ = {"XDG_CACHE_HOME": str(tmp_path)}
+    assert not is_compiled(environ)
+    place = tmp_path / "rigcal" / "numba" / "kernels_1"
+    place.mkdir(parents=True)
+    (place / "loops.nbi").write_bytes(b"")
+    assert is_compiled(environ)

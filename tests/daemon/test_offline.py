@@ -98,7 +98,7 @@ def test_evaluate_prints_every_stage_for_people(work: Path) -> None:
     result = run("evaluate", "--model", work / "model", "--data", work / "test.csv")
     assert result.exit_code == 0
     told = " ".join(result.stdout.split())  # where lines end depends on the numbers in them
-    for text in (*STAGES, "tmac", "noise", "lightgbm", "parameters determined", "Not determined"):
+    for text in (*STAGES, "tmac", "scatter of a fix", "lightgbm", "parameters determined", "Not determined"):
         assert text in told
 
 

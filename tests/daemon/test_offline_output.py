@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from click.testing import CliRunner
 from calibration.errors import CalibrationError, DataError, ModelError, RigError, UnsafeError
 from calibration.rig import shipped_rig
 from daemon.cli.offline import read_observations
-from daemon.cli.output import Command, json_option
+from daemon.cli.output import Command, json_option, progress_display
 from daemon.files import write_file
 from daemon.rigs import load_rig
 
@@ -70,6 +71,24 @@ def test_json_is_alone_on_standard_output_and_knows_no_nan() -> None:
     assert result.exit_code == 0
     assert json.loads(result.stdout) == {"number": 7, "nothing": None, "list": [1.5, None]}
     assert result.stderr == "a library talks\n"
+
+
+def test_long_work_tells_on_standard_error_what_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    told = threading.Event()
+
+    def echo(text: str, *, err: bool) -> None:
+        assert err, "standard output is for the result"
+        said.append(text)
+        if "fitting" in text:
+            told.set()
+
+    monkeypatch.setattr("daemon.cli.output.LINE_S", 0.01)
+    monkeypatch.setattr("daemon.cli.output.click.echo", echo)
+    with progress_display(as_json=True) as progress:
+        progress(0.5, "fitting")
+        assert told.wait(60.0)
+    assert said[-1].endswith("s: fitting (50%)")
 
 
 def test_traceback_is_shown_only_on_request(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ import sqlite3
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 from sqlite_utils import Database
@@ -68,7 +69,7 @@ def test_a_candidate_is_compared_on_check_sessions_then_accepted_and_loaded(rig:
     assert loaded.id == model
     shown = rig.registry.show_command({})
     assert [(h["state"], h["operator"]) for h in shown["history"]] == [("candidate", ""), ("live", "Ada")]
-    assert shown["history"][-1]["reason"].startswith("accepted: on 8 held-out fixes of 4 standstills it errs by")
+    assert shown["history"][-1]["reason"].startswith("accepted: on 8 held-out fixes of 4 standstills its error is")
 
 
 def test_a_candidate_that_is_not_better_than_the_live_model_is_refused(rig: ModelRig) -> None:
@@ -411,3 +412,27 @@ def test_a_change_in_the_midst_of_loading_is_not_overwritten_by_what_was_looked_
         table.nod.set()
         live.stop()
         jobs.close()
+
+
+def test_a_load_that_a_stop_cuts_short_is_no_defect_of_the_model(
+    rig: ModelRig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    rig.accepted()
+    live = LiveModel(rig.models, SOURCE.rig)
+    loads, stopped = threading.Event(), threading.Event()
+
+    def cut_short(_row: ModelRow) -> NoReturn:
+        loads.set()
+        assert stopped.wait(60.0)
+        raise ModelError("the process that loads it was ended")
+
+    monkeypatch.setattr(live, "load", cut_short)
+    monkeypatch.setattr("daemon.live_model.STOP_TIMEOUT_S", 0.0)
+    live.start()
+    assert loads.wait(60.0)
+    caplog.clear()
+    live.stop()
+    stopped.set()
+    live._thread.join()
+    assert not caplog.records
+    assert live.now() == Missing("the live model is being loaded")
