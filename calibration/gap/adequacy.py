@@ -1,8 +1,8 @@
 """Whether named effects explain what was to be explained: a name for a part of something else is a wrong name.
 
 Beside what the noise explains the kinematics alone leave a gap, and effects must close it. What the noise explains is
-known from the station and the rig file only as far as both tell the truth: encoders often read in coarser steps than
-their file says, which the readings themselves show, and sigmas are rarely right to better than a tenth.
+known from the station and the rig file only as far as both tell the truth: sigmas are rarely right to better than a
+tenth.
 """
 
 from __future__ import annotations
@@ -18,17 +18,12 @@ from calibration.gap.projection import Projection, Softly
 from calibration.gap.terms import modulations
 from calibration.gap.variables import Place, Variables
 from calibration.identification.samples import reading_covariance
-from calibration.observations import Floats
-from calibration.rig import Rig
 
 _CLOSED = 0.8  # of the gap, at least
 _LEFT = 0.05  # of what an effect explains together with what is left of it, at most
 _HIGH = 6.0  # standard errors of the variance that the gap must have to be judged
 _MISJUDGED = 0.1  # share by which a sigma may be off
 _FAR_MISJUDGED = 0.5  # the same where nothing says that it is anything but noise
-_STEP_OFF = 0.02  # of a step, by which readings in steps may be off whole ones
-_IN_STEPS = 0.98  # of the readings
-_LEAST_VALUES = 8
 
 
 def closes(first: Projection, last: Projection, *, is_structured: bool) -> bool:
@@ -42,7 +37,7 @@ def closes(first: Projection, last: Projection, *, is_structured: bool) -> bool:
     """
     noise = _noise_mm2(last)
     misjudged = _MISJUDGED if is_structured else _FAR_MISJUDGED
-    allowed = noise * ((1.0 + misjudged) ** 2 - 1.0) + _step_mm2(last)
+    allowed = noise * ((1.0 + misjudged) ** 2 - 1.0)
     gap, left = first.fit.excess_variance - allowed, last.fit.excess_variance - allowed
     standard_error = (noise + allowed) * math.sqrt(2.0 / (3.0 * float(last.fit.weight.sum())))
     return gap < _HIGH * standard_error or left < (1.0 - _CLOSED) * gap + standard_error
@@ -78,27 +73,3 @@ def _noise_mm2(projection: Projection) -> float:
     station = float(np.trace(samples.station_covariance, axis1=1, axis2=2).mean())
     readings = reading_covariance(rig, projection.joint_jacobian, samples.rates)
     return (station + float(np.trace(readings, axis1=1, axis2=2).mean())) / 3.0
-
-
-def _step_mm2(projection: Projection) -> float:
-    """Variance, mean over the axes, by readings in coarser steps than the rig file has."""
-    rig, joints = projection.situation.rig, projection.situation.observations.joints
-    steps = np.array([step_of(joints[joint.name]) for joint in rig.joints])
-    coarser = np.maximum(steps**2 - _resolutions(rig) ** 2, 0.0) / 12.0
-    return float(((projection.joint_jacobian**2).sum(axis=1) @ coarser).mean()) / 3.0
-
-
-def _resolutions(rig: Rig) -> Floats:
-    return np.array([joint.resolution for joint in rig.joints])
-
-
-def step_of(readings: Floats) -> float:
-    """The step in which a joint's readings (n,) come; 0 where they come in none that is seen."""
-    values = np.unique(readings)
-    if len(values) < _LEAST_VALUES:
-        return 0.0
-    between = np.diff(values)
-    step = float(between[between > _STEP_OFF * np.median(between)].min())
-    whole = (readings - values[0]) / step
-    off = np.abs(whole - np.rint(whole))
-    return step if float((off < _STEP_OFF).mean()) >= _IN_STEPS else 0.0

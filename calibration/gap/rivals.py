@@ -14,8 +14,8 @@ from calibration.gap.grammar import Found as Formula
 from calibration.gap.projection import Projection
 from calibration.gap.screen import Place, Screen, Weighed
 
-_ODDS = math.log(999.0)  # that something is there
-_CHANCE = 0.003  # of anything at all, corrected for all that was looked at
+_ODDS, _FURTHER_ODDS = math.log(99.0), math.log(999.0)  # that something is there, and something more beside that
+_CHANCE, _FURTHER_CHANCE = 0.01, 0.003  # of anything at all, corrected for all that was looked at, and of more
 NEAR = 5.0  # in log evidence: families this near are not told apart
 PLAIN = 100.0  # log evidence of what no half of the data can miss, where no rival comes near
 _POSSIBLE = 0.02  # posterior of a rival
@@ -54,10 +54,18 @@ def together(screen: Screen, chosen: Mapping[int, tuple[int, float]]) -> float:
     return screen.log_bayes_factor(options, [scale for _, scale in chosen.values()])
 
 
-def stands_out(weighed: Sequence[Weighed], looks: int) -> bool:
-    """Whether anything is there: by the evidence of all together, and by the chance of the most striking."""
+def stands_out(weighed: Sequence[Weighed], looks: int, *, beside: bool) -> bool:
+    """Whether anything is there: by the evidence of all together, and by the chance of the most striking.
+
+    Args:
+        weighed: all places.
+        looks: how many were looked at.
+        beside: whether something is adopted already: every further look is another chance, and what does not quite fit
+            leaves traces that look like other effects.
+    """
     best = max(w.log_bayes_factor + w.place.log_prior for w in weighed)
-    return best > _ODDS and min(w.p for w in weighed) * looks < _CHANCE
+    odds, chance = (_FURTHER_ODDS, _FURTHER_CHANCE) if beside else (_ODDS, _CHANCE)
+    return best > odds and min(w.p for w in weighed) * looks < chance
 
 
 def stands_for(weighed: Weighed, formula: Formula, over: Projection) -> bool:

@@ -10,16 +10,13 @@ import numpy as np
 from calibration.effects.base import Situation
 from calibration.effects.fitted import Choice
 from calibration.gap.adequacy import closes, depends
-from calibration.gap.adopt import (
-    Adopted,
-    JointFit,
-    adopted,
-)
+from calibration.gap.adopt import Adopted, JointFit, adopted, joint_fit
 from calibration.gap.detect import detect
 from calibration.gap.grammar import Found as Formula
 from calibration.gap.grammar import Grammar
 from calibration.gap.problem import OUTLIER, Problem, far_off
 from calibration.gap.projection import Projection
+from calibration.gap.reading_steps import in_true_steps
 from calibration.gap.screen import Place, Possible, Weighed, possible
 from calibration.gap.settle import settled
 from calibration.gap.turn import decide
@@ -312,4 +309,12 @@ def search(
         prior: as the solution was found with.
         seed: of half-samples and folds.
     """
-    return _Search(Problem(solution, observations, prior, seed), families).run()
+    seen = in_true_steps(solution, observations, prior)
+    found = _Search(Problem(seen, observations, prior, seed), families).run()
+    if seen is solution:
+        return found
+    # A model counts the noise of readings as its rig file has it, and what is beyond that as scatter.
+    if not found.joint.choices:
+        return replace(found, adopted=Adopted(solution, solution.fit, reason=found.adopted.reason))
+    joint = joint_fit(solution, observations, found.joint.choices, prior, found.joint.fit.x)
+    return replace(found, adopted=adopted(solution, joint, found.adopted.reason))

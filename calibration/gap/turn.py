@@ -80,13 +80,13 @@ def decide(problem: Problem, joint: JointFit, projection: Projection, places: Se
         places: where something may be missing.
     """
     reasons: dict[str, str] = {}
-    first = Screen(projection, places)
+    first, is_further = Screen(projection, places), bool(joint.choices)
     while True:
         weighed = first.weigh(without=reasons)
-        if not weighed or not stands_out(weighed, len(weighed)):
+        if not weighed or not stands_out(weighed, len(weighed), beside=is_further):
             return Decision("nothing", weighed, by_family(weighed), reasons=reasons)
         screen, weighed, tried = _sharpened(problem, joint, projection, with_a_chance(weighed), weighed[0])
-        if not stands_out(weighed, len(places)):
+        if not stands_out(weighed, len(places), beside=is_further):
             # What stood out was the tail of fixes that the fit now takes for outliers.
             return Decision("nothing", weighed, by_family(weighed), reasons=reasons)
         leading = weighed[0]

@@ -10,8 +10,8 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from calibration.effects.library import library
-from calibration.gap.adequacy import step_of
 from calibration.gap.projection import Softly, log_bayes_factor, without_folds
+from calibration.gap.reading_steps import step_of
 from calibration.gap.result import Gap
 from calibration.gap.workflow import find_gap
 from calibration.observations import parse_observations
@@ -169,3 +169,12 @@ def test_the_step_of_an_encoder_is_seen_in_its_readings() -> None:
     assert step_of(np.rint(angles / 0.1) * 0.1) == pytest.approx(0.1, rel=1e-6)
     assert step_of(angles) == 0.0
     assert step_of(np.repeat([1.0, 2.0, 3.0], 10)) == 0.0
+
+
+def test_an_encoder_that_reads_in_coarser_steps_than_its_file_says_hides_less_when_its_steps_are_known() -> None:
+    """As noise of one size along all axes, 0.1 deg at eight metres would drown an error along the boom."""
+    drawn = draw(SOURCE.rig, Cell("single", ("transducer_scale",), 0.5, "wide", "coarse", 370009))
+    assert drawn is not None
+    gap = find_gap(SOURCE.rig, SOURCE.text, parse_observations(drawn.train.encode(), SOURCE.rig, "case.csv"))
+    assert {(effect.family, effect.where) for effect in gap.effects} == hidden(drawn)
+    assert gap.model.rig == SOURCE.rig

@@ -125,7 +125,7 @@ def test_the_start_stands_beside_a_fifth_of_gross_outliers(session: Session) -> 
 
 @pytest.mark.parametrize(
     ("rows", "message"),
-    [([0, 1], "2 fixes cannot place the base"), ([4, 4, 4], "1 fixes cannot place the base")],
+    [([0, 1], "2 fixes cannot place the base"), ([4, 4, 4], "1 fix cannot place the base")],
     ids=["two fixes", "one fix copied"],
 )
 def test_a_base_that_fixes_cannot_place_is_refused(session: Session, rows: list[int], message: str) -> None:
