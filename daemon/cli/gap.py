@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -128,13 +129,13 @@ def _effect_table(found: Gap) -> Table:
     for name in ("effect", "where", "coefficient", "value", "95 % interval", "unit"):
         table.add_column(name, justify="right" if name in ("value", "95 % interval") else "left", no_wrap=True)
     for effect in found.effects:
-        head = [effect.family, effect.where]
+        heads = [(effect.family, effect.where), *([(f"  {effect.form}", "")] if effect.form else [])]
+        rows = []
         for c in effect.reported:
             half = _INTERVAL * c.standard_error
-            table.add_row(*head, c.name, f"{c.value:.4g}", f"\N{PLUS-MINUS SIGN} {half:.2g}", c.unit)
-            head = [f"  {effect.form}" if head[0] and effect.form else "", ""]
-        if head[0].startswith("  "):
-            table.add_row(*head, "", "", "", "")
+            rows.append((c.name, f"{c.value:.4g}", f"\N{PLUS-MINUS SIGN} {half:.2g}", c.unit))
+        for head, row in zip_longest(heads, rows, fillvalue=()):
+            table.add_row(*(head or ("", "")), *(row or ("",) * 4))
     return table
 
 

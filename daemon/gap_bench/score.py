@@ -108,16 +108,16 @@ def _sets(single: Sequence[Trial], alias: Sequence[Trial]) -> Iterable[Score]:
     sizes = [len(t.reported_set) for t in (*reported, *alias) if t.reported_set]
     yield _figure("families in a set, mean", sizes, np.mean)
     yield _share("exact aliases: set with the truth and its alias", alias, _alias_told, least=0.99)
-    measured = [t for t in reported if t.measured is not None]
-    yield _share(
-        "set resolved after 20 proposed poses",
-        measured,
-        lambda t: t.is_resolved,
-        least=0.80,
-    )
-    promised = [t for t in measured if t.is_promised]
-    yield _share("  where the poses were expected to resolve it", promised, lambda t: t.is_resolved)
+    measured = [t for t in (*reported, *alias) if t.measured is not None]
+    yield _share("set resolved after 20 proposed poses", measured, _resolved, least=0.80)
+    yield _share("  of a single effect", [t for t in measured if t.kind == "single"], _resolved)
+    yield _share("  of exact aliases", [t for t in measured if t.kind == "alias"], _resolved)
+    yield _share("  where the poses were expected to resolve it", [t for t in measured if t.is_promised], _resolved)
     yield _share("  sets that 20 poses were not expected to resolve", measured, lambda t: not t.is_promised)
+
+
+def _resolved(trial: Trial) -> bool:
+    return trial.is_resolved
 
 
 def _alias_told(trial: Trial) -> bool:
