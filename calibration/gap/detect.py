@@ -64,7 +64,8 @@ def detect(grammar: Grammar, rng: np.random.Generator) -> Detection:
         return Detection(1.0, ())
     groups = len(grammar.by_group)
     signs = 2.0 * rng.integers(0, 2, (_DRAWS, groups)) - 1.0
-    scores, chance = np.abs(grammar.score), np.abs(signs @ grammar.by_group) * _lost(grammar)
+    lost = _lost(grammar)
+    scores, chance = np.abs(grammar.score), np.abs(signs @ grammar.by_group) * lost
     kinds = np.array([term.kind for term in grammar.terms])
     p = np.ones(len(scores))
     for kind, share in _LARGEST.items():
@@ -84,7 +85,7 @@ def detect(grammar: Grammar, rng: np.random.Generator) -> Detection:
     if alarm < _ALARM:
         return Detection(alarm, tuple(listed.values()))
     for along in neighbours(grammar.projection, rng, _DRAWS):  # for what no term has words for
-        alike = max(_of_sum(along.shared, along.chance * _lost(grammar) ** 2) / _NEIGHBOURS, least)
+        alike = max(_of_sum(along.shared, along.chance * lost**2) / _NEIGHBOURS, least)
         alarm = min(alarm, alike)
         if alike < _LISTED:
             listed.setdefault((along.where, along.variable), Disagreement(along.where, along.variable, alike))

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.effects.base import Situation
 from calibration.effects.fitted import Choice
 from calibration.gap.adopt import JointFit, joint_fit, projected
 from calibration.gap.projection import Projection
@@ -43,19 +43,21 @@ class Problem:
         """Kinematics with effects, from a start as `joint_fit` takes it."""
         return joint_fit(self.solution, self.observations, choices, self.prior, start)
 
+    def alone(self) -> JointFit:
+        """The kinematics alone."""
+        chain, fit = self.solution.chain, self.solution.fit
+        return JointFit(Situation(chain, fit.x[: len(chain)], self.observations), (), (), fit)
+
+    def counted(self, joint: JointFit) -> JointFit:
+        """A fit in which outliers count that are not far off: what it lacks may show in a few samples only."""
+        weight, size = joint.fit.weight, np.linalg.norm(joint.error_mm(self.solution), axis=1)
+        far_off = (weight < OUTLIER) & (size > _GROSS * np.median(size))
+        return replace(joint, fit=replace(joint.fit, weight=np.where(far_off, weight, 1.0)))
+
     def open(self, joint: JointFit) -> Projection:
-        """About a fit, for what it lacks, which may show in a few fixes only: those that are not far off all count."""
-        off = far_off(joint.error_mm(self.solution), joint.fit.weight)
-        counted = replace(joint.fit, weight=np.where(off, joint.fit.weight, 1.0))
-        return self.project(replace(joint, fit=counted))
+        """About a fit, for what it lacks."""
+        return self.project(self.counted(joint))
 
     def project(self, joint: JointFit, *, without_last: bool = False) -> Projection:
         """About a fit; its last effect is no part of what is taken out, if so asked."""
         return projected(self.solution, joint, without_last=without_last)
-
-
-def far_off(error_mm: Floats, weight: Floats) -> NDArray[np.bool_]:
-    """(m,) samples that are far off, by errors (m, 3) and what they count (m,)."""
-    size = np.linalg.norm(error_mm, axis=1)
-    off: NDArray[np.bool_] = (weight < OUTLIER) & (size > _GROSS * np.median(size))
-    return off

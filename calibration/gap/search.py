@@ -7,20 +7,19 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calibration.effects.base import Situation
 from calibration.effects.fitted import Choice
 from calibration.gap.adequacy import closes, depends
 from calibration.gap.adopt import Adopted, JointFit, adopted, joint_fit
 from calibration.gap.detect import detect
 from calibration.gap.grammar import Found as Formula
 from calibration.gap.grammar import Grammar
-from calibration.gap.problem import OUTLIER, Problem, far_off
+from calibration.gap.problem import OUTLIER, Problem
 from calibration.gap.projection import Projection
 from calibration.gap.reading_steps import in_true_steps
 from calibration.gap.screen import Place, Possible, Weighed, possible
 from calibration.gap.settle import settled
 from calibration.gap.turn import decide
-from calibration.identification.refinement import Fit, Prior
+from calibration.identification.refinement import Prior
 from calibration.identification.solve import Solution
 from calibration.observations import Observations
 
@@ -90,15 +89,12 @@ class _Search:
         those after a step, or where a load has changed its side. Of both searches the one counts whose effects leave
         fewer outliers over.
         """
-        fit = self.problem.solution.fit
-        error_mm = self.problem.solution.samples.position_mm - self.problem.solution.chain.positions_mm(
-            fit.x, self.problem.solution.samples.data
-        )
-        off = far_off(error_mm, fit.weight)
-        found = self._run(replace(fit, weight=np.where(off, fit.weight, 1.0)))
-        if off.mean() < _MANY:
+        counted = self.problem.counted(self.problem.alone())
+        weight = counted.fit.weight
+        found = self._run(counted)
+        if (weight < OUTLIER).mean() < _MANY:
             return found
-        with_all = self._run(replace(fit, weight=np.ones(len(off))))
+        with_all = self._run(replace(counted, fit=replace(counted.fit, weight=np.ones_like(weight))))
         return with_all if with_all.joint.choices and self._outliers(with_all) < self._outliers(found) else found
 
     def _outliers(self, found: Found) -> int:
@@ -106,13 +102,11 @@ class _Search:
         fit = found.joint.fit if found.joint.choices else self.problem.solution.fit
         return int((fit.weight < OUTLIER).sum())
 
-    def _run(self, fit: Fit) -> Found:
-        solution = self.problem.solution
-        situation = Situation(solution.chain, fit.x[: len(solution.chain)], self.problem.observations)
-        joint = JointFit(situation, (), (), fit)
+    def _run(self, joint: JointFit) -> Found:
+        """The search from a fit of the kinematics alone, whose weights are those of the first turn."""
         projection = self.problem.project(joint)
         alone = Turn(joint, projection, (), {}, ())
-        first = possible(situation, projection, self.families)
+        first = possible(joint.situation, projection, self.families)
         turns: list[Turn] = []
         certain: dict[str, float] = {}
         pending: list[str] = []

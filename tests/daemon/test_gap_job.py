@@ -2,7 +2,6 @@
 
 import json
 import sqlite3
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,19 +23,6 @@ from tests.daemon.job_support import SOURCE, JobRig
 from tests.daemon.model_support import written
 
 LOOSE = "backlash@theta4:width_rad=3e-3"
-
-
-@pytest.fixture(autouse=True)
-def _often(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The scheduler looks what is due ten times as often as in a daemon, so that tests need not wait for it."""
-    monkeypatch.setattr("daemon.jobs.POLL_S", 0.05)
-
-
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[JobRig]:
-    rig = JobRig(tmp_path)
-    yield rig
-    rig.close()
 
 
 def with_live_model(rig: JobRig) -> ModelTable:

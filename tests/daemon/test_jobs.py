@@ -2,7 +2,6 @@
 
 import itertools
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,19 +20,6 @@ from daemon.scheduler import CHAIN, next_job
 from daemon.store.migrations import MIGRATIONS
 from drivers.clock import NS_PER_S, Stamp
 from tests.daemon.job_support import JobRig, is_gone
-
-
-@pytest.fixture(autouse=True)
-def _often(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The scheduler looks what is due ten times as often as in a daemon, so that tests need not wait for it."""
-    monkeypatch.setattr("daemon.jobs.POLL_S", 0.05)
-
-
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[JobRig]:
-    rig = JobRig(tmp_path)
-    yield rig
-    rig.close()
 
 
 def table(rig: JobRig) -> JobTable:
