@@ -24,7 +24,7 @@ Integers = NDArray[np.intp]
 
 X, Y, Z = 0, 1, 2
 _ANGLES: frozenset[RowParameter] = frozenset({"alpha", "theta", "beta"})
-_ROW_ORDER: Mapping[Convention, tuple[tuple[RowParameter, int], ...]] = {
+ROW_ORDER: Mapping[Convention, tuple[tuple[RowParameter, int], ...]] = {
     "mdh_beta_after": (("a", X), ("alpha", X), ("d", Z), ("theta", Z), ("beta", Y)),
     "mdh_beta_before": (("alpha", X), ("a", X), ("beta", Y), ("b", Y), ("theta", Z), ("d", Z)),
     "dh": (("theta", Z), ("d", Z), ("a", X), ("alpha", X), ("beta", Y)),
@@ -214,7 +214,7 @@ class Chain:
                 yield Op(True, axis, math.radians(angle))
         tolerances = self.rig.tolerances
         joints = self.rig.joint_names
-        for constant, axis in _ROW_ORDER[self.rig.convention]:
+        for constant, axis in ROW_ORDER[self.rig.convention]:
             angle_like = constant in _ANGLES
             nominal = getattr(row, f"{constant}_deg" if angle_like else f"{constant}_mm")
             scale = math.radians(1.0) if angle_like else 1.0

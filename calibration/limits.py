@@ -14,6 +14,7 @@ Flags = NDArray[np.bool_]
 
 _TURN_DEG = 360.0
 _SLACK = 0.05  # of a joint's range: a zero or a limit of the file may be off by so much
+_IMMOBILE = 0.01  # of the same: less is no motion
 
 
 def turns_deg(rig: Rig) -> Floats:
@@ -55,3 +56,8 @@ def beyond_limits(joint: Joint, values: Floats, share: float) -> Flags:
     low, high = joint.limits
     margin = share * (high - low)
     return np.asarray((values < low - margin) | (values > high + margin))
+
+
+def never_moved(joint: Joint, low: float, high: float) -> bool:
+    """Whether readings from `low` to `high`, deg or mm, are of a joint that stood still."""
+    return high - low < _IMMOBILE * (joint.limits[1] - joint.limits[0])

@@ -238,6 +238,8 @@ def _check_header(header: list[str], rig: Rig, source: str, positions_required: 
         raise DataError(source, "column appears twice", 1, doubled[0])
     needed = ["prism", *(j.column for j in rig.joints), *(POSITION_COLUMNS if positions_required else ())]
     missing = [name for name in needed if name not in header]
+    if len(header) == 1 and len(missing) == len(needed):
+        raise DataError(source, "one column only: separate columns by commas, and write decimals with a point", 1)
     if missing:
         raise DataError(source, f"column missing for rig {rig.name!r}; needed: {', '.join(needed)}", 1, missing[0])
 

@@ -6,12 +6,14 @@ after row i. Files keep degrees and mm, and so does this description.
 
 from __future__ import annotations
 
+import math
+import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib import resources
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from calibration.channels import Channel
 from calibration.errors import RigError
@@ -22,6 +24,8 @@ Driven = Literal["theta", "d", "a"]
 Convention = Literal["mdh_beta_after", "mdh_beta_before", "dh"]
 
 BEYOND_BUILDING = 4.0  # build tolerances: no correction by building alone is larger
+_NEARLY_PARALLEL = math.cos(math.radians(15.0))  # beyond it the other constants turn an axis within their tolerances
+_COORDINATE = re.compile(r"(sigma_)?[xyz](_pred)?_mm")  # columns of a fix and of its prediction
 
 
 class _Part(BaseModel):
@@ -65,6 +69,12 @@ class Joint(_Part):
             raise ValueError(f"limits must rise, got {self.limits[0]} .. {self.limits[1]}")
         return self
 
+    @model_validator(mode="after")
+    def _column_of_its_own(self) -> Joint:
+        if _COORDINATE.fullmatch(self.column):
+            raise ValueError(f"no joint can be called {self.name!r}: its column {self.column} is one of the fix's")
+        return self
+
 
 class FixedTransform(_Part):
     """A constant transform before a row: Trans(x,y,z) Rot(z) Rot(y) Rot(x), applied in that order."""
@@ -89,7 +99,8 @@ class Row(_Part):
     Attributes:
         alpha_deg, a_mm, d_mm, theta_deg, beta_deg, b_mm: constants of the row.
         drive: for `theta`, `d` or `a`: which joints move it, as a linear combination {joint: coefficient}.
-        identify: which of the row's constants calibration may correct.
+        identify: which of the row's constants calibration may correct; in a rig, a row that says nothing also has beta
+            where it alone can tilt an axis: where that is nearly parallel to the next.
         before: a fixed transform between the previous frame and this row.
         after: the frame that this row continues from, where it is not the one before it: rows may branch as a tree.
     """
@@ -190,6 +201,17 @@ class Rig(_Part):
     tolerances: Tolerances
     station: Station = Station()
 
+    @field_validator("rows")
+    @classmethod
+    def _beta_where_axes_are_parallel(cls, rows: tuple[Row, ...], info: ValidationInfo) -> tuple[Row, ...]:
+        tilting = _tilting_rows(rows, info.data["convention"]) if "convention" in info.data else set()
+        return tuple(
+            row.model_copy(update={"identify": (*row.identify, "beta")})
+            if number in tilting and "identify" not in row.model_fields_set
+            else row
+            for number, row in enumerate(rows, 1)
+        )
+
     @model_validator(mode="after")
     def _names_differ(self) -> Rig:
         for what, names in (
@@ -252,8 +274,7 @@ class Rig(_Part):
         numbers: list[int] = []
         while frame > 0:
             numbers.append(frame)
-            after = self.rows[frame - 1].after
-            frame = frame - 1 if after is None else after
+            frame = _continues_from(self.rows, frame)
         return tuple(reversed(numbers))
 
     def joint(self, name: str) -> Joint:
@@ -273,6 +294,40 @@ class Rig(_Part):
     def prism_names(self) -> tuple[str, ...]:
         """Names of the prisms, in file order."""
         return tuple(p.name for p in self.prisms)
+
+
+def _continues_from(rows: Sequence[Row], number: int) -> int:
+    after = rows[number - 1].after
+    return number - 1 if after is None else after
+
+
+def _tilting_rows(rows: Sequence[Row], convention: Convention) -> set[int]:
+    """Numbers of the rows whose beta tilts a row's axis against a nearly parallel one, that of the row it continues."""
+    tilting = set()
+    for number, row in enumerate(rows, 1):
+        before = _continues_from(rows, number)
+        if not 0 < before < number:
+            continue
+        last, fixed = rows[before - 1], row.before or FixedTransform()
+        mount = (("z", fixed.rz_deg), ("y", fixed.ry_deg), ("x", fixed.rx_deg))
+        between, tilts = {
+            "dh": ((("x", last.alpha_deg), ("y", last.beta_deg), *mount), before),
+            "mdh_beta_after": ((("y", last.beta_deg), *mount, ("x", row.alpha_deg)), before),
+            "mdh_beta_before": ((*mount, ("x", row.alpha_deg), ("y", row.beta_deg)), number),
+        }[convention]
+        if abs(_cosine_between_axes(between)) > _NEARLY_PARALLEL:
+            tilting.add(tilts)
+    return tilting
+
+
+def _cosine_between_axes(turns: Sequence[tuple[str, float]]) -> float:
+    """Of the angle between z before and after turns about x, y or z by so many degrees."""
+    axis = {"x": 0.0, "y": 0.0, "z": 1.0}
+    for about, angle_deg in reversed(turns):
+        u, v = {"x": ("y", "z"), "y": ("z", "x"), "z": ("x", "y")}[about]
+        c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+        axis[u], axis[v] = c * axis[u] - s * axis[v], s * axis[u] + c * axis[v]
+    return axis["z"]
 
 
 def parse_rig(text: str, source: str) -> Rig:

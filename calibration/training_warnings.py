@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+from calibration.effects.library import library
 from calibration.identification.solve import Solution
-from calibration.limits import beyond_limits
+from calibration.limits import beyond_limits, never_moved
 from calibration.model import CalibratedModel
 from calibration.observations import Observations
 from calibration.rig import BEYOND_BUILDING
@@ -14,8 +15,7 @@ from calibration.rig import BEYOND_BUILDING
 _LISTED = 10
 _BADLY = 0.3  # of what build tolerances explain
 _FAR_RAD = math.radians(10.0)
-_IMMOBILE = 0.01  # of the span between a joint's limits
-_BEYOND_LIMITS = 0.05  # of the same
+_BEYOND_LIMITS = 0.05  # of the span between a joint's limits
 _TOO_SMALL = 0.3  # of the expected scatter
 _FEW_FIXES = 6
 
@@ -66,7 +66,7 @@ def _of_coverage(model: CalibratedModel, observations: Observations) -> Iterator
             yield f"prism {prism!r} has no fixes; its offset stays at its nominal value"
     for joint in model.rig.joints:
         low, high = model.coverage.ranges[joint.name]
-        if high - low < _IMMOBILE * (joint.limits[1] - joint.limits[0]):
+        if never_moved(joint, low, high):
             yield (
                 f"{joint.name} never moved ({low:.2f} .. {high:.2f} {joint.unit}); "
                 f"what only its motion shows stays at its prior"
@@ -101,6 +101,12 @@ def _of_result(model: CalibratedModel) -> Iterator[str]:
             yield (
                 f"joint_compliance@{effect.where} is negative: {effect.where}_Nm seems to be the torque that holds the "
                 f"load, not the load; the model takes it so"
+            )
+        weighed = model.rig.masses or effect.where in model.coverage.torques
+        if "joint_compliance" in library()[effect.family].confused_with and not weighed:
+            yield (
+                f"{effect.family}@{effect.where} may be a deflection under load, which nothing here tells: give masses "
+                f"in the rig file or measured torques in {effect.where}_Nm"
             )
     for parameter in model.parameters:
         if parameter.kind == "row" and parameter.unit == "rad" and abs(parameter.value) > _FAR_RAD:

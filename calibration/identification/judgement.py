@@ -12,6 +12,7 @@ from calibration.identification.refinement import Fit, Prior
 from calibration.identification.samples import Samples, reading_covariance
 from calibration.identification.start import rough_start
 from calibration.kinematics import Chain, Placement
+from calibration.limits import never_moved
 from calibration.observations import Floats, Observations, originals
 from calibration.rig import Rig
 
@@ -40,11 +41,17 @@ def rms_left_mm(chain: Chain, samples: Samples, x: Floats) -> float:
     return math.sqrt(float((error**2).sum(axis=1).mean()))
 
 
-def require_enough(rig: Rig, observations: Observations, samples: int | None = None) -> None:
-    """UnsafeError if there are fewer fixes, or `samples` different ones, than could determine the parameters."""
+def different_fixes(samples: Samples) -> int:
+    """How many samples differ in prism, set-up or readings: the same pose again lowers the noise and shows no more."""
+    data = samples.data
+    return len(np.unique(np.column_stack([data.prism, data.setup, data.readings]), axis=0))
+
+
+def require_enough(rig: Rig, observations: Observations, different: int | None = None) -> None:
+    """UnsafeError if there are fewer fixes, or fewer `different` ones, than could determine the parameters."""
     parameters = len(Chain(rig, {})) + 6 * len(set(observations.setup.tolist()))
     fixes = len(observations)
-    different = fixes if samples is None else samples
+    different = fixes if different is None else different
     if 3 * different < parameters:
         repeats = f", repeats counted once of {fixes}," if different < fixes else ""
         raise UnsafeError(
@@ -69,9 +76,10 @@ def doubts(observations: Observations, chain: Chain, samples: Samples) -> Iterat
             f"{len(copied)} of {len(observations)} rows are copies of earlier ones in every digit, the first in row "
             f"{copied[0] + 1}, and count once"
         )
-    if len(samples) < len(chain):
+    different = different_fixes(samples)
+    if different < len(chain):
         yield (
-            f"{len(samples)} different fixes are few for {len(chain)} parameters: much of the model rests on build "
+            f"{different} different fixes are few for {len(chain)} parameters: much of the model rests on build "
             f"tolerances alone; {_how_many(len(chain))}"
         )
 
@@ -91,20 +99,25 @@ def tilts(chain: Chain, fit: Fit) -> Iterator[str]:
             )
 
 
+def known_variance(chain: Chain, samples: Samples, fit: Fit) -> float:
+    """What station, readings and repeats account for on the average, mm^2 per axis."""
+    lin = chain.linearise(fit.x, samples.data)
+    known = samples.station_covariance + reading_covariance(chain.rig, lin.joint_jacobian, samples.rates)
+    return float(np.trace(known, axis1=1, axis2=2).mean()) / 3.0
+
+
 def at_the_noise(chain: Chain, samples: Samples, fit: Fit) -> bool:
     """Whether nothing is left for another optimum to explain.
 
     Errors at the size that station, readings and repeats account for are as good as any model's, and the corrections
     that led there are as large as the prior expects (its scale included): another optimum could only tie.
     """
-    lin = chain.linearise(fit.x, samples.data)
-    known = samples.station_covariance + reading_covariance(chain.rig, lin.joint_jacobian, samples.rates)
     tolerated = np.isfinite(chain.prior_sigma)
     pull = fit.x[tolerated] / (fit.prior_scale * chain.prior_sigma[tolerated])
     ordinary = float(pull @ pull) < len(pull) + _CHANCE * math.sqrt(2.0 * len(pull))
-    variance = float(np.trace(known, axis1=1, axis2=2).mean()) / 3.0
+    explained = fit.excess_variance < _NOISE**2 * known_variance(chain, samples, fit)
     discarded = float((fit.weight < 0.5).mean())
-    return ordinary and fit.excess_variance < _NOISE**2 * variance and discarded < _FEW and fit.settled
+    return ordinary and explained and discarded < _FEW and fit.settled
 
 
 def rms_tolerated_mm(chain: Chain, samples: Samples, nominal: Fit) -> float:
@@ -136,10 +149,17 @@ def refuse_foreign(chain: Chain, samples: Samples, fit: Fit, tolerated_mm: float
     left = math.sqrt(float(fit.weight @ (error**2).sum(axis=1) / fit.weight.sum()))
     if left > _FOREIGN * tolerated_mm:
         hint = "" if prior == "as-built" else "; if the nominal model is that far off, use --prior as-built"
+        still = [
+            joint.name
+            for joint, readings in zip(chain.rig.joints, samples.data.readings.T, strict=True)
+            if never_moved(joint, float(readings.min()), float(readings.max()))
+        ]
+        if still:
+            hint += f"; {', '.join(still)} never moved in these data: if the machine did, its encoder does not read"
         raise UnsafeError(
             f"after the fit the fixes are still {left:.0f} mm RMS off, outliers aside, where this rig's build "
-            f"tolerances explain {tolerated_mm:.0f} mm even before it: another rig's data, exchanged columns or other "
-            f"units{hint}"
+            f"tolerances explain {tolerated_mm:.0f} mm even before it: another rig's data, exchanged columns, a "
+            f"station that moved, or units, zeros of joints or a convention of rows other than the rig file has{hint}"
         )
 
 

@@ -11,10 +11,12 @@ import numpy as np
 from calibration.errors import UnsafeError
 from calibration.identification.additions import Additions
 from calibration.identification.approach import PRIOR_SCALE, approach
+from calibration.identification.held_fixed import held_fixed
 from calibration.identification.identifiability import Identifiability, identifiability
 from calibration.identification.judgement import (
     at_the_noise,
     beyond_assembly,
+    different_fixes,
     doubts,
     mean_error_mm,
     refuse_discarded,
@@ -113,7 +115,7 @@ def solve(
     progress(0.0, "placing the base")
     require_enough(rig, observations)
     chain, samples, start = place(rig, observations)
-    require_enough(rig, observations, len(samples))
+    require_enough(rig, observations, different_fixes(samples))
     warnings = list(doubts(observations, chain, samples))
     nominal = refine(chain, samples, start.x, free=np.isinf(chain.prior_sigma))
     progress(0.1, "refining")
@@ -151,6 +153,7 @@ def solve(
     warnings += tilts(chain, fit)
     refuse_foreign(chain, samples, fit, tolerated_mm, prior)
     refuse_discarded(rig, samples, fit, prior)
+    warnings += held_fixed(chain, samples, fit, prior)
     progress(0.9, "checking what the data determine")
     seen = identifiability(chain, samples, fit.x, fit.excess_variance)
     return Solution(chain, samples, nominal, fit, seen, search, tolerated_mm, tuple(warnings))

@@ -111,6 +111,15 @@ def _sizes(chain: Chain, samples: Samples, before: Supposition) -> Iterator[Supp
 
 
 def _signs_and_turns(rig: Rig, nothing: Supposition) -> Iterator[Supposition]:
+    turning = [joint.kind == "revolute" for joint in rig.joints]
+    if sum(turning) > 1:
+        yield replace(
+            nothing,
+            what="all angles run the other way",
+            remedy="reverse the sign of their coefficients in the rig file, or of their columns",
+            subjects=frozenset(joint.column for joint in rig.joints if joint.kind == "revolute"),
+            factor=tuple(-1.0 if turns else 1.0 for turns in turning),
+        )
     for i, joint in enumerate(rig.joints):
         yield replace(
             nothing,

@@ -87,6 +87,7 @@ def test_a_sign_that_parameters_could_stand_for_is_named_all_the_same(session: S
     ("change", "words"),
     [
         (scaled(q2=-1.0), "q2 runs the other way"),
+        (scaled(**{f"q{joint}": -1.0 for joint in range(1, 7)}), "all angles run the other way"),
         (scaled(q5=np.pi / 180.0), "q5_deg is in radians"),
         (lambda o: in_metres(in_radians(o)), "all angles are in radians and the positions in m"),
         (exchanged("q4", "q6"), "columns q4_deg and q6_deg are exchanged"),
@@ -142,6 +143,19 @@ def test_copied_rows_count_once_and_are_named(session: Session) -> None:
 
 def test_fewer_fixes_than_parameters_are_named(session: Session) -> None:
     model = identify(session.rig, rig_text("swdt82"), session.training.select(np.arange(30)))
+    assert any(w.startswith("30 different fixes are few for 56 parameters") for w in model.warnings)
+
+
+def test_an_encoder_that_does_not_read_is_named(session: Session) -> None:
+    frozen = replace(session.training, joints={**session.training.joints, "theta3": np.full(250, 80.0)})
+    assert "theta3 never moved in these data" in refused(frozen, "swdt82", lambda o: o)
+
+
+def test_the_same_readings_again_count_as_one_fix(session: Session) -> None:
+    again = session.training.select(np.arange(120) % 30)
+    noise_mm = np.random.default_rng(5).normal(0.0, 3.0, (120, 3))
+    again = replace(again, position_mm=again.position_mm + noise_mm, pose=np.arange(120).astype(np.str_))
+    model = identify(session.rig, rig_text("swdt82"), again, effects="none")
     assert any(w.startswith("30 different fixes are few for 56 parameters") for w in model.warnings)
 
 

@@ -126,6 +126,45 @@ def test_every_shipped_rig_reads() -> None:
         shipped_rig("r2d2")
 
 
+ARM = """
+name = "arm"
+convention = "{convention}"
+tolerances = {{ length_mm = 1, angle_deg = 0.1, beta_deg = 0.1, prism_mm = 1 }}
+joint = [
+    {{ name = "lift", kind = "prismatic", limits = [0, 500], sigma = 0.1 }},
+    {{ name = "q1", kind = "revolute", limits = [-90, 90], sigma = 0.01 }},
+    {{ name = "q2", kind = "revolute", limits = [-90, 90], sigma = 0.01 }},
+    {{ name = "q3", kind = "revolute", limits = [-90, 90], sigma = 0.01 }},
+]
+prism = [{{ name = "tip", frame = 5, offset_mm = [100, 0, 0] }}]
+row = [{rows}]
+"""
+
+
+@pytest.mark.parametrize(
+    ("convention", "alphas_deg", "with_beta"),
+    [
+        # The lift slides along the axis of q1; q2 lies across it; the mounting of the second arm and q3 along q2.
+        ("dh", (5, -90, 180, 0), [1, 3, 4]),
+        ("mdh_beta_after", (0, 5, -90, 180), [1, 3, 4]),
+        ("mdh_beta_before", (0, 5, -90, 180), [2, 4, 5]),
+    ],
+)
+def test_rows_that_say_nothing_have_beta_where_axes_are_nearly_parallel(
+    convention: str, alphas_deg: tuple[int, ...], with_beta: list[int]
+) -> None:
+    drives = ["{ d = { lift = 1 } }", "{ theta = { q1 = 1 } }", "{ theta = { q2 = 1 } }"]
+    rows = [f"{{ alpha_deg = {a}, drive = {d} }}" for a, d in zip(alphas_deg, drives, strict=False)]
+    rows.append(f"{{ after = 3, alpha_deg = {alphas_deg[3]}, before = {{ rz_deg = 40 }} }}")
+    rows.append("{ before = { x_mm = 50 }, drive = { theta = { q3 = 1 } } }")
+
+    rig = parse_rig(ARM.format(convention=convention, rows=", ".join(rows)), "arm.toml")
+
+    assert [number for number, row in enumerate(rig.rows, 1) if "beta" in row.identify] == with_beta
+    kept = parse_rig(rig_text("swdt82"), "swdt82.toml")
+    assert [number for number, row in enumerate(kept.rows, 1) if "beta" in row.identify] == [1, 4]
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -134,6 +173,7 @@ def test_every_shipped_rig_reads() -> None:
         ("limits = [-360, 360]", "limits = [360, -360]", "limits must rise"),
         ("theta = { q1 = 1.0 }", "theta = { q9 = 1.0 }", "unknown joint 'q9'"),
         ("theta = { q1 = 1.0 }", "theta = { q2 = 1.0 }", "joint 'q1' drives no row"),
+        ('"q1"\nkind = "revolute"', '"z"\nkind = "prismatic"', "no joint can be called 'z': its column z_mm is one of"),
         ("frame = 6", "frame = 7", "beyond the last row 6"),
         ("d_mm = 127.3", "d_mm = 127.3\nb_mm = 1", "convention 'dh' has no b"),
     ],

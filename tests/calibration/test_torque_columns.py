@@ -58,6 +58,20 @@ def test_a_torque_that_was_measured_in_training_is_missed() -> None:
     assert not any("torque" in doubt for doubt in (*measured.doubts(with_torques), *computed.doubts(without)))
 
 
+def test_an_effect_that_a_load_could_make_is_doubted_where_no_load_is_known() -> None:
+    rig = shipped_rig("ys100")
+    massless = rig.model_copy(update={"masses": ()})
+    measured = fixes(rig, RigTruth(rig, 5, perturbation=0.6, effects=parse_effects(EFFECTS)), 60, 5, 1.0)
+
+    def doubted(rig: Rig, rows: Observations) -> bool:
+        model = identify(rig, rig_text("ys100"), rows, effects="angle_scale@theta2")
+        return any("angle_scale@theta2 may be a deflection under load" in warning for warning in model.warnings)
+
+    assert doubted(massless, weighed(measured, None))
+    assert not doubted(massless, measured)
+    assert not doubted(rig, weighed(measured, None))
+
+
 def test_coefficients_of_effects_count_among_what_the_data_must_determine() -> None:
     rig = shipped_rig("ys100")
     truth = RigTruth(rig, 5, perturbation=0.6, effects=parse_effects(EFFECTS))

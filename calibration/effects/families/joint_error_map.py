@@ -41,7 +41,7 @@ class JointErrorMap(JointFamily):
     equation: ClassVar[str] = "d_theta = sum of c_i B_i(theta), B_i even cubic B-splines, theta as read"
     source: ClassVar[str] = "P-splines (Eilers and Marx 1996) with independent weights (Higdon 2002)"
     kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
-    confused_with: ClassVar[tuple[str, ...]] = ("encoder_harmonic", "angle_scale")
+    confused_with: ClassVar[tuple[str, ...]] = ("encoder_harmonic", "angle_scale", "joint_compliance")
     revealed_by: ClassVar[str] = "poses that fill the joint's range densely, several in each wave of the curve"
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
