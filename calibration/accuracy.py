@@ -300,6 +300,7 @@ def _groups(model: CalibratedModel, rows: Observations, samples: Samples, label:
     lin, by_parameter = model.linearise(rows)
     error = samples.average(rows.position_mm - lin.position_mm)
     by_reading, by_parameter = samples.average(lin.joint_jacobian), samples.average(by_parameter)
+    taken = (by_parameter.reshape(-1, len(model.covariance)) @ model.covariance).reshape(by_parameter.shape)
     unsure = reading_variance(rig) + samples.average(model.unknown_variance(rows))
     velocity = by_reading @ samples.rates[:, :, None] * rig.station.timing_sigma_s
     alone = samples.station_covariance + velocity @ velocity.transpose(0, 2, 1)
@@ -318,7 +319,7 @@ def _groups(model: CalibratedModel, rows: Observations, samples: Samples, label:
                 error[at].reshape(shape),
                 known.reshape(*shape, 3 * size) + covariance_by_joints(arms, unsure[at].mean(axis=1)),
                 covariance_by_joints(arms, joint_error_sizes(rig) ** 2),
-                fitted @ model.covariance @ fitted.transpose(0, 2, 1),
+                taken[at].reshape(*shape, -1) @ fitted.transpose(0, 2, 1),
             )
         )
     return found

@@ -67,6 +67,15 @@ def require_place(directory: Path) -> None:
         raise ModelError(f"{directory} cannot be made, as {nearest} {reason}; name another directory")
 
 
+def check_loads(model: CalibratedModel, directory: Path) -> None:
+    """Let a child process load a model that is to be written to a directory, so that `write_model` need not.
+
+    Raises:
+        ModelError: the model does not load.
+    """
+    _check_in_child(model.to_files(), directory.resolve())
+
+
 def write_model(directory: Path, model: CalibratedModel, companions: Mapping[str, bytes] | None = None) -> str:
     """Write a model directory; a model already there is replaced in one step, so that a reader sees one or the other.
 

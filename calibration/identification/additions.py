@@ -39,7 +39,7 @@ class Additions:
     shift_mm: Floats | None = None
 
     def __len__(self) -> int:
-        return len(self.names)
+        return len(self.joint)
 
     def change(self, coefficients: Floats, joints: int) -> Floats:
         """(m, joints) by what coefficients (k,) change the readings, deg or mm."""
@@ -57,17 +57,21 @@ class Additions:
 
     def moved_mm(self, joint_jacobian: Floats) -> Floats:
         """(m, 3, k) what unit coefficients move, for the (m, 3, joints) Jacobian by readings in mm per deg or mm."""
-        moved = np.zeros((len(self.column), 3, len(self.joint))) if self.shift_mm is None else self.shift_mm.copy()
+        moved = np.empty((len(self.column), 3, len(self)))
         for joint, own in self._runs:
-            moved[:, :, own] += joint_jacobian[:, :, joint, None] * self.column[:, None, own]
+            np.multiply(joint_jacobian[:, :, joint, None], self.column[:, None, own], out=moved[:, :, own])
+        if self.shift_mm is not None:
+            moved += self.shift_mm
         return moved
 
     @cached_property
     def _runs(self) -> tuple[tuple[int, slice], ...]:
-        """Joints with the coefficients at each that follow one another: slices, which copy nothing."""
+        """Joints with the coefficients at each that follow one another: slices, which copy nothing.
+
+        The columns of those at none are zero, whichever joint `NO_JOINT` is taken for.
+        """
         edges = [0, *(np.flatnonzero(np.diff(self.joint)) + 1).tolist(), len(self)]
-        runs = ((int(self.joint[a]), slice(a, b)) for a, b in itertools.pairwise(edges) if a < b)
-        return tuple((joint, own) for joint, own in runs if joint != NO_JOINT)
+        return tuple((int(self.joint[a]), slice(a, b)) for a, b in itertools.pairwise(edges) if a < b)
 
     def over(self, rows: Callable[[Floats], Floats]) -> Additions:
         """The same coefficients for other rows, `rows` making theirs (m', ...) of what these have (m, ...)."""

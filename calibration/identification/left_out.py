@@ -55,7 +55,8 @@ def left_out_errors(
             noise[:, 3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += own[rows[:, i]]
         factor = np.linalg.cholesky(noise)
         whitened = np.linalg.solve(factor, jacobian[rows].reshape(flat))
-        leverage, axes = np.linalg.eigh(whitened @ covariance @ whitened.transpose(0, 2, 1))
+        taken = (whitened.reshape(-1, len(covariance)) @ covariance).reshape(flat)
+        leverage, axes = np.linalg.eigh(taken @ whitened.transpose(0, 2, 1))
         error = np.linalg.solve(factor, error_mm[rows].reshape(flat))
         grown = 1.0 / (1.0 - np.clip(leverage, 0.0, _GREATEST_LEVERAGE))
         left = factor @ (axes @ (grown[:, :, None] * (axes.transpose(0, 2, 1) @ error)))

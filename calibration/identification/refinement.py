@@ -25,6 +25,7 @@ from calibration.errors import CalibrationError
 from calibration.identification.additions import Additions
 from calibration.identification.samples import Samples, reading_variance
 from calibration.identification.whitening import Marginals, Whitening, factorise, marginals
+from calibration.kernels.gram import gram
 from calibration.kernels.lineariser import Lineariser
 from calibration.kinematics import Chain, ChainData
 from calibration.observations import Floats
@@ -305,7 +306,7 @@ class _View:
         self.jacobian = self.whitening.whiten(state.jacobian if free.all() else state.jacobian[:, :, free])
         self.error = self.whitening.whiten(state.error)[:, 0]
         self.precision = problem.precision(noise.scale)
-        self.normal = self.jacobian.T @ self.jacobian + np.diag(self.precision)
+        self.normal = gram(self.jacobian) + np.diag(self.precision)
         _require_finite(self.normal)
         self.gradient = self.jacobian.T @ self.error - self.precision * state.x[free]
 
@@ -326,7 +327,7 @@ class _View:
         jacobian = self.whitening.finish(self.jacobian)
         error = self.whitening.finish((self.error - self.jacobian @ step)[:, None])
         total, curvature = self.whitening.trace
-        left = total - float(np.sum((jacobian.T @ jacobian) * self.covariance))
+        left = total - float(np.sum(gram(jacobian) * self.covariance))
         if left <= 0.0:
             return self.noise.excess
         change = (float((error**2).sum()) - left) / (curvature * left / total)

@@ -124,8 +124,10 @@ class CrossValidation:
 
     def _network(self) -> Floats:
         out = np.empty_like(self.data.target_mm)
-        for fold, (training, held, shape) in enumerate(zip(self._training, self._held, self._shapes, strict=True)):
-            out[self.split == fold] = fit_shape(training.features, training.target_mm, shape, self.seed).predict(held)
+        work = partial(_network_estimate, seed=self.seed)
+        estimates = self._executor.map(work, self._training, self._held, self._shapes)
+        for fold, estimate in enumerate(estimates):
+            out[self.split == fold] = estimate
         return out
 
     def _process(self) -> Floats:
@@ -159,6 +161,11 @@ def with_network(data: Data, shape: Shape, seed: int) -> Features:
         network = fit_shape(data.features.select(~held), data.target_mm[~held], shape, seed)
         out[held] = network.predict(data.features.select(held))
     return data.features.with_signals(NETWORK_SIGNALS, out)
+
+
+def _network_estimate(training: Data, held: Features, shape: Shape, *, seed: int) -> Floats:
+    """What a network of the training rows says of the held-out ones."""
+    return fit_shape(training.features, training.target_mm, shape, seed).predict(held)
 
 
 def _process_estimate(training: Data, held: Features, *, seed: int) -> Floats:

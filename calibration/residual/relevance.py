@@ -91,10 +91,13 @@ class _Evidence:
         covariance = kernel.copy()
         covariance[self._diagonal] += noise + _JITTER
         factor = np.linalg.cholesky(covariance)
-        lower = np.tril(np.asarray(lapack.dpotri(factor, lower=1)[0], dtype=np.float64))
-        inverse = lower + np.tril(lower, -1).T
+        half_log_det = float(np.log(np.diag(factor)).sum())
+        # Rows of a lower triangle are columns of an upper one, as LAPACK has them: nothing is copied.
+        lower = np.asarray(lapack.dpotri(factor.T, overwrite_c=True)[0], dtype=np.float64).T
+        inverse = lower + lower.T
+        inverse[self._diagonal] *= 0.5
         solved = inverse @ self._y
-        value = self._y.shape[1] * float(np.log(np.diag(factor)).sum()) + 0.5 * float((self._y * solved).sum())
+        value = self._y.shape[1] * half_log_det + 0.5 * float((self._y * solved).sum())
         slope = self._y.shape[1] * inverse - solved @ solved.T  # twice the derivative by the covariance
         by_kernel = slope * kernel
         gradient = np.empty_like(at)

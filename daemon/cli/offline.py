@@ -147,7 +147,10 @@ def calibrate(
             checkpoint=checkpoint,
         )
         sources = {"data": f"{data.name}, SHA-256 {hashlib.sha256(raw).hexdigest()}"}
-        document = build_report(report_input(training, None, made_utc_ns=watch.utc_ns, sources=sources))
+        with ThreadPoolExecutor(1) as pool:  # another process loads the model while this one draws
+            loaded = pool.submit(modelfiles.check_loads, model, out)
+            document = build_report(report_input(training, None, made_utc_ns=watch.utc_ns, sources=sources))
+            loaded.result()
         modelfiles.write_model(out, model, {modelfiles.REPORT: document.encode("utf-8")})
     result = training.as_dict(watch.seconds)
     if not as_json:

@@ -16,6 +16,7 @@ import pytest
 
 from calibration.kernels import Fitness, evaluate
 from calibration.kernels.collapse import collapse
+from calibration.kernels.gram import gram
 from calibration.kernels.loops import fitness as compiled_fitness
 from calibration.kinematics import Chain, ChainData, Placement
 from calibration.observations import Floats
@@ -226,3 +227,12 @@ def test_the_kernel_compiles_where_numba_finds_no_place_for_its_cache() -> None:
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=300, env=dict(os.environ), check=False
     )
     assert (done.returncode, done.stdout.strip()) == (0, "True"), done.stderr
+
+
+@pytest.mark.parametrize("rare", [0, 80, 200])
+def test_products_of_columns_are_the_same_however_many_are_mostly_zero(rare: int) -> None:
+    rng = np.random.default_rng(5)
+    rows = rng.normal(size=(300, 200))
+    columns = rng.permutation(200)[:rare]
+    rows[:, columns] *= rng.random((300, rare)) < 0.05
+    np.testing.assert_allclose(gram(rows), rows.T @ rows, rtol=0.0, atol=1e-10)
