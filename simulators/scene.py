@@ -172,8 +172,9 @@ class Scene:
             poses: joint name -> (k,) deg or mm.
             seed: of the noise.
             columns: how they are taken where that matters (`theta4_dir`, `L2_rate`, `payload_kg`, `dwell_s`,
-                `temperature_degC`, `time_s`) -> (k,). Else each is a standstill of 20 s, a minute after the one before
-                and straight from it, with the payload and the temperature of the training's end.
+                `temperature_degC`, `time_s`), and how many `fixes` of each prism -> (k,). Else each is a standstill of
+                20 s, a minute after the one before and straight from it, with the payload and the temperature of the
+                training's end.
         """
         rng = np.random.default_rng([seed, 43])
         before = self.training
@@ -183,7 +184,10 @@ class Scene:
         way = travel_m(self.truth.rig, {k: np.concatenate([[here[k]], v]) for k, v in shift.joints.items()})
         travelled = {name: last[name] + metres[1:] for name, metres in way.items()}
         first = int(before.pose[-1]) + 1
-        further = _measure(self.truth, shift, travelled, None, self.settings, self.misjudged, rng, first=first)
+        settings, repeats = self.settings, (columns or {}).get("fixes")
+        further = _measure(
+            self.truth, shift, travelled, None, settings, self.misjudged, rng, first=first, repeats=repeats
+        )
         return self._observations(further, self.machine(effects))
 
     def _observations(self, taken: MeasuredFixes, machine: RigTruth) -> SimulatedObservations:
@@ -261,10 +265,15 @@ def _measure(
     rng: np.random.Generator,
     *,
     first: int = 0,
+    repeats: Floats | None = None,
 ) -> MeasuredFixes:
-    """Measure the chosen poses of a shift; None is all of them. Their numbers begin at `first`."""
+    """Measure the chosen poses of a shift; None is all of them. Their numbers begin at `first`.
+
+    `repeats` says how many fixes of each prism, where that is not as the settings have it.
+    """
     rig, n = truth.rig, len(shift.columns["time_s"])
-    fixes = _fixes(rig, shift, travelled, np.arange(n) if chosen is None else np.flatnonzero(chosen), settings)
+    which = np.arange(n) if chosen is None else np.flatnonzero(chosen)
+    fixes = _fixes(rig, shift, travelled, which, settings, repeats)
     order = fixes.pose
     noise = draw_noise(rig.station, fixes.places_mm(truth), order, settings.noise, rng)
     readings = read_joints(rig, shift.joints, shift.columns, settings.noise, rng)
@@ -290,14 +299,20 @@ def _travelled(rig: Rig, shift: Shift, is_training: Flags) -> dict[str, Floats]:
 
 
 def _fixes(
-    rig: Rig, shift: Shift, travelled: Mapping[str, Floats], chosen: NDArray[np.intp], settings: SceneSettings
+    rig: Rig,
+    shift: Shift,
+    travelled: Mapping[str, Floats],
+    chosen: NDArray[np.intp],
+    settings: SceneSettings,
+    repeats: Floats | None = None,
 ) -> Fixes:
     """Every prism, so many times, at each of the chosen poses; a fix a second."""
-    names, repeats = _prisms(rig, settings), settings.repeats
-    each = len(names) * repeats
-    pose = np.repeat(chosen, each)
-    shot = np.tile(np.arange(each, dtype=float), len(chosen))
-    prism: Strings = np.tile(np.repeat(np.array(names, dtype=np.str_), repeats), len(chosen))
+    names = np.array(_prisms(rig, settings), dtype=np.str_)
+    of_each = np.full(len(chosen), settings.repeats) if repeats is None else repeats.astype(np.intp)
+    count = len(names) * of_each
+    pose = np.repeat(chosen, count)
+    shot = np.arange(len(pose)) - np.repeat(np.cumsum(count) - count, count)
+    prism: Strings = names[shot // np.repeat(of_each, count)]
     columns = {k: v[pose] for k, v in (dict(shift.columns) | dict(travelled)).items()}
     standing = columns["dwell_s"] > 0.0
     columns |= {"time_s": columns["time_s"] + shot, "dwell_s": columns["dwell_s"] + shot * standing}

@@ -14,12 +14,14 @@ from calibration.observations import Floats
 from calibration.rig import Rig
 
 Conditions = Mapping[str, Floats]
-"""Columns of observations beside the joints' readings -> (n,) of each pose."""
+"""Columns of observations beside the joints' readings -> (n,) of each pose; `fixes`, how many of each prism."""
+
+FIXES = 5  # of each prism at a standstill: seconds each, and their mean has that much less of the station's noise
 
 DWELLS_S = (10.0, 120.0)
 TEMPERATURES_DEGC = (5.0, 25.0)
 PRESSURES_BAR = (50.0, 150.0)
-ROUNDS_S = (0.0, 3600.0, 7200.0, 10800.0)
+ROUNDS_S = (0.0, 14400.0, 28800.0, 43200.0)
 _POSE_S = 60.0  # from one fix of a round to the next
 _MOVING = 0.5  # share of poses that may be measured on the move
 _PACE = 0.1  # of a joint's greatest rate, at most: faster, an unsure instant hides as much as speed shows
@@ -27,7 +29,9 @@ _LOAD = 0.05  # of the machine's weight, where the rig file names no payload
 _SLOW = ("time_s", "temperature_degC", "payload_kg")  # nobody changes these from pose to pose
 
 
-def drawn(rig: Rig, count: int, rng: np.random.Generator, *, begin_s: float = 0.0) -> Conditions:
+def drawn(
+    rig: Rig, count: int, rng: np.random.Generator, *, begin_s: float = 0.0, payload_kg: float = 0.0
+) -> Conditions:
     """All conditions of `count` poses, each between its levels.
 
     Args:
@@ -35,10 +39,12 @@ def drawn(rig: Rig, count: int, rng: np.random.Generator, *, begin_s: float = 0.
         count: how many poses.
         rng: draws.
         begin_s: `time_s` of the first round.
+        payload_kg: that the machine has carried; where it has carried none, as the rig file has it.
     """
     sides = rng.choice([-1.0, 1.0], (count, len(rig.joints)))
     pace = _PACE * rng.random(sides.shape) * (rng.random(count) < _MOVING)[:, None]
     out = {f"{joint.name}_dir": sides[:, i] for i, joint in enumerate(rig.joints)}
+    out["fixes"] = np.full(count, float(FIXES))
     out |= {f"{joint.name}_rate": (pace * sides)[:, i] * joint.max_rate for i, joint in enumerate(rig.joints)}
     levels: dict[str, Sequence[float]] = {
         "time_s": [begin_s + after_s for after_s in ROUNDS_S],
@@ -47,16 +53,17 @@ def drawn(rig: Rig, count: int, rng: np.random.Generator, *, begin_s: float = 0.
         **dict.fromkeys(_pressures(rig), PRESSURES_BAR),
     }
     if any(mass.payload for mass in rig.masses):
-        levels["payload_kg"] = (0.0, _payload_kg(rig))
+        levels["payload_kg"] = (0.0, payload_kg or _payload_kg(rig))
     return out | {column: rng.choice(values, count) for column, values in levels.items()}
 
 
 def under(conditions: Conditions, names: Collection[str]) -> Conditions:
-    """Those of some names; what moves has not stood."""
+    """Those of some names; what moves has not stood, and passes a pose once."""
     out = {name: values for name, values in conditions.items() if name in names}
     rates = [values for name, values in out.items() if name.endswith("_rate")]
-    if rates and "dwell_s" in out:
-        out["dwell_s"] = np.where(np.any(rates, axis=0), 0.0, out["dwell_s"])
+    if rates:
+        moves, then = np.any(rates, axis=0), {"dwell_s": 0.0, "fixes": 1.0}
+        out |= {name: np.where(moves, then[name], values) for name, values in out.items() if name in then}
     return out
 
 
@@ -122,28 +129,31 @@ def one_after_another(conditions: Conditions) -> Conditions:
     return {**conditions, "time_s": np.array(times)}
 
 
-def instructions(rig: Rig, names: Collection[str]) -> tuple[str, ...]:
-    """What an operator has to do for each condition, in sentences."""
+def instructions(rig: Rig, conditions: Conditions) -> tuple[str, ...]:
+    """What an operator has to do for each condition of a plan, in sentences."""
     out = []
-    sides = [joint.name for joint in rig.joints if f"{joint.name}_dir" in names]
+    sides = [joint.name for joint in rig.joints if f"{joint.name}_dir" in conditions]
     if sides:
         out.append(
             f"come to the pose with {' and '.join(sides)} from below where the column of its direction has 1, and from "
             f"above where it has -1"
         )
-    if any(name.endswith("_rate") for name in names):
+    if any(name.endswith("_rate") for name in conditions):
         out.append("where rates are given, take the fix on the move, as the boom passes the pose at these rates")
-    if "dwell_s" in names:
+    if "fixes" in conditions:
+        out.append("take as many fixes of each prism as the column fixes says, all under the number of their pose")
+    if "dwell_s" in conditions:
         out.append("let the boom stand for dwell_s before the fix")
-    if "payload_kg" in names:
-        out.append(f"carry payload_kg: nothing, or {_payload_kg(rig):.0f} kg")
-    if "temperature_degC" in names:
+    if "payload_kg" in conditions:
+        out.append(f"carry payload_kg: nothing, or {conditions['payload_kg'].max():.0f} kg")
+    if "temperature_degC" in conditions:
         out.append("measure the cold poses and the warm ones at about temperature_degC, in the morning and at noon")
-    if "time_s" in names:
-        out.append(f"measure in {len(ROUNDS_S)} rounds an hour apart, as time_s says, without moving the station")
+    if "time_s" in conditions:
+        hours = np.ptp(conditions["time_s"]) / 3600.0
+        out.append(f"measure at time_s, {hours:.1f} hours from first to last, without moving the station")
     out += [
         f"bring the cylinder to about {name}, by what the boom carries or pushes against"
-        for name in sorted(names)
+        for name in sorted(conditions)
         if name.endswith("_bar")
     ]
     return tuple(out)

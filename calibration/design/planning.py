@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
 from calibration.accuracy import VOLUME_POSES, ExpectedAccuracy, predicted_accuracy, shares_left
 from calibration.design.conditions import instructions
 from calibration.design.knowledge import Knowledge, setup_of
-from calibration.design.poses import CANDIDATES, Candidates, Plan, draw, plan, volume_root, work_volume
+from calibration.design.poses import CANDIDATES, Candidates, Plan, draw, near, plan, volume_root, work_volume
 from calibration.design.visibility import Site, placement, site
 from calibration.errors import UnsafeError
 from calibration.kinematics import Chain, Placement
@@ -36,7 +36,8 @@ class PoseRow:
     Attributes:
         pose: from 1.
         joints: column of each joint -> value, deg or mm.
-        conditions: column of each condition that matters -> value; -1 or 1 for a direction of approach.
+        conditions: column of each condition that matters -> value; -1 or 1 for a direction of approach; `fixes`, how
+            many to take of each prism, where more than one.
         prisms: in view.
     """
 
@@ -92,7 +93,7 @@ class PosePlan:
         return {
             "rig": self.rig.name,
             "poses": [row.as_dict() for row in self.rows],
-            "fixes": int(self.plan.poses.seen.sum()),
+            "fixes": self.plan.poses.fixes_in_all,
             "seconds_of_motion": round(self.plan.seconds_of_motion, 1),
             "parameters": self.plan.parameters,
             "determined": self.plan.determined,
@@ -115,7 +116,7 @@ def pose_rows(rig: Rig, poses: Candidates) -> tuple[PoseRow, ...]:
             number + 1,
             {j.column: round(float(poses.readings[number, i]), _DIGITS) for i, j in enumerate(rig.joints)},
             {
-                name: int(values[number]) if name.endswith("_dir") else values[number] + 0.0
+                name: int(values[number]) if name.endswith(("_dir", "fixes")) else values[number] + 0.0
                 for name, values in conditions.items()
             },
             tuple(name for name, seen in zip(rig.prism_names, poses.seen[number], strict=True) if seen),
@@ -166,7 +167,9 @@ def plan_poses(
     candidates = draw(knowledge, at, rng, max(CANDIDATES, poses))
     volume = work_volume(knowledge, at, rng, VOLUME_POSES)
     report(0.4, "choosing poses")
-    chosen = plan(knowledge, candidates, poses, volume=None if model is None else volume, separate=separate)
+    nearby = partial(near, knowledge, at, rng) if separate else None
+    by_volume = None if model is None else volume
+    chosen = plan(knowledge, candidates, poses, volume=by_volume, separate=separate, nearby=nearby)
     report(0.9, "predicting the accuracy")
     before: ExpectedAccuracy | None = None
     advice = instructions(rig, chosen.poses.conditions)
@@ -291,7 +294,7 @@ def _poorly_known(knowledge: Knowledge, volume: Floats) -> Iterator[str]:
 
 
 def _warnings(rig: Rig, chosen: Plan, model: CalibratedModel | None) -> Iterator[str]:
-    fixes, needed = int(chosen.poses.seen.sum()), math.ceil(chosen.parameters / 3)
+    fixes, needed = chosen.poses.fixes_in_all, math.ceil(chosen.parameters / 3)
     if model is None and fixes < needed:
         yield f"{fixes} fixes are too few: to calibrate, {chosen.parameters} parameters need at least {needed}"
     for prism, name in enumerate(rig.prism_names):

@@ -8,7 +8,7 @@ or a model's covariance. With such a prior a redundant parameter is no obstacle:
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,7 +27,7 @@ from calibration.design.exchange import (
     information_of,
 )
 from calibration.design.knowledge import Knowledge, root_of
-from calibration.design.rivals import Rival, conditions_of, name_of, rival_of, together
+from calibration.design.rivals import Rival, changing, conditions_of, name_of, rival_of, together
 from calibration.design.tour import length_s, short_tour, travel_s
 from calibration.design.visibility import Bodies, Flags, Site, in_view, is_reachable, limits
 from calibration.effects.base import Situation
@@ -45,7 +45,10 @@ from calibration.rig import Rig
 CANDIDATES = 10_000
 _BATCHES = 10
 _MARGIN = 0.01  # of a joint's range, kept from its limits
+_NEAR = 100  # to each pose
+_WIDTHS = 0.02, 0.2  # of a joint's range, 1 sigma
 _SEEN = 0.1  # as in identifiability: the data alone determine a direction within ten prior sigmas
+_TRIED = 64  # poses in which conditions are tried
 _LINEARISED_AT_ONCE = 2000
 
 
@@ -65,6 +68,16 @@ class Candidates:
 
     def __len__(self) -> int:
         return len(self.readings)
+
+    @property
+    def fixes(self) -> Floats:
+        """(n,) how many are taken of each prism in view."""
+        return self.conditions.get("fixes", np.ones(len(self)))
+
+    @property
+    def fixes_in_all(self) -> int:
+        """Of all prisms in all poses."""
+        return int(self.fixes @ self.seen.sum(axis=1))
 
     def select(self, which: Integers) -> Candidates:
         """The given poses."""
@@ -101,7 +114,13 @@ class Plan:
 
 
 def draw(
-    knowledge: Knowledge, at: Site, rng: np.random.Generator, count: int = CANDIDATES, *, begin_s: float = 0.0
+    knowledge: Knowledge,
+    at: Site,
+    rng: np.random.Generator,
+    count: int = CANDIDATES,
+    *,
+    begin_s: float = 0.0,
+    payload_kg: float = 0.0,
 ) -> Candidates:
     """Random poses that the rig can take and in which the station sees a prism.
 
@@ -114,6 +133,7 @@ def draw(
         rng: draws.
         count: how many poses.
         begin_s: `time_s` at which they can be measured, at the earliest.
+        payload_kg: as for `conditions.drawn`.
 
     Raises:
         UnsafeError: there is none.
@@ -139,7 +159,25 @@ def draw(
             f"check the station's place and the floor"
         )
     readings, seen = readings[:count], seen[:count]
-    return Candidates(readings, drawn(chain.rig, len(readings), rng, begin_s=begin_s), seen)
+    conditions = drawn(chain.rig, len(readings), rng, begin_s=begin_s, payload_kg=payload_kg)
+    return Candidates(readings, conditions, seen)
+
+
+def near(knowledge: Knowledge, at: Site, rng: np.random.Generator, poses: Candidates) -> Candidates:
+    """These poses, and random ones that differ little from each in some of the joints, under the same conditions.
+
+    Only such as the rig can take and in which the station sees all that it sees in the one they are near.
+    """
+    low, high = limits(knowledge.chain.rig)
+    margin = _MARGIN * (high - low)
+    about = poses.select(np.repeat(np.arange(len(poses)), _NEAR))
+    width = np.tile(np.geomspace(*_WIDTHS, _NEAR), len(poses))[:, None]
+    moved = width * rng.standard_normal(about.readings.shape) * (rng.random(about.readings.shape) < 0.5)
+    moved[::_NEAR] = 0.0
+    tried = np.clip(about.readings + (high - low) * moved, low + margin, high - margin)
+    bodies = Bodies.of(knowledge.chain, knowledge.x, tried)
+    good = is_reachable(bodies, at) & (in_view(bodies, at) >= about.seen).all(axis=1)
+    return replace(about, readings=tried).select(np.flatnonzero(good))
 
 
 def work_volume(knowledge: Knowledge, at: Site, rng: np.random.Generator, count: int) -> Floats:
@@ -171,6 +209,7 @@ def plan(
     volume: Floats | None = None,
     separate: Sequence[str | FittedEffect] = (),
     measured: Observations | None = None,
+    nearby: Callable[[Candidates], Candidates] | None = None,
 ) -> Plan:
     """Choose poses.
 
@@ -183,6 +222,7 @@ def plan(
         separate: effects, each the `family@where` of one in the library, of plausible size, or one as it was found:
             choose to tell each from the others, one of them being there and none known yet.
         measured: rows that were measured already and are no part of what is known.
+        nearby: gives poses near some, these among them; the choice is made once more among those near the first.
 
     Raises:
         DataError: fewer candidates than poses; an effect that no choice of poses shows.
@@ -192,11 +232,7 @@ def plan(
     rig = knowledge.chain.rig
     before = knowledge.without([name_of(effect) for effect in separate])
     known = len(before.root)
-    matters = _sides(knowledge, candidates)
-    few = candidates.select(np.arange(1))
-    for effect in separate:
-        matters |= set(conditions_of(before, name_of(effect), few.readings, few.conditions))
-    candidates = candidates.under(matters)
+    candidates = _as_they_matter(knowledge, before, candidates, separate)
     with threadpool_limits(1, user_api="blas"):  # the blocks are small: threads would wait for each other
         rivals = tuple(rival_of(before, e, candidates.readings, candidates.conditions) for e in separate)
         told = None if measured is None else _told(before, measured, rivals)
@@ -209,6 +245,9 @@ def plan(
             criterion = Accuracy(volume_root(knowledge, volume))
         in_view = np.repeat(candidates.seen.any(axis=0), 3)
         chosen = candidates.select(choose(blocks[:, in_view], count, criterion, told))
+        if nearby is not None:
+            closer = nearby(chosen)
+            chosen = closer.select(choose(whitened(before, closer, rivals)[:, in_view], count, criterion, told))
         seconds = travel_s(rig, chosen.readings)
         order = _order(rig, seconds, chosen, [name_of(effect) for effect in separate])
         poses = chosen.select(order)
@@ -227,10 +266,33 @@ def plan(
         length_s(seconds, order),
         knowledge.parameters,
         len(seen),
-        observability_indices(seen, int(poses.seen.sum())),
+        observability_indices(seen, poses.fixes_in_all),
         knowledge.root @ root_of(after),
         stands_out,
     )
+
+
+def _as_they_matter(
+    knowledge: Knowledge, before: Knowledge, candidates: Candidates, separate: Sequence[str | FittedEffect]
+) -> Candidates:
+    """The same poses under the conditions that matter.
+
+    Those that effects to be told apart need, varied only where that changes any of them, and those that change some of
+    them and leave others.
+    """
+    matters = _sides(knowledge, candidates)
+    if not separate:
+        return candidates.under(matters)
+    few = candidates.select(np.arange(min(_TRIED, len(candidates))))
+    needed = {c for e in separate for c in conditions_of(before, name_of(e), few.readings, few.conditions)}
+    changes = changing(before, separate, few.readings, few.conditions)
+    idle = needed.intersection(name for kind, names in changes.items() if not names for name in kind)
+    telling = {name for kind, names in changes.items() if 0 < len(names) < len(separate) for name in kind}
+    held = {
+        name: np.full(len(candidates), values.min()) for name, values in candidates.conditions.items() if name in idle
+    }
+    kept = replace(candidates, conditions={**candidates.conditions, **held})
+    return kept.under(matters | needed | telling | {"fixes"})
 
 
 def _hypotheses(known: int, rivals: Sequence[Rival], before: Floats) -> tuple[Hypothesis, ...]:
@@ -304,6 +366,7 @@ def _noise(knowledge: Knowledge, lin: Linearisation, poses: Candidates) -> Float
     common = (lin.joint_jacobian * np.sqrt(reading_variance(rig) + unknown)[:, None, :]).reshape(n, size, -1)
     covariance: Floats = common @ common.transpose(0, 2, 1)
     own = station_covariance(rig, lin.position_mm, np.full(lin.position_mm.shape, np.nan))
+    own /= np.repeat(poses.fixes, len(rig.prisms))[:, None, None]
     even = knowledge.excess_variance + knowledge.unknown_mm2(poses.readings, poses.conditions)
     own = own + even[:, None, None] * np.eye(3)
     still = np.zeros(n)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.design.conditions import Conditions, needed
+from calibration.design.conditions import Conditions, changed, kinds_of, needed
 from calibration.design.knowledge import Knowledge
 from calibration.effects.base import Situation
 from calibration.effects.fitted import Choice, FittedEffect
@@ -20,6 +20,7 @@ from calibration.observations import Floats
 
 _LEFT = 1e-3  # of the mean square of what an effect may do; no fix shows the curves that make up less
 _MOST = 12  # coefficients: a curve of many has its broad features in the first
+_CHANGES = 0.05  # of what an effect moves, RMS
 _ROWS = 1000  # that its coefficients are found from
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
@@ -73,6 +74,16 @@ class Rival:
     def size(self) -> int:
         """How many coefficients."""
         return int(self.mixing.shape[1])
+
+    @property
+    def goes_by_travel(self) -> bool:
+        """Whether it grows with the path of its joint."""
+        return library()[self.choices[0].family].goes_by_travel
+
+    def moved_mm(self, situation: Situation) -> Floats:
+        """(n, 3, k) by what its coefficients move the prisms: as found, or each by its size where none were found."""
+        moved = self.additions(situation).moved_mm(situation.to_station(situation.located.joint_jacobian))
+        return moved * (self.found if self.found.any() else 1.0)
 
     def additions(self, situation: Situation) -> Additions:
         """Its k coefficients, of size 1, for the observations of a situation."""
@@ -135,6 +146,35 @@ def rival_of(knowledge: Knowledge, effect: str | FittedEffect, readings: Floats,
     if not variants:
         raise DataError(effect, f"does nothing at {where} of rig {knowledge.chain.rig.name!r} in any pose")
     return Rival.of(effect, tuple(Choice(name, where, settings) for settings in variants), situation)
+
+
+def changing(
+    knowledge: Knowledge, effects: Sequence[str | FittedEffect], readings: Floats, conditions: Conditions
+) -> Mapping[tuple[str, ...], tuple[str, ...]]:
+    """Which of several effects the conditions change, tried on paper.
+
+    Args:
+        knowledge: of the rig.
+        effects: that these poses show.
+        readings: (n, joints) poses.
+        conditions: all that may be chosen for them.
+
+    Returns:
+        Names of the conditions that change together -> `family@where` of the effects that change with them.
+    """
+    rivals = [rival_of(knowledge, effect, readings, conditions) for effect in effects]
+    before, found = knowledge.situation(readings, conditions), {}
+    for kind in kinds_of(knowledge.chain.rig):
+        after = knowledge.situation(readings, changed(conditions, kind))
+        # A path goes on with the poses, and not with the hours between them.
+        asked = [rival for rival in rivals if kind != ("time_s",) or not rival.goes_by_travel]
+        found[kind] = tuple(rival.name for rival in asked if _is_changed(rival, before, after))
+    return found
+
+
+def _is_changed(rival: Rival, before: Situation, after: Situation) -> bool:
+    was, is_now = rival.moved_mm(before), rival.moved_mm(after)
+    return float(np.linalg.norm(is_now - was)) > _CHANGES * float(np.linalg.norm(was))
 
 
 def together(rivals: tuple[Rival, ...], situation: Situation) -> Additions:

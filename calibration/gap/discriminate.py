@@ -7,24 +7,25 @@ as they are. So do effects that sit before and behind a place on the boom where 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from calibration.design.conditions import Conditions, changed, instructions, kinds_of
+from calibration.design.conditions import instructions
 from calibration.design.knowledge import Knowledge, setup_of
 from calibration.design.planning import pose_rows
-from calibration.design.poses import Candidates, Plan, draw, plan
-from calibration.design.rivals import conditions_of, name_of, rival_of
+from calibration.design.poses import Candidates, Plan, draw, near, plan
+from calibration.design.rivals import changing, conditions_of, name_of, rival_of
 from calibration.design.visibility import site
-from calibration.effects.fitted import Choice, FittedEffect
+from calibration.effects.fitted import FittedEffect
 from calibration.effects.library import library
 from calibration.errors import DataError, UnsafeError
 from calibration.gap.result import Experiment
 from calibration.gap.rivals import NEAR
 from calibration.model import CalibratedModel
-from calibration.observations import Floats, Observations
+from calibration.observations import Observations
 from calibration.rig import Rig
 
 POSES = 20
@@ -74,13 +75,14 @@ def experiments(
     knowledge = Knowledge.before(model, setup_of(model))
     try:
         at = site(model.chain, model.values, setup=knowledge.setup)
-        drawn = draw(knowledge, at, rng, max(_CANDIDATES, poses), begin_s=_end_s(observations))
+        begin_s, payload_kg = _end_s(observations), _heaviest_kg(observations)
+        drawn = draw(knowledge, at, rng, max(_CANDIDATES, poses), begin_s=begin_s, payload_kg=payload_kg)
     except UnsafeError:
         return (*_by_place(model.rig, rivals), *_as_the_library_says(rivals))
     candidates = _with_prisms(drawn, [bool(model.coverage.fixes.get(n)) for n in model.rig.prism_names])
     tried = drawn.select(np.arange(min(_TRIED, len(drawn))))
     return (
-        *_poses(knowledge, candidates, observations, rivals, poses),
+        *_poses(knowledge, candidates, observations, rivals, poses, partial(near, knowledge, at, rng)),
         *_by_condition(knowledge, tried, rivals),
         *_by_place(model.rig, rivals),
         *_as_the_library_says(rivals),
@@ -99,12 +101,13 @@ def _poses(
     observations: Observations,
     rivals: Sequence[FittedEffect],
     count: int,
+    nearby: Callable[[Candidates], Candidates],
 ) -> Iterator[Experiment]:
     few = candidates.select(np.arange(min(_TRIED, len(candidates))))
     shown = [rival for rival in rivals if len(candidates) >= count and _is_shown(knowledge, few, rival)]
     if not shown:
         return
-    chosen = plan(knowledge, candidates, count, separate=shown, measured=observations)
+    chosen = plan(knowledge, candidates, count, separate=shown, measured=observations, nearby=nearby)
     rows = tuple(row.as_dict() for row in pose_rows(knowledge.chain.rig, chosen.poses))
     setups = knowledge.chain.setups
     here = f" at set-up {setups[knowledge.setup]!r}" if len(setups) > 1 else ""
@@ -137,30 +140,12 @@ def _promise(chosen: Plan) -> str:
 
 def _by_condition(knowledge: Knowledge, poses: Candidates, rivals: Sequence[FittedEffect]) -> Iterator[Experiment]:
     """The conditions that change what some of the rivals do and not what the others do."""
-    before = [_moved_mm(knowledge, poses.readings, poses.conditions, rival) for rival in rivals]
-    size = [float(np.sqrt((moved**2).mean())) for moved in before]
-    for kind in kinds_of(knowledge.chain.rig):
-        there = changed(poses.conditions, kind)
-        concerned = []
-        for rival, moved, rms in zip(rivals, before, size, strict=True):
-            change = _moved_mm(knowledge, poses.readings, there, rival) - moved
-            if float(np.sqrt((change**2).mean())) > _CHANGES * rms:
-                concerned.append(name_of(rival))
+    for kind, concerned in changing(knowledge, rivals, poses.readings, poses.conditions).items():
         if 0 < len(concerned) < len(rivals):
             others = [name for name in map(name_of, rivals) if name not in concerned]
             name = next(value for end, value in _KINDS.items() if kind[0].endswith(end))
             order, changes, leaves = _order(name, kind[0]), _listed(concerned), _listed(others)
             yield Experiment(name, f"{order}: what {changes} does changes by it, what {leaves} does not")
-
-
-def _moved_mm(knowledge: Knowledge, readings: Floats, conditions: Conditions, rival: FittedEffect) -> Floats:
-    """(n * prisms, 3) by what an effect as found moves the prisms."""
-    situation = knowledge.situation(readings, conditions)
-    additions = Choice(rival.family, rival.where, rival.settings).additions(situation)
-    by_joint = situation.to_station(situation.located.joint_jacobian)
-    values = np.array([c.value for c in rival.coefficients])
-    moved: Floats = additions.moved_mm(by_joint) @ values
-    return moved
 
 
 def _by_place(rig: Rig, rivals: Sequence[FittedEffect]) -> Iterator[Experiment]:
@@ -223,3 +208,8 @@ def _listed(names: Sequence[str]) -> str:
 def _end_s(observations: Observations) -> float:
     times = observations.extra.get("time_s", np.empty(0))
     return float(np.nanmax(times)) + _PAUSE_S if np.isfinite(times).any() else 0.0
+
+
+def _heaviest_kg(observations: Observations) -> float:
+    carried = observations.extra.get("payload_kg", np.empty(0))
+    return float(np.nanmax(carried, initial=0.0))

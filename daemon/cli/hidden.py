@@ -236,7 +236,7 @@ def concessions(rig: Rig, rows: Sequence[Mapping[str, Any]]) -> list[str]:
     if times and max(times) - min(times) > LONGEST_S:
         asked_h = (max(times) - min(times)) / 3600.0
         out.append(f"The plan asks for rounds over {asked_h:.0f} h; here they are over {LONGEST_S / 60.0:.0f} min.")
-    done = {"pose", "prisms", "time_s", "dwell_s", *(joint.column for joint in rig.joints)}
+    done = {"pose", "prisms", "fixes", "time_s", "dwell_s", *(joint.column for joint in rig.joints)}
     done |= {f"{name}_dir" for name in rig.joint_names}
     left = sorted({name for row in rows for name in row} - done)
     if left:

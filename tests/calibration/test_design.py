@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from calibration.design.visibility import (
     site,
     spread_poses,
 )
+from calibration.effects.fitted import Choice
 from calibration.errors import DataError, UnsafeError
 from calibration.kinematics import Chain, Placement
 from calibration.observations import Floats
@@ -241,10 +243,30 @@ def test_poses_that_separate_two_effects_show_them_better_than_others() -> None:
     effects = ("joint_compliance@theta4", "angle_scale@theta4")
     separating = plan(knowledge, candidates, 15, separate=effects)
     random = plan(knowledge, candidates.select(np.arange(1, 1500, 100)), 15, separate=effects)
-    assert separating.poses.conditions == {}
     assert list(separating.stands_out) == list(effects)
     for effect in effects:
         assert separating.stands_out[effect] > 1.2 * random.stands_out[effect]
+
+
+def test_derivatives_by_the_coefficients_of_effects_are_those_of_the_positions() -> None:
+    knowledge, _, candidates = situation(shipped_rig("swdt82"), 5)
+    readings = candidates.readings
+    choices = [Choice("angle_scale", where, {}) for where in ("theta3", "theta5")]
+
+    def linearised(*scales: float) -> tuple[Floats, Floats]:
+        found = (np.array([scale]) for scale in scales)
+        effects = tuple(
+            choice.fitted(knowledge.situation(readings), value, np.zeros(1))
+            for choice, value in zip(choices, found, strict=True)
+        )
+        lin, derivatives = replace(knowledge, effects=effects).linearise(readings)
+        return lin.position_mm, derivatives[:, :, -2:]
+
+    _, derivatives = linearised(0.0, 0.0)
+    step = 1e-4
+    for number, more in enumerate(np.eye(2) * step):
+        change = linearised(*more)[0] - linearised(*-more)[0]
+        np.testing.assert_allclose(derivatives[:, :, number], change / (2.0 * step), rtol=1e-5, atol=1e-2)
 
 
 def test_an_effect_of_direction_is_planned_with_the_side_to_come_from() -> None:
