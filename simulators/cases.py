@@ -40,7 +40,7 @@ RULES = (
     "Amplitudes are capped at the library's hard bounds; a case that cannot reach its size anywhere is dropped",
     f"Separable, decided from the truth before any answer: the nearest family is beaten by ln odds of {MARGIN:g} in "
     "all but 2 % of the draws of the noise; loads as the machine's own; a free curve of a joint's angle is no rival",
-    "Right: every hidden family is named, and no other",
+    "Right: every hidden family that the library has is named, and no other",
     "With encoder_harmonic or angle_scale left out, joint_error_map is a true name and no misnaming: it is any curve "
     "of the joint's own angle",
     "Right location, of an effect outside the library: what is said of it first (the place named, the description, or "
@@ -82,13 +82,14 @@ def draw(rig: Rig, cell: Cell) -> Drawn | None:
         return None
     observed = scene.observe([h.effect for h in hidden])
     nearest = nearest_rival(scene, visibility, hidden[0].effect) if cell.kind == "single" else None
+    without = cell.families if cell.kind == "left_out" else ()
     label = {
         "kind": cell.kind,
         "poses": cell.poses,
         "noise": cell.noise,
         "size": cell.size,
         "seed": cell.seed,
-        "effects": [_effect_label(rig, h) for h in hidden],
+        "effects": [_effect_label(rig, h, without) for h in hidden],
         "separable": nearest is None or nearest.is_separable,
         "rival": "" if nearest is None else nearest.rival,
         "aliases": cell.families[0].split("|") if cell.kind == "alias" else [],
@@ -98,7 +99,6 @@ def draw(rig: Rig, cell: Cell) -> Drawn | None:
         "truth_mm": observed.held_out.oracle_mm.round(4).tolist(),
         "twin_mm": scene.observe(()).held_out.oracle_mm.round(4).tolist() if has_twin(cell) else None,
     }
-    without = cell.families if cell.kind == "left_out" else ()
     return Drawn(observed.training.csv_text(), _readings(observed.held_out), without, label)
 
 
@@ -117,7 +117,7 @@ def measured(rig: Rig, cell: Cell, poses: Sequence[Mapping[str, Any]]) -> str:
 
     Args:
         rig, cell: the case.
-        poses: rows of a plan: a column of every joint, and `<joint>_dir` and other columns where they matter.
+        poses: rows of a plan: a column of every joint; `<joint>_dir`, `fixes` and other columns where they matter.
 
     Raises:
         ValueError: no pose, or one that lacks a joint.
@@ -127,7 +127,7 @@ def measured(rig: Rig, cell: Cell, poses: Sequence[Mapping[str, Any]]) -> str:
     scene, hidden, _ = _hidden(rig, cell)
     effects = [h.effect for h in hidden]
     joints = {j.name: np.array([float(row[j.column]) for row in poses]) for j in rig.joints}
-    how = [k for k in scene.training.columns if all(k in row for row in poses)]
+    how = [k for k in (*scene.training.columns, "fixes") if all(k in row for row in poses)]
     columns = {k: np.array([float(row[k]) for row in poses]) for k in how}
     before, after = scene.observe(effects).training, scene.measure(effects, joints, cell.seed, columns=columns)
     table = {name: np.concatenate([values, after.columns[name]]) for name, values in before.columns.items()}
@@ -187,13 +187,14 @@ def _lacking(scene: Scene, effects: Sequence[Effect], rng: np.random.Generator) 
     return replace(scene, settings=replace(scene.settings, missing=(name,)))
 
 
-def _effect_label(rig: Rig, hidden: Hidden) -> dict[str, Any]:
+def _effect_label(rig: Rig, hidden: Hidden, without: Sequence[str]) -> dict[str, Any]:
     effect = hidden.effect
     plausible = type(effect)(where=effect.where)
     at_the_tip = {name for row in rig.rows if "a" in row.drive for driven in row.drive.values() for name in driven}
     return {
         "family": effect.family,
         "where": effect.where,
+        "has_name": effect.family in LIBRARY and effect.family not in without,
         # What the boom does shows where its tip is: at the joints of that row.
         "places": [effect.where, *(sorted(at_the_tip) if effect.where == "boom" else ())],
         "coefficients": {name: float(getattr(effect, name)) for name in effect.size},

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Literal
 
-Kind = Literal["single", "null", "decoy", "pair", "triple", "outside", "left_out", "alias"]
+Kind = Literal["single", "null", "decoy", "pair", "triple", "outside", "left_out", "alias", "beside"]
 Poses = Literal["wide", "face", "sparse"]
 Noise = Literal["fine", "stepped", "coarse"]
 
@@ -17,7 +17,7 @@ ALIASES = (
     "cylinder_compression|transducer_scale",
     "latency|clock_drift",
 )
-KINDS: tuple[Kind, ...] = ("single", "null", "decoy", "pair", "triple", "outside", "left_out", "alias")
+KINDS: tuple[Kind, ...] = ("single", "null", "decoy", "pair", "triple", "outside", "left_out", "alias", "beside")
 SIZES = (0.25, 0.5, 1.0, 3.0)
 POSES: tuple[Poses, ...] = ("wide", "face", "sparse")
 NOISES: tuple[Noise, ...] = ("fine", "stepped", "coarse")
@@ -32,7 +32,8 @@ class Cell:
 
     Attributes:
         kind: what it is for.
-        families: hidden effects; of an alias, one of `ALIASES`: two families that the data is made to confuse.
+        families: hidden effects; of an alias, one of `ALIASES`: two families that the data is made to confuse; of
+            `beside`, one that no library has, and one of the library.
         size: visible RMS of each effect in units of the noise; 0 without effects.
         poses: `wide`, `face` (feed held parallel to the tunnel axis) or `sparse` (few, in clusters).
         noise: encoders read in steps as the rig file has them (`fine`), of 0.02 deg (`stepped`) or 0.1 deg (`coarse`),
@@ -92,7 +93,7 @@ def short_plan(families: Sequence[str], outside: Sequence[str], aliases: Sequenc
 
 _Open = tuple[Kind, tuple[str, ...], float, Poses, Noise]
 
-_NULLS, _DECOYS, _PAIRS, _TRIPLES, _ALIASES = 600, 60, 60, 30, 10
+_NULLS, _DECOYS, _PAIRS, _TRIPLES, _ALIASES, _BESIDE = 600, 60, 60, 30, 10, 80
 
 
 def _full(families: Sequence[str], outside: Sequence[str], aliases: Sequence[str], repeats: int) -> Iterator[_Open]:
@@ -108,6 +109,7 @@ def _full(families: Sequence[str], outside: Sequence[str], aliases: Sequence[str
         yield "left_out", (family,), size, poses, "fine"
     for name, _ in product(aliases, range(_ALIASES)):
         yield "alias", (name,), 1.0, "wide", "fine"
+    yield from _beside(families, outside, _BESIDE)
 
 
 def _short(families: Sequence[str], outside: Sequence[str], aliases: Sequence[str]) -> Iterator[_Open]:
@@ -123,6 +125,7 @@ def _short(families: Sequence[str], outside: Sequence[str], aliases: Sequence[st
         yield "left_out", (family,), 1.0, "wide", "fine"
     for name in aliases:
         yield "alias", (name,), 1.0, "wide", "fine"
+    yield from _beside(families, outside, 4)
 
 
 def _without_effect(kind: Kind, number: int) -> Iterator[_Open]:
@@ -136,6 +139,14 @@ def _together(kind: Kind, families: Sequence[str], effects: int, number: int) ->
         step = 1 + index // len(families) + index % 3
         chosen = tuple(families[(index * effects + step * i) % len(families)] for i in range(effects))
         yield kind, tuple(dict.fromkeys(chosen)), 1.0, "wide", "fine"
+
+
+def _beside(families: Sequence[str], outside: Sequence[str], number: int) -> Iterator[_Open]:
+    """Every effect that no library has, with families that are farther along the list each time round."""
+    for index in range(number):
+        turn, at = divmod(index, len(outside))
+        family = families[(at * len(families) // len(outside) + turn) % len(families)]
+        yield "beside", (outside[at], family), (1.0, 3.0)[turn % 2], _COMMON[turn // 2 % len(_COMMON)], "fine"
 
 
 def _numbered(cells: Iterator[_Open], first: int) -> tuple[Cell, ...]:

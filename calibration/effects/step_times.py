@@ -41,9 +41,17 @@ class _Instants(NamedTuple):
 
 
 def step_grid(time_s: Floats) -> tuple[Settings, ...]:
-    """Instants at quantiles of the rows' times (n,), NaN where not known; none where too few rows have a time."""
+    """Instants at quantiles of the rows' times (n,), NaN where not known; none where too few rows have a time.
+
+    Each stands for those about it: its error is that of a step anywhere among them.
+    """
     instants = _instants(time_s)
-    return tuple(instants.settings(index) for index in _grid(instants))
+    grid = _grid(instants)
+    if not grid:
+        return ()
+    nearest = np.abs(np.arange(len(instants.time_s))[:, None] - grid).argmin(axis=1)
+    errors = np.bincount(nearest, instants.error_s)
+    return tuple(instants.settings(index, error) for index, error in zip(grid, errors.tolist(), strict=True))
 
 
 def refined_steps(time_s: Floats, settings: Settings) -> tuple[Settings, ...]:
@@ -71,6 +79,11 @@ def settled_step(forms: Sequence[Settings], probability: Floats) -> Settings:
     best = int(np.argmax(probability))
     variance = probability @ ((times - times[best]) ** 2 + errors**2)
     return {**forms[best], "time_error_s": math.sqrt(float(variance))}
+
+
+def step_odds(settings: Settings) -> float:
+    """How plausible an instant is beside the others: as long as the time is that it stands for."""
+    return settings["time_error_s"]
 
 
 def step_time(settings: Settings) -> FittedCoefficient:

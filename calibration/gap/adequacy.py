@@ -14,7 +14,7 @@ import numpy as np
 from calibration.gap.adopt import JointFit
 from calibration.gap.detect import detect
 from calibration.gap.grammar import Grammar
-from calibration.gap.projection import Projection, Softly
+from calibration.gap.projection import Projection
 from calibration.gap.terms import modulations
 from calibration.gap.variables import Place, Variables
 from calibration.identification.samples import reading_covariance
@@ -55,11 +55,13 @@ def depends(joint: JointFit, number: int, projection: Projection, rng: np.random
         projection: about that fit.
         rng: draws signs, as detection does.
     """
-    choice, own = joint.choices[number], joint.own(number)
-    moved_mm = projection.moved_mm(joint.parts[number]) @ joint.found(number)[0]
-    others = Softly(np.delete(projection.rows.kinematics, np.r_[own], axis=1))
-    explained = float((others(projection.whitened(moved_mm[:, :, None])) ** 2).sum())
-    place = Place(choice.where, str(choice), {}, moved_mm)
+    choice, part, own = joint.choices[number], joint.parts[number], joint.own(number)
+    value = joint.fit.x[own]
+    # Squares that nothing else explains: those of the coefficients in their posterior, less those in their prior.
+    explained = float(
+        value @ np.linalg.solve(joint.fit.covariance[own, own], value) - ((value / part.prior_sigma) ** 2).sum()
+    )
+    place = Place(choice.where, str(choice), {}, projection.moved_mm(part) @ value)
     grammar = Grammar(projection, modulations(Variables(projection), place))
     left = float((grammar.score**2).max(initial=0.0))
     if left < _LEFT * (explained + left) or not detect(grammar, rng).significant:

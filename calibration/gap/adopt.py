@@ -53,7 +53,7 @@ class JointFit:
         situation: of the observations, at the parameters whose loads and lever arms the effects have.
         choices: the effects.
         parts: what each of them does to the samples.
-        fit: of parameters (p,) and then of their coefficients, in this order.
+        fit: of parameters (p,), of what the solution has beside them, and last of their coefficients, in this order.
     """
 
     situation: Situation
@@ -62,13 +62,18 @@ class JointFit:
     fit: Fit
 
     @property
+    def _first(self) -> int:
+        """Which of the fit's parameters is the first coefficient of the effects."""
+        return len(self.fit.x) - sum(map(len, self.parts))
+
+    @property
     def additions(self) -> Additions | None:
         """All coefficients; None where there are no effects."""
         return joined(self.parts, len(self.parts[0].column)) if self.parts else None
 
     def own(self, number: int) -> slice:
         """Which of the fit's parameters are the coefficients of one of the effects."""
-        first = len(self.situation.chain) + sum(len(part) for part in self.parts[:number])
+        first = self._first + sum(len(part) for part in self.parts[:number])
         return slice(first, first + len(self.parts[number]))
 
     def found(self, number: int) -> tuple[Floats, Floats]:
@@ -79,11 +84,11 @@ class JointFit:
     def start(self, choices: Sequence[Choice]) -> Floats:
         """(p + k,) where a fit of these effects, all of them in this one, begins."""
         coefficients = [self.found(self.choices.index(choice))[0] for choice in choices]
-        return np.concatenate([self.fit.x[: len(self.situation.chain)], *coefficients])
+        return np.concatenate([self.fit.x[: self._first], *coefficients])
 
     def error_mm(self, solution: Solution) -> Floats:
         """(m, 3) what the fit leaves of the samples of a solution of its chain, mm."""
-        chain, data, additions = solution.chain, solution.samples.data, self.additions
+        chain, data, additions = solution.chain, solution.samples.data, along(solution, self.parts)
         x, coefficients = self.fit.x[: len(chain)], self.fit.x[len(chain) :]
         left = solution.samples.position_mm
         if additions is not None:
@@ -117,14 +122,20 @@ def joint_fit(
         start: (p,) or more: parameters, and coefficients of the first of the effects; the solution's by default.
     """
     chain, samples = solution.chain, solution.samples
-    x = solution.fit.x[: len(chain)] if start is None else start
+    x = solution.fit.x if start is None else start
     situation, parts = _parts(solution, observations, choices, x)
-    fit = refine(chain, samples, x, prior=prior, additions=joined(parts, len(samples)))
+    fit = refine(chain, samples, x, prior=prior, additions=along(solution, parts))
     again = _parts(solution, observations, choices, fit.x)
     if not all(same_columns(a, b) for a, b in zip(parts, again[1], strict=True)):
         situation, parts = again
-        fit = refine(chain, samples, fit.x, prior=prior, additions=joined(parts, len(samples)))
+        fit = refine(chain, samples, fit.x, prior=prior, additions=along(solution, parts))
     return JointFit(situation, tuple(choices), parts, fit)
+
+
+def along(solution: Solution, parts: Sequence[Additions]) -> Additions | None:
+    """All coefficients that a fit has beside the kinematics: the solution's own, and those of effects."""
+    own = () if solution.additions is None else (solution.additions,)
+    return joined([*own, *parts], len(solution.samples)) if own or parts else None
 
 
 def _parts(
@@ -236,9 +247,10 @@ def evidence_of_forms(situation: Situation, forms: Sequence[Choice], over: Proje
 def projected(solution: Solution, joint: JointFit, *, without_last: bool = False) -> Projection:
     """The projection about a joint fit; its last effect is no part of what is taken out, if so asked."""
     kept = joint.parts[:-1] if without_last else joint.parts
-    additions = joined(kept, len(solution.samples)) if kept else None
     tried = joint.parts[-1] if without_last else None
-    return Projection(replace(solution, fit=joint.fit, additions=additions), joint.situation, joint.fit, tried)
+    return Projection(
+        replace(solution, fit=joint.fit, additions=along(solution, kept)), joint.situation, joint.fit, tried
+    )
 
 
 def _in_finest_forms(solution: Solution, joint: JointFit, prior: Prior) -> JointFit:

@@ -5,45 +5,59 @@ The posterior alone is conditional on the library, the noise and the linear mode
 
 from __future__ import annotations
 
+import itertools
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
 from scipy import stats
+from scipy.linalg import solve_triangular
 
 from calibration.effects.base import Situation
-from calibration.gap.projection import Integers, Projection, Softly, log_bayes_factor, rows_of, without_folds
+from calibration.gap.projection import Integers, Projection, from_products, rows_of, without_folds
 from calibration.gap.screen import Weighed
 from calibration.observations import Floats
 from calibration.residual.folds import folds
 
 HALF_SAMPLES = 25
 _FOLDS = 10
-_CHANCE = 2.0  # standard errors
 
 
-def wins(projection: Projection, rivals: Sequence[Weighed], seed: int) -> float:
-    """Share of half-samples, drawn by group, in which the first of the rivals has the greatest evidence.
+def wins(projection: Projection, family: Sequence[Weighed], rivals: Sequence[Weighed], seed: int) -> dict[str, float]:
+    """Share of half-samples, drawn by group, in which a family has the greatest evidence, wherever it is.
 
-    Where another effect is likely beside the first, it is there beside each of them.
+    Where another effect is likely beside the first, it is there beside each of them. What it costs not to know a form,
+    both halves share.
 
     Args:
         projection: about the fit.
-        rivals: the candidate, and then those of other families that come near; nothing is a rival too.
+        family: the candidate, and other places of its family that come near.
+        rivals: those of other families that come near; nothing is a rival too.
         seed: of the halves.
+
+    Returns:
+        `family@where` -> share, the greatest first, of all that win any; the family by the name of the candidate.
     """
-    whitened = [_columns(projection, w) for w in rivals]
-    kinematics = _with_beside(projection, rivals[0])
+    weighed = [*family, *rivals]
+    columns = [_columns(projection, w) for w in weighed]
+    kinematics = _with_beside(projection, family[0])
+    every = np.hstack([kinematics, *columns, projection.rows.target[:, None]])
+    edges = np.cumsum([0, *(w.shape[1] for w in columns)])
     labels, group = np.unique(projection.groups, return_inverse=True)
     rng = np.random.default_rng(seed)
-    won = 0
+    names = [str(family[0].place)] * len(family) + [str(w.place) for w in rivals]
+    won = Counter[str]()
     for _ in range(HALF_SAMPLES):
         half = np.isin(group, rng.permutation(len(labels))[: (len(labels) + 1) // 2])
-        rows = rows_of(np.flatnonzero(half))
-        softly = Softly(kinematics[rows])
-        residual = softly(projection.rows.target[rows])
-        values = [log_bayes_factor(softly(w[rows]), residual, np.ones(w.shape[1])) for w in whitened]
-        won += values[0] >= max(values) and values[0] > 0.0
-    return won / HALF_SAMPLES
+        left = _without_first(every[rows_of(np.flatnonzero(half))], kinematics.shape[1])
+        values = [
+            0.5 * w.spread + from_products(left[a:b, a:b], left[a:b, -1], np.ones(b - a))
+            for w, (a, b) in zip(weighed, itertools.pairwise(edges.tolist()), strict=True)
+        ]
+        best = int(np.argmax(values))
+        if values[best] > 0.0:
+            won[names[best]] += 1
+    return {name: count / HALF_SAMPLES for name, count in won.most_common()}
 
 
 def chance_of_gain(projection: Projection, candidate: Weighed, seed: int) -> float:
@@ -76,6 +90,15 @@ def _with_beside(projection: Projection, weighed: Weighed) -> Floats:
     if weighed.beside is None:
         return projection.rows.kinematics
     return np.hstack([projection.rows.kinematics, _columns(projection, weighed.beside)])
+
+
+def _without_first(rows: Floats, first: int) -> Floats:
+    """(k, k) products of whitened columns (r, first + k) with those before `first`, of unit priors, taken out."""
+    products = rows.T @ rows
+    factor = np.linalg.cholesky(products[:first, :first] + np.eye(first))
+    taken = solve_triangular(factor, products[:first, first:], lower=True)
+    left: Floats = products[first:, first:] - taken.T @ taken
+    return left
 
 
 def _held_out(design: Floats, target: Floats, fold: Integers) -> Floats:

@@ -1,7 +1,7 @@
 """Formulas for what is in no library, as the data ask for them.
 
 Each term is a single column in the projected space, and its evidence is that of a coefficient whose order of magnitude
-nobody knows: the mean of the closed form of `projection.log_bayes_factor` over prior sigmas from one standard error up
+nobody knows: the mean of the closed form of `projection.from_products` over prior sigmas from one standard error up
 to what would be plain to see. Several terms are found one after the other, each in what those before it leave
 (orthogonal matching pursuit: Pati, Rezaiifar and Krishnaprasad, Asilomar 1993), from several beginnings: where an error
 has two terms, as a wave of any phase has, a third may look like both and beat each alone.

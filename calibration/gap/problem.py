@@ -10,8 +10,10 @@ import numpy as np
 from calibration.effects.base import Situation
 from calibration.effects.fitted import Choice
 from calibration.gap.adopt import JointFit, joint_fit, projected
+from calibration.gap.grammar import Found as Formula
 from calibration.gap.projection import Projection
-from calibration.identification.refinement import Prior
+from calibration.identification.additions import NO_JOINT, Additions
+from calibration.identification.refinement import Prior, refine
 from calibration.identification.solve import Solution
 from calibration.observations import Floats, Observations
 
@@ -28,12 +30,28 @@ class Problem:
         observations: the rows.
         prior: as the solution was found with.
         seed: of everything random.
+        formulas: of what no library has, that the solution's fit has beside the kinematics.
     """
 
     solution: Solution
     observations: Observations
     prior: Prior
     seed: int
+    formulas: tuple[Formula, ...] = ()
+
+    def beside(self, formulas: Sequence[Formula]) -> Problem:
+        """The same data with formulas fitted along, each of a size like the one that it has."""
+        chain, samples, fit = self.solution.chain, self.solution.samples, self.solution.fit
+        additions = Additions(
+            tuple(str(f.term) for f in formulas),
+            np.full(len(formulas), NO_JOINT),
+            np.zeros((len(samples), len(formulas))),
+            np.array([abs(f.coefficient) for f in formulas]),
+            np.stack([f.term.moved_mm for f in formulas], axis=2),
+        )
+        fit = refine(chain, samples, fit.x[: len(chain)], prior=self.prior, additions=additions)
+        solution = replace(self.solution, fit=fit, additions=additions)
+        return replace(self, solution=solution, formulas=tuple(formulas))
 
     def rng(self) -> np.random.Generator:
         """Draws the signs of detection, the same every time."""

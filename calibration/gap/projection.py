@@ -23,6 +23,7 @@ from calibration.identification.additions import Additions, joined
 from calibration.identification.refinement import Fit, whitened_rows
 from calibration.identification.samples import Samples
 from calibration.identification.solve import Solution
+from calibration.kernels.gram import gram
 from calibration.observations import Floats
 
 Labels = NDArray[np.str_]
@@ -52,8 +53,8 @@ class Softly:
     """
 
     def __init__(self, kinematics: Floats) -> None:
-        _, size, axes = np.linalg.svd(np.linalg.qr(kinematics, mode="r"), full_matrices=False)
-        root = np.sqrt(1.0 + size**2)
+        # Of a triangular root of I + K'K, whose small singular values do not suffer from the large ones' squares.
+        _, root, axes = np.linalg.svd(np.linalg.cholesky(gram(kinematics) + np.eye(kinematics.shape[1])).T)
         self._kinematics = kinematics
         self._half = axes.T / root
         self._middle: Floats = axes.T / (root * (1.0 + root)) @ axes
@@ -146,7 +147,7 @@ class Projection:
         """
         sigma = more.prior_sigma
         design = np.hstack([self.rows.kinematics, self.whitened(self.moved_mm(more)) * sigma])
-        normal = design.T @ design + np.eye(design.shape[1])
+        normal = gram(design) + np.eye(design.shape[1])
         x = np.linalg.solve(normal, design.T @ self.rows.target)
         kept = self.rows.kinematics.shape[1]
         solved: Floats = x * np.concatenate([1.0 / self._found.precision_root[:kept], sigma])
@@ -177,13 +178,11 @@ def without_folds(design: Floats, target: Floats, fold: Integers) -> Iterator[tu
         yield int(number), cho_solve(factor, right - own.T @ target[rows])
 
 
-def log_bayes_factor(columns: Floats, residual: Floats, sigma: Floats) -> float:
-    """ln of the evidence of columns (r, k) with prior sigmas (k,) over that of nothing."""
-    return from_products(columns.T @ columns, columns.T @ residual, sigma)
-
-
 def from_products(gram: Floats, along: Floats, sigma: Floats) -> float:
-    """The same from G'G (k, k) and G'r (k,): 1/2 b'A^-1 b - 1/2 ln |A|, A = I + S G'G S, b = S G'r."""
+    """ln of the evidence of columns with prior sigmas (k,) over that of nothing, from G'G (k, k) and G'r (k,).
+
+    1/2 b'A^-1 b - 1/2 ln |A|, A = I + S G'G S, b = S G'r.
+    """
     matrix = np.eye(len(sigma)) + gram * sigma * sigma[:, None]
     factor = np.linalg.cholesky(matrix)
     solved = np.linalg.solve(factor, along * sigma)

@@ -17,9 +17,10 @@ from calibration.gap.screen import Place, Screen, Weighed
 _ODDS, _FURTHER_ODDS = math.log(99.0), math.log(999.0)  # that something is there, and something more beside that
 _CHANCE, _FURTHER_CHANCE = 0.01, 0.003  # of anything at all, corrected for all that was looked at, and of more
 NEAR = 5.0  # in log evidence: families this near are not told apart
-PLAIN = 100.0  # log evidence of what no half of the data can miss, where no rival comes near
+PLAIN = 100.0  # log evidence beyond any doubt
+_AS_WELL = math.log(19.0)  # log odds at which a rival has a posterior of 0.05
 _POSSIBLE = 0.02  # posterior of a rival
-BOTH = 1.1  # posterior of two places together that cannot each be in place of the other
+_BOTH = 1.1  # posterior of two places together that cannot each be in place of the other
 _BESIDE = 0.1  # of the leading log evidence: less is neither like it nor seen beside it
 _COMPARED = 30  # places at least
 
@@ -74,8 +75,11 @@ def stands_for(weighed: Weighed, formula: Formula, over: Projection) -> bool:
     It may explain as much with more coefficients than these data ask for, at the same place: an error of another place
     that is simpler and explains more is something else.
     """
-    if weighed.place.where != formula.term.place.where:
-        return False
+    return weighed.place.where == formula.term.place.where and explains(weighed, formula, over)
+
+
+def explains(weighed: Weighed, formula: Formula, over: Projection) -> bool:
+    """Whether the data ask for nothing of a formula beside an effect."""
     additions = weighed.scaled_additions
     columns = over.columns(over.moved_mm(additions)) * additions.prior_sigma
     return not formula.shows_beside(columns, over.residual)
@@ -92,26 +96,41 @@ def best_of_each_family(weighed: Sequence[Weighed]) -> list[Weighed]:
 
 def near_rivals(weighed: Sequence[Weighed]) -> list[Weighed]:
     """The leading place, and the best of each other family that may be there in its place: none that is beside it."""
-    leading, found = weighed[0], {weighed[0].place.family: weighed[0]}
+    found = {weighed[0].place.family: weighed[0]}
     for w in sorted(weighed[1:], key=lambda w: -w.log_bayes_factor):
-        is_near = w.log_bayes_factor > leading.log_bayes_factor - NEAR or w.posterior > _POSSIBLE
-        if is_near and w.posterior + leading.posterior < BOTH:
+        if is_near(weighed[0], w):
             found.setdefault(w.place.family, w)
     return list(found.values())
 
 
+def is_near(leading: Weighed, other: Weighed) -> bool:
+    """Whether another place may be what it is in place of the leading one."""
+    near = other.log_bayes_factor > leading.log_bayes_factor - NEAR or other.posterior > _POSSIBLE
+    return near and other.posterior + leading.posterior < _BOTH
+
+
+def beyond_doubt(best: Sequence[Weighed]) -> bool:
+    """Whether the leading place is plain to see and no other family comes near, by the best of each family."""
+    leading, *others = (w.log_bayes_factor for w in best)
+    return leading > max([PLAIN, *(other + 2 * NEAR for other in others)])
+
+
 def as_simple(leading: Weighed, rival: Weighed) -> bool:
-    """Whether a rival explains the data nearly as well with no more coefficients: what is likelier beforehand is no
-    evidence, but that something simpler explains as much as a part of it is."""
-    near = rival.log_bayes_factor > leading.log_bayes_factor - NEAR
-    return near and rival.size <= leading.size
+    """Whether a rival explains the data nearly as well with no more coefficients.
+
+    What is likelier beforehand is no evidence, neither by the number of its places nor by the size that it asks for.
+    That something simpler explains as much as a part of it is.
+    """
+    better = leading.log_bayes_factor - rival.log_bayes_factor
+    fits_better = leading.log_likelihood - rival.log_likelihood
+    return rival.size <= leading.size and better < NEAR and min(better, fits_better) < _AS_WELL
 
 
-def with_option(place: Place, choice: Choice, over: Projection, situation: Situation) -> Place:
-    """A place with one variant more."""
+def with_finer(place: Place, option: int, choice: Choice, over: Projection, situation: Situation) -> Place:
+    """A place with a finer form of one of its variants more, as likely as that one."""
     choice = replace(choice, scale=1.0)
     additions = choice.additions(situation).over(over.samples.average)
-    odds = np.append(place.log_odds, place.log_odds.max())
+    odds = np.append(place.log_odds, place.log_odds[option])
     return replace(place, options=(*place.options, choice), additions=(*place.additions, additions), log_odds=odds)
 
 

@@ -12,6 +12,7 @@ import itertools
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import stats
@@ -58,6 +59,16 @@ class Place:
     def __str__(self) -> str:
         return f"{self.family}@{self.where}"
 
+    @cached_property
+    def alike(self) -> tuple[int, ...]:
+        """(o,) of each variant the first that has the same columns; the two differ in their prior alone."""
+        # Columns of different sums are told apart without comparing them.
+        sums = [(len(a), a.column.sum(), 0.0 if a.shift_mm is None else a.shift_mm.sum()) for a in self.additions]
+        return tuple(
+            next((k for k in range(n) if sums[k] == sums[n] and same_columns(self.additions[k], own)), n)
+            for n, own in enumerate(self.additions)
+        )
+
 
 @dataclass(frozen=True)
 class Possible:
@@ -82,6 +93,8 @@ class Weighed:
         scale: of that variant's plausible sizes.
         estimate, standard_error: (k,) of its coefficients in the linear model.
         log_bayes_factor: of the place against nothing, all its variants together.
+        spread: the same less that of its best variant by itself: what it costs not to know the form.
+        log_likelihood: against nothing, of the coefficients that fit best, whatever their size; averaged over variants.
         p: of the squares that the best variant explains, by chance, for one look.
         posterior: of the place, among all places, pairs and nothing.
         log_evidence: of the most probable model that has this place, the odds beforehand in it, against nothing.
@@ -94,6 +107,8 @@ class Weighed:
     estimate: Floats
     standard_error: Floats
     log_bayes_factor: float
+    spread: float
+    log_likelihood: float
     p: float
     posterior: float = 0.0
     log_evidence: float = -math.inf
@@ -202,14 +217,10 @@ class Screen:
         self._block: dict[tuple[int, int], int] = {}
         blocks: list[Additions] = []
         for number, place in enumerate(self.places):
-            own: list[tuple[Additions, int]] = []
-            for option, additions in enumerate(place.additions):
-                block = next((index for other, index in own if same_columns(other, additions)), None)
-                if block is None:
-                    block = len(blocks)
-                    blocks.append(additions)
-                own.append((additions, block))
-                self._block[number, option] = block
+            for option, first in enumerate(place.alike):
+                self._block[number, option] = len(blocks) if first == option else self._block[number, first]
+                if first == option:
+                    blocks.append(place.additions[option])
         target = projection.rows.target
         taken = projection.softly.taken(target)
         self._whitened: list[Floats] = []
@@ -263,13 +274,12 @@ class Screen:
         """All places but those called so (`family@where`), the most probable first."""
         each = {n: self._weigh(n) for n, place in enumerate(self.places) if str(place) not in without}
         best = sorted(each, key=lambda n: -(each[n].log_bayes_factor + each[n].place.log_prior))[:_PAIRED]
-        spread = {n: each[n].log_bayes_factor - self.together([each[n]]) for n in best}
         models: list[tuple[tuple[int, ...], float]] = [((), 0.0)]
         models += [((n,), w.log_bayes_factor + w.place.log_prior) for n, w in each.items()]
         for i, k in itertools.combinations(best, 2):
             pair = [each[i], each[k]]
             prior = sum(w.place.log_prior for w in pair) + math.log(2.0) + _SECOND
-            models.append(((i, k), self.together(pair) + spread[i] + spread[k] + prior))
+            models.append(((i, k), self.together(pair) + each[i].spread + each[k].spread + prior))
         total = logsumexp([value for _, value in models])
         share, top = dict.fromkeys(each, 0.0), dict.fromkeys(each, -math.inf)
         beside: dict[int, Weighed | None] = dict.fromkeys(each)
@@ -289,10 +299,12 @@ class Screen:
         that mirror or outgrow each other, data alone say which only by the sign and the size that they ask for.
         """
         place = self.places[number]
-        values = np.array([self._at_scales(number, option) for option in range(len(place.options))])
-        values += place.log_odds[:, None] + np.array(list(LOG_SCALE_ODDS.values()))
+        each = [self._at_scales(number, option) for option in range(len(place.options))]
+        odds = place.log_odds[:, None] + np.array(list(LOG_SCALE_ODDS.values()))
+        values = odds + [at_scales for at_scales, _ in each]
+        likelihood = float(logsumexp(place.log_odds + [0.5 * explained for _, explained in each]))
         while True:
-            found = self._weigh_best(number, values)
+            found = self._weigh_best(number, values, odds, likelihood)
             estimate, error = found.estimate, found.standard_error
             is_strained = found.choice.strained(estimate, error)
             if not is_strained and not found.choice.beyond(self.projection.situation, estimate, error):
@@ -303,15 +315,16 @@ class Screen:
                 return found
             values = rest
 
-    def _weigh_best(self, number: int, values: Floats) -> Weighed:
-        """One place by its best variant and scale, for the log evidence (options, scales) of all."""
+    def _weigh_best(self, number: int, values: Floats, odds: Floats, log_likelihood: float) -> Weighed:
+        """One place by its best variant and scale, for the log evidence (options, scales) of all, `odds` in it."""
         place = self.places[number]
         option, best = np.unravel_index(int(np.argmax(values)), values.shape)
         prior = place.additions[option].prior_sigma * SCALES[best]
         size, axes, along = self._eigen(number, int(option))
         size, along = size * SCALES[best] ** 2, along * SCALES[best]
-        seen = size > _SEEN * max(float(size[-1]), _TINY)
-        p = float(stats.chi2.sf(float((along[seen] ** 2 / size[seen]).sum()), int(seen.sum())))
+        explained, degrees = _explained(size, along)
+        p = float(stats.chi2.sf(explained, degrees))
+        together = float(logsumexp(values))
         looks = len({self._block[number, o] for o in range(len(values))})
         return Weighed(
             place,
@@ -319,16 +332,18 @@ class Screen:
             SCALES[best],
             prior * (axes @ (along / (1.0 + size))),
             prior * np.sqrt(np.clip(1.0 - axes**2 @ (size / (1.0 + size)), 0.0, 1.0)),
-            float(logsumexp(values)),
+            together,
+            together - float(values[option, best] - odds[option, best]),
+            log_likelihood,
             min(p * looks, 1.0),
         )
 
-    def _at_scales(self, number: int, option: int) -> Floats:
-        """(scales,) log Bayes factors of a variant by itself."""
-        size, _, along = self._eigen(number, option)
-        size, squares = size * _SQUARED_SCALES, along**2 * _SQUARED_SCALES
+    def _at_scales(self, number: int, option: int) -> tuple[Floats, float]:
+        """(scales,) log Bayes factors of a variant by itself, and the squares that it explains at most."""
+        one, _, along_one = self._eigen(number, option)
+        size, squares = one * _SQUARED_SCALES, along_one**2 * _SQUARED_SCALES
         values: Floats = 0.5 * (squares / (1.0 + size) - np.log1p(size)).sum(axis=1)
-        return values
+        return values, _explained(one, along_one)[0]
 
     def _eigen(self, number: int, option: int) -> tuple[Floats, Floats, Floats]:
         """Of a variant's G'G with the coefficients in prior sigmas: eigenvalues (k,), axes (k, k), G'r along these."""
@@ -339,8 +354,15 @@ class Screen:
 
     def _product(self, a: int, b: int) -> Floats:
         if (a, b) not in self._gram:
-            self._gram[a, b] = self._whitened[a].T @ self._whitened[b] - self._taken[a].T @ self._taken[b]
+            product = self._whitened[a].T @ self._whitened[b] - self._taken[a].T @ self._taken[b]
+            self._gram[a, b], self._gram[b, a] = product, product.T
         return self._gram[a, b]
+
+
+def _explained(size: Floats, along: Floats) -> tuple[float, int]:
+    """Squares that columns explain, by the eigenvalues (k,) of their products and G'r along these; and how many do."""
+    seen = size > _SEEN * max(float(size[-1]), _TINY)
+    return float((along[seen] ** 2 / size[seen]).sum()), int(seen.sum())
 
 
 def _several(blocks: Sequence[Additions]) -> Iterator[Sequence[Additions]]:

@@ -16,6 +16,7 @@ from calibration.gap.grammar import Grammar
 from calibration.gap.problem import OUTLIER, Problem
 from calibration.gap.projection import Projection
 from calibration.gap.reading_steps import in_true_steps
+from calibration.gap.rivals import explains
 from calibration.gap.screen import Place, Possible, Weighed, possible
 from calibration.gap.settle import settled
 from calibration.gap.turn import decide
@@ -27,6 +28,7 @@ MOST_FAMILIES = 4
 
 _STEPS = 30  # of the loop; every place of every adopted family
 _PENDING = 3  # sets that are looked behind
+_FORMULAS = 3  # that are fitted along
 _MANY = 0.02  # share of gross outliers that is more than accidents
 
 
@@ -61,6 +63,8 @@ class Found:
         turns: in their order, the last without anything taken in.
         rivals: of the set that is pending, the most probable first; none where nothing is.
         formulas: of the grammar, where they explain better than all of the library what is left.
+        strange: of the grammar, what beat the library beside all that had been named by then, even if that was taken
+            back; `formulas` by default.
         certain: `family@where` of what is adopted -> posterior of its family when it was.
         possible: all places at the beginning, and what the data lack for others.
         first: what the kinematics alone leave.
@@ -72,6 +76,7 @@ class Found:
     turns: tuple[Turn, ...]
     rivals: tuple[Weighed, ...]
     formulas: tuple[Formula, ...]
+    strange: tuple[Formula, ...]
     certain: Mapping[str, float]
     possible: Possible
     first: Projection
@@ -82,8 +87,10 @@ class _Search:
     def __init__(self, problem: Problem, families: Collection[str]) -> None:
         self.problem, self.families = problem, tuple(families)
 
-    def run(self) -> Found:
-        """The search, with the fixes that are far off left out, and with all where there are many such.
+    def run(self, before: Found | None = None) -> Found:
+        """The search without the fixes that are far off, and with all where there are many such.
+
+        It goes on after what was found `before`, if anything was.
 
         To kinematics alone a fix that shows an effect may look like an outlier, as such fixes are often the rare ones:
         those after a step, or where a load has changed its side. Of both searches the one counts whose effects leave
@@ -91,10 +98,10 @@ class _Search:
         """
         counted = self.problem.counted(self.problem.alone())
         weight = counted.fit.weight
-        found = self._run(counted)
+        found = self._run(counted, before)
         if (weight < OUTLIER).mean() < _MANY:
             return found
-        with_all = self._run(replace(counted, fit=replace(counted.fit, weight=np.ones_like(weight))))
+        with_all = self._run(replace(counted, fit=replace(counted.fit, weight=np.ones_like(weight))), before)
         return with_all if with_all.joint.choices and self._outliers(with_all) < self._outliers(found) else found
 
     def _outliers(self, found: Found) -> int:
@@ -102,7 +109,7 @@ class _Search:
         fit = found.joint.fit if found.joint.choices else self.problem.solution.fit
         return int((fit.weight < OUTLIER).sum())
 
-    def _run(self, joint: JointFit) -> Found:
+    def _run(self, joint: JointFit, before: Found | None) -> Found:
         """The search from a fit of the kinematics alone, whose weights are those of the first turn."""
         projection = self.problem.project(joint)
         alone = Turn(joint, projection, (), {}, ())
@@ -111,6 +118,11 @@ class _Search:
         certain: dict[str, float] = {}
         pending: list[str] = []
         there, steps = first.places, 0
+        if before is not None and before.joint.choices:
+            turns, certain = list(before.turns[:-1]), dict(before.certain)
+            joint = self.problem.fit(before.joint.choices, joint.fit.x)
+            projection = self.problem.open(joint)
+            there = self._possible(joint, projection)
         while True:
             decision = decide(self.problem, joint, projection, there)
             steps += 1
@@ -179,7 +191,7 @@ class _Search:
         solution = self.problem.solution
         joint, against = self._whole(joint, rivals)
         last = self.problem.project(joint) if joint.choices else alone.projection
-        left = Grammar(last)
+        left, strange = Grammar(last), formulas
         if against and not rivals:
             formulas = left.found()
         turns = self._as_they_count(turns, alone, joint, against)
@@ -187,7 +199,7 @@ class _Search:
         if joint.choices and not rivals:
             structured = bool(formulas) or detect(left, self.problem.rng()).significant
             if not closes(turns[0].projection, last, is_structured=structured):
-                return self._retracted(turns, formulas, first)
+                return self._retracted(turns, strange or formulas, first)
         taken = Adopted(
             self.problem.solution,
             self.problem.solution.fit,
@@ -196,7 +208,18 @@ class _Search:
         if joint.choices:
             taken = adopted(solution, joint, f"the data ask for {', '.join(map(str, joint.choices))}")
         posterior = {str(c): certain[str(c)] for c in joint.choices}
-        return Found(taken, joint, tuple(turns), rivals, formulas, posterior, first, turns[0].projection, left)
+        return Found(
+            taken,
+            joint,
+            tuple(turns),
+            rivals,
+            formulas,
+            strange or formulas,
+            posterior,
+            first,
+            turns[0].projection,
+            left,
+        )
 
     def _judged_again(self, joint: JointFit, name: str) -> tuple[JointFit, Turn | None, tuple[Weighed, ...]]:
         """What could not be told from others, now that all else is known: the fit with it, or without and the set."""
@@ -273,6 +296,7 @@ class _Search:
             (turn,),
             (),
             left.found() or formulas,
+            formulas or left.found(),
             {},
             first,
             start,
@@ -284,6 +308,54 @@ class _Search:
         taken = {c.family for c in joint.choices}
         allowed = [f for f in self.families if f in taken] if len(taken) >= MOST_FAMILIES else self.families
         return possible(joint.situation, projection, allowed, [str(c) for c in joint.choices]).places
+
+
+def _beside_formulas(problem: Problem, families: Collection[str], found: Found) -> Found:
+    """What was found, and what is beyond doubt beside the formulas of what no library has.
+
+    On a machine there is always something that no library has, and clear effects beside it. The search goes on with a
+    formula fitted along, one more each time: of several that are found together others may be an effect in words. The
+    model that comes of it has the effects alone; what they leave is told as ever.
+
+    Args:
+        problem: the data.
+        families: that may be named.
+        found: without formulas fitted along. It stays as it is where nothing more is named, or a set is not settled.
+    """
+    further, formulas = found, list[Formula]()
+    for _ in range(_FORMULAS):
+        new = next((f for f in further.strange if not _has_name(f, further)), None)
+        if new is None:
+            break
+        formulas.append(new)
+        further = _Search(problem.beside(formulas), families).run(further)
+    named, pending = {str(c) for c in further.joint.choices}, {str(w.place) for w in found.rivals}
+    if not {str(c) for c in found.joint.choices} < named or (pending and not pending & named):
+        return found
+    fits = [problem.fit(turn.fit.choices, problem.solution.fit.x) for turn in further.turns]
+    turns = [replace(t, fit=fit, projection=problem.project(fit)) for t, fit in zip(further.turns, fits, strict=True)]
+    joint, left = fits[-1], Grammar(turns[-1].projection)
+    return replace(
+        found,
+        adopted=adopted(problem.solution, joint, further.adopted.reason),
+        joint=joint,
+        turns=tuple(turns),
+        rivals=(),
+        formulas=left.found() or tuple(formulas),
+        certain=further.certain,
+        left=left,
+    )
+
+
+def _has_name(formula: Formula, found: Found) -> bool:
+    """Whether an effect that was weighed in the last turn explains what a formula does.
+
+    What does not show by itself, for all that hides it, is no more than a formula.
+    """
+    over = found.left.projection
+    shows = formula.shows_beside(np.empty((len(over.residual), 0)), over.residual)
+    weighed = found.turns[-1].weighed if shows else ()
+    return any(w.log_bayes_factor > 0.0 and explains(w, formula, over) for w in weighed)
 
 
 def search(
@@ -304,7 +376,8 @@ def search(
         seed: of half-samples and folds.
     """
     seen = in_true_steps(solution, observations, prior)
-    found = _Search(Problem(seen, observations, prior, seed), families).run()
+    problem = Problem(seen, observations, prior, seed)
+    found = _beside_formulas(problem, families, _Search(problem, families).run())
     if seen is solution:
         return found
     # A model counts the noise of readings as its rig file has it, and what is beyond that as scatter.

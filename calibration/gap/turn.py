@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -20,18 +20,18 @@ from calibration.gap.grammar import Grammar
 from calibration.gap.problem import Problem
 from calibration.gap.projection import Projection
 from calibration.gap.rivals import (
-    BOTH,
     NEAR,
-    PLAIN,
     as_simple,
     best_of_each_family,
+    beyond_doubt,
     further_places,
+    is_near,
     near_rivals,
     odds_text,
     stands_for,
     stands_out,
     with_a_chance,
-    with_option,
+    with_finer,
 )
 from calibration.gap.screen import Place, Screen, Weighed, by_family
 from calibration.gap.terms import candidates
@@ -41,6 +41,7 @@ from calibration.identification.additions import joined
 MOST_OF_A_SET = 3
 _CERTAIN = 0.95  # posterior of the family
 _LOOKED_AT = 0.5  # of the leading log evidence, for a rival to be looked at more closely
+_RIVALS = 5  # that are looked at in half-samples
 _STABLE = 0.8  # of half-samples
 _STABLE_AGAIN = 0.5  # the same for one more place of a family whose name is earned already
 _GAIN = 0.05  # p of no gain on held-out groups
@@ -80,7 +81,7 @@ def decide(problem: Problem, joint: JointFit, projection: Projection, places: Se
         places: where something may be missing.
     """
     reasons: dict[str, str] = {}
-    first, is_further = Screen(projection, places), bool(joint.choices)
+    first, is_further = Screen(projection, places), bool(joint.choices or problem.formulas)
     while True:
         weighed = first.weigh(without=reasons)
         if not weighed or not stands_out(weighed, len(weighed), beside=is_further):
@@ -101,7 +102,7 @@ def decide(problem: Problem, joint: JointFit, projection: Projection, places: Se
         reasons |= out
         if str(leading.place) not in out:
             break
-    weighed = screen.weigh(without=out)
+    weighed = screen.weigh(without=out) if out else weighed
     if str(weighed[0].place) != str(tried.choices[-1]):  # another one leads without those that are out
         start = screen.projection.solved(weighed[0].scaled_additions)
         tried = problem.fit([*joint.choices, weighed[0].choice], start)
@@ -118,53 +119,82 @@ def _judged(
     reasons: dict[str, str],
 ) -> Decision:
     leading, sharp = weighed[0], screen.projection
-    best = best_of_each_family(weighed)
     near = near_rivals(weighed)
     # A step is when those of the library are, wherever it is.
     steps = {w.choice.settings["time_s"] for w in near if "time_s" in w.choice.settings}
     grammar = Grammar(sharp, candidates(Variables(sharp, steps)))
     strongest = grammar.found(1)
     most = max(weighed, key=lambda w: w.log_evidence)
-    # One term that explains as much as two effects together is simpler.
-    margin = NEAR if most.beside is None else -NEAR
+    # One term that explains as much as two effects together is simpler, unless both are of what is known to be there.
+    known = {c.family for c in joint.choices}
+    is_simple = most.beside is None or {most.place.family, most.beside.place.family} <= known
+    margin = NEAR if is_simple else -NEAR
     is_beaten = bool(strongest) and strongest[0].log_evidence > most.log_evidence + margin
     if is_beaten and not any(stands_for(w, strongest[0], sharp) for w in near):
         beaten = near if most.beside is None else [*near, most, most.beside]
         reasons |= {str(w.place): f"{strongest[0].term} explains it better" for w in beaten}
         return Decision("outside", weighed, posterior, formulas=grammar.found(), reasons=reasons)
-    rivals = [w for w in best if w.log_bayes_factor > leading.log_bayes_factor - 6 * NEAR][:6]
-    against = ""
-    # The name of a family that is there already is earned; one more place of it needs less than a new name.
-    is_known = leading.place.family in {c.family for c in joint.choices}
-    has_equal = not is_known and any(as_simple(leading, w) for w in near[1:])
-    stable = _STABLE_AGAIN if is_known else _STABLE
-    if posterior[leading.place.family] < _CERTAIN or has_equal:
-        against = "another family is nearly as likely"
-    elif (len(rivals) > 1 or leading.log_bayes_factor < PLAIN) and (
-        share := wins(sharp, rivals, problem.seed)
-    ) < stable:
-        against = f"it wins in {share:.0%} of half-samples only"
-        near = near if len(near) > 1 else [w for w in rivals if w.posterior + leading.posterior < BOTH or w is leading]
-    elif (p := chance_of_gain(sharp, leading, problem.seed)) > _GAIN:
-        against = f"it lowers no errors of held-out groups beyond chance (p {p:.2g})"
+    against, in_place = _doubt(problem, sharp, weighed, posterior, near, is_known=leading.place.family in known)
     if not against:
-        reasons |= {str(w.place): odds_text(leading, w) for w in best[1:]}
+        reasons |= {str(w.place): odds_text(leading, w) for w in best_of_each_family(weighed)[1:]}
         more = further_places(screen, weighed)
         if more:
             taken = [leading, *more]
             start = sharp.solved(joined([w.scaled_additions for w in taken], len(sharp.samples)))
             tried = problem.fit([*joint.choices, *(w.choice for w in taken)], start)
         return Decision("take", weighed, posterior, tried, reasons=reasons)
-    reasons |= {str(w.place): against for w in near}
-    if len(near) < 2:
+    reasons |= {str(w.place): against for w in in_place}
+    if len(in_place) < 2 or problem.formulas:
         return Decision("nothing", weighed, posterior, reasons=reasons)
-    return Decision("set", weighed, posterior, tried, tuple(near[:MOST_OF_A_SET]), reasons=reasons)
+    return Decision("set", weighed, posterior, tried, tuple(in_place[:MOST_OF_A_SET]), reasons=reasons)
+
+
+def _doubt(
+    problem: Problem,
+    sharp: Projection,
+    weighed: Sequence[Weighed],
+    posterior: Mapping[str, float],
+    near: Sequence[Weighed],
+    *,
+    is_known: bool,
+) -> tuple[str, Sequence[Weighed]]:
+    """Why the leading place is not named, a clause that is empty where it is; and it with what may be in its place.
+
+    The name of a family that is there already (`is_known`) is earned; one more place of it needs less than a new name.
+    """
+    leading, best = weighed[0], best_of_each_family(weighed)
+    has_equal = not is_known and any(as_simple(leading, w) for w in near[1:])
+    if problem.formulas and not beyond_doubt(best):
+        return "beside what is not in the library it is not beyond all doubt", near
+    if any(f.term.place.where == leading.place.where for f in problem.formulas):
+        return "what is not in the library is at the same place", near
+    if posterior[leading.place.family] < _CERTAIN or has_equal:
+        return "another family is nearly as likely", near
+    elsewhere = [w for w in weighed[1:] if w.place.family == leading.place.family and is_near(leading, w)]
+    rivals = [w for w in best[1:] if w.log_bayes_factor > leading.log_bayes_factor - 6 * NEAR][:_RIVALS]
+    halves = wins(sharp, [leading, *elsewhere], rivals, problem.seed)
+    share = halves.get(str(leading.place), 0.0)
+    if share < (_STABLE_AGAIN if is_known else _STABLE):
+        winning = [w for name in halves for w in rivals if str(w.place) == name]
+        return f"it wins in {share:.0%} of half-samples only", [leading, *winning] if winning else near
+    p = chance_of_gain(sharp, leading, problem.seed)
+    return (f"it lowers no errors of held-out groups beyond chance (p {p:.2g})" if p > _GAIN else ""), near
+
+
+class _Round(NamedTuple):
+    """Places weighed with the noise that the one that was leading leaves."""
+
+    leading: Weighed
+    places: Sequence[Place]
+    screen: Screen
+    weighed: tuple[Weighed, ...]
 
 
 def _sharpened(
     problem: Problem, joint: JointFit, over: Projection, places: Sequence[Place], leading: Weighed
 ) -> tuple[Screen, tuple[Weighed, ...], JointFit]:
     """All places weighed with the noise that the best of them leaves, about the fit that has it."""
+    before: _Round | None = None
     for _ in range(_SHARPER):
         tried = problem.fit([*joint.choices, leading.choice], over.solved(leading.scaled_additions))
         if finer_forms(tried.situation, leading.choice):
@@ -173,7 +203,8 @@ def _sharpened(
             finer = refined_choice(tried, len(tried.choices) - 1, problem.project(counted, without_last=True))
             if finer.settings != leading.choice.settings:
                 tried = problem.fit([*joint.choices, finer], tried.fit.x)
-                places = [with_option(p, finer, over, joint.situation) if p is leading.place else p for p in places]
+                extended = with_finer(leading.place, leading.option, finer, over, joint.situation)
+                places = [extended if p is leading.place else p for p in places]
         sharp = problem.project(tried, without_last=True)
         screen = Screen(sharp, places)
         weighed = screen.weigh()
@@ -182,8 +213,13 @@ def _sharpened(
             places = finer_places
             screen = Screen(sharp, places)
             weighed = screen.weigh()
-        if (weighed[0].choice.family, weighed[0].choice.where) == (leading.choice.family, leading.choice.where):
+        if str(weighed[0].place) == str(leading.place):
             break
+        if before is not None and places is before.places and str(weighed[0].place) == str(before.leading.place):
+            # With the noise that either leaves the other one leads, and would for ever.
+            screen, weighed = before.screen, before.weighed
+            break
+        before = _Round(leading, places, screen, weighed)
         leading, over = weighed[0], sharp
     best, last = weighed[0].choice, tried.choices[-1]
     if (str(best), best.settings) != (str(last), last.settings):
@@ -200,4 +236,4 @@ def _finer(joint: JointFit, sharp: Projection, place: Place, weighed: Sequence[W
     if not finer:
         return place
     best = finer[int(np.argmax(evidence_of_forms(joint.situation, finer, sharp)))]
-    return with_option(place, best, sharp, joint.situation)
+    return with_finer(place, own.option, best, sharp, joint.situation)

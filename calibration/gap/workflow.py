@@ -20,6 +20,7 @@ from calibration.gap.forecast import forecasts
 from calibration.gap.grammar import Found as Formula
 from calibration.gap.grammar import Grammar, describe
 from calibration.gap.result import Candidate, Gap, Round, Verdict
+from calibration.gap.rivals import explains
 from calibration.gap.screen import Screen, Weighed
 from calibration.gap.search import Found, Turn, search
 from calibration.identification.refinement import Prior
@@ -177,9 +178,7 @@ def _of_library(found: Found, formula: Formula) -> str:
     """Whether an effect that was weighed and not named does what a formula says, a clause."""
     turn, projection = found.turns[-1], found.left.projection
     for weighed in turn.weighed[:_LISTED]:
-        additions = weighed.scaled_additions
-        columns = projection.columns(projection.moved_mm(additions)) * additions.prior_sigma
-        if weighed.log_bayes_factor > 0.0 and not formula.shows_beside(columns, projection.residual):
+        if weighed.log_bayes_factor > 0.0 and explains(weighed, formula, projection):
             reason = turn.reasons.get(str(weighed.place), "it does not stand out enough to be named")
             return f"{weighed.place} would do this, but {reason}"
     return "not in the library"

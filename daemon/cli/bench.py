@@ -39,7 +39,7 @@ def bench() -> None:
 @click.option(
     "--cells",
     metavar="KIND,...",
-    help="Only these kinds of case: single, null, decoy, pair, triple, outside, left_out, alias.",
+    help="Only these kinds of case: single, null, decoy, pair, triple, outside, left_out, alias, beside.",
 )
 @click.option("--poses", metavar="KIND,...", help="Only these poses: wide, face, sparse.")
 @click.option("--noises", metavar="KIND,...", help="Only these encoders: fine, stepped (0.02 deg), coarse (0.1 deg).")

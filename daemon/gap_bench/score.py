@@ -144,6 +144,9 @@ def _strangers(trials: Sequence[Trial]) -> Iterable[Score]:
     misnamed = "one family left out, its data shown: misnamed"
     yield _share(misnamed, left_out, lambda t: bool(t.named - t.general), most=0.03)
     yield _share("  or given the name of a more general family", left_out, lambda t: bool(t.named))
+    beside = [t for t in trials if t.kind == "beside"]
+    yield _share("beside an effect outside the library: named right", beside, _right)
+    yield _share("  misnamed", beside, lambda t: t.is_wrong)
 
 
 def _coefficients(trials: Sequence[Trial]) -> Iterable[Score]:

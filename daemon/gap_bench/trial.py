@@ -22,6 +22,7 @@ class TrueEffect:
 
     Attributes:
         family, where: which.
+        has_name: whether the library has it.
         places: that count as where it is.
         coefficients: name -> value, those that the library's family has.
         scale: name -> plausible size, for comparing coefficients of different units.
@@ -29,6 +30,7 @@ class TrueEffect:
 
     family: str
     where: str
+    has_name: bool
     places: tuple[str, ...]
     coefficients: Mapping[str, float]
     scale: Mapping[str, float]
@@ -39,7 +41,7 @@ class Trial:
     """A case.
 
     Attributes:
-        kind: `single`, `null`, `decoy`, `pair`, `triple`, `outside`, `left_out` or `alias`.
+        kind: `single`, `null`, `decoy`, `pair`, `triple`, `outside`, `left_out`, `alias` or `beside`.
         poses, noise, size: its cell; size is the visible RMS of an effect in units of the noise.
         seed: draws it again.
         effects: what is hidden.
@@ -76,8 +78,8 @@ class Trial:
 
     @property
     def families(self) -> frozenset[str]:
-        """Of the hidden effects."""
-        return frozenset(effect.family for effect in self.effects)
+        """Of the hidden effects that the library has."""
+        return frozenset(effect.family for effect in self.effects if effect.has_name)
 
     @property
     def named(self) -> frozenset[str]:
@@ -91,14 +93,14 @@ class Trial:
 
     @property
     def is_right(self) -> bool:
-        """Named what is hidden, all of it and nothing else."""
+        """Named what is hidden, all of it that has a name and nothing else."""
         return self.verdict == "named" and self.named == self.families
 
     @property
     def is_in_place(self) -> bool:
         """Named right, at the right places and no others."""
         told = {(effect["family"], effect["where"]) for effect in self.answer.get("effects", ())}
-        return self.is_right and told == {(effect.family, effect.where) for effect in self.effects}
+        return self.is_right and told == {(e.family, e.where) for e in self.effects if e.has_name}
 
     @property
     def is_wrong(self) -> bool:
@@ -186,7 +188,8 @@ def trial(
 ) -> Trial:
     """A label, as the keeper's JSON has it, joined with the answers of its case and of its twin."""
     effects = tuple(
-        TrueEffect(e["family"], e["where"], tuple(e["places"]), e["coefficients"], e["scale"]) for e in label["effects"]
+        TrueEffect(e["family"], e["where"], e["has_name"], tuple(e["places"]), e["coefficients"], e["scale"])
+        for e in label["effects"]
     )
     return Trial(
         case=label["case"],

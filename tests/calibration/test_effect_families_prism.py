@@ -12,7 +12,7 @@ import pytest
 from calibration.effects.base import PrismFamily, Situation
 from calibration.effects.fitted import Choice
 from calibration.effects.library import library
-from calibration.effects.step_times import refined_steps, settled_step, step_grid
+from calibration.effects.step_times import refined_steps, settled_step, step_grid, step_odds
 from calibration.kinematics import Chain, Placement
 from calibration.model import CalibratedModel
 from calibration.observations import Floats, Observations, parse_observations
@@ -257,6 +257,17 @@ def test_steps_lie_between_rows_with_a_few_of_them_on_either_side() -> None:
     assert step_grid(np.full(50, np.nan)) == step_grid(np.full(50, 3.0)) == ()
 
 
+def test_a_step_is_as_likely_at_an_instant_of_the_grid_as_the_time_about_it_is_long() -> None:
+    """Half of the rows in a minute, the others in another one an hour later: it was nearly surely in between."""
+    rng = np.random.default_rng(2)
+    time_s = np.concatenate([rng.uniform(0.0, 60.0, 250), rng.uniform(3600.0, 3660.0, 250)])
+    odds = np.array([step_odds(settings) for settings in step_grid(time_s)])
+    assert odds.max() / odds.sum() > 0.95
+    rows = np.sort(time_s)
+    counted = rows[-25] - rows[24]  # a step has 5 % of the rows on either side at least
+    assert odds.sum() * np.sqrt(12.0) == pytest.approx(counted)
+
+
 def test_a_step_is_refined_to_every_instant_up_to_its_neighbours_on_the_grid() -> None:
     time_s = np.random.default_rng(1).uniform(0.0, 7200.0, 500)
     grid = step_grid(time_s)
@@ -265,7 +276,7 @@ def test_a_step_is_refined_to_every_instant_up_to_its_neighbours_on_the_grid() -
     middles = np.sort(time_s)[:-1] + np.diff(np.sort(time_s)) / 2.0
     between = (middles > grid[9]["time_s"] + 1e-6) & (middles < grid[11]["time_s"] - 1e-6)
     np.testing.assert_allclose(times, middles[between])
-    assert grid[10] in fine
+    assert grid[10]["time_s"] in times
     (gap,) = np.diff(np.sort(time_s))[between][[0]]
     assert fine[0]["time_error_s"] == pytest.approx(gap / np.sqrt(12.0))
     assert refined_steps(time_s[:30], step_grid(time_s[:30])[2]) == ()  # the grid has them all

@@ -109,6 +109,13 @@ def test_stiffening_reducers_are_found_and_held_out_errors_fall_to_the_noise(sti
     assert "joint_compliance@theta2" in stiff.model.effects_reason
 
 
+def test_springs_of_all_joints_together_are_no_formula_of_the_base() -> None:
+    """Beside the first of five, one moment about the base explains nearly as much as the next two together."""
+    rig, training, _ = robot(2019, stiffening(2019))
+    adopted = search(solved(rig, training), training, library()).adopted
+    assert {(e.family, e.where) for e in adopted.effects} == {("joint_compliance", f"theta{n}") for n in range(2, 7)}
+
+
 def test_what_a_prediction_with_effects_says_of_its_own_error_holds(stiff: Fitted) -> None:
     prediction = stiff.model.predict(stiff.held_out)
     np.testing.assert_array_equal(prediction.position_mm, stiff.model.effects_mm(stiff.held_out))

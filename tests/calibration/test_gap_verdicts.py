@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from calibration.effects.library import library
-from calibration.gap.projection import Softly, log_bayes_factor, without_folds
+from calibration.gap.projection import Softly, from_products, without_folds
 from calibration.gap.reading_steps import step_of
 from calibration.gap.result import Gap
 from calibration.gap.workflow import find_gap
@@ -48,6 +48,12 @@ def test_two_effects_are_both_named_where_they_are_and_the_gap_closes() -> None:
 def test_an_effect_that_shows_in_a_few_fixes_only_is_found_beside_another() -> None:
     """Beside the first, a fit takes the fixes that show the second, nine of 250, for outliers."""
     drawn, gap = answered(Cell("pair", ("gravity_flip_play", "joint_error_map"), 1.0, "wide", "fine", 400002))
+    assert {(effect.family, effect.where) for effect in gap.effects} == hidden(drawn)
+
+
+def test_a_few_fixes_that_are_far_off_are_no_curve_of_a_joint() -> None:
+    """Three of 60 fixes are off, by 25 to 160 mm: so many that the search also tries what they were if true."""
+    drawn, gap = answered(Cell("single", ("pad_play",), 1.0, "sparse", "stepped", 650418))
     assert {(effect.family, effect.where) for effect in gap.effects} == hidden(drawn)
 
 
@@ -101,6 +107,20 @@ def test_an_effect_that_no_library_has_is_described_and_gets_no_name() -> None:
     assert gap.description.endswith("not in the library")
 
 
+def test_an_effect_is_named_beside_one_that_no_library_has() -> None:
+    drawn, gap = answered(Cell("beside", ("cross_law", "solar_bow"), 1.0, "wide", "fine", 52))
+    strange, known = drawn.label["effects"]
+    assert gap.verdict == "named"
+    assert [(effect.family, effect.where) for effect in gap.effects] == [(known["family"], known["where"])]
+    assert gap.remaining_significant
+    assert gap.description is not None
+    assert gap.description.startswith(f"{strange['where']} angle error = ")
+    assert "what is left over depends on what no effect of the library explains" in gap.warnings
+    true = known["coefficients"]["rad_per_K"]
+    (coefficient,) = gap.effects[0].reported
+    assert coefficient.value == pytest.approx(true, abs=4.0 * coefficient.standard_error)
+
+
 @pytest.mark.parametrize(
     ("family", "poses", "seed", "lookalike", "formula"),
     [
@@ -140,7 +160,8 @@ def test_evidence_in_the_projected_space_is_that_of_effect_and_kinematics_togeth
     scaled = columns * sigma
     with_effect = nothing + scaled @ scaled.T
     expected = [multivariate_normal(np.zeros(40), matrix).logpdf(target) for matrix in (with_effect, nothing)]
-    found = log_bayes_factor(softly(columns), softly(target), sigma)
+    left = softly(columns)
+    found = from_products(left.T @ left, left.T @ softly(target), sigma)
     assert found == pytest.approx(expected[0] - expected[1], abs=1e-8)
 
 

@@ -21,6 +21,7 @@ from daemon.gap_bench.score import Score, scores, tallies
 from daemon.gap_bench.trial import Floats, Trial, trial
 from daemon.rigs import load_rig
 
+STRANGE = ("gear_mesh",)  # what no library has
 TWIN_MM = np.array([[0.0, 0.0, 0.0], [90.0, 0.0, 0.0]])  # without the effect
 TRUTH_MM = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0]])
 
@@ -30,6 +31,7 @@ def label(kind: str = "single", *families: str, **more: Any) -> dict[str, Any]:
         {
             "family": family,
             "where": "theta4",
+            "has_name": family not in STRANGE,
             "places": ["theta4"],
             "coefficients": {"size": 2.0},
             "scale": {"size": 1.0},
@@ -206,6 +208,15 @@ def test_an_effect_outside_the_library_is_located_by_what_is_said_of_it() -> Non
     assert score(trials, "outside the library: misnamed").value == 0.25
 
 
+def test_beside_an_effect_outside_the_library_it_is_right_to_name_the_one_inside_alone() -> None:
+    of = label("beside", "gear_mesh", "backlash")
+    told = (named("backlash"), named("backlash", "latency"), silent("unidentified"), named("latency"))
+    trials = [judged(of, answer) for answer in told]
+
+    assert score(trials, "beside an effect outside the library: named right").value == 0.25
+    assert score(trials, "  misnamed").value == 0.5
+
+
 def test_a_more_general_family_is_no_misnaming_where_the_particular_one_is_left_out() -> None:
     of = label("left_out", "encoder_harmonic", general=["joint_error_map"])
     trials = [judged(of, told) for told in (named("joint_error_map"), named("angle_scale"), silent("unidentified"))]
@@ -301,12 +312,17 @@ def test_further_poses_are_measured_of_the_same_machine_and_only_before_unsealin
         case = keeps.cases[0]
         header = case.held_out.read_text().splitlines()[0].split(",")
         before = parse_observations(case.train.read_bytes(), rig, "train.csv")
-        after = parse_observations(keeps.measure(case.name, [pose, pose]).read_bytes(), rig, "measured.csv")
+        rows = [pose | {"fixes": 1}, pose | {"fixes": 3}]
+        after = parse_observations(keeps.measure(case.name, rows).read_bytes(), rig, "measured.csv")
         keeps.unseal(answers)
         with pytest.raises(KeeperError, match="nothing is measured after"):
             keeps.measure(case.name, [pose])
 
-    assert len(after) == len(before) + 2
+    assert len(after) == len(before) + 4
+    one, *three = after.pose[len(before) :]
+    assert len({one, *three}) == 2
+    assert len({*three}) == 1
+    assert np.ptp(after.position_mm[-3:], axis=0).min() > 0.0
     assert np.array_equal(after.position_mm[: len(before)], before.position_mm)
     assert after.joints["theta4"][-1] == pytest.approx(22.5, abs=0.2)
     # What is to be predicted comes without its answer.

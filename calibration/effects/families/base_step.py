@@ -9,7 +9,15 @@ import numpy as np
 
 from calibration.effects.base import Coefficient, FittedCoefficient, Settings, Situation
 from calibration.effects.base_motion import base_motion_mm
-from calibration.effects.step_times import STEP_SETTINGS, check_step, refined_steps, settled_step, step_grid, step_time
+from calibration.effects.step_times import (
+    STEP_SETTINGS,
+    check_step,
+    refined_steps,
+    settled_step,
+    step_grid,
+    step_odds,
+    step_time,
+)
 from calibration.effects.trained import TrainedFamily, check_settings, sizes
 from calibration.observations import Floats
 
@@ -32,6 +40,9 @@ class BaseStep(TrainedFamily):
 
     def refined(self, situation: Situation, where: str, settings: Settings) -> tuple[Settings, ...]:
         return self._sized(situation, where, refined_steps(situation.extra("time_s"), settings))
+
+    def odds(self, settings: Settings) -> float:
+        return step_odds(settings)
 
     def settled(self, forms: Sequence[Settings], probability: Floats) -> Settings:
         return settled_step(forms, probability)

@@ -8,7 +8,15 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from calibration.effects.base import Coefficient, FittedCoefficient, JointFamily, Settings, Situation
-from calibration.effects.step_times import STEP_SETTINGS, check_step, refined_steps, settled_step, step_grid, step_time
+from calibration.effects.step_times import (
+    STEP_SETTINGS,
+    check_step,
+    refined_steps,
+    settled_step,
+    step_grid,
+    step_odds,
+    step_time,
+)
 from calibration.observations import Floats
 
 
@@ -44,6 +52,9 @@ class TransducerIndexJump(JointFamily):
     def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
         del where
         return np.asarray(situation.extra("time_s") > settings["time_s"], dtype=np.float64)[:, None]
+
+    def odds(self, settings: Settings) -> float:
+        return step_odds(settings)
 
     def settled(self, forms: Sequence[Settings], probability: Floats) -> Settings:
         return settled_step(forms, probability)
