@@ -79,6 +79,10 @@ class Candidates:
         """Of all prisms in all poses."""
         return int(self.fixes @ self.seen.sum(axis=1))
 
+    def few(self) -> Candidates:
+        """Enough of them to try in which conditions what shows."""
+        return self.select(np.arange(min(_TRIED, len(self))))
+
     def select(self, which: Integers) -> Candidates:
         """The given poses."""
         conditions = {name: values[which] for name, values in self.conditions.items()}
@@ -283,7 +287,7 @@ def _as_they_matter(
     matters = _sides(knowledge, candidates)
     if not separate:
         return candidates.under(matters)
-    few = candidates.select(np.arange(min(_TRIED, len(candidates))))
+    few = candidates.few()
     needed = {c for e in separate for c in conditions_of(before, name_of(e), few.readings, few.conditions)}
     changes = changing(before, separate, few.readings, few.conditions)
     idle = needed.intersection(name for kind, names in changes.items() if not names for name in kind)

@@ -1,14 +1,14 @@
-"""When a step may have happened: instants between the rows, first on a grid and then finely about one of them."""
+"""Effects that happen at once, and when: instants between the rows, on a grid and then finely about one of them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from calibration.effects.base import FittedCoefficient, Settings
+from calibration.effects.base import Family, FittedCoefficient, Settings
 from calibration.observations import Floats
 
 STEP_SETTINGS = ("time_s", "time_error_s", "span_s")
@@ -17,6 +17,23 @@ _GRID = 40
 _FINE = 80
 _LEAST_SIDE = 0.05  # share of the rows on either side
 _LEAST_ROWS = 3
+
+
+class StepFamily(Family):
+    """An effect from an instant on, its variants those of `step_grid` and `refined_steps`."""
+
+    column: ClassVar[str] = "time_s"
+
+    def odds(self, settings: Settings) -> float:
+        return step_odds(settings)
+
+    def settled(self, forms: Sequence[Settings], probability: Floats) -> Settings:
+        return settled_step(forms, probability)
+
+    def reported(
+        self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
+    ) -> tuple[FittedCoefficient, ...]:
+        return (*coefficients, _step_time(settings))
 
 
 class _Instants(NamedTuple):
@@ -86,7 +103,7 @@ def step_odds(settings: Settings) -> float:
     return settings["time_error_s"]
 
 
-def step_time(settings: Settings) -> FittedCoefficient:
+def _step_time(settings: Settings) -> FittedCoefficient:
     """The instant as outputs list it."""
     plausible = settings["span_s"] / math.sqrt(12.0)  # anywhere between the first row and the last
     return FittedCoefficient("time_s", "s", settings["time_s"], settings["time_error_s"], plausible)

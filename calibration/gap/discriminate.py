@@ -30,8 +30,6 @@ from calibration.rig import Rig
 
 POSES = 20
 _CANDIDATES = 4000
-_TRIED = 64  # poses in which the conditions are tried
-_CHANGES = 0.05  # of what an effect moves, RMS
 _PAUSE_S = 600.0  # between the last fix and the first new one
 _KINDS = {
     "payload_kg": "payload",
@@ -80,7 +78,7 @@ def experiments(
     except UnsafeError:
         return (*_by_place(model.rig, rivals), *_as_the_library_says(rivals))
     candidates = _with_prisms(drawn, [bool(model.coverage.fixes.get(n)) for n in model.rig.prism_names])
-    tried = drawn.select(np.arange(min(_TRIED, len(drawn))))
+    tried = drawn.few()
     return (
         *_poses(knowledge, candidates, observations, rivals, poses, partial(near, knowledge, at, rng)),
         *_by_condition(knowledge, tried, rivals),
@@ -103,7 +101,7 @@ def _poses(
     count: int,
     nearby: Callable[[Candidates], Candidates],
 ) -> Iterator[Experiment]:
-    few = candidates.select(np.arange(min(_TRIED, len(candidates))))
+    few = candidates.few()
     shown = [rival for rival in rivals if len(candidates) >= count and _is_shown(knowledge, few, rival)]
     if not shown:
         return

@@ -17,7 +17,7 @@ from calibration.gap.screen import Place, Screen, Weighed
 _ODDS, _FURTHER_ODDS = math.log(99.0), math.log(999.0)  # that something is there, and something more beside that
 _CHANCE, _FURTHER_CHANCE = 0.01, 0.003  # of anything at all, corrected for all that was looked at, and of more
 NEAR = 5.0  # in log evidence: families this near are not told apart
-PLAIN = 100.0  # log evidence beyond any doubt
+_PLAIN = 100.0  # log evidence beyond any doubt
 _AS_WELL = math.log(19.0)  # log odds at which a rival has a posterior of 0.05
 _POSSIBLE = 0.02  # posterior of a rival
 _BOTH = 1.1  # posterior of two places together that cannot each be in place of the other
@@ -36,13 +36,13 @@ def further_places(screen: Screen, weighed: Sequence[Weighed]) -> list[Weighed]:
     """Where the leading family is as well beyond any doubt, given that it is at the leading place."""
     leading, found = weighed[0], list[Weighed]()
     for w in sorted(weighed[1:], key=lambda w: -w.log_bayes_factor):
-        if w.place.family != leading.place.family or w.log_bayes_factor < PLAIN:
+        if w.place.family != leading.place.family or w.log_bayes_factor < _PLAIN:
             continue
         there = [leading, *found]
         gain = screen.together([*there, w]) - screen.together(there)
         others = [v for v in weighed if v.place.where == w.place.where and v.place.family != w.place.family]
         rival = max((screen.together([*there, v]) - screen.together(there) for v in others), default=-math.inf)
-        if gain > max(PLAIN, rival + 2 * NEAR):
+        if gain > max(_PLAIN, rival + 2 * NEAR):
             found.append(w)
     return found
 
@@ -112,7 +112,7 @@ def is_near(leading: Weighed, other: Weighed) -> bool:
 def beyond_doubt(best: Sequence[Weighed]) -> bool:
     """Whether the leading place is plain to see and no other family comes near, by the best of each family."""
     leading, *others = (w.log_bayes_factor for w in best)
-    return leading > max([PLAIN, *(other + 2 * NEAR for other in others)])
+    return leading > max([_PLAIN, *(other + 2 * NEAR for other in others)])
 
 
 def as_simple(leading: Weighed, rival: Weighed) -> bool:

@@ -2,29 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
 
-from calibration.effects.base import Coefficient, FittedCoefficient, Settings, Situation
+from calibration.effects.base import Coefficient, Settings, Situation
 from calibration.effects.base_motion import base_motion_mm
-from calibration.effects.step_times import (
-    STEP_SETTINGS,
-    check_step,
-    refined_steps,
-    settled_step,
-    step_grid,
-    step_odds,
-    step_time,
-)
+from calibration.effects.step_times import STEP_SETTINGS, StepFamily, check_step, refined_steps, step_grid
 from calibration.effects.trained import TrainedFamily, check_settings, sizes
 from calibration.observations import Floats
 
 _NAMES = ("tilt_x_rad", "tilt_y_rad", "z_mm")
 
 
-class BaseStep(TrainedFamily):
+class BaseStep(StepFamily, TrainedFamily):
     """The base stands otherwise, as a rigid body, in all rows after one instant."""
 
     name: ClassVar[str] = "base_step"
@@ -33,24 +24,12 @@ class BaseStep(TrainedFamily):
     confused_with: ClassVar[tuple[str, ...]] = ("base_settlement", "payload_change", "transducer_index_jump")
     revealed_by: ClassVar[str] = "fixed control points, or one pose again and again all through the session"
     place: ClassVar[str] = "base"
-    column: ClassVar[str] = "time_s"
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
         return self._sized(situation, where, step_grid(situation.extra("time_s")))
 
     def refined(self, situation: Situation, where: str, settings: Settings) -> tuple[Settings, ...]:
         return self._sized(situation, where, refined_steps(situation.extra("time_s"), settings))
-
-    def odds(self, settings: Settings) -> float:
-        return step_odds(settings)
-
-    def settled(self, forms: Sequence[Settings], probability: Floats) -> Settings:
-        return settled_step(forms, probability)
-
-    def reported(
-        self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
-    ) -> tuple[FittedCoefficient, ...]:
-        return (*coefficients, step_time(settings))
 
     def names(self, settings: Settings) -> tuple[str, ...]:
         check_settings(settings, STEP_SETTINGS, len(_NAMES))

@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import ClassVar, Literal
 
 import numpy as np
 
-from calibration.effects.base import Coefficient, FittedCoefficient, JointFamily, Settings, Situation
-from calibration.effects.step_times import (
-    STEP_SETTINGS,
-    check_step,
-    refined_steps,
-    settled_step,
-    step_grid,
-    step_odds,
-    step_time,
-)
+from calibration.effects.base import Coefficient, JointFamily, Settings, Situation
+from calibration.effects.step_times import STEP_SETTINGS, StepFamily, check_step, refined_steps, step_grid
 from calibration.observations import Floats
 
 
-class TransducerIndexJump(JointFamily):
+class TransducerIndexJump(StepFamily, JointFamily):
     """From an instant on, true length minus reading is another one: counts were lost, or a draw wire has slipped."""
 
     name: ClassVar[str] = "transducer_index_jump"
@@ -28,7 +19,6 @@ class TransducerIndexJump(JointFamily):
     source: ClassVar[str] = "lost counts or a wrong reference mark of an incremental length transducer"
     confused_with: ClassVar[tuple[str, ...]] = ("transducer_cumulative", "base_step", "base_settlement")
     revealed_by: ClassVar[str] = "returning to a pose measured before, and driving the transducer over its reference"
-    column: ClassVar[str] = "time_s"
     kind: ClassVar[Literal["revolute", "prismatic"]] = "prismatic"
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
@@ -52,17 +42,6 @@ class TransducerIndexJump(JointFamily):
     def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
         del where
         return np.asarray(situation.extra("time_s") > settings["time_s"], dtype=np.float64)[:, None]
-
-    def odds(self, settings: Settings) -> float:
-        return step_odds(settings)
-
-    def settled(self, forms: Sequence[Settings], probability: Floats) -> Settings:
-        return settled_step(forms, probability)
-
-    def reported(
-        self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
-    ) -> tuple[FittedCoefficient, ...]:
-        return (*coefficients, step_time(settings))
 
     def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
         """Before and after the jump are equally likely."""
