@@ -11,7 +11,7 @@ from calibration.rig import Rig
 from drivers.can_channel import ChannelDecoder
 from drivers.canopen_setup import PROFILE_ANALOGUE, PROFILE_ENCODER, NodeSetup
 from drivers.cia404 import AnalogueChannel, AnalogueDecoder
-from drivers.cia406 import JUMP_MARGIN_S, EncoderChannel, EncoderDecoder, LinearChannel, LinearDecoder
+from drivers.cia406 import EncoderChannel, EncoderDecoder, LinearChannel, LinearDecoder
 from drivers.dbc import DbcFile
 from drivers.errors import DescriptionError
 from drivers.pdo import TransmitPdo
@@ -23,17 +23,13 @@ _USUAL_MAPPING = {"6004": 0x60040020, "6020": 0x60200120, "6130": 0x61300120, "7
 CanopenChannel = Cia406Encoder | Cia406Linear | Cia404Analogue
 
 
-def decoder_factories(
-    rig: Rig, directory: Path, link: str, *, time_scale: float = 1.0
-) -> list[Callable[[], ChannelDecoder]]:
+def decoder_factories(rig: Rig, directory: Path, link: str) -> list[Callable[[], ChannelDecoder]]:
     """For each channel of a link, what makes a fresh decoder of it.
 
     Args:
         rig: whose channels.
         directory: where the rig's DBC and EDS files are.
         link: name of the CAN link.
-        time_scale: how many times faster than real the rig's clock runs: the computer's delays are that much longer
-            on it, and a position must jump that much further to be no motion.
 
     Raises:
         DescriptionError: a DBC or EDS file is missing, malformed, or lacks what a channel names.
@@ -45,7 +41,7 @@ def decoder_factories(
             continue
         if isinstance(channel, DbcSignal) and channel.dbc not in dbc_files:
             dbc_files[channel.dbc] = DbcFile(directory / channel.dbc)
-        factories.append(_factory(channel, rig, directory, dbc_files, JUMP_MARGIN_S * max(1.0, time_scale)))
+        factories.append(_factory(channel, rig, directory, dbc_files))
     return factories
 
 
@@ -72,7 +68,7 @@ def node_setups(rig: Rig, directory: Path, link: str) -> list[NodeSetup]:
 
 
 def _factory(
-    channel: Channel, rig: Rig, directory: Path, dbc_files: dict[str, DbcFile], jump_margin_s: float
+    channel: Channel, rig: Rig, directory: Path, dbc_files: dict[str, DbcFile]
 ) -> Callable[[], ChannelDecoder]:
     match channel:
         case Cia406Encoder():
@@ -81,7 +77,6 @@ def _factory(
                 sign=channel.sign,
                 zero_counts=channel.zero_counts,
                 max_rate_per_s=_max_rate(rig, channel.name),
-                jump_margin_s=jump_margin_s,
                 units_per_revolution=channel.units_per_revolution,
                 total_units=channel.total_units,
             )
@@ -92,7 +87,6 @@ def _factory(
                 sign=channel.sign,
                 zero_counts=channel.zero_counts,
                 max_rate_per_s=_max_rate(rig, channel.name),
-                jump_margin_s=jump_margin_s,
                 position_object=int(channel.object, 16),
                 step_nm=channel.step_nm,
                 range_mm=channel.range_mm,

@@ -34,7 +34,6 @@ from drivers.station import StationDecoder, StationLink
 from simulators.replay import ReplayLink
 
 SIMULATED_SYNC_MS = 200
-SIMULATED_DELAY_S = 0.02  # from a simulated measurement to its record
 
 Mode = Literal["live", "simulated", "replayed"]
 
@@ -106,7 +105,16 @@ def simulated(
     if len(config.can) > 1 or len(config.station) > 1:
         raise ConfigError("a simulated rig has one CAN link and one station; configure one [[can]] and one [[station]]")
     rates = {joint.name: joint.max_rate for joint in source.rig.joints}
-    simulation = SimulatedRig(config.rig, rates, ports, clock, seed=seed, effects=effects, secret=secret)
+    simulation = SimulatedRig(
+        config.rig,
+        rates,
+        ports,
+        clock,
+        station_delay_s=next((station.link_delay_s for station in config.station), 0.0),
+        seed=seed,
+        effects=effects,
+        secret=secret,
+    )
     try:
         nodes = [c.node for c in source.rig.channels if isinstance(c, Cia406Encoder | Cia406Linear | Cia404Analogue)]
         bus = {
@@ -120,11 +128,9 @@ def simulated(
         }
         line = SerialConfig(path=str(simulation.station_port))
         can = tuple(section.model_copy(update=bus) for section in config.can)
-        station = tuple(
-            section.model_copy(update={"serial": line, "link_delay_s": SIMULATED_DELAY_S}) for section in config.station
-        )
+        station = tuple(section.model_copy(update={"serial": line}) for section in config.station)
         rewired = config.model_copy(update={"can": can, "station": station})
-        parts = _parts("simulated", rewired, source, clock, aim=partial(_aim, simulation), time_scale=rate)
+        parts = _parts("simulated", rewired, source, clock, aim=partial(_aim, simulation))
         parts = replace(parts, visit=partial(_visit, simulation, source.rig, dwell_s))
         simulation.drive_around(dwell_s)
         yield parts
@@ -163,12 +169,11 @@ def replayed(config: Config, source: RigSource, files: Sequence[Path], speed: fl
     return _parts("replayed", config, source, clock, links=links, is_over=is_over)
 
 
-def decoders(config: Config, source: RigSource, *, time_scale: float = 1.0) -> dict[str, Callable[[], Decoder]]:
+def decoders(config: Config, source: RigSource) -> dict[str, Callable[[], Decoder]]:
     """Link name -> what makes a fresh decoder of its captures.
 
     Args:
         config, source: links and rig.
-        time_scale: how many times faster than real the rig's clock runs.
 
     Raises:
         ConfigError: a channel's link is not configured.
@@ -176,8 +181,7 @@ def decoders(config: Config, source: RigSource, *, time_scale: float = 1.0) -> d
     """
     made: dict[str, Callable[[], Decoder]] = {}
     for section in config.can:
-        factories = decoder_factories(source.rig, source.directory, section.name, time_scale=time_scale)
-
+        factories = decoder_factories(source.rig, source.directory, section.name)
         made[section.name] = partial(_can_decoder, section.name, factories)
         _check_identifiers(section.name, config.own_identifiers(section.name), factories)
     for station in config.station:
@@ -228,7 +232,6 @@ def _parts(
     links: Sequence[LinkLoop] | None = None,
     aim: Callable[[str], None] | None = None,
     is_over: Callable[[], bool] = _never,
-    time_scale: float = 1.0,
 ) -> Parts:
     can_links: list[CanLink] = []
     played: list[ReplayLink] = []
@@ -247,7 +250,7 @@ def _parts(
         rig_text=source.text,
         clock=clock,
         links=[*can_links, *played, *stations] if links is None else links,
-        decoders=decoders(config, source, time_scale=time_scale),
+        decoders=decoders(config, source),
         joiner=joiner(config, source.rig),
         aim=aim,
         can_links=can_links if links is None else (),

@@ -83,6 +83,7 @@ class SimulatedRig:
         rates: joint name -> its greatest rate, deg/s or mm/s.
         directory: where the ports appear: `can` (an slcan adapter) and `station`.
         clock: shared with the process; its rate is the simulation's speed.
+        station_delay_s: how old a measurement of the station is when its record starts.
         seed: of the machine's imperfections, of all noise and of the poses.
         effects: hidden effects, as the simulator spells them.
         secret: where the simulator leaves the sealed envelope of one more, which it draws; none by default.
@@ -99,6 +100,7 @@ class SimulatedRig:
         directory: Path,
         clock: ScaledClock,
         *,
+        station_delay_s: float = 0.0,
         seed: int = 1,
         effects: tuple[str, ...] = (),
         secret: Path | None = None,
@@ -115,6 +117,7 @@ class SimulatedRig:
         command = [sys.executable, "-m", "simulators", "--rig", rig, "--seed", str(seed), "--rate", str(clock.rate)]
         command += ["--origin", origin, "--can-port", str(self.can_port), "--station-port", str(self.station_port)]
         command += ["--bus-master", "host", "--signal-ms", "200", "--effects", ",".join(effects)]
+        command += ["--latency-ms", str(station_delay_s * 1e3)]
         command += [] if secret is None else ["--secret", str(secret)]
         # In a session of its own: a Ctrl-C ends the daemon, which ends the rig when it is done with it.
         self._process = subprocess.Popen(

@@ -47,7 +47,8 @@ def _bit_words(bits: int, names: dict[int, str]) -> str:
     return ", ".join(words) or "none"
 
 
-JUMP_MARGIN_S = 0.25  # how far apart in time the samples of a moving joint may be from what their stamps say
+_MARGIN_NS = NS_PER_S // 4  # what samples may be read late by, without more ado
+_BACKLOG_NS = 5 * NS_PER_S  # what has queued is read within this time, however long nobody read
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,15 +59,12 @@ class PositionChannel(PdoChannel):
         sign: +1 or -1, the joint's positive direction against counting direction.
         zero_counts: position at which the joint reads zero.
         max_rate_per_s: fastest motion of the joint in units per second; None: jumps are not looked for.
-        jump_margin_s: uncertainty of the time between two samples, within which the joint may also have moved: what a
-            busy computer may be late by where the kernel does not stamp frames.
         speed_step_per_s: what one count of object 6030h is worth; None: speed is not read.
     """
 
     sign: Literal[-1, 1] = 1
     zero_counts: int = 0
     max_rate_per_s: float | None = None
-    jump_margin_s: float = JUMP_MARGIN_S
     speed_step_per_s: float | None = None
 
 
@@ -103,6 +101,36 @@ class LinearChannel(PositionChannel):
     range_mm: tuple[float, float] = (-1e5, 1e5)
 
 
+class _SampleTimes:
+    """Within what time a joint may have moved from one sample to the next.
+
+    A stamp says when a sample was read. What arrives while nobody reads (a busy computer, a program that is stopped)
+    waits, and is stamped when it is read at last. So a sample that ends a silence, and those after it until the backlog
+    is surely read, may have been taken at any time since the silence began. They are told from others by their stamps
+    alone: a log is judged as what came live.
+    """
+
+    def __init__(self) -> None:
+        self._read_ns: int | None = None
+        self._from_ns = self._late_until_ns = 0
+
+    def since_before(self, stamp: Stamp) -> int:
+        """Take a sample; the longest time, ns, that can lie between the sample before and this one."""
+        now_ns = stamp.monotonic_ns
+        before_ns, self._read_ns = self._read_ns, now_ns
+        if before_ns is None:  # what waited at a port is discarded when it is opened
+            self._from_ns = self._late_until_ns = now_ns
+            return 0
+        within_ns = max(now_ns - self._from_ns, 0) + _MARGIN_NS
+        silence_ns = now_ns - before_ns
+        is_late = silence_ns > _MARGIN_NS
+        if now_ns >= self._late_until_ns:
+            self._from_ns = before_ns if is_late else now_ns
+        if is_late:
+            self._late_until_ns = max(self._late_until_ns, now_ns + min(silence_ns // 2, _BACKLOG_NS))
+        return within_ns
+
+
 class _PositionDecoder(PdoChannelDecoder):
     """Alarms, warnings, speed and jumps; the position itself is the subclasses'."""
 
@@ -121,8 +149,8 @@ class _PositionDecoder(PdoChannelDecoder):
         self._warning_bits = 0
         rate = channel.max_rate_per_s
         self._jump_rate = None if rate is None else rate * counts_per_unit / NS_PER_S
-        self._margin = 2.0 + (0.0 if rate is None else rate * counts_per_unit * channel.jump_margin_s)
-        self._last: tuple[Stamp, int] | None = None
+        self._times = _SampleTimes()
+        self._last: int | None = None
 
     def object_read(self, stamp: Stamp, index: int, value: int) -> list[Record]:
         records: list[Record] = []
@@ -161,9 +189,9 @@ class _PositionDecoder(PdoChannelDecoder):
             records.append(DeviceEvent(self.name, stamp, EventKind.WARNING, text, bits))
             self._warning_bits = bits
 
-    def _is_jump(self, elapsed_ns: int, moved_counts: int) -> bool:
-        """Whether the joint cannot have moved so far in that time."""
-        return self._jump_rate is not None and abs(moved_counts) > self._jump_rate * max(elapsed_ns, 0) + self._margin
+    def _is_jump(self, within_ns: int, moved_counts: int) -> bool:
+        """Whether the joint cannot have moved so far within that time."""
+        return self._jump_rate is not None and abs(moved_counts) > self._jump_rate * within_ns + 2.0
 
     def _jumped(self, stamp: Stamp, counts: int, before: float, after: float, records: list[Record]) -> None:
         """A sample that no motion explains: one event, and no value, because it is not known which zero it counts from.
@@ -223,11 +251,12 @@ class EncoderDecoder(_PositionDecoder):
         half = self._half
         value = ((counts - self._zero + half) % total - half) * self._deg_per_count
         if self._jump_rate is not None:
-            last, self._last = self._last, (stamp, counts)
+            within_ns = self._times.since_before(stamp)
+            last, self._last = self._last, counts
             if last is not None:
-                moved = (counts - last[1] + total // 2) % total - total // 2
-                if self._is_jump(stamp.since(last[0]), moved):
-                    before = ((last[1] - self._zero + half) % total - half) * self._deg_per_count
+                moved = (counts - last + total // 2) % total - total // 2
+                if self._is_jump(within_ns, moved):
+                    before = ((last - self._zero + half) % total - half) * self._deg_per_count
                     self._jumped(stamp, counts, before, value, records)
                     return records
         records.append(Reading(self.name, stamp, value, self._unit, Status.OK, counts))
@@ -278,9 +307,10 @@ class LinearDecoder(_PositionDecoder):
             records.append(Reading(self.name, stamp, None, self._unit, Status.OUT_OF_RANGE, counts))
             return records
         if self._jump_rate is not None:
-            last, self._last = self._last, (stamp, counts)
-            if last is not None and self._is_jump(stamp.since(last[0]), counts - last[1]):
-                self._jumped(stamp, counts, self._value(last[1]), self._value(counts), records)
+            within_ns = self._times.since_before(stamp)
+            last, self._last = self._last, counts
+            if last is not None and self._is_jump(within_ns, counts - last):
+                self._jumped(stamp, counts, self._value(last), self._value(counts), records)
                 return records
         records.append(Reading(self.name, stamp, self._value(counts), self._unit, Status.OK, counts))
         return records

@@ -45,6 +45,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--setup", default="", help="name of the station set-up: decides where the machine stands")
     add("--profile", choices=("topcon_gts8", "topcon_classic", "sokkia_set"), default="topcon_gts8")
     add("--baud", type=int, default=9600, help="of the station's line")
+    add("--latency-ms", type=float, default=20.0, help="how old a measurement is when its record starts")
     add("--push-s", type=float, help="the station sends records unasked at this interval")
     return parser
 
@@ -62,7 +63,14 @@ def _build(options: argparse.Namespace) -> tuple[RigSimulator, Envelope | None]:
         raise ValueError("rate, sync-ms, signal-ms and baud must be positive, seed not negative")
     if options.push_s is not None and options.push_s <= 0:
         raise ValueError("push-s must be positive")
-    station = StationSettings(profile=options.profile, baud=options.baud, push_interval_s=options.push_s)
+    if options.latency_ms < 0:
+        raise ValueError("latency-ms must not be negative")
+    station = StationSettings(
+        profile=options.profile,
+        baud=options.baud,
+        latency_s=options.latency_ms / 1e3,
+        push_interval_s=options.push_s,
+    )
     settings = SimulatorSettings(
         bus_master=options.bus_master,
         sync_period_s=options.sync_ms / 1e3,

@@ -172,6 +172,46 @@ def test_a_long_silence_explains_a_long_way() -> None:
     assert not jumps(decoder.decode(at(10), u32(30000)))
 
 
+READ_EVERY = 0.02
+FASTEST = 20.0 * 65536 / 360  # counts in a second
+
+
+def read_late(decoder: EncoderDecoder, pieces: list[tuple[float, float]], queue: int) -> list[str]:
+    """Jumps told of a joint in fast motion whose reader is there, and is not, for these seconds in turn.
+
+    Nothing but the first `queue` samples of the time without a reader waits for it; they come back to back.
+    """
+    told: list[str] = []
+    now = 0.0
+    for there_s, away_s in pieces:
+        for _ in range(round(there_s / READ_EVERY)):
+            now += READ_EVERY
+            told += jumps(decoder.decode(at(now), u32(round(now * FASTEST) % 65536)))
+        left, now = now, now + away_s
+        for waited in range(min(queue, round(away_s / READ_EVERY))):
+            counts = round((left + (waited + 1) * READ_EVERY) * FASTEST)
+            told += jumps(decoder.decode(at(now + waited * 0.0005), u32(counts % 65536)))
+        now += 0.01
+    return told
+
+
+@given(
+    st.lists(st.tuples(st.floats(0.0, 2.0), st.floats(0.0, 8.0)), min_size=1, max_size=6), st.sampled_from([0, 10, 400])
+)
+def test_samples_that_nobody_read_in_time_are_no_jump(pieces: list[tuple[float, float]], queue: int) -> None:
+    assert read_late(encoder(max_rate_per_s=20.0), [(0.1, 0.0), *pieces, (0.2, 0.0)], queue) == []
+
+
+def test_a_preset_is_told_again_once_a_backlog_must_be_read() -> None:
+    decoder = encoder(max_rate_per_s=20.0)
+    assert not read_late(decoder, [(1.0, 60.0)], 10)
+    now = 61.5
+    for _ in range(250):
+        now += READ_EVERY
+        decoder.decode(at(now), u32(0))
+    assert jumps(decoder.decode(at(now + READ_EVERY), u32(2000)))
+
+
 def test_without_a_fastest_rate_no_jump_is_looked_for() -> None:
     decoder = encoder()
     decoder.decode(at(0), u32(0))

@@ -199,6 +199,7 @@ def test_an_unplugged_port_comes_back(rig: Process) -> None:
         (["--faults", "node_silent@1:node=99"], b"no node 99"),
         (["--rate", "0"], b"must be positive"),
         (["--push-s", "0"], b"push-s must be positive"),
+        (["--latency-ms", "-1"], b"latency-ms must not be negative"),
         (["--random-faults", "-1"], b"random-faults must be positive"),
         (["--origin", "now"], b"is not UTC_NS,MONOTONIC_NS,BOOT_ID"),
         (["--can-port", "/nowhere/can"], b"No such file"),
