@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from drivers.attendance import NOT_READ_IN_TIME, Attendance
 from drivers.can_ports import BATCH_MAX, OVERFLOW, CanPort, Interface, PortSettings, Received, open_port
 from drivers.can_stamps import ReceiveStamps
 from drivers.can_sync import SyncProducer
@@ -202,8 +203,8 @@ class CanLink:
             try:
                 outage.end(self._clock.now())
                 while True:
+                    session.take(received)
                     if received:
-                        session.take(received)
                         backoff.reset()
                     session.serve(self._requests.take(), self._take_published())
                     if stop.is_set():
@@ -298,6 +299,8 @@ class _Session:
         self._losses: dict[str, int] = {}
         opened = clock.now()
         self._stamps = ReceiveStamps(opened)
+        self._attendance = Attendance(clock)
+        self._late = 0  # frames that nobody read in time
         self._check_losses_ns = opened.monotonic_ns + LOSS_CHECK_NS
         self._checked = self._heard_then = opened  # when losses were last looked for, and the last frame before that
         self._sync: SyncProducer | None = None
@@ -311,13 +314,17 @@ class _Session:
         return self._stamps.latest
 
     def take(self, received: list[Received]) -> None:
-        """Stamp and emit what one read gave."""
+        """Stamp and emit what one read gave, but for what was not read in time and has no stamp of the kernel."""
         now = self._clock.now()
+        is_late = self._attendance.is_late(now, POLL_S)
         name, emit, stamp_of = self._name, self._emit, self._stamps.stamp
         stamps = []
         for frame, kernel_utc_ns in received:
             stamp = stamp_of(kernel_utc_ns, now)
             stamps.append(stamp)
+            if is_late and kernel_utc_ns is None:
+                self._late += 1
+                continue
             arbitration_id, data, is_extended, is_remote, is_error = frame
             emit(CanCapture(name, stamp, arbitration_id, data, is_extended, is_remote, is_error))
         if len(received) < BATCH_MAX:
@@ -380,7 +387,7 @@ class _Session:
             self._emit(event)
 
     def _report_losses(self) -> None:
-        now, losses = self._clock.now(), self._port.losses()
+        now, losses = self._clock.now(), self._port.losses() | {NOT_READ_IN_TIME: self._late}
         start, missed = self._checked, 0
         for reason, total in losses.items():
             lost = total - self._losses.get(reason, 0)

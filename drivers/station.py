@@ -9,6 +9,7 @@ from typing import Literal, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from drivers.attendance import NOT_READ_IN_TIME, Attendance
 from drivers.bytestream import ByteTimes, Frame, Framer, Garbage
 from drivers.clock import NS_PER_S, Clock, Stamp
 from drivers.conversation import Conversation, Timing
@@ -183,14 +184,23 @@ class StationLink:
 
     def _converse(self, port: SerialPort, emit: Emit, stop: threading.Event) -> None:
         conversation = start_conversation(self._config)
+        attendance, late = Attendance(self._clock), 0
         while not stop.is_set():
             wait_s = _LONGEST_READ_S if conversation is None else self._speak(port, conversation, emit)
-            data = port.read(self._clock.real_seconds(wait_s))
-            if data:
-                stamp = self._clock.now()
-                emit(SerialCapture(self.name, stamp, data))
-                if conversation is not None:
-                    conversation.feed(data, stamp.monotonic_ns)
+            patience_s = self._clock.real_seconds(wait_s)
+            data = port.read(patience_s)
+            stamp = self._clock.now()
+            if attendance.is_late(stamp, patience_s):
+                late += len(data)
+            else:
+                if late:
+                    self._tell(emit, EventKind.FRAMES_DROPPED, f"{late} bytes lost, {NOT_READ_IN_TIME}")
+                    emit(Gap(self.name, GapReason.FRAMES_LOST, attendance.left, stamp))
+                    late = 0
+                if data:
+                    emit(SerialCapture(self.name, stamp, data))
+            if data and conversation is not None:
+                conversation.feed(data, stamp.monotonic_ns)
         if conversation is not None:
             for command in conversation.closing():
                 self._send(port, command, emit)
