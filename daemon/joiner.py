@@ -2,8 +2,9 @@
 
 A fix was measured `link_delay_s` before the first byte of its record arrived. Every joint is interpolated linearly
 between the two samples around that instant, on the monotonic clock; a fix therefore waits until every joint has been
-sampled a little beyond it, or until `deadline_s` has passed without. Beside the joints' values a joined fix carries
-what effects depend on: direction of approach, rate, dwell, and the latest signals.
+sampled a little beyond it, or other joints `deadline_s` beyond it. Time is what the records say: links may be read
+late, one later than another, and a log is joined as what came live. Beside the joints' values a joined fix carries what
+effects depend on: direction of approach, rate, dwell, and the latest signals.
 """
 
 from __future__ import annotations
@@ -14,7 +15,16 @@ from dataclasses import dataclass
 
 from calibration.channels import Cia406Encoder, Cia406Linear
 from calibration.rig import Rig
-from daemon.tracks import MAX_GAP_S, STILL_AFTER_NS, JointInput, JointTrack, Motion, SignalInput, SignalTrack
+from daemon.tracks import (
+    HISTORY_NS,
+    MAX_GAP_S,
+    STILL_AFTER_NS,
+    JointInput,
+    JointTrack,
+    Motion,
+    SignalInput,
+    SignalTrack,
+)
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import DeviceEvent, EventKind, Fix, Reading, Record, Status
 
@@ -89,7 +99,8 @@ class ObservationJoiner:
         signals: what is carried along where it is fresh.
         link_delay_s: station -> how long before the first byte of its record it measured; 0 where not given.
         settle_s: how long the boom must have stood for a fix to belong to a standstill.
-        deadline_s: how long a fix waits for joints that have fallen silent.
+        deadline_s: how long a fix waits for joints that have fallen silent; where all are silent, it waits as long as
+            samples are kept.
 
     Attributes:
         refusals: reason -> how many fixes were refused for it.
@@ -117,8 +128,8 @@ class ObservationJoiner:
     def feed(self, records: Iterable[Record]) -> list[JoinedFix]:
         """Take records and return the fixes that they complete, refused ones included.
 
-        The records of one call may be in any order: those of one link commonly follow those of another. Fixes whose
-        own status is not OK are passed over. Records of another boot end what was pending.
+        The records of one call may be in any order, and those of a link may come calls after those of another. Fixes
+        whose own status is not OK are passed over. Records of another boot end what was pending.
         """
         done: list[JoinedFix] = []
         timed = [(r.stamp, r) for r in records if isinstance(r, Reading | Fix | DeviceEvent)]
@@ -134,12 +145,6 @@ class ObservationJoiner:
                 if self._pending:
                     done += self._release()
         return done
-
-    def tick(self, now: Stamp) -> list[JoinedFix]:
-        """Fixes whose deadline has passed by `now`, with everything captured by then fed before."""
-        if now.boot_id == self._boot_id:
-            self._newest_ns = max(self._newest_ns, now.monotonic_ns)
-        return self._release()
 
     def latest(self) -> MachineState | str:
         """The machine at the newest instant at which every joint is known, or why there is none."""
@@ -182,9 +187,9 @@ class ObservationJoiner:
         while self._pending:
             fix, stamp = self._pending[0]
             wanted_ns = stamp.monotonic_ns + STILL_AFTER_NS
-            if self._newest_ns - wanted_ns <= self._deadline_ns and any(
-                joint.newest_ns < wanted_ns for joint in self._joints.values()
-            ):
+            sampled_ns = [joint.newest_ns for joint in self._joints.values()]
+            is_in_time = max(sampled_ns) - wanted_ns <= self._deadline_ns and self._newest_ns - wanted_ns <= HISTORY_NS
+            if is_in_time and min(sampled_ns) < wanted_ns:
                 break
             self._pending.popleft()
             done.append(self._join(fix, stamp))

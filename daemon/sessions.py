@@ -12,18 +12,17 @@ import logging
 import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
-from dataclasses import dataclass, field
 from typing import Any
 
 from calibration.rig import Rig
 from daemon.config import SessionsSection
 from daemon.control import FAILED, CommandError
 from daemon.joiner import JoinedFix, ObservationJoiner
+from daemon.open_session import OpenSession, Shot, within
 from daemon.scheduler import CHECK, SESSION_KINDS
 from daemon.setups import AXES, Place, SetupBook, identifier
 from daemon.store.store import Store
-from drivers.clock import Clock, Stamp
+from drivers.clock import Clock
 from drivers.readings import DeviceEvent, EventKind, Fix, Record, Status
 from drivers.station import position_mm
 
@@ -33,25 +32,6 @@ STANDING_KINDS = ("static_poses", CHECK)
 CHECK_POSES = (3, 5)
 CONTROL_POINT_RADIUS_MM = 300.0  # a fix this close to a control point is of the control point, not of the boom
 SHOT_SPREAD_MM = 20.0  # fixes of one shot that lie further apart are not of one standing target
-
-
-@dataclass
-class _Shot:
-    """A control point being measured: the next good fixes, measured after `since`, are averaged."""
-
-    wanted: int
-    since: Stamp
-    fixes: list[Fix] = field(default_factory=list)
-    places_mm: list[Place] = field(default_factory=list)
-    done: Future[None] = field(default_factory=Future)
-
-
-@dataclass(frozen=True)
-class _OpenSession:
-    id: str
-    setup_id: str
-    prism: str
-    kind: str
 
 
 class SessionKeeper:
@@ -87,10 +67,8 @@ class SessionKeeper:
         self._setups, self._run_id = setups, run_id
         self._aim = aim
         self._commands = threading.Lock()
-        self._shot: _Shot | None = None
-        self._from = clock.now()  # fixes from then on are of the session's prism
-        self._jumped: dict[str, Stamp] = {}  # joints whose encoder jumped in the open session, since when
-        self._control_points: list[Place] = []
+        self._shot: Shot | None = None
+        self._ended: OpenSession | None = None  # the last one: fixes measured in it may still wait for their joints
         self._open = self._reopen()
 
     # ---- the writer thread -------------------------------------------------------------------------------------------
@@ -101,10 +79,10 @@ class SessionKeeper:
             if isinstance(record, Fix):
                 self._feed_shot(record)
             elif isinstance(record, DeviceEvent) and record.kind is EventKind.PRESET_JUMP:
-                self._jumped.setdefault(record.device, record.stamp)
+                for session in (self._ended, self._open):
+                    if session is not None and session.lasted(record.stamp):
+                        session.jumped.setdefault(record.device, record.stamp)
         for joined in self._joiner.feed(records):
-            self._observe(joined)
-        for joined in self._joiner.tick(self._clock.now()):
             self._observe(joined)
 
     def _feed_shot(self, fix: Fix) -> None:
@@ -112,7 +90,7 @@ class SessionKeeper:
         place_mm = position_mm(fix)
         if shot is None or shot.done.done() or place_mm is None or fix.status is not Status.OK:
             return
-        if fix.stamp.since(shot.since) < 0:
+        if not within(fix.stamp, shot.aimed, None):
             return
         if shot.places_mm and math.dist(place_mm, shot.places_mm[0]) > SHOT_SPREAD_MM:
             shot.fixes.clear()  # the station was still turning to it
@@ -123,8 +101,9 @@ class SessionKeeper:
             shot.done.set_result(None)
 
     def _observe(self, joined: JoinedFix) -> None:
-        session, place_mm = self._open, position_mm(joined.fix)
-        if session is None or place_mm is None or self._shot is not None or joined.stamp.since(self._from) < 0:
+        session = next((s for s in (self._ended, self._open) if s is not None and s.has(joined.stamp)), None)
+        place_mm = position_mm(joined.fix)
+        if session is None or place_mm is None:
             return
         standing = joined.standstill is not None
         self._store.insert(
@@ -144,13 +123,13 @@ class SessionKeeper:
             },
         )
 
-    def _exclusion(self, session: _OpenSession, joined: JoinedFix, place_mm: Place) -> str | None:
+    def _exclusion(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> str | None:
         if joined.refused:
             return joined.refused
         for joint in self._rig.joint_names:
-            if joint in self._jumped and joined.stamp.since(self._jumped[joint]) >= 0:
+            if joint in session.jumped and within(joined.stamp, session.jumped[joint], None):
                 return f"{joint} jumped: its readings from then on do not fit those before"
-        if any(math.dist(place_mm, p) < CONTROL_POINT_RADIUS_MM for p in self._control_points):
+        if any(math.dist(place_mm, p) < CONTROL_POINT_RADIUS_MM for p in session.control_points):
             return "a control point, not the prism"
         if session.kind in STANDING_KINDS and joined.standstill is None:
             return "moving"
@@ -171,7 +150,6 @@ class SessionKeeper:
             if kind not in SESSION_KINDS:
                 raise CommandError(f"there is no kind {kind!r}; kinds: {', '.join(SESSION_KINDS)}")
             setup_id = self._setups.usable(arguments.get("setup"))
-            now = self._clock.now()
             taken = {row["id"] for row in self._store.rows("SELECT id FROM calibration_sessions")}
             free = next(name for n in itertools.count(len(taken) + 1) if (name := f"s{n:03d}-{prism}") not in taken)
             session_id = identifier(arguments, "id", "a session's id", default=free)
@@ -179,6 +157,7 @@ class SessionKeeper:
                 raise CommandError(f"session {session_id!r} exists already; choose another --id")
             if self._aim is not None:
                 self._aim(prism)
+            now = self._clock.now()
             row = {
                 "id": session_id,
                 "rig": self._rig.name,
@@ -193,10 +172,8 @@ class SessionKeeper:
                 **self._store.instant(now, "started_"),
             }
             self._store.insert("calibration_sessions", row)
-            self._from = self._clock.now()
-            self._jumped.clear()
-            self._open = _OpenSession(session_id, setup_id, prism, kind)
-            self._control_points = self._setups.control_points(setup_id)
+            points = self._setups.control_points(setup_id)
+            self._open = OpenSession(session_id, setup_id, prism, kind, now, control_points=points)
             return {"id": session_id, "setup": setup_id, "prism": prism, "kind": kind, "advice": self._advice("start")}
 
     def stop_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -221,19 +198,22 @@ class SessionKeeper:
             name = identifier(arguments, "point", "a control point's name")
             if name in self._rig.prism_names:
                 raise CommandError(f"{name!r} is a prism of the rig; a control point stands still beside it")
-            if self._aim is not None:
-                self._aim(name)
-            shot = self._shot = _Shot(self._settings.fixes_per_shot, self._clock.now())
+            shot = Shot(self._settings.fixes_per_shot, self._clock.now())
+            session.shots.append(shot)
             try:
+                if self._aim is not None:
+                    self._aim(name)
+                shot.aimed = self._clock.now()
+                self._shot = shot
                 self._await(shot)
             finally:
+                self._shot = None
                 if self._aim is not None:
                     self._aim(session.prism)
-                self._from = self._clock.now()
-                self._shot = None
+                shot.until = self._clock.now()
             phase = self._phase(session, name)
             result = self._setups.store_shot(session.setup_id, session.id, name, phase, shot.fixes, shot.places_mm)
-            self._control_points = self._setups.control_points(session.setup_id)
+            session.control_points = self._setups.control_points(session.setup_id)
             return result
 
     def list_command(self, _arguments: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -258,7 +238,7 @@ class SessionKeeper:
 
     # ---- parts -------------------------------------------------------------------------------------------------------
 
-    def _await(self, shot: _Shot) -> None:
+    def _await(self, shot: Shot) -> None:
         """Wait until the shot is complete; the time-out runs on the clock of the rig."""
         arrived = threading.Event()
         shot.done.add_done_callback(lambda _: arrived.set())
@@ -269,11 +249,12 @@ class SessionKeeper:
                 FAILED,
             )
 
-    def _phase(self, session: _OpenSession, point: str) -> str:
+    def _phase(self, session: OpenSession, point: str) -> str:
         """`end` for a point that was shot before the observations so far, else `start`."""
         between = self._store.rows(
             "SELECT 1 FROM observations AS o JOIN control_shots AS c ON c.session_id = o.session_id AND c.name = ? "
-            "WHERE o.session_id = ? AND o.excluded IS NULL AND o.utc_ns > c.utc_ns LIMIT 1",
+            "WHERE o.session_id = ? AND o.excluded IS NULL "
+            "AND (o.boot_id, o.monotonic_ns) > (c.boot_id, c.monotonic_ns) LIMIT 1",
             (point, session.id),
         )
         return "end" if between else "start"
@@ -296,7 +277,7 @@ class SessionKeeper:
         advice += [
             f"{joint} jumped during the session, and nothing after that is used: if its encoder was preset, start anew"
             for joint in self._rig.joint_names
-            if joint in self._jumped
+            if joint in session.jumped
         ]
         if phase == "start":
             advice.append("stand still at every pose until status counts it; move all joints through their ranges")
@@ -347,16 +328,17 @@ class SessionKeeper:
 
     def _close(self, state: str) -> None:
         session = self._needs_open()
-        self._open = None
-        ended = self._store.instant(self._clock.now(), "ended_")
+        session.until = self._clock.now()
+        self._ended, self._open = session, None
+        ended = self._store.instant(session.until, "ended_")
         self._store.update("calibration_sessions", {"id": session.id}, {"state": state, **ended})
 
-    def _needs_open(self) -> _OpenSession:
+    def _needs_open(self) -> OpenSession:
         if self._open is None:
             raise CommandError("no session is open; start one with `rigcal session start`")
         return self._open
 
-    def _reopen(self) -> _OpenSession | None:
+    def _reopen(self) -> OpenSession | None:
         """The session that was open when an earlier run ended goes on."""
         rows = self._store.rows(
             "SELECT id, setup_id, prism, kind FROM calibration_sessions WHERE state = 'open' AND rig = ?",
@@ -364,10 +346,10 @@ class SessionKeeper:
         )
         if not rows:
             return None
-        session = _OpenSession(rows[0]["id"], rows[0]["setup_id"], rows[0]["prism"], rows[0]["kind"])
+        session = OpenSession(rows[0]["id"], rows[0]["setup_id"], rows[0]["prism"], rows[0]["kind"], since=None)
         log.warning("session %s (prism %s) was open when rigcal last ended; it goes on", session.id, session.prism)
         if self._aim is not None:
             self._aim(session.prism)  # what aims may have forgotten; an operator's station has kept its lock
-        self._control_points = self._setups.control_points(session.setup_id)
-        self._jumped = dict.fromkeys(self._earlier_jumps(session.id), self._from)  # before all of this run's fixes
+        session.control_points = self._setups.control_points(session.setup_id)
+        session.jumped = dict.fromkeys(self._earlier_jumps(session.id))
         return session

@@ -41,7 +41,6 @@ channel = "can0"
 serial.path = "/dev/rigcal-station"
 """
 REPLAYED = "replayed"
-LAST_WAIT_S = 10.0  # beyond every deadline that a fix may wait for its joints
 COUNTED = ("joint_samples", "signals", "fixes", "device_events", "decode_failures", "gaps", "observations")
 _LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
@@ -198,8 +197,6 @@ def replay(
             keeper.start_command({"id": REPLAYED, "prism": prism, "kind": kind, "operator": "replay"})
         acquisition = Acquisition((), made, store, clock, on_records=keeper.on_records)
         acquisition.run_inline(_followed(itertools.chain([first], captures), clock))
-        clock.advance(LAST_WAIT_S)
-        keeper.on_records([])
         session = keeper.stop_command({}) if prism is not None else None
     with Reader(path) as reader:
         if readings is not None:

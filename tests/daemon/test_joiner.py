@@ -47,7 +47,7 @@ def samples(
 
 def join(records: Sequence[Record], *joints: JointInput, **options: object) -> list[JoinedFix]:
     joiner = ObservationJoiner(joints or (THETA,), **options)  # type: ignore[arg-type] # options of any type
-    return joiner.feed(records) + joiner.tick(at(1000.0))
+    return joiner.feed([*records, reading("elsewhere", 1000.0, 0.0)])
 
 
 def preset(seconds: float, channel: str = "theta1") -> DeviceEvent:
@@ -123,6 +123,21 @@ def test_neither_order_nor_batches_of_records_change_what_is_joined(seed: int, b
     assert joined == expected
 
 
+@settings(max_examples=60)
+@given(st.integers(1, 400), st.floats(-20.0, 20.0))
+def test_one_link_may_be_read_long_after_another(batch: int, later_s: float) -> None:
+    fixes = [fix(t / 4) for t in range(1, 40)]
+    sampled = [*samples(11.0), *samples(11.0, lambda t: 50 * t, period_s=0.1, name="L2")]
+    expected = join([*sampled, *fixes], THETA, LENGTH)
+    as_read = [(fixes_ns(r) + later_s * 1e9, r) for r in fixes] + [(fixes_ns(r), r) for r in sampled]
+    in_time = [record for _, record in sorted(as_read, key=lambda item: item[0])]
+    joiner = ObservationJoiner([THETA, LENGTH])
+    joined: list[JoinedFix] = []
+    for start in range(0, len(in_time), batch):
+        joined += joiner.feed(in_time[start : start + batch])
+    assert joined == expected
+
+
 def fixes_ns(record: Record) -> int:
     assert not isinstance(record, Gap)
     return record.stamp.monotonic_ns
@@ -146,12 +161,10 @@ def test_a_fix_of_a_silent_joint_is_refused_after_the_deadline() -> None:
     assert joiner.refusals == {"L2: no sample after the fix": 1}
 
 
-def test_the_deadline_passes_when_nothing_at_all_arrives() -> None:
+def test_where_all_joints_are_silent_a_fix_waits_as_long_as_samples_are_kept() -> None:
     joiner = ObservationJoiner([THETA], deadline_s=2.0)
-    assert joiner.feed([fix(1.0)]) == []
-    assert joiner.tick(at(3.45)) == []
-    assert joiner.tick(at(99.0, "boot-b")) == []
-    (joined,) = joiner.tick(at(3.6))
+    assert joiner.feed([fix(1.0), fix(31.4, Status.NOT_AVAILABLE)]) == []
+    (joined,) = joiner.feed([fix(31.6, Status.NOT_AVAILABLE)])
     assert joined.refused == "theta1: no sample before the fix"
     assert joined.values == {}
     assert (joined.dwell_s, joined.standstill) == (None, None)

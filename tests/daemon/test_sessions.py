@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from calibration.observations import parse_observations
@@ -152,6 +153,36 @@ def test_observations_leave_as_the_contracts_csv_and_can_be_read_as_one(rig: Rig
     assert observations.position_mm[0] == pytest.approx((3000.0, 8000.0, 1000.0), abs=1e-6)
     assert (observations.extra["dwell_s"] > 0).all()
     assert (observations.extra["theta1_rate"] == 0).all()
+
+
+def test_a_clock_that_is_set_in_a_session_does_not_step_its_times(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    now = rig.clock.now()
+    rig.clock.set(Stamp(now.utc_ns - 86_400 * NS_PER_S, now.monotonic_ns, now.boot_id))
+    rig.live(2)
+    rig.say("stop")
+    with Reader(rig.store.path) as reader:
+        table = parse_observations(sessions_csv(reader, SOURCE.rig, ["s001-r"]), SOURCE.rig, "a session")
+    assert np.diff(table.extra["time_s"]) == pytest.approx(STEP_S)
+    assert table.extra["time_s"][-1] > 2.0
+
+
+def test_every_fix_is_its_session_s_by_when_it_was_measured_not_by_when_it_was_joined(rig: Rig) -> None:
+    start(rig)
+    begun = rig.clock.now().monotonic_ns
+    rig.live(2)
+    shot = rig.clock.now().monotonic_ns
+    rig.shoot("cp1", (1500.0, 9000.0, 2000.0))
+    rig.live(2)
+    rig.say("stop")
+    ended = rig.clock.now().monotonic_ns
+    rig.live(2)
+    observed = {row["monotonic_ns"] for row in rig.store.rows("SELECT monotonic_ns FROM observations")}
+    measured = [row["monotonic_ns"] for row in rig.store.rows("SELECT monotonic_ns FROM fixes")]
+    assert {t for t in measured if begun < t < shot} <= observed
+    assert {t for t in measured if ended - NS_PER_S < t < ended} <= observed
+    assert not {t for t in measured if t < begun or t > ended} & observed
 
 
 def test_a_multi_joint_session_keeps_what_it_measures_while_moving(rig: Rig) -> None:
@@ -336,6 +367,15 @@ def test_after_an_encoder_jumped_nothing_of_the_session_is_used(rig: Rig) -> Non
     assert sum(n for reason, n in summary["excluded"].items() if reason.startswith("theta1 jumped")) > 60
     assert any("theta1 jumped" in sentence for sentence in summary["advice"])
     rig.say("start", prism="r")
+    rig.live(2)
+    assert rig.say("stop")["observations"] > 10
+
+
+def test_a_jump_before_the_session_is_told_of_late_and_excludes_nothing(rig: Rig) -> None:
+    jumped = rig.clock.now()
+    rig.live(1)
+    start(rig)
+    rig.keeper.on_records([DeviceEvent("theta1", jumped, EventKind.PRESET_JUMP, "from 22 to 33")])
     rig.live(2)
     assert rig.say("stop")["observations"] > 10
 

@@ -1,0 +1,67 @@
+"""An open session, and which fixes are its own: those measured in it while the station was on its prism."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+
+from daemon.setups import Place
+from drivers.clock import Stamp
+from drivers.readings import Fix
+
+
+@dataclass
+class Shot:
+    """A control point being measured: the mean of the next good fixes.
+
+    Attributes:
+        wanted: how many.
+        since, until: fixes measured in between are not of the prism.
+        aimed: fixes measured from then on may be of the point; None until the station was told to turn to it.
+        fixes, places_mm: so far.
+        done: when there are enough.
+    """
+
+    wanted: int
+    since: Stamp
+    until: Stamp | None = None
+    aimed: Stamp | None = None
+    fixes: list[Fix] = field(default_factory=list)
+    places_mm: list[Place] = field(default_factory=list)
+    done: Future[None] = field(default_factory=Future)
+
+
+@dataclass
+class OpenSession:
+    """A session that takes fixes. Each fix's instant tells whose it is: it is joined, and comes, some time later.
+
+    Attributes:
+        since, until: fixes measured in between are of its prism; None for one that began in an earlier run of the
+            daemon, and while it is open.
+        shots: when the station was on control points instead.
+        jumped: joints whose encoder jumped in it, since when; None: in an earlier run.
+        control_points: where those of its set-up are, mm.
+    """
+
+    id: str
+    setup_id: str
+    prism: str
+    kind: str
+    since: Stamp | None
+    until: Stamp | None = None
+    shots: list[Shot] = field(default_factory=list)
+    jumped: dict[str, Stamp | None] = field(default_factory=dict)
+    control_points: list[Place] = field(default_factory=list)
+
+    def lasted(self, stamp: Stamp) -> bool:
+        """Whether that instant lies in it."""
+        return within(stamp, self.since, self.until)
+
+    def has(self, stamp: Stamp) -> bool:
+        """Whether what the station measured then is its prism."""
+        return self.lasted(stamp) and not any(within(stamp, shot.since, shot.until) for shot in self.shots)
+
+
+def within(stamp: Stamp, since: Stamp | None, until: Stamp | None) -> bool:
+    """Whether `stamp` lies between two instants, the first included; None is without bound."""
+    return (since is None or stamp.since(since) >= 0) and (until is None or stamp.since(until) < 0)
