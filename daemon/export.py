@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,6 +11,7 @@ from daemon.config import Config, ConfigError
 from daemon.control import CommandError
 from daemon.files import write_file
 from daemon.session_data import sessions_csv
+from daemon.steady_time import SteadyTime
 from daemon.store.reader import Reader
 from drivers.canlog import write_can_log
 from drivers.clock import NS_PER_S, Stamp
@@ -22,6 +24,9 @@ MARGIN_NS = 2 * NS_PER_S  # joints are interpolated, and dwell and direction com
 
 def export_session(config: Config, session_id: str, out: Path, can_format: CanFormat) -> list[Path]:
     """Write a session's captures, a file a link, and its observations.
+
+    Logs know UTC alone, so the captures' is made steady: what was recorded while the computer's clock was set must not
+    come again at another time than what came before and after it.
 
     Args:
         config: of the daemon whose store it is; gives the stations' profiles and speeds.
@@ -46,8 +51,11 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
         since, until = _margin(reader, session, "started_", -MARGIN_NS), _margin(reader, session, "ended_", MARGIN_NS)
         out.mkdir(parents=True, exist_ok=True)
         files = []
+        steady = SteadyTime()
+        steady.of(since)
         for link in list(reader.rows("SELECT name, kind FROM links ORDER BY id")):
-            captures = reader.captures(link["name"], since, until)
+            stored = reader.captures(link["name"], since, until)
+            captures = (replace(capture, stamp=steady.of(capture.stamp)) for capture in stored)
             if link["kind"] == "can":
                 path = out / f"{session_id}-{link['name']}.{can_format}"
                 write_can_log(path, (c for c in captures if isinstance(c, CanCapture)))

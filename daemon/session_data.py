@@ -13,8 +13,9 @@ from collections.abc import Sequence
 from calibration.observations import LABEL_COLUMNS, POSITION_COLUMNS, SIGMA_COLUMNS
 from calibration.rig import Rig
 from daemon.report.inputs import ControlPoint, SetupLine
+from daemon.steady_time import SteadyTime
 from daemon.store.reader import Reader
-from drivers.clock import NS_PER_S
+from drivers.clock import NS_PER_S, Stamp
 
 Misclosure = tuple[float, float, float]
 
@@ -22,27 +23,33 @@ Misclosure = tuple[float, float, float]
 def sessions_csv(reader: Reader, rig: Rig, session_ids: Sequence[str]) -> bytes:
     """Observations of the given sessions that calibration may use, oldest first.
 
-    `time_s` counts from the first observation, on UTC: sessions may lie boots apart.
+    `time_s` counts from the first observation, on UTC, steady within a session: sessions may lie boots apart.
     """
     marks = ",".join("?" * len(session_ids))
     rows = list(
         reader.rows(
-            "SELECT session_id, setup_id, prism, pose, utc_ns, x_mm, y_mm, z_mm, sigma_x_mm, sigma_y_mm, sigma_z_mm, "
-            f"dwell_s, values_json FROM observations WHERE excluded IS NULL AND session_id IN ({marks}) ORDER BY id",
+            "SELECT session_id, setup_id, prism, pose, utc_ns, monotonic_ns, boot_id, x_mm, y_mm, z_mm, "
+            "sigma_x_mm, sigma_y_mm, sigma_z_mm, dwell_s, values_json "
+            f"FROM observations WHERE excluded IS NULL AND session_id IN ({marks}) ORDER BY id",
             session_ids,
         )
     )
     values = [json.loads(row["values_json"]) for row in rows]
     joints = [joint.column for joint in rig.joints]
     more = sorted({name for row in values for name in row} - set(joints))
-    start_ns = min((row["utc_ns"] for row in rows), default=0)
+    steady = {session_id: SteadyTime() for session_id in session_ids}
+    utc_ns = [
+        steady[row["session_id"]].of(Stamp(row["utc_ns"], row["monotonic_ns"], str(row["boot_id"]))).utc_ns
+        for row in rows
+    ]
+    start_ns = min(utc_ns, default=0)
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(["prism", *joints, *POSITION_COLUMNS, *LABEL_COLUMNS, "time_s", *SIGMA_COLUMNS, "dwell_s", *more])
-    for row, measured in zip(rows, values, strict=True):
+    for row, measured, at_ns in zip(rows, values, utc_ns, strict=True):
         cells = [row["prism"], *(measured.get(name) for name in joints)]
         cells += [row[name] for name in POSITION_COLUMNS]
-        cells += [row["setup_id"], row["session_id"], row["pose"], round((row["utc_ns"] - start_ns) / NS_PER_S, 6)]
+        cells += [row["setup_id"], row["session_id"], row["pose"], round((at_ns - start_ns) / NS_PER_S, 6)]
         cells += [row[name] for name in SIGMA_COLUMNS] + [row["dwell_s"], *(measured.get(name) for name in more)]
         writer.writerow("" if cell is None else repr(cell) if isinstance(cell, float) else cell for cell in cells)
     return out.getvalue().encode()

@@ -71,24 +71,31 @@ class Reader:
 
         Args:
             link: name of the link; all when None.
-            since, until: bounds on utc_ns, both inclusive; unbounded when None.
+            since, until: bounds, both inclusive; unbounded when None. They hold on the monotonic clock of their boots:
+                the wall clock may have been set in between.
 
         Raises:
             StoreError: a chunk is damaged; the message names it.
         """
-        first = since.utc_ns if since is not None else -(2**63)
-        last = until.utc_ns if until is not None else 2**63 - 1
+        boots = {kernel_boot_id: number for number, kernel_boot_id in self.boots().items()}
+
+        def place(stamp: Stamp) -> tuple[int, int]:
+            return boots.get(stamp.boot_id, 0), stamp.monotonic_ns
+
+        first = place(since) if since is not None else (0, -(2**63))
+        last = place(until) if until is not None else (2**63 - 1, 0)
         sql = (
             "SELECT raw_chunks.id, chunk FROM raw_chunks JOIN links ON links.id = link_id "
-            "WHERE last_utc_ns >= ? AND first_utc_ns <= ?" + (" AND links.name = ?" if link is not None else "")
+            "WHERE (last_boot_id, last_monotonic_ns) >= (?, ?) AND (first_boot_id, first_monotonic_ns) <= (?, ?)"
+            + (" AND links.name = ?" if link is not None else "")
         )
-        parameters = [first, last] if link is None else [first, last, link]
+        parameters = [*first, *last] if link is None else [*first, *last, link]
         for chunk_id, blob in self._connection.execute(sql + " ORDER BY raw_chunks.id", parameters):
             try:
                 captures = decode_captures(blob)
             except StoreError as error:
                 raise StoreError(f"{self.path}: raw chunk {chunk_id}: {error}") from error
-            yield from (c for c in captures if first <= c.stamp.utc_ns <= last)
+            yield from (c for c in captures if first <= place(c.stamp) <= last)
 
     def stamp(self, row: Mapping[str, object], prefix: str = "") -> Stamp:
         """The instant in a row's `<prefix>utc_ns`, `<prefix>monotonic_ns`, `<prefix>boot_id`."""
