@@ -1,0 +1,197 @@
+"""An exported session replays to the observations that were made live, whatever was lost or came late."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from calibration.rig import shipped_rig
+from daemon.acquisition import Acquisition
+from daemon.cli.main import main
+from daemon.composition import decoders, joiner
+from daemon.config import read_config
+from daemon.rigs import load_rig
+from daemon.service import declare_channels
+from daemon.sessions import SessionKeeper
+from daemon.setups import SetupBook
+from daemon.store.reader import Reader
+from daemon.store.store import Store
+from drivers.clock import NS_PER_S, ManualClock, Stamp
+from drivers.readings import CanCapture, Capture, SerialCapture
+from simulators.generate import Step, generate
+from simulators.rig_simulator import RigSimulator, SimulatorSettings
+from simulators.scripted_host import ScriptedHost
+from simulators.total_station import StationSettings
+from simulators.truth import RigTruth
+from tests.daemon.acquisition_support import ListLink, wait_until
+
+CONFIG = """rig = "swdt82"
+state_directory = "."
+
+[[can]]
+channel = "can0"
+
+[[station]]
+profile = "passive"
+serial.path = "/dev/rigcal-station"
+link_delay_s = 0.02
+"""
+SECONDS = 28.0  # no longer than samples are kept for fixes that come late
+MOVES_S = (7.0, 14.0, 21.0)
+STOPS_S = ((7.5, 10.0), (14.5, 15.5), (25.0, 25.4))  # the first two while the boom drives
+QUEUE = 60  # frames that wait at a port while nobody reads
+HOUR_NS = 3600 * NS_PER_S
+
+
+@pytest.fixture(scope="module")
+def recorded() -> tuple[Capture, ...]:
+    """What crossed both links of a rig that drives to four poses and stands at each."""
+    settings = SimulatorSettings(
+        bus_master="machine",
+        sync_period_s=0.05,
+        signal_period_s=0.1,
+        station=StationSettings(profile="topcon_gts8", push_interval_s=0.25),
+    )
+    simulator = RigSimulator(RigTruth(shipped_rig("swdt82"), 7), 7, settings)
+    poses: tuple[dict[str, float], ...] = (
+        {"theta1": 40.0, "theta3": 60.0, "L2": 600.0},
+        {"theta1": 10.0, "theta3": 110.0, "L2": 1500.0},
+        {"theta4": 5.0, "theta5": 20.0, "L3": 900.0},
+    )
+    moves = [Step(at_s, pose=pose, speed=0.9) for at_s, pose in zip(MOVES_S, poses, strict=True)]
+    return generate(simulator, ScriptedHost(), SECONDS, ManualClock(), plan=[Step(0.0, aim="r"), *moves]).captures
+
+
+def seconds(capture: Capture, of: Sequence[Capture]) -> float:
+    return capture.stamp.since(of[0].stamp) / NS_PER_S
+
+
+def as_recorded(captures: Sequence[Capture]) -> list[Capture]:
+    return list(captures)
+
+
+def nobody_read(captures: Sequence[Capture]) -> list[Capture]:
+    """The program was stopped: what the ports held came at once, and the rest is lost."""
+    read: list[Capture] = []
+    for capture in captures:
+        stop = next((s for s in STOPS_S if s[0] <= seconds(capture, captures) < s[1]), None)
+        if stop is None:
+            read.append(capture)
+        elif isinstance(capture, CanCapture):
+            late = captures[0].stamp.shifted(round(stop[1] * NS_PER_S))
+            if sum(c.stamp == late for c in read) < QUEUE:
+                read.append(replace(capture, stamp=late))
+    return sorted(read, key=lambda capture: capture.stamp.monotonic_ns)
+
+
+def frames_were_lost(captures: Sequence[Capture]) -> list[Capture]:
+    return [c for c in captures if not any(s[0] <= seconds(c, captures) < s[1] for s in STOPS_S)]
+
+
+def clock_was_set(back_ns: int) -> Callable[[Sequence[Capture]], list[Capture]]:
+    """The computer's clock was set in the middle of the session."""
+
+    def happens(captures: Sequence[Capture]) -> list[Capture]:
+        return [
+            replace(c, stamp=Stamp(c.stamp.utc_ns - back_ns, c.stamp.monotonic_ns, c.stamp.boot_id))
+            if seconds(c, captures) > SECONDS / 2
+            else c
+            for c in captures
+        ]
+
+    return happens
+
+
+def live(directory: Path, captures: Sequence[Capture], *, station_first: bool) -> list[dict[str, Any]]:
+    """A session's observations as the daemon makes them, the links read one after the other."""
+    config = read_config(directory / "rigcal.toml")
+    source, clock = load_rig(config.rig), ManualClock(captures[0].stamp)
+    with closing(Store(config.store_path)) as store:
+        store.begin_run(clock.now())
+        declare_channels(store, source.rig)
+        setups = SetupBook(source.rig, store, clock, config.sessions.control_tolerance_mm)
+        setups.new_command({"id": "S1"})
+        keeper = SessionKeeper(
+            source.rig, source.text, store, setups, joiner(config, source.rig), config.sessions, clock, run_id=1
+        )
+        keeper.start_command({"prism": "r", "id": "s1"})
+        can = [c for c in captures if isinstance(c, CanCapture)]
+        serial = [c for c in captures if isinstance(c, SerialCapture)]
+        first = ListLink("station", serial) if station_first else ListLink("boom", can)
+        last = ListLink("boom", can, first.done) if station_first else ListLink("station", serial, first.done)
+        acquisition = Acquisition(
+            [first, last], decoders(config, source), store, clock, batch_seconds=0.01, on_records=keeper.on_records
+        )
+        acquisition.start()
+        wait_until(last.done.is_set)
+        acquisition.stop()
+        clock.set(captures[-1].stamp)
+        keeper.stop_command({})
+        store.end_run(clock.now())
+    return observations(config.store_path)
+
+
+def replayed(directory: Path) -> list[dict[str, Any]]:
+    """The observations that the exported session gives."""
+    config, store = directory / "rigcal.toml", directory / "again.sqlite"
+    exported = run("session", "export", "s1", "--config", config, "--out", directory / "out")
+    logs = [name for name in exported["files"] if not name.endswith(".csv")]
+    run("replay", *logs, "--config", config, "--store", store, "--prism", "r")
+    return observations(store)
+
+
+def run(*arguments: object) -> dict[str, Any]:
+    result = CliRunner().invoke(main, [*map(str, arguments), "--json"], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return dict(json.loads(result.stdout))
+
+
+def observations(store: Path) -> list[dict[str, Any]]:
+    with Reader(store) as reader:
+        rows = list(reader.rows("SELECT x_mm, y_mm, z_mm, dwell_s, pose, excluded, values_json FROM observations"))
+    return [
+        {**row, "pose": row["pose"] and row["pose"].split(".")[1], "values_json": json.loads(row["values_json"])}
+        for row in rows
+    ]
+
+
+def alike(live: dict[str, Any], again: dict[str, Any]) -> bool:
+    """Whether two observations are the same, but for what a log rounds: instants to the microsecond."""
+    numbers = {**live["values_json"], "dwell_s": live["dwell_s"]}
+    others = {**again["values_json"], "dwell_s": again["dwell_s"]}
+    exact = ("x_mm", "y_mm", "z_mm", "pose", "excluded")
+    return all(live[key] == again[key] for key in exact) and others == pytest.approx(numbers, rel=1e-4, abs=1e-3)
+
+
+@pytest.mark.parametrize("station_first", [True, False])
+@pytest.mark.parametrize(
+    "happens",
+    [
+        as_recorded,
+        nobody_read,
+        frames_were_lost,
+        pytest.param(clock_was_set(HOUR_NS), id="clock_was_set_back"),
+        pytest.param(clock_was_set(-HOUR_NS), id="clock_was_set_forward"),
+    ],
+)
+def test_a_replay_gives_the_observations_that_were_made_live(
+    tmp_path: Path,
+    recorded: Sequence[Capture],
+    happens: Callable[[Sequence[Capture]], list[Capture]],
+    station_first: bool,
+) -> None:
+    (tmp_path / "rigcal.toml").write_text(CONFIG, encoding="utf-8")
+    made = live(tmp_path, happens(recorded), station_first=station_first)
+    again = replayed(tmp_path)
+    assert len(made) == len(again)
+    assert [(a, b) for a, b in zip(made, again, strict=True) if not alike(a, b)] == []
+    kept = [row for row in made if row["excluded"] is None]
+    assert len({row["pose"] for row in kept}) == 1 + len(MOVES_S)
+    assert len(kept) > 20
