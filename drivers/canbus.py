@@ -314,7 +314,7 @@ class _Session:
         return self._stamps.latest
 
     def take(self, received: list[Received]) -> None:
-        """Stamp and emit what one read gave, but for what was not read in time and has no stamp of the kernel."""
+        """Stamp and emit what one read gave, but for what was not read in time and has no stamp but that of reading."""
         now = self._clock.now()
         is_late = self._attendance.is_late(now, POLL_S)
         name, emit, stamp_of = self._name, self._emit, self._stamps.stamp
@@ -322,7 +322,7 @@ class _Session:
         for frame, kernel_utc_ns in received:
             stamp = stamp_of(kernel_utc_ns, now)
             stamps.append(stamp)
-            if is_late and kernel_utc_ns is None:
+            if is_late and stamp == now:
                 self._late += 1
                 continue
             arbitration_id, data, is_extended, is_remote, is_error = frame
