@@ -1,4 +1,4 @@
-"""A stored session as files again: captured logs that `rigcal replay` reads, and the observations CSV."""
+"""A stored session as files again: captured logs and what `rigcal replay` must know of them; the observations CSV."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from daemon.config import Config, ConfigError
 from daemon.control import CommandError
 from daemon.files import write_file
 from daemon.session_data import sessions_csv
+from daemon.session_file import SessionFile
 from daemon.steady_time import SteadyTime
 from daemon.store.reader import Reader
 from drivers.canlog import write_can_log
@@ -19,11 +20,12 @@ from drivers.readings import CanCapture, SerialCapture
 from drivers.seriallog import SerialLogHeader, SerialLogWriter
 
 CanFormat = Literal["log", "asc", "blf"]
-MARGIN_NS = 2 * NS_PER_S  # joints are interpolated, and dwell and direction come from before the first fix
+BEFORE_NS = 60 * NS_PER_S  # dwell and direction of the first fixes come from motion before the session
+AFTER_NS = 2 * NS_PER_S  # the last fixes are interpolated between joints
 
 
 def export_session(config: Config, session_id: str, out: Path, can_format: CanFormat) -> list[Path]:
-    """Write a session's captures, a file a link, and its observations.
+    """Write a session's captures, a file a link, what the operator said of it, and its observations.
 
     Logs know UTC alone, so the captures' is made steady: what was recorded while the computer's clock was set must not
     come again at another time than what came before and after it.
@@ -35,7 +37,7 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
         can_format: of the CAN logs: candump `log`, Vector `asc` or `blf`.
 
     Returns:
-        The files, `<session>-<link>.<format>`, `<session>-<station>.serial` and `<session>.csv`.
+        The files, `<session>-<link>.<format>`, `<session>-<station>.serial`, `<session>.json` and `<session>.csv`.
 
     Raises:
         CommandError: no such session, or it is still open.
@@ -48,7 +50,8 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
         session = found[0]
         if session["ended_utc_ns"] is None:
             raise CommandError(f"session {session_id!r} is still open; stop it first")
-        since, until = _margin(reader, session, "started_", -MARGIN_NS), _margin(reader, session, "ended_", MARGIN_NS)
+        started, ended = _stamp(reader, session, "started_"), _stamp(reader, session, "ended_")
+        since, until = started.shifted(-BEFORE_NS), ended.shifted(AFTER_NS)
         out.mkdir(parents=True, exist_ok=True)
         files = []
         steady = SteadyTime()
@@ -67,15 +70,26 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
                         if isinstance(capture, SerialCapture):
                             writer.write(capture)
             files.append(path)
+        points = reader.rows("SELECT * FROM control_points WHERE setup_id = ?", (session["setup_id"],))
+        told = SessionFile(
+            prism=session["prism"],
+            kind=session["kind"],
+            since_utc_ns=steady.of(started).utc_ns,
+            until_utc_ns=steady.of(ended).utc_ns,
+            control_points={point["name"]: (point["x_mm"], point["y_mm"], point["z_mm"]) for point in points},
+        )
+        path = out / f"{session_id}.json"
+        write_file(path, told.model_dump_json(indent=2).encode() + b"\n")
+        files.append(path)
         table = out / f"{session_id}.csv"
         write_file(table, sessions_csv(reader, parse_rig(session["rig_text"], "the session's rig"), [session_id]))
         return [*files, table]
 
 
-def _margin(reader: Reader, session: dict[str, Any], prefix: str, shift_ns: int) -> Stamp:
+def _stamp(reader: Reader, session: dict[str, Any], prefix: str) -> Stamp:
     stamp = reader.stamp(session, prefix)
     assert stamp is not None  # the session has ended
-    return stamp.shifted(shift_ns)
+    return stamp
 
 
 def _header(config: Config, link: str) -> SerialLogHeader:

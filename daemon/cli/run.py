@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import logging
 import tempfile
 import threading
-from collections.abc import Iterable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +20,16 @@ from daemon.composition import decoders, joiner, live, replayed, simulated
 from daemon.config import Config, parse_config, read_config
 from daemon.files import write_file
 from daemon.notify import Notifier
-from daemon.replay import first_captures, merged, stored_readings
+from daemon.replay import BOOT_ID, LATEST_UTC_NS, first_captures, merged, stored_readings
 from daemon.rigs import load_rig
 from daemon.scheduler import SESSION_KINDS
 from daemon.service import Daemon, declare_channels, stop_on_signals
+from daemon.session_file import SessionFile, read_session_file
 from daemon.sessions import SessionKeeper
 from daemon.setups import SetupBook
 from daemon.store.reader import Reader
 from daemon.store.store import Store
-from drivers.clock import ManualClock
+from drivers.clock import ManualClock, Stamp
 from drivers.readings import Capture
 
 SIMULATED_CONFIG = """
@@ -151,6 +153,12 @@ def _apart(settings: Config) -> Config:
     "--kind", type=click.Choice(SESSION_KINDS), default="static_poses", show_default=True, help="Kind of that session."
 )
 @click.option(
+    "--session",
+    "session_file",
+    type=click.Path(path_type=Path),
+    help="In place of both: the session as `rigcal session export` told of it (.json), observed as it was live.",
+)
+@click.option(
     "--readings", type=click.Path(path_type=Path), help="Also write everything that was decoded as JSON lines."
 )
 @json_option
@@ -160,6 +168,7 @@ def replay(
     path: Path,
     prism: str | None,
     kind: str,
+    session_file: Path | None,
     readings: Path | None,
     *,
     as_json: bool,
@@ -172,11 +181,17 @@ def replay(
     source = load_rig(settings.rig)
     if path.exists():
         raise click.UsageError(f"{path} exists; a replay writes a store of its own, name a new file with --store")
+    if prism is not None and session_file is not None:
+        raise click.UsageError("give --prism or --session, not both")
     clock = ManualClock()
-    first_captures(files, settings)  # a bad log is refused before a store is made
-    captures = merged(files, settings)
-    first = next(captures)
-    clock.set(first.stamp)
+    starts = first_captures(files, settings)  # a bad log is refused before a store is made
+    clock.set(min((capture.stamp for capture in starts.values()), key=lambda stamp: stamp.monotonic_ns))
+    begin_ns = clock.monotonic_ns()
+    told = None
+    if session_file is not None:
+        told = read_session_file(session_file)
+    elif prism is not None:
+        told = SessionFile(prism=prism, kind=kind, since_utc_ns=begin_ns, until_utc_ns=LATEST_UTC_NS, control_points={})
     made = decoders(settings, source)
     with contextlib.closing(Store(path)) as store:
         declare_channels(store, source.rig)
@@ -192,12 +207,18 @@ def replay(
             run_id=0,
             aim=None,
         )
-        if prism is not None:
-            setups.new_command({"id": REPLAYED, "instrument": "replayed"})
-            keeper.start_command({"id": REPLAYED, "prism": prism, "kind": kind, "operator": "replay"})
+        operator: deque[tuple[int, Callable[[], object]]] = deque()
+        if told is not None:
+            points = {name: list(place) for name, place in told.control_points.items()}
+            setups.new_command({"id": REPLAYED, "instrument": "replayed", "control_points": points})
+            start = {"id": REPLAYED, "prism": told.prism, "kind": told.kind, "operator": "replay"}
+            operator.append((told.since_utc_ns, partial(keeper.start_command, start)))
+            operator.append((told.until_utc_ns, partial(keeper.stop_command, {})))
         acquisition = Acquisition((), made, store, clock, on_records=keeper.on_records)
-        acquisition.run_inline(_followed(itertools.chain([first], captures), clock))
-        session = keeper.stop_command({}) if prism is not None else None
+        acquisition.run_inline(_followed(merged(files, settings), clock, operator))
+        for _, command in operator:  # what comes after the last capture
+            command()
+        session = keeper.list_command({})[0] if told is not None else None
     with Reader(path) as reader:
         if readings is not None:
             write_file(readings, "".join(f"{line}\n" for line in stored_readings(reader)).encode())
@@ -208,9 +229,15 @@ def replay(
     return counts | ({} if session is None else {"session": session})
 
 
-def _followed(captures: Iterable[Capture], clock: ManualClock) -> Iterator[Capture]:
-    """The captures; the clock shows each one's instant when it comes."""
+def _followed(
+    captures: Iterable[Capture], clock: ManualClock, operator: deque[tuple[int, Callable[[], object]]]
+) -> Iterator[Capture]:
+    """The captures; the clock shows each one's instant when it comes, and the operator speaks when it is time."""
     for capture in captures:
+        while operator and operator[0][0] <= capture.stamp.monotonic_ns:
+            at_ns, command = operator.popleft()
+            clock.set(Stamp(at_ns, at_ns, BOOT_ID))
+            command()
         clock.set(capture.stamp)
         yield capture
 

@@ -19,12 +19,15 @@ from daemon.composition import decoders, joiner
 from daemon.config import read_config
 from daemon.rigs import load_rig
 from daemon.service import declare_channels
+from daemon.session_file import read_session_file
 from daemon.sessions import SessionKeeper
 from daemon.setups import SetupBook
 from daemon.store.reader import Reader
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, ManualClock, Stamp
-from drivers.readings import CanCapture, Capture, SerialCapture
+from drivers.errors import DescriptionError
+from drivers.readings import CanCapture, Capture, Fix, SerialCapture
+from drivers.station import StationConfig, StationDecoder, position_mm
 from simulators.generate import Step, generate
 from simulators.rig_simulator import RigSimulator, SimulatorSettings
 from simulators.scripted_host import ScriptedHost
@@ -46,6 +49,7 @@ link_delay_s = 0.02
 SECONDS = 28.0  # no longer than samples are kept for fixes that come late
 MOVES_S = (7.0, 14.0, 21.0)
 STOPS_S = ((7.5, 10.0), (14.5, 15.5), (25.0, 25.4))  # the first two while the boom drives
+SESSION_S = (3.0, 26.0)
 QUEUE = 60  # frames that wait at a port while nobody reads
 HOUR_NS = 3600 * NS_PER_S
 
@@ -109,18 +113,20 @@ def clock_was_set(back_ns: int) -> Callable[[Sequence[Capture]], list[Capture]]:
     return happens
 
 
-def live(directory: Path, captures: Sequence[Capture], *, station_first: bool) -> list[dict[str, Any]]:
+def live(directory: Path, captures: Sequence[Capture], *, station_first: bool, **setup: object) -> list[dict[str, Any]]:
     """A session's observations as the daemon makes them, the links read one after the other."""
+    (directory / "rigcal.toml").write_text(CONFIG, encoding="utf-8")
     config = read_config(directory / "rigcal.toml")
     source, clock = load_rig(config.rig), ManualClock(captures[0].stamp)
     with closing(Store(config.store_path)) as store:
         store.begin_run(clock.now())
         declare_channels(store, source.rig)
         setups = SetupBook(source.rig, store, clock, config.sessions.control_tolerance_mm)
-        setups.new_command({"id": "S1"})
+        setups.new_command({"id": "S1", **setup})
         keeper = SessionKeeper(
             source.rig, source.text, store, setups, joiner(config, source.rig), config.sessions, clock, run_id=1
         )
+        clock.set(captures[0].stamp.shifted(round(SESSION_S[0] * NS_PER_S)))
         keeper.start_command({"prism": "r", "id": "s1"})
         can = [c for c in captures if isinstance(c, CanCapture)]
         serial = [c for c in captures if isinstance(c, SerialCapture)]
@@ -130,10 +136,11 @@ def live(directory: Path, captures: Sequence[Capture], *, station_first: bool) -
             [first, last], decoders(config, source), store, clock, batch_seconds=0.01, on_records=keeper.on_records
         )
         acquisition.start()
+        wait_until(first.done.is_set)
+        clock.set(captures[0].stamp.shifted(round(SESSION_S[1] * NS_PER_S)))
+        keeper.stop_command({})
         wait_until(last.done.is_set)
         acquisition.stop()
-        clock.set(captures[-1].stamp)
-        keeper.stop_command({})
         store.end_run(clock.now())
     return observations(config.store_path)
 
@@ -141,9 +148,9 @@ def live(directory: Path, captures: Sequence[Capture], *, station_first: bool) -
 def replayed(directory: Path) -> list[dict[str, Any]]:
     """The observations that the exported session gives."""
     config, store = directory / "rigcal.toml", directory / "again.sqlite"
-    exported = run("session", "export", "s1", "--config", config, "--out", directory / "out")
-    logs = [name for name in exported["files"] if not name.endswith(".csv")]
-    run("replay", *logs, "--config", config, "--store", store, "--prism", "r")
+    exported = run("session", "export", "s1", "--config", config, "--out", directory / "out")["files"]
+    logs = [name for name in exported if name.endswith((".log", ".serial"))]
+    run("replay", *logs, "--session", directory / "out" / "s1.json", "--config", config, "--store", store)
     return observations(store)
 
 
@@ -187,7 +194,6 @@ def test_a_replay_gives_the_observations_that_were_made_live(
     happens: Callable[[Sequence[Capture]], list[Capture]],
     station_first: bool,
 ) -> None:
-    (tmp_path / "rigcal.toml").write_text(CONFIG, encoding="utf-8")
     made = live(tmp_path, happens(recorded), station_first=station_first)
     again = replayed(tmp_path)
     assert len(made) == len(again)
@@ -195,3 +201,29 @@ def test_a_replay_gives_the_observations_that_were_made_live(
     kept = [row for row in made if row["excluded"] is None]
     assert len({row["pose"] for row in kept}) == 1 + len(MOVES_S)
     assert len(kept) > 20
+
+
+def test_a_replay_knows_the_control_points(tmp_path: Path, recorded: Sequence[Capture]) -> None:
+    decoder = StationDecoder(StationConfig.model_validate({"profile": "passive", "serial": {"path": "/dev/station"}}))
+    fixes = [record for capture in recorded for record in decoder.feed(capture) if isinstance(record, Fix)]
+    place = next(place for fix in fixes if (place := position_mm(fix)) is not None)
+    made = live(tmp_path, recorded, station_first=True, control_points={"cp1": list(place)})
+    again = replayed(tmp_path)
+    assert [row["excluded"] for row in made] == [row["excluded"] for row in again]
+    assert sum(row["excluded"] == "a control point, not the prism" for row in made) > 10
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (None, "cannot be read"),
+        ("[]", "is no exported session"),
+        ('{"prism": "r", "kind": "check", "since_utc_ns": 0, "until_utc_ns": 1}', "control_points: Field required"),
+    ],
+)
+def test_a_session_file_that_is_none_is_refused_in_a_sentence(tmp_path: Path, text: str | None, reason: str) -> None:
+    told = tmp_path / "told.json"
+    if text is not None:
+        told.write_text(text, encoding="utf-8")
+    with pytest.raises(DescriptionError, match=reason):
+        read_session_file(told)
