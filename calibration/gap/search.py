@@ -132,6 +132,8 @@ class _Search:
             places = {c.where for c in taken}
             again = [c for c in joint.choices if not taken or c.where in places]
             rested = settled(self.problem, joint, again) if steps < _STEPS else joint
+            if rested is joint and decision.joint is None and steps < _STEPS:
+                rested = self._explaining_outliers(joint)
             if rested is not joint:
                 joint, projection = rested, self.problem.open(rested)
                 there = self._possible(joint, projection)
@@ -166,6 +168,17 @@ class _Search:
                 turns.insert(-1, turn)
                 certain |= {str(c): turn.posterior[c.family] for c in turn.taken}
         return self._concluded(joint, alone, turns, rivals, decision.formulas, certain, first)
+
+    def _explaining_outliers(self, joint: JointFit) -> JointFit:
+        """The fit with its effects in forms that also explain its outliers, where these are the likelier.
+
+        The few fixes beyond the loads of all others are outliers to a straight line, and the only ones that show a curve.
+        """
+        if (joint.fit.weight >= OUTLIER).all():
+            return joint
+        every = replace(joint, fit=replace(joint.fit, weight=np.ones_like(joint.fit.weight)))
+        tried = settled(self.problem, every, joint.choices)
+        return tried if tried is not every and tried.fit.cost < joint.fit.cost else joint
 
     def _concluded(
         self,
@@ -227,6 +240,8 @@ class _Search:
             return joint, None, ()
         others = [c for c in joint.choices if str(c) != name]
         without = self.problem.fit(others, joint.start(others))
+        # What all together explain is no outlier to a part of it.
+        without = replace(without, fit=replace(without.fit, weight=joint.fit.weight))
         projection = self.problem.open(without)
         decision = decide(self.problem, without, projection, self._possible(without, projection))
         if decision.kind != "take" or decision.joint is None:

@@ -116,6 +116,16 @@ def test_springs_of_all_joints_together_are_no_formula_of_the_base() -> None:
     assert {(e.family, e.where) for e in adopted.effects} == {("joint_compliance", f"theta{n}") for n in range(2, 7)}
 
 
+@pytest.mark.parametrize("seed", [3007, 3018])
+def test_the_few_poses_under_loads_that_no_other_has_show_the_curve_and_are_no_outliers(seed: int) -> None:
+    """Joint 2 is pulled one way in all poses but two or three."""
+    rig, training, held_out = robot(seed, stiffening(seed))
+    adopted = search(solved(rig, training), training, library()).adopted
+    assert (adopted.solution.fit.weight > 0.5).all()
+    model = with_effects(identify(rig, rig_text("ys100"), training, effects="none"), adopted)
+    assert np.linalg.norm(held_out.position_mm - model.effects_mm(held_out), axis=1).max() < 0.3
+
+
 def test_what_a_prediction_with_effects_says_of_its_own_error_holds(stiff: Fitted) -> None:
     prediction = stiff.model.predict(stiff.held_out)
     np.testing.assert_array_equal(prediction.position_mm, stiff.model.effects_mm(stiff.held_out))
