@@ -7,8 +7,10 @@ import hashlib
 import io
 import math
 import re
+import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,12 +28,13 @@ LABEL_COLUMNS = ("setup", "session", "pose")
 DIRECTIONS = (-1.0, 0.0, 1.0)
 _MOST_DEG = 36_000.0  # a hundred turns
 _MOST_MM = 1e7  # 10 km
+_LONGEST = 200  # characters of a label; every row takes as much memory as the longest
 # What an optional column can be, by how its name ends (the first that fits); what is beyond is in another unit, or
 # noise that would drown every number it meets.
 _POSSIBLE = {
     "dwell_s": (0.0, 1e9),
     "payload_kg": (0.0, 1e5),
-    "_degC": (-100.0, 500.0),
+    "_degC": (-100.0, 200.0),  # what is warmer is in kelvin
     "_rate": (-1e5, 1e5),
     "_Nm": (-1e9, 1e9),
     "": (-1e12, 1e12),
@@ -124,6 +127,9 @@ def parse_observations(data: bytes, rig: Rig, source: str, *, positions_required
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         raise DataError(source, f"byte {error.start} is not UTF-8; save the file as UTF-8", line) from error
+    if "\0" in text:
+        line = text.count("\n", 0, text.index("\0")) + 1
+        raise DataError(source, "a zero byte, as other encodings have; save the file as UTF-8", line)
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     lines: list[int] = []
     rows: list[list[str]] = []
@@ -222,7 +228,19 @@ class _Table:
         return out
 
     def labels(self, column: str) -> Strings:
-        return np.array(self.columns.get(column, [""] * len(self.lines)), dtype=np.str_)
+        cells = self.columns.get(column, [""] * len(self.lines))
+        alike: dict[str, str] = {}
+        for cell in dict.fromkeys(cells):
+            if len(cell) > _LONGEST:
+                self.refuse(column, cell, f"a label of {len(cell)} characters; at most {_LONGEST}")
+            other = alike.setdefault(_plain(cell), cell)
+            if other != cell:
+                self.refuse(column, cell, f"{cell!a} and {other!a} look the same; write them alike")
+        return np.array(cells, dtype=np.str_)
+
+    def refuse(self, column: str, cell: str, reason: str) -> NoReturn:
+        """DataError for the first row with this cell."""
+        raise DataError(self.source, reason, self.lines[self.columns[column].index(cell)], column)
 
     def check(self, column: str, values: Floats, bad: NDArray[np.bool_], reason: str) -> None:
         if bad.any():
@@ -234,6 +252,8 @@ def _check_header(header: list[str], rig: Rig, source: str, positions_required: 
     if not header or header == [""]:
         raise DataError(source, "the file is empty; a header is needed", 1)
     doubled = sorted({name for name in header if header.count(name) > 1})
+    if doubled[:1] == [""]:
+        raise DataError(source, f"{header.count('')} columns have no name; name them, or leave them out", 1)
     if doubled:
         raise DataError(source, "column appears twice", 1, doubled[0])
     needed = ["prism", *(j.column for j in rig.joints), *(POSITION_COLUMNS if positions_required else ())]
@@ -241,7 +261,20 @@ def _check_header(header: list[str], rig: Rig, source: str, positions_required: 
     if len(header) == 1 and len(missing) == len(needed):
         raise DataError(source, "one column only: separate columns by commas, and write decimals with a point", 1)
     if missing:
-        raise DataError(source, f"column missing for rig {rig.name!r}; needed: {', '.join(needed)}", 1, missing[0])
+        alike = [name for name in header if _plain(name).casefold() == missing[0].casefold()]
+        hint = f" (there is {alike[0]!a})" if alike else ""
+        raise DataError(
+            source, f"column missing{hint} for rig {rig.name!r}; needed: {', '.join(needed)}", 1, missing[0]
+        )
+    sigmas = [name for name in SIGMA_COLUMNS if name in header]
+    if 0 < len(sigmas) < len(SIGMA_COLUMNS):
+        raise DataError(source, f"needs the other two of {', '.join(SIGMA_COLUMNS)} beside it", 1, sigmas[0])
+
+
+def _plain(text: str) -> str:
+    """Text as a reader sees it: accents one way, nothing invisible, every space alike."""
+    seen = "".join(c for c in unicodedata.normalize("NFC", text) if unicodedata.category(c) != "Cf")
+    return " ".join(seen.split())
 
 
 def _build(table: _Table, header: list[str], rig: Rig, positions_required: bool) -> Observations:
@@ -261,7 +294,12 @@ def _build(table: _Table, header: list[str], rig: Rig, positions_required: bool)
         return out
 
     sigma_mm = triple(SIGMA_COLUMNS, required=False)
+    given = np.isfinite(sigma_mm)
     for i, name in enumerate(SIGMA_COLUMNS):
+        partly = ~given[:, i] & given.any(axis=1)
+        if partly.any():
+            reason = "empty beside the row's other sigmas; a fix has all three or none"
+            raise DataError(table.source, reason, table.lines[int(np.argmax(partly))], name)
         table.check(name, sigma_mm[:, i], sigma_mm[:, i] <= 0, "is not a standard deviation; it must be positive")
     joints = {j.name: table.numbers(j.column, required=True) for j in rig.joints}
     for joint in rig.joints:

@@ -18,7 +18,7 @@ from calibration.gap.projection import Projection
 from calibration.gap.reading_steps import in_true_steps
 from calibration.gap.rivals import explains
 from calibration.gap.screen import Place, Possible, Weighed, possible
-from calibration.gap.settle import settled
+from calibration.gap.settle import explaining_outliers, settled
 from calibration.gap.turn import decide
 from calibration.identification.refinement import Prior
 from calibration.identification.solve import Solution
@@ -128,12 +128,7 @@ class _Search:
             steps += 1
             is_set = decision.kind == "set" and len(pending) < _PENDING
             taken = () if decision.joint is None else decision.joint.choices[len(joint.choices) :]
-            # What is there already may have a better form by now, all the more at the same place; then look again.
-            places = {c.where for c in taken}
-            again = [c for c in joint.choices if not taken or c.where in places]
-            rested = settled(self.problem, joint, again) if steps < _STEPS else joint
-            if rested is joint and decision.joint is None and steps < _STEPS:
-                rested = self._explaining_outliers(joint)
+            rested = self._rested(joint, taken) if steps < _STEPS else joint
             if rested is not joint:
                 joint, projection = rested, self.problem.open(rested)
                 there = self._possible(joint, projection)
@@ -169,16 +164,15 @@ class _Search:
                 certain |= {str(c): turn.posterior[c.family] for c in turn.taken}
         return self._concluded(joint, alone, turns, rivals, decision.formulas, certain, first)
 
-    def _explaining_outliers(self, joint: JointFit) -> JointFit:
-        """The fit with its effects in forms that also explain its outliers, where these are the likelier.
+    def _rested(self, joint: JointFit, taken: Sequence[Choice]) -> JointFit:
+        """The fit with its effects at rest, before what is to be `taken` beside them comes in.
 
-        The few fixes beyond the loads of all others are outliers to a straight line, and the only ones that show a curve.
+        What is there may have a better form by now, all the more at the same place; and where nothing more is taken,
+        one that explains outliers as well.
         """
-        if (joint.fit.weight >= OUTLIER).all():
-            return joint
-        every = replace(joint, fit=replace(joint.fit, weight=np.ones_like(joint.fit.weight)))
-        tried = settled(self.problem, every, joint.choices)
-        return tried if tried is not every and tried.fit.cost < joint.fit.cost else joint
+        places = {c.where for c in taken}
+        rested = settled(self.problem, joint, [c for c in joint.choices if not taken or c.where in places])
+        return rested if taken or rested is not joint else explaining_outliers(self.problem, joint)
 
     def _concluded(
         self,

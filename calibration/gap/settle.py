@@ -6,9 +6,11 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from calibration.effects.fitted import Choice
 from calibration.gap.adopt import JointFit
-from calibration.gap.problem import Problem
+from calibration.gap.problem import OUTLIER, Problem
 from calibration.gap.projection import Projection
 from calibration.gap.rivals import together
 from calibration.gap.screen import Place, Screen, place_of, variants_at
@@ -33,6 +35,22 @@ def settled(problem: Problem, joint: JointFit, again: Sequence[Choice]) -> Joint
         if joint is before:
             break
     return joint
+
+
+def explaining_outliers(problem: Problem, joint: JointFit) -> JointFit:
+    """The fit with its effects in forms that explain its outliers too; comes back itself where these are less likely.
+
+    The few fixes beyond the loads of all others are outliers to a straight line, and the only ones that show a curve.
+
+    Args:
+        problem: the data.
+        joint: kinematics and effects.
+    """
+    if (joint.fit.weight >= OUTLIER).all():
+        return joint
+    every = replace(joint, fit=replace(joint.fit, weight=np.ones_like(joint.fit.weight)))
+    tried = settled(problem, every, joint.choices)
+    return tried if tried is not every and tried.fit.cost < joint.fit.cost else joint
 
 
 def _better(problem: Problem, joint: JointFit, again: Sequence[Choice]) -> JointFit:

@@ -65,6 +65,22 @@ def test_optional_columns_are_kept_and_strange_ones_are_listed() -> None:
             f"{HEADER},sigma_x_mm,sigma_y_mm,sigma_z_mm\n{ROW},0,1,1\n",
             "column sigma_x_mm: 0 is not a standard deviation",
         ),
+        (f"{HEADER},sigma_y_mm\n{ROW},1\n", "line 1, column sigma_y_mm: needs the other two of sigma_x_mm"),
+        (
+            f"{HEADER},sigma_x_mm,sigma_y_mm,sigma_z_mm\n{ROW},,,\n{ROW},1,,1\n",
+            "line 3, column sigma_y_mm: empty beside the row's other sigmas",
+        ),
+        (f"{HEADER},,\n{ROW},,\n", "line 1: 2 columns have no name"),
+        (f"\ufeff\ufeff{HEADER}\n{ROW}\n", r"column prism: column missing \(there is '\\ufeffprism'\)"),
+        (f"{HEADER.replace('q1_deg', 'Q1_DEG')}\n{ROW}\n", r"column q1_deg: column missing \(there is 'Q1_DEG'\)"),
+        (
+            f"{HEADER},setup\n{ROW},Tür\n{ROW},Tu\u0308r\n",
+            r"line 3, column setup: 'Tu\\u0308r' and 'T\\xfcr' look the same",
+        ),
+        (f"{HEADER},setup\n{ROW},S 1\n{ROW},S\xa01\n", r"line 3, column setup: 'S\\xa01' and 'S 1' look the same"),
+        (f"{HEADER},pose\n{ROW},{'p' * 201}\n", "line 2, column pose: a label of 201 characters; at most 200"),
+        (f"{HEADER}\n{ROW.replace('tmac', 'nose' * 99)}\n", "line 2, column prism: a label of 396 characters"),
+        (f"{HEADER}\n{ROW}\n".encode("utf-16-le"), "line 1: a zero byte, as other encodings have"),
         (HEADER.encode() + b"\n\xff\xfe", "line 2: byte .* is not UTF-8"),
         *[
             (
@@ -75,6 +91,7 @@ def test_optional_columns_are_kept_and_strange_ones_are_listed() -> None:
                 ("payload_kg", "-500"),
                 ("payload_kg", "110000"),
                 ("temperature_degC", "-300"),
+                ("temperature_degC", "223.15"),
                 ("temperature_degC", "1e300"),
                 ("q3_rate", "1e300"),
                 ("q4_Nm", "-1e300"),
