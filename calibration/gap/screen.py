@@ -29,6 +29,7 @@ LEAST_KNOWN = 0.5  # share of the rows that have what an effect needs
 _PAIRED = 10
 _SECOND = math.log(0.05)  # that another effect is there as well, beforehand
 _AT_ONCE = 128  # columns
+_KEPT = 16  # variants whose rows are at hand; all of them are gigabytes where there are thousands of fixes
 _SEEN = 1e-10  # least eigenvalue of products of columns, of their largest
 _TINY = float(np.finfo(np.float64).tiny)
 _AS_WELL = 5.0  # ln of a Bayes factor; less is no difference
@@ -223,22 +224,24 @@ class Screen:
                     blocks.append(place.additions[option])
         target = projection.rows.target
         taken = projection.softly.taken(target)
-        self._whitened: list[Floats] = []
+        self._blocks, self._kept = blocks, dict[int, Floats]()
         self._taken: list[Floats] = []
         self._along: list[Floats] = []
+        self._gram: dict[tuple[int, int], Floats] = {}
         for together in _several(blocks):
             whitened = projection.whitened(projection.moved_mm(joined(together, len(projection.samples))))
             of_kinematics = projection.softly.taken(whitened)
             along = whitened.T @ target - of_kinematics.T @ taken
             edges = np.cumsum([len(additions) for additions in together])[:-1]
-            self._whitened += np.split(whitened, edges, axis=1)
-            self._taken += np.split(of_kinematics, edges, axis=1)
             self._along += np.split(along, edges)
-        self._gram: dict[tuple[int, int], Floats] = {}
+            both = zip(np.split(whitened, edges, axis=1), np.split(of_kinematics, edges, axis=1), strict=True)
+            for number, (rows, own) in enumerate(both, len(self._taken)):
+                self._gram[number, number] = rows.T @ rows - own.T @ own
+                self._taken.append(own)
 
     def columns(self, place: int, option: int) -> Floats:
         """(3 m, k) of a variant."""
-        return self.projection.softly(self._whitened[self._block[place, option]])
+        return self.projection.softly(self._whitened(self._block[place, option]))
 
     def distinct(self, place: int) -> tuple[tuple[int, ...], ...]:
         """The variants of a place, those together that differ in their prior alone."""
@@ -354,9 +357,17 @@ class Screen:
 
     def _product(self, a: int, b: int) -> Floats:
         if (a, b) not in self._gram:
-            product = self._whitened[a].T @ self._whitened[b] - self._taken[a].T @ self._taken[b]
+            product = self._whitened(a).T @ self._whitened(b) - self._taken[a].T @ self._taken[b]
             self._gram[a, b], self._gram[b, a] = product, product.T
         return self._gram[a, b]
+
+    def _whitened(self, block: int) -> Floats:
+        """(3 m, k) of a block."""
+        if block not in self._kept:
+            if len(self._kept) == _KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[block] = self.projection.whitened(self.projection.moved_mm(self._blocks[block]))
+        return self._kept[block]
 
 
 def _explained(size: Floats, along: Floats) -> tuple[float, int]:
