@@ -162,6 +162,7 @@ class _Search:
                 joint = settled(self.problem, other, other.choices)
                 turns.insert(-1, turn)
                 certain |= {str(c): turn.posterior[c.family] for c in turn.taken}
+        joint = explaining_outliers(self.problem, joint)
         return self._concluded(joint, alone, turns, rivals, decision.formulas, certain, first)
 
     def _rested(self, joint: JointFit, taken: Sequence[Choice]) -> JointFit:
@@ -235,8 +236,7 @@ class _Search:
         others = [c for c in joint.choices if str(c) != name]
         without = self.problem.fit(others, joint.start(others))
         # What all together explain is no outlier to a part of it.
-        without = replace(without, fit=replace(without.fit, weight=joint.fit.weight))
-        projection = self.problem.open(without)
+        projection = self.problem.open(replace(without, fit=replace(without.fit, weight=joint.fit.weight)))
         decision = decide(self.problem, without, projection, self._possible(without, projection))
         if decision.kind != "take" or decision.joint is None:
             turn = Turn(without, projection, decision.weighed, decision.posterior, (), decision.reasons)

@@ -9,6 +9,11 @@ the joints as read, measured fixes with the whole sigma. The intervals in bracke
 Those of one session are not (redundant parameters err together), so the standard error over sessions stands beside:
 what the data do not see errs by what one machine was drawn, and a hundred machines tell the coverage of a kind of
 parameter to 2.5 % only.
+
+The base's angles of ys100 as built fall short, 93.0 +- 1.3 % over 300 sessions from 3000: its heading and the zero of
+joint 1 are one unknown, of 5 degrees. On the way along it the two tilts of the station's frame go on a curve, which the
+linear model's intervals leave. With the prior's scale known it is 92.6 %, one build tolerance off 93.9 %, and as turns
+about the base's own axes the same fits hold 95.3 %. Predictions do not suffer, and no output has an interval of a base.
 """
 
 from __future__ import annotations

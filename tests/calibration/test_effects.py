@@ -116,9 +116,9 @@ def test_springs_of_all_joints_together_are_no_formula_of_the_base() -> None:
     assert {(e.family, e.where) for e in adopted.effects} == {("joint_compliance", f"theta{n}") for n in range(2, 7)}
 
 
-@pytest.mark.parametrize("seed", [3007, 3018])
+@pytest.mark.parametrize("seed", [2012, 3007, 3018])
 def test_the_few_poses_under_loads_that_no_other_has_show_the_curve_and_are_no_outliers(seed: int) -> None:
-    """Joint 2 is pulled one way in all poses but two or three."""
+    """Joint 2 is pulled one way in all poses but one to three."""
     rig, training, held_out = robot(seed, stiffening(seed))
     adopted = search(solved(rig, training), training, library()).adopted
     assert (adopted.solution.fit.weight > 0.5).all()
