@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import re
+import tracemalloc
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
@@ -13,9 +14,11 @@ import pytest
 
 from calibration.effects.base import Situation
 from calibration.effects.fitted import Choice
+from calibration.effects.library import library
 from calibration.gap.detect import detect
 from calibration.gap.grammar import Grammar, describe
 from calibration.gap.projection import Projection
+from calibration.gap.screen import Screen, possible
 from calibration.gap.variables import Place, Variable
 from calibration.identification.approach import PRIOR_SCALE, approach
 from calibration.identification.identifiability import identifiability
@@ -243,3 +246,16 @@ def test_any_machine_has_words(name: str) -> None:
 def test_the_same_draws_find_the_same() -> None:
     words = grammar("creep@theta4:rad_per_Nm=8e-9")
     assert detect(words, np.random.default_rng(4)) == detect(words, np.random.default_rng(4))
+
+
+def test_a_screen_keeps_products_of_columns_and_not_the_columns() -> None:
+    over = projected(shipped_rig("swdt82"), measured(shipped_rig("swdt82"), "", 2))
+    places = possible(over.situation, over, library()).places
+    tracemalloc.start()
+    try:
+        screen = Screen(over, places)
+        kept = tracemalloc.get_traced_memory()[0]
+    finally:
+        tracemalloc.stop()
+    columns = sum(len(p.additions[option]) for p in screen.places for option in set(p.alike))
+    assert kept < 0.3 * columns * over.residual.nbytes
