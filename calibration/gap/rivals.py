@@ -14,7 +14,7 @@ from calibration.gap.grammar import Found as Formula
 from calibration.gap.projection import Projection
 from calibration.gap.screen import Place, Screen, Weighed
 
-_ODDS, _FURTHER_ODDS = math.log(99.0), math.log(999.0)  # that something is there, and something more beside that
+_ODDS, _FURTHER_ODDS = math.log(19.0), math.log(999.0)  # that something is there, and something more beside that
 _CHANCE, _FURTHER_CHANCE = 0.01, 0.003  # of anything at all, corrected for all that was looked at, and of more
 NEAR = 5.0  # in log evidence: families this near are not told apart
 _PLAIN = 100.0  # log evidence beyond any doubt
@@ -55,18 +55,23 @@ def together(screen: Screen, chosen: Mapping[int, tuple[int, float]]) -> float:
     return screen.log_bayes_factor(options, [scale for _, scale in chosen.values()])
 
 
-def stands_out(weighed: Sequence[Weighed], looks: int, *, beside: bool) -> bool:
-    """Whether anything is there: by the evidence of all together, and by the chance of the most striking.
+def may_stand_out(weighed: Sequence[Weighed]) -> bool:
+    """Whether any place is more likely than nothing, with the noise that nothing leaves."""
+    return max(w.log_bayes_factor + w.place.log_prior for w in weighed) > 0.0
+
+
+def stands_out(leading: Weighed, evidence: float, looks: int, *, beside: bool) -> bool:
+    """Whether anything is there: by its evidence, and by the chance of what it explains.
 
     Args:
-        weighed: all places.
-        looks: how many were looked at.
+        leading: the most probable place, with the noise that it leaves.
+        evidence: log evidence of it against nothing, each with the noise that it leaves.
+        looks: how many places were looked at.
         beside: whether something is adopted already: every further look is another chance, and what does not quite fit
             leaves traces that look like other effects.
     """
-    best = max(w.log_bayes_factor + w.place.log_prior for w in weighed)
     odds, chance = (_FURTHER_ODDS, _FURTHER_CHANCE) if beside else (_ODDS, _CHANCE)
-    return best > odds and min(w.p for w in weighed) * looks < chance
+    return evidence + leading.place.log_prior > odds and leading.p * looks < chance
 
 
 def stands_for(weighed: Weighed, formula: Formula, over: Projection) -> bool:

@@ -274,7 +274,11 @@ class Screen:
         return self.log_bayes_factor(chosen, [w.scale for w in weighed])
 
     def weigh(self, without: Collection[str] = ()) -> tuple[Weighed, ...]:
-        """All places but those called so (`family@where`), the most probable first."""
+        """All places but those called so (`family@where`), by the most probable model that has them.
+
+        Of a pair first the one that shows more by itself: two that are like each other share the probability of what
+        they may both be, and a small effect beside either of them would have all of its own.
+        """
         each = {n: self._weigh(n) for n, place in enumerate(self.places) if str(place) not in without}
         best = sorted(each, key=lambda n: -(each[n].log_bayes_factor + each[n].place.log_prior))[:_PAIRED]
         models: list[tuple[tuple[int, ...], float]] = [((), 0.0)]
@@ -293,7 +297,7 @@ class Screen:
                     top[number] = value
                     beside[number] = next((each[other] for other in members if other != number), None)
         weighed = [replace(w, posterior=share[n], log_evidence=top[n], beside=beside[n]) for n, w in each.items()]
-        return tuple(sorted(weighed, key=lambda w: (-w.posterior, -w.log_bayes_factor, str(w.place))))
+        return tuple(sorted(weighed, key=lambda w: (-w.log_evidence, -w.log_bayes_factor, str(w.place))))
 
     def _weigh(self, number: int) -> Weighed:
         """One place; its strained variants are left out, as long as they would be the best.

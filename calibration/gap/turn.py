@@ -26,6 +26,7 @@ from calibration.gap.rivals import (
     beyond_doubt,
     further_places,
     is_near,
+    may_stand_out,
     near_rivals,
     odds_text,
     stands_for,
@@ -84,13 +85,14 @@ def decide(problem: Problem, joint: JointFit, projection: Projection, places: Se
     first, is_further = Screen(projection, places), bool(joint.choices or problem.formulas)
     while True:
         weighed = first.weigh(without=reasons)
-        if not weighed or not stands_out(weighed, len(weighed), beside=is_further):
+        if not weighed or not may_stand_out(weighed):
             return Decision("nothing", weighed, by_family(weighed), reasons=reasons)
         screen, weighed, tried = _sharpened(problem, joint, projection, with_a_chance(weighed), weighed[0])
-        if not stands_out(weighed, len(places), beside=is_further):
-            # What stood out was the tail of fixes that the fit now takes for outliers.
-            return Decision("nothing", weighed, by_family(weighed), reasons=reasons)
         leading = weighed[0]
+        # Of two fits, each with its own outliers: what seemed to stand out may be the tail of a few fixes.
+        evidence = joint.fit.cost - tried.fit.cost + leading.spread
+        if not stands_out(leading, evidence, len(places), beside=is_further):
+            return Decision("nothing", weighed, by_family(weighed), reasons=reasons)
         near = [w for w in weighed if w.log_bayes_factor > leading.log_bayes_factor - 2 * NEAR]
         out = {
             str(w.place): f"{', '.join(names)} would be beyond what is physical"

@@ -57,6 +57,23 @@ def test_a_few_fixes_that_are_far_off_are_no_curve_of_a_joint() -> None:
     assert {(effect.family, effect.where) for effect in gap.effects} == hidden(drawn)
 
 
+def test_a_few_fixes_that_are_off_among_coarse_readings_are_no_effect() -> None:
+    """By what coarse encoders scatter they are not far off; with a step of the base two of them would be in place."""
+    drawn, gap = answered(Cell("null", (), 0.0, "sparse", "coarse", 100314))
+    assert (gap.verdict, hidden(drawn)) == ("none", set())
+
+
+def test_an_effect_is_weighed_with_the_noise_that_it_leaves_and_not_with_itself_as_noise() -> None:
+    drawn, gap = answered(Cell("single", ("transducer_quadratic",), 0.5, "sparse", "coarse", 300062))
+    assert {(effect.family, effect.where) for effect in gap.effects} == hidden(drawn)
+
+
+def test_two_effects_that_are_alike_are_a_set_whatever_little_there_seems_to_be_beside_either() -> None:
+    """Play at a joint seems to be beside both of them, and so is more probable than either."""
+    drawn, gap = answered(Cell("alias", ("base_settlement|base_step",), 1.0, "wide", "fine", 663007))
+    assert {candidate.family for candidate in gap.indistinguishable} == set(drawn.label["aliases"])
+
+
 def test_a_payload_is_no_less_a_payload_where_the_machine_is_lighter_than_its_rig_file() -> None:
     """Its compliance is just beyond the hard limit, which is as uncertain as the masses that it comes from."""
     drawn, gap = answered(Cell("pair", ("base_step", "payload_change"), 1.0, "wide", "fine", 400021))
