@@ -91,8 +91,15 @@ def refined_steps(time_s: Floats, settings: Settings) -> tuple[Settings, ...]:
 
 
 def settled_step(forms: Sequence[Settings], probability: Floats) -> Settings:
-    """The most probable instant, with the standard deviation that all of them (m,) leave about it."""
+    """The most probable instant, with the standard deviation that all of them (m,) leave about it.
+
+    Args:
+        forms: the instants.
+        probability: (m,) what the data give them, if all are as likely beforehand as each other.
+    """
     times, errors = (np.array([form[name] for form in forms]) for name in ("time_s", "time_error_s"))
+    probability = probability * [step_odds(form) for form in forms]
+    probability /= probability.sum()
     best = int(np.argmax(probability))
     variance = probability @ ((times - times[best]) ** 2 + errors**2)
     return {**forms[best], "time_error_s": math.sqrt(float(variance))}

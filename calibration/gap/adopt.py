@@ -216,19 +216,18 @@ def with_effects(model: CalibratedModel, taken: Adopted) -> CalibratedModel:
     )
 
 
-def refined_choice(joint: JointFit, number: int, over: Projection) -> Choice:
-    """The finest form of one of the effects, among those about the one that was chosen.
+def refined_choice(situation: Situation, choice: Choice, over: Projection) -> Choice:
+    """The finest form of an effect, among those about the one that was chosen.
 
     Args:
-        joint: the fit.
-        number: of the effect.
-        over: the projection about that fit, in which the effect is no part of what is taken out.
+        situation: of the observations.
+        choice: the effect.
+        over: a projection in which it is no part of what is taken out.
     """
-    choice = joint.choices[number]
-    finer = finer_forms(joint.situation, choice)
+    finer = finer_forms(situation, choice)
     if not finer:
         return choice
-    probability = softmax(evidence_of_forms(joint.situation, finer, over))
+    probability = softmax(evidence_of_forms(situation, finer, over))
     return replace(choice, settings=library()[choice.family].settled([c.settings for c in finer], probability))
 
 
@@ -261,7 +260,7 @@ def _in_finest_forms(solution: Solution, joint: JointFit, prior: Prior) -> Joint
         observations = joint.situation.observations
         others = [c for c in joint.choices if c != choice]
         tried = joint_fit(solution, observations, [*others, choice], prior, joint.start([*others, choice]))
-        finer = refined_choice(tried, len(others), projected(solution, tried, without_last=True))
+        finer = refined_choice(tried.situation, choice, projected(solution, tried, without_last=True))
         joint = joint_fit(
             solution, observations, [finer if c == choice else c for c in joint.choices], prior, joint.fit.x
         )

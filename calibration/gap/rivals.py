@@ -10,6 +10,7 @@ import numpy as np
 
 from calibration.effects.base import Situation
 from calibration.effects.fitted import Choice
+from calibration.effects.library import library
 from calibration.gap.grammar import Found as Formula
 from calibration.gap.projection import Projection
 from calibration.gap.screen import Place, Screen, Weighed
@@ -132,10 +133,11 @@ def as_simple(leading: Weighed, rival: Weighed) -> bool:
 
 
 def with_finer(place: Place, option: int, choice: Choice, over: Projection, situation: Situation) -> Place:
-    """A place with a finer form of one of its variants more, as likely as that one."""
-    choice = replace(choice, scale=1.0)
+    """A place with a finer form of one of its variants more, by its own odds beside that one."""
+    choice, family = replace(choice, scale=1.0), library()[place.family]
     additions = choice.additions(situation).over(over.samples.average)
-    odds = np.append(place.log_odds, place.log_odds[option])
+    beside = math.log(family.odds(choice.settings) / family.odds(place.options[option].settings))
+    odds = np.append(place.log_odds, place.log_odds[option] + beside)
     return replace(place, options=(*place.options, choice), additions=(*place.additions, additions), log_odds=odds)
 
 

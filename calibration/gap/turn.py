@@ -6,11 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
-import numpy as np
-
 from calibration.gap.adopt import (
     JointFit,
-    evidence_of_forms,
     finer_forms,
     refined_choice,
 )
@@ -202,7 +199,7 @@ def _sharpened(
         if finer_forms(tried.situation, leading.choice):
             # Which fixes are outliers depends on the form: those beside a step in a wrong place look like some.
             counted = replace(tried, fit=replace(tried.fit, weight=over.fit.weight))
-            finer = refined_choice(tried, len(tried.choices) - 1, problem.project(counted, without_last=True))
+            finer = refined_choice(tried.situation, leading.choice, problem.project(counted, without_last=True))
             if finer.settings != leading.choice.settings:
                 tried = problem.fit([*joint.choices, finer], tried.fit.x)
                 extended = with_finer(leading.place, leading.option, finer, over, joint.situation)
@@ -234,8 +231,8 @@ def _finer(joint: JointFit, sharp: Projection, place: Place, weighed: Sequence[W
     own = next(w for w in weighed if w.place is place)
     if own is weighed[0] or own.log_bayes_factor < _LOOKED_AT * weighed[0].log_bayes_factor:
         return place
-    finer = finer_forms(joint.situation, replace(own.choice, scale=1.0))
-    if not finer:
+    choice = replace(own.choice, scale=1.0)
+    finer = refined_choice(joint.situation, choice, sharp)
+    if finer.settings == choice.settings:
         return place
-    best = finer[int(np.argmax(evidence_of_forms(joint.situation, finer, sharp)))]
-    return with_finer(place, own.option, best, sharp, joint.situation)
+    return with_finer(place, own.option, finer, sharp, joint.situation)
