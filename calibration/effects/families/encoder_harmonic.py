@@ -9,14 +9,16 @@ import numpy as np
 from calibration.effects.base import Coefficient, JointFamily, Settings, Situation
 from calibration.observations import Floats
 
-_CYCLES = (1.0, 2.0)
+_FORMS: tuple[Settings, ...] = ({"k": 1.0}, {"k": 2.0}, {"k": 1.0, "doubled": 1.0})
 
 
 class EncoderHarmonic(JointFamily):
-    """An error that repeats k times a turn: k = 1 for eccentricity, 2 for an oval or tilted disc."""
+    """An error that repeats k times a turn: k = 1 for eccentricity, 2 for an oval or tilted disc; or both at once."""
 
     name: ClassVar[str] = "encoder_harmonic"
-    equation: ClassVar[str] = "d_theta = cosk cos(k theta) + sink sin(k theta), k = 1 or 2"
+    equation: ClassVar[str] = (
+        "d_theta = cosk cos(k theta) + sink sin(k theta), k = 1 or 2; for k = 1 also with the same of 2k beside it"
+    )
     source: ClassVar[str] = "eccentricity of a rotary encoder's disc: e / r = error in rad, once a turn"
     confused_with: ClassVar[tuple[str, ...]] = ("angle_scale", "joint_error_map", "joint_compliance")
     revealed_by: ClassVar[str] = "the joint alone over its whole range, in even steps"
@@ -24,23 +26,26 @@ class EncoderHarmonic(JointFamily):
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
         del situation, where
-        return tuple({"k": k} for k in _CYCLES)
+        return _FORMS
 
     def form(self, settings: Settings) -> str:
-        return f"k = {settings['k']:g}"
+        return f"k = {settings['k']:g}{' and 2k' if 'doubled' in settings else ''}"
 
     def names(self, settings: Settings) -> tuple[str, ...]:
-        if set(settings) != {"k"} or settings["k"] not in _CYCLES:
-            raise ValueError("the only setting is k, 1 or 2")
-        return "cosk_rad", "sink_rad"
+        if settings not in _FORMS:
+            raise ValueError(
+                "the settings are k, 1 or 2, and where k is 1 doubled = 1, if twice a turn is there as well"
+            )
+        return ("cosk_rad", "sink_rad", *(("cos2k_rad", "sin2k_rad") if "doubled" in settings else ()))
 
     def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
         del situation, where
         return tuple(Coefficient(name, "rad", 1.5e-3, -6e-3, 6e-3) for name in self.names(settings))
 
     def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
-        angle = settings["k"] * np.radians(situation.reading(where))
-        change: Floats = np.degrees(np.array([np.cos(angle), np.sin(angle)])).T
+        once = settings["k"] * np.radians(situation.reading(where))
+        angles = (once, 2.0 * once) if "doubled" in settings else (once,)
+        change: Floats = np.degrees([turn(angle) for angle in angles for turn in (np.cos, np.sin)]).T
         return change
 
 
