@@ -11,10 +11,16 @@ from calibration.observations import Floats
 
 
 class Backlash(JointFamily):
-    """The encoder lags behind the joint by half the play, on the side it came from."""
+    """Of encoder and joint one lags behind the other by half the play: the one that is driven through it.
+
+    An encoder on the joint's own side lags behind the joint, which is further along its last motion: the width is
+    positive. Behind an encoder at the motor the joint lags, and the width is negative.
+    """
 
     name: ClassVar[str] = "backlash"
-    equation: ClassVar[str] = "d_theta = width / 2 * direction of the last motion (column <joint>_dir)"
+    equation: ClassVar[str] = (
+        "d_theta = width / 2 * direction of the last motion (column <joint>_dir); width < 0: the joint lags"
+    )
     source: ClassVar[str] = "gear play; the approach from the other side shows it"
     confused_with: ClassVar[tuple[str, ...]] = ("load_hysteresis", "gravity_flip_play")
     revealed_by: ClassVar[str] = "coming to the same pose from both sides"
@@ -27,7 +33,7 @@ class Backlash(JointFamily):
 
     def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
         del situation, where, settings
-        return (Coefficient("width_rad", "rad", 1e-3, 0.0, 5e-3),)
+        return (Coefficient("width_rad", "rad", 1e-3, -5e-3, 5e-3),)
 
     def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
         del settings

@@ -24,13 +24,14 @@ _BOUND_RAD = 5e-3
 
 
 class LoadHysteresis(OfUncertainLoad, JointFamily):
-    """Friction holds the encoder's side back by the load, so that the joint is further along its last motion.
+    """Friction holds one side of a yielding drive back by the load.
 
-    As for a compliance, variants have what uncertain masses leave open about the load.
+    Where it is the encoder's, the joint is further along its last motion. Behind an encoder at the motor the joint
+    lags, and the coefficient is negative. As for a compliance, variants have what uncertain masses leave open.
     """
 
     name: ClassVar[str] = "load_hysteresis"
-    equation: ClassVar[str] = "d_theta = k * direction of the last motion * |torque|"
+    equation: ClassVar[str] = "d_theta = k * direction of the last motion * |torque|; k < 0: the joint lags"
     source: ClassVar[str] = "Coulomb friction in loaded bearings and gears (Armstrong-Helouvry et al. 1994)"
     confused_with: ClassVar[tuple[str, ...]] = ("backlash", "gravity_flip_play")
     revealed_by: ClassVar[str] = "coming to the same pose from both sides, under little load and under great load"
@@ -58,7 +59,7 @@ class LoadHysteresis(OfUncertainLoad, JointFamily):
         torque = situation.greatest_torque(where)
         most = _BOUND_RAD / torque
         return (
-            Coefficient("rad_per_Nm", UNIT, _SIGMA_RAD / torque, 0.0, most),
+            Coefficient("rad_per_Nm", UNIT, _SIGMA_RAD / torque, -most, most),
             *part_coefficients(settings, most),
         )
 
