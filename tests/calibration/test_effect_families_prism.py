@@ -115,6 +115,17 @@ def test_fixes_are_moved_as_the_simulator_does(simulated: str, machine: RigTruth
     assert rms(additions.shifted_mm(np.array(values)) - true_shift) < 0.005 * rms(true_shift)
 
 
+def test_a_mounting_that_does_not_grow_is_one_of_no_length(machine: RigTruth, still: Observations) -> None:
+    family, situation = moving_prisms("thermal_expansion"), placed(machine, still)
+    _, links = family.variants(situation, "boom")
+    bare = BOOM.model_copy(update={"prisms": tuple(p.model_copy(update={"offset_mm": (0, 0, 0)}) for p in BOOM.prisms)})
+    at_frames = Situation(Chain(bare, situation.chain.placements), situation.x, still)
+    (all_of_it,) = family.variants(at_frames, "boom")
+    grown = family.shift_mm(situation, "boom", links)
+    np.testing.assert_allclose(grown, family.shift_mm(at_frames, "boom", all_of_it), atol=1e-9)
+    assert family.names(links) == ("per_K",)
+
+
 def test_a_coupled_row_follows_every_joint_that_drives_it() -> None:
     """Of a torso: row 3 is -(q1 + q2), and only what is said of one of them changes it."""
     torso = parse_rig((RIGS / "torso.toml").read_text(encoding="utf-8"), "torso.toml")
@@ -372,6 +383,20 @@ def test_rows_that_lack_a_column_are_left_alone_and_made_as_uncertain_as_the_eff
     values = np.array([c.sigma for c in family.coefficients(situation, where, settings)])
     was = float(np.mean((shift @ values) ** 2))
     assert 0.3 * was < family.unknown_variance(values, values, settings) < 3.0 * was
+
+
+def test_ground_that_comes_to_rest_has_sunk_as_much_by_then_as_its_mean_rate_says(
+    machine: RigTruth, still: Observations
+) -> None:
+    family, situation = moving_prisms("base_settlement"), placed(machine, still)
+    steady, *slowing = (family.shift_mm(situation, "base", form) for form in family.variants(situation, "base"))
+    for number, shift in enumerate(slowing):
+        np.testing.assert_array_equal(shift[0], 0.0)
+        np.testing.assert_allclose(shift[-1], steady[-1])
+        # Half the time has more than half of it, the more the sooner it rests.
+        before = steady if number == 0 else slowing[number - 1]
+        middle = len(still) // 2
+        assert np.linalg.norm(shift[middle]) > 1.05 * np.linalg.norm(before[middle])
 
 
 @pytest.mark.parametrize("name", ["base_settlement", "clock_drift"])

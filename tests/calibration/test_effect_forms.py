@@ -70,6 +70,8 @@ def moved(projection: Projection, choice: Choice, values: tuple[float, ...]) -> 
         ("prism_incidence", "r", (6.0, -5.0), 2),
         ("leak_down", "theta6", (4e-5,), 1),
         ("leak_down", "theta6", (4e-5,), 0),
+        ("base_settlement", "base", (9e-4, -9e-4, -3.0), 0),
+        ("base_settlement", "base", (9e-4, -9e-4, -3.0), 3),
     ],
 )
 def test_the_data_tell_the_form_and_the_coefficients_go_with_it(
