@@ -197,6 +197,7 @@ class _Search:
             first: all places at the beginning.
         """
         solution = self.problem.solution
+        rivals = rivals if self._may_close(alone.projection, joint, rivals) else ()
         joint, against = self._whole(joint, rivals)
         last = self.problem.project(joint) if joint.choices else alone.projection
         left, strange = Grammar(last), formulas
@@ -204,10 +205,8 @@ class _Search:
             formulas = left.found()
         turns = self._as_they_count(turns, alone, joint, against)
         turns[-1] = replace(turns[-1], fit=joint, projection=last)
-        if joint.choices and not rivals:
-            structured = bool(formulas) or detect(left, self.problem.rng()).significant
-            if not closes(turns[0].projection, last, is_structured=structured):
-                return self._retracted(turns, strange or formulas, first)
+        if joint.choices and not rivals and not self._closes(turns[0].projection, left, is_structured=bool(formulas)):
+            return self._retracted(turns, strange or formulas, first)
         taken = Adopted(
             self.problem.solution,
             self.problem.solution.fit,
@@ -228,6 +227,18 @@ class _Search:
             turns[0].projection,
             left,
         )
+
+    def _may_close(self, first: Projection, joint: JointFit, rivals: Sequence[Weighed]) -> bool:
+        """Whether the gap closes with the most probable of a set: a set is held to what a name is held to."""
+        if not rivals:
+            return False
+        tried = self.problem.fit([*joint.choices, rivals[0].choice], joint.fit.x)
+        return self._closes(first, Grammar(self.problem.project(tried)), is_structured=False)
+
+    def _closes(self, first: Projection, left: Grammar, *, is_structured: bool) -> bool:
+        """Whether what is left, known to depend on something (`is_structured`) or not, is little beside the first gap."""
+        structured = is_structured or detect(left, self.problem.rng()).significant
+        return closes(first, left.projection, is_structured=structured)
 
     def _judged_again(self, joint: JointFit, name: str) -> tuple[JointFit, Turn | None, tuple[Weighed, ...]]:
         """What could not be told from others, now that all else is known: the fit with it, or without and the set."""
