@@ -52,7 +52,7 @@ def _of_fit(model: CalibratedModel, observations: Observations, solution: Soluti
         yield (
             f"the fixes scatter by {left_mm:.2g} mm RMS where their standard deviations say "
             f"{model.effects_noise_mm:.2g}: too large ones make a loose fit; check the sigma columns or the rig file's "
-            f"station"
+            f"station, for fixes of a moving machine its timing_sigma_s"
         )
 
 

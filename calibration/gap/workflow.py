@@ -14,13 +14,14 @@ from calibration.effects.library import library
 from calibration.errors import UnsafeError
 from calibration.evaluation import require_positions
 from calibration.gap.adopt import JointFit
+from calibration.gap.decide import beyond
 from calibration.gap.detect import detect
 from calibration.gap.discriminate import experiments
 from calibration.gap.forecast import forecasts
 from calibration.gap.grammar import Found as Formula
 from calibration.gap.grammar import Grammar, describe
 from calibration.gap.result import Candidate, Gap, Round, Verdict
-from calibration.gap.rivals import explains
+from calibration.gap.rivals import explains, stands_for
 from calibration.gap.screen import Screen, Weighed
 from calibration.gap.search import Found, Turn, search
 from calibration.identification.refinement import Prior
@@ -39,6 +40,7 @@ Progress = Callable[[float, str], None]
 _FOLDS = 10
 _LISTED = 12  # candidates of a round
 _EXCESS_SEEN = 0.2  # of the known noise's standard deviation; less is none
+_ANY_SIZE = 1e3  # of the plausible sizes of an effect
 _FAR_NOISIER = 2.0  # times what is known of the noise
 
 
@@ -122,9 +124,7 @@ def _answer(
     after = detect(left, rng)
     before = detect(Grammar(found.first), rng) if found.joint.choices else after
     formulas = found.formulas or (left.found() if after.significant and not found.rivals else ())
-    description = None
-    if formulas:
-        description = describe(formulas) if found.formulas else describe(formulas, _of_library(found, formulas[0]))
+    description = describe(formulas, _of_library(found, formulas[0])) if formulas else None
     effects = found.adopted.effects
     verdict: Verdict = "none"
     if found.rivals:
@@ -175,12 +175,16 @@ def _answer(
 
 
 def _of_library(found: Found, formula: Formula) -> str:
-    """Whether an effect that was weighed and not named does what a formula says, a clause."""
+    """Whether an effect that was not named does what a formula says, a clause."""
     turn, projection = found.turns[-1], found.left.projection
-    for weighed in turn.weighed[:_LISTED]:
+    for weighed in () if found.formulas else turn.weighed[:_LISTED]:
         if weighed.log_bayes_factor > 0.0 and explains(weighed, formula, projection):
             reason = turn.reasons.get(str(weighed.place), "it does not stand out enough to be named")
             return f"{weighed.place} would do this, but {reason}"
+    for weighed in Screen(projection, found.possible.places).weigh()[:_LISTED]:
+        names = beyond(projection.situation, weighed)
+        if names and stands_for(replace(weighed, scale=_ANY_SIZE), formula, projection):
+            return f"{weighed.place} would do this, but {', '.join(names)} would be beyond what is physical"
     return "not in the library"
 
 

@@ -19,9 +19,13 @@ from daemon.rigs import load_rig
 from simulators.aliases import alias_scene
 from simulators.cases import Drawn, draw
 from simulators.cells import Cell, Poses
+from simulators.dataset import simulate_observations
+from simulators.effects import parse_effects
 from simulators.hidden import hide
 from simulators.scene import SceneSettings, draw_scene
+from simulators.truth import RigTruth
 from simulators.visible import Visibility
+from tests.daemon.gap_support import session_csv
 
 SOURCE = load_rig("swdt82")
 
@@ -93,6 +97,44 @@ def test_scatter_far_beyond_the_instruments_is_no_effect_but_not_passed_over_in_
     assert any("the fixes scatter by" in warning for warning in loud.warnings)
     silent = find_gap(SOURCE.rig, SOURCE.text, quiet)
     assert not any("the fixes scatter by" in warning for warning in silent.warnings)
+
+
+@pytest.mark.parametrize("width", [3e-3, -3e-3])
+def test_play_has_its_name_on_whichever_side_of_it_the_encoder_is(width: float) -> None:
+    data = session_csv(60, hidden=f"backlash@theta4:width_rad={width}")
+    gap = find_gap(SOURCE.rig, SOURCE.text, parse_observations(data, SOURCE.rig, "session.csv"))
+    assert [(effect.family, effect.where) for effect in gap.effects] == [("backlash", "theta4")]
+    assert gap.effects[0].coefficients[0].value == pytest.approx(width, rel=0.2)
+
+
+def test_a_disc_that_is_off_its_axis_and_oval_is_an_encoder_error_and_no_curve() -> None:
+    robot = load_rig("ys100")
+    once, twice = "cosk_rad=2e-4:sink_rad=1e-4:k=1", "cosk_rad=-1e-4:sink_rad=8e-5:k=2"
+    disc = parse_effects(f"encoder_harmonic@theta1:{once},encoder_harmonic@theta1:{twice}")
+    data = simulate_observations(RigTruth(robot.rig, 3, effects=disc), 150, 3, noise_mm=0.05).csv_text().encode()
+    gap = find_gap(robot.rig, robot.text, parse_observations(data, robot.rig, "session.csv"))
+    assert [(effect.family, effect.where) for effect in gap.effects] == [("encoder_harmonic", "theta1")]
+    values = [c.value for c in gap.effects[0].reported]
+    np.testing.assert_allclose(values, (2e-4, 1e-4, -1e-4, 8e-5), atol=2e-5)
+
+
+def test_what_is_too_large_for_its_name_is_not_said_to_be_outside_of_the_library() -> None:
+    data = session_csv(60, hidden="transducer_scale@L2:scale=0.03")
+    gap = find_gap(SOURCE.rig, SOURCE.text, parse_observations(data, SOURCE.rig, "session.csv"))
+    assert (gap.verdict, gap.effects) == ("unidentified", ())
+    assert gap.description is not None
+    assert gap.description.endswith("transducer_scale@L2 would do this, but scale would be beyond what is physical")
+
+
+def test_effects_that_would_explain_next_to_nothing_of_a_gap_are_no_set() -> None:
+    """A distance meter's cyclic error, as a stranger's station may have it, leaves four times the noise."""
+    drawn = draw(SOURCE.rig, Cell("null", (), 0.0, "wide", "fine", 49))
+    assert drawn is not None
+    quiet = parse_observations(drawn.train.encode(), SOURCE.rig, "case.csv")
+    away_mm = np.linalg.norm(quiet.position_mm, axis=1)[:, None]
+    cyclic_mm = 8.0 * np.sin(2.0 * np.pi * away_mm / 5000.0) * quiet.position_mm / away_mm
+    gap = find_gap(SOURCE.rig, SOURCE.text, replace(quiet, position_mm=quiet.position_mm + cyclic_mm))
+    assert (gap.verdict, gap.effects, gap.indistinguishable) == ("unidentified", (), ())
 
 
 def test_a_set_beside_a_named_effect_leaves_the_errors_of_every_round_as_they_are_without_it() -> None:
