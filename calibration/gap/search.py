@@ -236,7 +236,7 @@ class _Search:
         return self._closes(first, Grammar(self.problem.project(tried)), is_structured=False)
 
     def _closes(self, first: Projection, left: Grammar, *, is_structured: bool) -> bool:
-        """Whether what is left, known to depend on something (`is_structured`) or not, is little beside the first gap."""
+        """Whether what is left is little beside the first gap; `is_structured`: it is known to depend on something."""
         structured = is_structured or detect(left, self.problem.rng()).significant
         return closes(first, left.projection, is_structured=structured)
 
