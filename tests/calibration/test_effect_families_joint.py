@@ -58,13 +58,6 @@ HIDDEN = (
         (1e-3, -2e-3),
         variant=1,
     ),
-    Hidden(
-        "encoder_harmonic@theta5:cosk_rad=1e-3:sink_rad=-2e-3:k=1,encoder_harmonic@theta5:cosk_rad=2e-3:sink_rad=1e-3:k=2",
-        "encoder_harmonic",
-        "theta5",
-        (1e-3, -2e-3, 2e-3, 1e-3),
-        variant=2,
-    ),
     Hidden("angle_scale@theta4:scale=-2e-3", "angle_scale", "theta4", (-2e-3,)),
     Hidden("angle_scale@theta1:scale=2e-3", "angle_scale", "theta1", (2e-3,)),
     Hidden("transducer_quadratic@L2:mm_per_m2=10", "transducer_quadratic", "L2", (10.0,)),

@@ -84,6 +84,11 @@ def test_the_data_tell_the_form_and_the_coefficients_go_with_it(
     assert (np.abs(found.estimate - values) < 3.5 * found.standard_error).all()
 
 
+def test_over_less_than_half_a_turn_an_encoder_errs_once_or_twice_a_turn_but_not_both(bare: Projection) -> None:
+    forms = variants_at(bare.situation, "encoder_harmonic", "theta7")
+    assert [form.settings for form in forms] == [{"k": 1.0}, {"k": 2.0}]
+
+
 def test_the_clearance_of_pads_is_as_open_as_what_they_overlap(bare: Projection) -> None:
     forms = variants_at(bare.situation, "pad_play", "boom")
     hidden = next(form for form in forms if form.settings["left"] == pytest.approx(0.2))

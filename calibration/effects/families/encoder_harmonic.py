@@ -9,11 +9,16 @@ import numpy as np
 from calibration.effects.base import Coefficient, JointFamily, Settings, Situation
 from calibration.observations import Floats
 
-_FORMS: tuple[Settings, ...] = ({"k": 1.0}, {"k": 2.0}, {"k": 1.0, "doubled": 1.0})
+_SINGLE: tuple[Settings, ...] = ({"k": 1.0}, {"k": 2.0})
+_BOTH: Settings = {"k": 1.0, "doubled": 1.0}
+_HALF_A_TURN_DEG = 180.0
 
 
 class EncoderHarmonic(JointFamily):
-    """An error that repeats k times a turn: k = 1 for eccentricity, 2 for an oval or tilted disc; or both at once."""
+    """An error that repeats k times a turn: k = 1 for eccentricity, 2 for an oval or tilted disc; or both at once.
+
+    Over less than half a turn both together bend like any curve, a straight line too: they are no form of it there.
+    """
 
     name: ClassVar[str] = "encoder_harmonic"
     equation: ClassVar[str] = (
@@ -25,14 +30,15 @@ class EncoderHarmonic(JointFamily):
     kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
-        del situation, where
-        return _FORMS
+        reading = situation.reading(where)
+        covers_both = len(reading) > 0 and np.ptp(reading) >= _HALF_A_TURN_DEG
+        return (*_SINGLE, _BOTH) if covers_both else _SINGLE
 
     def form(self, settings: Settings) -> str:
         return f"k = {settings['k']:g}{' and 2k' if 'doubled' in settings else ''}"
 
     def names(self, settings: Settings) -> tuple[str, ...]:
-        if settings not in _FORMS:
+        if settings not in (*_SINGLE, _BOTH):
             raise ValueError(
                 "the settings are k, 1 or 2, and where k is 1 doubled = 1, if twice a turn is there as well"
             )
