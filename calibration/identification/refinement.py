@@ -361,12 +361,14 @@ class _View:
     def cost(self) -> float:
         """Negative log evidence (Laplace), up to a constant: fits of one data set from different starts compare by it.
 
-        Every row's mixture by itself, plus what the correlation among the inliers of standstills adds.
+        Every row's mixture by itself, plus what the correlation among the inliers of standstills adds. Far out an
+        outlier is as likely as by Cauchy's distribution: how far a gross one is tells nothing of the noise of others.
         """
         rows, share = self.of_rows, self.noise.share
         inlier = math.log(1.0 - share) - 0.5 * (rows.square + rows.log_det)
         outlier = math.log(share) - 3.0 * math.log(_OUTLIER_WIDTH)
-        likelihood = np.logaddexp(inlier, outlier - 0.5 * (rows.square / _OUTLIER_WIDTH**2 + rows.log_det)).sum()
+        tail = 2.0 * np.log1p(rows.square / _OUTLIER_WIDTH**2)
+        likelihood = np.logaddexp(inlier, outlier - tail - 0.5 * rows.log_det).sum()
         together = float(self.error @ self.error) + self.whitening.log_det
         correlation = 0.5 * (float(self.weight @ rows.square) + float(rows.log_det.sum()) - together)
         prior = 0.5 * (np.log(self.precision) - self.precision * self.state.x[self.problem.free] ** 2).sum()
