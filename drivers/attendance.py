@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from drivers.clock import NS_PER_S, Clock, Stamp
 
-LATE_S = 0.25
+LATE_S = 0.25  # what is read later than this is given up, where nothing says when it came
 NOT_READ_IN_TIME = "nobody read for a while: rigcal was stopped, or the computer too busy"
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from drivers.attendance import LATE_S
 from drivers.can_channel import PdoChannel, PdoChannelDecoder, value_reading
 from drivers.clock import NS_PER_S, Stamp
 from drivers.errors import DescriptionError
@@ -47,7 +48,7 @@ def _bit_words(bits: int, names: dict[int, str]) -> str:
     return ", ".join(words) or "none"
 
 
-_MARGIN_NS = NS_PER_S // 4  # what samples may be read late by, without more ado
+_MARGIN_NS = int(LATE_S * NS_PER_S)  # what samples may be read late by before they are given up
 _BACKLOG_NS = 5 * NS_PER_S  # what has queued is read within this time, however long nobody read
 
 
