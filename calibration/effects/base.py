@@ -128,6 +128,12 @@ class Situation:
         return self.machine.face(self.data)
 
     @cached_property
+    def prism_frame(self) -> NDArray[np.intp]:
+        """(n,) the frame that each fix's prism is mounted on."""
+        frames = np.array([prism.frame for prism in self.rig.prisms], dtype=np.intp)
+        return frames[self.data.prism]
+
+    @cached_property
     def rotation(self) -> Floats:
         """(n, 3, 3) from the base frame to the station's."""
         return self.machine.rotations(self.data)

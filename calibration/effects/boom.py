@@ -104,8 +104,7 @@ class Boom:
     @cached_property
     def carries_prism(self) -> NDArray[np.bool_]:
         """(n,) whether the prism moves with the tip."""
-        frames = np.array([prism.frame for prism in self.situation.rig.prisms])
-        carried: NDArray[np.bool_] = self._beyond[frames[self.situation.data.prism]]
+        carried: NDArray[np.bool_] = self._beyond[self.situation.prism_frame]
         return carried
 
     @cached_property

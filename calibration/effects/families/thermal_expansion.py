@@ -66,9 +66,8 @@ def _shift_mm(situation: Situation, settings: Settings) -> Floats:
 
 def _mounted_mm(situation: Situation) -> Floats:
     """(n, 3) where the frames of the prisms are, in the base frame."""
-    frame = {prism.name: prism.frame for prism in situation.rig.prisms}
-    of_row = [frame[name] for name in situation.observations.prism.tolist()]
-    return np.asarray(situation.located.frames_mm[np.arange(len(situation)), of_row])
+    mounted_mm: Floats = situation.located.frames_mm[np.arange(len(situation)), situation.prism_frame]
+    return mounted_mm
 
 
 FAMILY = ThermalExpansion()
