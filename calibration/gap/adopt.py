@@ -81,6 +81,13 @@ class JointFit:
         own = self.own(number)
         return self.fit.x[own], np.sqrt(np.diag(self.fit.covariance)[own])
 
+    def with_last(self, number: int) -> JointFit:
+        """The same fit with one of its effects as the last."""
+        order = [*(n for n in range(len(self.choices)) if n != number), number]
+        own = np.concatenate([np.arange(self._first), *(np.r_[self.own(n)] for n in order)])
+        fit = replace(self.fit, x=self.fit.x[own], covariance=self.fit.covariance[np.ix_(own, own)])
+        return JointFit(self.situation, tuple(self.choices[n] for n in order), tuple(self.parts[n] for n in order), fit)
+
     def start(self, choices: Sequence[Choice]) -> Floats:
         """(p + k,) where a fit of these effects, all of them in this one, begins."""
         coefficients = [self.found(self.choices.index(choice))[0] for choice in choices]

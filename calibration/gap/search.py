@@ -16,8 +16,8 @@ from calibration.gap.grammar import Grammar
 from calibration.gap.problem import OUTLIER, Problem
 from calibration.gap.projection import Projection
 from calibration.gap.reading_steps import in_true_steps
-from calibration.gap.rivals import explains
-from calibration.gap.screen import Place, Possible, Weighed, possible
+from calibration.gap.rivals import best_of_each_family, beyond_doubt, explains
+from calibration.gap.screen import Place, Possible, Screen, Weighed, possible
 from calibration.gap.settle import explaining_outliers, settled
 from calibration.gap.turn import decide
 from calibration.identification.refinement import Prior
@@ -122,7 +122,7 @@ class _Search:
             turns, certain = list(before.turns[:-1]), dict(before.certain)
             joint = self.problem.fit(before.joint.choices, joint.fit.x)
             projection = self.problem.open(joint)
-            there = self._possible(joint, projection)
+            there = self._possible(joint.choices, projection)
         while True:
             decision = decide(self.problem, joint, projection, there)
             steps += 1
@@ -131,7 +131,7 @@ class _Search:
             rested = self._rested(joint, taken) if steps < _STEPS else joint
             if rested is not joint:
                 joint, projection = rested, self.problem.open(rested)
-                there = self._possible(joint, projection)
+                there = self._possible(joint.choices, projection)
                 continue
             if not is_set:
                 own = taken if decision.kind == "take" else ()
@@ -144,7 +144,7 @@ class _Search:
             certain |= {str(c): decision.posterior[c.family] for c in taken}
             joint = decision.joint
             projection = self.problem.open(joint)
-            there = self._possible(joint, projection)
+            there = self._possible(joint.choices, projection)
         rivals = decision.rivals
         for name in pending:
             joint, turn, left = self._judged_again(joint, name)
@@ -153,15 +153,10 @@ class _Search:
                 certain |= {str(c): turn.posterior[c.family] for c in turn.taken}
             elif turn is not None and left and not rivals:
                 turns[-1], rivals = turn, left
-        # What took a name when others were not known yet may have another one beside them.
-        for name in [str(c) for c in joint.choices if str(c) not in pending]:
-            if len({c.family for c in joint.choices}) == 1:
-                break
-            other, turn, _ = self._judged_again(joint, name)
-            if turn is not None and turn.taken and name not in map(str, turn.taken):
-                joint = settled(self.problem, other, other.choices)
-                turns.insert(-1, turn)
-                certain |= {str(c): turn.posterior[c.family] for c in turn.taken}
+        joint, renamed = self._renamed(joint, [str(c) for c in joint.choices if str(c) not in pending])
+        for turn in renamed:
+            turns.insert(-1, turn)
+            certain |= {str(c): turn.posterior[c.family] for c in turn.taken}
         joint = explaining_outliers(self.problem, joint)
         return self._concluded(joint, alone, turns, rivals, decision.formulas, certain, first)
 
@@ -240,6 +235,30 @@ class _Search:
         structured = is_structured or detect(left, self.problem.rng()).significant
         return closes(first, left.projection, is_structured=structured)
 
+    def _renamed(self, joint: JointFit, names: Sequence[str]) -> tuple[JointFit, list[Turn]]:
+        """The fit with what took one of the names when others were not known yet and has another one beside them."""
+        turns: list[Turn] = []
+        for name in names:
+            if len({c.family for c in joint.choices}) == 1:
+                break
+            if self._is_plain(joint, name):
+                continue
+            other, turn, _ = self._judged_again(joint, name)
+            if turn is not None and turn.taken and name not in map(str, turn.taken):
+                joint = settled(self.problem, other, other.choices)
+                turns.append(turn)
+        return joint, turns
+
+    def _is_plain(self, joint: JointFit, name: str) -> bool:
+        """Whether nothing comes near what took a name, beside all else that is there: it would take it again."""
+        number = next((n for n, c in enumerate(joint.choices) if str(c) == name), None)
+        if number is None:
+            return False
+        projection = self.problem.project(joint.with_last(number), without_last=True)
+        others = [c for c in joint.choices if str(c) != name]
+        weighed = Screen(projection, self._possible(others, projection)).weigh()
+        return str(weighed[0].place) == name and beyond_doubt(best_of_each_family(weighed))
+
     def _judged_again(self, joint: JointFit, name: str) -> tuple[JointFit, Turn | None, tuple[Weighed, ...]]:
         """What could not be told from others, now that all else is known: the fit with it, or without and the set."""
         if name not in map(str, joint.choices):
@@ -248,7 +267,7 @@ class _Search:
         without = self.problem.fit(others, joint.start(others))
         # What all together explain is no outlier to a part of it.
         projection = self.problem.open(replace(without, fit=replace(without.fit, weight=joint.fit.weight)))
-        decision = decide(self.problem, without, projection, self._possible(without, projection))
+        decision = decide(self.problem, without, projection, self._possible(others, projection))
         if decision.kind != "take" or decision.joint is None:
             turn = Turn(without, projection, decision.weighed, decision.posterior, (), decision.reasons)
             return without, turn, decision.rivals
@@ -323,11 +342,11 @@ class _Search:
             left,
         )
 
-    def _possible(self, joint: JointFit, projection: Projection) -> tuple[Place, ...]:
+    def _possible(self, there: Sequence[Choice], projection: Projection) -> tuple[Place, ...]:
         """All places for what may still be missing: of no other families once there are as many as a model takes."""
-        taken = {c.family for c in joint.choices}
+        taken = {c.family for c in there}
         allowed = [f for f in self.families if f in taken] if len(taken) >= MOST_FAMILIES else self.families
-        return possible(joint.situation, projection, allowed, [str(c) for c in joint.choices]).places
+        return possible(projection.situation, projection, allowed, [str(c) for c in there]).places
 
 
 def _beside_formulas(problem: Problem, families: Collection[str], found: Found) -> Found:
