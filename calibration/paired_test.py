@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import stdtr
 
 from calibration.observations import Floats
 
@@ -54,7 +54,7 @@ def paired_test(before_mm2: Floats, after_mm2: Floats, groups: NDArray[np.str_] 
     gain = np.bincount(index, before_mm2 - after_mm2) / size
     p = 1.0
     if len(gain) > 1 and (spread := float(gain.std(ddof=1))) > 0.0:
-        p = float(stats.t.sf(gain.mean() / (spread / np.sqrt(len(gain))), len(gain) - 1))
+        p = float(stdtr(len(gain) - 1, -gain.mean() / (spread / np.sqrt(len(gain)))))
     return PairedTest(
         before_mm=float(np.sqrt(before_mm2.mean())),
         after_mm=float(np.sqrt(after_mm2.mean())),

@@ -11,8 +11,8 @@ from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
+from calibration.halton import halton
 from calibration.kernels.machine import Facing, Located, Machine
 from calibration.kinematics import Chain, ChainData
 from calibration.observations import Floats, Observations
@@ -199,7 +199,7 @@ class Situation:
     @cached_property
     def work_volume(self) -> Situation:
         """The same machine in poses spread evenly between the limits of its joints, nothing else measured."""
-        unit = qmc.Halton(len(self.rig.joints), scramble=False).random(_VOLUME_POSES)
+        unit = halton(len(self.rig.joints), _VOLUME_POSES)
         blank = np.full((_VOLUME_POSES, 3), np.nan)
         empty = np.full(_VOLUME_POSES, "")
         joints = {j.name: j.limits[0] + (j.limits[1] - j.limits[0]) * unit[:, i] for i, j in enumerate(self.rig.joints)}

@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import stats
 from scipy.linalg import solve_triangular
 
 from calibration.effects.base import Situation
@@ -66,12 +65,14 @@ def chance_of_gain(projection: Projection, candidate: Weighed, seed: int) -> flo
     Both models are fitted without the groups, kinematics with their priors. By ranks: single fixes far from all
     others, where neither knows anything, would decide about a mean.
     """
+    from scipy.stats import wilcoxon
+
     kinematics, fold = _with_beside(projection, candidate), folds(projection.groups, _FOLDS, seed)
     before = _held_out(kinematics, projection.rows.target, fold)
     after = _held_out(np.hstack([kinematics, _columns(projection, candidate)]), projection.rows.target, fold)
     _, group, size = np.unique(projection.groups, return_inverse=True, return_counts=True)
     lowered = np.bincount(group, before - after) / size
-    return float(stats.wilcoxon(lowered, alternative="greater").pvalue) if np.any(lowered) else 1.0
+    return float(wilcoxon(lowered, alternative="greater").pvalue) if np.any(lowered) else 1.0
 
 
 def beyond(situation: Situation, candidate: Weighed) -> tuple[str, ...]:

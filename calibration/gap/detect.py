@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import log_ndtr
 
 from calibration.gap.grammar import Grammar
 from calibration.gap.neighbours import neighbours
@@ -110,8 +110,8 @@ def _of_largest(scores: Floats, chance: Floats) -> Floats:
     beyond = len(ordered) - np.searchsorted(ordered, scores, side="left")
     share = (beyond + 1.0) / (len(ordered) + 1.0)
     # The tail of the largest of many normal numbers is proportional to that of one.
-    edge = float(stats.norm.logsf(ordered[-_ENOUGH]))
-    tail = np.exp(np.minimum(stats.norm.logsf(scores) - edge, 0.0)) * (_ENOUGH + 1.0) / (len(ordered) + 1.0)
+    edge = float(log_ndtr(-ordered[-_ENOUGH]))
+    tail = np.exp(np.minimum(log_ndtr(-scores) - edge, 0.0)) * (_ENOUGH + 1.0) / (len(ordered) + 1.0)
     return np.where(beyond >= _ENOUGH, share, np.minimum(tail, share))
 
 
@@ -121,5 +121,7 @@ def _of_sum(total: float, chance: Floats) -> float:
     share = (beyond + 1.0) / (len(chance) + 1.0)
     if beyond >= _ENOUGH:
         return share
+    from scipy import stats
+
     tail = stats.pearson3.sf(total, stats.skew(chance), chance.mean(), chance.std())
     return min(share, float(tail))

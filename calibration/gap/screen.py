@@ -15,8 +15,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import stats
-from scipy.special import logsumexp
+from scipy.special import chdtrc, logsumexp
 
 from calibration.effects.base import FittedCoefficient, Situation
 from calibration.effects.fitted import Choice
@@ -330,7 +329,7 @@ class Screen:
         size, axes, along = self._eigen(number, int(option))
         size, along = size * SCALES[best] ** 2, along * SCALES[best]
         explained, degrees = _explained(size, along)
-        p = float(stats.chi2.sf(explained, degrees))
+        p = float(chdtrc(degrees, explained))
         together = float(logsumexp(values))
         looks = len({self._block[number, o] for o in range(len(values))})
         return Weighed(

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats.qmc import Halton
 
+from calibration.halton import halton
 from calibration.identification.additions import Additions
 from calibration.identification.samples import Samples, reading_covariance
 from calibration.identification.standing import standing_spread
@@ -308,7 +308,7 @@ def _with_still_joints_moved(chain: Chain, samples: Samples) -> dict[tuple[int, 
     still = np.flatnonzero(np.ptp(readings, axis=0) <= standing_spread(chain.rig)).tolist()
     if not still:
         return {}
-    turn = Halton(len(still), scramble=False).random(len(samples))
+    turn = halton(len(still), len(samples))
     low, high = np.array([chain.rig.joints[j].limits for j in still]).T
     spread = low + (high - low) * turn
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri, ndtri
 
 from calibration.observations import Floats
 
@@ -43,8 +43,8 @@ class Intervals:
         radius: of its 3-D norm, in units of the root of the three variances' sum.
     """
 
-    axes: tuple[float, float, float] = (float(stats.norm.ppf((1.0 + LEVEL) / 2.0)),) * 3
-    radius: float = float(np.sqrt(stats.chi2.ppf(LEVEL, 3) / 3.0))
+    axes: tuple[float, float, float] = (float(ndtri((1.0 + LEVEL) / 2.0)),) * 3
+    radius: float = float(np.sqrt(chdtri(3, 1.0 - LEVEL) / 3.0))
 
     def at_other_setups(self) -> Intervals:
         """The same where nobody knows which way x and y point, seen from the machine; z is up at all set-ups."""

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
-from scipy.special import ndtr
-from scipy.stats import norm, qmc
+from scipy.special import ndtr, ndtri
 
 from calibration.effects.base import Coefficient, FittedCoefficient, Settings, Situation
 from calibration.effects.load_shapes import TorqueFamily, gravity_shapes
 from calibration.errors import ModelError
+from calibration.halton import halton
 from calibration.observations import Floats
 
 _SIGMA_RAD = 1e-3
@@ -63,7 +63,7 @@ class GravityFlipPlay(TorqueFamily):
         if len(variants) < 2:
             return ()
         shapes = min(len(gravity_shapes(situation, where, constant=True)), _MOST_SHAPES)
-        cloud = norm.ppf(qmc.Halton(shapes, scramble=False).random(_CLOUD + 1)[1:])
+        cloud = ndtri(halton(shapes, _CLOUD + 1)[1:])
         common = {**variants[1], _SPREAD: _FINER}
         return (settings, *({**common, **{_shape(k): p for k, p in enumerate(at)}} for at in cloud.tolist()))
 

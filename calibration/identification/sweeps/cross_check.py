@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from calibration.identification.samples import reading_variance
 from calibration.identification.sweeps.circle_fit import CENTRE, DIRECTION, FEATURES, RADIUS, TRAVEL
@@ -166,7 +166,7 @@ def _chance(pick: Floats, difference: Floats, covariance: Floats, freedom: int) 
     own = pick @ covariance @ pick.T
     scale = 1.0 / np.sqrt(np.diag(own))
     square = float(part * scale @ np.linalg.solve(own * scale[:, None] * scale, part * scale))
-    return float(f_distribution.sf(square / len(part), len(part), max(freedom, 1)))
+    return float(fdtrc(len(part), max(freedom, 1), square / len(part)))
 
 
 def _with_sentence(check: AxisCheck, chance: float, *, turns: bool) -> AxisCheck:
