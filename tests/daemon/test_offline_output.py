@@ -141,10 +141,12 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["directory", "out.csv"]
 
 
-def test_commands_start_without_numba_matplotlib_and_lightgbm() -> None:
+def test_commands_and_calibrations_start_without_what_they_may_not_need() -> None:
     code = (
-        "import sys, daemon.cli.offline;"
-        "print([m for m in ('numba', 'matplotlib', 'lightgbm', 'scipy') if m in sys.modules])"
+        "import sys, daemon.cli.offline\n"
+        "print([m for m in ('numba', 'matplotlib', 'lightgbm', 'scipy') if m in sys.modules])\n"
+        "import calibration.pipeline\n"
+        "print([m for m in ('matplotlib', 'lightgbm', 'scipy.stats') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert done.stdout.splitlines() == ["[]", "[]"]
