@@ -46,10 +46,10 @@ def torso(tmp_path: Path) -> list[object]:
     """A rig file without masses: sweeps and other poses at one set-up, held-out poses at the same."""
     rig = parse_rig(TORSO.read_text(encoding="utf-8"), TORSO.name)
     truth = RigTruth(rig, 3)
-    single = simulate_observations(truth, 6 * len(rig.joints), 3, poses=sweeps(rig, 6), setup="east")
-    multi = simulate_observations(truth, 30, 4, setup="east")
+    single = simulate_observations(truth, 4 * len(rig.joints), 3, poses=sweeps(rig, 4), setup="east")
+    multi = simulate_observations(truth, 18, 4, setup="east")
     (tmp_path / "train.csv").write_text(table({"single": single, "multi": multi}), encoding="utf-8")
-    held_out = simulate_observations(truth, 40, 5, setup="east")
+    held_out = simulate_observations(truth, 20, 5, setup="east")
     (tmp_path / "test.csv").write_text(held_out.csv_text(), encoding="utf-8")
     data, test = tmp_path / "train.csv", tmp_path / "test.csv"
     return ["--rig", TORSO, "--data", data, "--holdout", test, "--out", tmp_path / "new" / "pages"]
@@ -90,7 +90,7 @@ def test_a_person_gets_a_table_reasons_shared_rows_and_the_page_s_path(torso: li
     assert "*" in best
     assert sum("not applicable" in line for line in lines if "masses" not in line) == 2
     assert sum("masses" in line for line in lines) == 2
-    assert "1 of the 121 rows of test.csv are rows of train.csv as well (the first is row 121)" in result.stdout
+    assert "1 of the 61 rows of test.csv are rows of train.csv as well (the first is row 61)" in result.stdout
     assert "comparison-torso.html" in lines[-1]
 
 

@@ -43,12 +43,12 @@ def record(daemon: DaemonProcess, prism: str, kind: str, poses: int) -> dict[str
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DaemonProcess]:
-    """A daemon that has recorded sessions on three prisms and a check, and whose jobs have ended."""
+    """A daemon that has recorded sessions on two prisms and a check, and whose jobs have ended."""
     daemon = DaemonProcess(tmp_path_factory.mktemp("rig"), *SIM, bus=SENDS_THE_TIP)
     try:
         daemon.wait("a fix", daemon.has_fix)
         daemon.say("setup.new", id="S1", instrument="simulated GTS-800A", tilt_arcsec=2.0)
-        for prism in ("r", "s", "b"):
+        for prism in ("r", "s"):
             record(daemon, prism, "static_poses", 12)
         record(daemon, "r", "check", 3)
         daemon.wait("the jobs", lambda: _ended(daemon.say("jobs.list")))
