@@ -71,7 +71,7 @@ class LiveModel:
         self._thread.start()
 
     def stop(self) -> None:
-        """Load no more. A first load under way in another process is not waited for."""
+        """Load no more. A load under way is not waited for beyond `STOP_TIMEOUT_S`."""
         self._stopping = True
         self._changed.set()
         if self._thread.is_alive():
@@ -88,7 +88,7 @@ class LiveModel:
             self._changed.set()
 
     def load(self, row: ModelRow) -> CalibratedModel:
-        """Read a model of the store; its first load is another process's.
+        """Read a model of the store, which another process has loaded when it was written.
 
         Raises:
             CalibrationError: it is damaged, edited, or made for another rig file.

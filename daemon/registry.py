@@ -2,7 +2,7 @@
 
 A candidate goes live only when it beats the live model on held-out sessions beyond chance and an operator accepts it;
 a first model must not be worse there than the nominal one. Any model that was live can be put back. Before either, the
-model's files are checked against their manifest, and loaded once by another process.
+model's files are checked against their manifest, and its sum against the store, and it is loaded.
 """
 
 from __future__ import annotations

@@ -129,6 +129,16 @@ def test_a_model_is_loaded_by_a_child_once_per_process(written: Path, monkeypatc
     read_model(written)
 
 
+def test_a_model_is_loaded_by_no_other_child_where_its_sum_was_kept(
+    written: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(modelfiles, "_checked", set())
+    monkeypatch.setattr("sys.executable", "/nowhere")
+    read_model(written, model_sha256(written))
+    with pytest.raises(FileNotFoundError):
+        read_model(written)
+
+
 @pytest.mark.parametrize(
     "manifest",
     [
