@@ -210,7 +210,7 @@ def test_rows_and_poses_that_training_and_held_out_data_share_are_named() -> Non
 def boom() -> tuple[Observations, Observations, Protocol]:
     rig = shipped_rig("swdt82")
     springs = "joint_compliance@theta4:compliance_rad_per_Nm=5e-8"
-    texts = data_sets(1002, poses=30, stops=5, perturbation=1.0, effects=springs)
+    texts = data_sets(1002, poses=20, stops=5, perturbation=1.0, effects=springs)
     training, held_out = (parsed(text, rig) for text in texts)
     with ThreadPoolExecutor(2) as executor:
         found = run_protocol(
@@ -226,7 +226,7 @@ def test_sweeps_are_told_from_motion_of_several_joints(boom: tuple[Observations,
     assert not single_joint_rows(shipped_rig("swdt82"), held_out).any()
     assert [b.motion for b in found.before] == ["single-joint", "multi-joint"]
     assert found.before[0].fixes == dict.fromkeys("wbrs", 45)
-    assert found.before[1].fixes == dict.fromkeys("wbrs", 30)
+    assert found.before[1].fixes == dict.fromkeys("wbrs", 20)
 
 
 def test_table_3_has_every_data_set_and_the_optimum_is_never_above_the_search(
@@ -251,7 +251,7 @@ def test_the_hybrid_learns_from_more_data_and_follows_the_path(
     boom: tuple[Observations, Observations, Protocol],
 ) -> None:
     _, held_out, found = boom
-    assert [p.poses for p in found.learning] == [37, 75]
+    assert [p.poses for p in found.learning] == [32, 65]
     assert found.learning[-1].hybrid_mm[0] < found.learning[0].hybrid_mm[0]
     path = found.trajectory
     assert (path.prism, len(path.rows), path.in_time) == ("r", PATH_POINTS, True)

@@ -185,7 +185,7 @@ def test_every_effect_of_the_library_can_be_planned_for(rig: Rig) -> None:
 def test_a_plan_varies_what_changes_one_effect_and_not_the_other(short: Measured) -> None:
     rivals = [of_plausible_size(short, f"{name}@theta4") for name in ("load_hysteresis", "backlash")]
     loaded = replace(short.observations, extra={"payload_kg": np.full(len(short.observations), 300.0)})
-    proposed, *_ = experiments(short.model, loaded, rivals, np.random.default_rng(0))
+    proposed, *_ = experiments(short.model, loaded, rivals, np.random.default_rng(0), poses=8)
     # As heavy as the machine has carried: the rig file does not say what its rods weigh.
     assert {row["payload_kg"] for row in proposed.poses} == {0.0, 300.0}
     assert {row["theta4_dir"] for row in proposed.poses} == {-1, 1}
@@ -203,7 +203,7 @@ def test_a_plan_waits_only_where_time_tells(short: Measured) -> None:
             settings = library()[name].variants(situation, where)[0]
             sigma = np.array([c.sigma for c in library()[name].coefficients(situation, where, settings)])
             rivals.append(Choice(name, where, settings).fitted(situation, sigma, 0.1 * sigma))
-        proposed, *_ = experiments(short.model, timed, rivals, np.random.default_rng(0))
+        proposed, *_ = experiments(short.model, timed, rivals, np.random.default_rng(0), poses=8)
         taken = np.array([float(str(row["time_s"])) for row in proposed.poses])
         hours[pair[0]] = float(np.ptp(taken)) / 3600.0
     assert hours["transducer_index_jump@L3"] < 1.0  # a minute a pose

@@ -46,7 +46,7 @@ def torso(tmp_path: Path) -> list[object]:
     """A rig file without masses: sweeps and other poses at one set-up, held-out poses at the same."""
     rig = parse_rig(TORSO.read_text(encoding="utf-8"), TORSO.name)
     truth = RigTruth(rig, 3)
-    single = simulate_observations(truth, 4 * len(rig.joints), 3, poses=sweeps(rig, 4), setup="east")
+    single = simulate_observations(truth, 5 * len(rig.joints), 3, poses=sweeps(rig, 5), setup="east")
     multi = simulate_observations(truth, 18, 4, setup="east")
     (tmp_path / "train.csv").write_text(table({"single": single, "multi": multi}), encoding="utf-8")
     held_out = simulate_observations(truth, 20, 5, setup="east")
@@ -100,6 +100,7 @@ def test_the_protocol_prints_its_tables_and_draws_its_plots(torso: list[object],
     for title in ("Before calibration", "Table 3", "Chosen weights", "Learning curve", "Trajectory", "Please note"):
         assert title in result.stdout
     assert "the paper's DE (stopped)" in result.stdout
+    assert "no single-joint sweep" not in result.stdout
     assert "stopped at the time limit" in result.stdout
     page = tmp_path / "new" / "pages" / "comparison-torso.html"
     assert result.stdout.splitlines()[-1].endswith(str(page))
