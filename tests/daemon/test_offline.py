@@ -313,7 +313,8 @@ def test_a_refusal_leaves_no_checkpoint_behind(work: Path, tmp_path: Path) -> No
     assert not checkpoint.exists()
 
 
-def test_a_cluster_that_is_not_there_is_named(work: Path, here: Path) -> None:
+def test_a_cluster_that_is_not_there_is_named(work: Path, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("daemon.cli.offline.CONNECT_TIMEOUT_S", 0.2)
     result = run(
         "calibrate", "--rig", "ur10", "--data", work / "train.csv", "--out", "m", "--dask", "tcp://127.0.0.1:1"
     )
