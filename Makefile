@@ -11,6 +11,9 @@ KERNELS := .cache/numba/$(firstword $(shell cat $(COMPILED) | cksum))
 export NUMBA_CACHE_DIR := $(CURDIR)/$(KERNELS)
 export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 
+# The tests start a hundred processes: each would compile every module anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: help environment setup demo test lint blind bench lock clean
 
 help: ## what there is to make
