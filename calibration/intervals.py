@@ -32,9 +32,13 @@ def with_intervals(
     error = observations.position_mm - prediction.position_mm
     if learned is not None and left_mm is not None:
         error[learned] = left_mm
-    lin, jacobian = model.linearise(observations)
-    samples = averaged(model.chain, model.corrected(observations))
-    mean = samples.average(error)
+    outlier = np.zeros(len(observations), dtype=bool)
+    outlier[[o.row for o in model.find_outliers(observations)]] = True
+    # The fit has not followed outliers: they are no nearer for it, nor is anything farther without them.
+    followed = observations.select(~outlier)
+    lin, jacobian = model.linearise(followed)
+    samples = averaged(model.chain, model.corrected(followed))
+    mean = samples.average(error[~outlier])
     apart = left_out_errors(
         model.rig,
         samples,
@@ -44,8 +48,5 @@ def with_intervals(
         model.covariance,
         model.excess_sigma_mm**2,
     )
-    outlier = np.zeros(len(observations), dtype=bool)
-    outlier[[o.row for o in model.find_outliers(observations)]] = True
-    # The fit has not followed outliers.
-    error += np.where(outlier[:, None], 0.0, (apart - mean)[samples.of_row])
+    error[~outlier] += (apart - mean)[samples.of_row]
     return replace(model, intervals=conformal_intervals(error, prediction.sigma_mm, len(samples)))

@@ -12,10 +12,11 @@ from calibration.identification.refinement import refine
 from calibration.identification.solve import place
 from calibration.intervals import with_intervals
 from calibration.model import CalibratedModel
-from calibration.observations import Floats
+from calibration.observations import Floats, parse_observations
 from calibration.pipeline import evaluate, identify
 from calibration.residual.conformal import Intervals, conformal_intervals
 from calibration.rig import shipped_rig
+from simulators.dataset import simulate_observations
 from simulators.truth import RigTruth
 from tests.calibration.conftest import Session, rig_text, simulated
 
@@ -120,6 +121,16 @@ def test_outliers_are_covered_like_other_fixes() -> None:
     covered = model.intervals.coverage(evaluation.errors_mm["hybrid"], evaluation.sigma_mm)
     assert covered.radius == pytest.approx(0.9, abs=0.04)
     assert model.intervals.radius > 3.0  # an eighth of all fixes is anywhere
+
+
+def test_an_outlier_makes_no_wider_what_stands_beside_it(session: Session) -> None:
+    """A quarter of the standstills have one prism of four far off: 6 % of the fixes, fewer than intervals leave out."""
+    data = simulate_observations(session.truth, 80, 14, prisms_per_pose="all", noise_mm=3.0)
+    rows = parse_observations(data.csv_text().encode(), session.rig, "simulated.csv")
+    position = rows.position_mm.copy()
+    position[::16] += np.random.default_rng(0).normal(0.0, 10_000.0, position[::16].shape)
+    wide = with_intervals(session.model, replace(rows, position_mm=position)).intervals
+    assert wide.radius == pytest.approx(with_intervals(session.model, rows).intervals.radius, rel=0.4)
 
 
 def test_intervals_travel_with_the_model(session: Session) -> None:
