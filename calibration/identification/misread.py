@@ -35,7 +35,7 @@ _CARRIED = 6
 _APPROACHED = 10  # of the best roughly placed suppositions of a round
 _MUCH = 0.5  # of the misfit before; a further supposition that gains less says nothing
 _EXPLAINS = 0.25  # of the misfit as given, or less: an explanation
-_SETTLES = 0.1  # likewise: nothing further need be supposed
+_SETTLES = 0.1  # likewise, and no more than needs no explanation: nothing further need be supposed
 _ALIKE = 1.5  # times the least misfit: as good an explanation
 
 
@@ -150,7 +150,7 @@ def explain(
             best = [t for t in as_good if t.quality.pull < _ALIKE * least.pull]
         elif best and _explains(least, before, tolerated_mm):
             break
-        if best and least.misfit_mm < _SETTLES * before.misfit_mm:
+        if best and least.misfit_mm < min(_SETTLES * before.misfit_mm, tolerated_mm):
             break
         carried = list(dict.fromkeys(t.suppositions for t in (*near[: _CARRIED // 2], *rough)))[:_CARRIED]
     if not best or not _explains(least, before, tolerated_mm):

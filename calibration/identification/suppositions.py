@@ -78,6 +78,7 @@ def conceivable_mistakes(chain: Chain, samples: Samples) -> Iterator[Supposition
     )
     units = list(_units(rig, readings, nothing))
     yield from _signs_and_turns(rig, nothing)
+    yield from _ratios(rig, nothing)
     yield from units
     yield from _exchanges(rig, sorted(set(samples.data.prism.tolist())), nothing)
     yield replace(
@@ -137,6 +138,20 @@ def _signs_and_turns(rig: Rig, nothing: Supposition) -> Iterator[Supposition]:
                 f"as-built, which finds turned joints by itself",
                 subjects=frozenset({joint.column}),
                 turn_deg=_at(nothing.turn_deg, i, turn_deg),
+            )
+
+
+def _ratios(rig: Rig, nothing: Supposition) -> Iterator[Supposition]:
+    """A unit that the rig file converts though the column is converted already, or a gear that is not there."""
+    for i, joint in enumerate(rig.joints):
+        ratio = max(abs(coefficient) for _, _, name, coefficient in rig.couplings() if name == joint.name)
+        if ratio != 1.0:
+            yield replace(
+                nothing,
+                what=f"{joint.name} drives {ratio:.3g} to 1 in the rig file and 1 to 1 in the data",
+                remedy=f"divide the coefficients of {joint.name} in the rig file by {ratio:.3g}",
+                subjects=frozenset({joint.column}),
+                factor=_at(nothing.factor, i, 1.0 / ratio),
             )
 
 

@@ -15,7 +15,7 @@ from click.testing import CliRunner
 from calibration.errors import UnsafeError
 from calibration.observations import Observations, format_observations
 from calibration.pipeline import evaluate, identify
-from calibration.rig import shipped_rig
+from calibration.rig import parse_rig, shipped_rig
 from daemon.cli.main import main as rigcal
 from tests.calibration.conftest import Session, rig_text, rms
 
@@ -67,6 +67,8 @@ def refused(training: Observations, name: str, change: Change, prior: str = "rec
         (exchanged("theta6", "theta7"), ["columns theta6_deg and theta7_deg are exchanged"]),
         (relabelled, ["prisms 'r' and 's' are exchanged", "column prism"]),
         (lambda o: replace(o, position_mm=o.position_mm[:, [0, 2, 1]]), ["mirrored", "right-handed"]),
+        # The first alone explains most of the misfit.
+        (scaled(theta4=-1.0, theta8=-1.0), ["theta4 runs the other way and theta8 runs the other way"]),
         (scaled(theta3=-1.0, theta4=np.pi / 180.0), ["theta3 runs the other way", "theta4_deg is in rad"]),
     ],
 )
@@ -98,6 +100,12 @@ def test_a_sign_that_parameters_could_stand_for_is_named_all_the_same(session: S
 )
 def test_mistakes_in_measured_data_are_named(ur10_random_poses: Observations, change: Change, words: str) -> None:
     assert words in refused(ur10_random_poses.select(np.arange(0, 2700, 10)), "ur10", change)
+
+
+def test_a_unit_that_the_rig_file_converts_once_too_often_is_named(session: Session) -> None:
+    text = rig_text("swdt82").replace("{ theta = { theta5 = -1.0 }", "{ theta = { theta5 = -0.0174533 }")
+    with pytest.raises(UnsafeError, match=r"theta5 drives 0.0175 to 1 in the rig file and 1 to 1 in the data"):
+        identify(parse_rig(text, "swdt82.toml"), text, session.training)
 
 
 def test_a_turned_joint_is_made_good_as_built_and_named(session: Session) -> None:
