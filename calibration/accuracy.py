@@ -1,9 +1,11 @@
 """How true a model is expected to be over the work volume: its own error, apart from the noise of a fix.
 
-Two things make a model's position err. Its parameters have a covariance. And it lacks something: joints that yield,
+Three things make a model's position err. Its parameters have a covariance. It lacks something: joints that yield,
 encoders that are eccentric, slack. Whatever enters through the joints grows with the lever arm of each prism, which
 noise of the fixes does not; so the training data themselves say how much of their scatter is the model's and how much
-the instrument's (`joint_error_scale`). What scatters evenly at all prisms counts as noise of the fixes.
+the instrument's (`joint_error_scale`). What scatters evenly at all prisms counts as noise of the fixes. And where the
+model has effects that depend on more than the pose, such as slack on the side from which a joint came, a pose by itself
+leaves them open.
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ _LINEARITY = 1e-3  # of a transducer's stroke
 _FLOOR = 0.1  # of the known variance: what a fitted row keeps at least
 _PARTS = 3  # of a joint's range, to say where the model is worst
 _NOTABLE = 1.15  # RMS there over the RMS of all
+_MOST = 0.5  # of the RMS over all
 _DRAWS, _SEED = 64, 0  # of errors in every pose
 
 
@@ -60,8 +63,9 @@ class ExpectedAccuracy:
         setup: the set-up in whose station's frame the positions are.
         readings: (v, joints) poses, deg or mm.
         parameters_mm2: (v, prisms, 3, 3) covariance of the error that the parameters' covariance makes.
-        lacking_mm2: (v, prisms, 3, 3) covariance of it that what the model lacks makes, and effects that are left out
-            in poses that give no direction of approach or torque.
+        lacking_mm2: (v, prisms, 3, 3) covariance of it that what the model lacks makes.
+        open_mm2: (v, prisms, 3, 3) covariance of it by effects that need more than a pose: a direction of approach, a
+            temperature, a load.
     """
 
     rig: Rig
@@ -69,11 +73,16 @@ class ExpectedAccuracy:
     readings: Floats
     parameters_mm2: Floats
     lacking_mm2: Floats
+    open_mm2: Floats
+
+    @cached_property
+    def _covariance_mm2(self) -> Floats:
+        return self.parameters_mm2 + self.lacking_mm2 + self.open_mm2
 
     @cached_property
     def rms_3d_mm(self) -> Floats:
         """(v, prisms) RMS 3-D error expected in each pose."""
-        return np.asarray(np.sqrt(_traces(self.parameters_mm2 + self.lacking_mm2)), dtype=np.float64)
+        return np.asarray(np.sqrt(_traces(self._covariance_mm2)), dtype=np.float64)
 
     @property
     def rms_mm(self) -> float:
@@ -90,10 +99,15 @@ class ExpectedAccuracy:
         """What the model lacks has in it, RMS 3-D over all poses and prisms."""
         return math.sqrt(float(_traces(self.lacking_mm2).mean()))
 
+    @property
+    def open_mm(self) -> float:
+        """What poses by themselves leave open has in it, RMS 3-D over all poses and prisms."""
+        return math.sqrt(float(_traces(self.open_mm2).mean()))
+
     @cached_property
     def _norms_mm(self) -> Floats:
         """(draws, v, prisms) norms of errors drawn in every pose, always the same draws."""
-        variance = np.maximum(np.linalg.eigvalsh(self.parameters_mm2 + self.lacking_mm2), 0.0)
+        variance = np.maximum(np.linalg.eigvalsh(self._covariance_mm2), 0.0)
         drawn = np.random.default_rng(_SEED).standard_normal((_DRAWS, *variance.shape))
         return np.asarray(np.sqrt((variance * drawn**2).sum(axis=-1)), dtype=np.float64)
 
@@ -116,7 +130,7 @@ class ExpectedAccuracy:
 
     @property
     def where(self) -> str:
-        """In words: the worst prism, and which part of a joint's range is worst, where that is much."""
+        """In words: the worst prism; the worst part of a joint's range and what poses leave open, where it is much."""
         worst, text = _NOTABLE * self.rms_mm, ""
         for index, joint in enumerate(self.rig.joints):
             edges = np.linspace(*joint.limits, _PARTS + 1)
@@ -126,15 +140,19 @@ class ExpectedAccuracy:
                     worst = _rms(self.rms_3d_mm[inside])
                     text = f" and where {joint.name} is {low:.0f} .. {high:.0f} {joint.unit} ({worst:.2g} mm)"
         prism, spread = max(self.per_prism.items(), key=lambda item: item[1].rms_mm)
+        if self.open_mm > _MOST * self.rms_mm:
+            closed_mm = math.hypot(self.parameters_mm, self.lacking_mm)
+            text += f"; {closed_mm:.2g} mm where the data have all columns that its effects need"
         return f"largest at prism {prism} ({spread.rms_mm:.2g} mm RMS){text}"
 
     def as_dict(self) -> dict[str, object]:
-        """For JSON: the set-up, the spread over poses and prisms and of each prism, both parts, and the worst pose."""
+        """For JSON: the set-up, the spread over poses and prisms and of each prism, its parts, and the worst pose."""
         pose, prism = self.worst
         return {
             **asdict(self.spread),
             "parameters_mm": self.parameters_mm,
             "lacking_mm": self.lacking_mm,
+            "open_mm": self.open_mm,
             "per_prism": {name: asdict(spread) for name, spread in self.per_prism.items()},
             "worst": {
                 "prism": self.rig.prism_names[prism],
@@ -168,7 +186,7 @@ def predicted_accuracy(
     """
     rig = knowledge.chain.rig
     lin, jacobian = knowledge.linearise(readings)
-    lacking = lacking_share * (joint_error_sizes(rig) * joint_error_scale) ** 2 + knowledge.unknown_variance(readings)
+    lacking = lacking_share * (joint_error_sizes(rig) * joint_error_scale) ** 2
     rows = jacobian @ root
     shape = len(readings), len(rig.prisms), 3, 3
     even = knowledge.unknown_mm2(readings)[:, None, None] * np.eye(3)
@@ -177,7 +195,8 @@ def predicted_accuracy(
         knowledge.chain.setups[knowledge.setup],
         readings,
         parameters_share * (rows @ rows.transpose(0, 2, 1)).reshape(shape),
-        (covariance_by_joints(lin.joint_jacobian, lacking) + even).reshape(shape),
+        covariance_by_joints(lin.joint_jacobian, lacking).reshape(shape),
+        (covariance_by_joints(lin.joint_jacobian, knowledge.unknown_variance(readings)) + even).reshape(shape),
     )
 
 

@@ -63,7 +63,7 @@ def test_on_measured_data_the_expected_error_is_the_held_out_one(ur10_random_pos
 def test_statistics_are_those_of_the_errors(session: Session) -> None:
     found = expected_accuracy(session.model, np.random.default_rng(1), poses=200)
     answer = found.as_dict()
-    covariance = (found.parameters_mm2 + found.lacking_mm2).reshape(-1, 3, 3)
+    covariance = (found.parameters_mm2 + found.lacking_mm2 + found.open_mm2).reshape(-1, 3, 3)
     drawn = np.random.default_rng(9).standard_normal((200, len(covariance), 3, 1))
     error_mm = np.linalg.norm((np.linalg.cholesky(covariance) @ drawn)[..., 0], axis=-1)
     assert np.mean(error_mm < answer["p95_mm"]) == pytest.approx(0.95, abs=0.003)
@@ -76,7 +76,8 @@ def test_statistics_are_those_of_the_errors(session: Session) -> None:
     squares = [s["rms_mm"] ** 2 for s in answer["per_prism"].values()]
     assert answer["rms_mm"] == pytest.approx(np.sqrt(np.mean(squares)))
     assert answer["median_mm"] < answer["mean_mm"] < answer["rms_mm"] < answer["p95_mm"] < answer["p99_mm"]
-    assert answer["rms_mm"] == pytest.approx(np.hypot(answer["parameters_mm"], answer["lacking_mm"]))
+    parts = [answer["parameters_mm"], answer["lacking_mm"], answer["open_mm"]]
+    assert answer["rms_mm"] == pytest.approx(np.linalg.norm(parts))
 
 
 def test_the_worst_part_of_a_range_is_named(session: Session) -> None:
@@ -87,7 +88,7 @@ def test_the_worst_part_of_a_range_is_named(session: Session) -> None:
     variance[readings[:, 7] > 1446.0] = 9.0
     variance[:, 2] *= 4.0
     covariance = variance[:, :, None, None] * np.eye(3)
-    found = ExpectedAccuracy(session.rig, "", readings, covariance, np.zeros_like(covariance))
+    found = ExpectedAccuracy(session.rig, "", readings, covariance, *np.zeros((2, *covariance.shape)))
     assert "prism r" in found.where
     assert "where L2 is 1445 .. 2168 mm" in found.where
 
