@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from calibration.effects.library import library
 from calibration.gap.adopt import Adopted, adopt
+from calibration.gap.remaining import remaining
 from calibration.gap.search import search
 from calibration.identification.refinement import Prior
 from calibration.identification.search.checkpoint import Checkpoint
@@ -95,5 +98,7 @@ def identify_by(method: str, rig: Rig, observations: Observations, options: Opti
     )
     options.progress(0.8, "asking for effects")
     if options.effects == "auto":
-        return search(solution, observations, library(), prior=options.prior, seed=options.seed).adopted
+        found = search(solution, observations, library(), prior=options.prior, seed=options.seed)
+        rest = remaining(found, np.random.default_rng([options.seed, 1]))
+        return replace(found.adopted, warnings=(*found.adopted.warnings, *rest.doubts()))
     return adopt(solution, observations, options.effects, prior=options.prior)

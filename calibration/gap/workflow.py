@@ -14,14 +14,12 @@ from calibration.effects.library import library
 from calibration.errors import UnsafeError
 from calibration.evaluation import require_positions
 from calibration.gap.adopt import JointFit
-from calibration.gap.decide import beyond
 from calibration.gap.detect import detect
 from calibration.gap.discriminate import experiments
 from calibration.gap.forecast import forecasts
-from calibration.gap.grammar import Found as Formula
-from calibration.gap.grammar import Grammar, describe
+from calibration.gap.grammar import Grammar
+from calibration.gap.remaining import remaining
 from calibration.gap.result import Candidate, Gap, Round, Verdict
-from calibration.gap.rivals import explains, stands_for
 from calibration.gap.screen import Screen, Weighed
 from calibration.gap.search import Found, Turn, search
 from calibration.identification.refinement import Prior
@@ -40,7 +38,6 @@ Progress = Callable[[float, str], None]
 _FOLDS = 10
 _LISTED = 12  # candidates of a round
 _EXCESS_SEEN = 0.2  # of the known noise's standard deviation; less is none
-_ANY_SIZE = 1e3  # of the plausible sizes of an effect
 _FAR_NOISIER = 2.0  # times what is known of the noise
 
 
@@ -120,26 +117,20 @@ def _answer(
     seed: int,
 ) -> Gap:
     rng = np.random.default_rng([seed, 1])
-    left = found.left
-    after = detect(left, rng)
-    before = detect(Grammar(found.first), rng) if found.joint.choices else after
-    formulas = found.formulas or (left.found() if after.significant and not found.rivals else ())
-    description = describe(formulas, _of_library(found, formulas[0])) if formulas else None
+    rest = remaining(found, rng)
+    before = detect(Grammar(found.first), rng) if found.joint.choices else rest.detection
     effects = found.adopted.effects
     verdict: Verdict = "none"
     if found.rivals:
         verdict = "indistinguishable"
     elif effects:
         verdict = "named"
-    elif after.significant or found.formulas:
+    elif rest.significant:
         verdict = "unidentified"
-        on = [f"{d.variable} ({d.where})" for d in after.disagreements[:1]] or ["something"]
-        description = description or f"the errors depend on {on[0]} in a way that no formula of the grammar says"
     error_before = observations.position_mm - model.geometric_mm(observations)
     error_after = observations.position_mm - model.effects_mm(observations)
-    is_left = bool(after.significant or found.rivals or found.formulas)
     is_counted = found.joint.fit.weight[solution.samples.of_row] > 0.5  # gross outliers are no structure
-    noise_mm, source, too_noisy = _noise(solution.samples, found, observations, scatter_is_noise=not is_left)
+    noise_mm, source, too_noisy = _noise(solution.samples, found, observations, scatter_is_noise=not rest.significant)
     held_out = None
     if holdout is not None:
         measured = holdout.position_mm
@@ -153,8 +144,8 @@ def _answer(
         effects=effects,
         posterior=found.certain,
         indistinguishable=candidates,
-        description=description,
-        remaining_significant=is_left,
+        description=rest.description,
+        remaining_significant=rest.significant,
         remaining_mm=float(np.sqrt(max(rms(error_after[is_counted]) ** 2 - noise_mm**2, 0.0))),
         disabled=found.possible.disabled,
         before_mm=rms(error_before),
@@ -172,20 +163,6 @@ def _answer(
         error_after_mm=error_after,
         warnings=(*_warnings(found, model, holdout), *([too_noisy] if too_noisy else [])),
     )
-
-
-def _of_library(found: Found, formula: Formula) -> str:
-    """Whether an effect that was not named does what a formula says, a clause."""
-    turn, projection = found.turns[-1], found.left.projection
-    for weighed in () if found.formulas else turn.weighed[:_LISTED]:
-        if weighed.log_bayes_factor > 0.0 and explains(weighed, formula, projection):
-            reason = turn.reasons.get(str(weighed.place), "it does not stand out enough to be named")
-            return f"{weighed.place} would do this, but {reason}"
-    for weighed in Screen(projection, found.possible.places).weigh()[:_LISTED]:
-        names = beyond(projection.situation, weighed)
-        if names and stands_for(replace(weighed, scale=_ANY_SIZE), formula, projection):
-            return f"{weighed.place} would do this, but {', '.join(names)} would be beyond what is physical"
-    return "not in the library"
 
 
 def rms(error_mm: Floats) -> float:
