@@ -14,10 +14,12 @@ import numpy as np
 from calibration.gap.adopt import JointFit
 from calibration.gap.detect import detect
 from calibration.gap.grammar import Grammar
+from calibration.gap.problem import OUTLIER
 from calibration.gap.projection import Projection
 from calibration.gap.terms import modulations
 from calibration.gap.variables import Place, Variables
 from calibration.identification.samples import reading_covariance
+from calibration.observations import Floats
 
 _CLOSED = 0.8  # of the gap, at least
 _LEFT = 0.05  # of what an effect explains together with what is left of it, at most
@@ -26,19 +28,25 @@ _MISJUDGED = 0.1  # share by which a sigma may be off
 _FAR_MISJUDGED = 0.5  # the same where nothing says that it is anything but noise
 
 
-def closes(first: Projection, last: Projection, *, is_structured: bool) -> bool:
+def closes(first: Projection, last: Projection, weight: Floats, *, is_structured: bool) -> bool:
     """Whether what was adopted between two projections closes the gap, or the gap is too small to tell.
+
+    Fixes that the kinematics alone do not weigh out are part of the gap: where it is closed for most of them and the
+    others become outliers, it is not closed.
 
     Args:
         first: of the kinematics alone.
         last: with all that was adopted.
+        weight: (m,) of the samples in the fit of the kinematics alone.
         is_structured: whether what is left depends on anything; if it does not, it may be noise that is far larger
             than it is said to be.
     """
     noise = _noise_mm2(last)
     misjudged = _MISJUDGED if is_structured else _FAR_MISJUDGED
     allowed = noise * ((1.0 + misjudged) ** 2 - 1.0)
-    gap, left = first.fit.excess_variance - allowed, last.fit.excess_variance - allowed
+    given_up = (weight >= OUTLIER) & (last.fit.weight < OUTLIER)
+    outside = float((last.error_mm[given_up] ** 2).sum()) / (3.0 * len(weight))
+    gap, left = first.fit.excess_variance - allowed, last.fit.excess_variance - allowed + outside
     standard_error = (noise + allowed) * math.sqrt(2.0 / (3.0 * float(last.fit.weight.sum())))
     return gap < _HIGH * standard_error or left < (1.0 - _CLOSED) * gap + standard_error
 

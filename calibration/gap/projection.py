@@ -85,6 +85,7 @@ class Projection:
         groups: (m,) workspace cells, a standstill in that of its first sample; no fold separates them.
         joint_jacobian: (m, 3, joints) by reading, station's frame, mm per deg or mm.
         jacobian: (m, 3, p) by the chain's parameters, mm per mm or rad.
+        error_mm: (m, 3) what the fit leaves of the samples, outliers too, station's frame.
         rows: the whitened rows before the kinematics are taken out.
         residual: (3 m,) what is left; independent standard normal numbers if nothing is missing.
     """
@@ -109,6 +110,7 @@ class Projection:
         self._found, self._additions = found, additions
         self._whiten = found.whiten
         self.joint_jacobian, self.jacobian = found.joint_jacobian, found.parameter_jacobian
+        self.error_mm = found.error_mm
         self.groups = cells(self.samples)
         self.fit = fit
         self.rows = Rows(found.error + found.jacobian @ found.value, found.jacobian[:, :kept])
@@ -131,10 +133,10 @@ class Projection:
         if self._additions is not None:
             moved.append(self._additions.moved_mm(found.joint_jacobian))
         design = np.concatenate(moved, axis=2) / found.precision_root
-        errors = np.empty_like(found.error_mm)
+        errors = np.empty_like(self.error_mm)
         for number, x in without_folds(found.jacobian, self.rows.target, fold):
             rows = fold == number
-            errors[rows] = found.error_mm[rows] - design[rows] @ (x - found.value)
+            errors[rows] = self.error_mm[rows] - design[rows] @ (x - found.value)
         return errors
 
     def solved(self, more: Additions) -> Floats:

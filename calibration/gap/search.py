@@ -233,7 +233,7 @@ class _Search:
     def _closes(self, first: Projection, left: Grammar, *, is_structured: bool) -> bool:
         """Whether what is left is little beside the first gap; `is_structured`: it is known to depend on something."""
         structured = is_structured or detect(left, self.problem.rng()).significant
-        return closes(first, left.projection, is_structured=structured)
+        return closes(first, left.projection, self.problem.solution.fit.weight, is_structured=structured)
 
     def _renamed(self, joint: JointFit, names: Sequence[str]) -> tuple[JointFit, list[Turn]]:
         """The fit with what took one of the names when others were not known yet and has another one beside them."""
