@@ -14,6 +14,7 @@ import math
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 from scipy.optimize import minimize
@@ -255,7 +256,7 @@ def joint_error_sizes(rig: Rig) -> Floats:
     )
 
 
-def joint_error_scale(model: CalibratedModel, observations: Observations) -> float:
+def joint_error_scale(model: CalibratedModel, observations: Observations, *, structured: bool = False) -> float:
     """What the kinematics (and effects) lack: the size of an error of every joint, in `joint_error_sizes`.
 
     The errors of the training fixes have the covariance Sigma_known + s^2 I + k^2 J_q D J_q' - J C J': station and
@@ -263,10 +264,13 @@ def joint_error_scale(model: CalibratedModel, observations: Observations) -> flo
     Maximum likelihood in s and k, with k = 0 unless the data prefer another by 5 in log likelihood. For that the prisms
     of a standstill count together, as a joint's error is the same at each; but the size of k is that of the fixes each
     by itself, which holds also where what the model lacks moves the prisms of a standstill otherwise than joints do.
+    Where the lever arms are much the same everywhere, the data cannot prefer; what is known to have structure counts as
+    an error of the joints all the same.
 
     Args:
         model: fitted to these rows; outliers are left out.
         observations: the training rows.
+        structured: whether the errors are known to depend on something, and so are no noise.
 
     Returns:
         k >= 0; 0 where even noise explains the scatter.
@@ -275,11 +279,14 @@ def joint_error_scale(model: CalibratedModel, observations: Observations) -> flo
     if len(rows) == 0:
         return 0.0
     samples = averaged(model.chain, rows)
-    each = np.arange(len(samples))
-    scale, gain = _likeliest(_groups(model, rows, samples, each), model.excess_sigma_mm)
+    each = _groups(model, rows, samples, np.arange(len(samples)))
+    scale, gain = _likeliest(each, model.excess_sigma_mm)
     if samples.standstill is not None and gain > _SURE:
         _, gain = _likeliest(_groups(model, rows, samples, samples.standstill), model.excess_sigma_mm)
-    return scale if gain > _SURE else 0.0
+    if gain > _SURE:
+        return scale
+    by_joint = _mean_variance(each, "by_joint")
+    return model.excess_sigma_mm / math.sqrt(by_joint) if structured and by_joint > 0.0 else 0.0
 
 
 @dataclass(frozen=True)
@@ -346,9 +353,7 @@ def _groups(model: CalibratedModel, rows: Observations, samples: Samples, label:
 
 def _likeliest(groups: list[_Groups], excess_sigma_mm: float) -> tuple[float, float]:
     """The likeliest size of an error of every joint, and what it gains in log likelihood over none."""
-    coordinates = sum(g.error.size for g in groups)
-    known = sum(float(_traces(g.known).sum()) for g in groups) / coordinates
-    by_joint = sum(float(_traces(g.by_joint).sum()) for g in groups) / coordinates
+    known, by_joint = _mean_variance(groups, "known"), _mean_variance(groups, "by_joint")
     if by_joint == 0.0:
         return 0.0, 0.0
 
@@ -365,6 +370,11 @@ def _likeliest(groups: list[_Groups], excess_sigma_mm: float) -> tuple[float, fl
     _, without = best(even)
     at, with_joints = best(even, even - math.log(by_joint))
     return math.exp(0.5 * float(at[1])), without - with_joints
+
+
+def _mean_variance(groups: list[_Groups], part: Literal["known", "by_joint"]) -> float:
+    """Of a coordinate, mm^2."""
+    return sum(float(_traces(getattr(g, part)).sum()) for g in groups) / sum(g.error.size for g in groups)
 
 
 def _traces(covariance: Floats) -> Floats:

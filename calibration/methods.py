@@ -100,5 +100,5 @@ def identify_by(method: str, rig: Rig, observations: Observations, options: Opti
     if options.effects == "auto":
         found = search(solution, observations, library(), prior=options.prior, seed=options.seed)
         rest = remaining(found, np.random.default_rng([options.seed, 1]))
-        return replace(found.adopted, warnings=(*found.adopted.warnings, *rest.doubts()))
+        return replace(rest.adopted, warnings=(*rest.adopted.warnings, *rest.doubts()))
     return adopt(solution, observations, options.effects, prior=options.prior)

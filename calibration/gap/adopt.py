@@ -36,6 +36,7 @@ class Adopted:
         effects: what was taken in.
         reason: why these, or why none, a clause.
         warnings: sentences for people.
+        structured: whether what is left is known to depend on something.
     """
 
     solution: Solution
@@ -43,6 +44,7 @@ class Adopted:
     effects: tuple[FittedEffect, ...] = ()
     reason: str = "switched off"
     warnings: tuple[str, ...] = ()
+    structured: bool = False
 
 
 @dataclass(frozen=True)

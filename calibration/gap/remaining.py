@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calibration.gap.adopt import Adopted
 from calibration.gap.decide import beyond
 from calibration.gap.detect import Detection, detect
 from calibration.gap.grammar import Found as Formula
@@ -37,6 +38,11 @@ class Remaining:
     def significant(self) -> bool:
         """Whether there is anything that has no name."""
         return bool(self.detection.significant or self.found.rivals or self.found.formulas)
+
+    @property
+    def adopted(self) -> Adopted:
+        """What the search adopted, with what is known of the rest."""
+        return replace(self.found.adopted, structured=self.significant)
 
     def doubts(self) -> Iterator[str]:
         """What people should know of a model that goes without it, one sentence."""

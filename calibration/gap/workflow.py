@@ -18,7 +18,7 @@ from calibration.gap.detect import detect
 from calibration.gap.discriminate import experiments
 from calibration.gap.forecast import forecasts
 from calibration.gap.grammar import Grammar
-from calibration.gap.remaining import remaining
+from calibration.gap.remaining import Remaining, remaining
 from calibration.gap.result import Candidate, Gap, Round, Verdict
 from calibration.gap.screen import Screen, Weighed
 from calibration.gap.search import Found, Turn, search
@@ -90,10 +90,12 @@ def find_gap(
         )
         report(0.3, "looking for missing effects")
         found = search(solution, observations, library() if families is None else families, prior=prior, seed=seed)
-        report(0.8, "building the model")
-        model = model_of(rig, rig_text, observations, found.adopted, prior, {"seed": seed, "method": "gap"})
-        report(0.9, "weighing what is left")
-        return _answer(solution, found, model, observations, holdout, seed)
+        report(0.8, "weighing what is left")
+        rng = np.random.default_rng([seed, 1])
+        rest = remaining(found, rng)
+        report(0.9, "building the model")
+        model = model_of(rig, rig_text, observations, rest.adopted, prior, {"seed": seed, "method": "gap"})
+        return _answer(solution, rest, model, observations, holdout, seed, rng)
 
 
 def _require_setups(holdout: Observations, observations: Observations) -> None:
@@ -110,14 +112,14 @@ def _require_setups(holdout: Observations, observations: Observations) -> None:
 
 def _answer(
     solution: Solution,
-    found: Found,
+    rest: Remaining,
     model: CalibratedModel,
     observations: Observations,
     holdout: Observations | None,
     seed: int,
+    rng: np.random.Generator,
 ) -> Gap:
-    rng = np.random.default_rng([seed, 1])
-    rest = remaining(found, rng)
+    found = rest.found
     before = detect(Grammar(found.first), rng) if found.joint.choices else rest.detection
     effects = found.adopted.effects
     verdict: Verdict = "none"

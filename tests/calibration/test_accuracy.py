@@ -5,9 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.accuracy import ExpectedAccuracy, expected_accuracy, joint_error_scale, predicted_accuracy
+from calibration.accuracy import (
+    ExpectedAccuracy,
+    expected_accuracy,
+    joint_error_scale,
+    joint_error_sizes,
+    predicted_accuracy,
+)
 from calibration.design.knowledge import Knowledge
 from calibration.design.planning import plan_poses
+from calibration.identification.samples import covariance_by_joints
 from calibration.model import CalibratedModel
 from calibration.observations import Floats, Observations, parse_observations
 from calibration.pipeline import identify
@@ -119,6 +126,15 @@ def test_repeats_of_a_standstill_are_no_further_evidence_of_what_the_model_lacks
     thrice = training.select(np.repeat(np.arange(len(training)), 3))
     assert joint_error_scale(model, training) == 0.0
     assert joint_error_scale(model, thrice) == 0.0
+
+
+def test_scatter_with_structure_is_the_models_even_where_lever_arms_do_not_show_it(session: Session) -> None:
+    noisier = replace(session.model, excess_sigma_mm=4.0)
+    scale = joint_error_scale(noisier, session.training, structured=True)
+    assert joint_error_scale(noisier, session.training) == 0.0
+    lin, _ = noisier.linearise(session.training)
+    made = covariance_by_joints(lin.joint_jacobian, (scale * joint_error_sizes(session.rig)) ** 2)
+    assert np.trace(made, axis1=1, axis2=2).mean() == pytest.approx(3.0 * 4.0**2, rel=0.02)
 
 
 def test_prisms_of_a_standstill_are_no_further_evidence_of_what_the_model_lacks() -> None:
