@@ -17,6 +17,7 @@ _BADLY = 0.3  # of what build tolerances explain
 _FAR_RAD = math.radians(10.0)
 _BEYOND_LIMITS = 0.05  # of the span between a joint's limits
 _TOO_SMALL = 0.3  # of the expected scatter
+_FAR_NOISIER = 2.0  # times what instruments and repeats account for
 _FEW_FIXES = 6
 
 
@@ -45,6 +46,13 @@ def _of_fit(model: CalibratedModel, observations: Observations, solution: Soluti
             f"the kinematics fit badly: {unexplained_mm:.1f} mm RMS are left beyond what station and readings explain, "
             f"where build tolerances explain {solution.tolerated_mm:.0f} mm before the fit; check zeros and signs of "
             f"the joints, the rig file, and whether the station stood still{hint}"
+        )
+    known_mm = math.sqrt(max(model.effects_noise_mm**2 - 3.0 * model.excess_sigma_mm**2, 0.0))
+    if model.effects_noise_mm > _FAR_NOISIER * known_mm:
+        yield (
+            f"the fixes scatter by {model.effects_noise_mm:.2g} mm RMS about the model, where station and readings "
+            f"account for {known_mm:.2g} mm: see whether the columns are there that effects need, whether the prism "
+            f"sits tight, and whether readings and fixes are of the same instant"
         )
     left = observations.position_mm - model.effects_mm(observations)
     left_mm = math.sqrt(float((left**2).sum(axis=1).mean()))

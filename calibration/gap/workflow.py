@@ -38,7 +38,6 @@ Progress = Callable[[float, str], None]
 _FOLDS = 10
 _LISTED = 12  # candidates of a round
 _EXCESS_SEEN = 0.2  # of the known noise's standard deviation; less is none
-_FAR_NOISIER = 2.0  # times what is known of the noise
 
 
 def find_gap(
@@ -132,7 +131,7 @@ def _answer(
     error_before = observations.position_mm - model.geometric_mm(observations)
     error_after = observations.position_mm - model.effects_mm(observations)
     is_counted = found.joint.fit.weight[solution.samples.of_row] > 0.5  # gross outliers are no structure
-    noise_mm, source, too_noisy = _noise(solution.samples, found, observations, scatter_is_noise=not rest.significant)
+    noise_mm, source = _noise(solution.samples, found, observations, scatter_is_noise=not rest.significant)
     held_out = None
     if holdout is not None:
         measured = holdout.position_mm
@@ -163,7 +162,7 @@ def _answer(
         observations=observations,
         error_before_mm=error_before,
         error_after_mm=error_after,
-        warnings=(*_warnings(found, model, holdout), *([too_noisy] if too_noisy else [])),
+        warnings=tuple(_warnings(found, model, holdout)),
     )
 
 
@@ -223,10 +222,8 @@ def _candidate(turn: Turn, weighed: Weighed) -> Candidate:
     )
 
 
-def _noise(
-    samples: Samples, found: Found, observations: Observations, *, scatter_is_noise: bool
-) -> tuple[float, str, str]:
-    """RMS 3-D noise of one fix, where it is known from, a clause, and a warning where it is far too large.
+def _noise(samples: Samples, found: Found, observations: Observations, *, scatter_is_noise: bool) -> tuple[float, str]:
+    """RMS 3-D noise of one fix, and where it is known from, a clause.
 
     What the data scatter beyond what is known is noise only where nothing says that it depends on anything.
     """
@@ -240,16 +237,9 @@ def _noise(
         known += 3.0 * samples.repeat_variance
         source += ", raised to the scatter of repeats"
     excess = 3.0 * fit.excess_variance if scatter_is_noise else 0.0
-    noise_mm, warning = float(np.sqrt(known + excess)), ""
-    if noise_mm > _FAR_NOISIER * np.sqrt(known):
-        warning = (
-            f"the fixes scatter by {noise_mm:.2g} mm RMS where {source} say {np.sqrt(known):.2g} mm, and nothing that "
-            "was looked at says on what it depends; see whether the columns are there that effects need, whether the "
-            "prism sits tight, and whether readings and fixes are of the same instant"
-        )
     if excess > _EXCESS_SEEN**2 * known:
         source += f", and {np.sqrt(excess):.2g} mm that the data scatter beyond it"
-    return noise_mm, source, warning
+    return float(np.sqrt(known + excess)), source
 
 
 def _warnings(found: Found, model: CalibratedModel, holdout: Observations | None) -> Iterator[str]:

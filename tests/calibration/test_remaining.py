@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 from calibration.observations import parse_observations
@@ -9,6 +12,7 @@ from calibration.pipeline import identify
 from daemon.rigs import load_rig
 from simulators.cases import draw
 from simulators.cells import Cell
+from tests.calibration.conftest import Session
 
 SOURCE = load_rig("swdt82")
 
@@ -29,3 +33,10 @@ def test_what_has_no_name_is_told(cell: Cell, words: str) -> None:
     told = [w for w in model.warnings if w.startswith(("the data ask for", "the kinematics leave more than noise"))]
     assert len(told) == bool(words)
     assert words in "".join(told)
+
+
+def test_scatter_far_beyond_the_instruments_is_told_whatever_was_looked_for(session: Session) -> None:
+    rng = np.random.default_rng(7)
+    shaken = session.training.position_mm + rng.normal(scale=9.0, size=session.training.position_mm.shape)
+    loud = identify(session.rig, SOURCE.text, replace(session.training, position_mm=shaken), effects="none")
+    assert any("where station and readings account for" in w for w in loud.warnings)
