@@ -167,10 +167,9 @@ def _visibility(scene: Scene) -> Visibility:
             step = settings.encoder_step_deg
         sigma[joint.name] = np.full(n, np.sqrt(joint.sigma**2 + _STEP_VARIANCE * step**2))
     late = {joint.name: fixes.columns[f"{joint.name}_rate"] * settings.jitter_s for joint in rig.joints}
-    station = fixes.noise.sigma_mm[:, :, None] ** 2 * np.eye(3)
     readings = reading_covariance_mm2(scene.truth, fixes.prism, fixes.joints, sigma)
     timing = timing_covariance_mm2(scene.truth, fixes.prism, fixes.joints, late)
-    return Visibility(scene.truth, fixes.prism, fixes.joints, station + readings + timing)
+    return Visibility(scene.truth, fixes.prism, fixes.joints, fixes.noise.covariance_mm2 + readings + timing)
 
 
 def _lacking(scene: Scene, effects: Sequence[Effect], rng: np.random.Generator) -> Scene:

@@ -198,6 +198,24 @@ def read_joint(joint: Joint, values: Floats, rng: np.random.Generator) -> Floats
     return np.rint(noisy / joint.resolution) * joint.resolution
 
 
+def station_covariance_mm2(station: Station, true_mm: Floats) -> Floats:
+    """(n, 3, 3) of the noise of positions (n, 3): a total station's range errs more than its circles do, or less."""
+    x, y, z = true_mm.T
+    level_mm = np.hypot(x, y)
+    range_mm = np.maximum(np.hypot(level_mm, z), 1.0)
+    hz, zenith = np.arctan2(x, y), np.arctan2(level_mm, z)
+    sigma_angle = station.angle_sigma_arcsec * ARCSEC
+    sigma_range_mm = station.distance_sigma_mm + station.distance_sigma_ppm * 1e-6 * range_mm
+    # Directions of growing range, horizontal circle and zenith angle, each with its own spread.
+    along = np.column_stack([np.sin(zenith) * np.sin(hz), np.sin(zenith) * np.cos(hz), np.cos(zenith)])
+    round_about = np.column_stack([np.cos(hz), -np.sin(hz), np.zeros_like(hz)])
+    downward = np.cross(round_about, along)
+    spread = np.stack([sigma_range_mm, level_mm * sigma_angle, range_mm * sigma_angle], axis=1)
+    root = np.stack([along, round_about, downward], axis=2) * spread[:, None]
+    covariance: Floats = root @ root.transpose(0, 2, 1) + station.target_sigma_mm**2 * np.eye(3)
+    return covariance
+
+
 def station_noise(station: Station, true_mm: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Measure positions with a total station in the origin.
 
@@ -225,14 +243,5 @@ def station_noise(station: Station, true_mm: Floats, rng: np.random.Generator) -
             range_ * np.cos(zenith_),
         ]
     )
-    # Directions of growing range, horizontal circle and zenith angle, each with its own spread.
-    along = np.column_stack([np.sin(zenith) * np.sin(hz), np.sin(zenith) * np.cos(hz), np.cos(zenith)])
-    round_about = np.column_stack([np.cos(hz), -np.sin(hz), np.zeros_like(hz)])
-    downward = np.cross(round_about, along)
-    variance = (
-        (along * sigma_range_mm[:, None]) ** 2
-        + (round_about * (level_mm * sigma_angle)[:, None]) ** 2
-        + (downward * (range_mm * sigma_angle)[:, None]) ** 2
-        + station.target_sigma_mm**2
-    )
-    return measured + shake_mm, np.sqrt(variance)
+    covariance = station_covariance_mm2(station, true_mm)
+    return measured + shake_mm, np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))

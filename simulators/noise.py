@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.rig import Rig, Station
-from simulators.dataset import read_joint, station_noise
+from simulators.dataset import read_joint, station_covariance_mm2, station_noise
 
 Floats = NDArray[np.float64]
 
@@ -48,13 +48,19 @@ class FixNoise:
 
     Attributes:
         shift_mm: (n, 3) measured minus true.
-        sigma_mm: (n, 3) standard deviation of each coordinate, without outliers.
+        covariance_mm2: (n, 3, 3) of each fix, without outliers.
         is_outlier: (n,).
     """
 
     shift_mm: Floats
-    sigma_mm: Floats
+    covariance_mm2: Floats
     is_outlier: NDArray[np.bool_]
+
+    @property
+    def sigma_mm(self) -> Floats:
+        """(n, 3) standard deviation of each coordinate."""
+        sigma: Floats = np.sqrt(np.diagonal(self.covariance_mm2, axis1=1, axis2=2))
+        return sigma
 
 
 def draw_noise(
@@ -73,8 +79,8 @@ def draw_noise(
         ValueError: shares that are no shares, or a negative size.
     """
     _check(settings)
-    measured_mm, sigma_mm = station_noise(station, true_mm, rng)
-    own = measured_mm - true_mm
+    covariance = station_covariance_mm2(station, true_mm)
+    own = station_noise(station, true_mm, rng)[0] - true_mm
     stands, first, which = np.unique(pose, return_index=True, return_inverse=True)
     shared = (station_noise(station, true_mm[first], rng)[0] - true_mm[first])[which]
     fresh = station_noise(station, true_mm[first], rng)[0] - true_mm[first]
@@ -88,15 +94,15 @@ def draw_noise(
     shift = np.sqrt(alone) * own + np.sqrt(settings.common_share) * shared
     shift += np.sqrt(settings.wander_share) * wander[which]
     if settings.rms_mm is not None:
-        scale = settings.rms_mm / float(np.sqrt(np.mean(np.sum(sigma_mm**2, axis=1))))
-        shift, sigma_mm = shift * scale, sigma_mm * scale
+        scale = settings.rms_mm / float(np.sqrt(np.mean(np.trace(covariance, axis1=1, axis2=2))))
+        shift, covariance = shift * scale, covariance * scale**2
     is_outlier = rng.random(len(shift)) < settings.outliers
     direction = rng.normal(size=shift.shape)
     direction /= np.linalg.norm(direction, axis=1)[:, None]
-    noise_mm = np.linalg.norm(sigma_mm, axis=1)
+    noise_mm = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
     off = np.exp(rng.uniform(*_LOG_OUTLIER_SIZES, len(shift))) * noise_mm
     shift = np.where(is_outlier[:, None], direction * off[:, None], shift)
-    return FixNoise(shift, sigma_mm, is_outlier)
+    return FixNoise(shift, covariance, is_outlier)
 
 
 def read_joints(
