@@ -17,7 +17,7 @@ from calibration.gap.grammar import Grammar
 from calibration.gap.problem import OUTLIER
 from calibration.gap.projection import Projection
 from calibration.gap.terms import modulations
-from calibration.gap.variables import Place, Variables
+from calibration.gap.variables import Place
 from calibration.identification.samples import reading_covariance
 from calibration.observations import Floats
 
@@ -70,7 +70,7 @@ def depends(joint: JointFit, number: int, projection: Projection, rng: np.random
         value @ np.linalg.solve(joint.fit.covariance[own, own], value) - ((value / part.prior_sigma) ** 2).sum()
     )
     place = Place(choice.where, str(choice), {}, projection.moved_mm(part) @ value)
-    grammar = Grammar(projection, modulations(Variables(projection), place))
+    grammar = Grammar(projection, modulations(projection, place))
     left = float((grammar.score**2).max(initial=0.0))
     if left < _LEFT * (explained + left) or not detect(grammar, rng).significant:
         return ""

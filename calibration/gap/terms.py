@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -71,11 +71,19 @@ def candidates(variables: Variables) -> tuple[Term, ...]:
     return tuple(Term(place, variable, kind, math.log(_SHARES[kind] / count[kind])) for place, variable, kind in found)
 
 
-def modulations(variables: Variables, place: Place) -> tuple[Term, ...]:
-    """An error of which what it does is known, times each of the things that its size may depend on."""
-    own = variables.conditions(place.where)
-    different = _different(np.column_stack([v.values for v in own]), has_offset=True)
-    return tuple(Term(place, own[i], "single", -math.log(len(different))) for i in different)
+def modulations(projection: Projection, place: Place) -> tuple[Term, ...]:
+    """An error of which what it does is known, times each of the things that its size may depend on.
+
+    Each counts from the value at which the product shows nothing of the error itself. The size is fitted, and shrunk by
+    its prior: along the error there is always something left that follows the size.
+    """
+    every = Variables(projection).conditions(place.where)
+    own = [every[i] for i in _different(np.column_stack([v.values for v in every]), has_offset=True)]
+    values = np.column_stack([np.ones(len(place.moved_mm)), *(v.values for v in own)])
+    itself, *products = projection.columns(place.moved_mm[:, :, None] * values[:, None]).T
+    square = max(float(itself @ itself), _TINY)
+    about = [replace(v, values=v.values - product @ itself / square) for v, product in zip(own, products, strict=True)]
+    return tuple(Term(place, variable, "single", -math.log(len(about))) for variable in about)
 
 
 def _different(values: Floats, *, has_offset: bool) -> list[int]:

@@ -19,6 +19,7 @@ from calibration.gap.detect import detect
 from calibration.gap.grammar import Grammar, describe
 from calibration.gap.projection import Projection
 from calibration.gap.screen import Screen, possible
+from calibration.gap.terms import columns_of, modulations
 from calibration.gap.variables import Place, Variable
 from calibration.identification.approach import PRIOR_SCALE, approach
 from calibration.identification.identifiability import identifiability
@@ -126,6 +127,17 @@ def test_thirty_signals_that_have_nothing_to_do_with_it_raise_no_alarm() -> None
     assert any("valve7" in term.variable.text for term in words.terms)
     assert len(words.terms) < 3000
     assert alarm(words) > 0.01
+
+
+def test_what_a_size_depends_on_is_asked_beside_the_error_itself() -> None:
+    """A fitted size is shrunk: along the error there is always something left, and what hardly varies goes with it."""
+    projection = grammar("").projection
+    joint = projection.situation.chain.joint_index["theta5"]
+    place = Place("theta5", "its error", {}, projection.joint_jacobian[:, :, joint])
+    itself = projection.columns(place.moved_mm[:, :, None])[:, 0]
+    terms = modulations(projection, place)
+    assert len(terms) > 20
+    np.testing.assert_allclose(columns_of(projection, terms)[1].T @ itself / np.linalg.norm(itself), 0.0, atol=1e-9)
 
 
 # -- what is there -----------------------------------------------------------------------------------------------------
