@@ -11,7 +11,7 @@ from calibration.gap.adopt import (
     finer_forms,
     refined_choice,
 )
-from calibration.gap.decide import beyond, chance_of_gain, wins
+from calibration.gap.decide import beyond, chance_of_foretelling, wins
 from calibration.gap.grammar import Found as Formula
 from calibration.gap.grammar import Grammar
 from calibration.gap.problem import Problem
@@ -42,7 +42,7 @@ _LOOKED_AT = 0.5  # of the leading log evidence, for a rival to be looked at mor
 _RIVALS = 5  # that are looked at in half-samples
 _STABLE = 0.8  # of half-samples
 _STABLE_AGAIN = 0.5  # the same for one more place of a family whose name is earned already
-_GAIN = 0.05  # p of no gain on held-out groups
+_FORETOLD = 0.05  # p that held-out groups go with it by chance
 _SHARPER = 3  # times the noise is taken anew from the best hypothesis
 
 
@@ -176,8 +176,8 @@ def _doubt(
     if share < (_STABLE_AGAIN if is_known else _STABLE):
         winning = [w for name in halves for w in rivals if str(w.place) == name]
         return f"it wins in {share:.0%} of half-samples only", [leading, *winning] if winning else near
-    p = chance_of_gain(sharp, leading, problem.seed)
-    return (f"it lowers no errors of held-out groups beyond chance (p {p:.2g})" if p > _GAIN else ""), near
+    p = chance_of_foretelling(sharp, leading, problem.seed)
+    return (f"it foretells errors of held-out groups no better than chance (p {p:.2g})" if p > _FORETOLD else ""), near
 
 
 class _Round(NamedTuple):
