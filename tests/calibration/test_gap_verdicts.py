@@ -18,7 +18,7 @@ from calibration.observations import parse_observations
 from daemon.rigs import load_rig
 from simulators.aliases import alias_scene
 from simulators.cases import Drawn, draw
-from simulators.cells import Cell, Poses
+from simulators.cells import Cell, Noise, Poses
 from simulators.dataset import simulate_observations
 from simulators.effects import parse_effects
 from simulators.hidden import hide
@@ -69,6 +69,15 @@ def test_a_few_fixes_that_are_off_among_coarse_readings_are_no_effect() -> None:
 
 def test_an_effect_is_weighed_with_the_noise_that_it_leaves_and_not_with_itself_as_noise() -> None:
     drawn, gap = answered(Cell("single", ("transducer_quadratic",), 0.5, "sparse", "coarse", 300062))
+    assert {(effect.family, effect.where) for effect in gap.effects} == hidden(drawn)
+
+
+@pytest.mark.parametrize(
+    ("family", "noise", "seed"), [("leak_down", "fine", 720331), ("joint_error_map", "coarse", 720059)]
+)
+def test_what_sixty_poses_show_plainly_has_its_name(family: str, noise: Noise, seed: int) -> None:
+    """Few of them stood long, and half of them hardly determines the kinematics; a curve is all but as free as they."""
+    drawn, gap = answered(Cell("single", (family,), 0.5, "sparse", noise, seed))
     assert {(effect.family, effect.where) for effect in gap.effects} == hidden(drawn)
 
 
