@@ -34,18 +34,9 @@ from simulators.scripted_host import ScriptedHost
 from simulators.total_station import StationSettings
 from simulators.truth import RigTruth
 from tests.daemon.acquisition_support import ListLink, wait_until
+from tests.golden.regenerate import CONFIG
 
-CONFIG = """rig = "swdt82"
-state_directory = "."
-
-[[can]]
-channel = "can0"
-
-[[station]]
-profile = "passive"
-serial.path = "/dev/rigcal-station"
-link_delay_s = 0.02
-"""
+STATION = "link_delay_s = 0.02\n"
 SECONDS = 28.0  # no longer than samples are kept for fixes that come late
 MOVES_S = (7.0, 14.0, 21.0)
 STOPS_S = ((7.5, 10.0), (14.5, 15.5), (25.0, 25.4))  # the first two while the boom drives
@@ -115,7 +106,7 @@ def clock_was_set(back_ns: int) -> Callable[[Sequence[Capture]], list[Capture]]:
 
 def live(directory: Path, captures: Sequence[Capture], *, station_first: bool, **setup: object) -> list[dict[str, Any]]:
     """A session's observations as the daemon makes them, the links read one after the other."""
-    (directory / "rigcal.toml").write_text(CONFIG, encoding="utf-8")
+    (directory / "rigcal.toml").write_text(CONFIG.format(profile="passive", options=STATION), encoding="utf-8")
     config = read_config(directory / "rigcal.toml")
     source, clock = load_rig(config.rig), ManualClock(captures[0].stamp)
     with closing(Store(config.store_path)) as store:

@@ -36,7 +36,7 @@ channel = "can0"
 
 [[station]]
 profile = "{profile}"
-{listen}serial.path = "/dev/rigcal-station"
+{options}serial.path = "/dev/rigcal-station"
 """
 
 
@@ -105,8 +105,8 @@ def write_case(name: str, case: Case) -> None:
         for capture in captures:
             if isinstance(capture, SerialCapture):
                 writer.write(capture)
-    listen = 'listen_to = "sokkia"\n' if case.station.profile == "sokkia_set" else ""
-    (folder / "rigcal.toml").write_text(CONFIG.format(profile=profile, listen=listen), encoding="utf-8")
+    options = 'listen_to = "sokkia"\n' if case.station.profile == "sokkia_set" else ""
+    (folder / "rigcal.toml").write_text(CONFIG.format(profile=profile, options=options), encoding="utf-8")
     replay(folder, "log", folder / "readings.jsonl")
 
 
