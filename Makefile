@@ -34,11 +34,10 @@ demo: setup ## a simulated rig, from bus traffic to a calibrated model and a rep
 	@$(BIN)/rigcal demo
 
 # The deployment tests ask systemd's own tools about the files in deploy/. What reads devices and what keeps their data
-# must be reached by its own tests almost line by line. Files start in the order of their names, the mathematics first:
-# by the number of their tests, as xdist would have it, few long ones start last and one core waits for the other.
+# must be reached by its own tests almost line by line.
 test: ## the whole test suite; needs no hardware
 	@$(BOOTSTRAP) -t systemd-analyze=systemd -t udevadm=udev .venv requirements-dev.lock
-	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder --cov=drivers --cov=daemon.store --cov-report=term-missing:skip-covered --cov-fail-under=95
+	$(BIN)/python -m pytest -n auto --dist loadfile --cov=drivers --cov=daemon.store --cov-report=term-missing:skip-covered --cov-fail-under=95
 
 lint: environment ## style, types and import floors
 	$(BIN)/ruff check
