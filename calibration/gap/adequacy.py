@@ -25,7 +25,7 @@ _CLOSED = 0.8  # of the gap, at least
 _LEFT = 0.05  # of what an effect explains together with what is left of it, at most
 _HIGH = 6.0  # standard errors of the variance that the gap must have to be judged
 _MISJUDGED = 0.1  # share by which a sigma may be off
-_FAR_MISJUDGED = 0.5  # the same where nothing says that it is anything but noise
+_FAR_MISJUDGED = 1.0  # the same where nothing says that it is anything but noise
 
 
 def closes(first: Projection, last: Projection, weight: Floats, *, is_structured: bool) -> bool:
