@@ -81,9 +81,9 @@ def full_plan(
         outside: effects that no library has.
         aliases: constructions of exact aliases.
         first: seed of the first case; the others follow.
-        repeats: cases of every cell of a single effect.
+        repeats: cases of every cell.
     """
-    return _numbered(_full(families, outside, aliases, repeats), first)
+    return _numbered((cell for cell in _full(families, outside, aliases) for _ in range(repeats)), first)
 
 
 def short_plan(families: Sequence[str], outside: Sequence[str], aliases: Sequence[str], first: int) -> tuple[Cell, ...]:
@@ -96,8 +96,8 @@ _Open = tuple[Kind, tuple[str, ...], float, Poses, Noise]
 _NULLS, _DECOYS, _PAIRS, _TRIPLES, _ALIASES, _BESIDE = 600, 60, 60, 30, 10, 80
 
 
-def _full(families: Sequence[str], outside: Sequence[str], aliases: Sequence[str], repeats: int) -> Iterator[_Open]:
-    for family, size, poses, noise, _ in product(families, SIZES, POSES, NOISES, range(repeats)):
+def _full(families: Sequence[str], outside: Sequence[str], aliases: Sequence[str]) -> Iterator[_Open]:
+    for family, size, poses, noise in product(families, SIZES, POSES, NOISES):
         yield "single", (family,), size, poses, noise
     yield from _without_effect("null", _NULLS)
     yield from _without_effect("decoy", _DECOYS)
