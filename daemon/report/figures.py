@@ -65,7 +65,9 @@ def _strip(axes: Axes, norms: Floats, centre: float, colour: str) -> None:
     scatter(axes, centre + spread * widths[which], norms[order], colour, size=6, alpha=0.5)
     rms = float(np.sqrt(np.mean(norms**2)))
     axes.plot([centre - 0.18, centre + 0.18], [rms, rms], color=INK, linewidth=1.6, solid_capstyle="butt")
-    axes.annotate(number(rms), (centre + 0.19, rms), va="center", ha="left", fontsize=8, fontweight="bold")
+    at = (centre + 0.2, rms)
+    label = axes.annotate(number(rms), at, va="center", ha="left", fontsize=8, fontweight="bold")
+    label.set_bbox({"facecolor": axes.get_facecolor(), "edgecolor": "none", "pad": 0.5})
 
 
 def errors_by_prism(report: ReportInput) -> Figure:
