@@ -126,7 +126,8 @@ def simulate_observations(
         for joints in (held, read)
     )
     if noise_mm is None:
-        measured_mm, sigma_mm = station_noise(rig.station, true_mm, rng)
+        measured_mm = station_measured_mm(rig.station, true_mm, rng)
+        sigma_mm = coordinate_sigma_mm(station_covariance_mm2(rig.station, true_mm))
     else:
         measured_mm = true_mm + rng.normal(0, noise_mm, true_mm.shape)
         sigma_mm = np.full_like(true_mm, noise_mm)
@@ -198,50 +199,62 @@ def read_joint(joint: Joint, values: Floats, rng: np.random.Generator) -> Floats
     return np.rint(noisy / joint.resolution) * joint.resolution
 
 
-def station_covariance_mm2(station: Station, true_mm: Floats) -> Floats:
-    """(n, 3, 3) of the noise of positions (n, 3): a total station's range errs more than its circles do, or less."""
+@dataclass(frozen=True)
+class _Sighted:
+    """Positions as a total station in the origin measures them, and how much each of its measurements errs."""
+
+    hz: Floats
+    zenith: Floats
+    range_mm: Floats
+    level_mm: Floats
+    sigma_angle: float
+    sigma_range_mm: Floats
+
+
+def _sighted(station: Station, true_mm: Floats) -> _Sighted:
     x, y, z = true_mm.T
     level_mm = np.hypot(x, y)
     range_mm = np.maximum(np.hypot(level_mm, z), 1.0)
-    hz, zenith = np.arctan2(x, y), np.arctan2(level_mm, z)
-    sigma_angle = station.angle_sigma_arcsec * ARCSEC
-    sigma_range_mm = station.distance_sigma_mm + station.distance_sigma_ppm * 1e-6 * range_mm
+    return _Sighted(
+        hz=np.arctan2(x, y),
+        zenith=np.arctan2(level_mm, z),
+        range_mm=range_mm,
+        level_mm=level_mm,
+        sigma_angle=station.angle_sigma_arcsec * ARCSEC,
+        sigma_range_mm=station.distance_sigma_mm + station.distance_sigma_ppm * 1e-6 * range_mm,
+    )
+
+
+def _position(hz: Floats, zenith: Floats, range_: Floats | float) -> Floats:
+    """(n, 3) what lies in a direction, as far off as is said."""
+    sideways = range_ * np.sin(zenith)
+    return np.column_stack([sideways * np.sin(hz), sideways * np.cos(hz), range_ * np.cos(zenith)])
+
+
+def station_covariance_mm2(station: Station, true_mm: Floats) -> Floats:
+    """(n, 3, 3) of the noise of positions (n, 3): a total station's range errs more than its circles do, or less."""
+    sighted = _sighted(station, true_mm)
     # Directions of growing range, horizontal circle and zenith angle, each with its own spread.
-    along = np.column_stack([np.sin(zenith) * np.sin(hz), np.sin(zenith) * np.cos(hz), np.cos(zenith)])
-    round_about = np.column_stack([np.cos(hz), -np.sin(hz), np.zeros_like(hz)])
+    along = _position(sighted.hz, sighted.zenith, 1.0)
+    round_about = np.column_stack([np.cos(sighted.hz), -np.sin(sighted.hz), np.zeros(len(true_mm))])
     downward = np.cross(round_about, along)
-    spread = np.stack([sigma_range_mm, level_mm * sigma_angle, range_mm * sigma_angle], axis=1)
+    across_mm = sighted.sigma_angle * np.stack([sighted.level_mm, sighted.range_mm], axis=1)
+    spread = np.column_stack([sighted.sigma_range_mm, across_mm])
     root = np.stack([along, round_about, downward], axis=2) * spread[:, None]
     covariance: Floats = root @ root.transpose(0, 2, 1) + station.target_sigma_mm**2 * np.eye(3)
     return covariance
 
 
-def station_noise(station: Station, true_mm: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Measure positions with a total station in the origin.
+def coordinate_sigma_mm(covariance_mm2: Floats) -> Floats:
+    """(n, 3) standard deviation of each coordinate, of covariances (n, 3, 3)."""
+    sigma_mm: Floats = np.sqrt(np.diagonal(covariance_mm2, axis1=1, axis2=2))
+    return sigma_mm
 
-    Args:
-        station: its random errors.
-        true_mm: (n, 3).
-        rng: source of the noise.
 
-    Returns:
-        (n, 3) measured positions and (n, 3) the standard deviation of each coordinate.
-    """
-    x, y, z = true_mm.T
-    level_mm = np.hypot(x, y)
-    range_mm = np.maximum(np.hypot(level_mm, z), 1.0)
-    hz, zenith = np.arctan2(x, y), np.arctan2(level_mm, z)
-    sigma_angle = station.angle_sigma_arcsec * ARCSEC
-    sigma_range_mm = station.distance_sigma_mm + station.distance_sigma_ppm * 1e-6 * range_mm
-    hz_, zenith_ = (a + rng.normal(0, sigma_angle, len(a)) for a in (hz, zenith))
-    range_ = range_mm + rng.normal(0, 1.0, len(x)) * sigma_range_mm
+def station_measured_mm(station: Station, true_mm: Floats, rng: np.random.Generator) -> Floats:
+    """(n, 3) positions (n, 3) as a total station in the origin measures them, with its random errors."""
+    sighted, n = _sighted(station, true_mm), len(true_mm)
+    hz, zenith = (a + rng.normal(0, sighted.sigma_angle, n) for a in (sighted.hz, sighted.zenith))
+    range_mm = sighted.range_mm + rng.normal(0, 1.0, n) * sighted.sigma_range_mm
     shake_mm = rng.normal(0, 1.0, true_mm.shape) * station.target_sigma_mm
-    measured = np.column_stack(
-        [
-            range_ * np.sin(zenith_) * np.sin(hz_),
-            range_ * np.sin(zenith_) * np.cos(hz_),
-            range_ * np.cos(zenith_),
-        ]
-    )
-    covariance = station_covariance_mm2(station, true_mm)
-    return measured + shake_mm, np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    return _position(hz, zenith, range_mm) + shake_mm

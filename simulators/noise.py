@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.rig import Rig, Station
-from simulators.dataset import read_joint, station_covariance_mm2, station_noise
+from simulators.dataset import coordinate_sigma_mm, read_joint, station_covariance_mm2, station_measured_mm
 
 Floats = NDArray[np.float64]
 
@@ -59,8 +59,7 @@ class FixNoise:
     @property
     def sigma_mm(self) -> Floats:
         """(n, 3) standard deviation of each coordinate."""
-        sigma: Floats = np.sqrt(np.diagonal(self.covariance_mm2, axis1=1, axis2=2))
-        return sigma
+        return coordinate_sigma_mm(self.covariance_mm2)
 
 
 def draw_noise(
@@ -80,10 +79,10 @@ def draw_noise(
     """
     _check(settings)
     covariance = station_covariance_mm2(station, true_mm)
-    own = station_noise(station, true_mm, rng)[0] - true_mm
+    own = station_measured_mm(station, true_mm, rng) - true_mm
     stands, first, which = np.unique(pose, return_index=True, return_inverse=True)
-    shared = (station_noise(station, true_mm[first], rng)[0] - true_mm[first])[which]
-    fresh = station_noise(station, true_mm[first], rng)[0] - true_mm[first]
+    shared = (station_measured_mm(station, true_mm[first], rng) - true_mm[first])[which]
+    fresh = station_measured_mm(station, true_mm[first], rng) - true_mm[first]
     keep = np.exp(-1.0 / settings.wander_poses)
     wander = np.empty_like(fresh)
     state = fresh[0]

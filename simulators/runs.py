@@ -19,7 +19,7 @@ from simulators.dataset import (
     prisms_mm,
     random_poses,
     read_joint,
-    station_noise,
+    station_measured_mm,
     travel_m,
 )
 from simulators.hydraulics import (
@@ -100,7 +100,7 @@ def simulate_runs(
     anchored = anchored_truth(truth, seen)
     true_mm, oracle_mm = (prisms_mm(anchored, prism, values, seen, setup=setup) for values in (fixed, read))
     if noise_mm is None:
-        measured_mm, _ = station_noise(rig.station, true_mm, rng)
+        measured_mm = station_measured_mm(rig.station, true_mm, rng)
     else:
         measured_mm = true_mm + rng.normal(0.0, noise_mm, true_mm.shape)
 

@@ -5,7 +5,7 @@ import pytest
 
 from calibration.observations import parse_observations
 from calibration.rig import Rig, shipped_rig
-from simulators.dataset import simulate_observations, station_covariance_mm2, station_noise
+from simulators.dataset import coordinate_sigma_mm, simulate_observations, station_covariance_mm2, station_measured_mm
 from simulators.effects import parse_effects
 from simulators.truth import RigTruth, replace_effects
 
@@ -87,8 +87,9 @@ def test_directions_are_those_of_the_last_move(swdt82: Rig) -> None:
 def test_station_noise_matches_its_covariance_and_its_sigma_columns(swdt82: Rig) -> None:
     rng = np.random.default_rng(0)
     true = np.array([3000.0, -9000.0, 4000.0])
-    measured, sigma = station_noise(swdt82.station, np.tile(true, (20000, 1)), rng)
-    expected = station_covariance_mm2(swdt82.station, true[None])[0]
+    measured = station_measured_mm(swdt82.station, np.tile(true, (20000, 1)), rng)
+    covariance = station_covariance_mm2(swdt82.station, true[None])
+    expected, sigma = covariance[0], coordinate_sigma_mm(covariance)
     assert abs(expected[0, 1]) > 0.5  # what makes the range errs x and y together
     assert np.allclose(np.cov(measured.T), expected, atol=0.15)
     assert np.allclose((measured - true).std(axis=0), sigma[0], rtol=0.03)
