@@ -93,17 +93,17 @@ class ExpectedAccuracy:
     @property
     def parameters_mm(self) -> float:
         """What the parameters' covariance has in it, RMS 3-D over all poses and prisms."""
-        return math.sqrt(float(_traces(self.parameters_mm2).mean()))
+        return _size_mm(self.parameters_mm2)
 
     @property
     def lacking_mm(self) -> float:
         """What the model lacks has in it, RMS 3-D over all poses and prisms."""
-        return math.sqrt(float(_traces(self.lacking_mm2).mean()))
+        return _size_mm(self.lacking_mm2)
 
     @property
     def open_mm(self) -> float:
         """What poses by themselves leave open has in it, RMS 3-D over all poses and prisms."""
-        return math.sqrt(float(_traces(self.open_mm2).mean()))
+        return _size_mm(self.open_mm2)
 
     @cached_property
     def _norms_mm(self) -> Floats:
@@ -379,6 +379,11 @@ def _mean_variance(groups: list[_Groups], part: Literal["known", "by_joint"]) ->
 
 def _traces(covariance: Floats) -> Floats:
     return np.asarray(np.trace(covariance, axis1=-2, axis2=-1), dtype=np.float64)
+
+
+def _size_mm(covariance: Floats) -> float:
+    """RMS 3-D error of covariances (v, prisms, 3, 3)."""
+    return math.sqrt(float(_traces(covariance).mean()))
 
 
 def _rms(values: Floats) -> float:

@@ -172,12 +172,16 @@ class CalibratedModel:
         return Predictor(self)
 
     @property
+    def known_noise_mm2(self) -> float:
+        """Mean square 3-D noise of a fix that station, readings and repeats account for."""
+        return max(self.effects_noise_mm**2 - 3.0 * self.excess_sigma_mm**2, 0.0)
+
+    @property
     def noise_mm(self) -> float:
         """RMS 3-D noise: what the whole model, residual included, leaves of a held-out fix."""
         if self.residual is None:
             return self.effects_noise_mm
-        known = self.effects_noise_mm**2 - 3.0 * self.excess_sigma_mm**2
-        return math.sqrt(max(known, 0.0) + float(self.residual.excess_variance_mm2.sum()))
+        return math.sqrt(self.known_noise_mm2 + float(self.residual.excess_variance_mm2.sum()))
 
     @property
     def parameters(self) -> tuple[ParameterEstimate, ...]:

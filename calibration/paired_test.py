@@ -43,6 +43,16 @@ class PairedTest:
         return self.p < CHANCE and self.after_mm < (1.0 - WORTHWHILE) * self.before_mm
 
 
+def chance_of_mean(draws: Floats) -> float:
+    """p of such a mean of independent draws (n,) where their true mean is zero or less: a one-sided t-test.
+
+    1 where fewer than two draws, or draws without any spread, allow no test.
+    """
+    if len(draws) < 2 or (spread := float(draws.std(ddof=1))) == 0.0:
+        return 1.0
+    return float(stdtr(len(draws) - 1, -draws.mean() / (spread / np.sqrt(len(draws)))))
+
+
 def paired_test(before_mm2: Floats, after_mm2: Floats, groups: NDArray[np.str_] | NDArray[np.intp]) -> PairedTest:
     """Compare squared errors, each group's mean gain taken as one draw.
 
@@ -52,13 +62,10 @@ def paired_test(before_mm2: Floats, after_mm2: Floats, groups: NDArray[np.str_] 
     """
     _, index, size = np.unique(groups, return_inverse=True, return_counts=True)
     gain = np.bincount(index, before_mm2 - after_mm2) / size
-    p = 1.0
-    if len(gain) > 1 and (spread := float(gain.std(ddof=1))) > 0.0:
-        p = float(stdtr(len(gain) - 1, -gain.mean() / (spread / np.sqrt(len(gain)))))
     return PairedTest(
         before_mm=float(np.sqrt(before_mm2.mean())),
         after_mm=float(np.sqrt(after_mm2.mean())),
-        p=p,
+        p=chance_of_mean(gain),
         rows=len(before_mm2),
         groups=len(gain),
         no_worse=float((gain >= 0.0).mean()),

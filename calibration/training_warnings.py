@@ -47,7 +47,7 @@ def _of_fit(model: CalibratedModel, observations: Observations, solution: Soluti
             f"where build tolerances explain {solution.tolerated_mm:.0f} mm before the fit; check zeros and signs of "
             f"the joints, the rig file, and whether the station stood still{hint}"
         )
-    known_mm = math.sqrt(max(model.effects_noise_mm**2 - 3.0 * model.excess_sigma_mm**2, 0.0))
+    known_mm = math.sqrt(model.known_noise_mm2)
     if model.effects_noise_mm > _FAR_NOISIER * known_mm:
         yield (
             f"the fixes scatter by {model.effects_noise_mm:.2g} mm RMS about the model, where station and readings "

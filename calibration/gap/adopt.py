@@ -210,7 +210,6 @@ def with_effects(model: CalibratedModel, taken: Adopted) -> CalibratedModel:
             additions=solution.additions,
             listed=np.array(listed),
         )
-    other = model.effects_noise_mm**2 - 3.0 * model.excess_sigma_mm**2
     return replace(
         model,
         values=fit.x[:parameters],
@@ -218,7 +217,7 @@ def with_effects(model: CalibratedModel, taken: Adopted) -> CalibratedModel:
         geometric_values=taken.geometric.x,
         prior_scale=fit.prior_scale,
         excess_sigma_mm=math.sqrt(fit.excess_variance),
-        effects_noise_mm=math.sqrt(max(other, 0.0) + 3.0 * fit.excess_variance),
+        effects_noise_mm=math.sqrt(model.known_noise_mm2 + 3.0 * fit.excess_variance),
         effects=taken.effects,
         effects_reason=taken.reason,
         identifiability=seen,

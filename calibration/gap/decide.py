@@ -7,17 +7,16 @@ what is left beside the kinematics that all of them determine: half of a few pos
 from __future__ import annotations
 
 import itertools
-import math
 from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import stdtr
 
 from calibration.effects.base import Situation
 from calibration.gap.projection import Projection, Softly, from_products, rows_of, without_folds
 from calibration.gap.screen import Weighed
 from calibration.observations import Floats
+from calibration.paired_test import chance_of_mean
 from calibration.residual.folds import folds
 
 HALF_SAMPLES = 25
@@ -72,9 +71,7 @@ def chance_of_foretelling(projection: Projection, candidate: Weighed, seed: int)
         rows = rows_of(np.flatnonzero(fold == number))
         along[fold == number] = ((columns[rows] @ x) * target[rows]).reshape(-1, 3).sum(axis=1)
     group = np.unique(projection.groups, return_inverse=True)[1]
-    foretold = np.bincount(group, along)
-    error = foretold.std(ddof=1) / math.sqrt(len(foretold))
-    return float(stdtr(len(foretold) - 1, -foretold.mean() / error)) if error > 0.0 else 1.0
+    return chance_of_mean(np.bincount(group, along).astype(np.float64))
 
 
 def beyond(situation: Situation, candidate: Weighed) -> tuple[str, ...]:
@@ -85,17 +82,13 @@ def beyond(situation: Situation, candidate: Weighed) -> tuple[str, ...]:
 def _left(projection: Projection, leading: Weighed, weighed: Sequence[Weighed]) -> Floats:
     """(3 m, k + 1) columns of several places and the target, without kinematics and what is likely beside the first."""
     columns = [_columns(projection, w) for w in weighed]
-    return Softly(_with_beside(projection, leading))(np.column_stack([*columns, projection.rows.target]))
+    softly = projection.softly
+    if leading.beside is not None:
+        softly = Softly(np.hstack([projection.rows.kinematics, _columns(projection, leading.beside)]))
+    return softly(np.column_stack([*columns, projection.rows.target]))
 
 
 def _columns(projection: Projection, weighed: Weighed) -> Floats:
     """(3 m, k) whitened, in prior sigmas."""
     whitened = projection.whitened(projection.moved_mm(weighed.additions))
     return whitened * (weighed.additions.prior_sigma * weighed.scale)
-
-
-def _with_beside(projection: Projection, weighed: Weighed) -> Floats:
-    """(3 m, q) kinematics, and the effect that is likely beside a candidate."""
-    if weighed.beside is None:
-        return projection.rows.kinematics
-    return np.hstack([projection.rows.kinematics, _columns(projection, weighed.beside)])

@@ -241,7 +241,7 @@ class _Search:
         for name in names:
             if len({c.family for c in joint.choices}) == 1:
                 break
-            if self._is_plain(joint, name):
+            if name not in map(str, joint.choices) or self._is_plain(joint, name):
                 continue
             other, turn, _ = self._judged_again(joint, name)
             if turn is not None and turn.taken and name not in map(str, turn.taken):
@@ -251,12 +251,9 @@ class _Search:
 
     def _is_plain(self, joint: JointFit, name: str) -> bool:
         """Whether nothing comes near what took a name, beside all else that is there: it would take it again."""
-        number = next((n for n, c in enumerate(joint.choices) if str(c) == name), None)
-        if number is None:
-            return False
-        projection = self.problem.project(joint.with_last(number), without_last=True)
-        others = [c for c in joint.choices if str(c) != name]
-        weighed = Screen(projection, self._possible(others, projection)).weigh()
+        joint = joint.with_last([str(c) for c in joint.choices].index(name))
+        projection = self.problem.project(joint, without_last=True)
+        weighed = Screen(projection, self._possible(joint.choices[:-1], projection)).weigh()
         return str(weighed[0].place) == name and beyond_doubt(best_of_each_family(weighed))
 
     def _judged_again(self, joint: JointFit, name: str) -> tuple[JointFit, Turn | None, tuple[Weighed, ...]]:
