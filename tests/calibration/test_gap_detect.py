@@ -15,6 +15,7 @@ import pytest
 from calibration.effects.base import Situation
 from calibration.effects.fitted import Choice
 from calibration.effects.library import library
+from calibration.gap.adequacy import closes
 from calibration.gap.detect import detect
 from calibration.gap.grammar import Grammar, describe
 from calibration.gap.projection import Projection
@@ -56,13 +57,20 @@ def weather(seed: int) -> dict[str, Floats]:
 
 
 def projected(rig: Rig, observations: Observations) -> Projection:
+    return about(solved(rig, observations), observations)
+
+
+def solved(rig: Rig, observations: Observations) -> Solution:
     chain, samples, start = place(rig, observations)
     nominal = refine(chain, samples, start.x, free=np.isinf(chain.prior_sigma))
     near = approach(chain, samples, nominal.x, precision=prior_precision(chain, PRIOR_SCALE["recalibration"]))
     fit = refine(chain, samples, near)
     seen = identifiability(chain, samples, fit.x, fit.excess_variance)
-    solution = Solution(chain, samples, nominal, fit, seen, "", 0.0)
-    return Projection(solution, Situation(chain, fit.x, observations))
+    return Solution(chain, samples, nominal, fit, seen, "", 0.0)
+
+
+def about(solution: Solution, observations: Observations) -> Projection:
+    return Projection(solution, Situation(solution.chain, solution.fit.x, observations))
 
 
 @cache
@@ -271,3 +279,16 @@ def test_a_screen_keeps_products_of_columns_and_not_the_columns() -> None:
         tracemalloc.stop()
     columns = sum(len(p.additions[option]) for p in screen.places for option in set(p.alike))
     assert kept < 0.3 * columns * over.residual.nbytes
+
+
+def test_what_becomes_an_outlier_of_a_fit_is_not_explained_by_it() -> None:
+    """Kinematics leave a clear gap; then a fit leaves nothing of them all, or of nine in ten."""
+    rig = shipped_rig("swdt82")
+    observations = measured(rig, "joint_compliance@theta3:compliance_rad_per_Nm=3e-6", 3)
+    solution = solved(rig, observations)
+    first = about(solution, observations)
+    size = np.linalg.norm(first.error_mm, axis=1)
+    counts = {"all": first.fit.weight, "most": np.where(size > np.quantile(size, 0.9), 0.0, first.fit.weight)}
+    for said, weight in counts.items():
+        last = about(replace(solution, fit=replace(solution.fit, excess_variance=0.0, weight=weight)), observations)
+        assert closes(first, last, first.fit.weight, is_structured=True) == (said == "all")
