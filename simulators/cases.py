@@ -39,7 +39,8 @@ RULES = (
     "within one build tolerance, the prism's offset and a free base can take of it taken out",
     "Amplitudes are capped at the library's hard bounds; a case that cannot reach its size anywhere is dropped",
     f"Separable, decided from the truth before any answer: the nearest family is beaten by ln odds of {MARGIN:g} in "
-    "all but 2 % of the draws of the noise; loads as the machine's own; a free curve of a joint's angle is no rival",
+    "all but 2 % of the draws of the noise; loads as the machine's own, sizes up to the hard bounds; a free curve of a "
+    "joint's angle is no rival",
     "Right: every hidden family that the library has is named, and no other",
     "With encoder_harmonic or angle_scale left out, joint_error_map is a true name and no misnaming: it is any curve "
     "of the joint's own angle",

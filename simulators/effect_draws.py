@@ -129,22 +129,26 @@ class EffectDraws:
         elif family in _EITHER_SIGN:
             size = {name: value * rng.choice([-1.0, 1.0]) for name, value in size.items()}
         effect = _resized(effect, {name: float(value) for name, value in size.items()})
-        return Bounded(effect, self._most(effect))
+        bounds = self.bounds(effect)
+        return Bounded(effect, min(bounds[name] / abs(value) for name, value in size.items() if value != 0.0))
 
     def largest_load(self, joint: str) -> float:
         """Largest load of the rig's own weights on a revolute joint in its work volume, N m."""
         return self._loads[joint]
 
-    def _most(self, effect: Effect) -> float:
-        family, size = effect.family, {name: abs(float(getattr(effect, name))) for name in effect.size}
+    def bounds(self, effect: Effect) -> dict[str, float]:
+        """Hard bound of each coefficient that makes an effect large, at its place and of its direction."""
+        family = effect.family
         if family in _BOUNDS:
-            return min(_BOUNDS[family][name] / value for name, value in size.items() if value > 0.0)
+            return dict(_BOUNDS[family])
         if family in _RAD_AT_THE_LARGEST_LOAD:
             load = max(self._loads.values()) if effect.where == "base" else self._loads[effect.where]
-            return _RAD_AT_THE_LARGEST_LOAD[family] / (load * max(size.values()))
+            return dict.fromkeys(effect.size, _RAD_AT_THE_LARGEST_LOAD[family] / load)
+        size = {name: abs(float(getattr(effect, name))) for name in effect.size}
         small = _resized(effect, {name: 1e-3 * value for name, value in size.items()})
         moved_mm = self._tip_mm([small]) - self._tip_mm([])
-        return _MM_AT_FULL_REACH[family] / (1e3 * float(np.linalg.norm(moved_mm, axis=1).max()))
+        most = _MM_AT_FULL_REACH[family] / (1e3 * float(np.linalg.norm(moved_mm, axis=1).max()))
+        return {name: value * most for name, value in size.items()}
 
     def _carries(self, where: str) -> bool:
         return self._loads.get(where, 0.0) >= _LEAST_LOAD * max(self._loads.values(), default=0.0) > 0.0

@@ -4,10 +4,11 @@ Each family of the simulator, at each of its places, is weighed against what the
 
     ln E = 1/2 b' A^-1 b - 1/2 ln |A|,   A = I + G'G,  b = G's
 
-with s what shows of the hidden effect and G what shows of the family's coefficients at plausible size, both in units
-of the noise. With noise, the odds of two families scatter by the length of the difference between their fits. An
-effect is separable where the nearest rival is beaten by `MARGIN` in all but 2 % of the draws of the noise. Places of
-the effect's own family are no rivals: what is asked is its name.
+with s what shows of the hidden effect and G what shows of the family's coefficients at their hard bounds, both in units
+of the noise: effects are drawn by how large they show, so that the size that is plausible for either of two says
+nothing about which of them it is. With noise, the odds of two families scatter by the length of the difference between
+their fits. An effect is separable where the nearest rival is beaten by `MARGIN` in all but 2 % of the draws of the
+noise. Places of the effect's own family are no rivals: what is asked is its name.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from simulators.visible import Visibility
 
 MARGIN = 5.0  # of ln odds
 _SIGMAS = 2.054  # a normal number is above minus this in 98 % of draws
-_RAD_AT_THE_LARGEST_LOAD = {"joint_compliance": 1e-3, "payload_change": 1e-3, "load_hysteresis": 0.5e-3}
 _STEP_TIMES = 9  # at which a rival may step
+_LINEAR = 1e-2  # of a bound: small enough to be linear
 # A free curve of the angle follows any other error of that joint's angle; its many coefficients are what speaks
 # against it, and not the data. It is no rival.
 _NO_RIVAL = ("joint_error_map",)
@@ -92,22 +93,14 @@ def _forms(effect: Effect, scene: Scene) -> Iterator[Effect]:
 
 
 def _columns(scene: Scene, visibility: Visibility, effect: Effect) -> Floats:
-    """(3 n, k) what shows of each coefficient of an effect at its plausible size; none where it lacks a column."""
-    size = _plausible(effect, scene)
+    """(3 n, k) what shows of each coefficient of an effect at its bound; none where it lacks a column."""
+    bounds = scene.draws.bounds(effect)
+    small = [{**dict.fromkeys(bounds, 0.0), name: _LINEAR * bound} for name, bound in bounds.items()]
     try:
-        moved = [scene.shift_mm([_changed(effect, **{**dict.fromkeys(size, 0.0), name: size[name]})]) for name in size]
+        moved = [scene.shift_mm([_changed(effect, **size)]) for size in small]
     except ValueError:
         return np.zeros((3 * len(scene.training.prism), 0))
-    return visibility.seen(np.stack(moved, axis=2))
-
-
-def _plausible(effect: Effect, scene: Scene) -> dict[str, float]:
-    """The size that is plausible for each coefficient before any data."""
-    if effect.family in _RAD_AT_THE_LARGEST_LOAD:
-        load = scene.draws.largest_load(effect.where)
-        return dict.fromkeys(effect.size, _RAD_AT_THE_LARGEST_LOAD[effect.family] / load)
-    common = type(effect)(where=effect.where)
-    return {name: float(getattr(common, name)) for name in effect.size}
+    return visibility.seen(np.stack(moved, axis=2) / _LINEAR)
 
 
 def _changed(effect: Effect, **values: Any) -> Effect:
