@@ -100,7 +100,8 @@ class Row(_Part):
         alpha_deg, a_mm, d_mm, theta_deg, beta_deg, b_mm: constants of the row.
         drive: for `theta`, `d` or `a`: which joints move it, as a linear combination {joint: coefficient}.
         identify: which of the row's constants calibration may correct; in a rig, a row that says nothing also has beta
-            where it alone can tilt an axis: where that is nearly parallel to the next.
+            where it alone can tilt an axis: where that is nearly parallel to the next, or the next row slides along `a`
+            before it turns.
         before: a fixed transform between the previous frame and this row.
         after: the frame that this row continues from, where it is not the one before it: rows may branch as a tree.
     """
@@ -302,7 +303,7 @@ def _continues_from(rows: Sequence[Row], number: int) -> int:
 
 
 def _tilting_rows(rows: Sequence[Row], convention: Convention) -> set[int]:
-    """Numbers of the rows whose beta tilts a row's axis against a nearly parallel one, that of the row it continues."""
+    """Numbers of the rows whose beta alone tilts an axis: one that is nearly parallel to that before it, or a slide."""
     tilting = set()
     for number, row in enumerate(rows, 1):
         before = _continues_from(rows, number)
@@ -315,19 +316,23 @@ def _tilting_rows(rows: Sequence[Row], convention: Convention) -> set[int]:
             "mdh_beta_after": ((("y", last.beta_deg), *mount, ("x", row.alpha_deg)), before),
             "mdh_beta_before": ((*mount, ("x", row.alpha_deg), ("y", row.beta_deg)), number),
         }[convention]
-        if abs(_cosine_between_axes(between)) > _NEARLY_PARALLEL:
+        if abs(_turned("z", between)["z"]) > _NEARLY_PARALLEL:
             tilting.add(tilts)
+        # Here `a` slides along x of the frame before, which nothing but its beta turns out of its x and y.
+        slides = convention == "mdh_beta_after" and "a" in row.drive
+        if slides and abs(_turned("x", mount)["y"]) < _NEARLY_PARALLEL:
+            tilting.add(before)
     return tilting
 
 
-def _cosine_between_axes(turns: Sequence[tuple[str, float]]) -> float:
-    """Of the angle between z before and after turns about x, y or z by so many degrees."""
-    axis = {"x": 0.0, "y": 0.0, "z": 1.0}
+def _turned(axis: str, turns: Sequence[tuple[str, float]]) -> dict[str, float]:
+    """x, y and z of the unit vector along an axis after turns about x, y or z by so many degrees."""
+    vector = {"x": 0.0, "y": 0.0, "z": 0.0, axis: 1.0}
     for about, angle_deg in reversed(turns):
         u, v = {"x": ("y", "z"), "y": ("z", "x"), "z": ("x", "y")}[about]
         c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
-        axis[u], axis[v] = c * axis[u] - s * axis[v], s * axis[u] + c * axis[v]
-    return axis["z"]
+        vector[u], vector[v] = c * vector[u] - s * vector[v], s * vector[u] + c * vector[v]
+    return vector
 
 
 def parse_rig(text: str, source: str) -> Rig:
