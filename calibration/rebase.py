@@ -9,6 +9,7 @@ import numpy as np
 from calibration.effects.base import Situation
 from calibration.effects.fitted import coefficient_values, fitted_additions
 from calibration.identification.additions import Additions
+from calibration.identification.judgement import refuse_turning
 from calibration.identification.refinement import Fit, information, refine
 from calibration.identification.samples import Samples, averaged
 from calibration.identification.start import rough_start
@@ -27,7 +28,7 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
 
     Raises:
         DataError: a prism that the rig lacks.
-        UnsafeError: fewer than three fixes of a set-up, all on a line, or mirrored.
+        UnsafeError: fewer than three fixes of a set-up, all on a line or in one place, or mirrored.
     """
     setups = sorted(set(observations.setup.tolist()))
     blank = Chain(model.rig, {setup: Placement.identity() for setup in setups})
@@ -48,6 +49,7 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
     near = refine(chain, samples, begun, free=moves, additions=additions)
     fit = refine(chain, samples, near.x, free=moves, excess_variance=model.excess_sigma_mm**2, additions=additions)
     effects_values = fit.x[: len(chain)]
+    refuse_turning(chain, samples, effects_values)
     left = samples
     for _ in range(_ROUNDS if model.residual is not None else 0):
         here = replace(model, placements=start.placements, values=fit.x[: len(chain)], covariance=fit.covariance)

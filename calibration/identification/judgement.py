@@ -8,8 +8,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from calibration.errors import UnsafeError
-from calibration.identification.refinement import Fit, Prior
+from calibration.identification.refinement import Fit, Prior, information, prior_precision
 from calibration.identification.samples import Samples, reading_covariance
+from calibration.identification.standing import standing_spread
 from calibration.identification.start import rough_start
 from calibration.kinematics import Chain, Placement
 from calibration.limits import never_moved
@@ -23,6 +24,7 @@ _FEW = 0.02  # share of the fixes left out
 _FAR_RAD = math.radians(75.0)  # from the rig file: no assembly is off so much, a reading may be
 _TILTED_DEG = 30.0  # no carrier works on such a slope
 _FAR_TOLERANCES = 100.0  # likewise of lengths
+_TURNING_DEG = 3.0  # standard error of a base's attitude beneath a known machine; 2 mm over a metre leave a tenth
 _DISCARDED = 1.0 / 3.0  # share of the fixes
 _DISCARDED_OF_PRISM = 0.8
 _LEAST_DISCARDED = 5
@@ -41,10 +43,20 @@ def rms_left_mm(chain: Chain, samples: Samples, x: Floats) -> float:
     return math.sqrt(float((error**2).sum(axis=1).mean()))
 
 
-def different_fixes(samples: Samples) -> int:
-    """How many samples differ in prism, set-up or readings: the same pose again lowers the noise and shows no more."""
+def different_fixes(chain: Chain, samples: Samples) -> int:
+    """How many samples differ in prism, set-up or, by more than readings of a standing joint do, in readings.
+
+    The same pose again lowers the noise and shows no more. Nobody asks for more than there are parameters: the count
+    ends there.
+    """
     data = samples.data
-    return len(np.unique(np.column_stack([data.prism, data.setup, data.readings]), axis=0))
+    left = np.column_stack([data.prism, data.setup, data.readings])
+    same = np.concatenate([[0.5, 0.5], standing_spread(chain.rig)])
+    count = 0
+    while len(left) and count < len(chain):
+        left = left[(np.abs(left - left[0]) > same).any(axis=1)]
+        count += 1
+    return count
 
 
 def require_enough(rig: Rig, observations: Observations, different: int | None = None) -> None:
@@ -54,9 +66,10 @@ def require_enough(rig: Rig, observations: Observations, different: int | None =
     different = fixes if different is None else different
     if 3 * different < parameters:
         repeats = f", repeats counted once of {fixes}," if different < fixes else ""
+        there_are = f"1 different fix{repeats} is" if different == 1 else f"{different} different fixes{repeats} are"
         raise UnsafeError(
-            f"{different} different fixes{repeats} are {3 * different} coordinates, which cannot determine "
-            f"{parameters} parameters; {_how_many(parameters)}"
+            f"{there_are} {3 * different} coordinates, which cannot determine {parameters} parameters; "
+            f"{_how_many(parameters)}"
         )
 
 
@@ -76,7 +89,7 @@ def doubts(observations: Observations, chain: Chain, samples: Samples) -> Iterat
             f"{len(copied)} of {len(observations)} rows are copies of earlier ones in every digit, the first in row "
             f"{copied[0] + 1}, and count once"
         )
-    different = different_fixes(samples)
+    different = different_fixes(chain, samples)
     if different < len(chain):
         yield (
             f"{different} different fixes are few for {len(chain)} parameters: much of the model rests on build "
@@ -161,6 +174,29 @@ def refuse_foreign(chain: Chain, samples: Samples, fit: Fit, tolerated_mm: float
             f"tolerances explain {tolerated_mm:.0f} mm even before it: another rig's data, exchanged columns, a "
             f"station that moved, or units, zeros of joints or a convention of rows other than the rig file has{hint}"
         )
+
+
+def refuse_turning(chain: Chain, samples: Samples, x: Floats) -> None:
+    """UnsafeError where the fixes of a set-up lie in one place, or on a line, but for their noise.
+
+    The base may turn about that, and noise alone would decide how: any pose but those measured would be metres off.
+
+    Args:
+        chain, samples: kinematics and rows.
+        x: (p,) parameters, about as they are.
+    """
+    known = information(chain, samples, x, excess_variance=0.0) + np.diag(prior_precision(chain, 1.0))
+    for number, setup in enumerate(chain.setups):
+        place, turn = np.split(np.arange(len(chain))[chain.base_index(number)], 2)
+        both = known[np.ix_(turn, place)]
+        attitude = known[np.ix_(turn, turn)] - both @ np.linalg.solve(known[np.ix_(place, place)], both.T)
+        sigma_deg = math.degrees(float(np.linalg.eigvalsh(attitude)[0]) ** -0.5)
+        if sigma_deg > _TURNING_DEG:
+            name = f"set-up {setup!r}" if setup else "the data"
+            raise UnsafeError(
+                f"{name}: all fixes lie in one place or on a line, but for their noise, so the base may turn about it "
+                f"(1 sigma: {sigma_deg:.0f} deg); measure other poses, and check the sigma columns where there are any"
+            )
 
 
 def refuse_discarded(rig: Rig, samples: Samples, fit: Fit, prior: Prior) -> None:

@@ -21,6 +21,7 @@ from calibration.identification.judgement import (
     mean_error_mm,
     refuse_discarded,
     refuse_foreign,
+    refuse_turning,
     require_enough,
     rms_tolerated_mm,
     tilts,
@@ -115,7 +116,7 @@ def solve(
     progress(0.0, "placing the base")
     require_enough(rig, observations)
     chain, samples, start = place(rig, observations)
-    require_enough(rig, observations, different_fixes(samples))
+    require_enough(rig, observations, different_fixes(chain, samples))
     warnings = list(doubts(observations, chain, samples))
     nominal = refine(chain, samples, start.x, free=np.isinf(chain.prior_sigma))
     progress(0.1, "refining")
@@ -153,6 +154,7 @@ def solve(
     warnings += tilts(chain, fit)
     refuse_foreign(chain, samples, fit, tolerated_mm, prior)
     refuse_discarded(rig, samples, fit, prior)
+    refuse_turning(chain, samples, fit.x)
     warnings += held_fixed(chain, samples, fit, prior)
     progress(0.9, "checking what the data determine")
     seen = identifiability(chain, samples, fit.x, fit.excess_variance)

@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 
 from calibration.errors import UnsafeError
 from calibration.identification.identifiability import identifiability
-from calibration.identification.judgement import refuse_mirrored, rms_left_mm, rms_tolerated_mm
+from calibration.identification.judgement import (
+    different_fixes,
+    refuse_mirrored,
+    refuse_turning,
+    rms_left_mm,
+    rms_tolerated_mm,
+)
 from calibration.identification.refinement import Prior, posterior, refine
 from calibration.identification.samples import Samples
 from calibration.identification.search.checkpoint import Checkpoint
@@ -71,9 +77,11 @@ def pde_paper(
     chain, samples, start = place(rig, observations)
     refuse_mirrored(chain, samples)
     nominal = refine(chain, samples, start.x, free=np.isinf(chain.prior_sigma))
+    refuse_turning(chain, samples, nominal.x)
     rows = np.array([p.kind == "row" for p in chain.parameters])
-    if 3 * len(samples) < rows.sum():
-        raise UnsafeError(f"{len(samples)} different fixes cannot determine {rows.sum()} constants of the rows")
+    different = different_fixes(chain, samples)
+    if 3 * different < rows.sum():
+        raise UnsafeError(f"{different} different fixes cannot determine {rows.sum()} constants of the rows")
     objective = _objective(chain, samples, rows, nominal.x)
     evolved = search(
         objective,

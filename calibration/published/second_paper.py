@@ -23,7 +23,13 @@ from calibration.errors import CalibrationError, DataError, UnsafeError
 from calibration.gap.adopt import Adopted
 from calibration.identification.additions import Additions, joined
 from calibration.identification.identifiability import identifiability
-from calibration.identification.judgement import refuse_mirrored, rms_left_mm, rms_tolerated_mm
+from calibration.identification.judgement import (
+    different_fixes,
+    refuse_mirrored,
+    refuse_turning,
+    rms_left_mm,
+    rms_tolerated_mm,
+)
 from calibration.identification.refinement import Fit, prior_precision, refine
 from calibration.identification.samples import Samples, reading_covariance
 from calibration.identification.solve import Solution, place
@@ -73,6 +79,7 @@ def km(rig: Rig, observations: Observations, *, progress: Progress) -> Solution:
     chain, samples, start = place(rig, observations)
     refuse_mirrored(chain, samples)
     nominal = refine(chain, samples, start.x, free=np.isinf(chain.prior_sigma))
+    refuse_turning(chain, samples, nominal.x)
     progress(0.2, "iterating least squares")
     fit, rounds = _iterated(chain, samples, nominal.x, _Compliances(samples, Situation(chain, nominal.x, observations)))
     tolerated_mm = rms_tolerated_mm(chain, samples, nominal)
@@ -161,9 +168,10 @@ def _iterated(chain: Chain, samples: Samples, start: Floats, compliances: _Compl
     linearise, additions = Lineariser(chain), compliances.at(start)
     state = _state(linearise, samples, np.concatenate([start, np.zeros(len(additions))]), additions)
     seen, unseen = _directions(state)
-    if 3 * len(samples) <= seen.shape[1]:
+    different = different_fixes(chain, samples)
+    if 3 * different <= seen.shape[1]:
         raise UnsafeError(
-            f"{len(samples)} different fixes cannot determine {seen.shape[1]} parameters by least squares; "
+            f"{different} different fixes cannot determine {seen.shape[1]} parameters by least squares; "
             f"measure at least {seen.shape[1] // 3 + 1}"
         )
     rounds, settled = 0, False

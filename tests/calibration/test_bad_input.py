@@ -18,6 +18,7 @@ from calibration.pipeline import evaluate, identify
 from calibration.rig import parse_rig, shipped_rig
 from daemon.cli.main import main as rigcal
 from tests.calibration.conftest import Session, rig_text, rms
+from tests.calibration.test_circles import joined_observations
 
 Change = Callable[[Observations], Observations]
 
@@ -165,6 +166,30 @@ def test_the_same_readings_again_count_as_one_fix(session: Session) -> None:
     again = replace(again, position_mm=again.position_mm + noise_mm, pose=np.arange(120).astype(np.str_))
     model = identify(session.rig, rig_text("swdt82"), again, effects="none")
     assert any(w.startswith("30 different fixes are few for 56 parameters") for w in model.warnings)
+
+
+def test_a_machine_that_stands_still_is_one_pose_whatever_its_encoders_add(session: Session) -> None:
+    still = session.training.select(np.zeros(60, dtype=np.intp))
+    rng = np.random.default_rng(6)
+    joints = {j.name: still.joints[j.name] + j.sigma * rng.normal(size=60) for j in session.rig.joints}
+    position_mm = still.position_mm + rng.normal(0.0, 2.0, (60, 3))
+    still = replace(still, joints=joints, position_mm=position_mm, pose=np.full(60, ""))
+    with pytest.raises(UnsafeError, match="1 different fix, repeats counted once of 60, is 3 coordinates"):
+        identify(session.rig, rig_text("swdt82"), still)
+
+
+@pytest.mark.parametrize("method", ["default", "km"])
+def test_a_base_that_only_noise_turns_is_refused(session: Session, method: str) -> None:
+    lone = session.training.select(np.zeros(12, dtype=np.intp))
+    noise_mm = np.random.default_rng(7).normal(0.0, 2.0, (12, 3))
+    lone = replace(
+        lone, position_mm=lone.position_mm + noise_mm, setup=np.full(12, "new"), pose=np.arange(12).astype(str)
+    )
+    turns = "set-up 'new': all fixes lie in one place or on a line, but for their noise"
+    with pytest.raises(UnsafeError, match=turns):
+        identify(session.rig, rig_text("swdt82"), joined_observations([session.training, lone]), method=method)
+    with pytest.raises(UnsafeError, match=turns):
+        evaluate(session.model, lone, refit_base=True)
 
 
 def test_coordinates_in_another_order_are_named_where_positions_come_out_right(session: Session) -> None:
