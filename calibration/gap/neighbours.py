@@ -52,14 +52,15 @@ def neighbours(projection: Projection, rng: np.random.Generator, draws: int) -> 
     residual = projection.residual.reshape(-1, 3)
     groups, group = np.unique(projection.groups, return_inverse=True)
     signs = 2.0 * rng.integers(0, 2, (draws, len(groups))) - 1.0
-    samples = projection.samples
-    range_mm = np.linalg.norm(samples.position_mm, axis=1)[:, None]
-    sight = samples.position_mm / np.maximum(range_mm, _LEAST_MM)
-    time_s = samples.average(projection.situation.extra("time_s")[:, None])
+    # Where the model has them: as measured, fixes of a prism that stands still would be neighbours by their noise.
+    place_mm = projection.samples.position_mm - projection.error_mm
+    range_mm = np.linalg.norm(place_mm, axis=1)[:, None]
+    sight = place_mm / np.maximum(range_mm, _LEAST_MM)
+    time_s = projection.samples.average(projection.situation.extra("time_s")[:, None])
     for where, variable, at, error in (
         ("base", "time", time_s, residual),
         ("station", "range", range_mm, (residual * sight).sum(axis=1)[:, None]),
-        ("station", "place", samples.position_mm, residual),
+        ("station", "place", place_mm, residual),
     ):
         a, b = _pairs(at, group)
         if len(a) < _LEAST:

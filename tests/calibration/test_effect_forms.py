@@ -22,7 +22,7 @@ from calibration.identification.identifiability import identifiability
 from calibration.identification.refinement import prior_precision, refine
 from calibration.identification.solve import Solution, place
 from calibration.observations import Floats, Observations, parse_observations
-from calibration.rig import shipped_rig
+from calibration.rig import Prism, Rig, shipped_rig
 from simulators.dataset import simulate_observations
 from simulators.truth import RigTruth
 
@@ -44,7 +44,12 @@ def projected(shift: Floats | None = None) -> Projection:
     observations = measured()
     if shift is not None:
         observations = replace(observations, position_mm=observations.position_mm + shift)
-    chain, samples, start = place(RIG, observations)
+    return fitted(RIG, observations)
+
+
+def fitted(rig: Rig, observations: Observations) -> Projection:
+    """The fit of the kinematics."""
+    chain, samples, start = place(rig, observations)
     nominal = refine(chain, samples, start.x, free=np.isinf(chain.prior_sigma))
     near = approach(chain, samples, nominal.x, precision=prior_precision(chain, PRIOR_SCALE["recalibration"]))
     fit = refine(chain, samples, near)
@@ -130,17 +135,25 @@ def test_the_base_tilts_about_level_axes_wherever_its_own_point(bare: Projection
     assert (rise[:, 2] > np.cos(np.radians(2.0))).all()
 
 
+def heard(projection: Projection) -> set[str]:
+    """Along which variables neighbours share an error."""
+    found = neighbours(projection, np.random.default_rng(3), 999)
+    return {along.variable for along in found if along.shared > 3.5 * along.chance.std()}
+
+
 def test_neighbours_share_an_error_that_no_formula_has_and_no_noise(bare: Projection) -> None:
     time_h = measured().extra["time_s"] / 3600.0
     swings = np.outer(np.sin(2.0 * np.pi * time_h / 0.7), [2.0, -3.0, 2.5])
     range_m = np.linalg.norm(measured().position_mm, axis=1) / 1e3
     ripples = measured().position_mm / range_m[:, None] * 5e-3 * np.sin(2.0 * np.pi * range_m / 2.0)[:, None]
 
-    def heard(projection: Projection) -> set[str]:
-        rng = np.random.default_rng(3)
-        found = neighbours(projection, rng, 999)
-        return {along.variable for along in found if along.shared > 3.5 * along.chance.std()}
-
     assert heard(bare) == set()
     assert heard(projected(swings)) == {"time"}
     assert heard(projected(ripples)) == {"range"}
+
+
+def test_noise_chooses_no_neighbours_of_a_prism_that_stands_still() -> None:
+    foot = Prism(name="foot", frame=0, offset_mm=(-800.0, 0.0, 300.0))
+    rig = RIG.model_copy(update={"prisms": (*RIG.prisms, foot)})
+    table = simulate_observations(RigTruth(rig, 1), 75, 1, noise_mm=3.0, prisms=("s", "foot"))
+    assert heard(fitted(rig, parse_observations(table.csv_text().encode(), rig, "simulated.csv"))) == set()
