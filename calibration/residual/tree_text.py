@@ -20,6 +20,7 @@ Integers = NDArray[np.int64]
 
 LEAVES_MAX: Final = 256
 _TEXT_MAX = 64 * 2**20
+_MOST = 1e300  # size of a number
 _DEFAULT_LEFT = 2  # bits of a decision type: 1 categorical, 2 missing values go left, 4 and 8 what is missing
 _DECISIONS = frozenset({0, 2, 4, 6, 8, 10})
 _HEADER = {"version": "v4", "num_class": "1", "num_tree_per_iteration": "1", "objective": "regression"}
@@ -37,7 +38,7 @@ class Tree:
 
     Attributes:
         feature: (k,) column that each node looks at.
-        threshold: (k,) values up to it go left.
+        threshold: (k,) values up to it go left; infinity divides what is missing from all else.
         missing: (k,) what counts as missing: 0 nothing (NaN is taken for zero), 1 zero and NaN, 2 NaN.
         missing_left: (k,) whether what is missing goes left.
         label: (k,) of the rows that the node divides.
@@ -111,7 +112,7 @@ def _tree(number: int, lines: Sequence[str], features: int) -> Tree:
         nodes = leaves - 1
         return _numbered(
             feature=_numbers(found["split_feature"], nodes, int),
-            threshold=_numbers(found["threshold"], nodes, float),
+            threshold=_numbers(found["threshold"], nodes, float, most=math.inf),
             decision=_numbers(found["decision_type"], nodes, int),
             left=_numbers(found["left_child"], nodes, int),
             right=_numbers(found["right_child"], nodes, int),
@@ -125,12 +126,12 @@ def _tree(number: int, lines: Sequence[str], features: int) -> Tree:
         raise ValueError(f"tree {number} cannot be read: {error}") from error
 
 
-def _numbers(text: str, count: int, kind: Callable[[str], N]) -> list[N]:
+def _numbers(text: str, count: int, kind: Callable[[str], N], most: float = _MOST) -> list[N]:
     words = text.split()
     if len(words) != count:
         raise ValueError(f"there are {len(words)} values where {count} are due")
     values = [kind(word) for word in words]
-    if not all(-1e300 <= value <= 1e300 for value in values):  # False for NaN
+    if not all(-_MOST <= value <= most for value in values):  # False for NaN
         raise ValueError("a value is not finite")
     return values
 

@@ -37,7 +37,8 @@ def table(n: int, seed: int) -> Floats:
 
 def grown(trees: int = 30, seed: int = 0, **more: Any) -> Any:
     rows = table(900, seed)
-    label = np.nan_to_num(rows[:, 0]) * rows[:, 2] + np.abs(rows[:, 1]) + np.sin(rows[:, 4]) + (rows[:, 1] == 0.0)
+    label = np.nan_to_num(rows[:, 0]) * rows[:, 2] + np.abs(rows[:, 1]) + np.sin(rows[:, 4])
+    label += (rows[:, 1] == 0.0) + 2.0 * np.isnan(rows[:, 0])
     parameters = {"objective": "l2", "verbose": -1, "num_threads": 1, "boost_from_average": False, "seed": seed}
     parameters |= {"learning_rate": 0.1, "num_leaves": 15, "bagging_fraction": 0.8, "bagging_freq": 1} | more
     return lightgbm.train(parameters, lightgbm.Dataset(rows, label=label, params=parameters), trees)
