@@ -213,6 +213,13 @@ class Rig(_Part):
             for number, row in enumerate(rows, 1)
         )
 
+    @field_validator("gravity")
+    @classmethod
+    def _points_somewhere(cls, gravity: Vector) -> Vector:
+        if not any(gravity):
+            raise ValueError("it points nowhere; downwards in the base frame is (0, 0, -1) where z is up")
+        return gravity
+
     @model_validator(mode="after")
     def _names_differ(self) -> Rig:
         for what, names in (
@@ -227,10 +234,11 @@ class Rig(_Part):
 
     @model_validator(mode="after")
     def _joints_fit(self) -> Rig:
-        driven = {name for _, _, name, _ in self.couplings()}
+        coefficients = [(name, coefficient) for _, _, name, coefficient in self.couplings()]
+        named, driven = {name for name, _ in coefficients}, {name for name, coefficient in coefficients if coefficient}
         known = {j.name for j in self.joints}
-        if driven - known:
-            raise ValueError(f"row is driven by unknown joint {sorted(driven - known)[0]!r}; joints: {sorted(known)}")
+        if named - known:
+            raise ValueError(f"row is driven by unknown joint {sorted(named - known)[0]!r}; joints: {sorted(known)}")
         if known - driven:
             raise ValueError(f"joint {sorted(known - driven)[0]!r} drives no row")
         for channel in self.channels:

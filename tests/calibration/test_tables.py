@@ -190,6 +190,8 @@ def test_rows_that_say_nothing_have_beta_where_axes_are_nearly_parallel(
         ("limits = [-360, 360]", "limits = [360, -360]", "limits must rise"),
         ("theta = { q1 = 1.0 }", "theta = { q9 = 1.0 }", "unknown joint 'q9'"),
         ("theta = { q1 = 1.0 }", "theta = { q2 = 1.0 }", "joint 'q1' drives no row"),
+        ("theta = { q1 = 1.0 }", "theta = { q1 = 0.0 }", "joint 'q1' drives no row"),
+        ("gravity = [0, 0, -1]", "gravity = [0, 0, 0]", "gravity: it points nowhere"),
         ('"q1"\nkind = "revolute"', '"z"\nkind = "prismatic"', "no joint can be called 'z': its column z_mm is one of"),
         ("frame = 6", "frame = 7", "beyond the last row 6"),
         ("d_mm = 127.3", "d_mm = 127.3\nb_mm = 1", "convention 'dh' has no b"),
