@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from calibration.identification.standing import standing_spread
 from calibration.kinematics import Chain, ChainData
+from calibration.limits import turns_deg
 from calibration.observations import Floats, Observations, originals
 from calibration.rig import Rig
 
@@ -115,20 +116,20 @@ def averaged(chain: Chain, observations: Observations) -> Samples:
     Raises:
         DataError: a prism or set-up that the chain does not know.
     """
-    rig = chain.rig
+    rig, turns = chain.rig, turns_deg(chain.rig)
     distinct, original = np.unique(originals(observations), return_inverse=True)
     observations = observations.select(distinct)
     data = chain.bind(observations)
     position = observations.position_mm
     covariance = station_covariance(rig, position, observations.sigma_mm)
-    of_row, squares, freedom = _standstills(rig, observations, data.readings, covariance)
+    of_row, squares, freedom = _standstills(rig, turns, observations, data.readings, covariance)
     count = np.bincount(of_row).astype(float)
     expected = np.trace(covariance, axis1=1, axis2=2).mean() / 3.0
     repeat_variance = max(0.0, squares / (3.0 * freedom) - expected) if freedom >= _LEAST_REPEATS else 0.0
 
     first = np.unique(of_row, return_index=True)[1]
     start = data.readings[first][of_row]
-    readings = start + _differences(rig, data.readings - start)
+    readings = start + _differences(turns, data.readings - start)
     means = ChainData(_averages(of_row, readings), data.prism[first], data.setup[first])
     return Samples(
         means,
@@ -137,7 +138,7 @@ def averaged(chain: Chain, observations: Observations) -> Samples:
         _averages(of_row, joint_rates(rig, observations)),
         of_row[original],
         float(repeat_variance),
-        _shared(rig, observations.select(first), means, np.bincount(of_row)),
+        _shared(rig, turns, observations.select(first), means, np.bincount(of_row)),
     )
 
 
@@ -151,7 +152,7 @@ def _averages(of_row: Integers, values: Floats) -> Floats:
     return averages
 
 
-def _shared(rig: Rig, observations: Observations, means: ChainData, count: Integers) -> Integers:
+def _shared(rig: Rig, turns: Floats, observations: Observations, means: ChainData, count: Integers) -> Integers:
     """(m,) number of each sample's standstill, from one observation of each, mean readings and how many it averages.
 
     A standstill takes a prism in once: a second sample of it is one that disagreed.
@@ -166,7 +167,7 @@ def _shared(rig: Rig, observations: Observations, means: ChainData, count: Integ
             continue
         prism, readings = int(means.prism[sample]), means.readings[sample]
         for number, first, prisms in begun.setdefault(key, []):
-            if prism not in prisms and (np.abs(_differences(rig, readings - first)) <= spread).all():
+            if prism not in prisms and (np.abs(_differences(turns, readings - first)) <= spread).all():
                 prisms.add(prism)
                 found[sample] = number
                 break
@@ -175,14 +176,13 @@ def _shared(rig: Rig, observations: Observations, means: ChainData, count: Integ
     return found
 
 
-def _differences(rig: Rig, change: Floats) -> Floats:
-    """(n, joints) changes of readings, deg or mm, the angles among them the short way round."""
-    turns = np.array([joint.kind == "revolute" for joint in rig.joints])
-    return np.where(turns, (change + 180.0) % 360.0 - 180.0, change)
+def _differences(turns: Floats, change: Floats) -> Floats:
+    """(n, joints) changes of readings, deg or mm, without the whole turns (joints,) that leave the machine in place."""
+    return np.where(turns > 0.0, (change + 180.0) % 360.0 - 180.0, change)
 
 
 def _standstills(
-    rig: Rig, observations: Observations, readings: Floats, covariance: Floats
+    rig: Rig, turns: Floats, observations: Observations, readings: Floats, covariance: Floats
 ) -> tuple[Integers, float, int]:
     """Sample index of every row; sum of squared deviations within standstills and its degrees of freedom.
 
@@ -211,7 +211,7 @@ def _standstills(
             # The half-way point of two repeats proves neither wrong, so their own spread does not widen the limit.
             spread = 3.0 * np.median(distance) if len(rows) > 2 else 0.0
             agrees = distance <= np.maximum(_REPEAT_LIMIT * sigma, spread)
-            change = _differences(rig, readings[rows] - readings[rows[0]])
+            change = _differences(turns, readings[rows] - readings[rows[0]])
             agrees &= (np.abs(change - np.median(change, axis=0)) <= from_middle).all(axis=1)
             for row in together[~agrees]:
                 of_row[row] = following

@@ -73,6 +73,16 @@ def test_angles_on_both_sides_of_a_turn_are_averaged_the_short_way_round(session
     assert abs(found) == pytest.approx(180.0)
 
 
+def test_a_turn_that_is_another_place_is_another_sample(session: Session) -> None:
+    observations = simulated(session.truth, 4, 3, repeats=4)
+    theta7 = observations.joints["theta7"] + [0.0, 0.0, 360.0, 0.0]
+    again = replace(observations, joints={**observations.joints, "theta7": theta7})
+    assert len(averaged(blank(session), again)) == 1
+    rows = [row.model_copy(update={"drive": {"theta": {"theta7": 0.5}}}) for row in session.rig.rows[6:7]]
+    geared = session.rig.model_copy(update={"rows": (*session.rig.rows[:6], *rows, *session.rig.rows[7:])})
+    assert len(averaged(Chain(geared, {"": Placement.identity()}), again)) == 2
+
+
 def test_fixes_without_a_pose_are_never_averaged(session: Session) -> None:
     observations = replace(session.training, pose=np.full(len(session.training), "", dtype=np.str_))
     assert len(averaged(blank(session), observations)) == len(observations)
