@@ -202,22 +202,22 @@ def predicted_accuracy(
 
 
 def expected_accuracy(
-    model: CalibratedModel, rng: np.random.Generator, *, setup: str | None = None, poses: int = VOLUME_POSES
+    model: CalibratedModel, rng: np.random.Generator, *, poses: int = VOLUME_POSES
 ) -> ExpectedAccuracy:
     """What a calibrated model expects of itself, in random poses of the work volume (`design.work_volume`).
 
-    With a learned residual, what it removed of the training data's scatter is removed here.
+    Of several set-ups it is the one that `design.knowledge.setup_of` chooses. What a learned residual removed of the
+    training data's scatter is removed here.
 
     Args:
         model: the model.
         rng: draws the poses.
-        setup: one of the model's set-ups; by default as `design.knowledge.setup_of` chooses.
         poses: how many.
 
     Raises:
-        UnsafeError: no such set-up; the rig can take no pose inside its joint limits.
+        UnsafeError: the rig can take no pose inside its joint limits.
     """
-    number = setup_of(model, setup)
+    number = setup_of(model)
     knowledge = Knowledge.of_model(model, number)
     at = site(model.chain, model.values, setup=number)
     readings = work_volume(knowledge, at, rng, poses)

@@ -8,7 +8,7 @@ import io
 import math
 import re
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import NoReturn
 
@@ -151,17 +151,14 @@ def parse_observations(data: bytes, rig: Rig, source: str, *, positions_required
     return _build(table, header, rig, positions_required)
 
 
-def format_observations(
-    observations: Observations, rig: Rig, more: Mapping[str, Sequence[object] | Floats] | None = None
-) -> str:
+def format_observations(observations: Observations, rig: Rig) -> str:
     """Observations as the contract's CSV, with shortest exact numbers and empty cells for what is not measured.
 
     Args:
         observations: the table.
         rig: gives the joints' units.
-        more: further columns to append (`predict` adds `x_pred_mm`, ...).
     """
-    columns: dict[str, Sequence[object] | Floats | Strings] = {"prism": observations.prism}
+    columns: dict[str, Floats | Strings] = {"prism": observations.prism}
     columns |= {rig.joint(name).column: values for name, values in observations.joints.items()}
     columns |= {name: observations.position_mm[:, i] for i, name in enumerate(POSITION_COLUMNS)}
     for name in LABEL_COLUMNS:
@@ -170,7 +167,7 @@ def format_observations(
             columns[name] = labels
     if np.isfinite(observations.sigma_mm).any():
         columns |= {name: observations.sigma_mm[:, i] for i, name in enumerate(SIGMA_COLUMNS)}
-    columns |= dict(observations.extra) | dict(more or {})
+    columns |= observations.extra
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(columns)
@@ -194,16 +191,8 @@ def originals(observations: Observations) -> NDArray[np.intp]:
     return np.array(first, dtype=np.intp)
 
 
-def _cells(values: Sequence[object] | Floats | Strings) -> list[str]:
-    if isinstance(values, np.ndarray) and values.dtype == np.float64:
-        return ["" if math.isnan(v) else repr(v) for v in values.tolist()]
-    return [_cell(value) for value in values]
-
-
-def _cell(value: object) -> str:
-    if isinstance(value, float):
-        return "" if math.isnan(value) else repr(float(value))
-    return str(value)
+def _cells(values: Floats | Strings) -> list[str]:
+    return [value if isinstance(value, str) else "" if math.isnan(value) else repr(value) for value in values.tolist()]
 
 
 @dataclass(frozen=True)

@@ -181,13 +181,13 @@ def choose(blocks: Floats, count: int, criterion: Criterion, before: Floats | No
     return np.array(chosen, dtype=np.intp)
 
 
-def covariance_of(blocks: Floats, before: Floats | None = None) -> Floats:
-    """(q, q) posterior covariance in prior units when all blocks (n, r, q) are measured, `before` as for `choose`."""
-    return _inverse(information_of(blocks, before))
+def covariance_of(blocks: Floats) -> Floats:
+    """(q, q) posterior covariance in prior units when all blocks (n, r, q) are measured."""
+    return _inverse(information_of(blocks))
 
 
 def information_of(blocks: Floats, before: Floats | None = None) -> Floats:
-    """(q, q) the inverse of that covariance."""
+    """(q, q) the inverse of that covariance, `before` as for `choose`."""
     rows = blocks.reshape(-1, blocks.shape[2])
     information: Floats = _known(blocks, before) + rows.T @ rows
     return information

@@ -37,7 +37,6 @@ def approach(
     *,
     precision: Floats,
     free: NDArray[np.bool_] | None = None,
-    seed: int = 0,
     rounds: int = _ROUNDS,
 ) -> Floats:
     """Parameters (p,) near the optimum that `start` leads to.
@@ -48,11 +47,10 @@ def approach(
         start: (p,) parameters.
         precision: (p,) 1 / sigma^2 of the prior.
         free: (p,) which parameters move; all by default.
-        seed: of the choice of rows.
         rounds: steps at most.
     """
     free = np.ones(len(chain), dtype=bool) if free is None else free
-    rows = drawn(samples.data, samples.position_mm, _ROWS, seed)
+    rows = drawn(samples.data, samples.position_mm, _ROWS, 0)
     data, position = samples.data.select(rows), samples.position_mm[rows]
     least = math.sqrt(float(np.trace(samples.station_covariance[rows], axis1=1, axis2=2).mean()) / 3.0)
     columns = int(free.sum())

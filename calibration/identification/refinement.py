@@ -107,21 +107,12 @@ def refine(
     return _fit(_Problem(chain, samples, free, additions), start, prior, excess_variance, moves=True)
 
 
-def posterior(
-    chain: Chain,
-    samples: Samples,
-    x: Floats,
-    *,
-    free: Flags | None = None,
-    prior: Prior = "recalibration",
-    excess_variance: float | None = None,
-    additions: Additions | None = None,
-) -> Fit:
+def posterior(chain: Chain, samples: Samples, x: Floats, *, prior: Prior = "recalibration") -> Fit:
     """Noise, outliers, covariance and cost as they are at `x` itself, for methods that search by other means.
 
-    Arguments and errors as `refine`; `free` says which parameters the covariance is of.
+    Arguments and errors as `refine`.
     """
-    return _fit(_Problem(chain, samples, free, additions), x, prior, excess_variance, moves=False)
+    return _fit(_Problem(chain, samples, None, None), x, prior, None, moves=False)
 
 
 def information(

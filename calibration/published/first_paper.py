@@ -54,7 +54,6 @@ def pde_paper(
     progress: Progress,
     should_stop: Callable[[], bool] | None = None,
     checkpoint: Checkpoint | None = None,
-    settings: PaperSettings | None = None,
 ) -> Solution:
     """Identify the rows' constants by the paper's search; every prism has the same weight in Eq. 19.
 
@@ -67,7 +66,6 @@ def pde_paper(
         progress: told (share done, what is going on).
         should_stop: asked after every generation; the best so far is taken once it says so.
         checkpoint: where the search keeps its state, and goes on from.
-        settings: the paper's by default.
 
     Raises:
         DataError: a prism that the rig lacks.
@@ -91,7 +89,6 @@ def pde_paper(
         progress=lambda share: progress(0.05 + 0.85 * share, "the paper's differential evolution"),
         should_stop=should_stop,
         checkpoint=checkpoint,
-        settings=settings,
     )
     x = nominal.x.copy()
     x[rows] = evolved.x
@@ -138,7 +135,7 @@ def search(
 ) -> Evolved:
     """The paper's search of an objective's free parameters within +-`width`: shuffled data, repeated.
 
-    Arguments and errors as `pde_paper`.
+    Arguments and errors as `pde_paper`; `settings` are the paper's by default.
     """
     return evolve_paper(
         [objective.fitness(part) for part in objective.shuffled(_REPEATS, _SHARE, seed)],

@@ -16,12 +16,12 @@ from calibration.identification.sweeps.circles import Axis, drives_several, join
 from calibration.kinematics import Chain, ChainData, Placement
 from calibration.observations import Floats
 
-_FAR_PRIOR = 100.0  # build tolerances within which a far start may lie, 1 sigma
+_FAR_PRIOR = 100.0  # build tolerances within which a far start may lie, 1 sigma: angles may be tens of degrees off
 _INNER_ROUNDS, _LAST_ROUNDS = 10, 40
 _FLOOR_RAD, _FLOOR_MM = np.radians(0.2), 5.0  # weights of a start: no axis counts more than it needs to
 
 
-def start_from_axes(chain: Chain, samples: Samples, axes: Sequence[Axis], *, prior_scale: float = _FAR_PRIOR) -> Floats:
+def start_from_axes(chain: Chain, samples: Samples, axes: Sequence[Axis]) -> Floats:
     """Parameters that bring the model's axes and circles onto the measured ones: a start for the refinement.
 
     Directions depend on angles alone, and hardly on one another's errors: base and angles are fitted to them first,
@@ -32,7 +32,6 @@ def start_from_axes(chain: Chain, samples: Samples, axes: Sequence[Axis], *, pri
         chain: kinematics with its bases placed anyhow.
         samples: the rows, for set-ups without sweeps.
         axes: of `find_axes`, at least one.
-        prior_scale: width of the prior in build tolerances; the default lets angles be tens of degrees off.
 
     Returns:
         (p,) parameters.
@@ -40,7 +39,7 @@ def start_from_axes(chain: Chain, samples: Samples, axes: Sequence[Axis], *, pri
     Raises:
         UnsafeError: a set-up without sweeps whose fixes cannot place its base.
     """
-    precision = prior_precision(chain, prior_scale)
+    precision = prior_precision(chain, _FAR_PRIOR)
     x = np.zeros(len(chain))
     seen = sorted({chain.setups.index(axis.setup) for axis in axes})
     for setup in seen:
