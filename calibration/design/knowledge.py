@@ -15,7 +15,7 @@ from calibration.errors import UnsafeError
 from calibration.identification.additions import Additions
 from calibration.identification.refinement import prior_precision
 from calibration.kernels.lineariser import Lineariser
-from calibration.kernels.machine import Machine
+from calibration.kernels.machine import Machine, root_of
 from calibration.kinematics import Chain, ChainData, Linearisation
 from calibration.model import CalibratedModel
 from calibration.observations import Floats, Observations
@@ -181,12 +181,3 @@ def setup_of(model: CalibratedModel, name: str | None = None) -> int:
         known = ", ".join(repr(s) for s in setups)
         raise UnsafeError(f"set-up {name!r} is unknown to the model (known: {known}); name one of these")
     return setups.index(name)
-
-
-def root_of(covariance: Floats) -> Floats:
-    """(q, q) a root of a covariance that may be singular."""
-    scale = np.sqrt(np.diag(covariance))
-    scale[scale == 0.0] = 1.0
-    value, vector = np.linalg.eigh(covariance / scale[:, None] / scale)
-    root: Floats = scale[:, None] * vector * np.sqrt(np.maximum(value, 0.0))
-    return root

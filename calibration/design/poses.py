@@ -26,7 +26,7 @@ from calibration.design.exchange import (
     covariance_of,
     information_of,
 )
-from calibration.design.knowledge import Knowledge, root_of
+from calibration.design.knowledge import Knowledge
 from calibration.design.rivals import Rival, changing, conditions_of, name_of, rival_of, together
 from calibration.design.tour import length_s, short_tour, travel_s
 from calibration.design.visibility import Bodies, Flags, Site, in_view, is_reachable, limits
@@ -38,6 +38,7 @@ from calibration.identification.additions import Additions, joined
 from calibration.identification.identifiability import observability_indices
 from calibration.identification.refinement import information, prior_precision
 from calibration.identification.samples import averaged, reading_variance, station_covariance
+from calibration.kernels.machine import root_of
 from calibration.kinematics import Linearisation
 from calibration.observations import Floats, Observations
 from calibration.rig import Rig

@@ -132,7 +132,8 @@ def explain(
         executor: runs the trials; the answer does not depend on it.
     """
     blank = Chain(chain.rig, {setup: Placement.identity() for setup in chain.setups})
-    some = _some(samples)
+    # A part of the samples is enough to tell suppositions apart.
+    some = samples.select(drawn(samples.data, samples.position_mm, _ROWS, 0))
     conceivable = list(conceivable_mistakes(blank, some))
     carried: list[tuple[Supposition, ...]] = [()]
     best: list[_Trial] = []
@@ -165,20 +166,6 @@ def _explains(after: Quality, before: Quality, tolerated_mm: float) -> bool:
     if before.misfit_mm < tolerated_mm:
         return after.pull < _MUCH * before.pull
     return after.misfit_mm < _EXPLAINS * before.misfit_mm
-
-
-def _some(samples: Samples) -> Samples:
-    """A part of the samples that is enough to tell suppositions apart."""
-    rows = drawn(samples.data, samples.position_mm, _ROWS, 0)
-    return replace(
-        samples,
-        data=samples.data.select(rows),
-        position_mm=samples.position_mm[rows],
-        station_covariance=samples.station_covariance[rows],
-        rates=samples.rates[rows],
-        of_row=np.arange(len(rows)),
-        standstill=None,
-    )
 
 
 def _extended(

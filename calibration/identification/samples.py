@@ -7,7 +7,7 @@ standing joint errs the same way at each of its fixes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,19 @@ class Samples:
 
     def __len__(self) -> int:
         return len(self.data)
+
+    def select(self, rows: Integers | NDArray[np.bool_]) -> Samples:
+        """The given samples, by mask or by index, each as a standstill and an observation of its own."""
+        data = self.data.select(rows)
+        return replace(
+            self,
+            data=data,
+            position_mm=self.position_mm[rows],
+            station_covariance=self.station_covariance[rows],
+            rates=self.rates[rows],
+            of_row=np.arange(len(data)),
+            standstill=None,
+        )
 
     def average(self, values: Floats) -> Floats:
         """(m, ...) means over the observations of each sample of their `values` (n, ...)."""

@@ -80,7 +80,7 @@ class Machine:
         repeat_sigma_mm: float = 0.0,
     ) -> None:
         station = chain.rig.station
-        root = np.zeros((len(chain), len(chain))) if covariance is None else _triangular_root(covariance)
+        root = np.zeros((len(chain), len(chain))) if covariance is None else _triangular(root_of(covariance))
         offsets = np.array([[op.constant + x[op.parameter] for op in ops] for ops in chain.prism_ops])
         bases = [_base(chain, x, setup) for setup in range(len(chain.setups))]
         self._bases: Floats = np.array(bases, dtype=np.float64).reshape(-1, 7, 3)
@@ -233,12 +233,17 @@ class Carrier:
         return out
 
 
-def _triangular_root(covariance: Floats) -> Floats:
-    """(q, q) lower triangular root of a covariance that may be singular."""
+def root_of(covariance: Floats) -> Floats:
+    """(q, q) a root of a covariance that may be singular: root @ root' is the covariance."""
     scale = np.sqrt(np.diag(covariance))
     scale[scale == 0.0] = 1.0
     value, vector = np.linalg.eigh(covariance / scale[:, None] / scale)
-    root = scale[:, None] * vector * np.sqrt(np.maximum(value, 0.0))
+    root: Floats = scale[:, None] * vector * np.sqrt(np.maximum(value, 0.0))
+    return root
+
+
+def _triangular(root: Floats) -> Floats:
+    """(q, q) the lower triangular root of the same covariance."""
     return np.ascontiguousarray(np.linalg.qr(root.T).R.T)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,18 +136,8 @@ def _place_others(chain: Chain, samples: Samples, x: Floats, seen: Sequence[int]
         return x
     names = {chain.setups[s]: Placement.identity() for s in others}
     blank = Chain(chain.rig, names)
-    rows = np.isin(samples.data.setup, others)
-    data = samples.data.select(rows)
-    number = {s: i for i, s in enumerate(others)}
-    data = ChainData(data.readings, data.prism, np.array([number[int(s)] for s in data.setup], dtype=np.intp))
-    own = Samples(
-        data,
-        samples.position_mm[rows],
-        samples.station_covariance[rows],
-        samples.rates[rows],
-        np.arange(int(rows.sum())),
-        samples.repeat_variance,
-    )
+    own = samples.select(np.isin(samples.data.setup, others))
+    own = replace(own, data=replace(own.data, setup=np.searchsorted(others, own.data.setup)))
     body = np.concatenate([x[: chain.base_start], np.zeros(6 * len(others))])
     # Only a start: whether coordinates are mirrored is judged by the fit.
     start = rough_start(blank, own, body, offsets=False, mirrored="let pass")
