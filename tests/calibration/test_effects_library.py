@@ -127,6 +127,17 @@ def test_a_family_has_sane_numbers_wherever_it_may_be_on_the_boom(
 
 
 @pytest.mark.parametrize("family", library().values(), ids=list(library()))
+def test_a_family_has_forms_where_a_spindle_turns_no_row(family: Family, situation: Situation) -> None:
+    rig = situation.rig
+    spindle = rig.joint("L3").model_copy(update={"kind": "revolute"})
+    joints = tuple(spindle if joint.name == "L3" else joint for joint in rig.joints)
+    chain = Chain(rig.model_copy(update={"joints": joints}), situation.chain.placements)
+    there = Situation(chain, situation.x, situation.observations)
+    for where, settings in forms(family, there):
+        assert np.isfinite(moved_mm(there, Choice(family.name, where, settings))).all()
+
+
+@pytest.mark.parametrize("family", library().values(), ids=list(library()))
 def test_columns_are_the_derivative_of_what_a_model_predicts(
     family: Family, situation: Situation, session: Session
 ) -> None:

@@ -32,6 +32,10 @@ class SolarBow(JointFamily):
     column: ClassVar[str] = _COLUMN
     kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
 
+    def places(self, rig: Rig) -> tuple[str, ...]:
+        turning = {joint for _, driven, joint, _ in rig.couplings() if driven == "theta"}
+        return tuple(name for name in super().places(rig) if name in turning)
+
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
         known, frame = self.known(situation, where), _link_end(situation, where)
         carries = situation.greatest_torque(where) > 0.0 or not situation.rig.masses
