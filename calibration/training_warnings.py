@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+
+import numpy as np
 
 from calibration.effects.library import library
 from calibration.identification.solve import Solution
 from calibration.limits import beyond_limits, never_moved
-from calibration.model import CalibratedModel
+from calibration.model import CalibratedModel, Outlier
 from calibration.observations import Observations
 from calibration.rig import BEYOND_BUILDING
 
 _LISTED = 10
+_TOGETHER = 0.9  # of the outliers
+_NOT_ALL = 0.7  # of all fixes
 _BADLY = 0.3  # of what build tolerances explain
 _FAR_RAD = math.radians(10.0)
 _BEYOND_LIMITS = 0.05  # of the span between a joint's limits
@@ -47,6 +51,7 @@ def _of_fit(model: CalibratedModel, observations: Observations, solution: Soluti
             f"where build tolerances explain {solution.tolerated_mm:.0f} mm before the fit; check zeros and signs of "
             f"the joints, the rig file, and whether the station stood still{hint}"
         )
+        return
     known_mm = math.sqrt(model.known_noise_mm2)
     if model.effects_noise_mm > _FAR_NOISIER * known_mm:
         yield (
@@ -98,8 +103,23 @@ def _of_outliers(model: CalibratedModel, observations: Observations, solution: S
         )
         yield (
             f"{len(worst)} of {len(observations)} training fixes are outliers and {share} (row {rows}{more}; "
-            f"up to {worst[0].sigma:.0f} sigma)"
+            f"up to {worst[0].sigma:.0f} sigma){_where_together(observations, model.find_outliers(observations))}"
         )
+
+
+def _where_together(observations: Observations, outliers: Sequence[Outlier]) -> str:
+    """What nearly all outliers have in common and most other fixes do not; nothing where there is no such thing."""
+    rows = [outlier.row for outlier in outliers]
+    for what, labels, cause in (
+        ("session", observations.session, "did the station move, or a joint's zero?"),
+        ("set-up", observations.setup, "did the station move?"),
+        ("prism", observations.prism, "does it sit tight, and was it always the one that was measured?"),
+    ):
+        names, fixes = np.unique(labels[rows], return_counts=True)
+        name, most = names[fixes.argmax()], int(fixes.max())
+        if len(rows) >= _LISTED and most >= _TOGETHER * len(rows) and (labels == name).mean() < _NOT_ALL:
+            return f"; {most} of them are of {what} {str(name)!r}: {cause}"
+    return ""
 
 
 def _of_result(model: CalibratedModel) -> Iterator[str]:

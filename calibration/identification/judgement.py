@@ -26,7 +26,7 @@ _TILTED_DEG = 30.0  # no carrier works on such a slope
 _FAR_TOLERANCES = 100.0  # likewise of lengths
 _TURNING_DEG = 3.0  # standard error of a base's attitude beneath a known machine; 2 mm over a metre leave a tenth
 _DISCARDED = 1.0 / 3.0  # share of the fixes
-_DISCARDED_OF_PRISM = 0.8
+_DISCARDED_OF_ONE = 0.8  # of a set-up or a prism
 _LEAST_DISCARDED = 5
 _FOREIGN = 2.0  # misfit after the fit over what build tolerances explain before it
 
@@ -162,13 +162,7 @@ def refuse_foreign(chain: Chain, samples: Samples, fit: Fit, tolerated_mm: float
     left = math.sqrt(float(fit.weight @ (error**2).sum(axis=1) / fit.weight.sum()))
     if left > _FOREIGN * tolerated_mm:
         hint = "" if prior == "as-built" else "; if the nominal model is that far off, use --prior as-built"
-        still = [
-            joint.name
-            for joint, readings in zip(chain.rig.joints, samples.data.readings.T, strict=True)
-            if never_moved(joint, float(readings.min()), float(readings.max()))
-        ]
-        if still:
-            hint += f"; {', '.join(still)} never moved in these data: if the machine did, its encoder does not read"
+        hint += _encoders_that_stood_still(chain.rig, samples)
         raise UnsafeError(
             f"after the fit the fixes are still {left:.0f} mm RMS off, outliers aside, where this rig's build "
             f"tolerances explain {tolerated_mm:.0f} mm even before it: another rig's data, exchanged columns, a "
@@ -199,19 +193,41 @@ def refuse_turning(chain: Chain, samples: Samples, x: Floats) -> None:
             )
 
 
-def refuse_discarded(rig: Rig, samples: Samples, fit: Fit, prior: Prior) -> None:
-    """A fit that holds only because it left out much of the data, or nearly all of a prism, is no fit of the data."""
+def _encoders_that_stood_still(rig: Rig, samples: Samples) -> str:
+    """What a refusal says of them: nothing where there are none."""
+    still = [
+        joint.name
+        for joint, readings in zip(rig.joints, samples.data.readings.T, strict=True)
+        if never_moved(joint, float(readings.min()), float(readings.max()))
+    ]
+    if not still:
+        return ""
+    return f"; {', '.join(still)} never moved in these data: if the machine did, its encoder does not read"
+
+
+def refuse_discarded(chain: Chain, samples: Samples, fit: Fit, prior: Prior) -> None:
+    """A fit that left out much of the data, or nearly all of a set-up or a prism, is no fit of the data."""
     discarded = fit.weight < 0.5
-    for prism, name in enumerate(rig.prism_names):
+    still = _encoders_that_stood_still(chain.rig, samples)
+    left_out = "the fit had to leave out"
+    for setup, name in enumerate(chain.setups):
+        own = discarded[samples.data.setup == setup]
+        if len(chain.setups) > 1 and own.sum() >= _LEAST_DISCARDED and own.mean() > _DISCARDED_OF_ONE:
+            raise UnsafeError(
+                f"{left_out} {own.sum()} of the {len(own)} fixes of set-up {name!r}: check unit, order and sign of its "
+                f"x, y, z, whether the station stood still, and whether the joints were read as at the other set-ups"
+            )
+    for prism, name in enumerate(chain.rig.prism_names):
         own = discarded[samples.data.prism == prism]
-        if own.sum() >= _LEAST_DISCARDED and own.mean() > _DISCARDED_OF_PRISM:
+        if own.sum() >= _LEAST_DISCARDED and own.mean() > _DISCARDED_OF_ONE:
             hint = "" if prior == "as-built" else "; --prior as-built also tries joints that are mounted turned"
             raise UnsafeError(
-                f"the fit had to leave out {own.sum()} of the {len(own)} fixes of prism {name!r}, so it would be wrong "
+                f"{left_out} {own.sum()} of the {len(own)} fixes of prism {name!r}, so it would be wrong "
                 f"there: check which prism was measured, its offset, and zero and sign of the joints before it{hint}"
+                f"{still}"
             )
     if discarded.mean() > _DISCARDED:
         raise UnsafeError(
-            f"the fit had to leave out {discarded.sum()} of {len(discarded)} fixes, so it describes a part of the data "
-            f"only: check columns, units and zeros of the joints, and the station's set-up"
+            f"{left_out} {discarded.sum()} of {len(discarded)} fixes, so it describes a part of the data "
+            f"only: check columns, units and zeros of the joints, and the station's set-up{still}"
         )

@@ -25,7 +25,9 @@ from calibration.identification.start import rough_start
 from calibration.identification.subset import drawn
 from calibration.identification.suppositions import Supposition, conceivable_mistakes
 from calibration.kinematics import Chain, Placement
+from calibration.limits import beyond_limits, on_one_turn
 from calibration.observations import Floats
+from calibration.rig import Rig
 
 _ROWS = 120
 _TRIMMED = 0.75
@@ -36,6 +38,7 @@ _APPROACHED = 10  # of the best roughly placed suppositions of a round
 _MUCH = 0.5  # of the misfit before; a further supposition that gains less says nothing
 _EXPLAINS = 0.25  # of the misfit as given, or less: an explanation
 _SETTLES = 0.1  # likewise, and no more than needs no explanation: nothing further need be supposed
+_SLACK = 0.05  # of a joint's range: its limits are no more exact
 _ALIKE = 1.5  # times the least misfit: as good an explanation
 
 
@@ -44,7 +47,8 @@ class Quality:
     """How well a model explains data.
 
     Attributes:
-        misfit_mm: mean of the smaller three quarters of the 3-D errors: outliers do not count, a wrong prism does.
+        misfit_mm: mean of the smaller three quarters of every prism's 3-D errors: outliers do not count, a wrong prism
+            does.
         pull: RMS of the corrections in build tolerances.
     """
 
@@ -54,10 +58,11 @@ class Quality:
     @classmethod
     def of(cls, chain: Chain, samples: Samples, x: Floats) -> Quality:
         """Of a chain with parameters `x` (p,)."""
-        length = np.sort(np.linalg.norm(samples.position_mm - chain.positions_mm(x, samples.data), axis=1))
+        length = np.linalg.norm(samples.position_mm - chain.positions_mm(x, samples.data), axis=1)
+        of_prisms = (np.sort(length[samples.data.prism == prism]) for prism in np.unique(samples.data.prism))
+        used = np.concatenate([own[: math.ceil(_TRIMMED * len(own))] for own in of_prisms])
         tolerated = np.isfinite(chain.prior_sigma)
         pull = x[tolerated] / chain.prior_sigma[tolerated]
-        used = length[: max(1, math.ceil(_TRIMMED * len(length)))]
         return cls(float(used.mean()), math.sqrt(float(pull @ pull) / max(1, len(pull))))
 
     def much_better_than(self, other: Quality) -> bool:
@@ -138,8 +143,10 @@ def explain(
     carried: list[tuple[Supposition, ...]] = [()]
     best: list[_Trial] = []
     least = before
-    for _ in range(at_once):
+    for number in range(at_once):
         sets = _extended(carried, conceivable)
+        if number == 0 and at_once > 1:
+            sets += _reversed_pairs(conceivable)
         rough = [t for t in executor.map(partial(_placed, blank, some), sets) if t is not None]
         rough.sort(key=lambda t: t.quality.misfit_mm)
         near = list(executor.map(partial(_approached, some, precision), rough[:_APPROACHED]))
@@ -149,16 +156,26 @@ def explain(
         if as_good and as_good[0].quality.much_better_than(least):
             least = as_good[0].quality
             best = [t for t in as_good if t.quality.pull < _ALIKE * least.pull]
-        elif best and _explains(least, before, tolerated_mm):
-            break
         if best and least.misfit_mm < min(_SETTLES * before.misfit_mm, tolerated_mm):
             break
         carried = list(dict.fromkeys(t.suppositions for t in (*near[: _CARRIED // 2], *rough)))[:_CARRIED]
     if not best or not _explains(least, before, tolerated_mm):
         return None
+    # As few mistakes as may be; what keeps to the limits of the joints is said first.
+    fewest = min(len(trial.suppositions) for trial in best)
+    best = [trial for trial in best if len(trial.suppositions) == fewest]
+    best.sort(key=lambda trial: _beyond_limits(chain.rig, some, trial.suppositions))
     first = best[0]
     others = tuple(t.suppositions for t in best[1:])
     return Explanation(first.suppositions, others, first.chain, _for_raw_data(first), before, least)
+
+
+def _beyond_limits(rig: Rig, samples: Samples, suppositions: tuple[Supposition, ...]) -> int:
+    """How many readings are beyond the limits of their joints once they are changed as supposed."""
+    for supposition in suppositions:
+        samples = supposition.applied(samples)
+    readings = on_one_turn(rig, dict(zip(rig.joint_names, samples.data.readings.T, strict=True)))
+    return sum(int(beyond_limits(joint, readings[joint.name], _SLACK).sum()) for joint in rig.joints)
 
 
 def _explains(after: Quality, before: Quality, tolerated_mm: float) -> bool:
@@ -181,9 +198,15 @@ def _extended(
     return list(seen.values())
 
 
+def _reversed_pairs(conceivable: Sequence[Supposition]) -> list[tuple[Supposition, ...]]:
+    """Two joints the other way round: either alone may be worse than none, as lengths that turn two axes about are."""
+    reversals = [s for s in conceivable if s.is_reversal]
+    return [pair for pair in itertools.combinations(reversals, 2) if _compatible(pair[:1], pair[1])]
+
+
 def _compatible(before: Sequence[Supposition], more: Supposition) -> bool:
     def may_both(one: Supposition) -> bool:
-        reversed_and_turned = one.is_turn != more.is_turn and min((*one.factor, *more.factor)) < 0.0
+        reversed_and_turned = (one.is_turn and more.is_reversal) or (one.is_reversal and more.is_turn)
         return not (one.subjects & more.subjects) or reversed_and_turned
 
     return all(may_both(one) for one in before)

@@ -153,7 +153,7 @@ def solve(
                 nominal = refine(chain, samples, np.where(flat, found.x, 0.0), free=flat)
     warnings += tilts(chain, fit)
     refuse_foreign(chain, samples, fit, tolerated_mm, prior)
-    refuse_discarded(rig, samples, fit, prior)
+    refuse_discarded(chain, samples, fit, prior)
     refuse_turning(chain, samples, fit.x)
     warnings += held_fixed(chain, samples, fit, prior)
     progress(0.9, "checking what the data determine")

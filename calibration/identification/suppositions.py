@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.identification.samples import Samples
 from calibration.kinematics import Chain, ChainData
@@ -17,7 +18,7 @@ from calibration.rig import Joint, Rig
 
 _T = TypeVar("_T")
 
-_LENGTHS = {"m": 1000.0, "cm": 10.0, "inches": 25.4, "feet": 304.8}
+_LENGTHS = {"m": 1000.0, "cm": 10.0, "micrometres": 1e-3, "inches": 25.4, "feet": 304.8}
 _SPAN = 1.3  # times the span of the limits that readings in another unit may fill
 _SIZE = 4.0  # how far, as a factor, positions may be from the size that the nominal rig has
 _MOST_RADIANS = 4.0 * math.pi
@@ -54,6 +55,11 @@ class Supposition:
     def is_turn(self) -> bool:
         """True where a parameter of the model can make it good as well."""
         return any(self.turn_deg)
+
+    @property
+    def is_reversal(self) -> bool:
+        """True where joints run the other way round."""
+        return min(self.factor) < 0.0
 
     def applied(self, samples: Samples) -> Samples:
         """The samples as they would be without the mistake."""
@@ -97,9 +103,10 @@ def _sizes(chain: Chain, samples: Samples, before: Supposition) -> Iterator[Supp
     """Positions in another unit, beside what is supposed already."""
     samples = before.applied(samples)
     # The nominal rig tells the size of the work volume, wherever it stands.
-    nominal_mm = chain.positions_mm(np.zeros(len(chain)), samples.data)
+    expected_mm = _spread(chain.positions_mm(np.zeros(len(chain)), samples.data), samples.data.setup)
+    measured_mm = _spread(samples.position_mm, samples.data.setup)
     for unit, factor in _LENGTHS.items():
-        if 1.0 / _SIZE < factor * _spread(samples.position_mm) / max(_spread(nominal_mm), 1e-9) < _SIZE:
+        if 1.0 / _SIZE < factor * measured_mm / max(expected_mm, 1e-9) < _SIZE:
             yield replace(
                 before,
                 what=f"{before.what} and the positions in {unit}" if before.what else f"the positions are in {unit}",
@@ -216,9 +223,12 @@ def _fits(joint: Joint, values: Floats, factor: float) -> bool:
     return bool(factor * values.min() > low - margin and factor * values.max() < high + margin)
 
 
-def _spread(position_mm: Floats) -> float:
-    """Median distance from the median place."""
-    return float(np.median(np.linalg.norm(position_mm - np.median(position_mm, axis=0), axis=1)))
+def _spread(position_mm: Floats, setup: NDArray[np.intp]) -> float:
+    """Median distance of positions (n, 3) from the median place of their set-up's (n,)."""
+    distance = np.empty(len(position_mm))
+    for own in (setup == number for number in np.unique(setup)):
+        distance[own] = np.linalg.norm(position_mm[own] - np.median(position_mm[own], axis=0), axis=1)
+    return float(np.median(distance))
 
 
 def _at(values: tuple[_T, ...], index: int, value: _T) -> tuple[_T, ...]:

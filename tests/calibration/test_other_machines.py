@@ -31,7 +31,13 @@ def simulated(truth: RigTruth, poses: int, seed: int, setups: tuple[str, ...]) -
 
 @pytest.mark.parametrize(
     ("name", "poses", "setups"),
-    [("arm7", 120, ("",)), ("lift_arm", 60, ("",)), ("torso", 40, ("west", "east")), ("gantry", 60, ("",))],
+    [
+        ("arm7", 120, ("",)),
+        ("lift_arm", 60, ("",)),
+        ("slides", 60, ("",)),
+        ("gantry", 60, ("",)),
+        ("torso", 40, ("west", "east")),
+    ],
 )
 @pytest.mark.parametrize("seed", [1, 2])
 def test_any_arm_is_calibrated_to_its_noise(name: str, poses: int, setups: tuple[str, ...], seed: int) -> None:
