@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -190,6 +191,12 @@ class Chain:
     def prior_sigma(self) -> Floats:
         """(p,) build tolerances; infinity where there is none."""
         return np.array([p.prior_sigma for p in self.parameters])
+
+    def with_tolerances(self, sigma: Mapping[str, float]) -> Chain:
+        """The same kinematics with other tolerances, mm or rad, for the parameters named."""
+        chain = copy(self)
+        chain.parameters = tuple(replace(p, prior_sigma=sigma.get(p.name, p.prior_sigma)) for p in self.parameters)
+        return chain
 
     def index(self, name: str) -> int:
         """Index of the parameter called `name`; ValueError if there is none."""

@@ -24,6 +24,7 @@ Driven = Literal["theta", "d", "a"]
 Convention = Literal["mdh_beta_after", "mdh_beta_before", "dh"]
 
 BEYOND_BUILDING = 4.0  # build tolerances: no correction by building alone is larger
+ANOTHER_VALUE = 10.0  # build tolerances: so far off, the file's value is another machine's and tells nothing
 _NEARLY_PARALLEL = math.cos(math.radians(15.0))  # beyond it the other constants turn an axis within their tolerances
 _COORDINATE = re.compile(r"(sigma_)?[xyz](_pred)?_mm")  # columns of a fix and of its prediction
 

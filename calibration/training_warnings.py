@@ -12,7 +12,7 @@ from calibration.identification.solve import Solution
 from calibration.limits import beyond_limits, never_moved
 from calibration.model import CalibratedModel, Outlier
 from calibration.observations import Observations
-from calibration.rig import BEYOND_BUILDING
+from calibration.rig import ANOTHER_VALUE, BEYOND_BUILDING
 
 _LISTED = 10
 _TOGETHER = 0.9  # of the outliers
@@ -136,14 +136,28 @@ def _of_result(model: CalibratedModel) -> Iterator[str]:
                 f"{effect.family}@{effect.where} may be a deflection under load, which nothing here tells: give masses "
                 f"in the rig file or measured torques in {effect.where}_Nm"
             )
+    yield from _of_corrections(model)
+
+
+def _of_corrections(model: CalibratedModel) -> Iterator[str]:
+    held = model.prior == "recalibration"
     for parameter in model.parameters:
-        if parameter.kind == "row" and parameter.unit == "rad" and abs(parameter.value) > _FAR_RAD:
+        size = f"{parameter.value:+.1f} mm"
+        if parameter.unit == "rad":
+            size = f"{math.degrees(parameter.value):+.2f} deg"
+        if held and abs(parameter.pull) > ANOTHER_VALUE:
             yield (
-                f"{parameter.name} came out {math.degrees(parameter.value):+.1f} deg from the rig file; "
-                f"check how the joint and its encoder are mounted, and correct the file"
+                f"{parameter.name} is {size} off the rig file, {abs(parameter.pull):.0f} build tolerances, so it was "
+                f"not held to them: was a zero set anew, or a part mounted otherwise? correct the file"
             )
-    pulled = sorted((p for p in model.parameters if abs(p.pull) > BEYOND_BUILDING), key=lambda p: -abs(p.pull))
-    if pulled and model.prior == "recalibration":
+        elif parameter.kind == "row" and parameter.unit == "rad" and abs(parameter.value) > _FAR_RAD:
+            yield (
+                f"{parameter.name} came out {size} from the rig file; check how the joint and its encoder are mounted, "
+                f"and correct the file"
+            )
+    pulled = [p for p in model.parameters if BEYOND_BUILDING < abs(p.pull) <= ANOTHER_VALUE]
+    if pulled and held:
+        pulled.sort(key=lambda p: -abs(p.pull))
         names = ", ".join(f"{p.name} ({p.pull:+.1f})" for p in pulled[:_LISTED])
         size = f"{BEYOND_BUILDING:g} build tolerances"
         yield f"corrected by more than {size}: {names}; an unmodelled effect may hide there"

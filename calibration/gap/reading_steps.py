@@ -34,7 +34,8 @@ def in_true_steps(solution: Solution, observations: Observations, prior: Prior) 
     rig = _as_read(solution.chain.rig, observations)
     if rig is solution.chain.rig:
         return solution
-    chain = Chain(rig, solution.chain.placements)
+    tolerances = {p.name: p.prior_sigma for p in solution.chain.parameters}
+    chain = Chain(rig, solution.chain.placements).with_tolerances(tolerances)
     return replace(solution, chain=chain, fit=refine(chain, solution.samples, solution.fit.x, prior=prior))
 
 

@@ -36,7 +36,7 @@ from calibration.identification.sweeps.axis_start import start_from_axes
 from calibration.identification.sweeps.circles import find_axes
 from calibration.kinematics import Chain, Placement
 from calibration.observations import Floats, Observations
-from calibration.rig import Rig
+from calibration.rig import ANOTHER_VALUE, Rig
 
 Progress = Callable[[float, str], None]
 
@@ -151,6 +151,7 @@ def solve(
                 chain, fit, search = found.chain, other, f"{found.what}: a start that knows led to a better optimum"
                 flat = np.isinf(chain.prior_sigma)
                 nominal = refine(chain, samples, np.where(flat, found.x, 0.0), free=flat)
+    chain, fit = _without_wrong_tolerances(chain, samples, fit, prior)
     warnings += tilts(chain, fit)
     refuse_foreign(chain, samples, fit, tolerated_mm, prior)
     refuse_discarded(chain, samples, fit, prior)
@@ -159,6 +160,22 @@ def solve(
     progress(0.9, "checking what the data determine")
     seen = identifiability(chain, samples, fit.x, fit.excess_variance)
     return Solution(chain, samples, nominal, fit, seen, search, tolerated_mm, tuple(warnings))
+
+
+def _without_wrong_tolerances(chain: Chain, samples: Samples, fit: Fit, prior: Prior) -> tuple[Chain, Fit]:
+    """The optimum where values that the rig file has wrong, such as zeros set anew, are held to it no more.
+
+    A tolerance that pulls by so much bends all the others, and what it is off would pass for an effect. The new one is
+    the distance itself, which makes the fit most probable.
+    """
+    if prior == "as-built":
+        return chain, fit
+    far = np.abs(fit.x) > ANOTHER_VALUE * chain.prior_sigma
+    if not far.any():
+        return chain, fit
+    off = {p.name: abs(float(x)) for p, x, is_far in zip(chain.parameters, fit.x, far, strict=True) if is_far}
+    chain = chain.with_tolerances(off)
+    return chain, refine(chain, samples, fit.x)
 
 
 def _descend(chain: Chain, samples: Samples, start: Floats, prior: Prior) -> Fit:

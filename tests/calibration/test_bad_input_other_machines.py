@@ -80,3 +80,13 @@ def test_outliers_that_one_setup_has_are_said_to_be_of_it() -> None:
     position[rows] += [35.0, 0.0, 0.0]
     model = identify(rig, text, replace(training, position_mm=position), effects="none")
     assert any("of them are of set-up 'east': did the station move?" in w for w in model.warnings)
+
+
+def test_a_zero_set_anew_is_named_and_passes_for_no_effect() -> None:
+    rig, text, training = machine("torso", "west", "east")
+    off = replace(training, joints={**training.joints, "yaw": training.joints["yaw"] + 10.0})
+    model = identify(rig, text, off)
+    assert model.effects == ()
+    beyond_limits, zero = model.warnings
+    assert beyond_limits.startswith("yaw: ")
+    assert zero.startswith("row4.theta is -10.04 deg off the rig file, 33 build tolerances, so it was not held to them")
