@@ -27,6 +27,7 @@ SIGMA_COLUMNS = ("sigma_x_mm", "sigma_y_mm", "sigma_z_mm")
 LABEL_COLUMNS = ("setup", "session", "pose")
 DIRECTIONS = (-1.0, 0.0, 1.0)
 _MOST_DEG = 36_000.0  # a hundred turns
+_MOST_TURNS_DEG = 720.0  # more than the limits have, within one file
 _MOST_MM = 1e7  # 10 km
 _LONGEST = 200  # characters of a label; every row takes as much memory as the longest
 # What an optional column can be, by how its name ends (the first that fits); what is beyond is in another unit, or
@@ -297,6 +298,14 @@ def _build(table: _Table, header: list[str], rig: Rig, positions_required: bool)
         table.check(
             joint.column, values, np.abs(values) > limit, f"is beyond what a joint can read ({limit:g} {joint.unit})"
         )
+        low, high = float(values.min()), float(values.max())
+        if joint.kind == "revolute" and high - low > joint.limits[1] - joint.limits[0] + _MOST_TURNS_DEG:
+            raise DataError(
+                table.source,
+                f"readings from {low:.6g} to {high:.6g} deg, turns further than its limits {joint.limits[0]:g} .. "
+                f"{joint.limits[1]:g} deg allow; were they converted to degrees twice?",
+                column=joint.column,
+            )
     position_mm = triple(POSITION_COLUMNS, required=positions_required)
     for i, name in enumerate(POSITION_COLUMNS):
         table.check(

@@ -14,6 +14,7 @@ from importlib import resources
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
+from pydantic_core import ErrorDetails
 
 from calibration.channels import Channel
 from calibration.errors import RigError
@@ -218,7 +219,7 @@ class Rig(_Part):
     @classmethod
     def _points_somewhere(cls, gravity: Vector) -> Vector:
         if not any(gravity):
-            raise ValueError("it points nowhere; downwards in the base frame is (0, 0, -1) where z is up")
+            raise ValueError("no direction; [0, 0, -1] is down along the base's z")
         return gravity
 
     @model_validator(mode="after")
@@ -235,11 +236,13 @@ class Rig(_Part):
 
     @model_validator(mode="after")
     def _joints_fit(self) -> Rig:
-        coefficients = [(name, coefficient) for _, _, name, coefficient in self.couplings()]
-        named, driven = {name for name, _ in coefficients}, {name for name, coefficient in coefficients if coefficient}
+        driven = {name for _, _, name, _ in self.couplings()}
         known = {j.name for j in self.joints}
-        if named - known:
-            raise ValueError(f"row is driven by unknown joint {sorted(named - known)[0]!r}; joints: {sorted(known)}")
+        for number, _, name, coefficient in self.couplings():
+            if name not in known:
+                raise ValueError(f"row {number}: driven by unknown joint {name!r}; joints: {', '.join(sorted(known))}")
+            if coefficient == 0.0:
+                raise ValueError(f"row {number}: joint {name!r} drives it by 0; leave it out, or give how far it moves")
         if known - driven:
             raise ValueError(f"joint {sorted(known - driven)[0]!r} drives no row")
         for channel in self.channels:
@@ -306,6 +309,18 @@ class Rig(_Part):
         return tuple(p.name for p in self.prisms)
 
 
+_SECTIONS: dict[str, type[BaseModel]] = {
+    "": Rig,
+    "joint": Joint,
+    "row": Row,
+    "row.before": FixedTransform,
+    "prism": Prism,
+    "mass": Mass,
+    "tolerances": Tolerances,
+    "station": Station,
+}
+
+
 def _continues_from(rows: Sequence[Row], number: int) -> int:
     after = rows[number - 1].after
     return number - 1 if after is None else after
@@ -359,9 +374,22 @@ def parse_rig(text: str, source: str) -> Rig:
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise RigError(source, "", f"not valid TOML: {error}") from error
     except ValidationError as error:
-        first = error.errors()[0]
+        # A misspelt key is unknown and missing; the spelling tells more.
+        first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
         where = ".".join(str(p + 1) if isinstance(p, int) else str(p) for p in first["loc"])
-        raise RigError(source, where, first["msg"].removeprefix("Value error, ")) from error
+        raise RigError(source, where, _reason(first)) from error
+
+
+def _reason(error: ErrorDetails) -> str:
+    """What is wrong at the place of one of pydantic's errors."""
+    if error["type"] == "missing":
+        return "missing; it is required"
+    if error["type"] == "extra_forbidden":
+        *inside, _ = (part for part in error["loc"] if isinstance(part, str))
+        section = _SECTIONS.get(".".join(inside))
+        allowed = [field.alias or name for name, field in section.model_fields.items()] if section else []
+        return "unknown key" + (f"; there are {', '.join(allowed)}" if allowed else "")
+    return error["msg"].removeprefix("Value error, ")
 
 
 def shipped_rigs() -> tuple[str, ...]:
