@@ -60,7 +60,7 @@ def _of_torques(model: CalibratedModel, situation: Situation) -> Iterator[str]:
     turning = {joint.name for joint in model.rig.joints if joint.kind == "revolute"}
     for name in sorted(_loads_by_name(model) & turning):
         before, now = name in model.coverage.torques, situation.is_torque_measured(name)
-        if before and not now:
+        if before and not now and model.rig.masses:
             yield (
                 f"the torque of {name} was measured in training ({name}_Nm), which this data lacks: it is computed "
                 f"from the rig file's masses, whose error is in no standard deviation"

@@ -251,9 +251,9 @@ def _repeats(asked: _Asked, pivot: int, part: Floats) -> str:
     """
     order = np.argsort(-np.abs(part), kind="stable").tolist()
     others = [i for i in order if i != pivot and abs(part[i]) > _PART * abs(part[pivot])]
-    named, more = others[:_NAMED], len(others) - _NAMED
-    names = _listed([asked.names[i] for i in named], more)
-    words = _listed(dict.fromkeys(asked.groups[i] for i in named), more)
+    groups = list(dict.fromkeys(asked.groups[i] for i in others))
+    names = _listed([asked.names[i] for i in others[:_NAMED]], len(others) - _NAMED)
+    words = _listed(groups[:_NAMED], len(groups) - _NAMED)
     return f"{asked.names[pivot]} repeats {names}: {asked.words[pivot]} repeats {words}"
 
 
@@ -270,8 +270,8 @@ def _words(chain: Chain, name: str) -> tuple[str, str]:
         base = f"the base at set-up {setup!r}" if setup else "the base"
         axis = constant[-1]
         if constant.startswith("r"):
-            return f"the turn of {base} about {axis}", f"the attitude of {base}"
-        return f"{axis} of {base}", f"the place of {base}"
+            return f"the turn of {base} about {axis}", "the attitude of the base"
+        return f"{axis} of {base}", "the place of the base"
     if where.startswith("prism."):
         prism = f"prism {where.removeprefix('prism.')}"
         return f"{constant} of {prism}", f"the place of {prism}"

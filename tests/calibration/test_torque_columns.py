@@ -56,6 +56,8 @@ def test_a_torque_that_was_measured_in_training_is_missed() -> None:
     assert any("theta2_Nm), which this data lacks" in doubt for doubt in measured.doubts(without))
     assert any("theta2_Nm): leave the column out" in doubt for doubt in computed.doubts(with_torques))
     assert not any("torque" in doubt for doubt in (*measured.doubts(with_torques), *computed.doubts(without)))
+    massless = replace(measured, rig=rig.model_copy(update={"masses": ()}))
+    assert sum("theta2_Nm" in doubt for doubt in massless.doubts(without)) == 1
 
 
 def test_an_effect_that_a_load_could_make_is_doubted_where_no_load_is_known() -> None:
