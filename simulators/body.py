@@ -105,6 +105,8 @@ class LoadedBody:
             coefficient = screw.weights.get(joint, 0.0)
             if coefficient == 0.0:
                 continue
+            if screw.turns != (self.rig.joint(joint).kind == "revolute"):
+                coefficient *= 1e3 if screw.turns else 1e-3  # rad and mm of a motion for each m and rad of its joint
             axis, point = self._axis(index, screw)
             for mass, place, weight in zip(masses, places, weights, strict=True):
                 if not self.posture.chain.carries(index, mass.frame):

@@ -46,7 +46,7 @@ def draw_poses(rig: Rig, plan: PosePlan, n: int, rng: np.random.Generator) -> di
 
 
 def _face(rig: Rig, n: int, rng: np.random.Generator) -> dict[str, Floats]:
-    chain = screw_chain(rig.convention, rig.rows, nominal_constants(rig))
+    chain = screw_chain(rig, nominal_constants(rig))
     turning = [j for j in rig.joints if j.kind == "revolute"]
     span = np.deg2rad([j.limits[1] - j.limits[0] for j in turning])
     middle = {j.name: np.array([sum(j.limits) / 2]) for j in rig.joints}

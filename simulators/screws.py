@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.rig import Convention, FixedTransform, Rig, Row
+from calibration.rig import Convention, FixedTransform, Rig
 
 Floats = NDArray[np.float64]
 
@@ -70,7 +70,7 @@ class Screw:
         turns: True for a rotation about `axis` through `point_mm`, False for a translation along `axis`.
         axis: (3,) unit vector.
         point_mm: (3,) a point on the axis.
-        weights: joint name -> coefficient of the joint's value.
+        weights: joint name -> rad or mm of the motion for each rad or mm of the joint's value.
         start: (4, 4) home pose of the frame in which the motion acts; its origin is where a driven length begins.
         before: number of the motion that carries this one, from 1; 0 for none. Rows may branch.
     """
@@ -157,28 +157,32 @@ def _fixed(before: FixedTransform) -> Floats:
     return out
 
 
-def screw_chain(convention: Convention, rows: Sequence[Row], constants: Sequence[RowConstants]) -> ScrewChain:
+def screw_chain(rig: Rig, constants: Sequence[RowConstants]) -> ScrewChain:
     """Home screws and frames of a machine with these constants.
 
     Args:
-        convention: order of the elementary transforms in a row.
-        rows: give the fixed transforms and what drives what; their constants are not used.
+        rig: gives the order of the elementary transforms in a row, the fixed transforms and what drives what; the
+            constants of its rows are not used.
         constants: the machine's own, one per row.
     """
+    radians = {joint.name: np.pi / 180 if joint.kind == "revolute" else 1.0 for joint in rig.joints}
     screws: list[Screw] = []
     homes = [np.eye(4)]
     last = [0]
-    for number, (row, own) in enumerate(zip(rows, constants, strict=True), 1):
+    for number, (row, own) in enumerate(zip(rig.rows, constants, strict=True), 1):
         origin = number - 1 if row.after is None else row.after
         pose, motion = homes[origin], last[origin]
         if row.before is not None:
             pose = pose @ _fixed(row.before)
         driven: Mapping[str, Mapping[str, float]] = {str(k): v for k, v in row.drive.items()}
-        for kind, axis, name in _ORDER[convention]:
+        for kind, axis, name in _ORDER[rig.convention]:
             if name in driven:
                 direction = pose[:3, :3] @ _AXES[axis]
                 point = pose[:3, 3].copy()
-                screws.append(Screw(number, kind == "turn", direction, point, driven[name], pose.copy(), motion))
+                # A rig file counts in deg and mm.
+                unit = np.pi / 180 if kind == "turn" else 1.0
+                weights = {joint: float(c * (unit / radians[joint])) for joint, c in driven[name].items()}
+                screws.append(Screw(number, kind == "turn", direction, point, weights, pose.copy(), motion))
                 motion = len(screws)
             pose = pose @ _elementary(kind, axis, getattr(own, name))
         homes.append(pose.copy())

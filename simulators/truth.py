@@ -80,7 +80,7 @@ class RigTruth:
             _perturbed(own, row, rig, rng.standard_normal(6) * perturbation)
             for own, row in zip(nominal_constants(rig), rig.rows, strict=True)
         )
-        self._chain = screw_chain(rig.convention, rig.rows, self.constants)
+        self._chain = screw_chain(rig, self.constants)
         self._prisms = {
             p.name: (
                 p.frame,

@@ -131,7 +131,7 @@ def _places_mm(
         moved: a prism, and (3,) mm by which it sits elsewhere in its frame.
     """
     rig = truth.rig
-    chain = screw_chain(rig.convention, rig.rows, truth.constants if constants is None else constants)
+    chain = screw_chain(rig, truth.constants if constants is None else constants)
     read = {j.name: np.deg2rad(joints[j.name]) if j.kind == "revolute" else joints[j.name] for j in rig.joints}
     posture = pose_chain(chain, read)
     out = np.empty((len(prism), 3))

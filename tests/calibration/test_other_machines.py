@@ -34,6 +34,7 @@ def simulated(truth: RigTruth, poses: int, seed: int, setups: tuple[str, ...]) -
     [
         ("arm7", 120, ("",)),
         ("lift_arm", 60, ("",)),
+        ("levers", 60, ("",)),
         ("slides", 60, ("",)),
         ("gantry", 60, ("",)),
         ("torso", 40, ("west", "east")),

@@ -264,7 +264,7 @@ class TestHide:
 
 class TestPosePlans:
     def feed(self, rig: Rig, poses: dict[str, Floats]) -> Floats:
-        chain = screw_chain(rig.convention, rig.rows, nominal_constants(rig))
+        chain = screw_chain(rig, nominal_constants(rig))
         rad = {j.name: np.deg2rad(poses[j.name]) if j.kind == "revolute" else poses[j.name] for j in rig.joints}
         return pose_chain(chain, rad).axes(len(rig.rows))[:, :, 2]
 
