@@ -379,9 +379,12 @@ def _out_of_reach(
     missed = closure_mm > CLOSURE_MM
     if missed.any():
         worst = int(np.argmax(closure_mm))
+        most, joints = max(len(rows) for rows in poses if missed[rows].any()), len(model.rig.joints)
+        asked = f"; {most} prisms of one pose ask for {3 * most} coordinates of {joints} joints"
         yield (
             f"{int(missed.sum())} of {len(missed)} targets are out of reach from their nominal commands, within the "
             f"limits of the joints: they are missed by up to {closure_mm[worst]:.3g} mm (row {worst + 1})"
+            f"{asked if 3 * most > joints else ''}"
         )
     position = None
     for rows in poses:
