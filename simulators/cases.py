@@ -41,6 +41,7 @@ RULES = (
     f"Separable, decided from the truth before any answer: the nearest family is beaten by ln odds of {MARGIN:g} in "
     "all but 2 % of the draws of the noise; loads as the machine's own, sizes up to the hard bounds; a free curve of a "
     "joint's angle is no rival",
+    "A set where one family could have been named: one that is beaten so in all but 0.1 % of the draws",
     "Right: every hidden family that the library has is named, and no other",
     "With encoder_harmonic or angle_scale left out, joint_error_map is a true name and no misnaming: it is any curve "
     "of the joint's own angle",
@@ -92,6 +93,7 @@ def draw(rig: Rig, cell: Cell) -> Drawn | None:
         "seed": cell.seed,
         "effects": [_effect_label(rig, h, without) for h in hidden],
         "separable": nearest is None or nearest.is_separable,
+        "plain": nearest is None or nearest.is_plain,
         "rival": "" if nearest is None else nearest.rival,
         "aliases": cell.families[0].split("|") if cell.kind == "alias" else [],
         "general": list(_GENERAL.get(cell.families[0], ())) if cell.kind == "left_out" else [],

@@ -8,7 +8,8 @@ with s what shows of the hidden effect and G what shows of the family's coeffici
 of the noise: effects are drawn by how large they show, so that the size that is plausible for either of two says
 nothing about which of them it is. With noise, the odds of two families scatter by the length of the difference between
 their fits. An effect is separable where the nearest rival is beaten by `MARGIN` in all but 2 % of the draws of the
-noise. Places of the effect's own family are no rivals: what is asked is its name.
+noise, and plain where it is in all but 0.1 %. Places of the effect's own family are no rivals: what is asked is its
+name.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from simulators.visible import Visibility
 
 MARGIN = 5.0  # of ln odds
 _SIGMAS = 2.054  # a normal number is above minus this in 98 % of draws
+_PLAIN_SIGMAS = 3.090  # likewise in 99.9 %
 _STEP_TIMES = 9  # at which a rival may step
 _LINEAR = 1e-2  # of a bound: small enough to be linear
 # A free curve of the angle follows any other error of that joint's angle; its many coefficients are what speaks
@@ -52,6 +54,11 @@ class Separation:
     def is_separable(self) -> bool:
         """Beaten in all but 2 % of the draws of the noise."""
         return self.log_odds - _SIGMAS * self.scatter >= MARGIN
+
+    @property
+    def is_plain(self) -> bool:
+        """Beaten in all but 0.1 % of the draws of the noise."""
+        return self.log_odds - _PLAIN_SIGMAS * self.scatter >= MARGIN
 
 
 def nearest_rival(scene: Scene, visibility: Visibility, effect: Effect) -> Separation:

@@ -139,6 +139,7 @@ def as_dict(found: Run) -> dict[str, object]:
                 "seed": t.seed,
                 "truth": [f"{e.family}@{e.where}" for e in t.effects],
                 "separable": t.separable,
+                "plain": t.plain,
                 "rival": t.rival,
                 "outcome": t.outcome,
                 "named": [f"{e['family']}@{e['where']}" for e in t.answer.get("effects", ())],

@@ -41,6 +41,7 @@ def label(kind: str = "single", *families: str, **more: Any) -> dict[str, Any]:
     cell = {"case": "case-1", "kind": kind, "poses": "wide", "noise": "station", "size": 1.0, "seed": 7}
     judged = {
         "separable": True,
+        "plain": True,
         "rival": "",
         "general": [],
         "aliases": [],
@@ -76,6 +77,8 @@ def score(trials: list[Trial], what: str) -> Score:
 
 
 RIGHT = "named right at >= 1x, separable"
+SET = "truth inside a reported set that could not have been a name"
+UNTOLD = {"separable": False, "plain": False}
 
 
 def test_a_case_is_right_only_if_all_that_is_hidden_was_named_and_nothing_else() -> None:
@@ -102,30 +105,38 @@ def test_the_right_family_at_another_joint_is_right_but_out_of_place() -> None:
 
 
 def test_what_nobody_could_tell_apart_does_not_count_as_separable() -> None:
-    trials = [judged(label("single", "backlash", separable=False), pending("backlash", "latency"))]
+    trials = [judged(label("single", "backlash", **UNTOLD), pending("backlash", "latency"))]
 
     assert score(trials, RIGHT).n == 0
     assert score(trials, RIGHT).met is None
     assert score(trials, "  of all, separable or not").value == 0.0
-    assert score(trials, "truth inside a reported set").value == 1.0
+    assert score(trials, SET).value == 1.0
+
+
+def test_a_set_is_no_miss_where_a_draw_in_fifty_leaves_nothing_else() -> None:
+    trials = [judged(label("single", "backlash", plain=False), pending("backlash", "latency"))]
+
+    assert score(trials, RIGHT).value == 0.0
+    assert score(trials, SET).value == 1.0
+    assert score(trials, "  the same of what is not separable").value == 0.0
 
 
 @pytest.mark.parametrize(
     ("of", "told"),
     [
-        pytest.param({"separable": True}, ("backlash", "latency"), id="could have been named"),
-        pytest.param({"separable": False}, ("leak_down", "latency"), id="truth is not in it"),
-        pytest.param({"separable": False}, ("backlash", "latency", "leak_down", "base_step"), id="four families"),
+        pytest.param({}, ("backlash", "latency"), id="could have been named"),
+        pytest.param(UNTOLD, ("leak_down", "latency"), id="truth is not in it"),
+        pytest.param(UNTOLD, ("backlash", "latency", "leak_down", "base_step"), id="four families"),
     ],
 )
 def test_a_set_is_a_miss(of: dict[str, Any], told: tuple[str, ...]) -> None:
     trials = [judged(label("single", "backlash", **of), pending(*told))]
 
-    assert score(trials, "truth inside a reported set").value == 0.0
+    assert score(trials, SET).value == 0.0
 
 
 def test_a_set_is_resolved_when_the_proposed_poses_lead_to_the_right_name() -> None:
-    of = label("single", "backlash", separable=False)
+    of = label("single", "backlash", **UNTOLD)
     trials = [
         judged(of, pending("backlash", "latency"), measured) for measured in (named("backlash"), named("latency"))
     ]
@@ -134,7 +145,7 @@ def test_a_set_is_resolved_when_the_proposed_poses_lead_to_the_right_name() -> N
 
 
 def test_what_poses_promised_is_held_against_what_they_brought() -> None:
-    of, trials = label("single", "backlash", separable=False), []
+    of, trials = label("single", "backlash", **UNTOLD), []
     for sigma, after in ((6.0, "backlash"), (6.0, "latency"), (2.0, "latency")):
         promised = {"kind": "poses", "text": "", "poses": [{}], "stands_out_sigma": {"backlash": 9.0, "latency": sigma}}
         trials.append(judged(of, {**pending("backlash", "latency"), "experiments": [promised]}, named(after)))
