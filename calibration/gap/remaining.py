@@ -10,11 +10,11 @@ import numpy as np
 from calibration.gap.adopt import Adopted
 from calibration.gap.decide import beyond
 from calibration.gap.detect import Detection, detect
+from calibration.gap.found import Found
 from calibration.gap.grammar import Found as Formula
 from calibration.gap.grammar import describe
 from calibration.gap.rivals import explains, stands_for
 from calibration.gap.screen import Screen
-from calibration.gap.search import Found
 
 _WEIGHED = 12  # effects that are held against a formula
 _ANY_SIZE = 1e3  # of the plausible sizes of an effect

@@ -17,11 +17,12 @@ from calibration.gap.adopt import JointFit
 from calibration.gap.detect import detect
 from calibration.gap.discriminate import experiments
 from calibration.gap.forecast import forecasts
+from calibration.gap.found import Found, Turn
 from calibration.gap.grammar import Grammar
 from calibration.gap.remaining import Remaining, remaining
 from calibration.gap.result import Candidate, Gap, Round, Verdict
 from calibration.gap.screen import Screen, Weighed
-from calibration.gap.search import Found, Turn, search
+from calibration.gap.search import search
 from calibration.identification.refinement import Prior
 from calibration.identification.samples import Samples, reading_covariance, station_covariance
 from calibration.identification.search.checkpoint import Checkpoint
