@@ -198,6 +198,10 @@ class Chain:
         chain.parameters = tuple(replace(p, prior_sigma=sigma.get(p.name, p.prior_sigma)) for p in self.parameters)
         return chain
 
+    def of(self, rig: Rig) -> Chain:
+        """The kinematics of another description on the same bases; parameters that both have keep their tolerances."""
+        return Chain(rig, self.placements).with_tolerances({p.name: p.prior_sigma for p in self.parameters})
+
     def index(self, name: str) -> int:
         """Index of the parameter called `name`; ValueError if there is none."""
         return [p.name for p in self.parameters].index(name)

@@ -12,7 +12,6 @@ import numpy as np
 
 from calibration.identification.refinement import Prior, refine
 from calibration.identification.solve import Solution
-from calibration.kinematics import Chain
 from calibration.observations import Floats, Observations
 from calibration.rig import Rig
 
@@ -34,8 +33,7 @@ def in_true_steps(solution: Solution, observations: Observations, prior: Prior) 
     rig = _as_read(solution.chain.rig, observations)
     if rig is solution.chain.rig:
         return solution
-    tolerances = {p.name: p.prior_sigma for p in solution.chain.parameters}
-    chain = Chain(rig, solution.chain.placements).with_tolerances(tolerances)
+    chain = solution.chain.of(rig)
     return replace(solution, chain=chain, fit=refine(chain, solution.samples, solution.fit.x, prior=prior))
 
 

@@ -31,8 +31,7 @@ def held_fixed(chain: Chain, samples: Samples, fit: Fit, prior: Prior) -> Iterat
     rig = chain.rig
     constants = tuple(constant for constant, _ in ROW_ORDER[rig.convention])
     rows = tuple(row.model_copy(update={"identify": constants}) for row in rig.rows)
-    tolerances = {p.name: p.prior_sigma for p in chain.parameters}
-    whole = Chain(rig.model_copy(update={"rows": rows}), chain.placements).with_tolerances(tolerances)
+    whole = chain.of(rig.model_copy(update={"rows": rows}))
     found = dict(zip((p.name for p in chain.parameters), fit.x.tolist(), strict=True))
     other = refine(whole, samples, np.array([found.get(p.name, 0.0) for p in whole.parameters]), prior=prior)
     if other.cost > fit.cost - _BETTER or other.excess_variance > _LESS**2 * fit.excess_variance:

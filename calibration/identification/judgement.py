@@ -81,15 +81,14 @@ def _how_many(parameters: int) -> str:
     )
 
 
-def doubts(observations: Observations, chain: Chain, samples: Samples) -> Iterator[str]:
-    """What about the data weakens the result without preventing it."""
+def doubts(observations: Observations, chain: Chain, different: int) -> Iterator[str]:
+    """What about the data, of so many different fixes, weakens the result without preventing it."""
     copied = np.flatnonzero(originals(observations) != np.arange(len(observations)))
     if len(copied):
         yield (
             f"{len(copied)} of {len(observations)} rows are copies of earlier ones in every digit, the first in row "
             f"{copied[0] + 1}, and count once"
         )
-    different = different_fixes(chain, samples)
     if different < len(chain):
         yield (
             f"{different} different fixes are few for {len(chain)} parameters: much of the model rests on build "
