@@ -1,8 +1,8 @@
 """What the fit sees: fixes of one standstill averaged, each with its measurement covariance.
 
 Fixes of one session, set-up, pose and prism repeat the same readings of the joints: averaging them lowers the
-station's noise, not that of the readings. Those of other prisms in the pose share the readings' errors as well: a
-standing joint errs the same way at each of its fixes.
+station's noise, as far as it shows among them, not that of the readings. Those of other prisms in the pose share the
+readings' errors as well: a standing joint errs the same way at each of its fixes.
 """
 
 from __future__ import annotations
@@ -138,7 +138,10 @@ def averaged(chain: Chain, observations: Observations) -> Samples:
     of_row, squares, freedom = _standstills(rig, turns, observations, data.readings, covariance)
     count = np.bincount(of_row).astype(float)
     expected = np.trace(covariance, axis1=1, axis2=2).mean() / 3.0
-    repeat_variance = max(0.0, squares / (3.0 * freedom) - expected) if freedom >= _LEAST_REPEATS else 0.0
+    within = squares / (3.0 * freedom) if freedom >= _LEAST_REPEATS else expected
+    repeat_variance = max(0.0, within - expected)
+    # What repeats do not show of the noise is common to a standstill: no number of them averages it out.
+    common = max(0.0, 1.0 - within / expected)
 
     first = np.unique(of_row, return_index=True)[1]
     start = data.readings[first][of_row]
@@ -147,7 +150,7 @@ def averaged(chain: Chain, observations: Observations) -> Samples:
     return Samples(
         means,
         _averages(of_row, position),
-        _averages(of_row, covariance + repeat_variance * np.eye(3)) / count[:, None, None],
+        _averages(of_row, covariance + repeat_variance * np.eye(3)) * (common + (1.0 - common) / count)[:, None, None],
         _averages(of_row, joint_rates(rig, observations)),
         of_row[original],
         float(repeat_variance),

@@ -43,6 +43,17 @@ def test_repeats_of_a_standstill_become_one_sample_with_less_station_noise(sessi
     assert samples.repeat_variance > 1.0
 
 
+def test_noise_that_repeats_of_a_standstill_do_not_show_is_not_averaged_out(session: Session) -> None:
+    observations = simulated(session.truth, 240, 3, repeats=4)
+    shared = np.repeat(np.random.default_rng(0).normal(0.0, 2.0, (60, 3)), 4, axis=0)
+    sigma_mm = np.full((240, 3), np.hypot(3.0, 2.0))
+    told = replace(observations, position_mm=observations.position_mm + shared, sigma_mm=sigma_mm)
+    samples = averaged(blank(session), told)
+    assert samples.repeat_variance == 0.0
+    of_mean = np.trace(samples.station_covariance, axis1=1, axis2=2).mean() / 3.0
+    assert of_mean == pytest.approx(2.0**2 + 3.0**2 / 4.0, rel=0.15)
+
+
 def test_a_repeat_that_disagrees_stands_alone(session: Session) -> None:
     observations = simulated(session.truth, 40, 3, repeats=4)
     position = observations.position_mm.copy()
