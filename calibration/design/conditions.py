@@ -16,7 +16,7 @@ from calibration.rig import Rig
 Conditions = Mapping[str, Floats]
 """Columns of observations beside the joints' readings -> (n,) of each pose; `fixes`, how many of each prism."""
 
-FIXES = 5  # of each prism at a standstill: seconds each, and their mean has that much less of the station's noise
+FIXES = 10  # of each prism at a standstill: seconds each, and their mean has that much less of the station's noise
 
 DWELLS_S = (10.0, 120.0)
 TEMPERATURES_DEGC = (5.0, 25.0)

@@ -87,7 +87,7 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Discrimination:
-    """The log odds that a design is expected to bring for the true model, whichever it is and against whichever other.
+    """The log odds that a design is expected to bring for a true model over another, whichever two they are.
 
     They are the Kullback-Leibler divergence of what the one predicts from what the other predicts (Box and Hill,
     Technometrics 9, 1967),
@@ -101,13 +101,15 @@ class Discrimination:
     Attributes:
         models: two or more.
         before: (q, q) information of the prior and of all that is known already.
+        pairs: indices of a true model and of one that it is to be told from.
     """
 
     models: tuple[Hypothesis, ...]
     before: Floats
+    pairs: tuple[tuple[int, int], ...]
 
     def value(self, information: Floats) -> float:
-        return -float(logsumexp(-self._of_pairs(self.log_odds(information))))
+        return -float(logsumexp(-self.log_odds(information)))
 
     def gain(self, information: Floats, blocks: Floats) -> Floats:
         own = [np.ascontiguousarray(blocks[:, :, model.free]) for model in self.models]
@@ -115,40 +117,34 @@ class Discrimination:
         projected = [_times(*pair) for pair in zip(own, covariance, strict=True)]
         scatter = [_grown(*pair) for pair in zip(projected, own, strict=True)]
         freedom = [2.0 * np.log(np.diagonal(np.linalg.cholesky(g), axis1=1, axis2=2)).sum(axis=1) for g in scatter]
-        now = self.log_odds(information)
-        grown = np.zeros((len(self.models), len(self.models), len(blocks)))
-        for j, other in enumerate(self.models):
-            known = _times(projected[j], _block(self.before, other.free)) @ projected[j].transpose(0, 2, 1)
-            for i, true in enumerate(self.models):
-                if i != j:
-                    moved = _times(blocks, self._left(true, other, information))
-                    squares = moved @ moved.transpose(0, 2, 1) - known
-                    off = np.trace(np.linalg.solve(scatter[j], squares), axis1=1, axis2=2)
-                    grown[i, j] = now[i, j] + 0.5 * (off + freedom[j] - freedom[i])
-        values: Floats = -logsumexp(-self._of_pairs(grown), axis=0) - self.value(information)
+        known = {
+            j: _times(projected[j], _block(self.before, self.models[j].free)) @ projected[j].transpose(0, 2, 1)
+            for j in {j for _, j in self.pairs}
+        }
+        grown = np.repeat(self.log_odds(information)[:, None], len(blocks), axis=1)
+        for number, (i, j) in enumerate(self.pairs):
+            moved = _times(blocks, self._left(self.models[i], self.models[j], information))
+            squares = moved @ moved.transpose(0, 2, 1) - known[j]
+            off = np.trace(np.linalg.solve(scatter[j], squares), axis1=1, axis2=2)
+            grown[number] += 0.5 * (off + freedom[j] - freedom[i])
+        values: Floats = -logsumexp(-grown, axis=0) - self.value(information)
         return values
 
     def log_odds(self, information: Floats) -> Floats:
-        """(models, models) expected log odds of the one, if it is true, over the other; 0 over itself."""
+        """(pairs,) expected log odds of the one, if it is true, over the other."""
         added = information - self.before
         freedom = [
             float(np.linalg.slogdet(_block(information, m.free))[1] - np.linalg.slogdet(_block(self.before, m.free))[1])
             for m in self.models
         ]
-        found = np.zeros((len(self.models), len(self.models)))
-        for j, other in enumerate(self.models):
+        found = np.zeros(len(self.pairs))
+        for number, (i, j) in enumerate(self.pairs):
+            true, other = self.models[i], self.models[j]
             noise = float((_inverse(_block(information, other.free)) * _block(added, other.free)).sum())
-            for i, true in enumerate(self.models):
-                if i != j:
-                    difference, left = self._difference(true, other), self._left(true, other, information)
-                    off = float((difference * (added @ left)).sum())
-                    found[i, j] = 0.5 * (off - noise + freedom[j] - freedom[i])
+            difference, left = self._difference(true, other), self._left(true, other, information)
+            off = float((difference * (added @ left)).sum())
+            found[number] = 0.5 * (off - noise + freedom[j] - freedom[i])
         return found
-
-    def _of_pairs(self, of_models: Floats) -> Floats:
-        """(pairs, ...) those off the diagonal of (models, models, ...)."""
-        pairs: Floats = of_models[~np.eye(len(self.models), dtype=bool)]
-        return pairs
 
     def _difference(self, true: Hypothesis, other: Hypothesis) -> Floats:
         """(q, 1 + f) the parameters of a true model less those of another: their means, and what is unknown of them."""

@@ -212,7 +212,7 @@ def plan(
     count: int,
     *,
     volume: Floats | None = None,
-    separate: Sequence[str | FittedEffect] = (),
+    separate: Sequence[str | Sequence[FittedEffect]] = (),
     measured: Observations | None = None,
     nearby: Callable[[Candidates], Candidates] | None = None,
 ) -> Plan:
@@ -224,8 +224,9 @@ def plan(
         count: how many poses.
         volume: (v, joints) poses of the work volume: choose for the accuracy of predictions there (V-optimal) and not
             for the parameters (D-optimal).
-        separate: effects, each the `family@where` of one in the library, of plausible size, or one as it was found:
-            choose to tell each from the others, one of them being there and none known yet.
+        separate: effects, each the `family@where` of one in the library, of plausible size, or one as it was found, and
+            after it others that would be the same answer: choose to tell each from the others, one of them being there
+            and none known yet.
         measured: rows that were measured already and are no part of what is known.
         nearby: gives poses near some, these among them; the choice is made once more among those near the first.
 
@@ -235,17 +236,21 @@ def plan(
     if len(candidates) < count:
         raise DataError("poses", f"only {len(candidates)} reachable poses in view were found, {count} are asked for")
     rig = knowledge.chain.rig
-    before = knowledge.without([name_of(effect) for effect in separate])
+    answers: list[Sequence[str | FittedEffect]] = [[one] if isinstance(one, str) else one for one in separate]
+    effects = [effect for answer in answers for effect in answer]
+    before = knowledge.without([name_of(effect) for effect in effects])
     known = len(before.root)
-    candidates = _as_they_matter(knowledge, before, candidates, separate)
+    candidates = _as_they_matter(knowledge, before, candidates, effects)
     with threadpool_limits(1, user_api="blas"):  # the blocks are small: threads would wait for each other
-        rivals = tuple(rival_of(before, e, candidates.readings, candidates.conditions) for e in separate)
+        rivals = tuple(rival_of(before, e, candidates.readings, candidates.conditions) for e in effects)
         told = None if measured is None else _told(before, measured, rivals)
         blocks = whitened(before, candidates, rivals)
         criterion: Criterion = Determinant()
         if rivals:
             nothing = information_of(blocks[:0], told)
-            criterion = Discrimination(_hypotheses(known, rivals, nothing), nothing)
+            pairs = _pairs([len(answer) for answer in answers])
+            hypotheses = _hypotheses(known, rivals, nothing)
+            criterion = Discrimination(hypotheses if len(answers) == 1 else hypotheses[:-1], nothing, pairs)
         elif volume is not None:
             criterion = Accuracy(volume_root(knowledge, volume))
         in_view = np.repeat(candidates.seen.any(axis=0), 3)
@@ -254,15 +259,16 @@ def plan(
             closer = nearby(chosen)
             chosen = closer.select(choose(whitened(before, closer, rivals)[:, in_view], count, criterion, told))
         seconds = travel_s(rig, chosen.readings)
-        order = _order(rig, seconds, chosen, [name_of(effect) for effect in separate])
+        order = _order(rig, seconds, chosen, [name_of(effect) for effect in effects])
         poses = chosen.select(order)
         poses = replace(poses, conditions=one_after_another(poses.conditions))
         stands_out: dict[str, float] = {}
         if isinstance(criterion, Discrimination):
             # Once more in their order: some effects depend on what was before.
             log_odds = criterion.log_odds(information_of(whitened(before, poses, rivals), told))
-            for number, rival in enumerate(rivals):
-                stands_out[rival.name] = math.sqrt(2.0 * max(0.0, float(np.delete(log_odds[number], number).min())))
+            for true in {true: None for true, _ in pairs if true < len(rivals)}:
+                least = min(odds for odds, (one, _) in zip(log_odds.tolist(), pairs, strict=True) if one == true)
+                stands_out[rivals[true].name] = math.sqrt(2.0 * max(0.0, least))
         after = covariance_of(whitened(knowledge, poses))
         alone = _alone(knowledge, poses)
     seen = alone[alone > _SEEN]
@@ -300,8 +306,25 @@ def _as_they_matter(
     return kept.under(matters | needed | telling | {"fixes"})
 
 
+def _pairs(members: Sequence[int]) -> tuple[tuple[int, int], ...]:
+    """Of answers with so many members each, the first of every one, and all of the others that it is to be told from.
+
+    One answer is to be told from none at all, which comes last.
+    """
+    first = [sum(members[:number]) for number in range(len(members))]
+    if len(members) == 1:
+        return ((0, members[0]), (members[0], 0))
+    return tuple(
+        (one, other + k)
+        for one in first
+        for other, size in zip(first, members, strict=True)
+        for k in range(size)
+        if other != one
+    )
+
+
 def _hypotheses(known: int, rivals: Sequence[Rival], before: Floats) -> tuple[Hypothesis, ...]:
-    """Each effect by itself beside the kinematics; where there is one, also the kinematics alone.
+    """Each effect by itself beside the kinematics, and last the kinematics alone.
 
     Args:
         known: how many parameters and coefficients there are beside those of the rivals.
@@ -318,9 +341,7 @@ def _hypotheses(known: int, rivals: Sequence[Rival], before: Floats) -> tuple[Hy
         # Beside it, the kinematics explain the rest of what was measured.
         mean[:known] = -np.linalg.solve(before[:known, :known], before[:known, own] @ rival.found)
         found.append(Hypothesis(mean, np.concatenate([kinematics, own])))
-    if len(found) == 1:
-        found.append(Hypothesis(np.zeros(len(before)), kinematics))
-    return tuple(found)
+    return (*found, Hypothesis(np.zeros(len(before)), kinematics))
 
 
 def whitened(knowledge: Knowledge, candidates: Candidates, rivals: tuple[Rival, ...] = ()) -> Floats:

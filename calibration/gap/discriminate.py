@@ -52,7 +52,7 @@ _ORDERS = {
 def experiments(
     model: CalibratedModel,
     observations: Observations,
-    rivals: Sequence[FittedEffect],
+    answers: Sequence[Sequence[FittedEffect]],
     rng: np.random.Generator,
     *,
     poses: int = POSES,
@@ -60,9 +60,10 @@ def experiments(
     """What to measure next for a set of effects.
 
     Args:
-        model: kinematics, and effects that are beyond doubt; the rivals are none of these.
+        model: kinematics, and effects that are beyond doubt; those of the set are none of these.
         observations: the rows that it was calibrated with.
-        rivals: two or three, each as it was found by itself.
+        answers: two or three, each an effect as it was found by itself, and then other forms and places of its family
+            that may be what it is.
         rng: draws the poses among which the best are chosen.
         poses: how many to propose.
 
@@ -70,7 +71,7 @@ def experiments(
         The poses first, for the prisms that were measured before; none where the rig can take too few, or where poses
         show none of the rivals.
     """
-    knowledge = Knowledge.before(model, setup_of(model))
+    knowledge, rivals = Knowledge.before(model, setup_of(model)), [first for first, *_ in answers]
     try:
         at = site(model.chain, model.values, setup=knowledge.setup)
         begin_s, payload_kg = _end_s(observations), _heaviest_kg(observations)
@@ -80,7 +81,7 @@ def experiments(
     candidates = _with_prisms(drawn, [bool(model.coverage.fixes.get(n)) for n in model.rig.prism_names])
     tried = drawn.few()
     return (
-        *_poses(knowledge, candidates, observations, rivals, poses, partial(near, knowledge, at, rng)),
+        *_poses(knowledge, candidates, observations, answers, poses, partial(near, knowledge, at, rng)),
         *_by_condition(knowledge, tried, rivals),
         *_by_place(model.rig, rivals),
         *_as_the_library_says(rivals),
@@ -97,15 +98,16 @@ def _poses(
     knowledge: Knowledge,
     candidates: Candidates,
     observations: Observations,
-    rivals: Sequence[FittedEffect],
+    answers: Sequence[Sequence[FittedEffect]],
     count: int,
     nearby: Callable[[Candidates], Candidates],
 ) -> Iterator[Experiment]:
     few = candidates.few()
-    shown = [rival for rival in rivals if len(candidates) >= count and _is_shown(knowledge, few, rival)]
-    if not shown:
+    shown = [[effect for effect in answer if _is_shown(knowledge, few, effect)] for answer in answers]
+    told = [answer for answer in shown if answer]
+    if not told or len(candidates) < count:
         return
-    chosen = plan(knowledge, candidates, count, separate=shown, measured=observations, nearby=nearby)
+    chosen = plan(knowledge, candidates, count, separate=told, measured=observations, nearby=nearby)
     rows = tuple(row.as_dict() for row in pose_rows(knowledge.chain.rig, chosen.poses))
     setups = knowledge.chain.setups
     here = f" at set-up {setups[knowledge.setup]!r}" if len(setups) > 1 else ""

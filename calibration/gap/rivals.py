@@ -24,6 +24,7 @@ _POSSIBLE = 0.02  # posterior of a rival
 _BOTH = 1.1  # posterior of two places together that cannot each be in place of the other
 _BESIDE = 0.1  # of the leading log evidence: less is neither like it nor seen beside it
 _COMPARED = 30  # places at least
+_INSTEAD = 2  # of a family, that a plan tells from the others as well
 
 
 def with_a_chance(weighed: Sequence[Weighed]) -> list[Place]:
@@ -113,6 +114,15 @@ def is_near(leading: Weighed, other: Weighed) -> bool:
     """Whether another place may be what it is in place of the leading one."""
     near = other.log_bayes_factor > leading.log_bayes_factor - NEAR or other.posterior > _POSSIBLE
     return near and other.posterior + leading.posterior < _BOTH
+
+
+def with_others_of_its_family(rival: Weighed, screen: Screen, weighed: Sequence[Weighed]) -> Weighed:
+    """One of a set, with the other forms and places of its family that may be what it is, the most probable first."""
+    least = weighed[0].log_bayes_factor - NEAR
+    elsewhere = [w for w in weighed if w.place.family == rival.place.family and w is not rival]
+    near = [w for w in elsewhere if w.log_bayes_factor >= least and is_near(weighed[0], w)]
+    others = sorted([*near, *screen.forms(rival, least)], key=lambda w: -w.log_bayes_factor)
+    return replace(rival, instead=tuple(others[:_INSTEAD]))
 
 
 def beyond_doubt(best: Sequence[Weighed]) -> bool:

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.special import chdtrc, logsumexp
 
 from calibration.effects.base import FittedCoefficient, Situation
-from calibration.effects.fitted import Choice
+from calibration.effects.fitted import Choice, FittedEffect
 from calibration.effects.library import library
 from calibration.gap.projection import Projection, from_products
 from calibration.identification.additions import Additions, joined, same_columns
@@ -99,6 +99,7 @@ class Weighed:
         posterior: of the place, among all places, pairs and nothing.
         log_evidence: of the most probable model that has this place, the odds beforehand in it, against nothing.
         beside: the other of the pair, where that model is a pair.
+        instead: other forms and places of its family that may be what it is, where it is one of a set.
     """
 
     place: Place
@@ -113,11 +114,16 @@ class Weighed:
     posterior: float = 0.0
     log_evidence: float = -math.inf
     beside: Weighed | None = None
+    instead: tuple[Weighed, ...] = ()
 
     @property
     def choice(self) -> Choice:
         """The best variant, of the scale that the data ask for."""
         return replace(self.place.options[self.option], scale=self.scale)
+
+    def fitted(self, situation: Situation) -> FittedEffect:
+        """As the linear model has it."""
+        return self.choice.fitted(situation, self.estimate, self.standard_error)
 
     @property
     def scaled_additions(self) -> Additions:
@@ -298,17 +304,26 @@ class Screen:
         weighed = [replace(w, posterior=share[n], log_evidence=top[n], beside=beside[n]) for n, w in each.items()]
         return tuple(sorted(weighed, key=lambda w: (-w.log_evidence, -w.log_bayes_factor, str(w.place))))
 
+    def forms(self, weighed: Weighed, least: float) -> Iterator[Weighed]:
+        """A weighed place in each of its other forms whose log evidence is at least this; finer ones are not others."""
+        choice, situation = weighed.choice, self.projection.situation
+        if library()[choice.family].refined(situation, choice.where, choice.settings):
+            return
+        number = self._number[id(weighed.place)]
+        values, odds, likelihood = self._values(number)
+        for together in self.distinct(number):
+            of_form = np.full_like(values, -math.inf)
+            of_form[list(together)] = values[list(together)]
+            if weighed.option not in together and logsumexp(of_form) >= least:
+                yield self._weigh_best(number, of_form, odds, likelihood)
+
     def _weigh(self, number: int) -> Weighed:
         """One place; its strained variants are left out, as long as they would be the best.
 
         And so are those whose coefficients are beyond their limits, where another explains the data as well: of forms
         that mirror or outgrow each other, data alone say which only by the sign and the size that they ask for.
         """
-        place = self.places[number]
-        each = [self._at_scales(number, option) for option in range(len(place.options))]
-        odds = place.log_odds[:, None] + np.array(list(LOG_SCALE_ODDS.values()))
-        values = odds + [at_scales for at_scales, _ in each]
-        likelihood = float(logsumexp(place.log_odds + [0.5 * explained for _, explained in each]))
+        values, odds, likelihood = self._values(number)
         while True:
             found = self._weigh_best(number, values, odds, likelihood)
             estimate, error = found.estimate, found.standard_error
@@ -320,6 +335,14 @@ class Screen:
             if rest.max() < (-math.inf if is_strained else values.max() - _AS_WELL) or np.isneginf(rest).all():
                 return found
             values = rest
+
+    def _values(self, number: int) -> tuple[Floats, Floats, float]:
+        """(options, scales) log evidence of a place, and the odds beforehand in it; its log likelihood."""
+        place = self.places[number]
+        each = [self._at_scales(number, option) for option in range(len(place.options))]
+        odds = place.log_odds[:, None] + np.array(list(LOG_SCALE_ODDS.values()))
+        values = odds + [at_scales for at_scales, _ in each]
+        return values, odds, float(logsumexp(place.log_odds + [0.5 * explained for _, explained in each]))
 
     def _weigh_best(self, number: int, values: Floats, odds: Floats, log_likelihood: float) -> Weighed:
         """One place by its best variant and scale, for the log evidence (options, scales) of all, `odds` in it."""

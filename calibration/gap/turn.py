@@ -30,6 +30,7 @@ from calibration.gap.rivals import (
     stands_out,
     with_a_chance,
     with_finer,
+    with_others_of_its_family,
 )
 from calibration.gap.screen import Place, Screen, Weighed, by_family
 from calibration.gap.terms import candidates
@@ -145,7 +146,8 @@ def _judged(
     reasons |= {str(w.place): against for w in in_place}
     if len(in_place) < 2 or problem.formulas:
         return Decision("nothing", weighed, posterior, reasons=reasons)
-    return Decision("set", weighed, posterior, tried, tuple(in_place[:MOST_OF_A_SET]), reasons=reasons)
+    rivals = tuple(with_others_of_its_family(w, screen, weighed) for w in in_place[:MOST_OF_A_SET])
+    return Decision("set", weighed, posterior, tried, rivals, reasons=reasons)
 
 
 def _doubt(

@@ -139,7 +139,7 @@ def _answer(
         held_out = rms(measured - model.geometric_mm(holdout)), rms(measured - model.effects_mm(holdout))
     candidates = tuple(_candidate(found.turns[-1], w) for w in found.rivals)
     situation = found.joint.situation
-    rivals = [w.choice.fitted(situation, w.estimate, w.standard_error) for w in found.rivals]
+    rivals = [[w.fitted(situation) for w in (rival, *rival.instead)] for rival in found.rivals]
     proposed = experiments(model, observations, rivals, rng) if rivals else ()
     return Gap(
         verdict=verdict,

@@ -151,10 +151,11 @@ MODELS = (
     Hypothesis(np.array([0.1, 0.2, 0.3, -0.4, 0.0, -1.0]), np.array([0, 1, 2, 3, 5])),
     Hypothesis(np.array([0.0, 0.2, 0.0, 0.0, 0.0, 0.0]), np.array([0, 1, 2, 3])),
 )
+PAIRS = tuple(itertools.permutations(range(3), 2))
 CRITERIA = [
     (Determinant(), None),
     (Accuracy(np.random.default_rng(9).normal(size=(6, 4))), None),
-    (Discrimination(MODELS, KNOWN), KNOWN - np.eye(6)),
+    (Discrimination(MODELS, KNOWN, PAIRS), KNOWN - np.eye(6)),
 ]
 
 
@@ -180,17 +181,17 @@ def test_the_exchange_comes_close_to_the_best_of_all_subsets(criterion: Criterio
 
 
 def test_the_log_odds_that_a_design_brings_are_those_of_data_that_one_of_the_models_makes() -> None:
-    criterion, rows = Discrimination(MODELS, KNOWN), blocks_of(4, 3, 6, 1).reshape(-1, 6)
+    criterion, rows = Discrimination(MODELS, KNOWN, PAIRS), blocks_of(4, 3, 6, 1).reshape(-1, 6)
     expected = criterion.log_odds(KNOWN + rows.T @ rows)
     rng, predicted = np.random.default_rng(0), []
     for model in MODELS:
         own = rows[:, model.free]
         spread = own @ np.linalg.inv(KNOWN[np.ix_(model.free, model.free)]) @ own.T
         predicted.append(stats.multivariate_normal(rows @ model.mean, spread + np.eye(len(rows))))
-    for (i, true), (j, other) in itertools.permutations(enumerate(predicted), 2):
+    for number, (true, other) in enumerate(itertools.permutations(predicted, 2)):
         data = true.rvs(20_000, rng)
         brought = true.logpdf(data) - other.logpdf(data)
-        assert expected[i, j] == pytest.approx(brought.mean(), abs=4.0 * brought.std() / np.sqrt(len(data)))
+        assert expected[number] == pytest.approx(brought.mean(), abs=4.0 * brought.std() / np.sqrt(len(data)))
 
 
 def test_a_way_through_poses_on_a_line_goes_along_it() -> None:

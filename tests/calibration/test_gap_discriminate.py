@@ -13,7 +13,7 @@ from calibration.design.conditions import DWELLS_S, FIXES, ROUNDS_S
 from calibration.design.knowledge import Knowledge
 from calibration.design.poses import draw, near, plan, whitened
 from calibration.design.visibility import Bodies, in_view, is_reachable, placement, site
-from calibration.effects.base import Situation
+from calibration.effects.base import Settings, Situation
 from calibration.effects.fitted import Choice, FittedEffect
 from calibration.effects.library import library
 from calibration.gap.adopt import Adopted
@@ -21,7 +21,8 @@ from calibration.gap.discriminate import POSES, experiments
 from calibration.gap.forecast import forecasts
 from calibration.gap.projection import Projection, from_products
 from calibration.gap.result import Experiment, Forecast
-from calibration.gap.screen import Screen, Weighed, possible
+from calibration.gap.rivals import with_others_of_its_family
+from calibration.gap.screen import Screen, Weighed, place_of, possible
 from calibration.identification.identifiability import identifiability
 from calibration.identification.refinement import refine
 from calibration.identification.solve import Solution, place
@@ -65,9 +66,16 @@ class Measured:
         weighed = self.screen(*{effect.partition("@")[0] for effect in effects}).weigh()
         return {str(w.place): w for w in weighed if str(w.place) in effects}
 
-    def found(self, *effects: str) -> list[FittedEffect]:
+    def found(self, *effects: str) -> list[list[FittedEffect]]:
         by_name = self.evidence(*effects)
-        return [w.choice.fitted(self.situation, w.estimate, w.standard_error) for w in map(by_name.get, effects) if w]
+        return [[by_name[effect].fitted(self.situation)] for effect in effects]
+
+    def in_form(self, effect: str, settings: Settings) -> list[FittedEffect]:
+        """As the data have it, if it is of this form."""
+        family, _, where = effect.partition("@")
+        projection = Projection(self.solution, self.situation)
+        place = place_of(self.situation, projection, family, where, [Choice(family, where, settings)])
+        return [w.fitted(self.situation) for w in Screen(projection, [place]).weigh()]
 
 
 def measure(truth: RigTruth, poses: dict[str, Floats], seed: int) -> Observations:
@@ -160,6 +168,38 @@ def test_what_was_measured_counts_when_poses_are_chosen(short: Measured) -> None
         assert sigma > alone.stands_out[name]
 
 
+def test_a_plan_tells_an_effect_from_all_forms_of_another_that_the_data_leave_open(short: Measured) -> None:
+    knowledge = Knowledge.before(short.model, 0)
+    at = site(short.model.chain, short.model.values, setup=0)
+    candidates = draw(knowledge, at, np.random.default_rng(0), 300)
+    scale, once, twice = (
+        short.in_form(*form)
+        for form in (
+            ("angle_scale@theta4", {}),
+            ("encoder_harmonic@theta4", {"k": 1}),
+            ("encoder_harmonic@theta4", {"k": 2}),
+        )
+    )
+    planned = {
+        len(other): plan(knowledge, candidates, 10, separate=[scale, other], measured=short.observations)
+        for other in (twice, twice + once)
+    }
+    said = {number: found.stands_out["angle_scale@theta4"] for number, found in planned.items()}
+    # The poses that tell it best from one form do not tell it from the other.
+    same = candidates.select(np.flatnonzero(np.isin(candidates.readings, planned[1].poses.readings).all(axis=1)))
+    really = plan(knowledge, same, 10, separate=[scale, twice + once], measured=short.observations)
+    assert really.stands_out["angle_scale@theta4"] < said[2] < said[1]
+
+
+def test_what_a_set_is_told_from_has_the_forms_and_places_that_come_near(short: Measured) -> None:
+    screen = short.screen("encoder_harmonic")
+    weighed = screen.weigh()
+    near = with_others_of_its_family(weighed[0], screen, weighed)
+    assert str(near.place) == "encoder_harmonic@theta4"
+    assert {str(w.place) for w in near.instead} == {"encoder_harmonic@theta4"}
+    assert near.choice.settings not in [w.choice.settings for w in near.instead]
+
+
 def test_every_effect_of_the_library_can_be_planned_for(rig: Rig) -> None:
     blank = Chain(rig, {"": Placement.identity()})
     at = site(blank, np.zeros(len(blank)))
@@ -183,7 +223,7 @@ def test_every_effect_of_the_library_can_be_planned_for(rig: Rig) -> None:
 
 
 def test_a_plan_varies_what_changes_one_effect_and_not_the_other(short: Measured) -> None:
-    rivals = [of_plausible_size(short, f"{name}@theta4") for name in ("load_hysteresis", "backlash")]
+    rivals = [[of_plausible_size(short, f"{name}@theta4")] for name in ("load_hysteresis", "backlash")]
     loaded = replace(short.observations, extra={"payload_kg": np.full(len(short.observations), 300.0)})
     proposed, *_ = experiments(short.model, loaded, rivals, np.random.default_rng(0), poses=8)
     # As heavy as the machine has carried: the rig file does not say what its rods weigh.
@@ -198,11 +238,11 @@ def test_a_plan_waits_only_where_time_tells(short: Measured) -> None:
     situation = replace(short.situation, observations=timed)
     hours = {}
     for pair in (("transducer_index_jump@L3", "transducer_cumulative@L3"), ("base_settlement@base", "base_step@base")):
-        rivals = []
+        rivals: list[list[FittedEffect]] = []
         for name, _, where in (effect.partition("@") for effect in pair):
             settings = library()[name].variants(situation, where)[0]
             sigma = np.array([c.sigma for c in library()[name].coefficients(situation, where, settings)])
-            rivals.append(Choice(name, where, settings).fitted(situation, sigma, 0.1 * sigma))
+            rivals.append([Choice(name, where, settings).fitted(situation, sigma, 0.1 * sigma)])
         proposed, *_ = experiments(short.model, timed, rivals, np.random.default_rng(0), poses=8)
         taken = np.array([float(str(row["time_s"])) for row in proposed.poses])
         hours[pair[0]] = float(np.ptp(taken)) / 3600.0
@@ -236,7 +276,7 @@ def test_poses_near_the_best_show_effects_better(short: Measured) -> None:
     candidates = draw(knowledge, at, rng, 300)
     drawn = plan(knowledge, candidates, 10, separate=rivals)
     closer = plan(knowledge, candidates, 10, separate=rivals, nearby=partial(near, knowledge, at, rng))
-    assert all(closer.stands_out[name] > sigma for name, sigma in drawn.stands_out.items())
+    assert min(closer.stands_out.values()) > min(drawn.stands_out.values())
     bodies = Bodies.of(knowledge.chain, knowledge.x, closer.poses.readings)
     assert is_reachable(bodies, at).all()
     assert (in_view(bodies, at) >= closer.poses.seen).all()
@@ -286,7 +326,8 @@ def test_a_boom_on_the_move_has_not_stood(rig: Rig) -> None:
 
 
 def by_kind(case: Measured, *effects: FittedEffect) -> dict[str, str]:
-    found = experiments(case.model, case.observations, effects, np.random.default_rng(0), poses=3)
+    answers = [[effect] for effect in effects]
+    found = experiments(case.model, case.observations, answers, np.random.default_rng(0), poses=3)
     return {experiment.kind: experiment.text for experiment in found}
 
 
