@@ -20,7 +20,7 @@ _NOT_ALL = 0.7  # of all fixes
 _BADLY = 0.3  # of what build tolerances explain
 _FAR_RAD = math.radians(10.0)
 _BEYOND_LIMITS = 0.05  # of the span between a joint's limits
-_TOO_SMALL = 0.3  # of the expected scatter
+_TOO_SMALL = 0.4  # of the expected scatter
 _FAR_NOISIER = 2.0  # times what instruments and repeats account for
 _FEW_FIXES = 6
 
@@ -54,10 +54,11 @@ def _of_fit(model: CalibratedModel, observations: Observations, solution: Soluti
         return
     known_mm = math.sqrt(model.known_noise_mm2)
     if model.effects_noise_mm > _FAR_NOISIER * known_mm:
+        given = ", whether the sigma columns are too small" if np.isfinite(observations.sigma_mm).any() else ""
         yield (
             f"the fixes scatter by {model.effects_noise_mm:.2g} mm RMS about the model, where station and readings "
-            f"account for {known_mm:.2g} mm: see whether the columns are there that effects need, whether the prism "
-            f"sits tight, and whether readings and fixes are of the same instant"
+            f"account for {known_mm:.2g} mm: see whether the columns are there that effects need{given}, whether the "
+            f"prism sits tight, and whether readings and fixes are of the same instant"
         )
     left = observations.position_mm - model.effects_mm(observations)
     left_mm = math.sqrt(float((left**2).sum(axis=1).mean()))
@@ -65,7 +66,7 @@ def _of_fit(model: CalibratedModel, observations: Observations, solution: Soluti
         yield (
             f"the fixes scatter by {left_mm:.2g} mm RMS where their standard deviations say "
             f"{model.effects_noise_mm:.2g}: too large ones make a loose fit; check the sigma columns or the rig file's "
-            f"station, for fixes of a moving machine its timing_sigma_s"
+            f"station, for fixes of a moving machine its timing_sigma_s (data computed without noise do so too)"
         )
 
 

@@ -5,6 +5,9 @@ whole groups of samples drawn at random (wild bootstrap: Wu, Annals of Statistic
 Hemerik, Goeman and Finos, JRSS B 82, 2020) they keep their sizes from place to place, their outliers and what they
 share with their neighbours, and lose only what depends on anything. Each of the many terms is held to the largest
 score of every draw (Westfall and Young 1993), and so pays for all that were looked at, however alike they are.
+
+Errors far smaller than the noise that the fixes are said to have are no disagreement: they show how build tolerances
+hold a fit that is looser than it need be.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ from calibration.observations import Floats
 
 _DRAWS = 999
 _ENOUGH = 10  # draws beyond a score, of which a share is a probability; with fewer a tail goes on from there
+_QUIET = 0.45  # of the noise that the fixes are said to have
 _ALARM = 0.005  # half of what false alarms may be: the library may raise some too
 _LISTED = 0.05
 _MOST = 10
@@ -60,7 +64,8 @@ def detect(grammar: Grammar, rng: np.random.Generator) -> Detection:
         grammar: the terms and their scores.
         rng: draws the signs.
     """
-    if not grammar.terms:
+    is_quiet = float(np.mean(grammar.projection.residual**2)) < _QUIET**2
+    if is_quiet or not grammar.terms:
         return Detection(1.0, ())
     groups = len(grammar.by_group)
     signs = 2.0 * rng.integers(0, 2, (_DRAWS, groups)) - 1.0
