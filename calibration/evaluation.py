@@ -9,6 +9,7 @@ import numpy as np
 
 from calibration.accuracy import ExpectedAccuracy, expected_accuracy
 from calibration.errors import DataError, UnsafeError
+from calibration.gap.reading_steps import rounding
 from calibration.identification.samples import averaged
 from calibration.identification.sweeps.circles import find_axes
 from calibration.identification.sweeps.cross_check import AxisCheck, cross_check, disagreements
@@ -16,6 +17,7 @@ from calibration.model import CalibratedModel, Outlier
 from calibration.observations import Floats, Observations, data_sha256, originals
 from calibration.rebase import with_refitted_base
 from calibration.residual.hybrid import tree_importance
+from calibration.row_doubts import row_doubts
 from calibration.single_thread import one_blas_thread
 
 _STRANGE = 3.0  # times the expected error, in the median; a right model's are 0.9
@@ -111,6 +113,9 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
         "effects": observations.position_mm - effects.effects_mm(observations),
         "hybrid": observations.position_mm - prediction.position_mm,
     }
+    left_mm = _statistics(errors["hybrid"])["rms_mm"]
+    found = rounding(effects.predictor.situation(observations))
+    warnings += [w for w in (*row_doubts(observations), *found.doubts(left_mm)) if w not in warnings]
     warnings += _strange(errors["hybrid"], prediction.sigma_mm)
     axes = _axes(effects, observations)
     warnings += [w for w in disagreements(axes) if w not in warnings]

@@ -309,9 +309,10 @@ class CalibratedModel:
         unknown = self.unknown_setups(observations)
         if unknown:
             known = ", ".join(repr(s) for s in sorted(self.placements))
+            blank = "" if unknown[0] else " (no setup in the row)"
             raise UnsafeError(
-                f"set-up {unknown[0]!r} is unknown to the model (known: {known}); its base transform would be a guess. "
-                f"Use --refit-base to fit it on these fixes"
+                f"set-up {unknown[0]!r}{blank} is unknown to the model (known: {known}); its base transform would be a "
+                f"guess. Use --refit-base to fit it on these fixes"
             )
 
     def doubts(self, observations: Observations) -> tuple[str, ...]:

@@ -312,7 +312,7 @@ def _build(table: _Table, header: list[str], rig: Rig, positions_required: bool)
             name,
             position_mm[:, i],
             np.abs(position_mm[:, i]) > _MOST_MM,
-            f"is beyond a station's reach ({_MOST_MM:g} mm)",
+            f"is beyond a station's reach ({_MOST_MM:g} mm); of map coordinates, subtract the instrument's",
         )
         table.check(
             SIGMA_COLUMNS[i],

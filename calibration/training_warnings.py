@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from calibration.effects.library import library
+from calibration.gap.reading_steps import rounding
 from calibration.identification.solve import Solution
 from calibration.limits import beyond_limits, never_moved
 from calibration.model import CalibratedModel, Outlier
@@ -34,16 +36,21 @@ def training_warnings(model: CalibratedModel, observations: Observations, soluti
         solution: what it was made from.
     """
     yield from solution.warnings
-    yield from _of_fit(model, observations, solution)
+    found = rounding(model.predictor.situation(observations))
+    rounded = list(found.doubts(model.effects_noise_mm))
+    yield from rounded
+    yield from _of_fit(model, observations, solution, found.moves_mm if rounded else 0.0)
     yield from _of_coverage(model, observations)
     yield from _of_outliers(model, observations, solution)
     yield from _of_result(model)
 
 
-def _of_fit(model: CalibratedModel, observations: Observations, solution: Solution) -> Iterator[str]:
+def _of_fit(
+    model: CalibratedModel, observations: Observations, solution: Solution, rounding_mm: float
+) -> Iterator[str]:
     if not solution.fit.settled:
         yield "the fit had not come to rest when it ended; treat the result with care"
-    unexplained_mm = math.sqrt(3.0) * model.excess_sigma_mm
+    unexplained_mm = math.sqrt(max(0.0, 3.0 * model.excess_sigma_mm**2 - rounding_mm**2))
     if unexplained_mm > _BADLY * solution.tolerated_mm:
         hint = "; try --prior as-built" if model.prior == "recalibration" else ""
         yield (
@@ -52,7 +59,7 @@ def _of_fit(model: CalibratedModel, observations: Observations, solution: Soluti
             f"the joints, the rig file, and whether the station stood still{hint}"
         )
         return
-    known_mm = math.sqrt(model.known_noise_mm2)
+    known_mm = math.sqrt(model.known_noise_mm2 + rounding_mm**2)
     if model.effects_noise_mm > _FAR_NOISIER * known_mm:
         given = ", whether the sigma columns are too small" if np.isfinite(observations.sigma_mm).any() else ""
         yield (
@@ -74,7 +81,10 @@ def _of_coverage(model: CalibratedModel, observations: Observations) -> Iterator
     for setup in sorted(model.placements):
         fixes = int((observations.setup == setup).sum())
         if fixes < _FEW_FIXES and len(model.placements) > 1:
-            yield f"set-up {setup!r} rests on {fixes} fixes: its base is known by them alone"
+            yield (
+                f"set-up {setup!r} rests on {fixes} fixes: its base is known by them alone, and the prisms seen from "
+                f"there to {_seen_mm(model, observations, setup):.2g} mm RMS over the poses of all set-ups"
+            )
     for prism, fixes in model.coverage.fixes.items():
         if fixes == 0:
             yield f"prism {prism!r} has no fixes; its offset stays at its nominal value"
@@ -92,6 +102,13 @@ def _of_coverage(model: CalibratedModel, observations: Observations) -> Iterator
                 f"{joint.name}: {beyond} of {len(values)} readings are beyond its limits {joint.limits[0]:g} .. "
                 f"{joint.limits[1]:g} {joint.unit}; check column and unit"
             )
+
+
+def _seen_mm(model: CalibratedModel, observations: Observations, setup: str) -> float:
+    """RMS 3-D standard deviation of the prisms' places in a set-up's frame, by parameters and effects."""
+    there = replace(observations, setup=np.full(len(observations), setup))
+    moved = model.linearise(there)[1]
+    return math.sqrt(float(((moved @ model.covariance) * moved).sum()) / len(there))
 
 
 def _of_outliers(model: CalibratedModel, observations: Observations, solution: Solution) -> Iterator[str]:

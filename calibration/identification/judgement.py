@@ -16,6 +16,7 @@ from calibration.kinematics import Chain, Placement
 from calibration.limits import never_moved
 from calibration.observations import Floats, Observations, originals
 from calibration.rig import Rig
+from calibration.row_doubts import row_doubts
 
 _NOISE = 2.0  # times the sigma of instruments and repeats: what is left is theirs
 _CHANCE = 4.0  # standard deviations of the chi-square of the corrections
@@ -89,6 +90,7 @@ def doubts(observations: Observations, chain: Chain, different: int) -> Iterator
             f"{len(copied)} of {len(observations)} rows are copies of earlier ones in every digit, the first in row "
             f"{copied[0] + 1}, and count once"
         )
+    yield from row_doubts(observations)
     if different < len(chain):
         yield (
             f"{different} different fixes are few for {len(chain)} parameters: much of the model rests on build "

@@ -1,0 +1,55 @@
+"""What rows say wrongly of where and when they were measured, whatever the model: one sentence each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from calibration.observations import Observations
+
+_FAR_MM = 5e5  # from the instrument: nobody measures a boom from there
+_UNORDERED = 0.25  # of the rows; a clock is not set as often
+
+
+def row_doubts(observations: Observations) -> Iterator[str]:
+    """Every doubt about set-ups, clock and origin."""
+    yield from _of_setups(observations)
+    yield from _of_clock(observations)
+    yield from _of_origin(observations)
+
+
+def _of_setups(observations: Observations) -> Iterator[str]:
+    blank = observations.setup == ""
+    if blank.any() and not blank.all():
+        named = ", ".join(repr(setup) for setup in np.unique(observations.setup[~blank]).tolist())
+        yield (
+            f"{blank.sum()} of {len(blank)} rows have no setup, the first in row {blank.argmax() + 1}, beside those of "
+            f"{named}: they are taken for another set-up with a base of its own; fill in the column"
+        )
+
+
+def _of_clock(observations: Observations) -> Iterator[str]:
+    """A clock that was set back, or that began anew; a table that is sorted by something else is no sign of one."""
+    time_s = observations.extra.get("time_s", np.full(len(observations), np.nan))
+    known = np.flatnonzero(np.isfinite(time_s))
+    # By prism and set-up tables are often sorted.
+    order = known[np.lexsort((observations.prism[known], observations.setup[known]))]
+    same = (observations.prism[order][1:] == observations.prism[order][:-1]) & (
+        observations.setup[order][1:] == observations.setup[order][:-1]
+    )
+    back = order[1:][same & (np.diff(time_s[order]) < 0.0)]
+    if 0 < len(back) <= _UNORDERED * len(known):
+        yield (
+            f"time_s runs backward, first in row {back.min() + 1}: what depends on time takes the rows in the order of "
+            f"time_s; was the clock set, or does every session count from zero? correct the column"
+        )
+
+
+def _of_origin(observations: Observations) -> Iterator[str]:
+    distance_mm = float(np.median(np.linalg.norm(observations.position_mm, axis=1)))
+    if distance_mm > _FAR_MM:
+        yield (
+            f"the fixes are {distance_mm / 1e6:.3g} km from the origin of x, y, z, where the instrument should be: of "
+            f"map coordinates, subtract the instrument's; the noise of a fix goes with its distance from there"
+        )
