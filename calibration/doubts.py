@@ -13,6 +13,7 @@ from calibration.effects.library import library
 from calibration.limits import turns_deg
 from calibration.observations import Observations
 from calibration.residual.features import DEFLECTION, missing_signals
+from calibration.torque_doubts import times_computed, unit_doubts
 from calibration.torques import torque_columns
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ _OUTSIDE = 0.1  # of a trained range
 _OUTSIDE_DEG = 1.0  # at least
 _OUTSIDE_MM = 10.0
 _OUTSIDE_KG = 1.0
+_OUTSIDE_LOAD = 0.25  # of a trained range: its ends are rarer poses than those of a joint's
 
 
 def doubts(model: CalibratedModel, observations: Observations) -> Iterator[str]:
@@ -56,9 +58,10 @@ def _of_readings(model: CalibratedModel, observations: Observations) -> Iterator
 
 
 def _of_torques(model: CalibratedModel, situation: Situation) -> Iterator[str]:
-    """Joints whose torque is computed where it was measured in training, or the other way round."""
+    """Torques that are not those of training: computed where they were measured, of another sign or beyond."""
     turning = {joint.name for joint in model.rig.joints if joint.kind == "revolute"}
-    for name in sorted(_loads_by_name(model) & turning):
+    used = _loads_by_name(model) & turning
+    for name in sorted(used):
         before, now = name in model.coverage.torques, situation.is_torque_measured(name)
         if before and not now and model.rig.masses:
             yield (
@@ -69,6 +72,21 @@ def _of_torques(model: CalibratedModel, situation: Situation) -> Iterator[str]:
             yield (
                 f"the torque of {name} was computed from the rig file's masses in training and is measured here "
                 f"({name}_Nm): leave the column out, or calibrate with it"
+            )
+    times = times_computed(situation) if used else {}
+    yield from unit_doubts(times)
+    for effect in model.effects:
+        name, value = effect.where, effect.coefficients[0].value
+        is_learned_from_it = effect.family == "joint_compliance" and name in model.coverage.torques
+        if is_learned_from_it and times.get(name, 0.0) * value < 0.0:
+            yield f"{name}_Nm has the other sign than in training, where {effect.family}@{name} was learned from it"
+    for name, (low, high) in model.coverage.loads.items():
+        load, margin = situation.torque(name), _OUTSIDE_LOAD * (high - low)
+        outside = int(((load < low - margin) | (load > high + margin)).sum())
+        if outside:
+            yield (
+                f"the load on {name} is outside the {low:.0f} .. {high:.0f} N m of the training data in {outside} of "
+                f"{len(load)} rows: what it does there was never seen"
             )
 
 

@@ -69,12 +69,14 @@ class Coverage:
         ranges: joint -> lowest and highest reading, deg or mm.
         torques: joints whose torque was measured in most rows.
         payload: lowest and highest `payload_kg`; None where no row had it.
+        loads: joint with an effect of its load -> lowest and highest, N m.
     """
 
     fixes: Mapping[str, int]
     ranges: Mapping[str, tuple[float, float]]
     torques: tuple[str, ...] = ()
     payload: tuple[float, float] | None = None
+    loads: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

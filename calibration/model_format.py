@@ -150,6 +150,7 @@ class _Document(_Part):
     ranges: dict[str, tuple[Bounded, Bounded]]
     torques: tuple[str, ...]
     payload: tuple[Variance, Variance] | None
+    loads: dict[str, tuple[Setting, Setting]] = {}  # models from before have none
     outliers: tuple[_Outlier, ...]
     residual: _Residual | None
     trials: tuple[_Trial, ...]
@@ -203,6 +204,7 @@ def write_model(model: CalibratedModel) -> dict[str, bytes]:
         ranges=dict(model.coverage.ranges),
         torques=model.coverage.torques,
         payload=model.coverage.payload,
+        loads=dict(model.coverage.loads),
         outliers=tuple(_Outlier(row=o.row, sigma=o.sigma) for o in model.outliers),
         residual=model.residual
         and _Residual(
@@ -339,7 +341,7 @@ def read_model(files: Mapping[str, bytes]) -> CalibratedModel:
             document.identifiability.marked,
             document.identifiability.observability,
         ),
-        coverage=Coverage(document.fixes, document.ranges, document.torques, document.payload),
+        coverage=Coverage(document.fixes, document.ranges, document.torques, document.payload, document.loads),
         effects=effects,
         effects_reason=document.effects_reason,
         joint_error_scale=document.joint_error_scale,
@@ -365,11 +367,12 @@ def _check_parts(document: _Document, chain: Chain, covariance: np.ndarray, base
     for setup, placement in chain.placements.items():
         check_placement(setup, placement)
     rig = chain.rig
-    check_names((*document.ranges, *document.torques), rig.joint_names, "joint")
+    check_names((*document.ranges, *document.torques, *document.loads), rig.joint_names, "joint")
     check_names((*document.fixes, *(document.residual.prisms if document.residual else ())), rig.prism_names, "prism")
-    reversed_ranges = [name for name, (low, high) in document.ranges.items() if low > high]
+    ranges = (*document.ranges.items(), *document.loads.items())
+    reversed_ranges = [name for name, (low, high) in ranges if low > high]
     if reversed_ranges:
-        raise ModelError(f"the range of joint {reversed_ranges[0]!r} in model.json ends before it begins")
+        raise ModelError(f"a range of joint {reversed_ranges[0]!r} in model.json ends before it begins")
 
 
 def _read_effect(part: _Effect, chain: Chain) -> FittedEffect:

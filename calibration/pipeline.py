@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from calibration.accuracy import joint_error_scale
 from calibration.effects.base import Situation
+from calibration.effects.library import library
 from calibration.evaluation import Evaluation, evaluate, require_positions
 from calibration.gap.adopt import Adopted, with_effects
 from calibration.identification.refinement import Prior
@@ -135,6 +136,7 @@ def model_of(
             {name: (float(v.min()), float(v.max())) for name, v in observations.joints.items()},
             tuple(name for name in rig.joint_names if situation.is_torque_measured(name)),
             _payload(observations),
+            _loads(adopted, situation),
         ),
         provenance={
             "data_sha256": data_sha256(observations, rig),
@@ -159,6 +161,14 @@ def _payload(observations: Observations) -> tuple[float, float] | None:
     payload = observations.extra.get("payload_kg", np.empty(0))
     measured = payload[np.isfinite(payload)]
     return (float(measured.min()), float(measured.max())) if len(measured) else None
+
+
+def _loads(adopted: Adopted, situation: Situation) -> dict[str, tuple[float, float]]:
+    """The lowest and highest load on every joint that has an effect of it."""
+    loaded = {effect.where for effect in adopted.effects if library()[effect.family].goes_with == "torque"}
+    loads = {name: situation.torque(name) for name in sorted(loaded)}
+    known = {name: load[np.isfinite(load)] for name, load in loads.items()}
+    return {name: (float(load.min()), float(load.max())) for name, load in known.items() if len(load)}
 
 
 def train_residual(

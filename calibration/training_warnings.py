@@ -15,6 +15,7 @@ from calibration.limits import beyond_limits, never_moved
 from calibration.model import CalibratedModel, Outlier
 from calibration.observations import Observations
 from calibration.rig import ANOTHER_VALUE, BEYOND_BUILDING
+from calibration.torque_doubts import times_computed, unit_doubts
 
 _LISTED = 10
 _TOGETHER = 0.9  # of the outliers
@@ -36,7 +37,9 @@ def training_warnings(model: CalibratedModel, observations: Observations, soluti
         solution: what it was made from.
     """
     yield from solution.warnings
-    found = rounding(model.predictor.situation(observations))
+    situation = model.predictor.situation(observations)
+    yield from unit_doubts(times_computed(situation))
+    found = rounding(situation)
     rounded = list(found.doubts(model.effects_noise_mm))
     yield from rounded
     yield from _of_fit(model, observations, solution, found.moves_mm if rounded else 0.0)

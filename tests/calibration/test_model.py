@@ -175,6 +175,8 @@ BASE = ("placements", "")
         (("fixes",), {"p99": 3}, "prism 'p99', which its rig lacks"),
         (("ranges", "theta3"), [9.0, -9.0], "ends before it begins"),
         (("torques",), ["theta99"], "theta99"),
+        (("loads",), {"theta99": [0.0, 1.0]}, "theta99"),
+        (("loads",), {"theta3": [1.0, 0.0]}, "ends before it begins"),
         (("outliers",), [{"row": -5, "sigma": 6.0}], "row"),
     ],
 )

@@ -60,6 +60,48 @@ def test_a_torque_that_was_measured_in_training_is_missed() -> None:
     assert sum("theta2_Nm" in doubt for doubt in massless.doubts(without)) == 1
 
 
+def of_load(model: CalibratedModel, rows: Observations) -> list[str]:
+    return [doubt for doubt in model.doubts(rows) if "N m" in doubt or "_Nm" in doubt]
+
+
+def test_torques_of_another_unit_are_named_in_training_and_after() -> None:
+    rig = shipped_rig("ys100")
+    truth = RigTruth(rig, 5, perturbation=0.6, effects=parse_effects(EFFECTS))
+    in_kilo = fixes(rig, truth, 60, 5, 1e-3)
+    model = identify(rig, rig_text("ys100"), in_kilo, effects="none")
+    assert sum("as if in kN m or of another shaft: theta2_Nm (0.00099 times)" in w for w in model.warnings) == 1
+    trained = identify(
+        rig, rig_text("ys100"), fixes(rig, truth, 60, 5, 1.0), effects="joint_compliance@theta2,joint_compliance@theta3"
+    )
+    assert not any("another shaft" in w for w in trained.warnings)
+    assert of_load(trained, fixes(rig, truth, 40, 6, 1.0)) == []
+    (said,) = of_load(trained, in_kilo)
+    assert "as if in kN m" in said
+
+
+def test_torques_whose_sign_has_changed_since_training_are_named() -> None:
+    rig = shipped_rig("ys100")
+    truth = RigTruth(rig, 5, perturbation=0.6, effects=parse_effects(EFFECTS))
+    for sign in (1.0, -1.0):
+        model = identify(rig, rig_text("ys100"), fixes(rig, truth, 60, 5, sign), effects="joint_compliance@theta2")
+        assert of_load(model, fixes(rig, truth, 40, 6, sign)) == []
+        changed = of_load(model, fixes(rig, truth, 40, 6, -sign))
+        assert changed[0].startswith("theta2_Nm has the other sign than in training")
+
+
+def test_loads_that_training_did_not_have_are_named() -> None:
+    rig = shipped_rig("ys100")
+    truth = RigTruth(rig, 5, perturbation=0.6, effects=parse_effects(EFFECTS))
+    everywhere, elsewhere = (weighed(fixes(rig, truth, 200, seed, 1.0), None) for seed in (5, 6))
+    raised = everywhere.select(everywhere.joints["theta2"] > 80.0)
+    effects = "joint_compliance@theta2,joint_compliance@theta3"
+    model, whole = (identify(rig, rig_text("ys100"), rows, effects=effects) for rows in (raised, everywhere))
+    assert of_load(whole, elsewhere) == []
+    doubts = of_load(model, elsewhere)
+    assert doubts[0].startswith("the load on theta2 is outside the -3455 .. 1803 N m of the training data in 29 of 200")
+    assert of_load(CalibratedModel.from_files(model.to_files()), elsewhere) == doubts
+
+
 def test_an_effect_that_a_load_could_make_is_doubted_where_no_load_is_known() -> None:
     rig = shipped_rig("ys100")
     massless = rig.model_copy(update={"masses": ()})
