@@ -20,7 +20,7 @@ import numpy as np
 
 from calibration.errors import UnsafeError
 from calibration.identification.approach import approach
-from calibration.identification.samples import Samples
+from calibration.identification.samples import Integers, Samples
 from calibration.identification.start import rough_start
 from calibration.identification.subset import drawn
 from calibration.identification.suppositions import Supposition, conceivable_mistakes
@@ -138,8 +138,8 @@ def explain(
     """
     blank = Chain(chain.rig, {setup: Placement.identity() for setup in chain.setups})
     # A part of the samples is enough to tell suppositions apart.
-    some = samples.select(drawn(samples.data, samples.position_mm, _ROWS, 0))
-    conceivable = list(conceivable_mistakes(blank, some))
+    part = drawn(samples.data, samples.position_mm, _ROWS, 0)
+    conceivable = list(conceivable_mistakes(blank, samples))
     carried: list[tuple[Supposition, ...]] = [()]
     best: list[_Trial] = []
     least = before
@@ -147,9 +147,9 @@ def explain(
         sets = _extended(carried, conceivable)
         if number == 0 and at_once > 1:
             sets += _reversed_pairs(conceivable)
-        rough = [t for t in executor.map(partial(_placed, blank, some), sets) if t is not None]
+        rough = [t for t in executor.map(partial(_placed, blank, samples, part), sets) if t is not None]
         rough.sort(key=lambda t: t.quality.misfit_mm)
-        near = list(executor.map(partial(_approached, some, precision), rough[:_APPROACHED]))
+        near = list(executor.map(partial(_approached, samples, part, precision), rough[:_APPROACHED]))
         near.sort(key=lambda t: t.quality.misfit_mm)
         as_good = [t for t in near if t.quality.misfit_mm < _ALIKE * near[0].quality.misfit_mm]
         as_good.sort(key=lambda t: t.quality.pull)
@@ -164,7 +164,7 @@ def explain(
     # As few mistakes as may be; what keeps to the limits of the joints is said first.
     fewest = min(len(trial.suppositions) for trial in best)
     best = [trial for trial in best if len(trial.suppositions) == fewest]
-    best.sort(key=lambda trial: _beyond_limits(chain.rig, some, trial.suppositions))
+    best.sort(key=lambda trial: _beyond_limits(chain.rig, samples, trial.suppositions))
     first = best[0]
     others = tuple(t.suppositions for t in best[1:])
     return Explanation(first.suppositions, others, first.chain, _for_raw_data(first), before, least)
@@ -172,8 +172,7 @@ def explain(
 
 def _beyond_limits(rig: Rig, samples: Samples, suppositions: tuple[Supposition, ...]) -> int:
     """How many readings are beyond the limits of their joints once they are changed as supposed."""
-    for supposition in suppositions:
-        samples = supposition.applied(samples)
+    samples = _applied(samples, suppositions)
     readings = on_one_turn(rig, dict(zip(rig.joint_names, samples.data.readings.T, strict=True)))
     return sum(int(beyond_limits(joint, readings[joint.name], _SLACK).sum()) for joint in rig.joints)
 
@@ -212,10 +211,15 @@ def _compatible(before: Sequence[Supposition], more: Supposition) -> bool:
     return all(may_both(one) for one in before)
 
 
-def _placed(blank: Chain, samples: Samples, suppositions: tuple[Supposition, ...]) -> _Trial | None:
-    """The nominal rig placed on the data so changed; None where it cannot be."""
+def _applied(samples: Samples, suppositions: Sequence[Supposition]) -> Samples:
     for supposition in suppositions:
         samples = supposition.applied(samples)
+    return samples
+
+
+def _placed(blank: Chain, samples: Samples, part: Integers, suppositions: tuple[Supposition, ...]) -> _Trial | None:
+    """The nominal rig placed on a part of the data so changed; None where it cannot be."""
+    samples = _applied(samples, suppositions).select(part)
     try:
         start = rough_start(blank, samples, np.zeros(len(blank)), mirrored="let pass", rounds=_PLACING)
     except UnsafeError:  # positions that so changed lie on a line
@@ -224,9 +228,8 @@ def _placed(blank: Chain, samples: Samples, suppositions: tuple[Supposition, ...
     return _Trial(suppositions, chain, start.x, Quality.of(chain, samples, start.x))
 
 
-def _approached(samples: Samples, precision: Floats, trial: _Trial) -> _Trial:
-    for supposition in trial.suppositions:
-        samples = supposition.applied(samples)
+def _approached(samples: Samples, part: Integers, precision: Floats, trial: _Trial) -> _Trial:
+    samples = _applied(samples, trial.suppositions).select(part)
     x = approach(trial.chain, samples, trial.x, precision=precision, rounds=_APPROACHING)
     return replace(trial, x=x, quality=Quality.of(trial.chain, samples, x))
 

@@ -19,6 +19,7 @@ from calibration.rig import Joint, Rig
 _T = TypeVar("_T")
 
 _LENGTHS = {"m": 1000.0, "cm": 10.0, "micrometres": 1e-3, "inches": 25.4, "feet": 304.8}
+_ANGLES = {"radians": math.degrees(1.0), "gon": 0.9}
 _SPAN = 1.3  # times the span of the limits that readings in another unit may fill
 _SIZE = 4.0  # how far, as a factor, positions may be from the size that the nominal rig has
 _MOST_RADIANS = 4.0 * math.pi
@@ -37,6 +38,7 @@ class Supposition:
         factor: (joints,) what the readings are multiplied by.
         turn_deg: (joints,) and then turned by.
         prism: (prisms,) which prism each label means.
+        rows_up: by how many rows the readings of all joints are moved up, beside the fixes.
         size: what the positions are multiplied by.
         mirrored: whether they are also mirrored.
     """
@@ -48,6 +50,7 @@ class Supposition:
     factor: tuple[float, ...]
     turn_deg: tuple[float, ...]
     prism: tuple[int, ...]
+    rows_up: int = 0
     size: float = 1.0
     mirrored: bool = False
 
@@ -62,9 +65,9 @@ class Supposition:
         return min(self.factor) < 0.0
 
     def applied(self, samples: Samples) -> Samples:
-        """The samples as they would be without the mistake."""
+        """The samples, all of them and in the order of their rows, as they would be without the mistake."""
         data = samples.data
-        readings = data.readings[:, list(self.column)] * self.factor + self.turn_deg
+        readings = np.roll(data.readings[:, list(self.column)] * self.factor + self.turn_deg, -self.rows_up, axis=0)
         changed = ChainData(readings, np.array(self.prism, dtype=np.intp)[data.prism], data.setup)
         signs = np.array([1.0, -1.0, 1.0]) if self.mirrored else np.ones(3)
         return replace(samples, data=changed, position_mm=samples.position_mm * (self.size * signs))
@@ -94,6 +97,14 @@ def conceivable_mistakes(chain: Chain, samples: Samples) -> Iterator[Supposition
         subjects=frozenset({"handedness"}),
         mirrored=True,
     )
+    for rows_up, where, way in ((1, "below", "up"), (-1, "above", "down")):
+        yield replace(
+            nothing,
+            what=f"the readings are a row {where} the fixes that they belong to",
+            remedy=f"move the columns of the joints a row {way}",
+            subjects=frozenset({"order of rows"}),
+            rows_up=rows_up,
+        )
     # Who writes positions in m writes readings in SI units as well, and neither alone would show.
     for before in (nothing, *(unit for unit in units if len(unit.subjects) > 1)):
         yield from _sizes(chain, samples, before)
@@ -172,26 +183,24 @@ def _units(rig: Rig, readings: Floats, nothing: Supposition) -> Iterator[Supposi
             factor=tuple(factors.get(i, 1.0) for i in range(len(rig.joints))),
         )
 
-    radians: dict[int, float] = {}
     metres: dict[int, float] = {}
     for i, joint in enumerate(rig.joints):
-        if joint.kind == "revolute":
-            if float(np.abs(readings[:, i]).max()) <= _MOST_RADIANS:
-                radians[i] = math.degrees(1.0)
-                yield supposed(f"{joint.column} is in radians", "it to degrees", {i: radians[i]})
-            continue
-        for unit, size in _LENGTHS.items():
+        for unit, size in _LENGTHS.items() if joint.kind == "prismatic" else ():
             if _fits(joint, readings[:, i], size):
                 yield supposed(f"{joint.column} is in {unit}", "it to mm", {i: size})
                 if unit == "m":
                     metres[i] = size
-    if len(radians) > 1:
-        yield supposed("all angles are in radians", "them to degrees", radians)
+    for unit, size in _ANGLES.items():
+        angles = {i: size for i, joint in enumerate(rig.joints) if _may_be(joint, readings[:, i], unit)}
+        for i in angles:
+            yield supposed(f"{rig.joints[i].column} is in {unit}", "it to degrees", {i: size})
+        if len(angles) > 1:
+            yield supposed(f"all angles are in {unit}", "them to degrees", angles)
+        if angles and metres:
+            what = f"all angles are in {unit} and the length transducers in m"
+            yield supposed(what, "them to degrees and mm", angles | metres)
     if len(metres) > 1:
         yield supposed("all length transducers are in m", "them to mm", metres)
-    if radians and metres:
-        what = "all angles are in radians and the length transducers in m"
-        yield supposed(what, "them to degrees and mm", radians | metres)
 
 
 def _exchanges(rig: Rig, seen: Sequence[int], nothing: Supposition) -> Iterator[Supposition]:
@@ -214,6 +223,11 @@ def _exchanges(rig: Rig, seen: Sequence[int], nothing: Supposition) -> Iterator[
             subjects=frozenset({f"prism {one_prism}", f"prism {other_prism}"}),
             prism=_at(_at(nothing.prism, i, k), k, i),
         )
+
+
+def _may_be(joint: Joint, values: Floats, unit: str) -> bool:
+    """Whether readings of an angle may be in a unit."""
+    return joint.kind == "revolute" and (unit != "radians" or float(np.abs(values).max()) <= _MOST_RADIANS)
 
 
 def _fits(joint: Joint, values: Floats, factor: float) -> bool:

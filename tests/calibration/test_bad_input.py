@@ -37,6 +37,14 @@ def in_radians(o: Observations) -> Observations:
     return replace(o, joints={k: v if k.startswith("L") else np.radians(v) for k, v in o.joints.items()})
 
 
+def in_gon(o: Observations) -> Observations:
+    return replace(o, joints={k: v if k.startswith("L") else v / 0.9 for k, v in o.joints.items()})
+
+
+def a_row_down(o: Observations) -> Observations:
+    return replace(o, joints={k: np.roll(v, 1) for k, v in o.joints.items()})
+
+
 def in_metres(o: Observations) -> Observations:
     return replace(o, position_mm=o.position_mm / 1000.0)
 
@@ -62,6 +70,8 @@ def refused(training: Observations, name: str, change: Change, prior: str = "rec
         (scaled(theta5=-1.0), ["theta5 runs the other way", "3.6 mm are left in place of", "reverse the sign"]),
         (scaled(L3=-1.0), ["L3 runs the other way", "column L3_mm"]),
         (in_radians, ["all angles are in radians", "convert them to degrees"]),
+        (in_gon, ["all angles are in gon", "convert them to degrees"]),
+        (a_row_down, ["the readings are a row below the fixes", "move the columns of the joints a row up"]),
         (scaled(L3=1e-3), ["L3_mm is in m", "convert it to mm"]),
         (in_metres, ["the positions are in m", "convert x_mm, y_mm and z_mm to mm"]),
         (in_si_units, ["all angles are in radians and the length transducers in m and the positions in m"]),
