@@ -115,7 +115,7 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
     }
     left_mm = _statistics(errors["hybrid"])["rms_mm"]
     found = rounding(effects.predictor.situation(observations))
-    warnings += [w for w in (*row_doubts(observations), *found.doubts(left_mm)) if w not in warnings]
+    warnings += [w for w in (*row_doubts(model.rig, observations), *found.doubts(left_mm)) if w not in warnings]
     warnings += _strange(errors["hybrid"], prediction.sigma_mm)
     axes = _axes(effects, observations)
     warnings += [w for w in disagreements(axes) if w not in warnings]

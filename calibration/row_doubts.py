@@ -1,4 +1,4 @@
-"""What rows say wrongly of where and when they were measured, whatever the model: one sentence each."""
+"""What rows say wrongly of where, when and with what they were measured, whatever the model: one sentence each."""
 
 from __future__ import annotations
 
@@ -7,16 +7,19 @@ from collections.abc import Iterator
 import numpy as np
 
 from calibration.observations import Observations
+from calibration.rig import Rig
 
 _FAR_MM = 5e5  # from the instrument: nobody measures a boom from there
+_LIGHT, _HEAVY = 1e-3, 10.0  # of the machine, between which its payload is
 _UNORDERED = 0.25  # of the rows; a clock is not set as often
 
 
-def row_doubts(observations: Observations) -> Iterator[str]:
-    """Every doubt about set-ups, clock and origin."""
+def row_doubts(rig: Rig, observations: Observations) -> Iterator[str]:
+    """Every doubt about set-ups, clock, origin and payload."""
     yield from _of_setups(observations)
     yield from _of_clock(observations)
     yield from _of_origin(observations)
+    yield from _of_payload(rig, observations)
 
 
 def _of_setups(observations: Observations) -> Iterator[str]:
@@ -52,4 +55,14 @@ def _of_origin(observations: Observations) -> Iterator[str]:
         yield (
             f"the fixes are {distance_mm / 1e6:.3g} km from the origin of x, y, z, where the instrument should be: of "
             f"map coordinates, subtract the instrument's; the noise of a fix goes with its distance from there"
+        )
+
+
+def _of_payload(rig: Rig, observations: Observations) -> Iterator[str]:
+    machine_kg = sum(mass.kg for mass in rig.masses)
+    most_kg = float(np.nanmax(observations.extra.get("payload_kg", np.zeros(0)), initial=0.0))
+    if min(machine_kg, most_kg) > 0.0 and not _LIGHT < most_kg / machine_kg < _HEAVY:
+        yield (
+            f"payload_kg is {most_kg:.3g} at most, on a machine of {machine_kg:.0f} kg by the rig file: is it in "
+            f"{'t' if most_kg < machine_kg else 'g'}? convert it to kg"
         )

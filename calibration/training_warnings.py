@@ -68,7 +68,7 @@ def _of_fit(
         yield (
             f"the fixes scatter by {model.effects_noise_mm:.2g} mm RMS about the model, where station and readings "
             f"account for {known_mm:.2g} mm: see whether the columns are there that effects need{given}, whether the "
-            f"prism sits tight, and whether readings and fixes are of the same instant"
+            f"prism sits tight and the station stood still, and whether readings and fixes are of the same instant"
         )
     left = observations.position_mm - model.effects_mm(observations)
     left_mm = math.sqrt(float((left**2).sum(axis=1).mean()))

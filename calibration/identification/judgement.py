@@ -90,7 +90,7 @@ def doubts(observations: Observations, chain: Chain, different: int) -> Iterator
             f"{len(copied)} of {len(observations)} rows are copies of earlier ones in every digit, the first in row "
             f"{copied[0] + 1}, and count once"
         )
-    yield from row_doubts(observations)
+    yield from row_doubts(chain.rig, observations)
     if different < len(chain):
         yield (
             f"{different} different fixes are few for {len(chain)} parameters: much of the model rests on build "

@@ -111,6 +111,15 @@ def test_a_base_that_few_fixes_place_says_how_well_they_do(session: Session) -> 
     assert 0.5 * said_mm < np.sqrt(total_mm**2 - model.effects_noise_mm**2) < 2.0 * said_mm
 
 
+@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "t"), (1e3, "g")])
+def test_a_payload_in_another_unit_is_named(session: Session, factor: float, unit: str) -> None:
+    payload_kg = np.linspace(0.0, 300.0, len(session.held_out))
+    good, bad = (replace(session.held_out, extra={"payload_kg": f * payload_kg}) for f in (1.0, factor))
+    (said,) = evaluate(session.model, bad).warnings
+    assert said.endswith(f"is it in {unit}? convert it to kg")
+    assert evaluate(session.model, good).warnings == ()
+
+
 def test_map_coordinates_are_named(session: Session) -> None:
     far = replace(session.training, position_mm=session.training.position_mm + np.array([5e5, 6.7e6, 1e5]))
     assert calibrated(session, far).warnings[0].startswith("the fixes are 6.73 km from the origin")
