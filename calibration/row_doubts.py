@@ -1,4 +1,4 @@
-"""What rows say wrongly of where, when and with what they were measured, whatever the model: one sentence each."""
+"""What rows say wrongly of how they were measured (set-up, clock, origin, payload, rates), one sentence each."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ from calibration.rig import Rig
 
 _FAR_MM = 5e5  # from the instrument: nobody measures a boom from there
 _LIGHT, _HEAVY = 1e-3, 10.0  # of the machine, between which its payload is
+_TOO_FAST = 3.0  # times the fastest motion of a joint
 _UNORDERED = 0.25  # of the rows; a clock is not set as often
 
 
 def row_doubts(rig: Rig, observations: Observations) -> Iterator[str]:
-    """Every doubt about set-ups, clock, origin and payload."""
+    """Every doubt that needs no model."""
     yield from _of_setups(observations)
     yield from _of_clock(observations)
     yield from _of_origin(observations)
     yield from _of_payload(rig, observations)
+    yield from _of_rates(rig, observations)
 
 
 def _of_setups(observations: Observations) -> Iterator[str]:
@@ -66,3 +68,14 @@ def _of_payload(rig: Rig, observations: Observations) -> Iterator[str]:
             f"payload_kg is {most_kg:.3g} at most, on a machine of {machine_kg:.0f} kg by the rig file: is it in "
             f"{'t' if most_kg < machine_kg else 'g'}? convert it to kg"
         )
+
+
+def _of_rates(rig: Rig, observations: Observations) -> Iterator[str]:
+    for joint in rig.joints:
+        rate = observations.extra.get(f"{joint.name}_rate", np.zeros(0))
+        beyond = int((np.abs(rate) > _TOO_FAST * joint.max_rate).sum())
+        if beyond:
+            yield (
+                f"{joint.name}_rate: {beyond} of {len(rate)} are more than {_TOO_FAST:g} times its max_rate, "
+                f"{joint.max_rate:g} {joint.unit}/s; check column and unit, for the noise of a fix goes with its rates"
+            )

@@ -120,6 +120,13 @@ def test_a_payload_in_another_unit_is_named(session: Session, factor: float, uni
     assert evaluate(session.model, good).warnings == ()
 
 
+def test_rates_that_no_joint_has_are_named(session: Session) -> None:
+    fast = np.where(np.arange(len(session.held_out)) < 20, 600.0, 5.0)
+    rows = replace(session.held_out, extra={"theta4_rate": fast, "theta5_rate": fast / 60.0})
+    (said,) = evaluate(session.model, rows).warnings
+    assert said.startswith("theta4_rate: 20 of 500 are more than 3 times its max_rate, ")
+
+
 def test_map_coordinates_are_named(session: Session) -> None:
     far = replace(session.training, position_mm=session.training.position_mm + np.array([5e5, 6.7e6, 1e5]))
     assert calibrated(session, far).warnings[0].startswith("the fixes are 6.73 km from the origin")
