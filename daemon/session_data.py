@@ -23,7 +23,7 @@ Misclosure = tuple[float, float, float]
 def sessions_csv(reader: Reader, rig: Rig, session_ids: Sequence[str]) -> bytes:
     """Observations of the given sessions that calibration may use, oldest first.
 
-    `time_s` counts from the first observation, on UTC, steady within a session: sessions may lie boots apart.
+    `time_s` counts from `time_zero_ns`, on UTC, steady within a session: sessions may lie boots apart.
     """
     marks = ",".join("?" * len(session_ids))
     rows = list(
@@ -42,17 +42,27 @@ def sessions_csv(reader: Reader, rig: Rig, session_ids: Sequence[str]) -> bytes:
         steady[row["session_id"]].of(Stamp(row["utc_ns"], row["monotonic_ns"], str(row["boot_id"]))).utc_ns
         for row in rows
     ]
-    start_ns = min(utc_ns, default=0)
+    zero_ns = time_zero_ns(reader)
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(["prism", *joints, *POSITION_COLUMNS, *LABEL_COLUMNS, "time_s", *SIGMA_COLUMNS, "dwell_s", *more])
     for row, measured, at_ns in zip(rows, values, utc_ns, strict=True):
         cells = [row["prism"], *(measured.get(name) for name in joints)]
         cells += [row[name] for name in POSITION_COLUMNS]
-        cells += [row["setup_id"], row["session_id"], row["pose"], round((at_ns - start_ns) / NS_PER_S, 6)]
+        cells += [row["setup_id"], row["session_id"], row["pose"], round((at_ns - zero_ns) / NS_PER_S, 6)]
         cells += [row[name] for name in SIGMA_COLUMNS] + [row["dwell_s"], *(measured.get(name) for name in more)]
         writer.writerow("" if cell is None else repr(cell) if isinstance(cell, float) else cell for cell in cells)
     return out.getvalue().encode()
+
+
+def time_zero_ns(reader: Reader) -> int:
+    """UTC of the first observation that calibration may use: `time_s` of every session counts from it. 0 without one.
+
+    It is the same whichever sessions are asked for. What a model has learned from some of them depends on time
+    (a jump, a base that settles), and is applied to others.
+    """
+    row = next(iter(reader.rows("SELECT utc_ns FROM observations WHERE excluded IS NULL ORDER BY id LIMIT 1")), None)
+    return 0 if row is None else int(row["utc_ns"])
 
 
 def setup_lines(reader: Reader, session_ids: Sequence[str]) -> list[SetupLine]:

@@ -22,7 +22,7 @@ from calibration.rig import Rig
 from daemon.cli.simulated_operator import DEADLINE_S, PRISMS, RIG, Advance, DemoError, Operator
 from daemon.cli.tables import say
 from daemon.rigs import load_rig
-from daemon.session_data import sessions_csv
+from daemon.session_data import sessions_csv, time_zero_ns
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S
 
@@ -98,7 +98,7 @@ def play(out: Path, rate: float, seed: int, advance: Advance, tell: Console) -> 
             found.append(_find_gap(out, rig, "gap-again", training, checks, seed))
     finally:
         operator.close()
-    truth = _timed_as(opened(envelope, commitment), envelope, out / STORE, training)
+    truth = _timed_as(opened(envelope, commitment), envelope, out / STORE)
     answer = found[-1]
     return {
         "seed": seed,
@@ -129,17 +129,12 @@ def opened(envelope: Path, commitment: str) -> Truth:
     return Truth(content["family"], content["where"], content["coefficients"], content["visible_over_noise"])
 
 
-def _timed_as(truth: Truth, envelope: Path, store: Path, training: Sequence[str]) -> Truth:
-    """The truth with instants counted as the observations of these sessions are, and not from simulated second 0."""
+def _timed_as(truth: Truth, envelope: Path, store: Path) -> Truth:
+    """The truth with instants counted as the store's observations are, and not from simulated second 0."""
     if "time_s" not in truth.coefficients:
         return truth
-    marks = ",".join("?" * len(training))
     with Reader(store) as reader:
-        (row,) = reader.rows(
-            f"SELECT min(utc_ns) AS first FROM observations WHERE excluded IS NULL AND session_id IN ({marks})",
-            training,
-        )
-    later_s = (row["first"] - int((envelope / BEGIN).read_text(encoding="utf-8"))) / NS_PER_S
+        later_s = (time_zero_ns(reader) - int((envelope / BEGIN).read_text(encoding="utf-8"))) / NS_PER_S
     time_s = truth.coefficients["time_s"] - later_s
     return replace(truth, coefficients={**truth.coefficients, "time_s": time_s})
 

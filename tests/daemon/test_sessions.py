@@ -168,6 +168,24 @@ def test_a_clock_that_is_set_in_a_session_does_not_step_its_times(rig: Rig) -> N
     assert table.extra["time_s"][-1] > 2.0
 
 
+def test_a_later_session_by_itself_is_timed_on_the_clock_of_all(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    rig.say("stop")
+    rig.live(30)
+    rig.say("start", prism="r", operator="Ada", kind="check")
+    rig.live(2)
+    rig.say("stop")
+    with Reader(rig.store.path) as reader:
+        both, check = (
+            parse_observations(sessions_csv(reader, SOURCE.rig, sessions), SOURCE.rig, "sessions")
+            for sessions in (["s001-r", "s002-r"], ["s002-r"])
+        )
+    assert both.extra["time_s"][0] == 0.0
+    assert check.extra["time_s"].tolist() == both.extra["time_s"][both.session == "s002-r"].tolist()
+    assert check.extra["time_s"][0] > 30.0
+
+
 def test_every_fix_is_its_session_s_by_when_it_was_measured_not_by_when_it_was_joined(rig: Rig) -> None:
     start(rig)
     begun = rig.clock.now().monotonic_ns
