@@ -295,6 +295,8 @@ def jobs_list(**where: Any) -> Any:
     def show(console: Console, found: list[dict[str, Any]]) -> None:
         for job in found:
             say(console, _job_line(job))
+        if not found:
+            say(console, "no jobs yet; those of a session are queued some seconds after it was closed")
 
     return ask(where, "jobs.list", show)
 

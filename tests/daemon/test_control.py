@@ -6,8 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 
+from daemon.cli.main import main as rigcal
 from daemon.control import CommandError, ControlServer, request
+from daemon.job_table import JobTable
+from daemon.store.store import Store
+from drivers.clock import ManualClock
 
 release = threading.Event()
 
@@ -118,3 +123,14 @@ def test_a_file_that_is_no_socket_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(CommandError, match="cannot be made: Address already in use"):
         ControlServer(precious, {})
     assert precious.read_text(encoding="utf-8") == "keep me"
+
+
+def test_an_operator_who_asks_for_jobs_before_there_are_any_is_told_when_there_will_be(tmp_path: Path) -> None:
+    store = Store(tmp_path / "rigcal.sqlite")
+    table = JobTable(store, "swdt82", ManualClock())
+    server = ControlServer(tmp_path / "s", {"jobs.list": lambda _: table.all()})
+    done = CliRunner().invoke(rigcal, ["jobs", "list", "--socket", str(tmp_path / "s")])
+    server.close()
+    store.close()
+    assert done.exit_code == 0
+    assert done.stdout == "no jobs yet; those of a session are queued some seconds after it was closed\n"
