@@ -46,6 +46,8 @@ def training_warnings(model: CalibratedModel, observations: Observations, soluti
     yield from _of_coverage(model, observations)
     yield from _of_outliers(model, observations, solution)
     yield from _of_result(model)
+    if solution.has_priors:  # without them, parameters that nearly repeat each other go far, and no file is wrong
+        yield from _of_corrections(model)
 
 
 def _of_fit(
@@ -157,7 +159,6 @@ def _of_result(model: CalibratedModel) -> Iterator[str]:
                 f"{effect.family}@{effect.where} may be a deflection under load, which nothing here tells: give masses "
                 f"in the rig file or measured torques in {effect.where}_Nm"
             )
-    yield from _of_corrections(model)
 
 
 def _of_corrections(model: CalibratedModel) -> Iterator[str]:

@@ -59,6 +59,7 @@ class Solution:
         tolerated_mm: RMS 3-D error that build tolerances explain before any fit.
         warnings: about the data and what was made of them.
         additions: coefficients of effects that were fitted along; they follow the parameters in `fit.x`.
+        has_priors: whether the rig file's build tolerances held the parameters.
     """
 
     chain: Chain
@@ -70,6 +71,7 @@ class Solution:
     tolerated_mm: float
     warnings: tuple[str, ...] = ()
     additions: Additions | None = None
+    has_priors: bool = True
 
 
 def place(rig: Rig, observations: Observations) -> tuple[Chain, Samples, Start]:

@@ -93,7 +93,7 @@ def km(rig: Rig, observations: Observations, *, progress: Progress) -> Solution:
     progress(0.9, "checking what the data determine")
     seen = identifiability(chain, samples, fit.x, fit.excess_variance)
     words = f"plain least squares from the nominal model, {rounds} rounds"
-    return Solution(chain, samples, nominal, fit, seen, words, tolerated_mm)
+    return Solution(chain, samples, nominal, fit, seen, words, tolerated_mm, has_priors=False)
 
 
 def skcm(rig: Rig, observations: Observations, *, progress: Progress) -> Adopted:

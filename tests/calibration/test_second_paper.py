@@ -15,13 +15,13 @@ from calibration.errors import DataError, UnsafeError
 from calibration.identification.solve import Solution, place
 from calibration.kinematics import Chain
 from calibration.model import CalibratedModel
-from calibration.observations import Floats, Observations
+from calibration.observations import Floats, Observations, parse_observations
 from calibration.pipeline import compensate_torques, identify
 from calibration.published.second_paper import km, require_torques, skcm
 from calibration.residual.features import Features, missing_signals, usable_torques
 from calibration.residual.hybrid import LOADERS, torque_compensation
 from calibration.residual.torque_network import TorqueNetwork, fit_torque_network
-from calibration.rig import Rig, parse_rig, shipped_rig
+from calibration.rig import ANOTHER_VALUE, Rig, parse_rig, shipped_rig
 from calibration.torques import gravity_torques, torque_columns
 from tests.calibration.conftest import features, rig_text, rms, simulated
 from tests.calibration.simulated_ys100 import linear, robot, stiffening
@@ -135,6 +135,14 @@ def test_data_of_another_machine_are_refused() -> None:
     shuffled = training.position_mm[np.random.default_rng(0).permutation(len(training))]
     with pytest.raises(UnsafeError, match="after plain least squares"):
         km(rig, replace(training, position_mm=shuffled), progress=quiet)
+
+
+def test_what_km_makes_of_nearly_equal_parameters_is_no_mistake_of_the_rig_file() -> None:
+    rig, table = shipped_rig("ur10"), Path(__file__).parent.parent / "data" / "ur10_random_poses.csv"
+    every_eighth = parse_observations(table.read_bytes(), rig, table.name).select(np.arange(6, 2773, 8))
+    model = identify(rig, rig_text("ur10"), every_eighth, method="km")
+    assert max(abs(parameter.pull) for parameter in model.parameters) > ANOTHER_VALUE
+    assert not [warning for warning in model.warnings if "file" in warning or "tolerances" in warning]
 
 
 # -- SKCM --------------------------------------------------------------------------------------------------------------
