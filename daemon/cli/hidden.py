@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -73,6 +74,8 @@ def play(out: Path, rate: float, seed: int, advance: Advance, tell: Console) -> 
     Raises:
         DemoError: it did not come to its end.
     """
+    from daemon.gap_files import REPORT
+
     rig = load_rig(RIG).rig
     envelope = out / ENVELOPE
     envelope.mkdir()
@@ -84,7 +87,8 @@ def play(out: Path, rate: float, seed: int, advance: Advance, tell: Console) -> 
         training = [operator.record(prism, "static_poses", TRAINING_POSES, advance) for prism in PRISMS]
         checks = [operator.record(prism, "check", CHECK_POSES, advance) for prism in CHECKED]
         advance("finding the gap", 0)
-        found = [_find_gap(out, rig, "gap", training, checks, seed)]
+        name = "gap"
+        found = [_find_gap(out, rig, name, training, checks, seed)]
         poses = _proposed(found[0])
         if poses:
             say(tell, f"The data cannot tell {_set_of(found[0])} apart. Measuring {len(poses)} poses that can.")
@@ -95,7 +99,8 @@ def play(out: Path, rate: float, seed: int, advance: Advance, tell: Console) -> 
                 operator.pause(pause_s)
                 training += [operator.record(prism, "static_poses", len(rows), advance, rows) for prism in CHECKED]
             advance("finding the gap again", 0)
-            found.append(_find_gap(out, rig, "gap-again", training, checks, seed))
+            name = "gap-again"
+            found.append(_find_gap(out, rig, name, training, checks, seed))
     finally:
         operator.close()
     truth = _timed_as(opened(envelope, commitment), envelope, out / STORE)
@@ -109,6 +114,7 @@ def play(out: Path, rate: float, seed: int, advance: Advance, tell: Console) -> 
         "verdicts": [told["verdict"] for told in found],
         "poses_measured_for_a_set": len(poses),
         "gap": answer,
+        "report": str(out / name / REPORT),
     }
 
 
@@ -180,6 +186,7 @@ def show(console: Console, result: Mapping[str, Any]) -> None:
         "missed": f"Missed: it is {name}, {sizes}.",
     }
     console.print(lines[result["outcome"]], style="bold", highlight=False, markup=False)
+    say(console, f"report: {os.path.relpath(result['report'])}")
 
 
 def _name(family: str, where: str) -> str:

@@ -183,6 +183,9 @@ def test_an_answer_is_right_or_a_set_with_the_truth_or_missed(
     gap = answer(effects, pending)
     assert outcome(gap, HIDDEN) == expected
     truth = {"family": HIDDEN.family, "where": HIDDEN.where, "coefficients": dict(HIDDEN.coefficients)}
-    result = {"gap": gap, "truth": truth, "outcome": expected, "visible_over_noise": 2.0}
+    report = str(Path.cwd() / "rigcal-demo" / "gap" / "report.html")
+    result = {"gap": gap, "truth": truth, "outcome": expected, "visible_over_noise": 2.0, "report": report}
     show(Console(width=120), json.loads(json.dumps(result)))
-    assert line in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert line in told
+    assert told.endswith("report: rigcal-demo/gap/report.html\n")
