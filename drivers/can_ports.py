@@ -139,8 +139,8 @@ def _said(error: BaseException) -> str:
 
 def _hint(settings: PortSettings) -> str:
     if settings.interface == "socketcan":
-        bitrate = settings.bitrate or 250_000
-        return f"try: ip link set {settings.channel} up type can bitrate {bitrate} restart-ms 100"
+        mode = f"bitrate {settings.bitrate or 250_000} listen-only {'on' if settings.is_listen_only else 'off'}"
+        return f"try: ip link set {settings.channel} up type can {mode} restart-ms 100"
     if settings.interface == "slcan":
         return "check that the adapter is plugged in, that this user may use the port, and the bitrate"
     return "check the channel and the options of the link"

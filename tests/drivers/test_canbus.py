@@ -270,8 +270,11 @@ def test_waiting_times_double_to_a_limit_and_are_the_same_every_time() -> None:
     assert backoff.next_s() == 0.5
 
 
-def test_a_bus_that_cannot_be_opened_is_told_once_with_what_to_do() -> None:
-    config = CanLinkConfig(name="boom", interface="socketcan", channel="can-none", bitrate=125_000)
+@pytest.mark.parametrize(("allow_transmit", "listen_only"), [(False, "on"), (True, "off")])
+def test_a_bus_that_cannot_be_opened_is_told_once_with_what_to_do(allow_transmit: bool, listen_only: str) -> None:
+    config = CanLinkConfig(
+        name="boom", interface="socketcan", channel="can-none", bitrate=125_000, allow_transmit=allow_transmit
+    )
     clock = ManualClock()
     heard, stop = Heard(), threading.Event()
     thread = threading.Thread(target=CanLink(config, clock).run, args=(heard, stop))
@@ -286,7 +289,8 @@ def test_a_bus_that_cannot_be_opened_is_told_once_with_what_to_do() -> None:
     (event,) = heard.events()
     assert event.kind is EventKind.LINK_LOST
     assert event.text.startswith("boom: cannot open socketcan 'can-none': ")
-    assert event.text.endswith("try: ip link set can-none up type can bitrate 125000 restart-ms 100")
+    hint = f"try: ip link set can-none up type can bitrate 125000 listen-only {listen_only} restart-ms 100"
+    assert event.text.endswith(hint)
     assert heard.gaps == [Gap("boom", GapReason.LINK_DOWN, start)]
 
 
