@@ -25,6 +25,8 @@ from drivers.readings import (
     Capture,
     DecodeFailure,
     Decoder,
+    DeviceEvent,
+    EventKind,
     Gap,
     LinkItem,
     LinkLoop,
@@ -45,6 +47,8 @@ INLINE_SPAN_NS = NS_PER_S
 
 # What is wrong with a record, in place of with the disk: out of a column's range or type, text that is no UTF-8.
 _REFUSED = (sqlite3.IntegrityError, sqlite3.ProgrammingError, ArithmeticError, TypeError, ValueError)
+
+_LINK_LEVELS = {EventKind.LINK_UP: logging.INFO, EventKind.LINK_LOST: logging.WARNING}
 
 
 class AcquisitionError(Exception):
@@ -209,6 +213,7 @@ class Acquisition:
         if items:
             chunk_ids = self._insist(lambda: self._commit_raw(captures, reports))
         self._board.captured(captures)
+        _tell_of_links(reports)
         records = decode(captures)
         if records or chunk_ids:
             self._insist(lambda: self._commit_records(records, chunk_ids))
@@ -269,6 +274,13 @@ class Acquisition:
                     log.warning("%s can be written again", self._store.path)
                     self._board.set_error(None)
                 return result
+
+
+def _tell_of_links(reports: Iterable[Record]) -> None:
+    """A rig that is silent must say why in the service's journal, where people look first."""
+    for report in reports:
+        if isinstance(report, DeviceEvent) and report.kind in _LINK_LEVELS:
+            log.log(_LINK_LEVELS[report.kind], "%s", report.text)
 
 
 class _Decoding:

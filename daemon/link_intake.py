@@ -97,6 +97,6 @@ class LinkIntake:
                 reason = f"{type(error).__name__}: {error}"
             if not stop.is_set():
                 self.restarts += 1
-                text = f"the link's loop ended ({reason}); it is started again in {RESTART_S:g} s"
+                text = f"{self.name}: the link's loop ended ({reason}); it is started again in {RESTART_S:g} s"
                 self._emit(DeviceEvent(self.name, self._clock.now(), EventKind.LINK_LOST, text))
                 self._clock.wait(stop, RESTART_S)

@@ -93,6 +93,8 @@ def run(
     A replay keeps its store in a directory of its own, beside the configured one's.
     """
     logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, format=_LOG_FORMAT)
+    if not verbose:
+        logging.getLogger("can").setLevel(logging.WARNING)  # python-can tells of every socket that it makes
     if bool(files) != is_replay or (sim and is_replay):
         raise click.UsageError("give either --sim, or --replay FILE..., or neither")
     settings = _settings(config, sim=sim)

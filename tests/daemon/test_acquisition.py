@@ -132,6 +132,17 @@ def test_a_link_without_a_decoder_is_captured_all_the_same(path: Path, acquire: 
     assert table(path, "undecoded_chunks") == table(path, "joint_samples") == []
 
 
+def test_a_link_that_is_lost_and_comes_back_is_told_in_the_log(acquire: Make, caplog: pytest.LogCaptureFixture) -> None:
+    lost = DeviceEvent("boom", at(0), EventKind.LINK_LOST, "boom: the bus went away")
+    back = DeviceEvent("boom", at(1), EventKind.LINK_UP, "boom: the bus is open")
+    with caplog.at_level(logging.INFO):
+        acquisition = acquire([ListLink("boom", [lost, back])])
+        acquisition.start()
+        wait_until(lambda: back.text in caplog.messages)
+    told = [(record.levelname, record.message) for record in caplog.records]
+    assert told == [("WARNING", lost.text), ("INFO", back.text)]
+
+
 def test_what_a_link_reports_is_stored_beside_what_it_captured(path: Path, acquire: Make) -> None:
     up = DeviceEvent("boom", at(0), EventKind.LINK_UP, "open")
     link = ListLink("boom", [up, frame(1)])
