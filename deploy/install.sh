@@ -46,10 +46,12 @@ command -v systemctl >/dev/null || die "systemd is not installed here; rigcal's 
 booted=''
 [ ! -d /run/systemd/system ] || booted=yes # sd_booted(3): false in a chroot or an image being built
 
-# Packages are not changed under a running daemon; it is started again whatever becomes of the installation.
+# Packages are not changed under a running daemon; it is started again whatever becomes of the installation, also when
+# the operator's connection is lost: dash leaves without EXIT's trap where a signal has none of its own.
 if [ -n "$booted" ] && systemctl --quiet is-active rigcal.service; then
     echo "Stopping rigcal.service for the upgrade"
     trap 'systemctl start rigcal.service' EXIT
+    trap 'exit 1' HUP INT TERM
     systemctl stop rigcal.service
 fi
 

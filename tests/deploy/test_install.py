@@ -1,11 +1,12 @@
 """Installing the service's files, and installing them again over a site's own."""
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
 
-from tests.deploy.conftest import DEPLOY, run
+from tests.deploy.conftest import DEPLOY, private_namespaces, run
 
 
 def test_a_second_installation_keeps_what_the_site_edited(installed: Path) -> None:
@@ -42,6 +43,26 @@ def test_without_root_the_installation_says_so_and_changes_nothing(tmp_path: Pat
     result = run(DEPLOY / "install.sh", DESTDIR="", PATH=f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
     assert result.returncode == 1
     assert result.stdout == ("rigcal installation: this changes /opt, /etc and the list of users; run it as root\n")
+
+
+@pytest.mark.parametrize("signal", ["HUP", "INT", "TERM"])
+def test_an_upgrade_that_is_cut_off_starts_the_service_again(tmp_path: Path, signal: str) -> None:
+    deploy, asked = tmp_path / "deploy", tmp_path / "asked"
+    shutil.copytree(DEPLOY, deploy)
+    for script, line in (
+        (deploy / "bootstrap.sh", f"kill -{signal} $PPID"),
+        (tmp_path / "systemctl", f'echo "$@" >>{asked}'),
+    ):
+        script.write_text(f"#!/bin/sh\n{line}\n", encoding="utf-8")
+        script.chmod(0o755)
+    booted = f"mount -t tmpfs none /run; mkdir -p /run/systemd/system; exec {deploy}/install.sh"
+    result = run(*private_namespaces(), booted, DESTDIR="", PATH=f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    assert result.returncode == 1, result.stdout
+    assert asked.read_text(encoding="utf-8").splitlines() == [
+        "--quiet is-active rigcal.service",
+        "stop rigcal.service",
+        "start rigcal.service",
+    ]
 
 
 @pytest.mark.parametrize("script", ["bootstrap.sh", "install.sh"])
