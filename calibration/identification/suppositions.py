@@ -22,7 +22,7 @@ _LENGTHS = {"m": 1000.0, "cm": 10.0, "micrometres": 1e-3, "inches": 25.4, "feet"
 _ANGLES = {"radians": math.degrees(1.0), "gon": 0.9}
 _SPAN = 1.3  # times the span of the limits that readings in another unit may fill
 _SIZE = 4.0  # how far, as a factor, positions may be from the size that the nominal rig has
-_MOST_RADIANS = 4.0 * math.pi
+_MOST_RADIANS = 4.0 * math.pi  # of a joint that reads on any turn; one that turns often says so by its limits
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,10 @@ def _exchanges(rig: Rig, seen: Sequence[int], nothing: Supposition) -> Iterator[
 
 def _may_be(joint: Joint, values: Floats, unit: str) -> bool:
     """Whether readings of an angle may be in a unit."""
-    return joint.kind == "revolute" and (unit != "radians" or float(np.abs(values).max()) <= _MOST_RADIANS)
+    if joint.kind != "revolute":
+        return False
+    few = unit != "radians" or float(np.abs(values).max()) <= _MOST_RADIANS
+    return few or _fits(joint, values, _ANGLES[unit])
 
 
 def _fits(joint: Joint, values: Floats, factor: float) -> bool:
