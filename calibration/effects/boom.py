@@ -1,7 +1,8 @@
-"""The telescoping boom of a machine: the row whose length `a` a transducer drives, and what it carries."""
+"""The telescoping boom of a machine: the first row that slides and is swung, and what it carries."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Literal
@@ -10,18 +11,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.effects.base import PrismFamily, Situation
+from calibration.kinematics import Chain, rotation_about
 from calibration.observations import Floats
 from calibration.rig import Rig
 
 _LEAST_MM = 1e-6
+_PARALLEL = math.cos(math.radians(1.0))  # an axis so near to a slide's direction does not swing it
 
 
 def boom_of(rig: Rig) -> tuple[int, str] | None:
     """Number of the row that is the boom and the joint that extends it; None where a rig has no such row.
 
-    Of several the first: it carries the others.
+    A boom slides, along `a` or `d`, and a joint before it swings it, about an axis that is not parallel to it. Of
+    several the first: it carries the others.
     """
-    return next(((number, joint) for number, driven, joint, _ in rig.couplings() if driven == "a"), None)
+    chain = Chain(rig, {})
+    return next((found for number in range(1, len(rig.rows) + 1) if (found := _swung(chain, number))), None)
+
+
+def _swung(chain: Chain, number: int) -> tuple[int, str] | None:
+    """A row and the joint that slides it, where another swings it.
+
+    Asked with all readings at zero: where all axes are parallel to the slide there, turning about them leaves them so.
+    """
+    turned, axes = np.eye(3), np.empty((0, 3))
+    for row in chain.rig.path(number):
+        for op in chain.row_ops[row - 1]:
+            along = turned[:, op.axis]
+            if op.rotates:
+                axes = np.vstack([axes, along]) if op.drive else axes
+                turned = turned @ rotation_about(op.axis, op.constant)
+            elif op.drive and row == number and (np.abs(axes @ along) < _PARALLEL).any():
+                return number, chain.rig.joint_names[op.drive[0][0]]
+    return None
 
 
 class BoomFamily(PrismFamily):
@@ -59,6 +81,12 @@ class Boom:
     def _root(self) -> int:
         path = self.situation.rig.path(self.row)
         return path[-2] if len(path) > 1 else 0
+
+    @cached_property
+    def outer_mm(self) -> float:
+        """Length of the outer section: the boom's at a reading of zero."""
+        row = self.situation.rig.rows[self.row - 1]
+        return abs(row.a_mm if self.joint in row.drive.get("a", {}) else row.d_mm)
 
     @cached_property
     def root_mm(self) -> Floats:

@@ -19,6 +19,7 @@ from calibration.design.planning import pose_rows
 from calibration.design.poses import Candidates, Plan, draw, near, plan
 from calibration.design.rivals import changing, conditions_of, name_of, rival_of
 from calibration.design.visibility import site
+from calibration.effects.boom import boom_of
 from calibration.effects.fitted import FittedEffect
 from calibration.effects.library import library
 from calibration.errors import DataError, UnsafeError
@@ -184,7 +185,8 @@ def _by_place(rig: Rig, rivals: Sequence[FittedEffect]) -> Iterator[Experiment]:
 def _row(rig: Rig, where: str) -> int | None:
     """Number of the first row that an effect at a joint value or the boom moves; None for all others."""
     if where == "boom":
-        return next((number for number, driven, _, _ in rig.couplings() if driven == "a"), None)
+        boom = boom_of(rig)
+        return None if boom is None else boom[0]
     return next((number for number, _, name, _ in rig.couplings() if name == where), None)
 
 

@@ -15,7 +15,7 @@ from calibration.gap.search import search
 from calibration.kinematics import Chain, Placement
 from calibration.observations import Floats, Observations, parse_observations
 from calibration.pipeline import identify
-from calibration.rig import Rig, shipped_rig
+from calibration.rig import Rig, parse_rig, shipped_rig
 from simulators.cases import draw
 from simulators.cells import Cell, Poses
 from simulators.dataset import random_poses, simulate_observations
@@ -185,3 +185,51 @@ def test_a_run_without_times_in_training_goes_by_time_where_later_rows_have_it()
     assert change[0] == pytest.approx(np.abs(np.diff(observations.joints["L2"])).sum() / 1e3)
     assert family.goes_by_order({"mean_m": 0.0})
     assert not family.goes_by_order({"mean_m": 0.0, "time_0_s": 0.0, "path_0_m": 1.0})
+
+
+# -- the boom ----------------------------------------------------------------------------------------------------------
+
+CRANE = """
+name = "crane"
+convention = "dh"
+tolerances = { length_mm = 5.0, angle_deg = 0.2, beta_deg = 0.1, prism_mm = 3.0 }
+joint = [
+    { name = "slew", kind = "revolute", limits = [-170, 170], sigma = 0.005 },
+    { name = "mast", kind = "prismatic", limits = [0, 1500], sigma = 0.2 },
+    { name = "luff", kind = "revolute", limits = [5, 75], sigma = 0.005 },
+    { name = "tele", kind = "prismatic", limits = [0, 6000], sigma = 0.5 },
+]
+row = [
+    { d_mm = 2000, drive = { theta = { slew = 1.0 } } },
+    { alpha_deg = 90, drive = { d = { mast = 1.0 } } },
+TELESCOPE
+]
+prism = [{ name = "head", frame = 4, offset_mm = [300, 200, 100] }]
+mass = [{ name = "hook", kg = 800, frame = 4, centre_mm = [200, -300, 150] }]
+"""
+ALONG_X = """
+    { drive = { theta = { luff = 1.0 } } },
+    { a_mm = 7000, drive = { a = { tele = 1.0 } } },
+"""
+ALONG_Z = """
+    { theta_deg = 90, alpha_deg = 90, drive = { theta = { luff = 1.0 } } },
+    { theta_deg = 90, alpha_deg = 90, d_mm = 7000, drive = { d = { tele = 1.0 } } },
+"""
+
+
+@pytest.mark.parametrize("family", ["boom_droop", "pad_play"])
+def test_a_telescope_is_a_boom_along_whichever_axis_it_is_written(family: str) -> None:
+    """The mast slides before it, but nothing swings that."""
+    x, z = (parse_rig(CRANE.replace("TELESCOPE", rows), "crane.toml") for rows in (ALONG_X, ALONG_Z))
+    turned = z.prisms[0].model_copy(update={"offset_mm": (100.0, 300.0, 200.0)})
+    weight = z.masses[0].model_copy(update={"centre_mm": (150.0, 200.0, -300.0)})
+    z = z.model_copy(update={"prisms": (turned,), "masses": (weight,)})
+    observations = exact(RigTruth(x, 1, perturbation=0.0), 40)
+    moved = []
+    for rig in (x, z):
+        situation = perfect(RigTruth(rig, 1, perturbation=0.0), observations)
+        settings = library()[family].variants(situation, "boom")[0]
+        moved.append(library()[family].shift_mm(situation, "boom", settings))
+    assert library()[family].places(x) == library()[family].places(z) == ("boom",)
+    assert np.abs(moved[0]).max() > 0.0
+    np.testing.assert_allclose(moved[1], moved[0], rtol=1e-9, atol=1e-9 * np.abs(moved[0]).max())

@@ -80,7 +80,7 @@ class PadPlay(BoomFamily):
             return np.zeros((len(situation), 3, 1))
         low, high = situation.rig.joint(boom.joint).limits
         overlap_mm = np.maximum(high - situation.reading(boom.joint), 0.0) + settings[_LEFT] * (high - low)
-        mouth_mm = boom.root_mm + boom.axis * situation.rig.rows[boom.row - 1].a_mm
+        mouth_mm = boom.root_mm + boom.axis * boom.outer_mm
         places_mm, newton = boom.weights
         hanging = newton * boom.hanging
         about = (hanging[:, None, :] @ places_mm)[:, 0] - hanging.sum(axis=1)[:, None] * mouth_mm
