@@ -167,6 +167,15 @@ def test_sweeps_are_found_among_other_poses_and_by_set_up() -> None:
     assert found == {(joint, setup) for joint in truth.rig.joint_names for setup in "ab"}
 
 
+def test_a_prism_that_one_joint_moves_may_be_out_of_view_of_a_set_up() -> None:
+    shipped = shipped_rig("swdt82")
+    low = shipped.prisms[0].model_copy(update={"frame": 1, "offset_mm": (900.0, 0.0, 300.0)})
+    truth = RigTruth(shipped.model_copy(update={"prisms": (low, *shipped.prisms[1:])}), 1003)
+    here, there = sweeps(truth, 1, "a"), sweeps(truth, 2, "b")
+    chain, samples, _ = placed(truth.rig, joined_observations([here, there.select(there.prism != "w")]))
+    assert {(a.joint, a.setup) for a in find_axes(chain, samples) if a.prism == "w"} == {("theta1", "a")}
+
+
 def test_a_gross_outlier_in_a_sweep_is_left_out_and_counted() -> None:
     truth = RigTruth(shipped_rig("ys100"), 1002)
     observations = sweeps(truth, 3)

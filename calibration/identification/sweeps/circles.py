@@ -150,16 +150,15 @@ def _sweeps(chain: Chain, samples: Samples) -> Iterator[tuple[int, Kind, Integer
     """Every joint with the rows of one of its sweeps."""
     spread = standing_spread(chain.rig)
     data = samples.data
-    for setup in np.unique(data.setup):
-        for prism in np.unique(data.prism):
-            rows = np.flatnonzero((data.setup == setup) & (data.prism == prism))
-            ops = [op for op in chain.prism_chain(int(prism)) if op.drive]
-            movers = sorted({joint for op in ops for joint, _ in op.drive})
-            for joint in movers:
-                turns = any(op.rotates for op in ops for driven, _ in op.drive if driven == joint)
-                others = [j for j in movers if j != joint]
-                for standing in _standing(data.readings[rows][:, others] / spread[others]):
-                    yield joint, "revolute" if turns else "prismatic", rows[standing]
+    for setup, prism in np.unique(np.column_stack([data.setup, data.prism]), axis=0).tolist():
+        rows = np.flatnonzero((data.setup == setup) & (data.prism == prism))
+        ops = [op for op in chain.prism_chain(prism) if op.drive]
+        movers = sorted({joint for op in ops for joint, _ in op.drive})
+        for joint in movers:
+            turns = any(op.rotates for op in ops for driven, _ in op.drive if driven == joint)
+            others = [j for j in movers if j != joint]
+            for standing in _standing(data.readings[rows][:, others] / spread[others]):
+                yield joint, "revolute" if turns else "prismatic", rows[standing]
 
 
 def _standing(values: Floats) -> Iterator[Integers]:
