@@ -30,6 +30,7 @@ Labels = NDArray[np.str_]
 Integers = NDArray[np.intp]
 
 _CELL_MM = 100.0
+_PART = 0.4  # of the usual distance from the middle of all places: of a small machine no cell is larger
 
 
 @dataclass(frozen=True)
@@ -163,11 +164,15 @@ class Projection:
 def cells(samples: Samples) -> Labels:
     """(m,) workspace cells for grouped splits, a standstill in that of its first sample.
 
+    They are 100 mm wide, or less where the machine is small: all in one cell, no split is left.
     Set-ups and sessions are no groups here: without a set-up's fixes its base, a part of the fit, has no place.
     """
-    cell = np.rint(samples.position_mm / _CELL_MM).astype(int)
+    place_mm, setup = samples.position_mm, np.unique(samples.data.setup, return_inverse=True)[1]
+    middle_mm = np.array([np.median(place_mm[setup == number], axis=0) for number in range(setup.max() + 1)])
+    usual_mm = float(np.median(np.linalg.norm(place_mm - middle_mm[setup], axis=1)))
+    cell = np.rint(place_mm / (min(_CELL_MM, _PART * usual_mm) or _CELL_MM)).astype(int)
     first = np.arange(len(samples)) if samples.standstill is None else samples.standstill
-    return np.array([f"{s}|{x},{y},{z}" for s, (x, y, z) in zip(samples.data.setup[first], cell[first], strict=True)])
+    return np.array([f"{s}|{x},{y},{z}" for s, (x, y, z) in zip(setup[first], cell[first], strict=True)])
 
 
 def without_folds(design: Floats, target: Floats, fold: Integers) -> Iterator[tuple[int, Floats]]:

@@ -18,7 +18,7 @@ from calibration.effects.library import library
 from calibration.gap.adequacy import closes
 from calibration.gap.detect import detect
 from calibration.gap.grammar import Grammar, describe
-from calibration.gap.projection import Projection
+from calibration.gap.projection import Projection, cells
 from calibration.gap.screen import Screen, possible
 from calibration.gap.terms import columns_of, modulations
 from calibration.gap.variables import Place, Variable
@@ -124,6 +124,14 @@ def test_no_probability_is_smaller_than_that_of_all_signs_alike() -> None:
     np.add.at(sums, np.arange(len(words.by_group)) % 8, words.by_group)
     words.by_group, words.score = sums, sums.sum(axis=0)
     assert detect(words, np.random.default_rng(0)).p >= 0.5**7
+
+
+def test_a_machine_of_a_few_millimetres_has_groups_as_a_large_one_has() -> None:
+    rig = shipped_rig("swdt82")
+    samples = projected(rig, measured(rig, "", 7)).samples
+    tiny = replace(samples, position_mm=samples.position_mm / 1e3)
+    assert len(np.unique(cells(samples))) > 200
+    assert len(np.unique(cells(tiny))) > 50
 
 
 def test_thirty_signals_that_have_nothing_to_do_with_it_raise_no_alarm() -> None:
