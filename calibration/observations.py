@@ -26,6 +26,8 @@ POSITION_COLUMNS = ("x_mm", "y_mm", "z_mm")
 SIGMA_COLUMNS = ("sigma_x_mm", "sigma_y_mm", "sigma_z_mm")
 LABEL_COLUMNS = ("setup", "session", "pose")
 DIRECTIONS = (-1.0, 0.0, 1.0)
+CELL_MM = 100.0
+_PART = 0.4  # of the spread of all places: no cell is larger
 _MOST_DEG = 36_000.0  # a hundred turns
 _MOST_TURNS_DEG = 720.0  # more than the limits have, within one file
 _MOST_MM = 1e7  # 10 km
@@ -91,16 +93,35 @@ class Observations:
         )
 
     def groups(self) -> Strings:
-        """(n,) labels for grouped splits: sessions or set-ups where there are several, else 100 mm workspace cells."""
+        """(n,) labels for grouped splits: sessions or set-ups where there are several, else workspace cells.
+
+        They are of 100 mm, or less where the machine is small (`cell_mm`).
+        """
         for labels in (self.session, self.setup):
             if len(np.unique(labels)) > 1:
                 return labels
-        return self.cells()
+        return self.cells(cell_mm(self.position_mm, self.setup))
 
-    def cells(self, size_mm: float = 100.0) -> Strings:
+    def cells(self, size_mm: float = CELL_MM) -> Strings:
         """(n,) workspace cells: coordinates divided by `size_mm` and rounded to even halves, as `round` does."""
         index = np.rint(self.position_mm / size_mm).astype(int)
         return np.array([f"{x},{y},{z}" for x, y, z in index], dtype=np.str_)
+
+
+def cell_mm(position_mm: Floats, setup: Strings | NDArray[np.intp]) -> float:
+    """Width of the workspace cells that split a machine's fixes: 100 mm, or less where it is small.
+
+    All in one cell, nothing would be left to split. `position_mm` and `setup` as for `spread_mm`.
+    """
+    return min(CELL_MM, _PART * spread_mm(position_mm, setup)) or CELL_MM
+
+
+def spread_mm(position_mm: Floats, setup: Strings | NDArray[np.intp]) -> float:
+    """Median distance of positions (n, 3) from the median place of their set-up's (n,); 0 where there are none."""
+    distance_mm = np.zeros(max(1, len(position_mm)))
+    for own in (setup == label for label in np.unique(setup)):
+        distance_mm[own] = np.linalg.norm(position_mm[own] - np.median(position_mm[own], axis=0), axis=1)
+    return float(np.median(distance_mm))
 
 
 def optional_columns(rig: Rig) -> set[str]:

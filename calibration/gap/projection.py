@@ -24,13 +24,10 @@ from calibration.identification.refinement import Fit, whitened_rows
 from calibration.identification.samples import Samples
 from calibration.identification.solve import Solution
 from calibration.kernels.gram import gram
-from calibration.observations import Floats
+from calibration.observations import Floats, cell_mm
 
 Labels = NDArray[np.str_]
 Integers = NDArray[np.intp]
-
-_CELL_MM = 100.0
-_PART = 0.4  # of the usual distance from the middle of all places: of a small machine no cell is larger
 
 
 @dataclass(frozen=True)
@@ -164,13 +161,10 @@ class Projection:
 def cells(samples: Samples) -> Labels:
     """(m,) workspace cells for grouped splits, a standstill in that of its first sample.
 
-    They are 100 mm wide, or less where the machine is small: all in one cell, no split is left.
     Set-ups and sessions are no groups here: without a set-up's fixes its base, a part of the fit, has no place.
     """
-    place_mm, setup = samples.position_mm, np.unique(samples.data.setup, return_inverse=True)[1]
-    middle_mm = np.array([np.median(place_mm[setup == number], axis=0) for number in range(setup.max() + 1)])
-    usual_mm = float(np.median(np.linalg.norm(place_mm - middle_mm[setup], axis=1)))
-    cell = np.rint(place_mm / (min(_CELL_MM, _PART * usual_mm) or _CELL_MM)).astype(int)
+    setup = samples.data.setup
+    cell = np.rint(samples.position_mm / cell_mm(samples.position_mm, setup)).astype(int)
     first = np.arange(len(samples)) if samples.standstill is None else samples.standstill
     return np.array([f"{s}|{x},{y},{z}" for s, (x, y, z) in zip(setup[first], cell[first], strict=True)])
 

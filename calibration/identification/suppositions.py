@@ -9,11 +9,10 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.identification.samples import Samples
 from calibration.kinematics import Chain, ChainData
-from calibration.observations import Floats
+from calibration.observations import Floats, spread_mm
 from calibration.rig import Joint, Rig
 
 _T = TypeVar("_T")
@@ -114,8 +113,8 @@ def _sizes(chain: Chain, samples: Samples, before: Supposition) -> Iterator[Supp
     """Positions in another unit, beside what is supposed already."""
     samples = before.applied(samples)
     # The nominal rig tells the size of the work volume, wherever it stands.
-    expected_mm = _spread(chain.positions_mm(np.zeros(len(chain)), samples.data), samples.data.setup)
-    measured_mm = _spread(samples.position_mm, samples.data.setup)
+    expected_mm = spread_mm(chain.positions_mm(np.zeros(len(chain)), samples.data), samples.data.setup)
+    measured_mm = spread_mm(samples.position_mm, samples.data.setup)
     for unit, factor in _LENGTHS.items():
         if 1.0 / _SIZE < factor * measured_mm / max(expected_mm, 1e-9) < _SIZE:
             yield replace(
@@ -238,14 +237,6 @@ def _fits(joint: Joint, values: Floats, factor: float) -> bool:
     low, high = joint.limits
     margin = (_SPAN - 1.0) * (high - low)
     return bool(factor * values.min() > low - margin and factor * values.max() < high + margin)
-
-
-def _spread(position_mm: Floats, setup: NDArray[np.intp]) -> float:
-    """Median distance of positions (n, 3) from the median place of their set-up's (n,)."""
-    distance = np.empty(len(position_mm))
-    for own in (setup == number for number in np.unique(setup)):
-        distance[own] = np.linalg.norm(position_mm[own] - np.median(position_mm[own], axis=0), axis=1)
-    return float(np.median(distance))
 
 
 def _at(values: tuple[_T, ...], index: int, value: _T) -> tuple[_T, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.observations import Observations
+from calibration.observations import Observations, cell_mm
 
 Integers = NDArray[np.intp]
 
@@ -32,11 +32,11 @@ def group_labels(observations: Observations) -> NDArray[np.str_]:
 
 
 def standstill_labels(observations: Observations) -> NDArray[np.str_]:
-    """(n,) labels of fixes whose errors hang together: of one standstill, or while moving of one 100 mm cell.
+    """(n,) labels of fixes whose errors hang together: of one standstill, or while moving of one workspace cell.
 
     What a test over fixes may take for one draw, whatever the number of prisms at a standstill.
     """
-    cells = np.char.add("cell ", observations.cells())
+    cells = np.char.add("cell ", observations.cells(cell_mm(observations.position_mm, observations.setup)))
     place = np.where(observations.pose != "", np.char.add("pose ", observations.pose), cells)
     within = np.char.add(np.char.add(observations.setup, "|"), np.char.add(observations.session, "|"))
     return np.char.add(within, place)

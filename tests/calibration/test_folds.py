@@ -54,6 +54,13 @@ def test_without_standstills_groups_are_the_cells(sweeps: Observations) -> None:
     np.testing.assert_array_equal(group_labels(some)[8:], some.cells()[8:])
 
 
+def test_a_machine_of_a_few_millimetres_has_groups_as_a_large_one_has(sweeps: Observations) -> None:
+    tiny = replace(sweeps, position_mm=sweeps.position_mm / 1e3)
+    assert len(np.unique(group_labels(sweeps))) > 40
+    assert len(np.unique(group_labels(tiny))) > 20
+    assert len(np.unique(standstill_labels(replace(tiny, pose=np.full(len(tiny), ""))))) > 20
+
+
 def test_fixes_of_a_standstill_are_one_draw_and_moving_fixes_one_a_cell(sweeps: Observations) -> None:
     labels = standstill_labels(sweeps)
     assert len(np.unique(labels)) == POSES < len(np.unique(sweeps.cells()))
