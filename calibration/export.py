@@ -197,24 +197,22 @@ class _Places:
     setup: int
 
     def nominal_mm(self, prism: str, readings: Floats) -> Floats:
-        model, rows = self.model, self._rows(prism, readings)
-        return self._in_base(model.nominal_values, model.nominal_mm(rows))
+        model = self.model
+        base = model.chain.base(model.nominal_values, self.setup)
+        turned: Floats = (model.nominal_mm(self._rows(prism, readings)) - base.translation_mm) @ base.rotation
+        return turned
 
     def corrected_mm(self, prism: str, readings: Floats) -> Floats:
-        parts = [
-            self.model.predict(self._rows(prism, readings[start : start + _CHUNK])).position_mm
-            for start in range(0, len(readings), _CHUNK)
-        ]
-        return self._in_base(self.model.values, np.concatenate(parts))
+        return np.concatenate(
+            [
+                self.model.base_mm(self._rows(prism, readings[start : start + _CHUNK]))
+                for start in range(0, len(readings), _CHUNK)
+            ]
+        )
 
     def difference_mm(self, prism: str, readings: Floats) -> Floats:
         difference: Floats = self.corrected_mm(prism, readings) - self.nominal_mm(prism, readings)
         return difference
-
-    def _in_base(self, x: Floats, position_mm: Floats) -> Floats:
-        base = self.model.chain.base(x, self.setup)
-        turned: Floats = (position_mm - base.translation_mm) @ base.rotation
-        return turned
 
     def _rows(self, prism: str, readings: Floats) -> Observations:
         n = len(readings)

@@ -243,6 +243,21 @@ class CalibratedModel:
         self.check(observations)
         return self.predictor.predict(observations, executor)
 
+    def base_mm(self, observations: Observations) -> Floats:
+        """Where the prisms are in the base frame, by the whole model.
+
+        What effects add to fixes alone (of station, prisms and clocks), and how they move the base, is no part of it.
+
+        Returns:
+            (n, 3) mm.
+
+        Raises:
+            UnsafeError: a set-up that the model does not know.
+            CalibrationError: a place is not a finite number.
+        """
+        self.check(observations)
+        return self.predictor.base_mm(observations)
+
     def deviations(self, observations: Observations) -> Floats:
         """(n,) errors of stage effects in sigma (Mahalanobis length).
 

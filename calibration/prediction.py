@@ -31,7 +31,7 @@ class Prediction:
     """Positions with their uncertainty.
 
     Attributes:
-        position_mm: (n, 3) in the station's frame.
+        position_mm: (n, 3) in the station's frame, as its fixes would be: what these err by is part of it.
         sigma_mm: (n, 3) standard deviation of a fix about it: parameters, readings, timing, station, effects left out
             for want of a column, what the model lacks.
     """
@@ -120,14 +120,22 @@ class Predictor:
     def parts(self, observations: Observations) -> Parts:
         """The whole model without its uncertainty, part by part."""
         rows = self._rows(observations)
-        if self._model.residual is None:
-            located, correction = self._machine.locate(rows.data), np.zeros((len(observations), 3))
-        else:
-            located = self._linearise(rows)
-            correction, _ = self._learned(rows, located)
+        located, correction = self._located(rows)
         by_joint = self._rotations(rows.data) @ located.joint_jacobian
         _refuse_infinite(located.position_mm, correction)
         return Parts(rows.shifted(located.position_mm) + correction, rows.data.readings, by_joint, correction)
+
+    def base_mm(self, observations: Observations) -> Floats:
+        """(n, 3) where the prisms are in the base frame."""
+        rows = self._rows(observations)
+        located, moved_mm = self._located(rows)
+        shift_mm = self._effects.machine_shifted_mm(rows.columns)
+        if shift_mm is not None:
+            moved_mm = moved_mm + shift_mm
+        in_base = (self._rotations(rows.data).transpose(0, 2, 1) @ moved_mm[:, :, None])[:, :, 0]
+        place_mm: Floats = located.prism_mm + in_base
+        _refuse_infinite(place_mm)
+        return place_mm
 
     def predict(self, observations: Observations, executor: Executor | None = None) -> Prediction:
         """Positions and the standard deviation that a fix of them has.
@@ -217,6 +225,13 @@ class Predictor:
         if self._model.effects:
             data = ChainData(data.readings + self._effects.change(columns), data.prism, data.setup)
         return Rows(data, situation, columns, self._effects.shifted_mm(columns))
+
+    def _located(self, rows: Rows) -> tuple[Located, Floats]:
+        """Where the kinematics have the prisms; (n, 3) what the residual learner adds, in the station's frame, mm."""
+        if self._model.residual is None:
+            return self._machine.locate(rows.data), np.zeros((len(rows.data), 3))
+        located = self._linearise(rows)
+        return located, self._learned(rows, located)[0]
 
     def _linearise(self, rows: Rows) -> Located:
         return self._machine.linearise(rows.data, rows.columns.column, self._shift_in_base(rows))

@@ -245,6 +245,8 @@ class Family(ABC):
             anything else say so in `needs` and `known`.
         limit_sigma: by what share the hard limits may be off, where they are not numbers but what a load makes of them.
         goes_by_travel: whether it grows with the path that its joint travels.
+        moves_machine: whether it moves prisms in the base frame; it does not where only fixes err, or where the base
+            moves and all the machine with it.
     """
 
     name: ClassVar[str]
@@ -256,6 +258,7 @@ class Family(ABC):
     column: ClassVar[str] = ""
     limit_sigma: ClassVar[float] = 0.0
     goes_by_travel: ClassVar[bool] = False
+    moves_machine: ClassVar[bool] = True
 
     @abstractmethod
     def places(self, rig: Rig) -> tuple[str, ...]:

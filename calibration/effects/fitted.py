@@ -152,6 +152,8 @@ class AppliedEffects:
         self.joint = np.repeat(np.array(at, dtype=np.intp), np.diff(ends))
         self.goes_by_order = any(family.goes_by_order(effect.settings) for family, effect, _ in self._parts)
         self._value = coefficient_values(effects)
+        of_machine = [family.moves_machine for family, _, _ in self._parts]
+        self._of_machine = self._value * np.repeat(np.array(of_machine, dtype=bool), np.diff(ends))
         self._by_joint = np.zeros((ends[-1], len(chain.joint_index)))
         moving = np.flatnonzero(self.joint != NO_JOINT)
         self._by_joint[moving, self.joint[moving]] = self._value[moving]
@@ -182,6 +184,10 @@ class AppliedEffects:
     def shifted_mm(self, columns: Columns) -> Floats | None:
         """(n, 3) by what they move the prism beside that, in the station's frame; None where none does."""
         return None if columns.shift_mm is None else columns.shift_mm @ self._value
+
+    def machine_shifted_mm(self, columns: Columns) -> Floats | None:
+        """(n, 3) that part of it by which prisms move in the base frame; still along the station's axes."""
+        return None if columns.shift_mm is None else columns.shift_mm @ self._of_machine
 
     def unknown_variance(self, situation: Situation) -> Floats:
         """(n, joints) variance of the joints' values in rows that lack what an effect needs, deg^2 or mm^2."""

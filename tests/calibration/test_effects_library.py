@@ -49,6 +49,15 @@ REPORTED = {
     "prism_incidence": ("cos1_mm", "sin1_mm"),
     "linkage_coupling": ("coupling",),
 }
+BESIDE_THE_MACHINE = {
+    "latency",
+    "clock_drift",
+    "station_scale",
+    "prism_constant",
+    "prism_incidence",
+    "base_settlement",
+    "base_step",
+}
 FAMILIES = sorted(library().items())
 ROWS = 40
 UNKNOWN = 15  # of the rows of `lacking`, which lack all that is optional
@@ -163,6 +172,27 @@ def test_columns_are_the_derivative_of_what_a_model_predicts(
                 difference = (ends[0] - ends[1]) / (2.0 * step[i])
                 size = max(np.abs(by_column[:, :, i]).max(), 1e-6 / step[i])
                 assert np.abs(difference - by_column[:, :, i]).max() < 2e-3 * size, (where, c.name)
+
+
+@pytest.mark.parametrize(("name", "family"), FAMILIES)
+def test_in_the_base_frame_a_model_has_what_the_machine_does_and_nothing_else(
+    name: str, family: Family, situation: Situation, session: Session
+) -> None:
+    """What fixes err by and how the base moves is in the station's frame alone; all other effects are in both."""
+    observations, model = situation.observations, session.model
+    where = family.places(situation.rig)[0]
+    settings = next(settings for at, settings in forms(family, situation) if at == where)
+    sigma = np.array([c.sigma for c in family.coefficients(situation, where, settings)])
+    covariance = np.zeros((len(model.values) + len(sigma),) * 2)
+    erring = replace(
+        model, effects=(Choice(name, where, settings).fitted(situation, sigma, 0.1 * sigma),), covariance=covariance
+    )
+    base = model.chain.base(model.values, 0)
+    of_fixes = (erring.effects_mm(observations) - base.translation_mm) @ base.rotation
+    plain = (model.effects_mm(observations) - base.translation_mm) @ base.rotation
+    assert np.abs(of_fixes - plain).max() > 1e-2
+    of_machine = plain if name in BESIDE_THE_MACHINE else of_fixes
+    np.testing.assert_allclose(erring.base_mm(observations), of_machine, rtol=0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("family", library().values(), ids=list(library()))

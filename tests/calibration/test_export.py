@@ -6,9 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calibration.effects.base import Situation
+from calibration.effects.fitted import Choice
+from calibration.effects.library import library, parse_effects
 from calibration.errors import DataError
 from calibration.export import correction_grid, document
 from calibration.kinematics import Chain, Placement
+from calibration.model import CalibratedModel
 from tests.calibration.conftest import Session, rms
 
 
@@ -46,6 +50,26 @@ def test_the_grid_interpolated_linearly_is_close_to_the_model(session: Session) 
     assert grid.rms_mm < 0.7 * coarse.rms_mm, "more nodes come closer"
     at_nodes = grid.correction_mm("r", grid.readings[::977])
     np.testing.assert_allclose(at_nodes, (grid.corrected_mm["r"] - grid.nominal_mm["r"])[::977], atol=1e-9)
+
+
+def model_with(session: Session, effects: str) -> CalibratedModel:
+    """The session's model with effects of their plausible sizes."""
+    model, rows = session.model, session.held_out
+    situation = Situation(model.chain, model.values, replace(rows, extra={"time_s": np.arange(len(rows)) * 10.0}))
+    found = []
+    for name, where in parse_effects(effects, session.rig):
+        family = library()[name]
+        settings = family.variants(situation, where)[-1]
+        sigma = np.array([c.sigma for c in family.coefficients(situation, where, settings)])
+        found.append(Choice(name, where, settings).fitted(situation, sigma, 0.1 * sigma))
+    covariance = np.zeros((len(model.values) + sum(len(effect.coefficients) for effect in found),) * 2)
+    return replace(model, effects=tuple(found), covariance=covariance)
+
+
+def test_what_fixes_err_by_and_how_the_base_moved_is_not_in_the_grid(session: Session) -> None:
+    erring = model_with(session, "prism_constant@station,station_scale@station,base_settlement@base")
+    wanted, found = (correction_grid(model, ("r",), 512, np.random.default_rng(0)) for model in (session.model, erring))
+    np.testing.assert_allclose(found.corrected_mm["r"], wanted.corrected_mm["r"], rtol=0.0, atol=1e-6)
 
 
 def test_nodes_span_what_the_model_was_trained_on_and_joints_that_matter_get_more(session: Session) -> None:

@@ -35,6 +35,7 @@ class BaseSettlement(TrainedFamily):
     )
     place: ClassVar[str] = "base"
     column: ClassVar[str] = "time_s"
+    moves_machine: ClassVar[bool] = False
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
         known = self.known(situation, where)

@@ -24,6 +24,7 @@ class BaseStep(StepFamily, TrainedFamily):
     confused_with: ClassVar[tuple[str, ...]] = ("base_settlement", "payload_change", "transducer_index_jump")
     revealed_by: ClassVar[str] = "fixed control points, or one pose again and again all through the session"
     place: ClassVar[str] = "base"
+    moves_machine: ClassVar[bool] = False
 
     def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
         return self._sized(situation, where, step_grid(situation.extra("time_s")))

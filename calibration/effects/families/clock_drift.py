@@ -23,6 +23,7 @@ class ClockDrift(TrainedFamily):
     confused_with: ClassVar[tuple[str, ...]] = ("latency",)
     revealed_by: ClassVar[str] = "fixes of a moving boom at the start and at the end of a long session"
     place: ClassVar[str] = "clock"
+    moves_machine: ClassVar[bool] = False
 
     def needs(self, where: str) -> str:
         del where

@@ -22,6 +22,7 @@ class Latency(TrainedFamily):
     confused_with: ClassVar[tuple[str, ...]] = ("clock_drift", "backlash", "load_hysteresis")
     revealed_by: ClassVar[str] = "the same path driven through without a stop at two speeds, and stopped on"
     place: ClassVar[str] = "clock"
+    moves_machine: ClassVar[bool] = False
 
     def needs(self, where: str) -> str:
         del where

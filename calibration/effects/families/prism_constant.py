@@ -27,6 +27,7 @@ class PrismConstant(PrismFamily):
     source: ClassVar[str] = "additive constant of reflectors (ISO 17123-4); makers' usual ones are 0, 30 and 34.4 mm"
     confused_with: ClassVar[tuple[str, ...]] = ("prism_incidence", "station_scale")
     revealed_by: ClassVar[str] = "the same poses from a second set-up that sees the prism from another side"
+    moves_machine: ClassVar[bool] = False
 
     def places(self, rig: Rig) -> tuple[str, ...]:
         return (*rig.prism_names, _SHARED) if len(rig.prisms) > 1 else rig.prism_names

@@ -28,6 +28,7 @@ class PrismIncidence(PrismFamily):
     source: ClassVar[str] = "360 degree prisms err by several mm with the angle of incidence (Favre and Hennes 2000)"
     confused_with: ClassVar[tuple[str, ...]] = ("prism_constant", "encoder_harmonic", "angle_scale")
     revealed_by: ClassVar[str] = "poses that turn the prism all round before the station, or a second set-up"
+    moves_machine: ClassVar[bool] = False
 
     def places(self, rig: Rig) -> tuple[str, ...]:
         return rig.prism_names

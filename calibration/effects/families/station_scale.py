@@ -19,6 +19,7 @@ class StationScale(PrismFamily):
     confused_with: ClassVar[tuple[str, ...]] = ("thermal_expansion", "prism_constant", "transducer_scale")
     revealed_by: ClassVar[str] = "the same poses from a second set-up at another distance, or control points"
     place: ClassVar[str] = "station"
+    moves_machine: ClassVar[bool] = False
 
     def names(self, settings: Settings) -> tuple[str, ...]:
         refuse_settings(settings)
