@@ -29,11 +29,15 @@ class Loaded:
         id: its number in the store.
         model: to predict with.
         jumped: joints whose readings jumped since it was trained: their zeros are not those that it knows.
+        zero_ns: UTC that `time_s` of its training counts from.
+        newest_ns: UTC of the newest observation that it was trained on; now is later, or the clock is wrong.
     """
 
     id: int
     model: CalibratedModel
     jumped: tuple[str, ...]
+    zero_ns: int
+    newest_ns: int
 
 
 @dataclass(frozen=True)
@@ -117,7 +121,7 @@ class LiveModel:
             if row is None:
                 return Missing(NO_MODEL)
             jumped = tuple(name for name in self._table.jumped(row) if name in self._rig.joint_names)
-            loaded = Loaded(row.id, self.load(row), jumped)
+            loaded = Loaded(row.id, self.load(row), jumped, *self._table.training_ns(row))
         except Exception as error:
             if self._stopping:
                 return Missing(LOADING)  # store and processes are going away under it: no defect of the model

@@ -9,7 +9,7 @@ the model does not know, and poses beyond what it was trained on.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +25,7 @@ from drivers.readings import DeviceEvent, EventKind, Record
 from drivers.tip_frames import TipMessage, TipStatus
 
 if TYPE_CHECKING:
+    from calibration.model import CalibratedModel
     from calibration.observations import Observations
 
 log = logging.getLogger(__name__)
@@ -53,7 +54,8 @@ class Tip:
         sigma_mm: RMS of the 3-D error to be expected: parameters, readings, timing, what the model lacks. The base
             frame is the one that the calibration has placed before its stations.
         setup: the newest usable set-up, where the model knows it.
-        station_mm, station_sigma_mm: x, y, z in that station's frame, and their standard deviations.
+        station_mm, station_sigma_mm: x, y, z in that station's frame as it would measure them, with what its fixes err
+            by and how the base has moved, and their standard deviations.
         warnings: what the model was not trained on.
     """
 
@@ -205,12 +207,10 @@ def _predicted(live: Loaded, rig: Rig, state: MachineState, known: Tip, setup: s
     model = live.model
     is_known = setup is not None and setup in model.placements
     at = setup if setup is not None and is_known else list(model.placements)[-1]
-    row = _observation(rig, state, known, at)
+    row = _observation(live, rig, state, known, at)
     prediction = model.predict(row)
     position, sigma = prediction.position_mm[0], prediction.sigma_mm[0]
-    base = model.chain.base(model.values, model.chain.setups.index(at))
-    in_base = base.rotation.T @ (position - base.translation_mm)
-    warnings = model.doubts(row)
+    warnings = (*model.doubts(row), *_travelled(model))
     return Tip(
         TipStatus.DOUBTFUL if warnings else TipStatus.OK,
         "",
@@ -219,13 +219,25 @@ def _predicted(live: Loaded, rig: Rig, state: MachineState, known: Tip, setup: s
         known.utc_ns,
         known.age_s,
         known.joints,
-        base_mm=_place(in_base),
+        base_mm=_place(model.base_mm(row)[0]),
         sigma_mm=float(np.linalg.norm(sigma)),
         setup=at if is_known else None,
         station_mm=_place(position) if is_known else None,
         station_sigma_mm=_place(sigma) if is_known else None,
         warnings=warnings,
     )
+
+
+def _travelled(model: CalibratedModel) -> Iterator[str]:
+    """A doubt about every effect that one instant does not tell."""
+    from calibration.effects.library import library
+
+    for effect in model.effects:
+        if library()[effect.family].goes_by_travel:
+            yield (
+                f"{effect.family}@{effect.where} grows with the path that {effect.where} travels, which is not known "
+                f"since the training: calibrate again where that is much"
+            )
 
 
 def _readings(rig: Rig, state: MachineState) -> dict[str, float]:
@@ -235,7 +247,7 @@ def _readings(rig: Rig, state: MachineState) -> dict[str, float]:
     return {joint.column: float(turned[joint.name][0]) for joint in rig.joints}
 
 
-def _observation(rig: Rig, state: MachineState, known: Tip, setup: str) -> Observations:
+def _observation(live: Loaded, rig: Rig, state: MachineState, known: Tip, setup: str) -> Observations:
     """One row as training saw it: the joints, and whatever else is known of the machine."""
     from calibration.observations import Observations
 
@@ -243,6 +255,8 @@ def _observation(rig: Rig, state: MachineState, known: Tip, setup: str) -> Obser
     extra = {name: np.array([value]) for name, value in state.values.items() if name not in known.joints}
     if state.dwell_s is not None:
         extra["dwell_s"] = np.array([state.dwell_s])
+    if known.utc_ns is not None and known.utc_ns >= live.newest_ns:  # a clock that was set back tells no time
+        extra["time_s"] = np.array([(known.utc_ns - live.zero_ns) / NS_PER_S])
     return Observations(
         prism=np.array([known.prism]),
         joints=joints,

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from daemon.control import REFUSED, CommandError
+from daemon.session_data import time_zero_ns
 from daemon.store.store import Store
 from drivers.clock import Clock
 
@@ -151,6 +152,16 @@ class ModelTable:
         )
         found = self._store.rows(_JUMPED, (*next(started, (0, 0)), checked["through"]))
         return {row["device"]: row["newest"] for row in found}
+
+    def training_ns(self, model: ModelRow) -> tuple[int, int]:
+        """UTC that `time_s` of its training counts from, and of the newest observation that it was trained on."""
+        marks = ",".join("?" * len(model.sessions))
+        (newest,) = self._store.rows(
+            "SELECT coalesce(max(utc_ns), 0) AS utc_ns FROM observations "
+            f"WHERE excluded IS NULL AND session_id IN ({marks})",
+            model.sessions,
+        )
+        return time_zero_ns(self._store), newest["utc_ns"]
 
     # ---- what changes ------------------------------------------------------------------------------------------------
 

@@ -15,6 +15,7 @@ from calibration.rig import Rig
 from daemon.report.inputs import ControlPoint, SetupLine
 from daemon.steady_time import SteadyTime
 from daemon.store.reader import Reader
+from daemon.store.store import Store
 from drivers.clock import NS_PER_S, Stamp
 
 Misclosure = tuple[float, float, float]
@@ -55,7 +56,7 @@ def sessions_csv(reader: Reader, rig: Rig, session_ids: Sequence[str]) -> bytes:
     return out.getvalue().encode()
 
 
-def time_zero_ns(reader: Reader) -> int:
+def time_zero_ns(reader: Reader | Store) -> int:
     """UTC of the first observation that calibration may use: `time_s` of every session counts from it. 0 without one.
 
     It is the same whichever sessions are asked for. What a model has learned from some of them depends on time

@@ -20,6 +20,7 @@ from simulators.dataset import SimulatedObservations, simulate_observations
 from simulators.truth import RigTruth
 
 SOURCE = load_rig("swdt82")
+TRUTH = RigTruth(SOURCE.rig, 1)
 DEADLINE_S = 180.0
 START = Stamp(1_700_000_000 * NS_PER_S, 1000 * NS_PER_S, "boot-a")
 LABELS = {"prism", "setup", "session", "pose", "time_s", "dwell_s", "x_mm", "y_mm", "z_mm"}
@@ -123,14 +124,21 @@ class JobRig:
         ended = self.store.instant(self.clock.now(), "ended_")
         self.store.update("calibration_sessions", {"id": name}, {"state": "closed", **ended})
 
-    def measured(self, name: str, poses: int, kind: str = "static_poses", prisms: Sequence[str] | None = None) -> None:
+    def measured(
+        self,
+        name: str,
+        poses: int,
+        kind: str = "static_poses",
+        prisms: Sequence[str] | None = None,
+        truth: RigTruth = TRUTH,
+    ) -> None:
         """A closed session with observations of one and the same simulated machine and set-up."""
         self.session(name, kind)
         if not self.store.rows("SELECT id FROM station_setups"):
             setup = {"id": "S1", "instrument": "simulated", "serial": "", "state": "ok"}
             self.store.insert("station_setups", {**setup, **self.store.instant(self.clock.now(), "created_")})
         self.store.update("calibration_sessions", {"id": name}, {"setup_id": "S1"})
-        truth, seed = RigTruth(SOURCE.rig, 1), 20 + kind.count(CHECK)
+        seed = 20 + kind.count(CHECK)
         self.observed(name, simulate_observations(truth, poses, seed, setup="S1", prisms=prisms))
 
     def observed(self, session: str, data: SimulatedObservations) -> None:

@@ -29,10 +29,8 @@ from daemon.registry import ModelRegistry
 from drivers.clock import Stamp
 from drivers.readings import Reading, Record, Status
 from simulators.dataset import simulate_observations
-from simulators.truth import RigTruth
-from tests.daemon.job_support import SOURCE, JobRig
+from tests.daemon.job_support import SOURCE, TRUTH, JobRig
 
-TRUTH = RigTruth(SOURCE.rig, 1)
 PRISMS = ("r", "s")
 DEADLINE_S = 60.0
 
@@ -73,14 +71,14 @@ class ModelRig:
         self.live.stop()
         self.jobs.close()
 
-    def candidate(self, poses: int = 30, sessions: tuple[str, ...] = ("a",)) -> int:
-        """A candidate in the store, as a job that was trained on these sessions leaves it."""
+    def candidate(self, poses: int = 30, sessions: tuple[str, ...] = ("a",), trained: Path | None = None) -> int:
+        """A candidate in the store, as a job that was trained on these sessions leaves it; by default `written`."""
         if not self.store.rows("SELECT 1 FROM calibration_sessions WHERE id = ?", (sessions[0],)):
             self.jobs.session(sessions[0])
         with self.store.transaction():
             row = {"kind": "residual", "session_id": sessions[0], "through_session_id": sessions[0], "state": "running"}
             job = self.store.insert("jobs", row | self.store.instant(self.clock.now(), "created_"))
-        directory = Path(shutil.copytree(written(poses), self.config.models_directory / f"{job:05d}-hybrid"))
+        directory = Path(shutil.copytree(trained or written(poses), self.config.models_directory / f"{job:05d}-hybrid"))
         result = {
             "model": str(directory),
             "manifest_sha256": model_sha256(directory),
