@@ -18,6 +18,8 @@ from scipy.interpolate import RegularGridInterpolator
 from calibration.accuracy import expected_accuracy
 from calibration.design.knowledge import setup_of
 from calibration.design.visibility import Bodies, is_reachable, site
+from calibration.effects.fitted import left_out
+from calibration.effects.library import library
 from calibration.errors import DataError, UnsafeError
 from calibration.model import CalibratedModel
 from calibration.observations import Floats, Observations
@@ -31,6 +33,7 @@ _CURVATURE_STEP = 0.05  # of a joint's range
 _PROOF_POSES = 500
 _LEAST_RANGE = 1.0  # deg or mm, of a joint that stood still in training
 _CHUNK = 10_000
+_LATER_S = 1e12  # `time_s` of the grid, after any training: what has jumped then has jumped
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,7 @@ class CorrectionGrid:
         readings: (g, joints) all combinations, the last joint changing fastest.
         nominal_mm, corrected_mm: prism -> (g, 3) by the drawings, and by the model.
         reachable: (g,) whether the rig touches neither itself nor the floor.
+        left_out: a sentence for every effect of the machine that needs more than joint values.
         rms_mm, p95_mm, max_mm: how far the interpolated corrections are from the model's own, in random poses on the
             grid, all prisms taken together.
         correction_rms_mm: how large the model's own corrections are there.
@@ -52,6 +56,7 @@ class CorrectionGrid:
     nominal_mm: Mapping[str, Floats]
     corrected_mm: Mapping[str, Floats]
     reachable: NDArray[np.bool_]
+    left_out: tuple[str, ...]
     rms_mm: float
     p95_mm: float
     max_mm: float
@@ -125,7 +130,8 @@ def correction_grid(
     Elsewhere a model says what its kinematics say, and a grid that reached there would be coarser everywhere.
 
     Args:
-        model: the model. Effects and residual are taken as for data that have joint values and nothing else.
+        model: the model. Effects and residual are taken as for data that have joint values and nothing else, measured
+            after the training.
         prisms: of its rig, at least one.
         most_poses: the grid has no more nodes.
         rng: draws the poses by which nodes are placed and the interpolation is judged.
@@ -159,6 +165,7 @@ def correction_grid(
                 for start in range(0, len(readings), _CHUNK)
             ]
         ),
+        places.left_out(prisms[0], readings[:1]),
         *(math.nan,) * 4,  # told below, once it can be interpolated
     )
     poses = rng.uniform(low, high, (_PROOF_POSES, len(joints)))
@@ -210,6 +217,11 @@ class _Places:
             ]
         )
 
+    def left_out(self, prism: str, readings: Floats) -> tuple[str, ...]:
+        model = self.model
+        of_machine = [effect for effect in model.effects if library()[effect.family].moves_machine]
+        return left_out(of_machine, model.predictor.situation(self._rows(prism, readings)))
+
     def difference_mm(self, prism: str, readings: Floats) -> Floats:
         difference: Floats = self.corrected_mm(prism, readings) - self.nominal_mm(prism, readings)
         return difference
@@ -224,6 +236,7 @@ class _Places:
             setup=np.full(n, self.model.chain.setups[self.setup]),
             session=np.full(n, ""),
             pose=np.full(n, ""),
+            extra={"time_s": np.full(n, _LATER_S)},
         )
 
 

@@ -54,6 +54,7 @@ def exported(directory: Path, prisms: Sequence[str], most_poses: int) -> tuple[d
 
 
 def _warnings(grid: CorrectionGrid) -> Iterator[str]:
+    yield from (f"{GRID}: {sentence}; `rigcal predict` has it where the data do" for sentence in grid.left_out)
     if grid.is_coarse:
         yield (
             f"between the nodes of {GRID}, interpolated corrections are wrong by {grid.rms_mm:.2g} mm RMS, more than "

@@ -13,6 +13,7 @@ from calibration.errors import DataError
 from calibration.export import correction_grid, document
 from calibration.kinematics import Chain, Placement
 from calibration.model import CalibratedModel
+from calibration.observations import Observations
 from tests.calibration.conftest import Session, rms
 
 
@@ -70,6 +71,21 @@ def test_what_fixes_err_by_and_how_the_base_moved_is_not_in_the_grid(session: Se
     erring = model_with(session, "prism_constant@station,station_scale@station,base_settlement@base")
     wanted, found = (correction_grid(model, ("r",), 512, np.random.default_rng(0)) for model in (session.model, erring))
     np.testing.assert_allclose(found.corrected_mm["r"], wanted.corrected_mm["r"], rtol=0.0, atol=1e-6)
+
+
+def test_the_grid_is_of_the_machine_after_all_that_jumped_and_says_what_it_lacks(session: Session) -> None:
+    jumped = model_with(session, "transducer_index_jump@L2")
+    grid = correction_grid(jumped, ("r",), 512, np.random.default_rng(0))
+    jump_mm = jumped.effects[0].coefficients[0].value
+    n = len(grid.readings)
+    joints = dict(zip(session.rig.joint_names, grid.readings.T, strict=True))
+    joints["L2"] = joints["L2"] + jump_mm
+    empty, nothing = np.full(n, ""), np.full((n, 3), np.nan)
+    true = session.model.base_mm(Observations(np.full(n, "r"), joints, nothing, nothing, empty, empty, empty))
+    np.testing.assert_allclose(grid.corrected_mm["r"], true, rtol=0.0, atol=1e-6)
+    assert grid.left_out == ()
+    lacking = correction_grid(model_with(session, "backlash@theta4"), ("r",), 512, np.random.default_rng(0))
+    assert lacking.left_out == ("backlash@theta4 is left out: this data lacks the column theta4_dir",)
 
 
 def test_nodes_span_what_the_model_was_trained_on_and_joints_that_matter_get_more(session: Session) -> None:
