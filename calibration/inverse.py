@@ -73,6 +73,7 @@ def inverse(model: CalibratedModel, targets: Observations) -> Inverse:
         model: the whole model counts: effects and residual too. Columns that they need are taken from the rows.
         targets: n rows whose positions are where the prisms should be, in the frame of their set-up's station, and
             whose joints are the nominal command: where the search begins and what the result stays nearest to.
+            Positions are those that the station would measure, as `predict` gives them, with what its fixes err by.
 
     Raises:
         DataError: a row without a position, a joint value that is no number, rows of one pose with different commands.

@@ -24,6 +24,9 @@ CLOSURE_COLUMN = "closure_mm"
 def inverse(directory: Path, data: Path, out: Path | None, *, as_json: bool) -> dict[str, object] | Delivered:
     """Joint values to command, so that the true prisms are where x_mm, y_mm, z_mm of the data say.
 
+    These are places in the frame of the set-up's station as it would measure them, the inverse of `rigcal predict`:
+    where the model knows that the station's scale or a prism's constant is wrong, a fix there reads the target.
+
     The joints in the data are the nominal command: of all joint values that reach the targets, those nearest to it are
     found, inside the limits of the joints. Rows of one pose are solved together: two prisms of a feed give its
     attitude. The whole model counts, effects and learned residual too; columns that these need (direction of approach,

@@ -24,8 +24,9 @@ FOLLOW_S = 0.2
 def tip(prism: str | None, *, follow: bool, **where: Any) -> Any:
     """Where a prism is now: the joints' latest readings through the live model.
 
-    In the base frame, and in the station's where its set-up is known to the model. Where the place is not known, the
-    status says why. With --follow and --json, standard output holds one object a line.
+    In the base frame, and in the station's, as it would measure the prism, where its set-up is known to the model.
+    Where the place is not known, the status says why. With --follow and --json, standard output holds one object a
+    line.
     """
     arguments = {} if prism is None else {"prism": prism}
     socket = socket_of(where["socket"], where["config"])
