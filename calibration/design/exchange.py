@@ -121,13 +121,14 @@ class Discrimination:
             j: _times(projected[j], _block(self.before, self.models[j].free)) @ projected[j].transpose(0, 2, 1)
             for j in {j for _, j in self.pairs}
         }
-        grown = np.repeat(self.log_odds(information)[:, None], len(blocks), axis=1)
+        now = self.log_odds(information)
+        grown = np.repeat(now[:, None], len(blocks), axis=1)
         for number, (i, j) in enumerate(self.pairs):
             moved = _times(blocks, self._left(self.models[i], self.models[j], information))
             squares = moved @ moved.transpose(0, 2, 1) - known[j]
             off = np.trace(np.linalg.solve(scatter[j], squares), axis1=1, axis2=2)
             grown[number] += 0.5 * (off + freedom[j] - freedom[i])
-        values: Floats = -logsumexp(-grown, axis=0) - self.value(information)
+        values: Floats = logsumexp(-now) - logsumexp(-grown, axis=0)
         return values
 
     def log_odds(self, information: Floats) -> Floats:
@@ -137,13 +138,13 @@ class Discrimination:
             float(np.linalg.slogdet(_block(information, m.free))[1] - np.linalg.slogdet(_block(self.before, m.free))[1])
             for m in self.models
         ]
+        noise = [float((_inverse(_block(information, m.free)) * _block(added, m.free)).sum()) for m in self.models]
         found = np.zeros(len(self.pairs))
         for number, (i, j) in enumerate(self.pairs):
             true, other = self.models[i], self.models[j]
-            noise = float((_inverse(_block(information, other.free)) * _block(added, other.free)).sum())
             difference, left = self._difference(true, other), self._left(true, other, information)
             off = float((difference * (added @ left)).sum())
-            found[number] = 0.5 * (off - noise + freedom[j] - freedom[i])
+            found[number] = 0.5 * (off - noise[j] + freedom[j] - freedom[i])
         return found
 
     def _difference(self, true: Hypothesis, other: Hypothesis) -> Floats:

@@ -266,9 +266,12 @@ def plan(
         if isinstance(criterion, Discrimination):
             # Once more in their order: some effects depend on what was before.
             log_odds = criterion.log_odds(information_of(whitened(before, poses, rivals), told))
-            for true in {true: None for true, _ in pairs if true < len(rivals)}:
-                least = min(odds for odds, (one, _) in zip(log_odds.tolist(), pairs, strict=True) if one == true)
-                stands_out[rivals[true].name] = math.sqrt(2.0 * max(0.0, least))
+            least: dict[int, float] = {}
+            for odds, (true, _) in zip(log_odds.tolist(), pairs, strict=True):
+                least[true] = min(odds, least.get(true, math.inf))
+            for true, odds in least.items():
+                if true < len(rivals):  # nothing at all is told apart, too, and has no name
+                    stands_out[rivals[true].name] = math.sqrt(2.0 * max(0.0, odds))
         after = covariance_of(whitened(knowledge, poses))
         alone = _alone(knowledge, poses)
     seen = alone[alone > _SEEN]
