@@ -38,7 +38,7 @@ def test_a_killed_daemons_job_ends_with_it_and_runs_again_in_the_next(tmp_path: 
     finally:
         daemon.kill()
     orphan = first_job(tmp_path)["pid"]
-    deadline = time.monotonic() + 4.0
+    deadline = time.monotonic() + 30.0
     while not is_gone(orphan):
         assert time.monotonic() < deadline, "the orphan lives on"
         time.sleep(0.02)

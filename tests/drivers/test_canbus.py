@@ -549,6 +549,6 @@ def test_a_link_stops_soon_and_its_last_words_are_kept() -> None:
     with running(link) as heard:
         heard.wait_for(EventKind.LINK_UP)
         start = time.monotonic()
-    assert time.monotonic() - start < 1.0
+    assert time.monotonic() - start < DEADLINE_S
     assert all(isinstance(item, CanCapture | DeviceEvent | Gap) for item in (*heard.captures, *heard.events()))
     assert isinstance(heard.events()[0].stamp, Stamp)
