@@ -378,4 +378,4 @@ def test_a_thousand_samples_a_second_are_no_burden() -> None:
         assert sum(not j.refused for j in joined) >= fixes - 15
         return worked
 
-    assert worked_s(20.0) < 8 * worked_s(5.0), "four times the samples: four times the work, not sixteen"
+    assert worked_s(40.0) < 10 * worked_s(10.0), "four times the samples: four times the work, not sixteen"
