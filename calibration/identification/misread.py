@@ -11,10 +11,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
-from concurrent.futures import Executor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -24,7 +22,7 @@ from calibration.identification.samples import Integers, Samples
 from calibration.identification.start import rough_start
 from calibration.identification.subset import drawn
 from calibration.identification.suppositions import Supposition, conceivable_mistakes
-from calibration.kinematics import Chain, Placement
+from calibration.kinematics import Chain, ChainData, Placement
 from calibration.limits import beyond_limits, on_one_turn
 from calibration.observations import Floats
 from calibration.rig import Rig
@@ -34,6 +32,7 @@ _TRIMMED = 0.75
 _APPROACHING = 40  # rounds
 _PLACING = 20  # rounds; a rough place tells suppositions apart
 _CARRIED = 6
+_TOGETHER = 32  # suppositions whose positions are computed at once
 _APPROACHED = 10  # of the best roughly placed suppositions of a round
 _MUCH = 0.5  # of the misfit before; a further supposition that gains less says nothing
 _EXPLAINS = 0.25  # of the misfit as given, or less: an explanation
@@ -58,8 +57,13 @@ class Quality:
     @classmethod
     def of(cls, chain: Chain, samples: Samples, x: Floats) -> Quality:
         """Of a chain with parameters `x` (p,)."""
-        length = np.linalg.norm(samples.position_mm - chain.positions_mm(x, samples.data), axis=1)
-        of_prisms = (np.sort(length[samples.data.prism == prism]) for prism in np.unique(samples.data.prism))
+        misfit_mm = np.linalg.norm(samples.position_mm - chain.positions_mm(x, samples.data), axis=1)
+        return cls.at(chain, samples, x, misfit_mm)
+
+    @classmethod
+    def at(cls, chain: Chain, samples: Samples, x: Floats, misfit_mm: Floats) -> Quality:
+        """Likewise, where the 3-D misfits (m,) are known."""
+        of_prisms = (np.sort(misfit_mm[samples.data.prism == prism]) for prism in np.unique(samples.data.prism))
         used = np.concatenate([own[: math.ceil(_TRIMMED * len(own))] for own in of_prisms])
         tolerated = np.isfinite(chain.prior_sigma)
         pull = x[tolerated] / chain.prior_sigma[tolerated]
@@ -110,7 +114,7 @@ class Explanation:
 @dataclass(frozen=True)
 class _Trial:
     suppositions: tuple[Supposition, ...]
-    chain: Chain
+    placements: Mapping[str, Placement]
     x: Floats
     quality: Quality
 
@@ -123,7 +127,6 @@ def explain(
     before: Quality,
     tolerated_mm: float,
     at_once: int,
-    executor: Executor,
 ) -> Explanation | None:
     """Look for mistakes that explain why data do not fit, or fit with a model far from the rig file only.
 
@@ -134,7 +137,6 @@ def explain(
         before: the best fit to them as they are given.
         tolerated_mm: misfit that needs no explanation.
         at_once: how many mistakes to suppose together at most.
-        executor: runs the trials; the answer does not depend on it.
     """
     blank = Chain(chain.rig, {setup: Placement.identity() for setup in chain.setups})
     # A part of the samples is enough to tell suppositions apart.
@@ -147,9 +149,10 @@ def explain(
         sets = _extended(carried, conceivable)
         if number == 0 and at_once > 1:
             sets += _reversed_pairs(conceivable)
-        rough = [t for t in executor.map(partial(_placed, blank, samples, part), sets) if t is not None]
+        together = [sets[begin : begin + _TOGETHER] for begin in range(0, len(sets), _TOGETHER)]
+        rough = [trial for some in together for trial in _placed(blank, samples, part, some)]
         rough.sort(key=lambda t: t.quality.misfit_mm)
-        near = list(executor.map(partial(_approached, samples, part, precision), rough[:_APPROACHED]))
+        near = [_approached(chain.rig, samples, part, precision, trial) for trial in rough[:_APPROACHED]]
         near.sort(key=lambda t: t.quality.misfit_mm)
         as_good = [t for t in near if t.quality.misfit_mm < _ALIKE * near[0].quality.misfit_mm]
         as_good.sort(key=lambda t: t.quality.pull)
@@ -167,7 +170,8 @@ def explain(
     best.sort(key=lambda trial: _beyond_limits(chain.rig, samples, trial.suppositions))
     first = best[0]
     others = tuple(t.suppositions for t in best[1:])
-    return Explanation(first.suppositions, others, first.chain, _for_raw_data(first), before, least)
+    chain = Chain(chain.rig, first.placements)
+    return Explanation(first.suppositions, others, chain, _for_raw_data(chain, first), before, least)
 
 
 def _beyond_limits(rig: Rig, samples: Samples, suppositions: tuple[Supposition, ...]) -> int:
@@ -217,29 +221,40 @@ def _applied(samples: Samples, suppositions: Sequence[Supposition]) -> Samples:
     return samples
 
 
-def _placed(blank: Chain, samples: Samples, part: Integers, suppositions: tuple[Supposition, ...]) -> _Trial | None:
-    """The nominal rig placed on a part of the data so changed; None where it cannot be."""
-    samples = _applied(samples, suppositions).select(part)
-    try:
-        start = rough_start(blank, samples, np.zeros(len(blank)), mirrored="let pass", rounds=_PLACING)
-    except UnsafeError:  # positions that so changed lie on a line
-        return None
-    chain = Chain(blank.rig, start.placements)
-    return _Trial(suppositions, chain, start.x, Quality.of(chain, samples, start.x))
+def _placed(blank: Chain, samples: Samples, part: Integers, sets: Sequence[tuple[Supposition, ...]]) -> list[_Trial]:
+    """The nominal rig placed on a part of the data, changed as each set supposes; without those where it cannot be."""
+    changed = [_applied(samples, suppositions).select(part) for suppositions in sets]
+    at_once = ChainData(
+        np.concatenate([own.data.readings for own in changed]),
+        np.concatenate([own.data.prism for own in changed]),
+        np.concatenate([own.data.setup for own in changed]),
+    )
+    nominal = np.zeros(len(blank))
+    in_base_mm = np.split(blank.positions_mm(nominal, at_once), len(sets))
+    out = []
+    for suppositions, own, own_mm in zip(sets, changed, in_base_mm, strict=True):
+        try:
+            start = rough_start(blank, own, nominal, mirrored="let pass", rounds=_PLACING, in_base_mm=own_mm)
+        except UnsafeError:  # positions that so changed lie on a line
+            continue
+        quality = Quality.at(blank, own, start.x, start.misfit_mm)
+        out.append(_Trial(suppositions, start.placements, start.x, quality))
+    return out
 
 
-def _approached(samples: Samples, part: Integers, precision: Floats, trial: _Trial) -> _Trial:
+def _approached(rig: Rig, samples: Samples, part: Integers, precision: Floats, trial: _Trial) -> _Trial:
+    chain = Chain(rig, trial.placements)
     samples = _applied(samples, trial.suppositions).select(part)
-    x = approach(trial.chain, samples, trial.x, precision=precision, rounds=_APPROACHING)
-    return replace(trial, x=x, quality=Quality.of(trial.chain, samples, x))
+    x = approach(chain, samples, trial.x, precision=precision, rounds=_APPROACHING)
+    return replace(trial, x=x, quality=Quality.of(chain, samples, x))
 
 
-def _for_raw_data(trial: _Trial) -> Floats | None:
+def _for_raw_data(chain: Chain, trial: _Trial) -> Floats | None:
     """Turned joints as offsets of the rows that they drive; None for what offsets cannot stand for."""
     x = trial.x.copy()
     for supposition in trial.suppositions:
         for joint, turn_deg in enumerate(supposition.turn_deg):
-            for op in itertools.chain.from_iterable(trial.chain.row_ops):
+            for op in itertools.chain.from_iterable(chain.row_ops):
                 for driven, coefficient in op.drive:
                     if driven == joint and turn_deg:
                         if op.parameter < 0:

@@ -143,7 +143,6 @@ def solve(
             before=Quality.of(chain, samples, fit.x),
             tolerated_mm=_SUSPICIOUS * tolerated_mm,
             at_once=_MISTAKES if misfits else 1,
-            executor=executor,
         )
         if found is not None and (prior != "as-built" or found.x is None):
             raise UnsafeError(f"data and rig file do not fit each other: {found}")

@@ -29,11 +29,13 @@ class Start:
         placements: set-up -> where the base stands.
         x: (p,) parameters, with the offsets of unknown prisms.
         scale_mm: robust size of the 3-D misfit there.
+        misfit_mm: (m,) 3-D misfit of each sample there.
     """
 
     placements: dict[str, Placement]
     x: Floats
     scale_mm: float
+    misfit_mm: Floats
 
 
 def rigid_fit(base_mm: Floats, station_mm: Floats, weight: Floats, *, mirrored: bool = False) -> Placement:
@@ -58,6 +60,7 @@ def rough_start(
     offsets: bool = True,
     mirrored: Literal["refuse", "let pass"] = "refuse",
     rounds: int = _ROUNDS,
+    in_base_mm: Floats | None = None,
 ) -> Start:
     """Place every base, alternating with the offsets of prisms whose mounting is unknown.
 
@@ -68,14 +71,15 @@ def rough_start(
         offsets: False to leave the offsets of prisms as `x` has them.
         mirrored: what to do about coordinates that fit much better as their mirror image.
         rounds: of reweighting at most.
+        in_base_mm: (m, 3) positions in the frames of the bases at `x`, where they are known already.
 
     Raises:
         UnsafeError: a set-up with fewer than three fixes, with all fixes on a line, or mirrored.
     """
     data = samples.data
-    arm, offset_jacobian, _ = chain.linearise(x, data)
     unknown = np.array([offsets and p.kind == "prism" and p.is_flat for p in chain.parameters])
-    offset_jacobian = offset_jacobian[:, :, unknown]
+    arm = chain.positions_mm(x, data) if in_base_mm is None else in_base_mm
+    offset_jacobian = chain.jacobian(x, data)[:, :, unknown] if unknown.any() else np.zeros((len(data), 3, 0))
     offset = np.zeros(int(unknown.sum()))
     weight = np.ones(len(samples))
     rows_of = [np.flatnonzero(data.setup == s) for s in range(len(chain.setups))]
@@ -107,7 +111,8 @@ def rough_start(
         _check_handedness(setup, point[rows], samples.position_mm[rows], weight[rows], placement)
     x = x.copy()
     x[unknown] += offset
-    return Start(dict(zip(chain.setups, placements, strict=True)), x, scale)
+    left = base - arm - offset_jacobian @ offset
+    return Start(dict(zip(chain.setups, placements, strict=True)), x, scale, np.linalg.norm(left, axis=1))
 
 
 def on_a_line(position_mm: Floats) -> bool:

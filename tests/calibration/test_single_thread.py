@@ -5,15 +5,11 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from calibration.identification.misread import Quality, explain
-from calibration.identification.refinement import prior_precision
-from calibration.identification.solve import place
 from calibration.pipeline import calibrate
 from calibration.single_thread import SingleThreaded, one_blas_thread
 from tests.calibration.conftest import Session, rig_text
@@ -54,26 +50,3 @@ def test_threads_and_spawned_processes_calibrate_the_same_model(session: Session
 
     with ThreadPoolExecutor(2) as threads:
         assert model(processes) == model(threads)
-
-
-def test_threads_and_spawned_processes_explain_a_turned_joint_alike(session: Session, processes: Executor) -> None:
-    joints = session.training.joints
-    turned = replace(session.training, joints={**joints, "theta5": joints["theta5"] + 180.0})
-    chain, samples, start = place(session.rig, turned)
-
-    def found(executor: Executor) -> tuple[str, bytes]:
-        explanation = explain(
-            chain,
-            samples,
-            precision=prior_precision(chain, 30.0),
-            before=Quality.of(chain, samples, start.x),
-            tolerated_mm=10.0,
-            at_once=1,
-            executor=SingleThreaded(executor),
-        )
-        assert explanation is not None
-        assert explanation.x is not None
-        return explanation.what, explanation.x.tobytes()
-
-    with ThreadPoolExecutor(2) as threads:
-        assert found(processes) == found(threads)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -47,15 +46,13 @@ def test_a_reversed_joint_is_named_beside_a_small_set_up(session: Session) -> No
     joined = joined_observations([session.training, session.held_out, simulated(session.truth, 8, 9, setup="small")])
     reversed_ = replace(joined, joints={**joined.joints, "theta5": -joined.joints["theta5"]})
     chain, samples, start = place(session.rig, reversed_)
-    with ThreadPoolExecutor(2) as pool:
-        found = explain(
-            chain,
-            samples,
-            precision=prior_precision(chain, 1.0),
-            before=Quality.of(chain, samples, start.x),
-            tolerated_mm=10.0,
-            at_once=1,
-            executor=pool,
-        )
+    found = explain(
+        chain,
+        samples,
+        precision=prior_precision(chain, 1.0),
+        before=Quality.of(chain, samples, start.x),
+        tolerated_mm=10.0,
+        at_once=1,
+    )
     assert found is not None
     assert found.what == "theta5 runs the other way"
