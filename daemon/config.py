@@ -84,7 +84,7 @@ class JobsSection(_Section):
     Attributes:
         enabled: closed sessions trigger jobs.
         time_limit_s: a job that runs longer is stopped.
-        max_attempts: how often an interrupted job is offered again.
+        max_attempts: how often a job is started that something interrupts; stops of the daemon do not count.
         seed: of every random choice in identification and residual training.
     """
 

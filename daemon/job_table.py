@@ -20,6 +20,7 @@ from daemon.store.store import Store
 from drivers.clock import Clock
 
 CANCELLED = Outcome("cancelled", "cancelled by the operator")
+STOPPED = Outcome("interrupted", "the daemon was stopped")
 CANCELLABLE = ("queued", "running", "interrupted")
 RETRIABLE = ("failed", "cancelled", "interrupted")
 SHOWN = "id, kind, session_id, state, progress, message, attempts, error"
@@ -253,6 +254,8 @@ class JobTable:
     def end(self, job_id: int, outcome: Outcome) -> Outcome:
         """A job has ended; with one that failed or was cancelled end those that wait for it.
 
+        An orderly stop of the daemon is no fault of the job's and no attempt.
+
         Returns:
             how it ended in the end: what the operator said goes before what the process said.
         """
@@ -262,10 +265,12 @@ class JobTable:
                 outcome = CANCELLED
             ended = self._store.instant(self._clock.now(), "ended_")
             is_done = outcome.state == "done"
+            attempts = self._job(job_id)["attempts"]
             self._set(
                 job_id,
                 state=outcome.state,
                 error=outcome.error,
+                attempts=attempts - 1 if outcome == STOPPED else attempts,
                 result_json=outcome.result,
                 progress=1.0 if is_done else 0.0,
                 message="",  # what it was doing is no news any more
@@ -382,7 +387,7 @@ class JobTable:
 
     def _job(self, job_id: object) -> dict[str, Any]:
         found = isinstance(job_id, int) and self._store.rows(
-            "SELECT id, kind, state, depends_on FROM jobs WHERE id = ?", (job_id,)
+            "SELECT id, kind, state, attempts, depends_on FROM jobs WHERE id = ?", (job_id,)
         )
         if not found:
             raise CommandError(f"there is no job {job_id!r}; `rigcal jobs list` shows them")

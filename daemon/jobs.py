@@ -14,7 +14,7 @@ from typing import Any
 from daemon.config import Config
 from daemon.control import REFUSED, CommandError
 from daemon.job_child import JOB_COMMAND, JobChild
-from daemon.job_table import CANCELLED, JobTable
+from daemon.job_table import CANCELLED, STOPPED, JobTable
 from daemon.model_table import ModelRow
 from daemon.order import Outcome
 from daemon.scheduler import DueChain, JobFacts, due_jobs, next_job, spent_jobs
@@ -152,7 +152,7 @@ class JobRunner:
         deadline_ns = self._work_clock.monotonic_ns() + int(limit_s * NS_PER_S)
         while True:
             if self._stopping.is_set():
-                return Outcome("interrupted", "the daemon was stopped")
+                return STOPPED
             if self._table.is_cancelled(job_id):
                 return CANCELLED
             if self._work_clock.monotonic_ns() > deadline_ns:

@@ -55,7 +55,7 @@ def test_a_killed_daemons_job_ends_with_it_and_runs_again_in_the_next(tmp_path: 
     assert first_job(tmp_path) == {
         "state": "interrupted",
         "pid": None,
-        "attempts": 2,
+        "attempts": 1,  # the kill; an orderly stop is none
         "error": "the daemon was stopped",
     }
     assert is_gone(pid)
