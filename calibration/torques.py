@@ -13,23 +13,26 @@ from collections.abc import Mapping
 import numpy as np
 
 from calibration.kernels.machine import Carrier
-from calibration.kinematics import Chain
+from calibration.kinematics import Chain, Placement
 from calibration.observations import Floats, Observations
 from calibration.rig import Rig
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
 MASS_SIGMA = 0.15 / math.sqrt(3.0)  # a rig file's masses and centres of gravity are within +-15 % of the machine's
 _LEAST_LOAD = 1e-6  # of the largest load; a joint with less than this in every pose carries nothing
+_LEVEL = math.cos(math.radians(10.0))  # a station's frame that is further off the rig file's vertical is not levelled
 
 
 class GravityLoads:
     """Gravity's load on the joints of a machine whose parameters stay; build it once and ask for any rows.
 
     Args:
-        chain: kinematics; where its bases stand plays no part.
+        chain: kinematics; where its bases stand counts in `down` alone.
         x: (p,) its parameters.
 
     Attributes:
+        direction: (1, 3) unit vector of gravity in the base frame, as the rig file has it.
+        down: (setups, 3) the same at each set-up, by a levelled station.
         point_frame, point_mass: (points,) of every point at which weight hangs its frame and the index of its mass.
     """
 
@@ -38,6 +41,8 @@ class GravityLoads:
         frames, offsets_mm, share = _points(rig)
         self.point_frame = np.array(frames, dtype=np.intp)
         self.point_mass = share.argmax(axis=0) if rig.masses else np.empty(0, dtype=np.intp)
+        self.direction = np.array([rig.gravity]) / np.linalg.norm(rig.gravity)
+        self.down = np.array([self._down(chain.base(x, setup)) for setup in range(len(chain.setups))]).reshape(-1, 3)
         self._measured = [(i, f"{j.name}_Nm") for i, j in enumerate(rig.joints) if j.kind == "revolute"]
         self._carrier: Carrier | None = None
         self._origins: Carrier | None = None
@@ -47,9 +52,8 @@ class GravityLoads:
         self._origins = Carrier(chain, x, frames, np.zeros_like(offsets_mm))
         self._has_centre = [mass.centre_mm is not None and any(mass.centre_mm) for mass in rig.masses]
         self._share_newton = STANDARD_GRAVITY * share
-        self._kilograms = np.array([mass.kg for mass in rig.masses])
+        self._kilograms = np.array([[mass.kg for mass in rig.masses]])
         self._payload = np.array([mass.payload for mass in rig.masses])
-        self._direction = np.array(rig.gravity) / np.linalg.norm(rig.gravity)
         # N mm per deg of a reading are 180 / pi N mm per rad; N mm per mm are N.
         self._unit = np.array([math.degrees(1.0) / 1e3 if j.kind == "revolute" else 1.0 for j in rig.joints])
 
@@ -63,7 +67,8 @@ class GravityLoads:
         """
         if self._carrier is None:
             return np.empty((len(readings), 0, 3)), np.empty((len(readings), 0))
-        return self._carrier.places_mm(readings), self._kilograms_of(extra, len(readings)) @ self._share_newton
+        force = self._kilograms_of(extra) @ self._share_newton
+        return self._carrier.places_mm(readings), np.broadcast_to(force, (len(readings), force.shape[1]))
 
     def parts(self, readings: Floats, extra: Mapping[str, Floats], down: Floats | None = None) -> Floats:
         """(n, joints, parts) change of the loads when one mass, or one centre's distance, is `MASS_SIGMA` larger.
@@ -75,8 +80,8 @@ class GravityLoads:
         """
         if self._carrier is None or self._origins is None:
             return np.empty((*readings.shape, 0))
-        along = self._direction if down is None else down
-        newton = STANDARD_GRAVITY * self._kilograms_of(extra, len(readings))
+        along = self.direction if down is None else down
+        newton = STANDARD_GRAVITY * self._kilograms_of(extra)
         out = []
         for mass, share in enumerate(self._share_newton / STANDARD_GRAVITY):
             force = newton[:, [mass]] * share
@@ -91,14 +96,22 @@ class GravityLoads:
                 parts[np.isfinite(measured), index] = 0.0
         return parts
 
-    def _kilograms_of(self, extra: Mapping[str, Floats], rows: int) -> Floats:
-        """(n, masses) with the payload of each row."""
-        kilograms = np.empty((rows, len(self._kilograms)))
-        kilograms[:] = self._kilograms
+    def _down(self, base: Placement) -> Floats:
+        """(3,) gravity in the base frame.
+
+        The station is levelled, so that the base as found tells how the machine leans; loads that are about to change
+        their sign depend on tenths of a degree. The rig file says where gravity points in a frame that is not level.
+        """
+        plumb, by_file = -base.rotation[2], self.direction[0]
+        down: Floats = plumb if plumb @ by_file >= _LEVEL else by_file
+        return down
+
+    def _kilograms_of(self, extra: Mapping[str, Floats]) -> Floats:
+        """(n, masses) with the payload of each row; (1, masses) where none is known."""
         payload = extra.get("payload_kg")
-        if payload is not None:
-            kilograms = np.where(self._payload & np.isfinite(payload)[:, None], payload[:, None], kilograms)
-        return kilograms
+        if payload is None:
+            return self._kilograms
+        return np.where(self._payload & np.isfinite(payload)[:, None], payload[:, None], self._kilograms)
 
     def __call__(self, readings: Floats, extra: Mapping[str, Floats], down: Floats | None = None) -> Floats:
         """(n, joints) loads, as `gravity_torques` describes them.
@@ -111,9 +124,8 @@ class GravityLoads:
         if self._carrier is None:
             load = np.full(readings.shape, np.nan)
         else:
-            kilograms = self._kilograms_of(extra, len(readings))
-            along = self._direction if down is None else down
-            load = self._carrier.work(readings, kilograms @ self._share_newton, along) * self._unit
+            along = self.direction if down is None else down
+            load = self._carrier.work(readings, self._kilograms_of(extra) @ self._share_newton, along) * self._unit
         for index, column in self._measured:
             measured = extra.get(column)
             if measured is not None:

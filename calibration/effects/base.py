@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +21,6 @@ from calibration.torques import GravityLoads
 _VOLUME_POSES = 256
 _LEAST_LOAD = 1e-6  # of the largest on any revolute joint; less is rounding
 _LEAST_NM = 1e-6  # a milligram on a lever of 100 mm: less is no load
-_LEVEL = math.cos(math.radians(10.0))  # a station's frame that is further off the rig file's vertical is not levelled
 
 Settings = Mapping[str, float]
 
@@ -144,15 +142,9 @@ class Situation:
 
     @cached_property
     def down(self) -> Floats:
-        """(n, 3) unit vectors of gravity in the base frame.
-
-        The station is levelled, so that the base as found tells how the machine leans; loads that are about to change
-        their sign depend on tenths of a degree. The rig file says where gravity points in a frame that is not level.
-        """
-        by_file = np.array(self.rig.gravity) / np.linalg.norm(self.rig.gravity)
-        plumb = -self.rotation[:, 2, :] if self.levelled else np.tile(by_file, (len(self), 1))
-        down: Floats = np.where((plumb @ by_file >= _LEVEL)[:, None], plumb, by_file)
-        return down
+        """(n, 3) unit vectors of gravity in the base frame."""
+        loads = self.loads
+        return loads.down[self.data.setup] if self.levelled else np.repeat(loads.direction, len(self), axis=0)
 
     @cached_property
     def loads(self) -> GravityLoads:
@@ -170,16 +162,12 @@ class Situation:
         return self.chain.bind(self.observations)
 
     @cached_property
-    def _readings(self) -> Floats:
-        return np.array([self.observations.joints[name] for name in self.chain.joint_index]).T
-
-    @cached_property
     def _torques(self) -> Floats:
-        return self.loads(self._readings, self.observations.extra, self.down)
+        return self.loads(self.data.readings, self.observations.extra, self.down)
 
     @cached_property
     def _parts(self) -> Floats:
-        return self.loads.parts(self._readings, self.observations.extra, self.down)
+        return self.loads.parts(self.data.readings, self.observations.extra, self.down)
 
     @cached_property
     def _payloads(self) -> tuple[dict[str, Floats], dict[str, Floats]]:
@@ -188,12 +176,12 @@ class Situation:
 
     @cached_property
     def _payload_torques(self) -> Floats:
-        with_payload, without = (self.loads(self._readings, extra, self.down) for extra in self._payloads)
+        with_payload, without = (self.loads(self.data.readings, extra, self.down) for extra in self._payloads)
         return np.nan_to_num(with_payload - without)  # not a number where there are no masses
 
     @cached_property
     def _payload_parts(self) -> Floats:
-        with_payload, without = (self.loads.parts(self._readings, extra, self.down) for extra in self._payloads)
+        with_payload, without = (self.loads.parts(self.data.readings, extra, self.down) for extra in self._payloads)
         return with_payload - without
 
     @cached_property

@@ -219,10 +219,10 @@ class Carrier:
 
         Args:
             readings: (n, joints) deg or mm.
-            force: (n, m) at the points.
-            direction: (n, 3) or (3,) along which the forces act, unit vectors of the base frame.
+            force: (n, m) at the points; (1, m) for all rows alike.
+            direction: (n, 3) along which the forces act, unit vectors of the base frame; (1, 3) for all rows alike.
         """
-        out, along = np.empty(readings.shape), np.ascontiguousarray(np.broadcast_to(direction, (len(readings), 3)))
+        out, along = np.empty(readings.shape), np.ascontiguousarray(direction)
         machine_loops.work(np.ascontiguousarray(readings), np.ascontiguousarray(force), along, *self._tables, out)
         return out
 

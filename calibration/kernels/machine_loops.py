@@ -364,6 +364,7 @@ def work(
 ) -> None:
     """Fill `out` (n, joints) with the work of forces (n, points) along `direction` (n, 3), per unit of each reading.
 
+    Forces and directions that are the same in all rows are one.
     From the last row back to the base, each transform moves all the points beyond it: their sum and moment suffice.
     """
     transforms = Transforms(kind, amount, drive_start, drive_joint, drive_size, row_start, frame_before)
@@ -371,15 +372,16 @@ def work(
     ends, kept, frames = np.empty((rows + 1, 3, 3)), np.empty((len(kind), 6)), np.empty((rows + 1, 3))
     place, beyond = np.empty(3), np.empty((rows + 1, 4))
     for n in range(len(readings)):
-        d0, d1, d2 = direction[n, 0], direction[n, 1], direction[n, 2]
+        pull, along = force[n if len(force) > 1 else 0], direction[n if len(direction) > 1 else 0]
+        d0, d1, d2 = along[0], along[1], along[2]
         out[n] = 0.0
         beyond[:] = 0.0
         _walk(readings[n], transforms, ends, kept, frames)
         for m in range(len(frame)):
             _place(offset[m], ends[frame[m]], frames[frame[m]], place)
-            beyond[frame[m], 3] += force[n, m]
+            beyond[frame[m], 3] += pull[m]
             for i in range(3):
-                beyond[frame[m], i] += force[n, m] * place[i]
+                beyond[frame[m], i] += pull[m] * place[i]
         for row in range(rows, 0, -1):
             total = beyond[row, 3]
             for k in range(row_start[row - 1], row_start[row]):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar, Literal
 
 import numpy as np
 
 from calibration.effects.base import Coefficient, JointFamily, Settings, Situation, refuse_settings
 from calibration.observations import Floats
+
+_HALF_A_RAD_DEG = math.degrees(0.5)
 
 
 class Backlash(JointFamily):
@@ -38,12 +41,12 @@ class Backlash(JointFamily):
     def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
         del settings
         direction = situation.extra(f"{where}_dir")
-        change: Floats = np.degrees(0.5) * np.where(np.isfinite(direction), direction, 0.0)[:, None]
+        change: Floats = _HALF_A_RAD_DEG * np.where(np.isfinite(direction), direction, 0.0)[:, None]
         return change
 
     def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
         del plausible, settings
-        return float(np.degrees(0.5 * values[0])) ** 2
+        return float(_HALF_A_RAD_DEG * values[0]) ** 2
 
 
 FAMILY = Backlash()

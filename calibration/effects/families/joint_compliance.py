@@ -115,14 +115,15 @@ class JointCompliance(OfUncertainLoad, TorqueFamily):
 
     def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
         load = situation.torque(where)
-        torque = np.nan_to_num(load)
+        known = np.isfinite(load)
+        torque = np.where(known, load, 0.0)
         if "bend_rad" in settings:
-            return np.degrees(np.isfinite(load)[:, None] * _curved(torque, settings))
-        columns = [torque[:, None]]
+            return np.degrees(known[:, None] * _curved(torque, settings))
+        own = torque[:, None]
         if part_names(settings):
             shapes = gravity_shapes(situation, where)
-            columns.append(shape_columns(shapes, torque, situation.torque_parts(where), settings))
-        return np.degrees(np.hstack(columns))
+            own = np.hstack([own, shape_columns(shapes, torque, situation.torque_parts(where), settings)])
+        return np.degrees(own)
 
     def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
         """Of a link that may point anywhere up or down: its load goes as the sine between those of training."""
