@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.doubts import doubts
 from calibration.effects.fitted import FittedEffect
@@ -98,9 +99,15 @@ class LearnedResidual:
     excess_variance_mm2: Floats
     region: Region
 
-    def estimate(self, seen: Features) -> tuple[Floats, Floats]:
-        """(n, 3) estimate of the residual in the base frame, mm, as far as it counts; (n,) how much it does, 0 to 1."""
+    def estimate(self, seen: Features, trained: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+        """(n, 3) estimate of the residual in the base frame, mm, as far as it counts; (n,) how much it does, 0 to 1.
+
+        Args:
+            seen: features of n rows.
+            trained: (n,) which are of prisms that it was trained on; elsewhere it does not count.
+        """
         settled, weight = self.region.settle(seen)
+        weight *= trained
         estimate_mm: Floats = weight[:, None] * self.learner.predict(settled)
         return estimate_mm, weight
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -95,7 +96,10 @@ class Predictor:
         self._machine = Machine(model.chain, model.values, model.covariance, self._effects.joint, model.repeat_sigma_mm)
         self._reading_variance = reading_variance(rig)
         self._rate_columns = [(index, f"{name}_rate") for index, name in enumerate(rig.joint_names)]
+        self._made_good = 1.0 - model.random_share(model.noise_mm**2)
+        self._excess_mm2 = np.full((2, 3), model.excess_sigma_mm**2)
         if model.residual is not None:
+            self._excess_mm2[1] = model.residual.excess_variance_mm2
             self._extract = Extractor(model.chain, model.values, model.residual.signals)
             self._trained = np.array([name in model.residual.prisms for name in rig.prism_names])
 
@@ -120,20 +124,20 @@ class Predictor:
     def parts(self, observations: Observations) -> Parts:
         """The whole model without its uncertainty, part by part."""
         rows = self._rows(observations)
-        located, correction = self._located(rows)
-        by_joint = self._rotations(rows.data) @ located.joint_jacobian
+        located, estimate, _ = self._located(rows)
+        rotation = self._rotations(rows.data)
+        correction, by_joint = _turned(rotation, estimate), rotation @ located.joint_jacobian
         _refuse_infinite(located.position_mm, correction)
         return Parts(rows.shifted(located.position_mm) + correction, rows.data.readings, by_joint, correction)
 
     def base_mm(self, observations: Observations) -> Floats:
         """(n, 3) where the prisms are in the base frame."""
         rows = self._rows(observations)
-        located, moved_mm = self._located(rows)
+        located, estimate, _ = self._located(rows)
+        place_mm = located.prism_mm + estimate
         shift_mm = self._effects.machine_shifted_mm(rows.columns)
         if shift_mm is not None:
-            moved_mm = moved_mm + shift_mm
-        in_base = (self._rotations(rows.data).transpose(0, 2, 1) @ moved_mm[:, :, None])[:, :, 0]
-        place_mm: Floats = located.prism_mm + in_base
+            place_mm += _turned(self._rotations(rows.data).transpose(0, 2, 1), shift_mm)
         _refuse_infinite(place_mm)
         return place_mm
 
@@ -162,29 +166,33 @@ class Predictor:
         )
 
     def _predict(self, observations: Observations) -> Prediction:
-        model, rows = self._model, self._rows(observations)
-        located, of_fix, of_parameters = self._spread(rows, jacobian=model.residual is not None)
-        position_mm = rows.shifted(located.position_mm)
-        known, by_parameters = _diagonals(of_fix), _diagonals(of_parameters)
-        if model.residual is None:
-            return Prediction(position_mm, np.sqrt(known + by_parameters + model.excess_sigma_mm**2))
-        correction, weight = self._learned(rows, located)
-        made_good = weight[:, None] * (1.0 - model.random_share(model.noise_mm**2))
-        by_parameters = by_parameters - made_good * (by_parameters - self._by_refitted_base(rows, located))
-        along = (self._rotations(rows.data) ** 2 @ self._excess(weight)[:, :, None])[:, :, 0]
-        return Prediction(position_mm + correction, np.sqrt(known + by_parameters + along))
+        rows = self._rows(observations)
+        located, of_fix, of_parameters = self._spread(rows, jacobian=self._model.residual is not None)
+        estimate, weight = self._learned(rows, located)
+        position_mm, sigma_mm = self._machine.learned(
+            rows.data,
+            rows.shifted(located.position_mm),
+            estimate,
+            weight,
+            of_fix,
+            of_parameters,
+            self._by_refitted_base(rows, located),
+            self._made_good,
+            self._excess_mm2,
+        )
+        return Prediction(position_mm, sigma_mm)
 
     def correction(self, observations: Observations) -> tuple[Floats, Floats]:
         """(n, 3) what the residual learner adds, mm; (n, 3, 3) covariance of what the model lacks even so, mm^2.
 
         Both in the station's frame.
         """
-        correction, weight = np.zeros((len(observations), 3)), np.zeros(len(observations))
-        rotation = self.rotations(observations)
-        if self._model.residual is not None and len(observations) > 0:
-            rows = self._rows(observations)
-            correction, weight = self._learned(rows, self._linearise(rows))
-        return correction, (rotation * self._excess(weight)[:, None, :]) @ rotation.transpose(0, 2, 1)
+        rows = self._rows(observations)
+        rotation = self._rotations(rows.data)
+        _, estimate, weight = self._located(rows)
+        without, learned = self._excess_mm2
+        excess = (1.0 - weight)[:, None] * without + weight[:, None] * learned
+        return _turned(rotation, estimate), (rotation * excess[:, None, :]) @ rotation.transpose(0, 2, 1)
 
     def features(self, observations: Observations, signals: Sequence[str]) -> Features:
         """What a residual learner sees, effects taken into account."""
@@ -220,18 +228,16 @@ class Predictor:
         return Situation(self._chain, self._model.values, observations, self._loads, self._machine)
 
     def _rows(self, observations: Observations) -> Rows:
-        data, situation = self._chain.bind(observations), self.situation(observations)
-        columns = self._effects.columns(situation)
+        situation = self.situation(observations)
+        data, columns = situation.data, self._effects.columns(situation)
         if self._model.effects:
             data = ChainData(data.readings + self._effects.change(columns), data.prism, data.setup)
         return Rows(data, situation, columns, self._effects.shifted_mm(columns))
 
-    def _located(self, rows: Rows) -> tuple[Located, Floats]:
-        """Where the kinematics have the prisms; (n, 3) what the residual learner adds, in the station's frame, mm."""
-        if self._model.residual is None:
-            return self._machine.locate(rows.data), np.zeros((len(rows.data), 3))
-        located = self._linearise(rows)
-        return located, self._learned(rows, located)[0]
+    def _located(self, rows: Rows) -> tuple[Located, Floats, Floats]:
+        """Where the kinematics have the prisms, and what the residual learner adds, as `_learned`."""
+        located = self._machine.locate(rows.data) if self._model.residual is None else self._linearise(rows)
+        return located, *self._learned(rows, located)
 
     def _linearise(self, rows: Rows) -> Located:
         return self._machine.linearise(rows.data, rows.columns.column, self._shift_in_base(rows))
@@ -267,38 +273,27 @@ class Predictor:
 
     def _by_refitted_base(self, rows: Rows, located: Located) -> Floats:
         """(n, 3) variance by what a base's own few fixes leave uncertain of it, which no learner makes good."""
-        if self._model.base_covariance is None:
+        if self._model.residual is None or self._model.base_covariance is None:
             return np.zeros((len(rows.data), 3))
         base = slice(self._chain.base_start, len(self._chain))
         jacobian = self._rotations(rows.data) @ located.jacobian[:, :, base]
         variance: Floats = ((jacobian @ self._model.base_covariance) * jacobian).sum(axis=2)
         return variance
 
-    def _excess(self, weight: Floats) -> Floats:
-        """(n, 3) variance of what the model lacks along the base frame's axes where a learner counts (n,) so much."""
-        residual, counts = self._model.residual, weight[:, None]
-        learned = np.zeros(3) if residual is None else residual.excess_variance_mm2
-        excess: Floats = (1.0 - counts) * self._model.excess_sigma_mm**2 + counts * learned
-        return excess
-
     def _learned(self, rows: Rows, located: Located) -> tuple[Floats, Floats]:
-        """(n, 3) what the residual learner adds, in the station's frame, mm; (n,) how much it counts, 0 to 1."""
+        """(n, 3) what the residual learner adds, in the base frame, mm; (n,) how much it counts, 0 to 1."""
         residual, data = self._model.residual, rows.data
-        correction, weight = np.zeros((len(data), 3)), np.zeros(len(data))
-        trained = self._trained[data.prism]
-        if residual is None or not trained.any():
-            return correction, weight
+        if residual is None:
+            return np.zeros((len(data), 3)), np.zeros(len(data))
         seen = self._extract(data.readings, located, rows.situation.observations.extra)
-        estimate, weight[trained] = residual.estimate(seen if trained.all() else seen.select(trained))
-        correction[trained] = (self._rotations(data)[trained] @ estimate[:, :, None])[:, :, 0]
-        return correction, weight
+        return residual.estimate(seen, self._trained[data.prism])
 
 
 def _refuse_infinite(*numbers: Floats) -> None:
     """Raise CalibrationError where one of the arrays (n, 3) of predictions has what is not a finite number."""
     for predicted in numbers:
         # One sum costs less than a look at each, and hides neither infinity nor NaN.
-        if not np.isfinite(predicted.sum()):
+        if not math.isfinite(predicted.sum()):
             row = int(np.argmin(np.isfinite(predicted).all(axis=1)))
             raise CalibrationError(
                 f"the prediction of row {row} (from 0) is not a finite number; look for a reading or signal of that "
@@ -306,5 +301,7 @@ def _refuse_infinite(*numbers: Floats) -> None:
             )
 
 
-def _diagonals(covariance: Floats) -> Floats:
-    return np.diagonal(covariance, axis1=1, axis2=2)
+def _turned(rotation: Floats, vector: Floats) -> Floats:
+    """(n, 3) vectors (n, 3), each turned by its rotation (n, 3, 3)."""
+    turned: Floats = (rotation @ vector[:, :, None])[:, :, 0]
+    return turned

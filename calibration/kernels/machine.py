@@ -163,6 +163,49 @@ class Machine:
         """
         return self._locate(data, column, shift_mm, sigma_mm, rates, variance, wanted=jacobian)
 
+    def learned(
+        self,
+        data: ChainData,
+        position_mm: Floats,
+        estimate: Floats,
+        weight: Floats,
+        of_fix: Floats,
+        of_parameters: Floats,
+        of_base: Floats,
+        made_good: float,
+        excess_mm2: Floats,
+    ) -> tuple[Floats, Floats]:
+        """Positions with what a residual learner adds, and the standard deviation of a fix about them.
+
+        Args:
+            data: n rows.
+            position_mm: (n, 3) without the learner.
+            estimate, weight: (n, 3) what it adds, in the base frame, mm; (n,) how much it counts, 0 to 1.
+            of_fix, of_parameters: (n, 3, 3) as from `spread`.
+            of_base: (n, 3) the variance by parameters of which no learner makes anything good, mm^2.
+            made_good: share of the rest that one makes good where it counts in full.
+            excess_mm2: (2, 3) variance of what is lacking along the base frame's axes, without a learner and with it.
+
+        Returns:
+            (n, 3) mm and (n, 3) mm, in the station's frame.
+        """
+        position, sigma = np.empty((len(data), 3)), np.empty((len(data), 3))
+        machine_loops.add_learned(
+            data.setup,
+            self._bases,
+            np.ascontiguousarray(position_mm),
+            np.ascontiguousarray(estimate),
+            weight,
+            of_fix,
+            of_parameters,
+            of_base,
+            made_good,
+            excess_mm2,
+            position,
+            sigma,
+        )
+        return position, sigma
+
     def _locate(
         self,
         data: ChainData,

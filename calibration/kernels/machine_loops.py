@@ -347,6 +347,33 @@ def locate(
 
 
 @compiled
+def add_learned(
+    setup: Integers,
+    bases: Floats,
+    before: Floats,
+    estimate: Floats,
+    weight: Floats,
+    of_fix: Floats,
+    of_parameters: Floats,
+    of_base: Floats,
+    made_good: float,
+    excess: Floats,
+    position: Floats,
+    sigma: Floats,
+) -> None:
+    """Fill `position` and `sigma` (n, 3) as `Machine.learned` has them."""
+    for n in range(len(setup)):
+        base, counts = bases[setup[n]], weight[n]
+        for i in range(3):
+            place, by_parameters = before[n, i], of_parameters[n, i, i]
+            variance = of_fix[n, i, i] + by_parameters - counts * made_good * (by_parameters - of_base[n, i])
+            for j in range(3):
+                place += base[i, j] * estimate[n, j]
+                variance += base[i, j] * base[i, j] * ((1.0 - counts) * excess[0, j] + counts * excess[1, j])
+            position[n, i], sigma[n, i] = place, math.sqrt(variance)
+
+
+@compiled
 def work(
     readings: Floats,
     force: Floats,

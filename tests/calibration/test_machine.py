@@ -90,6 +90,22 @@ def test_covariances_are_those_of_the_formulas(case: Case) -> None:
     np.testing.assert_allclose(of_fix, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
 
 
+def test_what_a_learner_adds_is_turned_into_the_stations_frame_and_counts_as_far_as_it_is_trusted(case: Case) -> None:
+    rng = np.random.default_rng(2)
+    estimate, weight, of_base = rng.normal(size=(ROWS, 3)), rng.uniform(size=(ROWS, 1)), rng.uniform(size=(ROWS, 3))
+    of_fix, of_parameters = (np.eye(3) + rng.uniform(-0.2, 0.2, (ROWS, 3, 3)) for _ in range(2))
+    place, excess = rng.normal(size=(ROWS, 3)), np.array([[4.0, 4.0, 4.0], [1.0, 2.0, 3.0]])
+    position, sigma = case.machine.learned(
+        case.data, place, estimate, weight[:, 0], of_fix, of_parameters, of_base, 0.7, excess
+    )
+    turn = case.machine.rotations(case.data)
+    np.testing.assert_allclose(position - place, np.einsum("nij,nj->ni", turn, estimate), rtol=0.0, atol=1e-12)
+    fix, parameters = (np.diagonal(covariance, axis1=1, axis2=2) for covariance in (of_fix, of_parameters))
+    lacking = np.einsum("nij,nj->ni", turn**2, (1.0 - weight) * excess[0] + weight * excess[1])
+    expected = fix + parameters - 0.7 * weight * (parameters - of_base) + lacking
+    np.testing.assert_allclose(sigma**2, expected, rtol=1e-12)
+
+
 def test_a_rate_that_was_not_measured_is_none(case: Case) -> None:
     unmeasured, standing = np.full_like(case.rates, np.nan), np.zeros_like(case.rates)
     found = [
