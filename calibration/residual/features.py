@@ -11,6 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.kernels import features as kernel
 from calibration.kernels.machine import Located
 from calibration.kinematics import Chain
 from calibration.observations import Floats, Observations
@@ -22,7 +23,6 @@ _LEAST_MEASURED = 0.5
 _VARYING = 1e-6  # of the largest load
 DEFLECTION = ("deflection_x_mm", "deflection_y_mm", "deflection_z_mm")
 _COMPLIANCE_RAD_PER_NM = 1e-7  # of every joint: what counts of a deflection is its shape
-_RIGID = 6  # ways in which a base can be off
 _FRAME_ORIGIN = re.compile(r"frame\d+_[xyz]_mm")
 _PLACE = re.compile(r"(frame\d+|prism)_[xyz]_mm")
 
@@ -52,7 +52,7 @@ class Features:
 
     def table(self) -> Floats:
         """(n, g + s) all columns."""
-        return np.hstack([self.geometry, self.signals])
+        return np.concatenate([self.geometry, self.signals], axis=1)
 
     def columns(self, names: Sequence[str]) -> Floats:
         """(n, k) the columns of these names; ValueError for one that is not there."""
@@ -140,7 +140,7 @@ def no_features(chain: Chain, signals: Sequence[str]) -> Features:
         np.empty((0, len(names) - len(signals))),
         np.empty((0, len(signals))),
         np.empty((0, 3, joints)),
-        np.empty((0, 3, chain.base_start + _RIGID)),
+        np.empty((0, 3, chain.base_start + kernel.RIGID)),
     )
 
 
@@ -154,16 +154,6 @@ def is_place(name: str) -> bool:
     return _PLACE.fullmatch(name) is not None
 
 
-def _rigid(place_mm: Floats) -> Floats:
-    """(n, 3, 6) how shifts along the base frame's axes and turns about them move places (n, 3)."""
-    out = np.zeros((len(place_mm), 3, _RIGID))
-    for axis in range(3):
-        out[:, axis, axis] = 1.0
-        one, other = (axis + 1) % 3, (axis + 2) % 3
-        out[:, one, 3 + axis], out[:, other, 3 + axis] = -place_mm[:, other], place_mm[:, one]
-    return out
-
-
 class Extractor:
     """Puts the features of a rig's observations together; build it once for a model.
 
@@ -173,12 +163,15 @@ class Extractor:
     """
 
     def __init__(self, chain: Chain, x: Floats, signals: Sequence[str]) -> None:
-        self._names, self._signals = feature_names(chain.rig, signals), tuple(signals)
-        self._torques = torque_columns(chain.rig)
+        computed = (*torque_columns(chain.rig), *DEFLECTION)
+        self._names = feature_names(chain.rig, signals)
+        self._measured = tuple(name for name in signals if name not in computed)
+        place = {name: index for index, name in enumerate((*self._measured, *computed))}
+        self._source = np.array([place[name] for name in signals], dtype=np.intp)
         turning = np.array([joint.kind == "revolute" for joint in chain.rig.joints])
         self._deg_per_nm = math.degrees(_COMPLIANCE_RAD_PER_NM) * turning
-        self._loads = None if set(signals).isdisjoint((*self._torques, *DEFLECTION)) else GravityLoads(chain, x)
-        self._parameters, self._frames = chain.base_start, 3 * len(chain.rig.rows)
+        self._loads = None if set(signals).isdisjoint(computed) else GravityLoads(chain, x)
+        self._parameters = chain.base_start + kernel.RIGID
 
     def __call__(self, readings: Floats, located: Located, extra: Mapping[str, Floats]) -> Features:
         """Features of n rows.
@@ -188,25 +181,28 @@ class Extractor:
             located: the rows there, with the Jacobian by parameters.
             extra: optional columns of the rows.
         """
-        n, known = len(readings), extra
-        if self._loads is not None:
-            loads = self._loads(readings, extra)
-            turned = np.where(np.isfinite(loads), loads, 0.0) * self._deg_per_nm
-            deflection = (located.joint_jacobian @ turned[:, :, None])[:, :, 0]
-            known = {
-                **extra,
-                **dict(zip(self._torques, loads.T, strict=True)),
-                **dict(zip(DEFLECTION, deflection.T, strict=True)),
-            }
-        signals = np.full((n, len(self._signals)), np.nan)
-        for index, name in enumerate(self._signals):
-            column = known.get(name)
-            if column is not None:
-                signals[:, index] = column
-        return Features(
+        n, signals = len(readings), len(self._source)
+        missing = np.full(n, np.nan)
+        measured = np.array([extra.get(name, missing) for name in self._measured], dtype=np.float64)
+        out = Features(
             self._names,
-            np.concatenate([readings, located.frames_mm[:, 1:].reshape(n, self._frames), located.prism_mm], axis=1),
-            signals,
+            np.empty((n, len(self._names) - signals)),
+            np.empty((n, signals)),
             located.joint_jacobian,
-            np.concatenate([located.jacobian[:, :, : self._parameters], _rigid(located.prism_mm)], axis=2),
+            np.empty((n, 3, self._parameters)),
         )
+        kernel.fill(
+            np.ascontiguousarray(readings),
+            located.frames_mm,
+            located.prism_mm,
+            located.joint_jacobian,
+            located.jacobian,
+            np.full(readings.shape, np.nan) if self._loads is None else self._loads(readings, extra),
+            self._deg_per_nm,
+            measured.reshape(len(self._measured), n),
+            self._source,
+            out.geometry,
+            out.signals,
+            out.parameter_jacobian,
+        )
+        return out
