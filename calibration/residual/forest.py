@@ -205,7 +205,7 @@ def _predict(
             _rank(table, first, count, feature, source[c, 1], missing_rank[c], of_column, ranks[_ROWS * c :])
         for t in range(len(tree) - 1):
             output, begin, end, values = tree[t, 0], tree[t, 1], tree[t + 1, 1], leaf_value[tree[t, 2] :]
-            for r in range(_ROWS):
+            for r in range(count):
                 labels[r] = 0
             if count >= _FEW:
                 for node in range(begin, end):

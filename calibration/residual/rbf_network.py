@@ -17,7 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from calibration.observations import Floats
 from calibration.residual.folds import folds
-from calibration.residual.relevance import Relevance, gaussian, relevance, spread_rows
+from calibration.residual.relevance import Relevance, gaussian, half_squares, relevance, spread_rows
 
 _UNITS = (60, 250, 400)
 _USUAL_UNITS = 250
@@ -83,25 +83,32 @@ class RbfNetwork:
     def of(cls, centre: Floats, scale: Floats, units: Floats, output: Floats) -> Self:
         """A network with fitted parts: (d,) means, (d,) one over widths, (m, d) scaled units, (m, k) weights."""
         network = cls()
-        network.centre_, network.scale_, network.units_, network.output_ = centre, scale, units, output
+        network.centre_, network.scale_, network.output_ = centre, scale, output
+        network._stand(units)
         return network
 
     def predict(self, x: Floats) -> Floats:
         """(n, k) outputs for (n, d) inputs."""
         scaled = self._scaled(x)
         if len(scaled) <= _BLOCK:
-            return gaussian(scaled, self.units_) @ self.output_
+            return self._outputs(scaled)
         out = np.empty((len(scaled), self.output_.shape[1]))
         for begin in range(0, len(scaled), _BLOCK):
             rows = slice(begin, begin + _BLOCK)
-            out[rows] = gaussian(scaled[rows], self.units_) @ self.output_
+            out[rows] = self._outputs(scaled[rows])
         return out
+
+    def _outputs(self, scaled: Floats) -> Floats:
+        return gaussian(scaled, self.units_, self._half_squares) @ self.output_
 
     def _place(self, x: Floats, hyperparameters: Hyperparameters) -> None:
         """Scale the inputs and stand the units among them."""
         self.centre_, _ = standardisation(x)
         self.scale_ = 1.0 / np.array(hyperparameters.widths)
-        self.units_ = k_means(self._scaled(x), hyperparameters.units, self.seed)
+        self._stand(k_means(self._scaled(x), hyperparameters.units, self.seed))
+
+    def _stand(self, units: Floats) -> None:
+        self.units_, self._half_squares = units, half_squares(units)
 
     def _scaled(self, x: Floats) -> Floats:
         scaled: Floats = (x - self.centre_) * self.scale_

@@ -108,11 +108,16 @@ class _Evidence:
         return value + _PRIOR * float(relevances.sum()), gradient
 
 
-def gaussian(a: Floats, b: Floats) -> Floats:
-    """(n, m) exp(-|a - b|^2 / 2) of every row of a with every row of b."""
+def half_squares(rows: Floats) -> Floats:
+    """(n,) half the squared length of each row."""
+    return np.asarray(0.5 * np.einsum("ij,ij->i", rows, rows))
+
+
+def gaussian(a: Floats, b: Floats, half_squares_b: Floats | None = None) -> Floats:
+    """(n, m) exp(-|a - b|^2 / 2) of every row of a with every row of b, whose half squares may be known."""
     exponent = a @ b.T
-    exponent -= 0.5 * np.einsum("ij,ij->i", a, a)[:, None]
-    exponent -= 0.5 * np.einsum("ij,ij->i", b, b)
+    exponent -= half_squares(a)[:, None]
+    exponent -= half_squares(b) if half_squares_b is None else half_squares_b
     np.minimum(exponent, 0.0, out=exponent)
     return np.asarray(np.exp(exponent, out=exponent))
 
