@@ -263,10 +263,11 @@ class Chain:
             DataError: a prism that the rig lacks, a set-up without a placement, a joint without readings or with one
                 that is no number.
         """
-        lacking = self.joint_index.keys() - observations.joints.keys()
-        if lacking:
-            raise DataError("observations", f"joint {min(lacking)} is missing; are they another rig's?")
-        readings = np.array([observations.joints[name] for name in self.joint_index], dtype=np.float64)
+        try:
+            readings = np.array([observations.joints[name] for name in self.joint_index], dtype=np.float64)
+        except KeyError:
+            lacking = min(self.joint_index.keys() - observations.joints.keys())
+            raise DataError("observations", f"joint {lacking} is missing; are they another rig's?") from None
         if not np.isfinite(readings).all():
             joint, row = np.argwhere(~np.isfinite(readings))[0]
             column = self.rig.joints[joint].column
