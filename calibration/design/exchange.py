@@ -9,7 +9,9 @@ Fedorov's (1972), restricted to the candidates that gain most, as the KL-exchang
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -121,10 +123,11 @@ class Discrimination:
             j: _times(projected[j], _block(self.before, self.models[j].free)) @ projected[j].transpose(0, 2, 1)
             for j in {j for _, j in self.pairs}
         }
-        now = self.log_odds(information)
+        left = self._left(information)
+        now = self._log_odds(information, left)
         grown = np.repeat(now[:, None], len(blocks), axis=1)
         for number, (i, j) in enumerate(self.pairs):
-            moved = _times(blocks, self._left(self.models[i], self.models[j], information))
+            moved = _times(blocks, left[number])
             squares = moved @ moved.transpose(0, 2, 1) - known[j]
             off = np.trace(np.linalg.solve(scatter[j], squares), axis1=1, axis2=2)
             grown[number] += 0.5 * (off + freedom[j] - freedom[i])
@@ -133,6 +136,9 @@ class Discrimination:
 
     def log_odds(self, information: Floats) -> Floats:
         """(pairs,) expected log odds of the one, if it is true, over the other."""
+        return self._log_odds(information, self._left(information))
+
+    def _log_odds(self, information: Floats, left: Sequence[Floats]) -> Floats:
         added = information - self.before
         freedom = [
             float(np.linalg.slogdet(_block(information, m.free))[1] - np.linalg.slogdet(_block(self.before, m.free))[1])
@@ -141,25 +147,29 @@ class Discrimination:
         noise = [float((_inverse(_block(information, m.free)) * _block(added, m.free)).sum()) for m in self.models]
         found = np.zeros(len(self.pairs))
         for number, (i, j) in enumerate(self.pairs):
-            true, other = self.models[i], self.models[j]
-            difference, left = self._difference(true, other), self._left(true, other, information)
-            off = float((difference * (added @ left)).sum())
+            off = float((self._differences[number] * (added @ left[number])).sum())
             found[number] = 0.5 * (off - noise[j] + freedom[j] - freedom[i])
         return found
 
-    def _difference(self, true: Hypothesis, other: Hypothesis) -> Floats:
-        """(q, 1 + f) the parameters of a true model less those of another: their means, and what is unknown of them."""
-        root = np.zeros((len(self.before), 1 + len(true.free)))
-        root[:, 0] = true.mean - other.mean
-        root[true.free, 1:] = np.linalg.cholesky(_inverse(_block(self.before, true.free)))
-        return root
+    @cached_property
+    def _differences(self) -> list[Floats]:
+        """(q, 1 + f) of each pair, the true model's parameters less the other's: means, and what is unknown of them."""
+        found = []
+        for true, other in ((self.models[i], self.models[j]) for i, j in self.pairs):
+            root = np.zeros((len(self.before), 1 + len(true.free)))
+            root[:, 0] = true.mean - other.mean
+            root[true.free, 1:] = np.linalg.cholesky(_inverse(_block(self.before, true.free)))
+            found.append(root)
+        return found
 
-    def _left(self, true: Hypothesis, other: Hypothesis, information: Floats) -> Floats:
-        """(q, 1 + f) the same once the other is fitted to what the design tells."""
-        left = self._difference(true, other)
-        told = (information - self.before)[other.free] @ left
-        left[other.free] -= np.linalg.solve(_block(information, other.free), told)
-        return left
+    def _left(self, information: Floats) -> list[Floats]:
+        """(q, 1 + f) of each pair, the same once the other is fitted to what the design tells."""
+        added, found = information - self.before, []
+        for (_, j), difference in zip(self.pairs, self._differences, strict=True):
+            free, left = self.models[j].free, difference.copy()
+            left[free] -= np.linalg.solve(_block(information, free), added[free] @ difference)
+            found.append(left)
+        return found
 
 
 def choose(blocks: Floats, count: int, criterion: Criterion, before: Floats | None = None) -> Integers:
@@ -176,6 +186,29 @@ def choose(blocks: Floats, count: int, criterion: Criterion, before: Floats | No
         if not _sweep(blocks, chosen, criterion, known):
             break
     return np.array(chosen, dtype=np.intp)
+
+
+def improve(blocks: Floats, near: Integers, criterion: Criterion, before: Floats | None = None) -> Integers:
+    """Indices of one block for each of several poses, the best of those near it while the others are as they are.
+
+    Coordinate exchange (Meyer and Nachtsheim, Technometrics 37, 1995), whole poses being the coordinates.
+
+    Args:
+        blocks: (n, r, q).
+        near: (n,) number of the pose, from 0, that each is near; the first of each is the pose's own, and stays where
+            no other is better.
+        criterion, before: as for `choose`.
+    """
+    chosen = np.unique(near, return_index=True)[1]
+    information = information_of(blocks[chosen], before)
+    for place, old in enumerate(chosen.tolist()):
+        information -= blocks[old].T @ blocks[old]
+        rivals = np.flatnonzero(near == place)
+        gained = criterion.gain(information, blocks[rivals])
+        if gained.max() > gained[0]:
+            chosen[place] = rivals[int(np.argmax(gained))]
+        information += blocks[chosen[place]].T @ blocks[chosen[place]]
+    return chosen
 
 
 def covariance_of(blocks: Floats) -> Floats:

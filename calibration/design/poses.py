@@ -24,6 +24,7 @@ from calibration.design.exchange import (
     Integers,
     choose,
     covariance_of,
+    improve,
     information_of,
 )
 from calibration.design.knowledge import Knowledge
@@ -47,6 +48,7 @@ CANDIDATES = 10_000
 _BATCHES = 10
 _MARGIN = 0.01  # of a joint's range, kept from its limits
 _NEAR = 100  # to each pose
+_MOVES = 20  # of each pose; as many again would bring a hundredth more of the log odds
 _WIDTHS = 0.02, 0.2  # of a joint's range, 1 sigma
 _SEEN = 0.1  # as in identifiability: the data alone determine a direction within ten prior sigmas
 _TRIED = 64  # poses in which conditions are tried
@@ -168,21 +170,23 @@ def draw(
     return Candidates(readings, conditions, seen)
 
 
-def near(knowledge: Knowledge, at: Site, rng: np.random.Generator, poses: Candidates) -> Candidates:
+def near(knowledge: Knowledge, at: Site, rng: np.random.Generator, poses: Candidates) -> tuple[Candidates, Integers]:
     """These poses, and random ones that differ little from each in some of the joints, under the same conditions.
 
-    Only such as the rig can take and in which the station sees all that it sees in the one they are near.
+    Only such as the rig can take and in which the station sees all that it sees in the one they are near, whose number
+    comes with each; the pose itself is the first of them.
     """
     low, high = limits(knowledge.chain.rig)
     margin = _MARGIN * (high - low)
-    about = poses.select(np.repeat(np.arange(len(poses)), _NEAR))
+    number = np.repeat(np.arange(len(poses)), _NEAR)
+    about = poses.select(number)
     width = np.tile(np.geomspace(*_WIDTHS, _NEAR), len(poses))[:, None]
     moved = width * rng.standard_normal(about.readings.shape) * (rng.random(about.readings.shape) < 0.5)
     moved[::_NEAR] = 0.0
     tried = np.clip(about.readings + (high - low) * moved, low + margin, high - margin)
     bodies = Bodies.of(knowledge.chain, knowledge.x, tried)
-    good = is_reachable(bodies, at) & (in_view(bodies, at) >= about.seen).all(axis=1)
-    return replace(about, readings=tried).select(np.flatnonzero(good))
+    good = np.flatnonzero(is_reachable(bodies, at) & (in_view(bodies, at) >= about.seen).all(axis=1))
+    return replace(about, readings=tried).select(good), number[good]
 
 
 def work_volume(knowledge: Knowledge, at: Site, rng: np.random.Generator, count: int) -> Floats:
@@ -214,7 +218,7 @@ def plan(
     volume: Floats | None = None,
     separate: Sequence[str | Sequence[FittedEffect]] = (),
     measured: Observations | None = None,
-    nearby: Callable[[Candidates], Candidates] | None = None,
+    nearby: Callable[[Candidates], tuple[Candidates, Integers]] | None = None,
 ) -> Plan:
     """Choose poses.
 
@@ -228,7 +232,7 @@ def plan(
             after it others that would be the same answer: choose to tell each from the others, one of them being there
             and none known yet.
         measured: rows that were measured already and are no part of what is known.
-        nearby: gives poses near some, these among them; the choice is made once more among those near the first.
+        nearby: as `near` without its first arguments; the poses chosen move to better ones near them, time and again.
 
     Raises:
         DataError: fewer candidates than poses; an effect that no choice of poses shows.
@@ -256,8 +260,9 @@ def plan(
         in_view = np.repeat(candidates.seen.any(axis=0), 3)
         chosen = candidates.select(choose(blocks[:, in_view], count, criterion, told))
         if nearby is not None:
-            closer = nearby(chosen)
-            chosen = closer.select(choose(whitened(before, closer, rivals)[:, in_view], count, criterion, told))
+            for _ in range(_MOVES):
+                closer, number = nearby(chosen)
+                chosen = closer.select(improve(whitened(before, closer, rivals)[:, in_view], number, criterion, told))
         seconds = travel_s(rig, chosen.readings)
         order = _order(rig, seconds, chosen, [name_of(effect) for effect in effects])
         poses = chosen.select(order)

@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 
 from calibration.design.conditions import instructions
+from calibration.design.exchange import Integers
 from calibration.design.knowledge import Knowledge, setup_of
 from calibration.design.planning import pose_rows
 from calibration.design.poses import Candidates, Plan, draw, near, plan
@@ -101,7 +102,7 @@ def _poses(
     observations: Observations,
     answers: Sequence[Sequence[FittedEffect]],
     count: int,
-    nearby: Callable[[Candidates], Candidates],
+    nearby: Callable[[Candidates], tuple[Candidates, Integers]],
 ) -> Iterator[Experiment]:
     few = candidates.few()
     shown = [[effect for effect in answer if _is_shown(knowledge, few, effect)] for answer in answers]

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,11 +15,12 @@ from calibration.design.exchange import (
     Discrimination,
     Hypothesis,
     choose,
+    improve,
     information_of,
 )
 from calibration.design.knowledge import Knowledge
 from calibration.design.planning import plan_poses
-from calibration.design.poses import Candidates, draw, plan
+from calibration.design.poses import Candidates, draw, near, plan
 from calibration.design.tour import length_s, short_tour, travel_s
 from calibration.design.visibility import (
     Bodies,
@@ -180,6 +182,20 @@ def test_the_exchange_comes_close_to_the_best_of_all_subsets(criterion: Criterio
         assert reached > max(values) - 0.03 * (max(values) - np.median(values))
 
 
+@pytest.mark.parametrize(("criterion", "told"), CRITERIA)
+def test_each_pose_moves_to_the_best_near_it_while_the_others_stay(criterion: Criterion, told: Floats | None) -> None:
+    blocks, near = blocks_of(12, 2, 6, 3), np.repeat(np.arange(4), 3)
+
+    def value(of: list[int]) -> float:
+        return criterion.value(information_of(blocks[of], told))
+
+    expected = [0, 3, 6, 9]
+    for place in range(4):
+        rest = [expected[:place], expected[place + 1 :]]
+        expected[place] = max(range(3 * place, 3 * place + 3), key=lambda own: value([*rest[0], own, *rest[1]]))
+    assert improve(blocks, near, criterion, told).tolist() == expected
+
+
 def test_the_log_odds_that_a_design_brings_are_those_of_data_that_one_of_the_models_makes() -> None:
     criterion, rows = Discrimination(MODELS, KNOWN, PAIRS), blocks_of(4, 3, 6, 1).reshape(-1, 6)
     expected = criterion.log_odds(KNOWN + rows.T @ rows)
@@ -247,6 +263,20 @@ def test_poses_that_separate_two_effects_show_them_better_than_others() -> None:
     assert list(separating.stands_out) == list(effects)
     for effect in effects:
         assert separating.stands_out[effect] > 1.2 * random.stands_out[effect]
+
+
+def test_poses_that_may_move_separate_two_effects_better_than_those_among_which_they_are_chosen() -> None:
+    knowledge, at, candidates = situation(shipped_rig("swdt82"), 1500)
+    effects = ("joint_compliance@theta4", "angle_scale@theta4")
+    fixed = plan(knowledge, candidates, 15, separate=effects)
+    moved = plan(
+        knowledge, candidates, 15, separate=effects, nearby=partial(near, knowledge, at, np.random.default_rng(0))
+    )
+    for effect in effects:
+        assert moved.stands_out[effect] > 1.05 * fixed.stands_out[effect]
+    bodies = Bodies.of(knowledge.chain, knowledge.x, moved.poses.readings)
+    assert is_reachable(bodies, at).all()
+    assert (in_view(bodies, at) >= moved.poses.seen).all()
 
 
 def test_derivatives_by_the_coefficients_of_effects_are_those_of_the_positions() -> None:
