@@ -22,7 +22,7 @@ from scipy.optimize import minimize
 from calibration.design.knowledge import Knowledge, setup_of
 from calibration.design.poses import work_volume
 from calibration.design.visibility import site
-from calibration.identification.samples import Samples, averaged, covariance_by_joints, reading_variance
+from calibration.identification.samples import Samples, averaged, covariance_by_joints
 from calibration.kinematics import Integers
 from calibration.model import OUTLIER_SIGMA, CalibratedModel
 from calibration.observations import Floats, Observations
@@ -327,9 +327,8 @@ def _groups(model: CalibratedModel, rows: Observations, samples: Samples, label:
     error = samples.average(rows.position_mm - lin.position_mm)
     by_reading, by_parameter = samples.average(lin.joint_jacobian), samples.average(by_parameter)
     taken = (by_parameter.reshape(-1, len(model.covariance)) @ model.covariance).reshape(by_parameter.shape)
-    unsure = reading_variance(rig) + samples.average(model.unknown_variance(rows))
-    velocity = by_reading @ samples.rates[:, :, None] * rig.station.timing_sigma_s
-    alone = samples.station_covariance + velocity @ velocity.transpose(0, 2, 1)
+    unsure = samples.shared_variance(rig) + samples.average(model.unknown_variance(rows))
+    alone = samples.own_covariance(rig, by_reading)
     order = np.argsort(label, kind="stable")
     start, count = np.unique(label[order], return_index=True, return_counts=True)[1:]
     found = []

@@ -18,7 +18,6 @@ from calibration.gap.problem import OUTLIER
 from calibration.gap.projection import Projection
 from calibration.gap.terms import modulations
 from calibration.gap.variables import Place
-from calibration.identification.samples import reading_covariance
 from calibration.observations import Floats
 
 _CLOSED = 0.8  # of the gap, at least
@@ -80,6 +79,5 @@ def depends(joint: JointFit, number: int, projection: Projection, rng: np.random
 def _noise_mm2(projection: Projection) -> float:
     """Variance of a fix by station, readings and instant, mean over the axes."""
     samples, rig = projection.samples, projection.situation.rig
-    station = float(np.trace(samples.station_covariance, axis1=1, axis2=2).mean())
-    readings = reading_covariance(rig, projection.joint_jacobian, samples.rates)
-    return (station + float(np.trace(readings, axis1=1, axis2=2).mean())) / 3.0
+    known = samples.covariance(rig, projection.joint_jacobian)
+    return float(np.trace(known, axis1=1, axis2=2).mean()) / 3.0

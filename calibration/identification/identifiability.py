@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from calibration.halton import halton
 from calibration.identification.additions import Additions
-from calibration.identification.samples import Samples, reading_covariance
+from calibration.identification.samples import Samples
 from calibration.identification.standing import standing_spread
 from calibration.kinematics import Chain, Linearisation
 from calibration.observations import Floats
@@ -182,8 +182,7 @@ def _whitened(
 ) -> Floats:
     """(3 m, q) change of the fixes in their sigmas by one prior sigma of each parameter asked for."""
     lin, jacobian = _linearised(chain, samples, at, additions)
-    covariance = samples.station_covariance + reading_covariance(chain.rig, lin.joint_jacobian, samples.rates)
-    covariance = covariance + excess_variance * np.eye(3)
+    covariance = samples.covariance(chain.rig, lin.joint_jacobian) + excess_variance * np.eye(3)
     whitened = np.linalg.solve(np.linalg.cholesky(covariance), jacobian[:, :, asked.columns] * asked.sigma)
     return np.asarray(whitened.reshape(-1, len(asked.columns)), dtype=np.float64)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.errors import UnsafeError
 from calibration.identification.refinement import Fit, Prior, information, prior_precision
-from calibration.identification.samples import Samples, reading_covariance
+from calibration.identification.samples import Samples
 from calibration.identification.standing import standing_spread
 from calibration.identification.start import rough_start
 from calibration.kinematics import Chain, Placement
@@ -116,7 +116,7 @@ def tilts(chain: Chain, fit: Fit) -> Iterator[str]:
 def known_variance(chain: Chain, samples: Samples, fit: Fit) -> float:
     """What station, readings and repeats account for on the average, mm^2 per axis."""
     lin = chain.linearise(fit.x, samples.data)
-    known = samples.station_covariance + reading_covariance(chain.rig, lin.joint_jacobian, samples.rates)
+    known = samples.covariance(chain.rig, lin.joint_jacobian)
     return float(np.trace(known, axis1=1, axis2=2).mean()) / 3.0
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.identification.samples import Samples, reading_variance
+from calibration.identification.samples import Samples
 from calibration.observations import Floats
 from calibration.rig import Rig
 
@@ -39,9 +39,8 @@ def left_out_errors(
     Returns:
         (m, 3), mm.
     """
-    velocity = np.einsum("nij,nj->ni", joint_jacobian, samples.rates * rig.station.timing_sigma_s)
-    own = samples.station_covariance + velocity[:, :, None] * velocity[:, None, :] + excess_variance * np.eye(3)
-    by_reading = joint_jacobian * np.sqrt(reading_variance(rig))
+    own = samples.own_covariance(rig, joint_jacobian) + excess_variance * np.eye(3)
+    by_reading = joint_jacobian * np.sqrt(samples.shared_variance(rig))
     out = np.empty_like(error_mm)
     standstill = np.arange(len(samples)) if samples.standstill is None else samples.standstill
     order = np.argsort(standstill, kind="stable")

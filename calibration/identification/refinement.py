@@ -2,7 +2,7 @@
 
 The model of an observation: with probability 1 - epsilon its error is normal with the covariance
 Sigma_station + J_q Sigma_q J_q' + timing + s^2 I, else thirty times as wide; inliers of one standstill are correlated,
-as they share the errors of its readings (`whitening`). s^2 is what the data's own scatter adds, so that small sigma
+as they share errors of its readings (`whitening`). s^2 is what the data's own scatter adds, so that small sigma
 columns never make the fit chase a few rows when what the kinematics lack dominates. It is found by restricted maximum
 likelihood (the parameters' degrees of freedom do not count as noise), epsilon by expectation-maximisation, and the
 prior's scale, where asked for, by MacKay's evidence update.
@@ -23,7 +23,7 @@ from scipy.special import expit
 
 from calibration.errors import CalibrationError
 from calibration.identification.additions import Additions
-from calibration.identification.samples import Samples, reading_variance
+from calibration.identification.samples import Samples
 from calibration.identification.whitening import Marginals, Whitening, factorise, marginals
 from calibration.kernels.gram import gram
 from calibration.kernels.lineariser import Lineariser
@@ -243,7 +243,8 @@ class _Problem:
         self._position_mm = samples.position_mm[self.order]
         self._station = samples.station_covariance[self.order]
         self._rates = samples.rates[self.order] * chain.rig.station.timing_sigma_s
-        self._variance = reading_variance(chain.rig)
+        self._shared = samples.shared_variance(chain.rig)
+        self._variance = self._shared + samples.own_variance(chain.rig)[self.order]
         self._linearise = Lineariser(chain)
         added = np.zeros(0) if additions is None else additions.prior_sigma
         self._added_precision = 1.0 / added**2
@@ -276,7 +277,7 @@ class _Problem:
         return marginals(self._station, velocity, state.by_joint, self._variance, excess, state.error)
 
     def whitening(self, state: _State, of_rows: Marginals, weight: Floats) -> Whitening:
-        return factorise(self._start, of_rows, state.by_joint, self._variance, weight)
+        return factorise(self._start, of_rows, state.by_joint, self._shared, weight)
 
     def original(self, weight: Floats) -> Floats:
         """Values (m,) in the order of the samples."""

@@ -1,8 +1,8 @@
 """What the fit sees: fixes of one standstill averaged, each with its measurement covariance.
 
-Fixes of one session, set-up, pose and prism repeat the same readings of the joints: averaging them lowers the
-station's noise, as far as it shows among them, not that of the readings. Those of other prisms in the pose share the
-readings' errors as well: a standing joint errs the same way at each of its fixes.
+Fixes of one session, set-up, pose and prism are repeats: averaging them lowers the noise of station and readings, as
+far as it shows among them. What does not show is common to a standstill: no number of repeats averages it out, and in
+the readings it is the same at other prisms of the pose as well.
 """
 
 from __future__ import annotations
@@ -35,8 +35,10 @@ class Samples:
         rates: (m, joints) deg/s or mm/s at the fix, 0 where not measured.
         of_row: (n,) which sample each observation went into, a copy into that of its original.
         repeat_variance: mm^2 per axis that repeats scatter beyond the station's covariance.
-        standstill: (m,) samples with the same number share the random errors of their readings; None where each is a
-            standstill of its own.
+        fixes: (m,) how many observations each is the mean of.
+        reading_scatter: (joints,) variance, deg^2 or mm^2, that readings show among repeats; 0 where these are too few.
+        standstill: (m,) samples with the same number share those random errors of their readings that repeats do not
+            show; None where each is a standstill of its own.
     """
 
     data: ChainData
@@ -45,6 +47,8 @@ class Samples:
     rates: Floats
     of_row: Integers
     repeat_variance: float
+    fixes: Floats
+    reading_scatter: Floats
     standstill: Integers | None = None
 
     def __len__(self) -> int:
@@ -60,12 +64,41 @@ class Samples:
             station_covariance=self.station_covariance[rows],
             rates=self.rates[rows],
             of_row=np.arange(len(data)),
+            fixes=self.fixes[rows],
             standstill=None,
         )
 
     def average(self, values: Floats) -> Floats:
         """(m, ...) means over the observations of each sample of their `values` (n, ...)."""
         return _averages(self.of_row, values)
+
+    def shared_variance(self, rig: Rig) -> Floats:
+        """(joints,) variance of a standstill's readings that is common to all of its samples, deg^2 or mm^2."""
+        shared: Floats = np.maximum(reading_variance(rig) - self.reading_scatter, 0.0)
+        return shared
+
+    def own_covariance(self, rig: Rig, joint_jacobian: Floats) -> Floats:
+        """(m, 3, 3) of each sample's position without what it shares with others of its standstill, mm^2.
+
+        Arguments as `covariance`.
+        """
+        readings = covariance_by_joints(joint_jacobian, self.own_variance(rig))
+        return self.station_covariance + readings + _timing_covariance(rig, joint_jacobian, self.rates)
+
+    def own_variance(self, rig: Rig) -> Floats:
+        """(m, joints) variance of each sample's mean readings beside that, deg^2 or mm^2."""
+        own: Floats = np.minimum(reading_variance(rig), self.reading_scatter) / self.fixes[:, None]
+        return own
+
+    def covariance(self, rig: Rig, joint_jacobian: Floats) -> Floats:
+        """(m, 3, 3) of each sample's position by station, readings and the instant of the fix, mm^2.
+
+        Args:
+            rig: gives the random errors of readings and instant.
+            joint_jacobian: (m, 3, joints) mm per deg or mm.
+        """
+        shared = covariance_by_joints(joint_jacobian, self.shared_variance(rig))
+        return shared + self.own_covariance(rig, joint_jacobian)
 
 
 def station_covariance(rig: Rig, position_mm: Floats, sigma_mm: Floats) -> Floats:
@@ -98,9 +131,13 @@ def reading_covariance(rig: Rig, joint_jacobian: Floats, rates: Floats) -> Float
     J_q Sigma_q J_q' + (J_q q_dot)(J_q q_dot)' sigma_t^2, of each fix by itself.
     """
     covariance = covariance_by_joints(joint_jacobian, reading_variance(rig))
+    return covariance + _timing_covariance(rig, joint_jacobian, rates)
+
+
+def _timing_covariance(rig: Rig, joint_jacobian: Floats, rates: Floats) -> Floats:
     velocity = joint_jacobian @ rates[:, :, None] * rig.station.timing_sigma_s
-    moving: Floats = covariance + velocity @ velocity.transpose(0, 2, 1)
-    return moving
+    covariance: Floats = velocity @ velocity.transpose(0, 2, 1)
+    return covariance
 
 
 def covariance_by_joints(joint_jacobian: Floats, variance: Floats) -> Floats:
@@ -140,13 +177,14 @@ def averaged(chain: Chain, observations: Observations) -> Samples:
     expected = np.trace(covariance, axis1=1, axis2=2).mean() / 3.0
     within = squares / (3.0 * freedom) if freedom >= _LEAST_REPEATS else expected
     repeat_variance = max(0.0, within - expected)
-    # What repeats do not show of the noise is common to a standstill: no number of them averages it out.
     common = max(0.0, 1.0 - within / expected)
 
     first = np.unique(of_row, return_index=True)[1]
     start = data.readings[first][of_row]
     readings = start + _differences(turns, data.readings - start)
-    means = ChainData(_averages(of_row, readings), data.prism[first], data.setup[first])
+    mean = _averages(of_row, readings)
+    scatter = ((readings - mean[of_row]) ** 2).sum(axis=0) / max(freedom, 1)
+    means = ChainData(mean, data.prism[first], data.setup[first])
     return Samples(
         means,
         _averages(of_row, position),
@@ -154,6 +192,8 @@ def averaged(chain: Chain, observations: Observations) -> Samples:
         _averages(of_row, joint_rates(rig, observations)),
         of_row[original],
         float(repeat_variance),
+        count,
+        scatter if freedom >= _LEAST_REPEATS else np.zeros_like(scatter),
         _shared(rig, turns, observations.select(first), means, np.bincount(of_row)),
     )
 

@@ -1,13 +1,14 @@
 """The noise of fixes that share a standstill, compiled: marginal sizes, and rows whitened by the whole covariance.
 
-Fixes of one standstill share the random errors of its readings, so their covariance is
+Fixes of one standstill share random errors of its readings, so their covariance is
 
     V = blockdiag(S_i) + J_q Sigma_q J_q'
 
-over all of them, S_i being station, timing and excess. A row with the probability w of being no outlier counts as if
-independent noise of covariance (1/w - 1) V_ii came on top: w = 1 is the model above, w = 0 takes the row out, and a
-standstill of a single fix gets the familiar w V^-1. With W the w on the diagonal, V_w = W^-1/2 A W^-1/2, where A has
-the blocks V_ii on its diagonal and sqrt(w_i w_j) J_i Sigma_q J_j' beside it; so nothing is ever divided by w.
+over all of them, S_i being station, timing, excess and errors that the readings of each fix have to themselves. A row
+with the probability w of being no outlier counts as if independent noise of covariance (1/w - 1) V_ii came on top:
+w = 1 is the model above, w = 0 takes the row out, and a standstill of a single fix gets the familiar w V^-1. With W the
+w on the diagonal, V_w = W^-1/2 A W^-1/2, where A has the blocks V_ii on its diagonal and sqrt(w_i w_j) J_i Sigma_q J_j'
+beside it; so nothing is ever divided by w.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ def _blocks(station: Floats, velocity: Floats, by_joint: Floats, variance: Float
         for i in range(3):
             for j in range(i + 1):
                 total = station[m, i, j] + velocity[m, i] * velocity[m, j]
-                for k in range(len(variance)):
-                    total += by_joint[m, i, k] * variance[k] * by_joint[m, j, k]
+                for k in range(variance.shape[1]):
+                    total += by_joint[m, i, k] * variance[m, k] * by_joint[m, j, k]
                 out[m, i, j] = total
                 out[m, j, i] = total
             out[m, i, i] += excess
@@ -119,8 +120,8 @@ def _factorise(
 ) -> None:
     """Cholesky factors of A, standstill by standstill.
 
-    Row 3 i + c of `factor` (3 m, widest) is the factor's row of coordinate c of fix i; `sigma` (joints,) is of a
-    reading, `root` (m,) is sqrt(w); `sums` (3,) gets log det A and the traces of A^-1 and A^-2.
+    Row 3 i + c of `factor` (3 m, widest) is the factor's row of coordinate c of fix i; `sigma` (joints,) is what
+    readings share, `root` (m,) is sqrt(w); `sums` (3,) gets log det A and the traces of A^-1 and A^-2.
     """
     widest = factor.shape[1]
     shared, inverse = np.empty((widest, len(sigma))), np.empty((widest, widest))
@@ -228,7 +229,7 @@ def marginals(
         station: (m, 3, 3) covariance of the fix, mm^2.
         velocity: (m, 3) mm that the prism moves within the timing uncertainty.
         by_joint: (m, 3, joints) derivatives by the readings.
-        variance: (joints,) of a reading.
+        variance: (m, joints) of the readings.
         excess: s^2, mm^2.
         error: (m, 3) mm.
     """
@@ -239,11 +240,14 @@ def marginals(
     return out
 
 
-def factorise(start: Integers, of_rows: Marginals, by_joint: Floats, variance: Floats, weight: Floats) -> Whitening:
-    """Factors of the covariance of m rows in the order of their standstills, whose first rows `start` has."""
+def factorise(start: Integers, of_rows: Marginals, by_joint: Floats, shared: Floats, weight: Floats) -> Whitening:
+    """Factors of the covariance of m rows in the order of their standstills, whose first rows `start` has.
+
+    `shared` (joints,) is the variance of the readings that the fixes of a standstill have in common.
+    """
     root = np.sqrt(weight)
     factor = np.zeros((3 * len(root), 3 * int(np.diff(start).max(initial=1))))
     sums = np.empty(3)
-    _factorise(start, of_rows.block, by_joint, np.sqrt(variance), root, factor, sums)
+    _factorise(start, of_rows.block, by_joint, np.sqrt(shared), root, factor, sums)
     dropped = (1.0 - weight) @ of_rows.trace
     return Whitening(start, root, factor, float(sums[0]), (float(sums[1] - dropped[0]), float(sums[2] - dropped[1])))

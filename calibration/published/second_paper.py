@@ -31,7 +31,7 @@ from calibration.identification.judgement import (
     rms_tolerated_mm,
 )
 from calibration.identification.refinement import Fit, prior_precision, refine
-from calibration.identification.samples import Samples, reading_covariance
+from calibration.identification.samples import Samples
 from calibration.identification.solve import Solution, place
 from calibration.kernels.lineariser import Lineariser
 from calibration.kinematics import Chain, Linearisation
@@ -220,7 +220,7 @@ def _fit(chain: Chain, samples: Samples, state: _State, seen: Floats, unseen: Fl
     variance = state.squares / (3 * m - seen.shape[1])
     if not math.isfinite(variance):
         raise CalibrationError("identification: the fit left the range of numbers; check units of the observations")
-    known = samples.station_covariance + reading_covariance(chain.rig, state.lin.joint_jacobian, samples.rates)
+    known = samples.covariance(chain.rig, state.lin.joint_jacobian)
     excess = max(variance - float(np.trace(known, axis1=1, axis2=2).mean()) / 3.0, 1e-12)
     triangle = np.linalg.qr(state.columns() @ seen, mode="r")
     half = seen @ np.linalg.inv(triangle)

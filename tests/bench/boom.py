@@ -135,5 +135,7 @@ def boom(seed: int, poses: int = 200, reach_mm: float = 400.0, reach_deg: float 
         np.zeros_like(data.readings),
         np.arange(n),
         0.0,
+        np.ones(n),
+        np.zeros(len(rig.joints)),
     )
     return Boom(chain, samples, truth, free, reach[free])

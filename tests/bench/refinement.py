@@ -22,7 +22,7 @@ from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
 from calibration.identification.refinement import prior_precision, refine
-from calibration.identification.samples import Samples, averaged, reading_covariance
+from calibration.identification.samples import Samples, averaged
 from calibration.identification.start import rough_start
 from calibration.kernels.lineariser import Lineariser
 from calibration.kinematics import Chain, Linearisation, Placement
@@ -54,7 +54,7 @@ class Residuals:
     ) -> None:
         self._samples, self._linearise = samples, linearise
         lin = linearise(x, samples.data)
-        covariance = samples.station_covariance + reading_covariance(chain.rig, lin.joint_jacobian, samples.rates)
+        covariance = samples.covariance(chain.rig, lin.joint_jacobian)
         self._whiten = np.linalg.inv(np.linalg.cholesky(covariance + excess * np.eye(3)))
         self._prior = np.sqrt(prior_precision(chain, 1.0))
 

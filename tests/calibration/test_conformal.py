@@ -82,6 +82,7 @@ def test_errors_left_out_are_those_of_a_fit_that_never_saw_the_standstill() -> N
             station_covariance=samples.station_covariance[~out],
             rates=samples.rates[~out],
             of_row=np.arange((~out).sum()),
+            fixes=samples.fixes[~out],
             standstill=samples.standstill[~out],
         )
         again = refine(chain, rest, fit.x, excess_variance=9.0)

@@ -24,18 +24,12 @@ def uniform_samples(rig: Rig, n: int = 250, seed: int = 0, setups: tuple[str, ..
     readings = np.column_stack([poses[j] for j in rig.joint_names])
     data = ChainData(readings, np.arange(n) % len(rig.prisms), np.arange(n) // len(rig.prisms) % len(setups))
     covariance = np.tile(9.0 * np.eye(3), (n, 1, 1))
-    return chain, Samples(data, np.zeros((n, 3)), covariance, np.zeros_like(readings), np.arange(n), 0.0)
+    rates, scatter = np.zeros_like(readings), np.zeros(readings.shape[1])
+    return chain, Samples(data, np.zeros((n, 3)), covariance, rates, np.arange(n), 0.0, np.ones(n), scatter)
 
 
 def rows(samples: Samples, chosen: np.ndarray) -> Samples:
-    return replace(
-        samples,
-        data=samples.data.select(chosen),
-        position_mm=samples.position_mm[chosen],
-        station_covariance=samples.station_covariance[chosen],
-        rates=samples.rates[chosen],
-        of_row=np.arange(int(chosen.sum())),
-    )
+    return samples.select(chosen)
 
 
 def seen(rig: Rig) -> Identifiability:

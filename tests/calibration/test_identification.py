@@ -11,7 +11,7 @@ import pytest
 from calibration.errors import UnsafeError
 from calibration.identification.approach import PRIOR_SCALE, approach
 from calibration.identification.refinement import prior_precision, refine
-from calibration.identification.samples import averaged, reading_covariance, station_covariance
+from calibration.identification.samples import averaged, reading_covariance, reading_variance, station_covariance
 from calibration.identification.search.global_search import search_globally
 from calibration.identification.solve import place, solve
 from calibration.identification.start import rigid_fit, rough_start
@@ -52,6 +52,22 @@ def test_noise_that_repeats_of_a_standstill_do_not_show_is_not_averaged_out(sess
     assert samples.repeat_variance == 0.0
     of_mean = np.trace(samples.station_covariance, axis1=1, axis2=2).mean() / 3.0
     assert of_mean == pytest.approx(2.0**2 + 3.0**2 / 4.0, rel=0.15)
+
+
+def test_noise_of_readings_is_averaged_as_far_as_repeats_show_it(session: Session) -> None:
+    rig, observations = session.rig, simulated(session.truth, 240, 3, repeats=4)
+    chain, expected, rng = blank(session), reading_variance(rig), np.random.default_rng(1)
+    same = {name: readings[::4].repeat(4) for name, readings in observations.joints.items()}
+    own_sigma = dict(zip(rig.joint_names, np.sqrt(0.75 * expected), strict=True))
+    noisy = {name: readings + own_sigma[name] * rng.normal(size=240) for name, readings in same.items()}
+    steady = averaged(chain, replace(observations, joints=same))
+    np.testing.assert_allclose(steady.shared_variance(rig), expected)
+    np.testing.assert_allclose(steady.own_variance(rig), 0.0, atol=1e-12 * expected.max())
+    unsteady = averaged(chain, replace(observations, joints=noisy))
+    np.testing.assert_allclose(unsteady.shared_variance(rig), 0.25 * expected, atol=0.2 * expected.max())
+    np.testing.assert_allclose(unsteady.own_variance(rig).mean(axis=0) / expected, 0.75 / 4.0, rtol=0.3)
+    few = averaged(chain, replace(observations, joints=noisy).select(np.arange(8)))
+    np.testing.assert_allclose(few.shared_variance(rig), expected)
 
 
 def test_a_repeat_that_disagrees_stands_alone(session: Session) -> None:

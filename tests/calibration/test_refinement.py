@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 from calibration.errors import CalibrationError
 from calibration.identification.additions import Additions
 from calibration.identification.refinement import Fit, Prior, information, posterior, prior_precision, refine
-from calibration.identification.samples import Samples, averaged, reading_variance
+from calibration.identification.samples import Samples, averaged
 from calibration.identification.solve import place
 from calibration.kernels.lineariser import Lineariser
 from calibration.kinematics import Chain, ChainData, Placement, rotation_about
@@ -39,9 +39,19 @@ def noisy_joints() -> Rig:
     return rig.model_copy(update={"joints": tuple(joints)})
 
 
-@pytest.fixture(scope="module")
-def fitted(noisy_joints: Rig) -> tuple[Chain, Samples, Fit]:
-    chain, samples, start = place(noisy_joints, standstills(RigTruth(noisy_joints, 21), 40, 21))
+def unsteady(observations: Observations, rig: Rig) -> Observations:
+    """Two fixes of each, whose readings differ by a half of what they may."""
+    twice, rng = observations.select(np.repeat(np.arange(len(observations)), 2)), np.random.default_rng(5)
+    joints = {j.name: twice.joints[j.name] + 0.5 * j.sigma * rng.normal(size=len(twice)) for j in rig.joints}
+    return replace(twice, joints=joints)
+
+
+@pytest.fixture(scope="module", params=["readings that stand", "readings that scatter"])
+def fitted(request: pytest.FixtureRequest, noisy_joints: Rig) -> tuple[Chain, Samples, Fit]:
+    observations = standstills(RigTruth(noisy_joints, 21), 40, 21)
+    if request.param == "readings that scatter":
+        observations = unsteady(observations, noisy_joints)
+    chain, samples, start = place(noisy_joints, observations)
     return chain, samples, refine(chain, samples, start.x)
 
 
@@ -51,11 +61,13 @@ def dense(chain: Chain, samples: Samples, x: Floats, excess: float) -> tuple[Flo
     assert samples.standstill is not None
     together = np.kron(samples.standstill[:, None] == samples.standstill, np.ones((3, 3)))
     by_joint = lin.joint_jacobian.reshape(3 * len(samples), -1)
-    covariance = together * ((by_joint * reading_variance(chain.rig)) @ by_joint.T)
+    covariance = together * ((by_joint * samples.shared_variance(chain.rig)) @ by_joint.T)
     covariance += block_diag(*samples.station_covariance) + excess * np.eye(len(covariance))
+    own = samples.own_variance(chain.rig)
     for row, (jacobian, rate) in enumerate(zip(lin.joint_jacobian, samples.rates, strict=True)):
         velocity = jacobian @ rate * chain.rig.station.timing_sigma_s
-        covariance[3 * row : 3 * row + 3, 3 * row : 3 * row + 3] += np.outer(velocity, velocity)
+        block = np.outer(velocity, velocity) + (jacobian * own[row]) @ jacobian.T
+        covariance[3 * row : 3 * row + 3, 3 * row : 3 * row + 3] += block
     return covariance, lin.jacobian.reshape(len(covariance), -1), (samples.position_mm - lin.position_mm).ravel()
 
 

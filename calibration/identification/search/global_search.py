@@ -11,7 +11,7 @@ import numpy as np
 
 from calibration.identification.approach import PRIOR_SCALE
 from calibration.identification.refinement import Fit, Prior, prior_precision
-from calibration.identification.samples import Samples, reading_covariance
+from calibration.identification.samples import Samples
 from calibration.identification.search.checkpoint import Checkpoint
 from calibration.identification.search.islands import Settings, evolve
 from calibration.identification.subset import drawn
@@ -75,9 +75,10 @@ def search_globally(
         seed, executor, progress, should_stop, checkpoint: as `evolve`.
     """
     rows = drawn(samples.data, samples.position_mm, _SEARCH_ROWS, seed)
-    data, position = samples.data.select(rows), samples.position_mm[rows]
+    searched = samples.select(rows)
+    data, position = searched.data, searched.position_mm
     lin = chain.linearise(nominal.x, data)
-    known = samples.station_covariance[rows] + reading_covariance(chain.rig, lin.joint_jacobian, samples.rates[rows])
+    known = searched.covariance(chain.rig, lin.joint_jacobian)
     # Noise far below the misfit would make the basin a needle's eye; the refinement has the true noise.
     variance = float(np.trace(known, axis1=1, axis2=2).mean()) / 3.0 + (scale_mm / 30.0) ** 2
     weight = np.full(len(rows), 1.0 / variance)
