@@ -40,7 +40,7 @@ def closes(first: Projection, last: Projection, weight: Floats, *, is_structured
         is_structured: whether what is left depends on anything; if it does not, it may be noise that is far larger
             than it is said to be.
     """
-    noise = _noise_mm2(last)
+    noise = last.samples.variance(last.situation.rig, last.joint_jacobian)
     misjudged = _MISJUDGED if is_structured else _FAR_MISJUDGED
     allowed = noise * ((1.0 + misjudged) ** 2 - 1.0)
     given_up = (weight >= OUTLIER) & (last.fit.weight < OUTLIER)
@@ -74,10 +74,3 @@ def depends(joint: JointFit, number: int, projection: Projection, rng: np.random
     if left < _LEFT * (explained + left) or not detect(grammar, rng).significant:
         return ""
     return grammar.terms[int(np.abs(grammar.score).argmax())].variable.text
-
-
-def _noise_mm2(projection: Projection) -> float:
-    """Variance of a fix by station, readings and instant, mean over the axes."""
-    samples, rig = projection.samples, projection.situation.rig
-    known = samples.covariance(rig, projection.joint_jacobian)
-    return float(np.trace(known, axis1=1, axis2=2).mean()) / 3.0

@@ -116,8 +116,7 @@ def tilts(chain: Chain, fit: Fit) -> Iterator[str]:
 def known_variance(chain: Chain, samples: Samples, fit: Fit) -> float:
     """What station, readings and repeats account for on the average, mm^2 per axis."""
     lin = chain.linearise(fit.x, samples.data)
-    known = samples.covariance(chain.rig, lin.joint_jacobian)
-    return float(np.trace(known, axis1=1, axis2=2).mean()) / 3.0
+    return samples.variance(chain.rig, lin.joint_jacobian)
 
 
 def at_the_noise(chain: Chain, samples: Samples, fit: Fit) -> bool:

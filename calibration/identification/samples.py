@@ -100,6 +100,10 @@ class Samples:
         shared = covariance_by_joints(joint_jacobian, self.shared_variance(rig))
         return shared + self.own_covariance(rig, joint_jacobian)
 
+    def variance(self, rig: Rig, joint_jacobian: Floats) -> float:
+        """Mean of it over samples and axes, mm^2; arguments as `covariance`."""
+        return float(np.trace(self.covariance(rig, joint_jacobian), axis1=1, axis2=2).mean()) / 3.0
+
 
 def station_covariance(rig: Rig, position_mm: Floats, sigma_mm: Floats) -> Floats:
     """(n, 3, 3) covariance of fixes at positions (n, 3), mm^2.

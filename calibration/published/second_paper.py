@@ -220,8 +220,7 @@ def _fit(chain: Chain, samples: Samples, state: _State, seen: Floats, unseen: Fl
     variance = state.squares / (3 * m - seen.shape[1])
     if not math.isfinite(variance):
         raise CalibrationError("identification: the fit left the range of numbers; check units of the observations")
-    known = samples.covariance(chain.rig, state.lin.joint_jacobian)
-    excess = max(variance - float(np.trace(known, axis1=1, axis2=2).mean()) / 3.0, 1e-12)
+    excess = max(variance - samples.variance(chain.rig, state.lin.joint_jacobian), 1e-12)
     triangle = np.linalg.qr(state.columns() @ seen, mode="r")
     half = seen @ np.linalg.inv(triangle)
     precision = np.concatenate([prior_precision(chain, 1.0), state.additions.prior_sigma**-2.0])

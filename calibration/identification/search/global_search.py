@@ -78,9 +78,8 @@ def search_globally(
     searched = samples.select(rows)
     data, position = searched.data, searched.position_mm
     lin = chain.linearise(nominal.x, data)
-    known = searched.covariance(chain.rig, lin.joint_jacobian)
     # Noise far below the misfit would make the basin a needle's eye; the refinement has the true noise.
-    variance = float(np.trace(known, axis1=1, axis2=2).mean()) / 3.0 + (scale_mm / 30.0) ** 2
+    variance = searched.variance(chain.rig, lin.joint_jacobian) + (scale_mm / 30.0) ** 2
     weight = np.full(len(rows), 1.0 / variance)
     fitness = Fitness.build(chain, data, position, weight, robust_scale=4.0 * scale_mm / math.sqrt(variance))
     reach = max(float(np.median(np.linalg.norm(position - position.mean(axis=0), axis=1))), 1.0)
