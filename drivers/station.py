@@ -30,7 +30,7 @@ from drivers.serialport import SerialConfig, SerialPort
 from drivers.sokkia.conversation import set_conversation
 from drivers.sokkia.interpreter import SetInterpreter
 from drivers.sokkia.set import SetFramer
-from drivers.survey import RecordError, position_mm
+from drivers.survey import RecordError, position_mm, range_checked
 from drivers.target import JumpGuard, LockWatch, MotionLimit, SilenceWatch
 from drivers.topcon.codec import GtsFramer
 from drivers.topcon.conversation import classic_conversation, tracking_conversation
@@ -68,6 +68,8 @@ class StationConfig(BaseModel):
             joins them with the joints takes it off.
         ack_timeout_s, reply_timeout_s, give_up_s, relock_after_s: see `drivers.conversation.Timing`.
         max_speed_m_s, jump_slack_m, new_target_after_s: see `drivers.target.MotionLimit`.
+        max_range_m: a fix further away is refused. The default is the longest that distance meters of these families
+            measure to a single prism, under good conditions.
         silence_timeout_s: no record for longer than this is a gap; 0 for a station that speaks when it is told to.
         ppm_scale, prism_scale_mm: see `drivers.topcon.records.CorrectionScales`.
     """
@@ -90,6 +92,7 @@ class StationConfig(BaseModel):
     max_speed_m_s: float = Field(default=5.0, gt=0)
     jump_slack_m: float = Field(default=0.1, gt=0)
     new_target_after_s: float = Field(default=30.0, gt=0)
+    max_range_m: float = Field(default=6000.0, gt=0)
     silence_timeout_s: float = Field(default=5.0, ge=0)
     ppm_scale: float = Field(default=0.1, gt=0)
     prism_scale_mm: float = Field(default=0.1, gt=0)
@@ -255,6 +258,7 @@ class StationDecoder:
         self._guard = JumpGuard(
             config.name, MotionLimit(config.max_speed_m_s, config.jump_slack_m, config.new_target_after_s)
         )
+        self._max_range_m = config.max_range_m
         self._silence = SilenceWatch(config.name, config.silence_timeout_s)
         self._last_byte: Stamp | None = None
 
@@ -293,7 +297,7 @@ class StationDecoder:
         records: list[Record] = []
         for record in said:
             if isinstance(record, Fix):
-                fix, jump = self._guard.see(record)
+                fix, jump = self._guard.see(range_checked(record, self._max_range_m))
                 records += [*self._silence.heard(record), *self._lock.see(record)]
                 records += [fix] if jump is None else [jump, fix]
             else:

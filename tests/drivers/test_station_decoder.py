@@ -40,6 +40,7 @@ from tests.drivers.serial_support import (
 )
 
 BYTE_S = 10 / 9600
+NEAR_COORDINATES = framed(b"U+00006148-00023344-00029912m+2515656d")
 
 
 def config(**settings: object) -> StationConfig:
@@ -142,8 +143,8 @@ def test_all_records_of_a_classic_station_become_fixes() -> None:
 
 
 def test_a_passive_listener_understands_what_the_profiles_understand() -> None:
-    (fix,) = fixes(decode(decoder(profile="passive"), [(1, COORDINATES + b"\x03")]))
-    assert position_mm(fix) == pytest.approx((-23344, 1234566148, -29912))
+    (fix,) = fixes(decode(decoder(profile="passive"), [(1, NEAR_COORDINATES)]))
+    assert position_mm(fix) == pytest.approx((-23344, 6148, -29912))
     (fix,) = fixes(decode(decoder(profile="passive", listen_to="sokkia"), [(1, SET_REPLY + b"\r\n")]))
     assert fix.slope_distance_m == pytest.approx(6.662)
 
@@ -308,6 +309,73 @@ def test_silence_of_a_station_that_speaks_when_it_is_told_to_may_be_ignored() ->
     assert station.tick(at(10_000)) == []
 
 
+# --- what no instrument can measure
+
+
+def test_a_distance_beyond_what_the_instrument_can_measure_is_refused() -> None:
+    records = decode(decoder(), [(1.0, tracking_record(6_000_000)), (1.1, tracking_record(6_000_001))])
+    near, far = fixes(records)
+    assert near.status is Status.OK
+    assert (far.status, far.reason) == (
+        Status.OUT_OF_RANGE,
+        "slope distance 6000.001 m is beyond max_range_m = 6000",
+    )
+    assert position_mm(far) is None
+    assert fixes(decode(decoder(max_range_m=9), [(1.0, tracking_record(10_000))]))[0].status is Status.OUT_OF_RANGE
+
+
+def test_coordinates_beyond_what_the_instrument_can_measure_are_refused() -> None:
+    (fix,) = fixes(decode(decoder(profile="topcon_classic"), [(1, COORDINATES + b"\x03")]))
+    assert (fix.status, fix.north_m) == (Status.OUT_OF_RANGE, pytest.approx(1234566.148))
+    assert "coordinates 1234566.149 m from their origin are beyond max_range_m = 6000" in fix.reason
+    assert "set the station's own coordinates to 0" in fix.reason
+
+
+# --- a Sokkia station without check sums
+
+
+def warnings(records: Sequence[Record]) -> list[str]:
+    return [text for kind, text in events(records) if kind is EventKind.WARNING]
+
+
+BARE_REPLY = SET_REPLY[:-3] + b"\r\n"
+FULL_REPLY = SET_REPLY + b"\r\n"
+
+
+def test_a_sokkia_station_without_check_sums_is_warned_about_once() -> None:
+    for profile in ({"profile": "sokkia_set"}, {"profile": "passive", "listen_to": "sokkia"}):
+        records = decode(decoder(**profile), [(k / 10, BARE_REPLY) for k in range(1, 30)])
+        (text,) = warnings(records)
+        assert "switch Checksum on" in text
+        assert [fix.status for fix in fixes(records)] == [Status.OK] * 29
+
+
+def test_the_identity_of_a_sokkia_station_tells_that_it_sends_no_check_sums() -> None:
+    assert warnings(decode(decoder(profile="sokkia_set"), [(1, b"A SET2C,123456,4100,2506\r\n")]))
+    assert not warnings(decode(decoder(profile="sokkia_set"), [(1, b"A SET2C,123456,4100,2506,39\r\n")]))
+
+
+def test_a_sokkia_station_with_check_sums_is_not_warned_about() -> None:
+    assert warnings(decode(decoder(profile="sokkia_set"), [(k / 10, FULL_REPLY) for k in range(1, 5)])) == []
+
+
+def test_a_reply_that_lost_its_check_sum_on_the_way_is_refused() -> None:
+    records = decode(decoder(profile="sokkia_set"), [(1, FULL_REPLY), (2, BARE_REPLY), (3, FULL_REPLY)])
+    assert len(fixes(records)) == 2
+    assert [reason for reason, _ in failures(records)] == [
+        "the line ends before its SUM, which the lines before it carry"
+    ]
+    assert warnings(records) == []
+
+
+def test_check_sums_that_are_switched_off_are_warned_about() -> None:
+    records = decode(
+        decoder(profile="sokkia_set"), [(1, FULL_REPLY), (2, BARE_REPLY), (3, BARE_REPLY), (4, BARE_REPLY)]
+    )
+    assert len(fixes(records)) == 3
+    assert len(warnings(records)) == 1
+
+
 # --- jumps to another prism
 
 
@@ -410,7 +478,7 @@ def test_shots_far_apart_in_time_are_not_judged() -> None:
 
 
 def test_coordinates_and_circles_are_never_compared() -> None:
-    records = decode(decoder(profile="topcon_classic"), [(1, SLOPE_MM + b"\x03"), (1.2, COORDINATES + b"\x03")])
+    records = decode(decoder(profile="topcon_classic"), [(1, SLOPE_MM + b"\x03"), (1.2, NEAR_COORDINATES)])
     assert usable(records) == [True, True]
 
 
