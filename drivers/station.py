@@ -13,6 +13,7 @@ from drivers.attendance import NOT_READ_IN_TIME, Attendance
 from drivers.bytestream import ByteTimes, Frame, Framer, Garbage
 from drivers.clock import NS_PER_S, Clock, Stamp
 from drivers.conversation import Conversation, Timing
+from drivers.device_watch import DeviceWatch, watch_path
 from drivers.errors import LinkError
 from drivers.readings import (
     Capture,
@@ -43,8 +44,8 @@ _LONGEST_READ_S = 0.5  # how soon a loop with nothing to do notices that it is t
 _LONGEST_WRITE_S = 5.0
 _SET_PAUSE_S = 0.7  # SET600: the next command comes this long after ACK or NAK
 _UNFINISHED_NS = 2 * NS_PER_S  # an unfinished record is given up after this; the slowest takes 0.6 s at 1200 baud
-_FIRST_RETRY_S = 0.5
-_LAST_RETRY_S = 10.0
+_FIRST_PAUSE_S = 0.5
+_LAST_PAUSE_S = 2.0  # a device is back for no longer than this before it is opened, also where nothing can be watched
 
 Emit = Callable[[LinkItem], None]
 
@@ -159,31 +160,40 @@ class StationLink:
 
         Emits captures at once, LINK_UP, LINK_LOST, CONFIGURED and INSTRUMENT_ERROR events, and the LINK_DOWN gap.
         """
-        retry_s = _FIRST_RETRY_S
-        opened: Stamp | None = None
+        with closing(watch_path(self._config.serial.path)) as watch:
+            self._run(watch, emit, stop)
+
+    def _run(self, watch: DeviceWatch, emit: Emit, stop: threading.Event) -> None:
+        pause_s = _FIRST_PAUSE_S
         down_since: Stamp | None = None
         told = ""
         while not stop.is_set():
+            opened: Stamp | None = None
             try:
                 port = SerialPort(self._config.serial, self.name, self._clock.real_seconds(_LONGEST_WRITE_S))
                 with closing(port):
+                    watch.close()
                     self._tell(emit, EventKind.LINK_UP, f"{self._config.serial.path} opened")
                     if down_since is not None:
                         emit(Gap(self.name, GapReason.LINK_DOWN, down_since, self._clock.now()))
                     down_since, told, opened = None, "", self._clock.now()
                     self._converse(port, emit, stop)
             except LinkError as error:
-                if opened is not None and self._clock.now().since(opened) > _LAST_RETRY_S * NS_PER_S:
-                    retry_s = _FIRST_RETRY_S  # a port that fails as soon as it is open is tried ever more rarely
-                opened = None
                 if down_since is None:
                     down_since = self._clock.now()
                     emit(Gap(self.name, GapReason.LINK_DOWN, down_since))
                 if str(error) != told:  # once a cause, not once an attempt
                     told = str(error)
                     self._tell(emit, EventKind.LINK_LOST, told)
-                self._clock.wait(stop, retry_s)
-                retry_s = min(2 * retry_s, _LAST_RETRY_S)
+                is_short_lived = opened is not None and self._clock.now().since(opened) < _LAST_PAUSE_S * NS_PER_S
+                if opened is not None and not is_short_lived:
+                    pause_s = _FIRST_PAUSE_S
+                real_s = min(pause_s, self._clock.real_seconds(pause_s))
+                if is_short_lived:
+                    stop.wait(real_s)  # it comes and goes by itself: to try whenever it comes would be to spin
+                else:
+                    watch.wait(stop, real_s)
+                pause_s = min(2 * pause_s, _LAST_PAUSE_S)
 
     def _converse(self, port: SerialPort, emit: Emit, stop: threading.Event) -> None:
         conversation = start_conversation(self._config)
