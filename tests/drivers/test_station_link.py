@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from pathlib import Path
 
@@ -186,7 +187,7 @@ def test_a_port_that_fails_as_soon_as_it_is_open_is_not_tried_without_a_pause(tm
                 instrument.unplug()
                 instrument.plug_in()  # at once: a new entry in the directory each time
             opened = [event.stamp.monotonic_ns for event in collected.events(EventKind.LINK_UP)]
-        pauses = [later - earlier for earlier, later in zip(opened, opened[1:], strict=False)]
+        pauses = [later - earlier for earlier, later in itertools.pairwise(opened)]
         assert all(pause >= 0.5e9 * 2**k for k, pause in enumerate(pauses))
 
 
