@@ -66,7 +66,7 @@ class Daemon:
             parts.rig,
             parts.joiner,
             self._live_model,
-            self._setups.newest_usable,
+            self._setups.current,
             parts.clock,
             prism,
             fresh_s=FRESH_S / parts.clock.real_seconds(1.0),  # what delays readings here are computers, in real time
@@ -133,6 +133,7 @@ class Daemon:
             "session.stop": sessions.stop_command,
             "session.abort": sessions.abort_command,
             "session.shoot": sessions.shoot_command,
+            "session.accept": sessions.accept_command,
             "session.list": sessions.list_command,
             "session.show": sessions.show_command,
             "jobs.list": jobs.list_command,
