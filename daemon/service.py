@@ -11,7 +11,7 @@ from typing import Any
 
 from calibration.rig import Rig
 from daemon.acquisition import Acquisition
-from daemon.composition import Parts
+from daemon.composition import Parts, motion_limits
 from daemon.config import Config
 from daemon.control import FAILED, REFUSED, CommandError, ControlServer, Handler
 from daemon.drift_table import DriftTable
@@ -58,6 +58,7 @@ class Daemon:
             parts.clock,
             run_id=store.run_id,
             aim=parts.aim,
+            limits=motion_limits(config),
         )
         models = ModelTable(store, parts.rig.name, parts.clock)
         self._live_model = LiveModel(models, parts.rig)
@@ -133,6 +134,7 @@ class Daemon:
             "session.stop": sessions.stop_command,
             "session.abort": sessions.abort_command,
             "session.shoot": sessions.shoot_command,
+            "session.confirm-prism": sessions.confirm_prism_command,
             "session.accept": sessions.accept_command,
             "session.list": sessions.list_command,
             "session.show": sessions.show_command,

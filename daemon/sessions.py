@@ -20,13 +20,15 @@ from daemon.config import SessionsSection
 from daemon.control import FAILED, CommandError
 from daemon.joiner import JoinedFix, ObservationJoiner
 from daemon.open_session import OpenSession, Shot, within
+from daemon.prism_guard import MotionLimit, Suspicion, Word
+from daemon.prism_watch import PrismWatch, as_dict
 from daemon.scheduler import CHECK, SESSION_KINDS
 from daemon.session_table import SessionTable
 from daemon.setups import AXES, Place, SetupBook, identifier, text_argument
 from daemon.standstill_places import StandstillPlaces
 from daemon.store.errors import is_unwritable
 from daemon.store.store import Store
-from drivers.clock import Clock
+from drivers.clock import Clock, Stamp
 from drivers.readings import DeviceEvent, EventKind, Fix, Record, Status
 from drivers.station import position_mm
 
@@ -34,7 +36,6 @@ log = logging.getLogger(__name__)
 
 STANDING_KINDS = ("static_poses", CHECK)
 CHECK_POSES = (3, 5)
-CONTROL_POINT_RADIUS_MM = 300.0  # a fix this close to a control point is of the control point, not of the boom
 SHOT_SPREAD_MM = 20.0  # fixes of one shot that lie further apart are not of one standing target
 
 
@@ -51,6 +52,7 @@ class SessionKeeper:
         run_id: of this run of the daemon; poses are numbered within it.
         aim: turns the station to a prism or control point where something can (a simulated rig); None where the
             operator does it.
+        limits: station -> what motion can do to its prism.
     """
 
     def __init__(
@@ -65,6 +67,7 @@ class SessionKeeper:
         *,
         run_id: int,
         aim: Callable[[str], None] | None = None,
+        limits: Mapping[str, MotionLimit] | None = None,
     ) -> None:
         self._rig, self._rig_text = rig, rig_text
         self._store, self._joiner, self._settings, self._clock = store, joiner, settings, clock
@@ -75,6 +78,7 @@ class SessionKeeper:
         self._shot: Shot | None = None
         self._ended: OpenSession | None = None  # the last one: fixes measured in it may still wait for their joints
         self._places = StandstillPlaces(rig)
+        self._prisms = PrismWatch(store, clock, limits or {})
         self._unstored: list[Callable[[], object]] = []  # observations that the store has yet to take, in their order
         self._is_waiting = False
         self._open = self._reopen()
@@ -86,6 +90,7 @@ class SessionKeeper:
         for record in records:
             if isinstance(record, Fix):
                 self._feed_shot(record)
+                self._watch_prism(record)
             elif isinstance(record, DeviceEvent) and record.kind is EventKind.PRESET_JUMP:
                 for session in (self._ended, self._open):
                     if session is not None and session.lasted(record.stamp):
@@ -109,6 +114,13 @@ class SessionKeeper:
         shot.places_mm.append(place_mm)
         if len(shot.fixes) == shot.wanted:
             shot.done.set_result(None)
+
+    def _watch_prism(self, fix: Fix) -> None:
+        for session in (self._ended, self._open):
+            if session is not None and session.lasted(fix.stamp):
+                event = self._prisms.see(session, fix)
+                if event is not None:
+                    self._unstored.append(partial(self._store.insert_records, [event]))
 
     def _observe(self, joined: JoinedFix) -> None:
         session = next((s for s in (self._ended, self._open) if s is not None and s.has(joined.stamp)), None)
@@ -160,8 +172,11 @@ class SessionKeeper:
         for joint in self._rig.joint_names:
             if joint in session.jumped and within(joined.stamp, session.jumped[joint], None):
                 return f"{joint} jumped: its readings from then on do not fit those before"
-        if any(math.dist(place_mm, p) < CONTROL_POINT_RADIUS_MM for p in session.control_points):
+        if session.is_control_point(place_mm):
             return "a control point, not the prism"
+        doubt = self._prisms.doubt(session, joined.fix)
+        if doubt is not None:
+            return doubt
         if session.kind in STANDING_KINDS and joined.standstill is None:
             return "moving"
         return None
@@ -201,6 +216,7 @@ class SessionKeeper:
             }
             self._table.start(row, now)
             self._open = session = OpenSession(session_id, setup_id, prism, kind, now, control_points=points)
+            self._turned(session, now)
             return {
                 "id": session_id,
                 "setup": setup_id,
@@ -243,15 +259,22 @@ class SessionKeeper:
                 shot.aimed = self._clock.now()
                 self._shot = shot
                 self._await(shot)
+                phase = self._table.phase(session.id, name)
+                result = self._setups.store_shot(session.setup_id, session.id, name, phase, shot.fixes, shot.places_mm)
+                # Before the shot is over: fixes that come late are of the point, and known to be
+                session.control_points = self._setups.control_points(session.setup_id)
             finally:
                 self._shot = None
                 if self._aim is not None:
                     self._aim(session.prism)
                 shot.until = self._clock.now()
-            phase = self._table.phase(session.id, name)
-            result = self._setups.store_shot(session.setup_id, session.id, name, phase, shot.fixes, shot.places_mm)
-            session.control_points = self._setups.control_points(session.setup_id)
+                self._turned(session, shot.until)
             return result | {"advice": _after_a_move(session) if result["moved"] else []}
+
+    def confirm_prism_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Take the operator's word that the station is on the session's prism: its fixes count from now on."""
+        with self._commands:
+            return self._prisms.confirm(self._needs_open(), text_argument(arguments, "operator"))
 
     def list_command(self, _arguments: Mapping[str, Any]) -> list[dict[str, Any]]:
         """All sessions with what they hold, oldest first."""
@@ -265,9 +288,22 @@ class SessionKeeper:
     def open_session(self) -> dict[str, Any] | None:
         """What `status` shows of the open session."""
         session = self._open
-        return None if session is None else self._table.summary(session.id)
+        if session is None:
+            return None
+        suspicions = [as_dict(suspicion) for suspicion in self._prisms.suspicions(session)]
+        return self._table.summary(session.id) | {"prism_suspicions": suspicions}
+
+    def prism_suspicions(self) -> list[Suspicion]:
+        """Stations that may be on another prism than that of the open session; from any thread."""
+        session = self._open
+        return [] if session is None else self._prisms.suspicions(session)
 
     # ---- parts -------------------------------------------------------------------------------------------------------
+
+    def _turned(self, session: OpenSession, at: Stamp) -> None:
+        """Where something aims the station, it has been told to turn to the session's prism."""
+        if self._aim is not None:
+            session.words.append(Word(at, is_turning=True))
 
     def _await(self, shot: Shot) -> None:
         """Wait until the shot is complete; the time-out runs on the clock of the rig."""
@@ -294,6 +330,10 @@ class SessionKeeper:
             f"{joint} jumped during the session, and nothing after that is used: if its encoder was preset, start anew"
             for joint in self._rig.joint_names
             if joint in session.jumped
+        ]
+        advice += [
+            f"{suspicion.reason}; its fixes since then do not count: {suspicion.remedy}"
+            for suspicion in self._prisms.suspicions(session)
         ]
         if phase == "start":
             advice.append("stand still at every pose until status counts it; move all joints through their ranges")
@@ -335,6 +375,10 @@ class SessionKeeper:
             self._aim(session.prism)  # what aims may have forgotten; an operator's station has kept its lock
         session.control_points = self._setups.control_points(session.setup_id)
         session.jumped = dict.fromkeys(self._table.jumped(session.id))
+        if self._aim is None:
+            self._prisms.restore(session)
+        else:
+            self._turned(session, self._clock.now())
         return session
 
 

@@ -30,9 +30,9 @@ from drivers.readings import (
 from drivers.serialport import SerialConfig, SerialPort
 from drivers.sokkia.conversation import set_conversation
 from drivers.sokkia.interpreter import SetInterpreter
-from drivers.sokkia.set import SetFramer
+from drivers.sokkia.set import TRACKING, SetFramer
 from drivers.survey import RecordError, position_mm, range_checked
-from drivers.target import JumpGuard, LockWatch, MotionLimit, SilenceWatch
+from drivers.target import LockWatch, SilenceWatch
 from drivers.topcon.codec import GtsFramer
 from drivers.topcon.conversation import classic_conversation, tracking_conversation
 from drivers.topcon.interpreter import GtsInterpreter
@@ -68,7 +68,10 @@ class StationConfig(BaseModel):
         link_delay_s: constant delay from the measurement to the first byte on the host. Fixes do not contain it; who
             joins them with the joints takes it off.
         ack_timeout_s, reply_timeout_s, give_up_s, relock_after_s: see `drivers.conversation.Timing`.
-        max_speed_m_s, jump_slack_m, new_target_after_s: see `drivers.target.MotionLimit`.
+        max_speed_m_s, jump_slack_m, relock_within_m: a target that moves by more than the first two allow from one fix
+            to the next may be another prism, and so may one that is locked, after the prism was lost, further than the
+            third from where that was. In a session such fixes do not count until the station is back or an operator
+            confirms the prism.
         max_range_m: a fix further away is refused. The default is the longest that distance meters of these families
             measure to a single prism, under good conditions.
         silence_timeout_s: no record for longer than this is a gap; 0 for a station that speaks when it is told to.
@@ -92,11 +95,21 @@ class StationConfig(BaseModel):
     relock_after_s: float = Field(default=30.0, gt=0)
     max_speed_m_s: float = Field(default=5.0, gt=0)
     jump_slack_m: float = Field(default=0.1, gt=0)
-    new_target_after_s: float = Field(default=30.0, gt=0)
+    relock_within_m: float = Field(default=2.0, gt=0)
     max_range_m: float = Field(default=6000.0, gt=0)
     silence_timeout_s: float = Field(default=5.0, ge=0)
     ppm_scale: float = Field(default=0.1, gt=0)
     prism_scale_mm: float = Field(default=0.1, gt=0)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_prism_is_accepted_by_time(cls, given: object) -> object:
+        if isinstance(given, dict) and "new_target_after_s" in given:
+            raise ValueError(
+                "new_target_after_s is gone, remove it: another prism is never taken for the one that is meant because "
+                "time has passed; `rigcal session confirm-prism` says that it is"
+            )
+        return given
 
     @field_validator("init")
     @classmethod
@@ -116,6 +129,11 @@ class StationConfig(BaseModel):
     def is_sokkia(self) -> bool:
         """Whether the station's records are those of the SET family."""
         return self.profile == "sokkia_set" or (self.profile == "passive" and self.listen_to == "sokkia")
+
+    @property
+    def tracks_silently(self) -> bool:
+        """Whether the station follows its prism by itself although its records say nothing of its lock."""
+        return self.is_sokkia and TRACKING.decode() in self.init
 
 
 def start_conversation(config: StationConfig) -> Conversation | None:
@@ -265,9 +283,6 @@ class StationDecoder:
         )
         self._times = ByteTimes(config.serial.character_s)
         self._lock = LockWatch(config.name)
-        self._guard = JumpGuard(
-            config.name, MotionLimit(config.max_speed_m_s, config.jump_slack_m, config.new_target_after_s)
-        )
         self._max_range_m = config.max_range_m
         self._silence = SilenceWatch(config.name, config.silence_timeout_s)
         self._last_byte: Stamp | None = None
@@ -307,9 +322,8 @@ class StationDecoder:
         records: list[Record] = []
         for record in said:
             if isinstance(record, Fix):
-                fix, jump = self._guard.see(range_checked(record, self._max_range_m))
-                records += [*self._silence.heard(record), *self._lock.see(record)]
-                records += [fix] if jump is None else [jump, fix]
+                fix = range_checked(record, self._max_range_m)
+                records += [*self._silence.heard(fix), *self._lock.see(fix), fix]
             else:
                 records.append(record)
         return records

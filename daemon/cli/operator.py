@@ -223,6 +223,17 @@ def session_shoot(point: str, **where: Any) -> Any:
     return ask(where, "session.shoot", show, timeout_s=SHOT_TIMEOUT_S, point=point)
 
 
+@session.command(cls=Command, name="confirm-prism")
+@click.option("--operator", default=lambda: os.environ.get("USER", ""), help="Who says so.")
+@talks
+def session_confirm_prism(operator: str, **where: Any) -> Any:
+    """Say that the station is on the prism of the open session, although it looks like another one.
+
+    Fixes count from now on; those that were in doubt before stay excluded.
+    """
+    return ask(where, "session.confirm-prism", lambda c, r: say(c, r["text"]), operator=operator)
+
+
 @session.command(cls=Command, name="list")
 @talks
 def session_list(**where: Any) -> Any:
@@ -278,6 +289,9 @@ def _show_session(console: Console, session: dict[str, Any]) -> None:
     )
     for reason, n in session["excluded"].items():
         say(console, f"  {n} excluded: {reason}")
+    for suspicion in session.get("prism_suspicions", ()):
+        console.print(f"  [red]since {utc(suspicion['since_utc_ns'])}[/]", end=" ", highlight=False)
+        say(console, f"{suspicion['text']}; its fixes do not count: {suspicion['remedy']}")
     for shot in session["control_shots"]:
         size = "defined" if shot["misclosure_mm"] is None else f"misclosure {shot['misclosure_mm']:.1f} mm"
         say(console, f"  control point {shot['point']} at the {shot['phase']}: {size}")

@@ -252,6 +252,18 @@ def m009_uncontrolled_sessions(db: Database) -> None:
     )
 
 
+@MIGRATIONS()
+def m014_prism_confirmations(db: Database) -> None:
+    """Operators' words that a session's stations are on its prism: fixes that looked like another one's count again."""
+    _create(
+        db,
+        f"""CREATE TABLE prism_confirmations (id INTEGER PRIMARY KEY,
+            session_id TEXT NOT NULL REFERENCES calibration_sessions(id), {_instant()},
+            operator TEXT NOT NULL DEFAULT '') STRICT""",
+        "CREATE INDEX prism_confirmations_by_session ON prism_confirmations(session_id)",
+    )
+
+
 def unknown_migrations(db: Database) -> list[str]:
     """Migrations that `db` has and this program does not know: it was made by a newer one."""
     empty = Database(memory=True)
