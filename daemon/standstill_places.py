@@ -1,8 +1,8 @@
 """Places of one standstill: the boom does not move, so fixes of its prism lie at one place.
 
-A station that lost its prism may lock on to another one, or to a reflection, and its fixes look as good as before. Where
-the fixes of a standstill lie at several places, the place with the most fixes is taken for the prism's and the fixes of
-the others are excluded; while two places have equally many, both are. More fixes may turn the decision.
+A station that lost its prism may lock on to another one, or to a reflection, and its fixes look as good as before.
+Where the fixes of a standstill lie at several places, the place with the most fixes is taken for the prism's and the
+fixes of the others are excluded; while two places have equally many, both are. More fixes may turn the decision.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from calibration.rig import Rig
 from daemon.setups import Place
 
-# Fixes of a standing prism scatter by some mm, in tracking mode by 10 mm, and a long boom that has just stopped sways by
-# some tens of mm. Two prisms, or a prism and a reflection, that are nearer to each other than this look like one.
+# Fixes of a standing prism scatter by some mm, in tracking mode by 10 mm, and a long boom that has just stopped sways
+# by some tens of mm. Two prisms, or a prism and a reflection, that are nearer to each other than this look like one.
 SAME_PLACE_MM = 100.0
 MOST_PLACES = 100
 SETTLED_FIXES = 50_000  # hours; what was decided by then stays
@@ -88,11 +88,9 @@ class StandstillPlaces:
 
     def _place(self, place_mm: Place, joints: Mapping[str, float]) -> _Place:
         """The nearest place that a fix may belong to, or a new one."""
-        near = [
-            p for p in self._places if math.dist(place_mm, p.latest_mm) <= SAME_PLACE_MM + self._moved_mm(p, joints)
-        ]
+        near = [place for place in self._places if self._is_near(place, place_mm, joints)]
         if near:
-            return min(near, key=lambda p: math.dist(place_mm, p.latest_mm))
+            return min(near, key=lambda place: math.dist(place_mm, place.latest_mm))
         if len(self._places) == MOST_PLACES:
             self._places.remove(min(self._places, key=lambda p: p.count))  # its fixes stay excluded
         made = _Place(place_mm, place_mm, joints)
@@ -101,12 +99,11 @@ class StandstillPlaces:
         self._places.append(made)
         return made
 
-    def _moved_mm(self, place: _Place, joints: Mapping[str, float]) -> float:
-        """How far the joints' changes since a place's latest fix can have moved the prism."""
-        common = joints.keys() & place.joints.keys()
-        return sum(
-            _change(column, joints[column] - place.joints[column]) * self._travel_mm[column] for column in common
-        )
+    def _is_near(self, place: _Place, place_mm: Place, joints: Mapping[str, float]) -> bool:
+        """True if scatter, sway and what the joints have moved since explain the distance from a place's latest fix."""
+        changes = {column: joints[column] - place.joints[column] for column in joints.keys() & place.joints.keys()}
+        moved_mm = sum(_size(column, change) * self._travel_mm[column] for column, change in changes.items())
+        return math.dist(place_mm, place.latest_mm) <= SAME_PLACE_MM + moved_mm
 
     def _decide(self) -> Exclusions:
         """Exclude all but the place with the most fixes; the fixes for which that is news."""
@@ -138,9 +135,9 @@ def _metres(place: _Place, other: _Place) -> str:
     return f"{math.dist(place.first_mm, other.first_mm) / 1000:.2f}"
 
 
-def _change(column: str, difference: float) -> float:
+def _size(column: str, change: float) -> float:
     """Size of a joint's change; of an angle the short way round."""
-    return abs(math.remainder(difference, 360.0) if column.endswith("_deg") else difference)
+    return abs(math.remainder(change, 360.0) if column.endswith("_deg") else change)
 
 
 def _travel_mm(rig: Rig) -> dict[str, float]:

@@ -36,7 +36,8 @@ def rigcal(*arguments: str) -> subprocess.CompletedProcess[str]:
 def record(daemon: DaemonProcess, prism: str, kind: str, poses: int) -> dict[str, Any]:
     name = daemon.say("session.start", prism=prism, kind=kind, operator="Ada")["id"]
     daemon.say("session.shoot", point="cp1")
-    daemon.wait(f"{poses} poses", lambda: daemon.say("session.show", id=name)["poses"] >= poses)
+    early = daemon.say("session.show", id=name)["poses"]  # before the shot; a busy computer was slow to say it
+    daemon.wait(f"{poses} poses", lambda: daemon.say("session.show", id=name)["poses"] >= early + poses)
     daemon.say("session.shoot", point="cp1")
     return dict(daemon.say("session.stop"))
 
