@@ -60,7 +60,7 @@ class PrismWatch:
         """Take the word that the session's stations are on its prism: their fixes count from now on."""
         ended = self.suspicions(session)
         at = self._clock.now()
-        row = {"session_id": session.id, **self._store.instant(at), "operator": operator}
+        row = {"session_id": session.id, **self._store.instant(at), "operator": operator, "turning": False}
         who = operator or "an operator"
         text = f"{who} confirms that the station is on prism {session.prism}; its fixes count from now on"
         stations = [suspicion.station for suspicion in ended] or [*self._limits]
@@ -72,6 +72,12 @@ class PrismWatch:
         log.info("session %s: %s", session.id, text)
         return {"session": session.id, "prism": session.prism, "text": text, "ended": [as_dict(s) for s in ended]}
 
+    def turned(self, session: OpenSession, at: Stamp) -> None:
+        """The station was turned to the session's prism by something that knows where that is."""
+        row = {"session_id": session.id, **self._store.instant(at), "turning": True}
+        self._store.insert("prism_confirmations", row)
+        session.words.append(Word(at, is_turning=True))
+
     def restore(self, session: OpenSession) -> None:
         """What an earlier run of the daemon knew, from what it stored; where it left off, the next fix is a new lock.
 
@@ -80,7 +86,7 @@ class PrismWatch:
         with Reader(self._store.path) as reader:
             boots = reader.boots()
             words = reader.rows("SELECT * FROM prism_confirmations WHERE session_id = ? ORDER BY id", (session.id,))
-            session.words += [Word(stamp_of(row, boots)) for row in words]
+            session.words += [Word(stamp_of(row, boots), bool(row["turning"])) for row in words]
             for station in self._limits:
                 for row in reader.rows(_FIXES, (session.id, station)):
                     self._take(session, _fix(station, row, stamp_of(row, boots)))

@@ -20,7 +20,7 @@ from daemon.config import SessionsSection
 from daemon.control import FAILED, CommandError
 from daemon.joiner import JoinedFix, ObservationJoiner
 from daemon.open_session import OpenSession, Shot, within
-from daemon.prism_guard import MotionLimit, Suspicion, Word
+from daemon.prism_guard import MotionLimit, Suspicion
 from daemon.prism_watch import PrismWatch, as_dict
 from daemon.scheduler import CHECK, SESSION_KINDS
 from daemon.session_table import SessionTable
@@ -28,7 +28,7 @@ from daemon.setups import AXES, Place, SetupBook, identifier, text_argument
 from daemon.standstill_places import StandstillPlaces
 from daemon.store.errors import is_unwritable
 from daemon.store.store import Store
-from drivers.clock import Clock, Stamp
+from drivers.clock import Clock
 from drivers.readings import DeviceEvent, EventKind, Fix, Record, Status
 from drivers.station import position_mm
 
@@ -216,7 +216,8 @@ class SessionKeeper:
             }
             self._table.start(row, now)
             self._open = session = OpenSession(session_id, setup_id, prism, kind, now, control_points=points)
-            self._turned(session, now)
+            if self._aim is not None:
+                self._prisms.turned(session, now)
             return {
                 "id": session_id,
                 "setup": setup_id,
@@ -268,13 +269,21 @@ class SessionKeeper:
                 if self._aim is not None:
                     self._aim(session.prism)
                 shot.until = self._clock.now()
-                self._turned(session, shot.until)
+                if self._aim is not None:
+                    self._prisms.turned(session, shot.until)
             return result | {"advice": _after_a_move(session) if result["moved"] else []}
 
     def confirm_prism_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Take the operator's word that the station is on the session's prism: its fixes count from now on."""
         with self._commands:
             return self._prisms.confirm(self._needs_open(), text_argument(arguments, "operator"))
+
+    def turned_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """In a replay: the station was turned to the session's prism at this instant."""
+        with self._commands:
+            session = self._needs_open()
+            self._prisms.turned(session, self._clock.now())
+            return {"session": session.id}
 
     def list_command(self, _arguments: Mapping[str, Any]) -> list[dict[str, Any]]:
         """All sessions with what they hold, oldest first."""
@@ -293,17 +302,27 @@ class SessionKeeper:
         suspicions = [as_dict(suspicion) for suspicion in self._prisms.suspicions(session)]
         return self._table.summary(session.id) | {"prism_suspicions": suspicions}
 
+    def aim_again(self) -> None:
+        """Where something can aim the station, do what an operator would when it may be on another prism."""
+        session = self._open
+        if self._aim is None or session is None or not self.prism_suspicions():
+            return
+        if self._commands.acquire(blocking=False):  # else a command is at work on the session: another time
+            try:
+                if session is self._open:
+                    self._aim(session.prism)
+                    self._prisms.turned(session, self._clock.now())
+            except CommandError as error:
+                log.warning("station not aimed at prism %s again: %s", session.prism, error)
+            finally:
+                self._commands.release()
+
     def prism_suspicions(self) -> list[Suspicion]:
         """Stations that may be on another prism than that of the open session; from any thread."""
         session = self._open
         return [] if session is None else self._prisms.suspicions(session)
 
     # ---- parts -------------------------------------------------------------------------------------------------------
-
-    def _turned(self, session: OpenSession, at: Stamp) -> None:
-        """Where something aims the station, it has been told to turn to the session's prism."""
-        if self._aim is not None:
-            session.words.append(Word(at, is_turning=True))
 
     def _await(self, shot: Shot) -> None:
         """Wait until the shot is complete; the time-out runs on the clock of the rig."""
@@ -378,7 +397,7 @@ class SessionKeeper:
         if self._aim is None:
             self._prisms.restore(session)
         else:
-            self._turned(session, self._clock.now())
+            self._prisms.turned(session, self._clock.now())
         return session
 
 

@@ -217,7 +217,9 @@ def replay(
             start = {"id": REPLAYED, "prism": told.prism, "kind": told.kind, "operator": "replay"}
             operator.append((told.since_utc_ns, partial(keeper.start_command, start)))
             confirm = partial(keeper.confirm_prism_command, {"operator": "replay"})
-            operator.extend((at_ns, confirm) for at_ns in told.prism_confirmed_utc_ns)
+            words = [(at_ns, confirm) for at_ns in told.prism_confirmed_utc_ns]
+            words += [(at_ns, partial(keeper.turned_command, {})) for at_ns in told.prism_turned_utc_ns]
+            operator.extend(sorted(words, key=lambda word: word[0]))
             operator.append((told.until_utc_ns, partial(keeper.stop_command, {})))
         acquisition = Acquisition((), made, store, clock, on_records=keeper.on_records)
         acquisition.run_inline(_followed(merged(files, settings), clock, operator))

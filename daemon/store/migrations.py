@@ -254,12 +254,14 @@ def m009_uncontrolled_sessions(db: Database) -> None:
 
 @MIGRATIONS()
 def m014_prism_confirmations(db: Database) -> None:
-    """Operators' words that a session's stations are on its prism: fixes that looked like another one's count again."""
+    """Words that a session's stations are on its prism: fixes that looked like another one's count from then on."""
     _create(
         db,
+        # turning: nobody said so, but something turned the station to the prism; it may have measured what it was on
+        # before for a while.
         f"""CREATE TABLE prism_confirmations (id INTEGER PRIMARY KEY,
             session_id TEXT NOT NULL REFERENCES calibration_sessions(id), {_instant()},
-            operator TEXT NOT NULL DEFAULT '') STRICT""",
+            operator TEXT NOT NULL DEFAULT '', turning INTEGER NOT NULL CHECK (turning IN (0, 1))) STRICT""",
         "CREATE INDEX prism_confirmations_by_session ON prism_confirmations(session_id)",
     )
 

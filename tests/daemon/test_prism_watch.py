@@ -201,6 +201,30 @@ def test_another_prism_that_was_found_while_the_daemon_was_away_is_suspected(rig
     assert set(used(rig)) == {8000}
 
 
+def test_where_something_can_aim_a_station_that_is_suspected_is_aimed_again(rig: Rig) -> None:
+    def aim(target: str) -> None:
+        rig.aimed.append(target)
+        rig.target_mm = PRISM_MM
+
+    rig.keeper = rig.new_keeper(aim)
+    start(rig)
+    rig.live(2)
+    rig.keeper.aim_again()
+    assert rig.aimed == ["r"]
+    rig.target_mm = ANOTHER_MM  # taken for the turn that the start told it to make
+    rig.live(1)
+    rig.target_mm = (3000.0, 28000.0, 1000.0)
+    rig.live(1)
+    assert len(rig.keeper.prism_suspicions()) == 1
+    rig.keeper.aim_again()
+    assert rig.aimed == ["r", "r"]
+    rig.values["theta1"] += 5
+    before = len(used(rig))
+    rig.live(2)
+    assert set(used(rig)[before:]) == {8000}
+    assert [row["turning"] for row in table(rig.store.path, "prism_confirmations")] == [1, 1]
+
+
 def test_what_operators_confirmed_is_exported_with_the_session(rig: Rig, tmp_path: Path) -> None:
     start(rig, id="s1")
     rig.live(2)

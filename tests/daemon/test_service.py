@@ -158,6 +158,19 @@ def test_a_target_that_is_not_there_is_refused_at_once_and_the_rig_goes_on(finis
     finished.say("session.abort")
 
 
+def test_an_operator_confirms_the_prism_and_status_says_whether_it_is_suspected(finished: DaemonProcess) -> None:
+    socket = ("--socket", str(finished.socket))
+    refused = rigcal("session", "confirm-prism", *socket)
+    assert refused.returncode == 2
+    assert "no session is open" in refused.stderr
+    finished.say("session.start", prism="r", id="confirmed")
+    confirmed = rigcal("session", "confirm-prism", "--operator", "Ada", *socket)
+    assert confirmed.returncode == 0, confirmed.stderr
+    assert "Ada confirms that the station is on prism r" in confirmed.stdout
+    assert finished.say("status")["session"]["prism_suspicions"] == []
+    finished.say("session.abort")
+
+
 def test_an_accepted_model_gives_the_live_tip_on_the_socket_and_on_the_bus(finished: DaemonProcess) -> None:
     socket = ("--socket", str(finished.socket))
     early, best = finished.say("model.list")
