@@ -32,14 +32,17 @@ _COUNTS = """SELECT count(*) FILTER (WHERE excluded IS NULL) AS observations,
 _EXCLUDED = """SELECT excluded AS reason, count(*) AS n FROM observations
     WHERE session_id = ? AND excluded IS NOT NULL GROUP BY excluded ORDER BY n DESC, reason"""
 _SHOTS = "SELECT name AS point, phase, misclosure_mm FROM control_shots WHERE session_id = ? ORDER BY id"
-# Every instant of a session after the one before it. Within a boot both clocks run alike, whatever NTP does to their
-# rate: their difference changes only when the clock is set. A later boot must not show an earlier time.
-_CLOCK_STEPS = f"""WITH instants AS (
+_INSTANTS = """WITH instants AS (
         SELECT boot_id, monotonic_ns, utc_ns FROM observations WHERE session_id = ?1
         UNION ALL SELECT boot_id, monotonic_ns, utc_ns FROM control_shots WHERE session_id = ?1
         UNION ALL SELECT started_boot_id, started_monotonic_ns, started_utc_ns FROM calibration_sessions WHERE id = ?1
         UNION ALL SELECT ended_boot_id, ended_monotonic_ns, ended_utc_ns FROM calibration_sessions
-            WHERE id = ?1 AND ended_utc_ns IS NOT NULL),
+            WHERE id = ?1 AND ended_utc_ns IS NOT NULL)"""
+# Within a boot both clocks run alike, whatever NTP does to their rate: their difference changes only when the clock is
+# set. A later boot must not show an earlier time. The first query is cheap, and nearly always the answer.
+_MAY_HAVE_STEPPED = f"""{_INSTANTS} SELECT min(boot_id) < max(boot_id)
+        OR max(utc_ns - monotonic_ns) - min(utc_ns - monotonic_ns) >= {CLOCK_STEP_NS} AS maybe FROM instants"""
+_CLOCK_STEPS = f"""{_INSTANTS},
     pairs AS (SELECT utc_ns, utc_ns - lag(utc_ns) OVER earlier AS passed_ns,
             boot_id = lag(boot_id) OVER earlier AS is_same_boot,
             monotonic_ns - lag(monotonic_ns) OVER earlier AS true_ns
@@ -212,10 +215,7 @@ def _summary(reader: Reader, session_id: str) -> dict[str, Any]:
     row = found[0]
     accepted = {key: row.pop(f"accepted_{key}") for key in ("despite", "by", "utc_ns")}
     (counts,) = reader.rows(_COUNTS, (session_id,))
-    steps = [
-        {"at_utc_ns": step["at_utc_ns"], "step_s": step["step_ns"] / NS_PER_S}
-        for step in reader.rows(_CLOCK_STEPS, (session_id,))
-    ]
+    steps = _clock_steps(reader, session_id)
     return {
         **row,
         **counts,
@@ -226,6 +226,15 @@ def _summary(reader: Reader, session_id: str) -> dict[str, Any]:
         "clock_steps": steps,
         "utc_ran_backwards": any(step["step_s"] < 0 for step in steps),
     }
+
+
+def _clock_steps(reader: Reader, session_id: str) -> list[dict[str, Any]]:
+    """When, and by how much, the computer's clock was set during a session."""
+    (found,) = reader.rows(_MAY_HAVE_STEPPED, (session_id,))
+    if not found["maybe"]:
+        return []
+    steps = reader.rows(_CLOCK_STEPS, (session_id,))
+    return [{"at_utc_ns": step["at_utc_ns"], "step_s": step["step_ns"] / NS_PER_S} for step in steps]
 
 
 def _unknown(session_id: str) -> CommandError:
