@@ -48,7 +48,7 @@ def _bit_words(bits: int, names: dict[int, str]) -> str:
     return ", ".join(words) or "none"
 
 
-_MARGIN_NS = int(LATE_S * NS_PER_S)  # what samples may be read late by before they are given up
+_MARGIN_NS = int(LATE_S * NS_PER_S)  # what samples may be read late by before they are marked
 _BACKLOG_NS = 5 * NS_PER_S  # what has queued is read within this time, however long nobody read
 
 
@@ -251,7 +251,7 @@ class EncoderDecoder(_PositionDecoder):
             return records
         half = self._half
         value = ((counts - self._zero + half) % total - half) * self._deg_per_count
-        if self._jump_rate is not None:
+        if self._jump_rate is not None and not stamp.is_doubtful:
             within_ns = self._times.since_before(stamp)
             last, self._last = self._last, counts
             if last is not None:
@@ -307,7 +307,7 @@ class LinearDecoder(_PositionDecoder):
         if not self._is_in_range(counts):
             records.append(Reading(self.name, stamp, None, self._unit, Status.OUT_OF_RANGE, counts))
             return records
-        if self._jump_rate is not None:
+        if self._jump_rate is not None and not stamp.is_doubtful:
             within_ns = self._times.since_before(stamp)
             last, self._last = self._last, counts
             if last is not None and self._is_jump(within_ns, counts - last):

@@ -126,10 +126,10 @@ def virtual_link(channel: str, clock: Clock | None = None, **settings: object) -
     return _link("virtual", channel, clock or SystemClock(), settings)
 
 
-def slcan_link(adapter: Adapter, **settings: object) -> CanLink:
+def slcan_link(adapter: Adapter, clock: Clock | None = None, **settings: object) -> CanLink:
     """A link behind an slcan adapter."""
     options = {"bitrate": 250_000, "options": {"sleep_after_open": 0.0}}
-    return _link("slcan", str(adapter.path), SystemClock(), options | settings)
+    return _link("slcan", str(adapter.path), clock or SystemClock(), options | settings)
 
 
 def _link(interface: str, channel: str, clock: Clock, settings: dict[str, object]) -> CanLink:
