@@ -12,6 +12,7 @@ import time
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import can
@@ -45,6 +46,12 @@ def capture(text: str, seconds: float = 0.0, **flags: bool) -> CanCapture:
     return CanCapture(
         "boom", at(seconds), int(identifier, 16), bytes.fromhex("".join(data)), len(identifier) == 8, **flags
     )
+
+
+def late(text: str, seconds: float = 0.0, **flags: bool) -> CanCapture:
+    """The same, of doubtful time."""
+    captured = capture(text, seconds, **flags)
+    return replace(captured, stamp=captured.stamp.doubted())
 
 
 def the_reading(records: object) -> Reading:

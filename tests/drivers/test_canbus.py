@@ -12,6 +12,7 @@ from pathlib import Path
 import can
 import pytest
 
+from drivers import canbus
 from drivers.can_ports import (
     BATCH_MAX,
     INTERFACE_DROPS,
@@ -332,6 +333,27 @@ def test_an_adapter_that_is_unplugged_and_plugged_in_again_is_found_again(adapte
     assert closed.start == opened.start
     assert closed.end is not None
     assert closed.end.since(opened.start) > 0
+
+
+def test_an_adapter_is_found_as_soon_as_its_path_is_there_again(
+    adapter: Adapter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(canbus, "BACKOFF_FIRST_S", 10 * DEADLINE_S)
+    with running(slcan_link(adapter)) as heard:
+        heard.wait_for(EventKind.LINK_UP)
+        adapter.unplug()
+        heard.wait_for(EventKind.LINK_LOST)
+        adapter.plug_in()
+        heard.wait_for(EventKind.LINK_UP, 2)
+
+
+def test_an_adapter_that_comes_back_is_found_in_real_time_however_slowly_the_clock_runs(adapter: Adapter) -> None:
+    with running(slcan_link(adapter, ScaledClock(0.01, SystemClock().now()))) as heard:
+        heard.wait_for(EventKind.LINK_UP)
+        adapter.unplug()
+        heard.wait_for(EventKind.LINK_LOST)
+        adapter.plug_in()
+        heard.wait_for(EventKind.LINK_UP, 2)
 
 
 # Datagrams: SocketCAN frames over a socket pair, and udp_multicast for real
