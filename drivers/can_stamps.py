@@ -26,6 +26,10 @@ class _Epoch:
     since_ns: int
     until_ns: int = _NEVER_NS
 
+    def may_hold(self, utc_ns: int) -> bool:
+        """Whether the wall clock may have shown `utc_ns` in it."""
+        return self.since_ns - EXACT_NS <= utc_ns - self.ahead_ns <= self.until_ns + EXACT_NS
+
 
 class ReceiveStamps:
     """Stamps what a link reads.
@@ -96,13 +100,12 @@ class ReceiveStamps:
 
     def _stamp(self, kernel_utc_ns: int, began: Stamp, ended: Stamp, is_late: bool) -> Stamp:
         """The instant of a frame, on the host's clocks."""
-        floor_ns = self._floor_ns
+        floor_ns, ended_ns = self._floor_ns, ended.monotonic_ns
+        earliest_ns, latest_ns = floor_ns - EXACT_NS, ended_ns + EXACT_NS
         possible = [
             epoch
             for epoch in self._epochs
-            if max(epoch.since_ns, floor_ns) - EXACT_NS
-            <= kernel_utc_ns - epoch.ahead_ns
-            <= min(epoch.until_ns, ended.monotonic_ns) + EXACT_NS
+            if earliest_ns <= kernel_utc_ns - epoch.ahead_ns <= latest_ns and epoch.may_hold(kernel_utc_ns)
         ]
         if len(possible) == 1:
             ahead_ns = possible[0].ahead_ns
@@ -110,6 +113,10 @@ class ReceiveStamps:
             if at_ns < began.monotonic_ns - EXACT_NS:
                 self._is_stamped = True
             if self._is_stamped or not is_late:
-                self._floor_ns = at_ns = min(max(at_ns, floor_ns), ended.monotonic_ns)
+                if at_ns < floor_ns:
+                    at_ns = floor_ns
+                elif at_ns > ended_ns:
+                    at_ns = ended_ns
+                self._floor_ns = at_ns
                 return Stamp(at_ns + ahead_ns, at_ns, ended.boot_id)
         return Stamp(floor_ns + self._epochs[-1].ahead_ns, floor_ns, ended.boot_id, True)
