@@ -1,6 +1,19 @@
-"""What can go wrong with the store."""
+"""What can go wrong with the store, and how to say it."""
 
 from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import pwd
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_READ_ONLY = {errno.EROFS}
+_NO_PLACE = {errno.ENOENT, errno.ENOTDIR, errno.EACCES, errno.EPERM}
 
 
 class StoreError(Exception):
@@ -20,3 +33,74 @@ class StoreBusyError(StoreError):
             f"{path}: {holder} holds this store; stop it first (`rigcal status` shows it), or configure another file"
         )
         self.pid = pid
+
+
+def storage_sentence(path: Path, error: sqlite3.Error | OSError) -> str:
+    """What the disk or SQLite refused to do with a file, and what to do about it, in one sentence.
+
+    Args:
+        path: of the store; an OSError that names a file is told with that name.
+        error: what was raised.
+    """
+    if isinstance(error, OSError):
+        path, reason, code = Path(error.filename or path), error.strerror or str(error), error.errno
+        name = ""
+    else:
+        reason, code = str(error), None
+        name = getattr(error, "sqlite_errorname", "") or ""  # the module's own errors have none
+    place = _existing(path.parent)
+    if code in _FULL or name == "SQLITE_FULL":
+        return (
+            f"{path}: cannot be written, the disk is full ({reason}; {_free(place)}): delete files there that are not "
+            "rigcal's, or move the state directory to a larger disk"
+        )
+    if code in _READ_ONLY or name.startswith("SQLITE_READONLY"):
+        return (
+            f"{path}: cannot be written ({reason}): {place} or the file is read-only; mount it for writing (`dmesg` "
+            f"tells whether the kernel found a fault of the disk) and let user {_user()} write to it"
+        )
+    if code in _NO_PLACE or name.startswith("SQLITE_CANTOPEN") or name == "SQLITE_PERM":
+        return (
+            f"{path}: cannot be made or opened ({reason}): the directory must exist, and user {_user()} must be "
+            "allowed to write to it"
+        )
+    if name.startswith(("SQLITE_CORRUPT", "SQLITE_NOTADB")):
+        return f"{path}: cannot be used as a store ({reason}): move it away and restore the store from a backup"
+    if name.startswith(("SQLITE_BUSY", "SQLITE_LOCKED")):
+        return f"{path}: another program holds it locked ({reason}): end that program (a `sqlite3` shell, a backup)"
+    return f"{path}: cannot be used ({reason}; {_free(place)}): check the disk, `dmesg` may tell what is wrong with it"
+
+
+@contextlib.contextmanager
+def storage_errors(path: Path) -> Iterator[None]:
+    """Raise what disk and SQLite refuse as a StoreError that says what to do.
+
+    Args:
+        path: of the store.
+
+    Raises:
+        StoreError: in place of sqlite3.Error and OSError.
+    """
+    try:
+        yield
+    except (sqlite3.Error, OSError) as error:
+        raise StoreError(storage_sentence(path, error)) from error
+
+
+def _existing(directory: Path) -> Path:
+    """The directory, or the nearest one above it that can be looked at."""
+    return next((place for place in (directory, *directory.parents) if os.access(place, os.F_OK)), Path("/"))
+
+
+def _free(directory: Path) -> str:
+    try:
+        return f"{shutil.disk_usage(directory).free / 2**20:.0f} MiB free in {directory}"
+    except OSError:
+        return f"free space in {directory} is unknown"
+
+
+def _user() -> str:
+    try:
+        return pwd.getpwuid(os.getuid()).pw_name
+    except KeyError:
+        return str(os.getuid())
