@@ -15,6 +15,8 @@ _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _READ_ONLY = {errno.EROFS}
 _NO_PLACE = {errno.ENOENT, errno.ENOTDIR, errno.EACCES, errno.EPERM}
 
+NOTHING_BYTES = 2**20  # a disk with less than this has no room
+
 
 class StoreError(Exception):
     """The store cannot be opened or used; the message names the file and what to do."""
@@ -49,9 +51,13 @@ def storage_sentence(path: Path, error: sqlite3.Error | OSError) -> str:
         reason, code = str(error), None
         name = getattr(error, "sqlite_errorname", "") or ""  # the module's own errors have none
     place = _existing(path.parent)
-    if code in _FULL or name == "SQLITE_FULL":
+    free_bytes = _free_bytes(place)
+    free = "free space is unknown" if free_bytes is None else f"{free_bytes / 2**20:.0f} MiB free in {place}"
+    # On a full disk SQLite speaks of an I/O error where the log's index cannot grow.
+    is_full = name.startswith("SQLITE_IOERR") and free_bytes is not None and free_bytes < NOTHING_BYTES
+    if is_full or code in _FULL or name == "SQLITE_FULL":
         return (
-            f"{path}: cannot be written, the disk is full ({reason}; {_free(place)}): delete files there that are not "
+            f"{path}: cannot be written, the disk is full ({reason}; {free}): delete files there that are not "
             "rigcal's, or move the state directory to a larger disk"
         )
     if code in _READ_ONLY or name.startswith("SQLITE_READONLY"):
@@ -68,7 +74,7 @@ def storage_sentence(path: Path, error: sqlite3.Error | OSError) -> str:
         return f"{path}: cannot be used as a store ({reason}): move it away and restore the store from a backup"
     if name.startswith(("SQLITE_BUSY", "SQLITE_LOCKED")):
         return f"{path}: another program holds it locked ({reason}): end that program (a `sqlite3` shell, a backup)"
-    return f"{path}: cannot be used ({reason}; {_free(place)}): check the disk, `dmesg` may tell what is wrong with it"
+    return f"{path}: cannot be used ({reason}; {free}): check the disk, `dmesg` may tell what is wrong with it"
 
 
 @contextlib.contextmanager
@@ -92,11 +98,11 @@ def _existing(directory: Path) -> Path:
     return next((place for place in (directory, *directory.parents) if os.access(place, os.F_OK)), Path("/"))
 
 
-def _free(directory: Path) -> str:
+def _free_bytes(directory: Path) -> int | None:
     try:
-        return f"{shutil.disk_usage(directory).free / 2**20:.0f} MiB free in {directory}"
+        return shutil.disk_usage(directory).free
     except OSError:
-        return f"free space in {directory} is unknown"
+        return None
 
 
 def _user() -> str:
