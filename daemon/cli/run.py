@@ -203,7 +203,7 @@ def replay(
     elif prism is not None:
         told = SessionFile(prism=prism, kind=kind, since_utc_ns=begin_ns, until_utc_ns=LATEST_UTC_NS, control_points={})
     made = decoders(settings, source)
-    with contextlib.closing(Store(path)) as store:
+    with storage_errors(path), contextlib.closing(Store(path)) as store:
         declare_channels(store, source.rig)
         setups = SetupBook(source.rig, store, clock, settings.sessions.control_tolerance_mm)
         keeper = SessionKeeper(
