@@ -114,7 +114,8 @@ class AcquisitionStatus:
         decode_failures: device -> how many captures could not be decoded since the start.
         writer_lag_s: how old the oldest capture of the last batch was when the batch was stored.
         writer_lag_p99_s: the same, of the last minute's batches, 99th percentile.
-        error: why nothing can be stored at present; None when all is well.
+        error: why something cannot be stored at present; None when all is well.
+        is_behind: captures wait in the store to be decoded, as after a kill: readings and fixes come late.
     """
 
     links: list[LinkStatus]
@@ -125,6 +126,7 @@ class AcquisitionStatus:
     writer_lag_s: float
     writer_lag_p99_s: float
     error: str | None
+    is_behind: bool
 
 
 class StatusBoard:
@@ -176,12 +178,15 @@ class StatusBoard:
                 elif isinstance(record, DeviceEvent) and record.kind in (EventKind.LINK_UP, EventKind.LINK_LOST):
                     self._up[record.device] = record.kind is EventKind.LINK_UP
 
-    def snapshot(self, intakes: Sequence[LinkIntake], summaries: Sequence[CanSummary]) -> AcquisitionStatus:
+    def snapshot(
+        self, intakes: Sequence[LinkIntake], summaries: Sequence[CanSummary], *, is_behind: bool
+    ) -> AcquisitionStatus:
         """All of it, now.
 
         Args:
             intakes: of all links.
             summaries: of the CAN links.
+            is_behind: as `AcquisitionStatus` has it.
         """
         heard = {summary.link: summary for summary in summaries}
         now_ns = self._clock.monotonic_ns()
@@ -212,6 +217,7 @@ class StatusBoard:
                 writer_lag_s=last_lag / NS_PER_S,
                 writer_lag_p99_s=lags[int(0.99 * (len(lags) - 1))] / NS_PER_S if lags else 0.0,
                 error=self._error,
+                is_behind=is_behind,
             )
 
     def _link(self, intake: LinkIntake, heard: CanSummary | None) -> LinkStatus:

@@ -35,6 +35,8 @@ class JobKind(StrEnum):
 CHECKS = (JobKind.REPORT, JobKind.COMPARISON)
 CHAIN = (JobKind.GAP, JobKind.RESIDUAL, *CHECKS)
 DRIFT = (JobKind.DRIFT,)
+# A job is not to blame for power cuts; one that exhausts the computer until it restarts must end all the same.
+MAX_INTERRUPTIONS = 20
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,7 @@ class JobFacts:
         attempts: how often it was started.
         is_ready: whether the job that it depends on, if any, is done.
         ended: when it was interrupted last.
+        interruptions: how often something interrupted it that was no attempt: the computer's own end, a full disk.
     """
 
     id: int
@@ -77,6 +80,7 @@ class JobFacts:
     attempts: int
     is_ready: bool
     ended: Stamp | None
+    interruptions: int = 0
 
 
 @dataclass(frozen=True)
@@ -135,8 +139,8 @@ def due_jobs(
         state: what the store holds.
         now: the present instant; durations are taken on the monotonic clock, within one boot.
         quiet_s: how long after a session's end its jobs wait for a next session to begin.
-        retry_after_s: an interrupted job waits this long times its attempts, so that one that kills the daemon does
-            not do so without pause.
+        retry_after_s: an interrupted job waits this long times its attempts and interruptions, so that one that kills
+            the daemon or the computer does not do so without pause.
         max_attempts: an interrupted job that was started this often is not offered again.
     """
     if _is_open(state):
@@ -145,8 +149,8 @@ def due_jobs(
         DueRetry(job.id)
         for job in state.jobs
         if job.state == "interrupted"
-        and job.attempts < max_attempts
-        and _passed(job.ended, now, retry_after_s * job.attempts)
+        and not _is_spent(job, max_attempts)
+        and _passed(job.ended, now, retry_after_s * (job.attempts + job.interruptions))
     ]
     closed = [s for s in state.sessions if s.state == "closed"]
     if not closed or not _passed(closed[-1].ended, now, quiet_s):
@@ -165,8 +169,8 @@ def due_jobs(
 
 
 def spent_jobs(state: State, *, max_attempts: int = 3) -> list[JobFacts]:
-    """Interrupted jobs that were started so often that they are not offered again."""
-    return [job for job in state.jobs if job.state == "interrupted" and job.attempts >= max_attempts]
+    """Interrupted jobs that were started or interrupted so often that they are not offered again."""
+    return [job for job in state.jobs if job.state == "interrupted" and _is_spent(job, max_attempts)]
 
 
 def next_job(state: State) -> JobFacts | None:
@@ -177,6 +181,10 @@ def next_job(state: State) -> JobFacts | None:
     if _is_open(state) or any(job.state == "running" for job in state.jobs):
         return None
     return next((job for job in state.jobs if job.state == "queued" and job.is_ready), None)
+
+
+def _is_spent(job: JobFacts, max_attempts: int) -> bool:
+    return job.attempts >= max_attempts or job.interruptions >= MAX_INTERRUPTIONS
 
 
 def _is_open(state: State) -> bool:

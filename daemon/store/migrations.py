@@ -266,6 +266,21 @@ def m014_prism_confirmations(db: Database) -> None:
     )
 
 
+@MIGRATIONS()
+def m012_store_health(db: Database) -> None:
+    """Checks of the store itself, and what the end of the computer did to jobs."""
+    _create(
+        db,
+        # result: `ok`, or what is damaged; NULL while a check runs, and where it never came to its end.
+        f"""CREATE TABLE store_checks (id INTEGER PRIMARY KEY, {_instant("started_")},
+            {_instant("ended_", optional=True)}, result TEXT) STRICT""",
+        # host_boot: the kernel's boot in which the job was started, whatever the rig's clock says (a simulated one has
+        # boots of its own). interruptions: how often something interrupted it that was none of its attempts.
+        "ALTER TABLE jobs ADD COLUMN host_boot TEXT",
+        "ALTER TABLE jobs ADD COLUMN interruptions INTEGER NOT NULL DEFAULT 0",
+    )
+
+
 def unknown_migrations(db: Database) -> list[str]:
     """Migrations that `db` has and this program does not know: it was made by a newer one."""
     empty = Database(memory=True)

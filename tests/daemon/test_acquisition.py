@@ -324,7 +324,7 @@ def test_a_link_whose_loop_dies_is_started_again(
 def test_a_link_that_does_not_stop_is_left_behind(
     path: Path, acquire: Make, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(link_intake, "JOIN_S", 0.05)
+    monkeypatch.setattr(acquisition_module, "LINKS_STOP_S", 0.05)
     release = threading.Event()
 
     class Stuck(ListLink):
@@ -345,7 +345,7 @@ def test_a_decoder_that_raises_is_a_failure_of_that_frame_alone(
     acquisition = acquire([link], {"boom": lambda: NumberDecoder(fail_at=2)})
     acquisition.start()
     wait_until(lambda: len(values(path)) == 4)
-    assert acquisition.status().decode_failures == {"boom": 1}
+    wait_until(lambda: acquisition.status().decode_failures == {"boom": 1})
     acquisition.stop()
     assert values(path) == [0, 1, 3, 4]
     (failure,) = table(path, "decode_failures")

@@ -139,6 +139,16 @@ def test_an_interrupted_job_is_offered_again_after_a_pause_until_its_attempts_ar
     assert [j.id for j in spent_jobs(after(3))] == [1]
 
 
+def test_a_job_that_the_computers_end_interrupted_waits_too_and_ends_after_twenty_times() -> None:
+    cut = replace(job(1, "interrupted", attempts=0), interruptions=3)
+    assert due_jobs(state(session(1), jobs=[cut], covered=BOTH), T0.shifted(14 * NS_PER_S)) == []
+    assert due_jobs(state(session(1), jobs=[cut], covered=BOTH), T0.shifted(15 * NS_PER_S)) == [DueRetry(1)]
+    assert spent_jobs(state(jobs=[replace(cut, interruptions=19)])) == []
+    spent = replace(cut, interruptions=20)
+    assert spent_jobs(state(jobs=[spent])) == [spent]
+    assert due_jobs(state(session(1), jobs=[spent], covered=BOTH), LATER) == []
+
+
 def test_queued_jobs_wait_while_a_session_is_open() -> None:
     assert next_job(state(session(2, state="open"), jobs=[job(1, "queued")])) is None
 
