@@ -99,7 +99,7 @@ class StationConfig(BaseModel):
     jump_slack_m: float = Field(default=0.1, gt=0)
     relock_within_m: float = Field(default=2.0, gt=0)
     max_range_m: float = Field(default=6000.0, gt=0)
-    silence_timeout_s: float = Field(default=5.0, ge=0)
+    silence_timeout_s: float = Field(default=4.0, ge=0)
     ppm_scale: float = Field(default=0.1, gt=0)
     prism_scale_mm: float = Field(default=0.1, gt=0)
 
