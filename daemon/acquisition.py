@@ -14,8 +14,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import TypeVar
 
-from daemon.acquisition_status import AcquisitionStatus, StatusBoard
+from daemon.acquisition_status import AcquisitionStatus
 from daemon.link_intake import LinkIntake
+from daemon.present_state import NOTHING_EXPECTED, Expected
+from daemon.status_board import StatusBoard
 from daemon.store import Store, StoreError
 from drivers.can_decoder import CanDecoder
 from drivers.can_summary import CanSummary
@@ -69,6 +71,7 @@ class Acquisition:
         queue_captures: how many captures of one link may wait while the disk is slow.
         on_records: called in the writer's thread, within a transaction of its own, with records after they were
             committed, and with none when time has passed (ten times a second).
+        expected: what should be heard, for `status`.
     """
 
     def __init__(
@@ -81,13 +84,14 @@ class Acquisition:
         batch_seconds: float = 0.05,
         queue_captures: int = 200_000,
         on_records: Callable[[Sequence[Record]], None],
+        expected: Expected = NOTHING_EXPECTED,
     ) -> None:
         self._store, self._clock, self._on_records = store, clock, on_records
         self._batch_seconds = batch_seconds
         self._intakes = [LinkIntake(link, clock, queue_captures) for link in links]
         self._factories = decoders
         self._decoding = _Decoding(decoders)
-        self._board = StatusBoard(clock)
+        self._board = StatusBoard(clock, expected)
         self._stop_links = threading.Event()
         self._finish = threading.Event()
         self._writer: threading.Thread | None = None
@@ -121,7 +125,9 @@ class Acquisition:
 
     def status(self) -> AcquisitionStatus:
         """A snapshot, from any thread."""
-        return self._board.snapshot(self._intakes, self._decoding.summaries(self._clock.now()))
+        return self._board.snapshot(
+            self._intakes, self._decoding.summaries(self._clock.now()), self._decoding.defects()
+        )
 
     def check(self) -> None:
         """Whether the writer lives; a disk that is full or slow is no reason to raise, it is waited for.
@@ -174,7 +180,7 @@ class Acquisition:
                 log.exception("a chunk cannot be decoded")
                 records = [DecodeFailure("store", now, str(error), b"")]
             self._commit_records(records, [chunk_id])
-            self._hand_on(records)
+            self._pass_on(records)  # and not to the board: they say nothing of how things are now
 
     # ---- replay ----------------------------------------------------------------------------------------------------
 
@@ -244,6 +250,9 @@ class Acquisition:
 
     def _hand_on(self, records: Sequence[Record]) -> None:
         self._board.recorded(records)
+        self._pass_on(records)
+
+    def _pass_on(self, records: Sequence[Record]) -> None:
         try:
             with self._store.transaction():
                 self._on_records(records)
@@ -290,7 +299,7 @@ class _Decoding:
         self._factories = factories
         self._decoders: dict[str, Decoder] = {}
         self._boots: dict[str, str] = {}
-        self._defective: set[str] = set()
+        self._defects: dict[str, Stamp] = {}
         self._ticked_ns = -TICK_NS
 
     def feed(self, captures: Sequence[Capture]) -> list[Record]:
@@ -344,11 +353,15 @@ class _Decoding:
         decoders = [self._decoders.get(link) for link in self._factories]
         return [decoder.summary(now) for decoder in decoders if isinstance(decoder, CanDecoder)]
 
+    def defects(self) -> dict[str, Stamp]:
+        """Link -> when its decoder last showed a defect of its own; from any thread."""
+        return dict(self._defects)
+
     def _failure(self, link: str, stamp: Stamp, error: Exception, raw: bytes) -> DecodeFailure:
         """A decoder never raises by contract; a defect in one must not end acquisition, nor flood the log."""
-        if link not in self._defective:
-            self._defective.add(link)
+        if link not in self._defects:
             log.critical("link %s: its decoder is defective; captures are kept", link, exc_info=error)
+        self._defects[link] = stamp
         return DecodeFailure(link, stamp, f"the decoder failed: {type(error).__name__}: {error}", raw)
 
     def _decoder(self, link: str, boot: str) -> Decoder:

@@ -106,7 +106,7 @@ class JobTable:
         )
 
     def _stale_candidate(self, run: LiveRun) -> int | None:
-        """See `State.stale_candidate`. One comparison for each model that goes live: what fails is not tried for ever."""
+        """See `State.stale_candidate`; one comparison for each model that goes live, as what fails must not loop."""
         candidate = self._models.waiting()
         if candidate is None or candidate.comparison is None or candidate.comparison["live"] == run.model_id:
             return None
