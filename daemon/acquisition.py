@@ -15,6 +15,7 @@ from functools import partial
 from typing import TypeVar
 
 from daemon.acquisition_status import AcquisitionStatus
+from daemon.clock_watch import ClockWatch
 from daemon.link_intake import LinkIntake
 from daemon.present_state import NOTHING_EXPECTED, Expected
 from daemon.status_board import StatusBoard
@@ -72,6 +73,7 @@ class Acquisition:
         on_records: called in the writer's thread, within a transaction of its own, with records after they were
             committed, and with none when time has passed (ten times a second).
         expected: what should be heard, for `status`.
+        clock_watch: looks after the computer's clock, live; none where the clock is another one.
     """
 
     def __init__(
@@ -85,6 +87,7 @@ class Acquisition:
         queue_captures: int = 200_000,
         on_records: Callable[[Sequence[Record]], None],
         expected: Expected = NOTHING_EXPECTED,
+        clock_watch: ClockWatch | None = None,
     ) -> None:
         self._store, self._clock, self._on_records = store, clock, on_records
         self._batch_seconds = batch_seconds
@@ -92,6 +95,7 @@ class Acquisition:
         self._factories = decoders
         self._decoding = _Decoding(decoders)
         self._board = StatusBoard(clock, expected)
+        self._clock_watch = clock_watch
         self._stop_links = threading.Event()
         self._finish = threading.Event()
         self._writer: threading.Thread | None = None
@@ -152,6 +156,8 @@ class Acquisition:
                 now = self._clock.now()
                 self._last_cycle_ns = now.monotonic_ns
                 items = [item for intake in self._intakes for item in intake.drain()]
+                if self._clock_watch is not None and (step := self._clock_watch.look(now)) is not None:
+                    items.append(step)
                 if now.monotonic_ns >= next_tick_ns:
                     self._store_batch(items, partial(self._decoding.feed_until, now=now))
                     next_tick_ns = now.monotonic_ns + TICK_NS

@@ -170,6 +170,7 @@ class EventKind(StrEnum):
     PRISM_JUMP = "prism_jump"  # the station's target jumped: it follows another prism
     STATION_SILENT = "station_silent"
     INSTRUMENT_ERROR = "instrument_error"
+    CLOCK_STEP = "clock_step"  # the computer's clock was set; the code is by how many milliseconds
 
 
 @dataclass(frozen=True, slots=True)
