@@ -107,6 +107,7 @@ class StationStatus:
         fixes: stored since the start.
         last_status, last_lock: of its last fix, however old; "" if there was none.
         good_age_s: since its last fix that is ok; None if there was none.
+        tilt_ok: its last fix says that the compensator works and is in range; None where it does not say.
         sentence: all of it in one clause, for people.
     """
 
@@ -119,6 +120,7 @@ class StationStatus:
     last_status: str = ""
     last_lock: str = ""
     good_age_s: float | None = None
+    tilt_ok: bool | None = None
     sentence: str = ""
 
 

@@ -110,6 +110,7 @@ def is_present(status: str) -> bool:
 
 def duration(seconds: float) -> str:
     """A length of time for people: `40 s`, `12 min`, `3.2 h`, `5 days`."""
+    seconds = max(seconds, 0.0)
     if seconds < 120:
         return f"{seconds:.0f} s"
     if seconds < 7200:
@@ -120,11 +121,11 @@ def duration(seconds: float) -> str:
 
 
 def station_sentence(status: str, age_s: float | None, last_lock: str, last_status: str, reason: str) -> str:
-    """What a station is, in one clause: `locked, ok` or `silent since 40 s (last: locked, ok)`."""
+    """What a station is, in one clause: `locked, ok, 0 s ago` or `silent for 40 s (last: locked, ok)`."""
+    words = {STARTING: "not heard yet", SILENT: "silent", LINK_DOWN: "link down"}
+    if age_s is None:
+        return words[status] if status == STARTING else f"{words[status]}, not heard since the start"
     last = f"{last_lock}, {last_status}" + (f" ({reason})" if reason else "")
     if is_present(status):
-        return last
-    words = {STARTING: "not heard yet", SILENT: "silent", LINK_DOWN: "link down"}[status]
-    if age_s is None:
-        return words if status == STARTING else f"{words}, never heard since the start"
-    return f"{words}, last heard {duration(age_s)} ago (then: {last})"
+        return f"{last}, {duration(age_s)} ago"
+    return f"{words[status]}, not heard for {duration(age_s)} (last: {last})"

@@ -213,6 +213,7 @@ class StatusBoard:
             last_status=last or "",
             last_lock=last_lock,
             good_age_s=None if good is None else _age_s(good.stamp, now),
+            tilt_ok=None if fix is None else fix.tilt_ok,
             sentence=station_sentence(status, age_s, last_lock, last or "", reason),
         )
 

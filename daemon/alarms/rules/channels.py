@@ -1,0 +1,82 @@
+"""Joints and machine signals that are silent or cannot be used."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from daemon.acquisition_status import ChannelStatus
+from daemon.alarms.alarm import Finding, rule
+from daemon.alarms.evidence import Evidence
+from daemon.present_state import SILENT, is_present
+from drivers.readings import Status
+
+START_S = 3.0  # devices take so long to start, and a computer that is busy to read them
+
+_WHY = {
+    Status.NOT_AVAILABLE: "the device sends that it has no value",
+    Status.OUT_OF_RANGE: "the value is beyond what the device can measure",
+    Status.DEVICE_ALARM: "the device reports an alarm that makes its value void",
+    Status.MALFORMED: "the value cannot be decoded",
+}
+
+
+@rule("critical", "Check that the machine is switched on, and the cable between bus and adapter.", after_s=START_S)
+def link_silent(evidence: Evidence) -> Iterator[Finding]:
+    """A CAN link is open and none of its channels is heard, for 3 s. It explains that its channels are silent, and they
+    raise no alarms of their own."""
+    for link, channels in _by_link(evidence).items():
+        if _is_silent(channels):
+            yield link, f"the link is open, and none of its {len(channels)} channels is heard"
+
+
+@rule("critical", "Check the encoder's power and cable; without it no fix can be used.", after_s=START_S, hold_s=3.0)
+def joint_silent(evidence: Evidence) -> Iterator[Finding]:
+    """A joint has not been read for longer than its time-out and 3 s. Cleared when it has been read again for 3 s."""
+    yield from _silent(evidence, "joint")
+
+
+@rule("warning", "Check the signal's device and cable; effects that need it cannot be told.", after_s=START_S, hold_s=3)
+def signal_silent(evidence: Evidence) -> Iterator[Finding]:
+    """A machine signal has not been read for longer than its time-out and 3 s. Cleared as for joints."""
+    yield from _silent(evidence, "signal")
+
+
+@rule("critical", "Look at the device; without the joint no fix can be used.", after_s=1.5, hold_s=3.0)
+def joint_not_usable(evidence: Evidence) -> Iterator[Finding]:
+    """The readings of a joint carry no value: the device has none, reports an alarm, is out of its range, or cannot be
+    decoded. Raised after 1.5 s, so that one bad sample is no alarm; cleared after 3 s of good ones."""
+    yield from _not_usable(evidence, "joint")
+
+
+@rule("warning", "Look at the device; effects that need the signal cannot be told.", after_s=1.5, hold_s=3.0)
+def signal_not_usable(evidence: Evidence) -> Iterator[Finding]:
+    """The readings of a machine signal carry no value. Raised and cleared as for joints."""
+    yield from _not_usable(evidence, "signal")
+
+
+def _by_link(evidence: Evidence) -> dict[str, list[ChannelStatus]]:
+    found: dict[str, list[ChannelStatus]] = {}
+    for channel in evidence.acquisition.channels:
+        found.setdefault(channel.link, []).append(channel)
+    return found
+
+
+def _is_silent(channels: list[ChannelStatus]) -> bool:
+    """Whether the link itself seems to be cut: several channels, and none is heard."""
+    return len(channels) > 1 and all(channel.status == SILENT for channel in channels)
+
+
+def _silent(evidence: Evidence, kind: str) -> Iterator[Finding]:
+    for channels in _by_link(evidence).values():
+        if _is_silent(channels):
+            continue
+        for channel in channels:
+            if channel.kind == kind and channel.status == SILENT:
+                before = "since the start" if channel.last_status is None else f"any more (last: {channel.last_status})"
+                yield channel.name, f"{channel.name} is not heard {before}"
+
+
+def _not_usable(evidence: Evidence, kind: str) -> Iterator[Finding]:
+    for channel in evidence.acquisition.channels:
+        if channel.kind == kind and is_present(channel.status) and channel.status != Status.OK:
+            yield channel.name, f"{channel.name}: {_WHY[Status(channel.status)]}"
