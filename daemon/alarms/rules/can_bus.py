@@ -34,11 +34,13 @@ def bus_error_passive(evidence: Evidence) -> Iterator[Finding]:
             yield event.device, event.text
 
 
-@rule("critical", "Check the node's power and cable.", hold_s=3.0)
+@rule("warning", "Look at the node: it may be about to fail, or was set up anew without a heartbeat.", after_s=3.0)
 def heartbeat_lost(evidence: Evidence) -> Iterator[Finding]:
-    """A CANopen node has stopped its heartbeat. Cleared when it is heard again."""
+    """A CANopen node has stopped its heartbeat and still sends values: it is not supervised any more. One that sends
+    nothing at all is a joint or signal that is silent. Cleared when the heartbeat is heard again."""
+    present = {channel.name for channel in evidence.acquisition.channels if is_present(channel.status)}
     for event in evidence.standing(EventKind.HEARTBEAT_LOST, EventKind.HEARTBEAT_RESTORED):
-        if not evidence.is_cut_off(event.device):
+        if event.device in present:
             yield event.device, event.text
 
 

@@ -10,7 +10,7 @@ from daemon.alarms.evidence import Evidence
 from daemon.present_state import SILENT, is_present
 from drivers.readings import Status
 
-START_S = 3.0  # devices take so long to start, and a computer that is busy to read them
+START_S = 5.0  # devices take so long to start after their link was opened
 
 _WHY = {
     Status.NOT_AVAILABLE: "the device sends that it has no value",
@@ -20,24 +20,25 @@ _WHY = {
 }
 
 
-@rule("critical", "Check that the machine is switched on, and the cable between bus and adapter.", after_s=START_S)
+@rule("critical", "Check that the machine is switched on, and the cable between bus and adapter.", after_s=1, hold_s=3)
 def link_silent(evidence: Evidence) -> Iterator[Finding]:
-    """A CAN link is open and none of its channels is heard, for 3 s. It explains that its channels are silent, and they
-    raise no alarms of their own."""
+    """A CAN link has been open for 5 s, and none of its channels is heard. It explains that its channels are silent,
+    and they raise no alarms of their own. Cleared 3 s after one of them is heard."""
     for link, channels in _by_link(evidence).items():
-        if _is_silent(channels):
+        if _is_silent(channels) and _has_started(evidence, channels[0]):
             yield link, f"the link is open, and none of its {len(channels)} channels is heard"
 
 
-@rule("critical", "Check the encoder's power and cable; without it no fix can be used.", after_s=START_S, hold_s=3.0)
+@rule("critical", "Check the encoder's power and cable; without it no fix can be used.", after_s=1.0, hold_s=3.0)
 def joint_silent(evidence: Evidence) -> Iterator[Finding]:
-    """A joint has not been read for longer than its time-out and 3 s. Cleared when it has been read again for 3 s."""
+    """A joint has not been read for 1 s longer than its time-out, and its link has been open for 5 s. Cleared when it
+    has been read again for 3 s."""
     yield from _silent(evidence, "joint")
 
 
-@rule("warning", "Check the signal's device and cable; effects that need it cannot be told.", after_s=START_S, hold_s=3)
+@rule("warning", "Check the signal's device and cable; effects that need it cannot be told.", after_s=1.0, hold_s=3.0)
 def signal_silent(evidence: Evidence) -> Iterator[Finding]:
-    """A machine signal has not been read for longer than its time-out and 3 s. Cleared as for joints."""
+    """A machine signal has not been read for 1 s longer than its time-out. Raised and cleared as for joints."""
     yield from _silent(evidence, "signal")
 
 
@@ -66,12 +67,17 @@ def _is_silent(channels: list[ChannelStatus]) -> bool:
     return len(channels) > 1 and all(channel.status == SILENT for channel in channels)
 
 
+def _has_started(evidence: Evidence, channel: ChannelStatus) -> bool:
+    link = evidence.link_of(channel.name)
+    return link is None or link.since_s >= START_S
+
+
 def _silent(evidence: Evidence, kind: str) -> Iterator[Finding]:
     for channels in _by_link(evidence).values():
         if _is_silent(channels):
             continue
         for channel in channels:
-            if channel.kind == kind and channel.status == SILENT:
+            if channel.kind == kind and channel.status == SILENT and _has_started(evidence, channel):
                 before = "since the start" if channel.last_status is None else f"any more (last: {channel.last_status})"
                 yield channel.name, f"{channel.name} is not heard {before}"
 
