@@ -8,9 +8,10 @@ from daemon.acquisition_status import ChannelStatus
 from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
 from daemon.present_state import SILENT, is_present
-from drivers.readings import Status
+from drivers.readings import EventKind, Status
 
 START_S = 5.0  # devices take so long to start after their link was opened
+AT_ONCE_S = 0.5  # devices that were heard last so close together fell silent together
 
 _WHY = {
     Status.NOT_AVAILABLE: "the device sends that it has no value",
@@ -22,11 +23,11 @@ _WHY = {
 
 @rule("critical", "Check that the machine is switched on, and the cable between bus and adapter.", after_s=1, hold_s=3)
 def link_silent(evidence: Evidence) -> Iterator[Finding]:
-    """A CAN link has been open for 5 s, and none of its channels is heard. It explains that its channels are silent,
-    and they raise no alarms of their own. Cleared 3 s after one of them is heard."""
+    """A CAN link has been open for 5 s, channels of it are silent, and no other frame has come since they were heard.
+    It explains that they are silent, and they raise no alarms of their own. Cleared 3 s after a frame has come."""
     for link, channels in _by_link(evidence).items():
-        if _is_silent(channels) and _has_started(evidence, channels[0]):
-            yield link, f"the link is open, and none of its {len(channels)} channels is heard"
+        if _is_quiet(evidence, link, channels) and _has_started(evidence, channels[0]):
+            yield link, "the link is open, and nothing is heard on it"
 
 
 @rule("critical", "Check the encoder's power and cable; without it no fix can be used.", after_s=1.0, hold_s=3.0)
@@ -45,7 +46,8 @@ def signal_silent(evidence: Evidence) -> Iterator[Finding]:
 @rule("critical", "Look at the device; without the joint no fix can be used.", after_s=1.5, hold_s=3.0)
 def joint_not_usable(evidence: Evidence) -> Iterator[Finding]:
     """The readings of a joint carry no value: the device has none, reports an alarm, is out of its range, or cannot be
-    decoded. Raised after 1.5 s, so that one bad sample is no alarm; cleared after 3 s of good ones."""
+    decoded. Raised after 1.5 s, so that one bad sample is no alarm; cleared after 3 s of good ones. Where the device's
+    own alarm or emergency stands, it explains that its values are void."""
     yield from _not_usable(evidence, "joint")
 
 
@@ -62,9 +64,17 @@ def _by_link(evidence: Evidence) -> dict[str, list[ChannelStatus]]:
     return found
 
 
-def _is_silent(channels: list[ChannelStatus]) -> bool:
-    """Whether the link itself seems to be cut: several channels, and none is heard."""
-    return len(channels) > 1 and all(channel.status == SILENT for channel in channels)
+def _is_quiet(evidence: Evidence, link: str, channels: list[ChannelStatus]) -> bool:
+    """Whether the link itself seems to be cut: it has several channels, and nothing came since a silent one was heard.
+
+    Other channels may have longer time-outs: they will be silent in a moment.
+    """
+    silent = [channel for channel in channels if channel.status == SILENT]
+    if len(channels) < 2 or not silent:
+        return False
+    heard_s = [f.age_s for f in evidence.acquisition.frames if f.link == link and f.age_s is not None]
+    silent_s = [channel.age_s for channel in silent if channel.age_s is not None]
+    return not heard_s or (bool(silent_s) and min(heard_s) >= min(silent_s) - AT_ONCE_S)
 
 
 def _has_started(evidence: Evidence, channel: ChannelStatus) -> bool:
@@ -73,8 +83,8 @@ def _has_started(evidence: Evidence, channel: ChannelStatus) -> bool:
 
 
 def _silent(evidence: Evidence, kind: str) -> Iterator[Finding]:
-    for channels in _by_link(evidence).values():
-        if _is_silent(channels):
+    for link, channels in _by_link(evidence).items():
+        if _is_quiet(evidence, link, channels):
             continue
         for channel in channels:
             if channel.kind == kind and channel.status == SILENT and _has_started(evidence, channel):
@@ -83,6 +93,10 @@ def _silent(evidence: Evidence, kind: str) -> Iterator[Finding]:
 
 
 def _not_usable(evidence: Evidence, kind: str) -> Iterator[Finding]:
+    told = {event.device for event in evidence.standing(EventKind.ALARM, EventKind.BOOT_UP)}
+    told |= {e.device for e in evidence.standing(EventKind.EMERGENCY, EventKind.EMERGENCY_CLEARED, EventKind.BOOT_UP)}
     for channel in evidence.acquisition.channels:
+        if channel.status == Status.DEVICE_ALARM and channel.name in told:
+            continue
         if channel.kind == kind and is_present(channel.status) and channel.status != Status.OK:
             yield channel.name, f"{channel.name}: {_WHY[Status(channel.status)]}"

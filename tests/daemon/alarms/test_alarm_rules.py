@@ -13,6 +13,7 @@ from daemon.acquisition_status import (
     AcquisitionStatus,
     ChannelStatus,
     EventStatus,
+    FrameStatus,
     LinkStatus,
     StationStatus,
 )
@@ -63,6 +64,7 @@ def known(
     channels: Sequence[ChannelStatus] = (channel(),),
     stations: Sequence[StationStatus] = (station(),),
     decoding: Sequence[DecodeStatus] = (),
+    frames_s: Sequence[float] = (0.1,),
     error: str | None = None,
     **more: Any,
 ) -> Evidence:
@@ -72,6 +74,7 @@ def known(
         stations=[*stations],
         last_events=[*events],
         decoding=[*decoding],
+        frames=[FrameStatus("boom", f"{i:03X}", "", 5, None, age_s, None) for i, age_s in enumerate(frames_s)],
         error=error,
     )
     return Evidence(NOW, **{"running_s": 1000.0, "acquisition": acquisition, **more})
@@ -164,11 +167,20 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
     ],
     "link_silent": [
         (
-            known(channels=[SILENT, QUIET]),
+            known(channels=[SILENT, QUIET], frames_s=[40.0, 41.0]),
             ["boom"],
-            known(channels=[SILENT, QUIET], links=[link(since_s=2.0)]),
+            known(channels=[SILENT, QUIET], frames_s=[40.0], links=[link(since_s=2.0)]),
         ),
-        (known(channels=[SILENT, QUIET]), ["boom"], known(channels=[SILENT, channel(name="theta3")])),
+        (
+            known(channels=[SILENT, channel(name="slow", age_s=40.0)], frames_s=[40.0]),
+            ["boom"],
+            known(channels=[SILENT, channel(name="theta3")]),
+        ),
+        (
+            known(channels=[channel("silent", n, last=None) for n in "ab"], frames_s=[]),
+            ["boom"],
+            known(channels=[channel("silent", n, last=None) for n in "ab"]),
+        ),
     ],
     "joint_silent": [
         (
@@ -182,13 +194,20 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
             known(channels=[channel("link_down"), channel("link_down", "theta3")], links=[link(False)]),
         ),
     ],
-    "signal_silent": [(known(channels=[channel(), QUIET]), ["boom_valve"], known(channels=[SILENT, QUIET]))],
+    "signal_silent": [
+        (known(channels=[channel(), QUIET]), ["boom_valve"], known(channels=[SILENT, QUIET], frames_s=[40.0]))
+    ],
     "joint_not_usable": [
         (
             known(channels=[channel(s, s) for s in ("not_available", "out_of_range", "device_alarm", "malformed")]),
             ["not_available", "out_of_range", "device_alarm", "malformed"],
             known(channels=[channel(s) for s in ("ok", "silent", "link_down", "starting")]),
-        )
+        ),
+        (
+            known(event(E.ALARM, "theta1", code=0), channels=[channel("device_alarm")]),
+            ["theta1"],
+            known(event(E.ALARM, "theta1", code=1), channels=[channel("device_alarm")]),
+        ),
     ],
     "signal_not_usable": [
         (known(channels=[channel("not_available", "boom_valve", "signal")]), ["boom_valve"], known()),
@@ -309,7 +328,7 @@ def test_an_unplugged_bus_is_one_alarm_and_so_is_a_bus_that_is_cut_beyond_the_ad
     names = [f"theta{n}" for n in range(1, 9)]
     events = [event(E.HEARTBEAT_LOST, name, n) for n, name in enumerate(names)]
     unplugged = known(*events, links=[link(False)], channels=[channel("link_down", name) for name in names])
-    cut = known(*events, channels=[channel("silent", name, age_s=9) for name in names])
+    cut = known(*events, channels=[channel("silent", name, age_s=9) for name in names], frames_s=[9.0])
     for evidence, kind in ((unplugged, "link_down"), (cut, "link_silent")):
         assert [alarm.key for rule in library() for alarm in rule(evidence)] == [(kind, "boom")]
 
