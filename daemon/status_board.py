@@ -107,16 +107,17 @@ class StatusBoard:
         """These records are stored now."""
         with self._lock:
             self._failures.tell_time(self._clock.monotonic_ns())
-            decoded, malformed = self._failures.decoded, Status.MALFORMED
+            decoded: list[str] = []
+            malformed = Status.MALFORMED
             for record in records:
                 if isinstance(record, Reading):
                     self._readings[record.channel] = record
                     if record.status is not malformed:
-                        decoded[record.channel] += 1
+                        decoded.append(record.channel)
                 elif isinstance(record, Fix):
                     self._fixes[record.station] = record
                     self._fix_counts[record.station] += 1
-                    decoded[record.station] += 1
+                    decoded.append(record.station)
                     if record.status is Status.OK:
                         self._good_fixes[record.station] = record
                 elif isinstance(record, DecodeFailure):
@@ -127,6 +128,7 @@ class StatusBoard:
                     self._gaps[record.channel, record.reason] = record
                 else:
                     self._gaps.pop((record.channel, record.reason), None)
+            self._failures.decoded.update(decoded)
 
     def _happened(self, event: DeviceEvent) -> None:
         self._event_count += 1
