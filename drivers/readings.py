@@ -174,6 +174,7 @@ class EventKind(StrEnum):
     PRISM_CONFIRMED = "prism_confirmed"  # an operator says that the station is on the prism that is meant
     STATION_SILENT = "station_silent"
     INSTRUMENT_ERROR = "instrument_error"
+    CLOCK_STEP = "clock_step"  # the computer's clock was set; the code is by how many milliseconds
 
 
 @dataclass(frozen=True, slots=True)
