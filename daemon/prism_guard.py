@@ -155,7 +155,7 @@ class PrismGuard:
         if fix.status is Status.NOT_AVAILABLE and (fix.lock is not LockState.UNKNOWN or self.limit.tracks):
             self._is_new_lock = True
         point = position_mm(fix)
-        if point is None:
+        if point is None or fix.status is Status.TIME_DOUBTFUL:  # how fast it came there is not known
             return None
         seen = _Seen(point, fix.stamp, fix.slope_distance_m is not None)
         is_new_lock, self._is_new_lock = self._is_new_lock, False

@@ -113,7 +113,18 @@ class Daemon:
         self._gap = GapStatus(store, parts.rig.name, drift)
         self._alarms = AlarmBoard(
             AlarmTable(store),
-            Gatherer(self._acquisition.status, store, parts.rig.name, self._live_model, drift, parts.clock, before),
+            Gatherer(
+                store,
+                parts.rig.name,
+                self._live_model,
+                drift,
+                parts.clock,
+                before,
+                acquisition=self._acquisition.status,
+                health=lambda: self._watch.health,
+                suspicions=self._sessions.prism_suspicions,
+                is_control_served=lambda: True,
+            ),
             parts.clock,
         )
         self._models = ModelRegistry(models, parts.rig.name, self._live_model, compare=self._jobs.compare)

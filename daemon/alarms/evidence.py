@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from daemon.acquisition_status import AcquisitionStatus, EventStatus, LinkStatus
+from daemon.prism_guard import Suspicion
 from drivers.clock import Stamp
 from drivers.readings import EventKind
 
@@ -18,11 +19,13 @@ class SessionEvidence:
         id: of the session.
         age_s: since it was opened.
         jumped: joints whose encoder has jumped in it.
+        suspicions: stations that may be on another prism than its own.
     """
 
     id: str
     age_s: float
     jumped: tuple[str, ...] = ()
+    suspicions: tuple[Suspicion, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -74,12 +77,14 @@ class StoreEvidence:
     """The store and its disk.
 
     Attributes:
-        fault: what is wrong with its file (damaged, replaced, missing), in a clause; "" if nothing is known to be.
+        fault: what is wrong with its files (damaged, replaced, missing), and what to do; "" if nothing is known to be.
         free_bytes: on its disk; None while not known.
+        is_low: little of the disk is free, as `daemon.store.health` has it.
     """
 
     fault: str = ""
     free_bytes: int | None = None
+    is_low: bool = False
 
 
 @dataclass(frozen=True)
@@ -97,7 +102,8 @@ class Evidence:
         store: its file and its disk.
         previous_run: when the daemon's run before this one was last alive, by a clock that can be compared.
         is_control_served: commands are taken on the control socket.
-        untrained_sessions: closed sessions that nothing trains on, for want of control shots.
+        untrained_sessions: closed sessions that nothing trains on -> why; those that newer ones make up for are not
+            there.
         unwatched: rule or part of the evidence that has failed itself -> why.
     """
 
@@ -111,7 +117,7 @@ class Evidence:
     store: StoreEvidence = StoreEvidence()
     previous_run: Stamp | None = None
     is_control_served: bool = True
-    untrained_sessions: tuple[str, ...] = ()
+    untrained_sessions: Mapping[str, str] = field(default_factory=dict)
     unwatched: Mapping[str, str] = field(default_factory=dict)
 
     def standing(self, kind: EventKind, *ended_by: EventKind) -> list[EventStatus]:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 from daemon.acquisition_status import AcquisitionStatus
 from daemon.alarms.evidence import Evidence, FailedJob, ModelEvidence, SessionEvidence, SetupEvidence, StoreEvidence
 from daemon.drift_table import DriftTable
 from daemon.live_model import LiveModel, Loaded
-from daemon.store.alarm_evidence import failed_jobs, newest_setup, open_session
+from daemon.prism_guard import Suspicion
+from daemon.store.alarm_evidence import failed_jobs, newest_setup, open_session, untrained_sessions
+from daemon.store.health import StoreHealth
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, Clock, Stamp
 
@@ -21,26 +22,34 @@ class Gatherer:
     """Takes a snapshot of everything, again and again. A part that fails keeps what it was last known to be.
 
     Args:
-        acquisition: its status.
         store: for sessions, set-ups and jobs.
         rig_name: whose.
         live: the live model.
         drift: of the live model.
         clock: when it is.
         previous_run: as of `Evidence`.
+        acquisition: its status.
+        health: of the store.
+        suspicions: stations that may be on another prism than the open session's.
+        is_control_served: whether commands are taken.
     """
 
     def __init__(
         self,
-        acquisition: Callable[[], AcquisitionStatus],
         store: Store,
         rig_name: str,
         live: LiveModel,
         drift: DriftTable,
         clock: Clock,
         previous_run: Stamp | None,
+        *,
+        acquisition: Callable[[], AcquisitionStatus],
+        health: Callable[[], StoreHealth],
+        suspicions: Callable[[], Sequence[Suspicion]],
+        is_control_served: Callable[[], bool],
     ) -> None:
-        self._acquisition, self._store, self._rig = acquisition, store, rig_name
+        self._acquisition, self._health, self._suspicions = acquisition, health, suspicions
+        self._is_control_served, self._store, self._rig = is_control_served, store, rig_name
         self._live, self._drift, self._clock, self._previous_run = live, drift, clock, previous_run
         self._began = clock.now()
         self._known = Evidence(self._began)
@@ -58,8 +67,10 @@ class Gatherer:
             setup=self._part("the set-ups", self._setup, known.setup),
             failed_jobs=self._part("the jobs", self._failed_jobs, known.failed_jobs),
             model=self._part("the live model", self._model, known.model),
-            store=self._part("the disk", self._disk, known.store),
+            store=self._part("the store's files", self._files, known.store),
             previous_run=self._previous_run,
+            is_control_served=self._part("the control socket", self._is_control_served, known.is_control_served),
+            untrained_sessions=self._part("the sessions", self._untrained, known.untrained_sessions),
             unwatched=self._failed,
         )
         return self._known
@@ -75,7 +86,8 @@ class Gatherer:
         row = open_session(self._store, self._rig)
         if row is None:
             return None
-        return SessionEvidence(row.id, self._clock.now().since(row.started) / NS_PER_S, row.jumped)
+        age_s = self._clock.now().since(row.started) / NS_PER_S
+        return SessionEvidence(row.id, age_s, row.jumped, tuple(self._suspicions()))
 
     def _setup(self) -> SetupEvidence | None:
         found = newest_setup(self._store)
@@ -94,5 +106,10 @@ class Gatherer:
             return ModelEvidence(run.model_id, live.jumped, "", drifted_with)
         return ModelEvidence(run.model_id, (), live.reason if live.is_defect else "", drifted_with)
 
-    def _disk(self) -> StoreEvidence:
-        return StoreEvidence(free_bytes=shutil.disk_usage(self._store.path.parent).free)
+    def _files(self) -> StoreEvidence:
+        health = self._health()
+        fault = health.text if health.state in ("damaged", "replaced", "missing") else ""
+        return StoreEvidence(fault, health.free_bytes, health.is_low)
+
+    def _untrained(self) -> dict[str, str]:
+        return untrained_sessions(self._store, self._rig)

@@ -16,6 +16,12 @@ _FAILED = """SELECT max(job.id) AS id, job.kind, job.error FROM jobs AS job
     WHERE job.state = 'failed' AND session.rig = ? GROUP BY job.kind ORDER BY job.id"""
 _DONE_LATER = """SELECT 1 FROM jobs AS job CROSS JOIN calibration_sessions AS session ON session.id = job.session_id
     WHERE job.state = 'done' AND job.id > ? AND job.kind = ? AND session.rig = ? LIMIT 1"""
+# Those after the newest session that is used: later measurements make up for the earlier ones.
+_UNTRAINED = """SELECT id, excluded FROM calibration_sessions
+    WHERE rig = ?1 AND state = 'closed' AND excluded IS NOT NULL AND rowid >
+        (SELECT coalesce(max(rowid), 0) FROM calibration_sessions
+            WHERE rig = ?1 AND state = 'closed' AND excluded IS NULL)
+    ORDER BY rowid"""
 
 
 @dataclass(frozen=True)
@@ -42,6 +48,11 @@ def open_session(store: Store, rig_name: str) -> OpenSessionRow | None:
     assert started is not None  # the columns are NOT NULL
     jumped = store.rows(_JUMPED, (rows[0]["started_boot_id"], rows[0]["started_monotonic_ns"]))
     return OpenSessionRow(rows[0]["id"], started, tuple(row["device"] for row in jumped))
+
+
+def untrained_sessions(store: Store, rig_name: str) -> dict[str, str]:
+    """Closed sessions of the rig that nothing trains on, newer than all that are used -> why."""
+    return {row["id"]: row["excluded"] for row in store.rows(_UNTRAINED, (rig_name,))}
 
 
 def newest_setup(store: Store) -> tuple[str, str] | None:

@@ -30,6 +30,7 @@ AT_START_S = 3.0  # a small store is checked by then, and its state known from t
 STOP_S = 5.0
 LOW_BYTES = 2**30
 LOW_SHARE = 0.05
+LOW_SHARE_MOST_BYTES = 10 * 2**30
 FINDINGS = 5
 NICE = 15
 SOUND = "ok"
@@ -45,7 +46,7 @@ class StoreHealth:
         text: what is wrong and what to do, a sentence; "" when all is well.
         since: when it came to be so.
         free_bytes: free space where the store lies; None where the file system does not tell.
-        is_low: less than 1 GiB of it, or less than 5 %, is free.
+        is_low: less than 1 GiB is free, or less than 5 % of the disk and 10 GiB.
     """
 
     state: HealthState
@@ -202,7 +203,7 @@ def _space(directory: Path) -> tuple[int | None, bool]:
         usage = shutil.disk_usage(directory)
     except OSError:
         return None, False
-    return usage.free, usage.free < max(LOW_BYTES, LOW_SHARE * usage.total)
+    return usage.free, usage.free < max(LOW_BYTES, min(LOW_SHARE * usage.total, LOW_SHARE_MOST_BYTES))
 
 
 def _descriptors() -> list[str]:

@@ -53,6 +53,14 @@ def frames_lost(evidence: Evidence) -> Iterator[Finding]:
         yield event.device, event.text
 
 
+@rule("warning", "Look what else the computer does, and whether its clock is set while rigcal runs.")
+def time_doubtful(evidence: Evidence) -> Iterator[Finding]:
+    """When captures of a link were received is not known, as nobody read for a while or the clock was set, within the
+    last 5 minutes. They are stored and marked, and their readings are not used."""
+    for event in evidence.lately(EventKind.TIME_DOUBTFUL, LATELY_S):
+        yield event.device, event.text
+
+
 @rule("warning", "Check bit rate, wiring and the description of the device (DBC, EDS, profile).", hold_s=60.0)
 def decode_failures(evidence: Evidence) -> Iterator[Finding]:
     """One in a hundred captures of a device or more, and ten at least, could not be decoded in the last minute or so.

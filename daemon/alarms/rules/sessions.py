@@ -38,12 +38,12 @@ def session_open_long(evidence: Evidence) -> Iterator[Finding]:
         yield evidence.session.id, "the session has been open for more than 24 hours, and jobs wait for its end"
 
 
-@rule("warning", "Shoot the control points at both ends next time; `rigcal session show NAME` tells what is missing.")
+@rule("warning", "Hold a new session with control shots at both ends, or accept it: `rigcal session accept NAME`.")
 def session_not_trained(evidence: Evidence) -> Iterator[Finding]:
-    """Nothing trains on a closed session, because control shots are missing at its start or end. Cleared when the
-    operator says that it is to be used, or newer sessions make it unimportant."""
-    for name in evidence.untrained_sessions:
-        yield name, "no model is trained on the session: control shots are missing at its start or end"
+    """Calibration does not use a closed session: control shots are missing at its start or end, or the station moved.
+    Cleared when an operator accepts it, and by a newer session that is used."""
+    for name, why in evidence.untrained_sessions.items():
+        yield name, f"calibration does not use the session: {why}"
 
 
 @rule("critical", "Check the joint's zero; then `rigcal model zeros-checked`, or calibrate again.", hold_s=10.0)

@@ -54,9 +54,11 @@ def instrument_error(evidence: Evidence) -> Iterator[Finding]:
             yield event.device, event.text
 
 
-@rule("critical", "See which prism the station follows, and aim it at the session's.")
+@rule("critical", "Aim the station at the session's prism; if it is on it, say `rigcal session confirm-prism`.")
 def prism_jump(evidence: Evidence) -> Iterator[Finding]:
-    """A station's target jumped further than a boom can move: it may follow another prism, and its fixes are refused.
-    Cleared when fixes count again."""
-    for event in evidence.standing(EventKind.PRISM_JUMP, EventKind.LOCK_ACQUIRED):
-        yield event.device, event.text
+    """A station's target jumped further than a boom can move while a session is open: it may follow another prism, and
+    its fixes do not count. Cleared when the target is the earlier one again, when an operator confirms the prism, and
+    with the session; never by time."""
+    if evidence.session is not None:
+        for suspicion in evidence.session.suspicions:
+            yield suspicion.station, f"{suspicion.reason}; its fixes do not count"

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
 
-_GB = 1_000_000_000
+CRITICAL_BYTES = 200 * 2**20
 
 
 @rule("critical", "Free space on the disk, or check it; captures wait in memory meanwhile.", hold_s=5.0)
@@ -17,17 +17,19 @@ def not_storing(evidence: Evidence) -> Iterator[Finding]:
         yield "store", evidence.acquisition.error
 
 
-@rule("critical", "Stop rigcal, keep the file, and restore the store from a backup.")
+@rule("critical", "Do as the alarm says before rigcal is stopped: what lies in a file without a name goes with it.")
 def store_unsound(evidence: Evidence) -> Iterator[Finding]:
-    """The file of the store is damaged, was replaced, or is gone."""
+    """The store is damaged, or a file of it was replaced or is gone."""
     if evidence.store.fault:
         yield "store", evidence.store.fault
 
 
 @rule("warning", "Free space on the disk of the store.", hold_s=60.0)
 def disk_nearly_full(evidence: Evidence) -> Iterator[Finding]:
-    """Less than 2 GB are free on the disk of the store; critical below 200 MB. Cleared after a minute with more."""
+    """Little of the store's disk is free: less than 1 GiB, or less than 5 % and 10 GiB. Critical below 200 MiB. Cleared
+    after a minute with more."""
     free = evidence.store.free_bytes
-    if free is not None and free < 2 * _GB:
-        least = "200 MB" if free < _GB // 5 else "2 GB"
-        yield "store", f"less than {least} are free on the disk", "critical" if free < _GB // 5 else "warning"
+    if free is not None and free < CRITICAL_BYTES:
+        yield "store", "less than 200 MiB are free on the disk", "critical"
+    elif evidence.store.is_low:
+        yield "store", "the disk is nearly full"

@@ -13,6 +13,8 @@ from daemon.alarms.evidence import FailedJob, SetupEvidence
 from daemon.alarms.gather import Gatherer
 from daemon.drift_table import DriftTable
 from daemon.order import Outcome
+from daemon.prism_guard import Suspicion
+from daemon.store.health import StoreHealth
 from drivers.readings import DeviceEvent, EventKind
 from tests.daemon.model_support import ModelRig, wait
 
@@ -27,7 +29,18 @@ def rig(tmp_path: Path) -> Iterator[ModelRig]:
 @pytest.fixture
 def gather(rig: ModelRig) -> Gatherer:
     drift = DriftTable(rig.store, "swdt82", rig.clock)
-    return Gatherer(AcquisitionStatus, rig.store, "swdt82", rig.live, drift, rig.clock, None)
+    return Gatherer(
+        rig.store,
+        "swdt82",
+        rig.live,
+        drift,
+        rig.clock,
+        None,
+        acquisition=AcquisitionStatus,
+        health=lambda: StoreHealth("replaced", "another file", rig.clock.now(), 5, is_low=True),
+        suspicions=lambda: [Suspicion("station", rig.clock.now(), 9.5)],
+        is_control_served=lambda: False,
+    )
 
 
 def job(rig: ModelRig, kind: str, session: str) -> int:
@@ -63,6 +76,7 @@ def test_an_open_session_is_told_with_its_age_and_the_joints_that_jumped_in_it(r
     session = gather().session
     assert session is not None
     assert (session.id, session.age_s, session.jumped) == ("a", 100.0, ("theta3",))
+    assert [suspicion.distance_m for suspicion in session.suspicions] == [9.5]
     rig.jobs.close_session("a")
     assert gather().session is None
 
@@ -100,6 +114,22 @@ def test_the_live_model_is_told_with_jumps_defects_and_drift(rig: ModelRig, gath
     file.write_bytes(file.read_bytes()[:-10])
     rig.live.changed()
     wait(lambda: (found := gather().model) is not None and "truncated" in found.defect)
+
+
+def test_a_session_that_is_not_used_is_told_until_a_newer_one_is(rig: ModelRig, gather: Gatherer) -> None:
+    for name in ("a", "b", "c"):
+        rig.jobs.session(name)
+    for name in ("a", "c"):
+        rig.store.update("calibration_sessions", {"id": name}, {"excluded": "no control point was shot"})
+    assert gather().untrained_sessions == {"c": "no control point was shot"}
+    rig.jobs.session("d")
+    assert gather().untrained_sessions == {}
+
+
+def test_the_store_and_the_control_socket_are_told_as_they_are(gather: Gatherer) -> None:
+    evidence = gather()
+    assert (evidence.store.fault, evidence.store.free_bytes, evidence.store.is_low) == ("another file", 5, True)
+    assert not evidence.is_control_served
 
 
 def test_a_part_that_fails_keeps_what_it_was_last_known_to_be(rig: ModelRig, gather: Gatherer) -> None:

@@ -29,6 +29,7 @@ from daemon.alarms.evidence import (
 from daemon.alarms.library import library
 from daemon.alarms.page import page
 from daemon.decode_failures import DecodeStatus
+from daemon.prism_guard import Suspicion
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import EventKind
 
@@ -98,6 +99,7 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
         (known(links=[link(restarted_age_s=5)]), ["boom"], known(links=[link(restarted_age_s=301)])),
     ],
     "queue_full": [(known(links=[link(dropped_age_s=1)]), ["boom"], known(links=[link(dropped_age_s=6)]))],
+    "time_doubtful": [(known(event(E.TIME_DOUBTFUL)), ["boom"], known(event(E.TIME_DOUBTFUL, age_s=301)))],
     "frames_lost": [(known(event(E.FRAMES_DROPPED)), ["boom"], known(event(E.FRAMES_DROPPED, age_s=301)))],
     "decode_failures": [
         (known(decoding=[failures(10, 0.02)]), ["theta1"], known(decoding=[failures(10, 0.005)])),
@@ -250,15 +252,16 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
     ],
     "prism_jump": [
         (
-            known(event(E.PRISM_JUMP, "station", 3), event(E.LOCK_ACQUIRED, "station", 2)),
+            known(session=replace(SESSION, suspicions=(Suspicion("station", NOW, 9.5),))),
             ["station"],
-            known(event(E.PRISM_JUMP, "station", 3), event(E.LOCK_ACQUIRED, "station", 4)),
+            known(event(E.PRISM_JUMP, "station"), session=SESSION),
         )
     ],
     "not_storing": [(known(error="disk full"), ["store"], known())],
     "store_unsound": [(known(store=StoreEvidence("the file is gone")), ["store"], known())],
     "disk_nearly_full": [
-        (known(store=StoreEvidence(free_bytes=10**9)), ["store"], known(store=StoreEvidence(free_bytes=10**10))),
+        (known(store=StoreEvidence(is_low=True)), ["store"], known(store=StoreEvidence(free_bytes=10**10))),
+        (known(store=StoreEvidence(free_bytes=10**8)), ["store"], known(store=StoreEvidence(free_bytes=10**9))),
     ],
     "setup_moved": [(known(setup=SetupEvidence("S2", True)), ["S2"], known(setup=SetupEvidence("S3", False)))],
     "session_without_fixes": [
@@ -276,7 +279,7 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
     "session_open_long": [
         (known(session=replace(SESSION, age_s=86_401)), ["s001-r"], known(session=replace(SESSION, age_s=86_399))),
     ],
-    "session_not_trained": [(known(untrained_sessions=("s001-r",)), ["s001-r"], known())],
+    "session_not_trained": [(known(untrained_sessions={"s001-r": "no control point was shot"}), ["s001-r"], known())],
     "zero_lost": [
         (
             known(model=ModelEvidence(1, ("theta1",)), session=replace(SESSION, jumped=("theta1", "theta3"))),
