@@ -36,8 +36,8 @@ from drivers.canlog import read_can_log
 from drivers.clock import SystemClock
 from drivers.readings import CanCapture, EventKind, LinkItem
 from simulators.frame import Frame
-from tests.bench.acquisition import SETTLE_S, START_S, Child
-from tests.bench.traffic import FRAMES_PER_MS, MULTICAST_GROUP, Bus, MulticastSender, number_of, send_all
+from tests.bench.acquisition import SETTLE_S, START_S, Child, cpu_s
+from tests.bench.traffic import FRAMES_PER_MS, MULTICAST_GROUP, Bus, MulticastSender, frame_at, number_of, send_all
 
 SPINNERS_PER_CORE = 2
 VCAN = "vcan0"
@@ -61,6 +61,7 @@ class Heard:
         monotonic_ns: of the frames; None where the listener does not know it.
         doubtful: how many frames are marked.
         overflowed: frames that the kernel dropped because they were not fetched; None where the listener cannot tell.
+        cpu_s: that its process used while it listened.
         events: what else the listener told.
     """
 
@@ -69,6 +70,7 @@ class Heard:
     monotonic_ns: array[int] | None
     doubtful: int | None
     overflowed: int | None
+    cpu_s: float
     events: list[str]
 
 
@@ -96,6 +98,7 @@ class Result:
         steps_back: frames whose stamp is before that of the frame before.
         late_p50_ms, late_p99_ms, late_max_ms: stamp less the instant of sending.
         early_max_ms: the same, the other way round: a stamp before its frame was sent.
+        us_per_frame: CPU time by frame received.
     """
 
     name: str
@@ -109,6 +112,7 @@ class Result:
     late_p99_ms: float
     late_max_ms: float
     early_max_ms: float
+    us_per_frame: float
 
 
 # ---- processes -------------------------------------------------------------------------------------------------------
@@ -141,26 +145,29 @@ def run_rigcal(transport: Transport, parent: Connection) -> None:
     loop = threading.Thread(target=CanLink(config, SystemClock()).run, args=(emit, stop))
     loop.start()
     is_up.wait(START_S)
+    before_s = cpu_s()
     parent.send("ready")
     parent.recv()
     stop.set()
     loop.join()
-    parent.send(Heard(numbers, utc_ns, monotonic_ns, doubtful, overflowed, events))
+    parent.send(Heard(numbers, utc_ns, monotonic_ns, doubtful, overflowed, cpu_s() - before_s, events))
 
 
 def run_python_can(transport: Transport, path: Path, parent: Connection) -> None:
     """Process: python-can's logger."""
     bus = can.Bus(transport.channel, transport.interface, ignore_config=True, **transport.options)
     notifier = can.Notifier(bus, [can.CanutilsLogWriter(path)])
+    before_s = cpu_s()
     parent.send("ready")
     parent.recv()
     notifier.stop()
     bus.shutdown()
+    used_s = cpu_s() - before_s
     numbers, utc_ns = array("q"), array("q")
     for capture in read_can_log(path):
         numbers.append(number_of(capture.data))
         utc_ns.append(capture.stamp.utc_ns)
-    parent.send(Heard(numbers, utc_ns, None, None, None, []))
+    parent.send(Heard(numbers, utc_ns, None, None, None, used_s, []))
 
 
 class NotedBus:
@@ -209,6 +216,9 @@ def run_sender(transport: Transport, seconds: float, parent: Connection) -> None
     parent.send("ready")
     parent.recv()
     took_s = send_all(bus, seconds)
+    parent.send("sent")
+    parent.recv()
+    bus.send(frame_at(len(bus.utc_ns)))  # the kernel tells of frames that it lost with the next one alone
     bus.close()
     parent.send(Sent(bus.monotonic_ns, bus.utc_ns, took_s, is_real_time))
 
@@ -248,11 +258,13 @@ def measure(seconds: float, spinners_per_core: int, directory: Path) -> dict[str
     try:
         time.sleep(SETTLE_S)
         sender.tell()
-        sent = sender.hear(seconds * 5 + START_S)
+        sender.hear(seconds * 5 + START_S)
         time.sleep(SETTLE_S)
     finally:
         for spinner in spinners:
             spinner.kill()
+    sender.tell()
+    sent = sender.hear(START_S)
     assert isinstance(sent, Sent)
     time.sleep(SETTLE_S)
     found = []
@@ -296,6 +308,7 @@ def _result(name: str, heard: Heard, sent: Sent) -> Result:
         late_p99_ms=float(np.percentile(late_ms, 99)),
         late_max_ms=float(late_ms.max()),
         early_max_ms=max(0.0, -float(late_ms.min())),
+        us_per_frame=1e6 * heard.cpu_s / max(received, 1),
     )
 
 
@@ -320,6 +333,7 @@ def table(report: dict[str, object]) -> str:
         ("p99", lambda r: f"{r['late_p99_ms']:.3f} ms"),
         ("max", lambda r: f"{r['late_max_ms']:.3f} ms"),
         ("stamp early by, max", lambda r: f"{r['early_max_ms']:.3f} ms"),
+        ("CPU per frame", lambda r: f"{r['us_per_frame']:.1f} us"),
     ]
     lines = [
         f"{report['sent']:,} frames in {report['seconds']:.1f} s ({report['frames_per_s']:,.0f}/s of "

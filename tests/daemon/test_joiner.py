@@ -105,7 +105,7 @@ def test_a_length_does_not_wrap() -> None:
     assert joined.values["L2_mm"] == pytest.approx(750.0)
 
 
-@settings(max_examples=60)
+@settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32), st.integers(1, 400), st.floats(0.0, 0.3))
 def test_neither_order_nor_batches_of_records_change_what_is_joined(seed: int, batch: int, delay_s: float) -> None:
     fixes = [fix(t / 20) for t in range(5, 50)]
@@ -124,7 +124,7 @@ def test_neither_order_nor_batches_of_records_change_what_is_joined(seed: int, b
     assert joined == expected
 
 
-@settings(max_examples=60)
+@settings(max_examples=60, deadline=None)
 @given(st.integers(1, 400), st.floats(-20.0, 20.0))
 def test_one_link_may_be_read_long_after_another(batch: int, later_s: float) -> None:
     fixes = [fix(t / 4) for t in range(1, 40)]

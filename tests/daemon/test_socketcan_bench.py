@@ -23,8 +23,8 @@ def test_a_short_benchmark_drops_nothing_and_no_stamp_goes_back() -> None:
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     rigcal, python_can = report["results"]
-    assert report["sent"] == 4000
-    assert rigcal["received"] + rigcal["lost_in_kernel"] == 4000
+    assert report["sent"] == 4001
+    assert rigcal["received"] + rigcal["lost_in_kernel"] == 4001
     assert (rigcal["dropped"], rigcal["doubtful"], rigcal["repeated"], rigcal["steps_back"]) == (0, 0, 0, 0)
     assert rigcal["early_max_ms"] < 1.0
-    assert python_can["received"] + python_can["dropped"] == 4000
+    assert python_can["received"] + python_can["dropped"] == 4001
