@@ -266,6 +266,44 @@ def m014_prism_confirmations(db: Database) -> None:
     )
 
 
+@MIGRATIONS()
+def m012_store_health(db: Database) -> None:
+    """Checks of the store itself, and what the end of the computer did to jobs."""
+    _create(
+        db,
+        # result: `ok`, or what is damaged; NULL while a check runs, and where it never came to its end.
+        f"""CREATE TABLE store_checks (id INTEGER PRIMARY KEY, {_instant("started_")},
+            {_instant("ended_", optional=True)}, result TEXT) STRICT""",
+        # host_boot: the kernel's boot in which the job was started, whatever the rig's clock says (a simulated one has
+        # boots of its own). interruptions: how often something interrupted it that was none of its attempts.
+        "ALTER TABLE jobs ADD COLUMN host_boot TEXT",
+        "ALTER TABLE jobs ADD COLUMN interruptions INTEGER NOT NULL DEFAULT 0",
+    )
+
+
+@MIGRATIONS()
+def m013_comparisons_know_the_live_model(db: Database) -> None:
+    """A comparison of a named model says with which change the model beside it had gone live."""
+    _create(
+        db,
+        "ALTER TABLE jobs ADD COLUMN live_since INTEGER REFERENCES model_states(id)",
+        "CREATE INDEX jobs_by_model ON jobs(model_id, live_since) WHERE model_id IS NOT NULL",
+    )
+
+
+@MIGRATIONS()
+def m013_alarms(db: Database) -> None:
+    """What is wrong, since when, and what to do about it."""
+    _create(
+        db,
+        # raised_: when it was noticed; cleared_ is NULL while it is active.
+        f"""CREATE TABLE alarms (id INTEGER PRIMARY KEY, kind TEXT NOT NULL, subject TEXT NOT NULL,
+            {_one_of("severity", "warning", "critical")}, text TEXT NOT NULL, remedy TEXT NOT NULL,
+            {_instant("raised_")}, {_instant("cleared_", optional=True)}) STRICT""",
+        "CREATE UNIQUE INDEX alarms_one_active ON alarms(kind, subject) WHERE cleared_utc_ns IS NULL",
+    )
+
+
 def unknown_migrations(db: Database) -> list[str]:
     """Migrations that `db` has and this program does not know: it was made by a newer one."""
     empty = Database(memory=True)
