@@ -146,7 +146,7 @@ def test_a_cancellation_is_kept_when_the_jobs_end_cannot_be_stored(tmp_path: Pat
     jobs.cancel(job.id)
     with disk_fails(), pytest.raises(sqlite3.OperationalError):
         jobs.end(job.id, Outcome("done", result={"model": "m"}))
-    jobs.interrupt_running("the daemon could not see it through")
+    jobs.interrupt_running("the daemon could not see it through", is_innocent=True)
     assert {row["state"] for row in rig.store.rows("SELECT state FROM jobs")} == {"cancelled"}
     rig.store.close()
 
@@ -164,6 +164,6 @@ def test_a_cancellation_outlives_a_daemon_that_is_killed_before_the_job_has_ende
     jobs.cancel(job.id)
     rig.store.close()
     again = Store(tmp_path / "rigcal.sqlite")
-    JobTable(again, "swdt82", rig.clock).interrupt_running("the daemon ended while it ran")
+    JobTable(again, "swdt82", rig.clock).interrupt_left_over("this boot")
     assert {row["state"] for row in again.rows("SELECT state FROM jobs")} == {"cancelled"}
     again.close()

@@ -35,24 +35,34 @@ def stand(rig: Rig, place: tuple[float, float, float], fixes: int) -> None:
     rig.live(fixes * STEP_S)
 
 
-@pytest.mark.parametrize("metres", [10.02, 0.3])
-def test_another_prisms_fixes_within_a_standstill_are_excluded_by_name(rig: Rig, metres: float) -> None:
+def test_another_prism_too_near_to_be_a_jump_is_excluded_by_name(rig: Rig) -> None:
     rig.say("start", prism="r")
     stand(rig, PRISM, 60)
-    stand(rig, away(metres), 40)
+    stand(rig, away(0.3), 40)
     stand(rig, PRISM, 60)
-    reason = f"another prism or a reflection: more fixes of this standstill lie {metres:.2f} m away"
+    reason = "another prism or a reflection: more fixes of this standstill lie 0.30 m away"
     summary = rig.say("stop")
     assert summary["excluded"][reason] == 40
     assert {why for y, why in observed(rig) if y == 8000.0} == {None}
     assert summary["observations"] == sum(y == 8000.0 for y, _ in observed(rig))
 
 
+def test_another_prism_that_an_operator_takes_for_the_right_one_is_excluded_by_name(rig: Rig) -> None:
+    rig.say("start", prism="r")
+    stand(rig, PRISM, 60)
+    stand(rig, away(10.02), 20)
+    rig.say("confirm_prism", operator="Ada")
+    stand(rig, away(10.02), 40)
+    excluded = rig.say("stop")["excluded"]
+    assert excluded["another prism or a reflection: more fixes of this standstill lie 10.02 m away"] > 20
+    assert {y for y, why in observed(rig) if why is None} == {8000.0}
+
+
 def test_what_came_first_is_excluded_when_it_turns_out_to_be_the_minority(rig: Rig) -> None:
     rig.say("start", prism="r")
-    stand(rig, away(10.0), 40)
+    stand(rig, away(0.3), 40)
     stand(rig, PRISM, 35)
-    assert {y for y, why in observed(rig) if why is None} == {18000.0}
+    assert {y for y, why in observed(rig) if why is None} == {8300.0}
     stand(rig, PRISM, 60)
     assert {y for y, why in observed(rig) if why is None} == {8000.0}
     assert all((why is None) == (y == 8000.0) for y, why in observed(rig))
@@ -83,7 +93,7 @@ def test_a_third_place_is_excluded_with_the_second() -> None:
 
 def test_each_standstill_has_a_place_of_its_own(rig: Rig) -> None:
     rig.say("start", prism="r")
-    for metres in (0.0, 1.0, 2.0):
+    for metres in (0.0, 0.3, 0.6):
         rig.live(1, theta1=5.0)
         stand(rig, away(metres), 60)
     assert {why for _, why in observed(rig)} == {None}
