@@ -76,8 +76,8 @@ class Acquisition:
         batch_seconds: how long captures are gathered before they are committed, in real time: it bounds how often
             the disk must sync.
         queue_captures: how many captures of one link may wait while the disk is slow.
-        on_records: called in the writer's thread, within a transaction of its own, with records after they were
-            committed, and with none when time has passed (ten times a second).
+        on_records: called in the writer's thread with records after they were committed, and with none when time has
+            passed (ten times a second). What it stores it commits itself.
     """
 
     def __init__(
@@ -340,8 +340,7 @@ class Acquisition:
     def _hand_on(self, records: Sequence[Record]) -> None:
         self._board.recorded(records)
         try:
-            with self._store.transaction():
-                self._on_records(records)
+            self._on_records(records)
         except Exception:
             # The records are stored; a fault of their consumer must not end acquisition.
             log.exception("records are stored, but could not be handed on")

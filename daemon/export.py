@@ -71,11 +71,17 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
                             writer.write(capture)
             files.append(path)
         points = reader.rows("SELECT * FROM control_points WHERE setup_id = ?", (session["setup_id"],))
+        sql = "SELECT * FROM prism_confirmations WHERE session_id = ? ORDER BY id"
+        words = [
+            (row["turning"], steady.of(_stamp(reader, row, "")).utc_ns) for row in list(reader.rows(sql, (session_id,)))
+        ]
         told = SessionFile(
             prism=session["prism"],
             kind=session["kind"],
             since_utc_ns=steady.of(started).utc_ns,
             until_utc_ns=steady.of(ended).utc_ns,
+            prism_confirmed_utc_ns=tuple(at_ns for turning, at_ns in words if not turning),
+            prism_turned_utc_ns=tuple(at_ns for turning, at_ns in words if turning),
             control_points={point["name"]: (point["x_mm"], point["y_mm"], point["z_mm"]) for point in points},
         )
         path = out / f"{session_id}.json"

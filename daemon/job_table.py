@@ -7,6 +7,7 @@ process does meet here, and the second of the two finds what the first one did.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
 from daemon.config import Config
@@ -27,10 +28,11 @@ SHOWN = "id, kind, session_id, state, progress, message, attempts, error"
 
 # These run twice a second beside acquisition, for months: CROSS JOIN and NOT INDEXED keep SQLite's planner from
 # starting with all of a rig's sessions.
-# The newest session of each kind and state; the index by kind holds all that it asks for.
+# The newest session of each kind and state that calibration may use; the index holds all that it asks for.
 _SESSIONS = """SELECT id, rowid AS number, kind, state, ended_utc_ns, ended_monotonic_ns, ended_boot_id
     FROM calibration_sessions WHERE rowid IN
-        (SELECT max(rowid) FROM calibration_sessions WHERE rig = ? AND state IN ('open', 'closed') GROUP BY state, kind)
+        (SELECT max(rowid) FROM calibration_sessions
+            WHERE rig = ? AND state IN ('open', 'closed') AND excluded IS NULL GROUP BY state, kind)
     ORDER BY rowid"""
 _JOBS = """SELECT job.id, job.kind, job.session_id, job.state, job.attempts,
         job.depends_on IS NULL OR before.state = 'done' AS is_ready,
@@ -38,15 +40,19 @@ _JOBS = """SELECT job.id, job.kind, job.session_id, job.state, job.attempts,
     FROM jobs AS job CROSS JOIN calibration_sessions AS session ON session.id = job.session_id
         LEFT JOIN jobs AS before ON before.id = job.depends_on
     WHERE job.state IN ('queued', 'running', 'interrupted') AND session.rig = ? ORDER BY job.id"""
-# Walks back from the newest session to one that a job of this kind was queued through, or that no longer matters.
-_COVERED = """SELECT session.rowid AS number FROM calibration_sessions AS session NOT INDEXED
-    WHERE session.rig = ? AND session.rowid > ?
-        AND EXISTS (SELECT 1 FROM jobs WHERE jobs.through_session_id = session.id AND jobs.kind = ?)
+# Walks back from the newest session to one that a job of this kind was queued through, or that no longer matters. A job
+# that was queued before an operator accepted a session does not work on that one, and covers nothing any more.
+_COVERED = f"""SELECT session.rowid AS number FROM calibration_sessions AS session NOT INDEXED
+    WHERE session.rig = ?1 AND session.rowid > ?2
+        AND EXISTS (SELECT 1 FROM jobs WHERE jobs.through_session_id = session.id AND jobs.kind = ?3 AND jobs.id >
+            (SELECT coalesce(max(accepted_after_job), 0) FROM calibration_sessions
+                WHERE rig = ?1 AND accepted_after_job IS NOT NULL AND (kind = '{CHECK}') = ?4))
     ORDER BY session.rowid DESC LIMIT 1"""
 _NEWEST_MODEL = """SELECT job.result_json FROM jobs AS job
     JOIN calibration_sessions AS session ON session.id = job.session_id
     WHERE job.state = 'done' AND job.kind = 'residual' AND session.rig = ? ORDER BY job.id DESC LIMIT 1"""
 _WORKED_ON = """SELECT rowid AS number, id, kind FROM calibration_sessions WHERE rig = ? AND state = 'closed'
+        AND excluded IS NULL AND coalesce(accepted_after_job, 0) < ?
         AND rowid <= (SELECT rowid FROM calibration_sessions WHERE id = ?)
     ORDER BY rowid"""
 _CHAIN = """WITH RECURSIVE chain(id) AS (VALUES (?) UNION SELECT jobs.id FROM jobs JOIN chain ON depends_on = chain.id)
@@ -68,7 +74,6 @@ class JobTable:
         self._clock = clock
         self._models = ModelTable(store, rig_name, clock)
         self._drift = DriftTable(store, rig_name, clock)
-        self._cancelled: set[int] = set()  # running jobs that the operator wants to end
 
     # ---- what is there -----------------------------------------------------------------------------------------------
 
@@ -79,7 +84,7 @@ class JobTable:
         covered = {
             kind: rows[0]["number"]
             for kind, after in back_to.items()
-            if (rows := self._store.rows(_COVERED, (self._rig, after, kind)))
+            if (rows := self._store.rows(_COVERED, (self._rig, after, kind, kind is not JobKind.GAP)))
         }
         return State(
             [
@@ -120,7 +125,7 @@ class JobTable:
     def order(self, job: JobFacts, config: Config) -> Order:
         """What a job's process is asked to do: the sessions were settled when the job was queued."""
         (row,) = self._store.rows("SELECT depends_on, through_session_id, model_id FROM jobs WHERE id = ?", (job.id,))
-        sessions = self._store.rows(_WORKED_ON, (self._rig, row["through_session_id"]))
+        sessions = self._store.rows(_WORKED_ON, (self._rig, job.id, row["through_session_id"]))
         training = tuple(s["id"] for s in sessions if s["kind"] != CHECK)
         checks = tuple(s["id"] for s in sessions if s["kind"] == CHECK)
         if row["model_id"] is not None:
@@ -259,7 +264,7 @@ class JobTable:
 
     def is_cancelled(self, job_id: int) -> bool:
         """Whether the operator wants a running job to end."""
-        return job_id in self._cancelled
+        return _is_cancelled(self._job(job_id))
 
     def end(self, job_id: int, outcome: Outcome, *, is_innocent: bool = False) -> Outcome:
         """A job has ended; with one that failed or was cancelled end those that wait for it.
@@ -275,12 +280,11 @@ class JobTable:
             how it ended in the end: what the operator said goes before what the process said.
         """
         with self._store.transaction():
-            if job_id in self._cancelled:
-                self._cancelled.discard(job_id)
+            job = self._job(job_id)
+            if _is_cancelled(job):
                 outcome, is_innocent = CANCELLED, False
             ended = self._store.instant(self._clock.now(), "ended_")
             is_done = outcome.state == "done"
-            job = self._job(job_id)
             self._set(
                 job_id,
                 state=outcome.state,
@@ -306,7 +310,7 @@ class JobTable:
                         self._set(waiting["id"], state="cancelled", error=error, **ended)
             return outcome
 
-    def interrupt_running(self, why: str, *, is_innocent: bool) -> None:
+    def interrupt_running(self, why: str, *, is_innocent: bool = False) -> None:
         """Jobs that the store takes for running, and that nobody runs, did not end: the scheduler offers them again.
 
         Args:
@@ -350,7 +354,7 @@ class JobTable:
             if job["state"] not in CANCELLABLE:
                 raise CommandError(f"job {job['id']} is {job['state']}; only one that has not ended can be cancelled")
             if job["state"] == "running":
-                self._cancelled.add(job["id"])
+                self._set(job["id"], error=CANCELLED.error)  # whoever runs it, now or after a restart, finds it there
                 return f"job {job['id']} ({job['kind']}) is being cancelled"
             self.end(job["id"], CANCELLED)
             return f"job {job['id']} ({job['kind']}) is cancelled"
@@ -382,22 +386,24 @@ class JobTable:
             return f"job {job['id']} ({job['kind']}) is queued again"
 
     def compare(self, model: ModelRow) -> str:
-        """Queue a comparison of a model with the live one, on all check sessions that are closed.
+        """Queue a comparison of a model with the live one, on all check sessions that are closed and used.
 
         Returns:
             a sentence for the operator.
 
         Raises:
-            CommandError: no check session is closed.
+            CommandError: there is none.
         """
         closed = self._store.rows(
-            "SELECT id, kind FROM calibration_sessions WHERE rig = ? AND state = 'closed' ORDER BY rowid", (self._rig,)
+            "SELECT id, kind FROM calibration_sessions WHERE rig = ? AND state = 'closed' AND excluded IS NULL "
+            "ORDER BY rowid",
+            (self._rig,),
         )
         checks = [session["id"] for session in closed if session["kind"] == CHECK]
         if not checks:
             raise CommandError(
-                "no check session is closed, so nothing is held out to compare on; hold one with `rigcal session "
-                "start --kind check`",
+                "no check session is closed and used, so nothing is held out to compare on; hold one with `rigcal "
+                "session start --kind check`",
                 REFUSED,
             )
         job_id = self._add(JobKind.COMPARISON, checks[-1], closed[-1]["id"], model_id=model.id)
@@ -428,7 +434,7 @@ class JobTable:
 
     def _job(self, job_id: object) -> dict[str, Any]:
         found = isinstance(job_id, int) and self._store.rows(
-            "SELECT id, kind, state, attempts, interruptions, depends_on FROM jobs WHERE id = ?", (job_id,)
+            "SELECT id, kind, state, attempts, interruptions, depends_on, error FROM jobs WHERE id = ?", (job_id,)
         )
         if not found:
             raise CommandError(f"there is no job {job_id!r}; `rigcal jobs list` shows them")
@@ -440,3 +446,8 @@ class JobTable:
 
     def _set(self, job_id: int, **columns: object) -> None:
         self._store.update("jobs", {"id": job_id}, columns)
+
+
+def _is_cancelled(job: Mapping[str, Any]) -> bool:
+    """True if the operator wants a running job to end; one that runs has no other error."""
+    return (job["state"], job["error"]) == ("running", CANCELLED.error)

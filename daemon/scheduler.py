@@ -4,7 +4,8 @@ A closed session triggers the gap workflow, which identifies the kinematics and 
 residual training, and of that model the report and the comparison with the live one, which do not wait for each other.
 A closed check session triggers report and comparison alone, its poses are not trained on, and the live model is held
 against it. Once the checks have drifted from the live model, the chain runs on all that was measured, checks included.
-Work waits while a session is open: acquisition comes first.
+A session that no control points vouch for triggers nothing until an operator accepts it. Work waits while a session is
+open: acquisition comes first.
 
 What a job covers is decided by the order of sessions, never by time: a wall clock may be wrong for whole boots.
 """
@@ -87,10 +88,12 @@ class State:
     """What the store holds, as far as it can still matter.
 
     Attributes:
-        sessions: in the order they were started; those older than the newest of their kind and state may be left out.
+        sessions: those that calibration may use, in the order they were started; those older than the newest of their
+            kind and state may be left out.
         jobs: those that have not ended for good, in the order they were created.
         covered: kind of job -> number of the newest session that was closed when the newest job of the kind was
-            queued: that job works on it and on all before it. No entry where there is no such job.
+            queued: that job works on it and on all before it. No entry where there is no such job, or where an
+            operator has accepted a session since, which the job does not know of.
         has_model: a model exists that a check session could be held against.
         live_from: number of the newest session when the live model went live; None without one. Checks after it count
             for drift.

@@ -12,7 +12,7 @@ from typing import Any
 
 from calibration.rig import Rig
 from daemon.acquisition import Acquisition
-from daemon.composition import Parts
+from daemon.composition import Parts, motion_limits
 from daemon.config import Config
 from daemon.control import FAILED, REFUSED, CommandError, ControlServer, Handler
 from daemon.drift_table import DriftTable
@@ -77,6 +77,7 @@ class Daemon:
             parts.clock,
             run_id=store.run_id,
             aim=parts.aim,
+            limits=motion_limits(config),
         )
         models = ModelTable(store, parts.rig.name, parts.clock)
         self._live_model = LiveModel(models, parts.rig)
@@ -85,7 +86,7 @@ class Daemon:
             parts.rig,
             parts.joiner,
             self._live_model,
-            self._setups.newest_usable,
+            self._setups.current,
             parts.clock,
             prism,
             fresh_s=FRESH_S / parts.clock.real_seconds(1.0),  # what delays readings here are computers, in real time
@@ -127,6 +128,7 @@ class Daemon:
             while not stop.wait(beat_s):
                 self._acquisition.check()
                 self._watch.look()
+                self._sessions.aim_again()
                 # The watchdog hears of the writer, not of this loop: a hung disk must restart the service.
                 if self._acquisition.alive(within_s=notifier.watchdog_s or 60.0):
                     notifier.send("WATCHDOG=1")
@@ -178,6 +180,8 @@ class Daemon:
             "session.stop": sessions.stop_command,
             "session.abort": sessions.abort_command,
             "session.shoot": sessions.shoot_command,
+            "session.confirm-prism": sessions.confirm_prism_command,
+            "session.accept": sessions.accept_command,
             "session.list": sessions.list_command,
             "session.show": sessions.show_command,
             "jobs.list": jobs.list_command,

@@ -15,6 +15,8 @@ class SessionFile(BaseModel):
     Attributes:
         prism, kind: as the session was started.
         since_utc_ns, until_utc_ns: from when to when it took fixes, on the time of its captures' logs.
+        prism_confirmed_utc_ns: when an operator said that the station was on the prism, on the same time.
+        prism_turned_utc_ns: when something turned the station to the prism, on the same time.
         control_points: name -> place, mm, of those of its set-up: fixes there are not of the prism.
     """
 
@@ -25,6 +27,8 @@ class SessionFile(BaseModel):
     since_utc_ns: int = Field(ge=0)
     until_utc_ns: int = Field(ge=0)
     control_points: dict[str, tuple[float, float, float]]
+    prism_confirmed_utc_ns: tuple[int, ...] = ()
+    prism_turned_utc_ns: tuple[int, ...] = ()
 
 
 def read_session_file(path: Path) -> SessionFile:

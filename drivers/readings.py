@@ -167,7 +167,8 @@ class EventKind(StrEnum):
     CONFIGURED = "configured"
     LOCK_ACQUIRED = "lock_acquired"
     LOCK_LOST = "lock_lost"
-    PRISM_JUMP = "prism_jump"  # the station's target jumped: it follows another prism
+    PRISM_JUMP = "prism_jump"  # the station's target jumped: it may follow another prism
+    PRISM_CONFIRMED = "prism_confirmed"  # an operator says that the station is on the prism that is meant
     STATION_SILENT = "station_silent"
     INSTRUMENT_ERROR = "instrument_error"
 

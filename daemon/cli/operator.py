@@ -160,7 +160,7 @@ def session() -> None:
 @session.command(cls=Command, name="start")
 @click.option("--prism", required=True, help="The prism that the station follows.")
 @click.option("--kind", type=click.Choice(SESSION_KINDS), default="static_poses", show_default=True)
-@click.option("--setup", help="Station set-up; the newest usable one when not given.")
+@click.option("--setup", help="Station set-up; the newest when not given.")
 @click.option("--operator", default=lambda: os.environ.get("USER", ""), help="Who is responsible.")
 @click.option("--id", help="Name of the session.")
 @click.option("--note", default="")
@@ -197,6 +197,15 @@ def session_abort(**where: Any) -> Any:
     return ask(where, "session.abort", _show_session)
 
 
+@session.command(cls=Command, name="accept")
+@click.argument("name")
+@click.option("--operator", default=lambda: os.environ.get("USER", ""), help="Who is responsible.")
+@talks
+def session_accept(name: str, operator: str, **where: Any) -> Any:
+    """Use closed session NAME although its control points were not shot at both ends, or did not hold."""
+    return ask(where, "session.accept", _show_session, id=name, operator=operator)
+
+
 @session.command(cls=Command, name="shoot")
 @click.argument("point")
 @talks
@@ -205,12 +214,24 @@ def session_shoot(point: str, **where: Any) -> Any:
 
     def show(console: Console, result: dict[str, Any]) -> None:
         if result["misclosure_mm"] is None:
-            say(console, f"{result['point']} is known from now on")
+            say(console, f"{result['point']} is known from now on; shoot it again before you stop the session")
             return
         verdict = "[red]the set-up has moved[/]" if result["moved"] else "the set-up holds"
         console.print(f"{result['point']}: misclosure {result['misclosure_mm']:.1f} mm, {verdict}", highlight=False)
+        _advise(console, result["advice"])
 
     return ask(where, "session.shoot", show, timeout_s=SHOT_TIMEOUT_S, point=point)
+
+
+@session.command(cls=Command, name="confirm-prism")
+@click.option("--operator", default=lambda: os.environ.get("USER", ""), help="Who says so.")
+@talks
+def session_confirm_prism(operator: str, **where: Any) -> Any:
+    """Say that the station is on the prism of the open session, although it looks like another one.
+
+    Fixes count from now on; those that were in doubt before stay excluded.
+    """
+    return ask(where, "session.confirm-prism", lambda c, r: say(c, r["text"]), operator=operator)
 
 
 @session.command(cls=Command, name="list")
@@ -222,7 +243,8 @@ def session_list(**where: Any) -> Any:
         table = Table("session", "kind", "prism", "set-up", "state", "poses", "observations", "operator")
         for s in sessions:
             counts = (str(s["poses"]), str(s["observations"]))
-            table.add_row(s["id"], s["kind"], s["prism"], s["setup"], s["state"], *counts, s["operator"])
+            state = s["state"] if s["not_used"] is None else f"{s['state']}, not used"
+            table.add_row(s["id"], s["kind"], s["prism"], s["setup"], state, *counts, s["operator"])
         console.print(table)
 
     return ask(where, "session.list", show)
@@ -267,11 +289,23 @@ def _show_session(console: Console, session: dict[str, Any]) -> None:
     )
     for reason, n in session["excluded"].items():
         say(console, f"  {n} excluded: {reason}")
+    for suspicion in session.get("prism_suspicions", ()):
+        console.print(f"  [red]since {utc(suspicion['since_utc_ns'])}[/]", end=" ", highlight=False)
+        say(console, f"{suspicion['text']}; its fixes do not count: {suspicion['remedy']}")
     for shot in session["control_shots"]:
         size = "defined" if shot["misclosure_mm"] is None else f"misclosure {shot['misclosure_mm']:.1f} mm"
         say(console, f"  control point {shot['point']} at the {shot['phase']}: {size}")
+    for step in session["clock_steps"]:
+        back = "back" if step["step_s"] < 0 else "forward"
+        say(console, f"  {utc(step['at_utc_ns'])}: the computer's clock was set {back} by {abs(step['step_s']):.1f} s")
     if session["setup_moved"]:
-        console.print("  [red]the set-up has moved: its sessions are doubtful[/]")
+        console.print("  [red]the station has moved since this set-up was described[/]")
+    if session["not_used"] is not None:
+        console.print("  [red]calibration does not use this session:[/]", end=" ")
+        say(console, f"{session['not_used']}; to use it anyway: `rigcal session accept {session['id']}`")
+    if session["accepted"] is not None:
+        accepted = session["accepted"]
+        say(console, f"  accepted by {accepted['by'] or 'an operator'}, although {accepted['despite']}")
 
 
 def _advise(console: Console, advice: list[str]) -> None:

@@ -16,7 +16,7 @@ import click
 
 from daemon.acquisition import Acquisition
 from daemon.cli.output import Command, json_option
-from daemon.composition import decoders, joiner, live, replayed, simulated
+from daemon.composition import decoders, joiner, live, motion_limits, replayed, simulated
 from daemon.config import Config, parse_config, read_config
 from daemon.files import write_file
 from daemon.notify import Notifier
@@ -216,6 +216,7 @@ def replay(
             clock,
             run_id=0,
             aim=None,
+            limits=motion_limits(settings),
         )
         operator: deque[tuple[int, Callable[[], object]]] = deque()
         if told is not None:
@@ -223,6 +224,10 @@ def replay(
             setups.new_command({"id": REPLAYED, "instrument": "replayed", "control_points": points})
             start = {"id": REPLAYED, "prism": told.prism, "kind": told.kind, "operator": "replay"}
             operator.append((told.since_utc_ns, partial(keeper.start_command, start)))
+            confirm = partial(keeper.confirm_prism_command, {"operator": "replay"})
+            words = [(at_ns, confirm) for at_ns in told.prism_confirmed_utc_ns]
+            words += [(at_ns, partial(keeper.turned_command, {})) for at_ns in told.prism_turned_utc_ns]
+            operator.extend(sorted(words, key=lambda word: word[0]))
             operator.append((told.until_utc_ns, partial(keeper.stop_command, {})))
         acquisition = Acquisition((), made, store, clock, on_records=keeper.on_records)
         acquisition.run_inline(_followed(merged(files, settings), clock, operator))

@@ -16,6 +16,13 @@ _READ_ONLY = {errno.EROFS}
 _NO_PLACE = {errno.ENOENT, errno.ENOTDIR, errno.EACCES, errno.EPERM}
 
 NOTHING_BYTES = 2**20  # a disk with less than this has no room
+_UNWRITABLE = {sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN}
+
+
+def is_unwritable(error: BaseException) -> bool:
+    """True if the disk refused: it is full, faulty or read-only. The transaction was rolled back."""
+    code = getattr(error, "sqlite_errorcode", None) if isinstance(error, sqlite3.Error) else None
+    return code is not None and code & 0xFF in _UNWRITABLE  # the low byte; the rest says which read or write it was
 
 
 class StoreError(Exception):

@@ -256,7 +256,8 @@ class Store:
                 "software_version": importlib.metadata.version("rigcal"),
                 "sqlite_version": sqlite3.sqlite_version,
             }
-            self.run_id = self.insert("daemon_runs", run | self.instant(now, "started_") | self.instant(now, "alive_"))
+            run_id = self.insert("daemon_runs", run | self.instant(now, "started_") | self.instant(now, "alive_"))
+        self.run_id = run_id
 
     def _last_alive(self) -> Stamp | None:
         """When the last run was last known to be alive; None before the first."""

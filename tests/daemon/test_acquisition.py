@@ -389,8 +389,9 @@ def test_a_consumer_that_fails_does_not_end_acquisition_and_leaves_nothing_half_
     path: Path, store: Store, acquire: Make, caplog: pytest.LogCaptureFixture
 ) -> None:
     def fails(records: Sequence[Record]) -> None:
-        store.insert("links", {"name": f"half{len(records)}", "kind": "can"})
-        raise RuntimeError("a defect")
+        with store.transaction():
+            store.insert("links", {"name": f"half{len(records)}", "kind": "can"})
+            raise RuntimeError("a defect")
 
     gate = threading.Event()
     links = [ListLink("boom", [frame(1)]), ListLink("boom", [frame(2)], gate)]
