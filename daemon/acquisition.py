@@ -18,9 +18,12 @@ from functools import partial
 from operator import itemgetter
 from typing import TypeVar
 
-from daemon.acquisition_status import AcquisitionStatus, StatusBoard
+from daemon.acquisition_status import AcquisitionStatus
 from daemon.backlog import BATCH_CAPTURES, Backlog, Batch
+from daemon.clock_watch import ClockWatch
 from daemon.link_intake import LinkIntake
+from daemon.present_state import NOTHING_EXPECTED, Expected
+from daemon.status_board import StatusBoard
 from daemon.store import Store
 from daemon.store.errors import storage_sentence
 from daemon.time_budget import TimeBudget
@@ -78,6 +81,8 @@ class Acquisition:
         queue_captures: how many captures of one link may wait while the disk is slow.
         on_records: called in the writer's thread with records after they were committed, and with none when time has
             passed (ten times a second). What it stores it commits itself.
+        expected: what should be heard, for `status`.
+        clock_watch: looks after the computer's clock, live; none where the clock is another one.
     """
 
     def __init__(
@@ -90,6 +95,8 @@ class Acquisition:
         batch_seconds: float = 0.05,
         queue_captures: int = 200_000,
         on_records: Callable[[Sequence[Record]], None],
+        expected: Expected = NOTHING_EXPECTED,
+        clock_watch: ClockWatch | None = None,
     ) -> None:
         self._store, self._clock, self._on_records = store, clock, on_records
         self._batch_seconds = batch_seconds
@@ -102,7 +109,8 @@ class Acquisition:
         self._next_tick_ns = 0
         self._unstored = 0  # captures that were drained and are not committed
         self._troubles: dict[str, str] = {}
-        self._board = StatusBoard(clock)
+        self._board = StatusBoard(clock, expected)
+        self._clock_watch = clock_watch
         self._stop_links = threading.Event()
         self._finish = threading.Event()
         self._decode_until = TimeBudget(0.0)  # when stopping
@@ -158,7 +166,7 @@ class Acquisition:
     def status(self) -> AcquisitionStatus:
         """A snapshot, from any thread."""
         summaries = self._decoding.summaries(self._clock.now())
-        return self._board.snapshot(self._intakes, summaries, is_behind=self.is_behind)
+        return self._board.snapshot(self._intakes, summaries, self._decoding.defects(), is_behind=self.is_behind)
 
     @property
     def is_behind(self) -> bool:
@@ -215,6 +223,8 @@ class Acquisition:
     def _take_in(self) -> None:
         """Commit what the links have captured, however long the disk is full or faulty; meanwhile captures queue."""
         queues = [intake.drain() for intake in self._intakes]
+        if self._clock_watch is not None and (step := self._clock_watch.look(self._clock.now())) is not None:
+            queues.append([step])
         items = [item for queue in queues for item in queue]
         if not items:
             return
@@ -244,7 +254,9 @@ class Acquisition:
         ):
             return False
         self._decoded = None
-        self._hand_on([*decoded.reports, *decoded.records])
+        # What an earlier run left over says nothing of how things are now.
+        hand_on = self._pass_on if self._is_left_over else self._hand_on
+        hand_on([*decoded.reports, *decoded.records])
         return True
 
     def _decode(self, now: Stamp) -> None:
@@ -339,6 +351,9 @@ class Acquisition:
 
     def _hand_on(self, records: Sequence[Record]) -> None:
         self._board.recorded(records)
+        self._pass_on(records)
+
+    def _pass_on(self, records: Sequence[Record]) -> None:
         try:
             self._on_records(records)
         except Exception:
@@ -420,7 +435,7 @@ class _Decoding:
         self._factories = factories
         self._decoders: dict[str, Decoder] = {}
         self._boots: dict[str, str] = {}
-        self._defective: set[str] = set()
+        self._defects: dict[str, Stamp] = {}
         self._ticked_ns = -TICK_NS
 
     def feed(self, captures: Sequence[Capture]) -> list[Record]:
@@ -470,11 +485,15 @@ class _Decoding:
         decoders = [self._decoders.get(link) for link in self._factories]
         return [decoder.summary(now) for decoder in decoders if isinstance(decoder, CanDecoder)]
 
+    def defects(self) -> dict[str, Stamp]:
+        """Link -> when its decoder last showed a defect of its own; from any thread."""
+        return dict(self._defects)
+
     def _failure(self, link: str, stamp: Stamp, error: Exception, raw: bytes) -> DecodeFailure:
         """A decoder never raises by contract; a defect in one must not end acquisition, nor flood the log."""
-        if link not in self._defective:
-            self._defective.add(link)
+        if link not in self._defects:
             log.critical("link %s: its decoder is defective; captures are kept", link, exc_info=error)
+        self._defects[link] = stamp
         return DecodeFailure(link, stamp, f"the decoder failed: {type(error).__name__}: {error}", raw)
 
     def _decoder(self, link: str, boot: str) -> Decoder:

@@ -12,7 +12,7 @@ from typing import Any
 
 from daemon.config import Config
 from daemon.control import REFUSED, CommandError
-from daemon.drift_table import DriftTable
+from daemon.drift_table import DriftTable, LiveRun
 from daemon.model_table import ModelRow, ModelTable, trained_on
 from daemon.order import Order, Outcome, Progress
 from daemon.scheduler import CHECK, CHECKS, DueChain, JobFacts, JobKind, SessionFacts, State
@@ -108,7 +108,19 @@ class JobTable:
             has_model=bool(self._store.rows(_NEWEST_MODEL, (self._rig,))),
             live_from=run.after_session if run else None,
             drifted=self._drift.drifted(run) if run else None,
+            stale_candidate=self._stale_candidate(run) if run else None,
         )
+
+    def _stale_candidate(self, run: LiveRun) -> int | None:
+        """See `State.stale_candidate`; one comparison for each model that goes live, as what fails must not loop."""
+        candidate = self._models.waiting()
+        if candidate is None or candidate.comparison is None or candidate.comparison["live"] == run.model_id:
+            return None
+        queued = self._store.rows(
+            "SELECT 1 FROM jobs WHERE kind = 'comparison' AND model_id = ? AND live_since = ? LIMIT 1",
+            (candidate.id, run.since),
+        )
+        return None if queued else candidate.id
 
     def all(self) -> list[dict[str, Any]]:
         """All jobs with their results, newest last. Read beside the writing connection, which must not wait."""
@@ -406,8 +418,15 @@ class JobTable:
                 "session start --kind check`",
                 REFUSED,
             )
-        job_id = self._add(JobKind.COMPARISON, checks[-1], closed[-1]["id"], model_id=model.id)
+        run = self._drift.run()
+        job_id = self._add(
+            JobKind.COMPARISON, checks[-1], closed[-1]["id"], model_id=model.id, live_since=run.since if run else None
+        )
         return f"job {job_id} will compare model {model.id} with the live one"
+
+    def compare_again(self, model_id: int) -> str:
+        """Queue a comparison of the model of that number, as `compare` does."""
+        return self.compare(self._models.get(model_id))
 
     # ---- parts -------------------------------------------------------------------------------------------------------
 
@@ -419,6 +438,7 @@ class JobTable:
         *,
         depends_on: int | None = None,
         model_id: int | None = None,
+        live_since: int | None = None,
     ) -> int:
         """Queue a job; its number."""
         row = {
@@ -428,6 +448,7 @@ class JobTable:
             "state": "queued",
             "depends_on": depends_on,
             "model_id": model_id,
+            "live_since": live_since,
             **self._store.instant(self._clock.now(), "created_"),
         }
         return self._store.insert("jobs", row)

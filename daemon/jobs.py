@@ -18,7 +18,7 @@ from daemon.job_child import JOB_COMMAND, JobChild
 from daemon.job_table import CANCELLED, STOPPED, JobTable
 from daemon.model_table import ModelRow
 from daemon.order import Outcome
-from daemon.scheduler import DueChain, JobFacts, due_jobs, next_job, spent_jobs
+from daemon.scheduler import DueChain, DueComparison, JobFacts, due_jobs, next_job, spent_jobs
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, Clock, SystemClock
 
@@ -138,6 +138,8 @@ class JobRunner:
         for item in due:
             if isinstance(item, DueChain):
                 self._table.queue(item)
+            elif isinstance(item, DueComparison):
+                log.info("another model is live: %s", self._table.compare_again(item.model_id))
             elif self._table.offer_again(item.job_id):
                 log.info("job %d is offered again after an interruption", item.job_id)
         next_one = next_job(self._table.state() if due else state)

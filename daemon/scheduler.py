@@ -4,7 +4,8 @@ A closed session triggers the gap workflow, which identifies the kinematics and 
 residual training, and of that model the report and the comparison with the live one, which do not wait for each other.
 A closed check session triggers report and comparison alone, its poses are not trained on, and the live model is held
 against it. Once the checks have drifted from the live model, the chain runs on all that was measured, checks included.
-A session that no control points vouch for triggers nothing until an operator accepts it. Work waits while a session is
+A session that no control points vouch for triggers nothing until an operator accepts it. A candidate that was compared
+with a model that is live no more is compared again, once for each model that goes live. Work waits while a session is
 open: acquisition comes first.
 
 What a job covers is decided by the order of sessions, never by time: a wall clock may be wrong for whole boots.
@@ -98,6 +99,8 @@ class State:
         live_from: number of the newest session when the live model went live; None without one. Checks after it count
             for drift.
         drifted: number and id of the check session with which the live model was found to have drifted; None before.
+        stale_candidate: the model that waits to be accepted, where its comparison is with another model than the live
+            one and none with the live one was queued yet.
     """
 
     sessions: Sequence[SessionFacts]
@@ -106,6 +109,7 @@ class State:
     has_model: bool
     live_from: int | None = None
     drifted: tuple[int, str] | None = None
+    stale_candidate: int | None = None
 
 
 @dataclass(frozen=True)
@@ -130,9 +134,19 @@ class DueRetry:
     job_id: int
 
 
+@dataclass(frozen=True)
+class DueComparison:
+    """A candidate to compare with the live model."""
+
+    model_id: int
+
+
+Due = DueChain | DueRetry | DueComparison
+
+
 def due_jobs(
     state: State, now: Stamp, *, quiet_s: float = 2.0, retry_after_s: float = 5.0, max_attempts: int = 3
-) -> list[DueChain | DueRetry]:
+) -> list[Due]:
     """What should be queued now.
 
     Args:
@@ -145,7 +159,7 @@ def due_jobs(
     """
     if _is_open(state):
         return []
-    due: list[DueChain | DueRetry] = [
+    due: list[Due] = [
         DueRetry(job.id)
         for job in state.jobs
         if job.state == "interrupted"
@@ -165,6 +179,8 @@ def due_jobs(
         due.append(DueChain(CHECKS, checks[-1].id, closed[-1].id))
     if checks and _counts_for_drift(checks[-1], state) and not _is_covered(checks[-1], JobKind.DRIFT, state):
         due.append(DueChain(DRIFT, checks[-1].id, closed[-1].id))
+    if checks and state.stale_candidate is not None and not _is_being_compared(state, due):
+        due.append(DueComparison(state.stale_candidate))
     return due
 
 
@@ -185,6 +201,13 @@ def next_job(state: State) -> JobFacts | None:
 
 def _is_spent(job: JobFacts, max_attempts: int) -> bool:
     return job.attempts >= max_attempts or job.interruptions >= MAX_INTERRUPTIONS
+
+
+def _is_being_compared(state: State, due: Sequence[Due]) -> bool:
+    """Whether a comparison is under way or about to be queued: what comes of it is waited for."""
+    return any(job.kind is JobKind.COMPARISON for job in state.jobs) or any(
+        isinstance(item, DueChain) and JobKind.COMPARISON in item.kinds for item in due
+    )
 
 
 def _is_open(state: State) -> bool:

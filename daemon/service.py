@@ -12,6 +12,9 @@ from typing import Any
 
 from calibration.rig import Rig
 from daemon.acquisition import Acquisition
+from daemon.alarms.board import AlarmBoard
+from daemon.alarms.gather import Gatherer
+from daemon.clock_watch import ClockWatch
 from daemon.composition import Parts, motion_limits
 from daemon.config import Config
 from daemon.control import FAILED, REFUSED, CommandError, ControlServer, Handler
@@ -22,11 +25,14 @@ from daemon.live_model import LiveModel
 from daemon.live_tip import FRESH_S, LiveTip
 from daemon.model_table import ModelTable
 from daemon.notify import Notifier
+from daemon.present_state import expected_of
 from daemon.registry import ModelRegistry
 from daemon.sessions import SessionKeeper
 from daemon.setups import SetupBook
+from daemon.store.alarms import AlarmTable
 from daemon.store.errors import storage_errors, storage_sentence
 from daemon.store.health import StoreHealth, StoreWatch
+from daemon.store.runs import previous_run
 from daemon.store.store import Store
 from daemon.time_budget import TimeBudget
 from daemon.tip_sender import TipSender
@@ -92,9 +98,24 @@ class Daemon:
             fresh_s=FRESH_S / parts.clock.real_seconds(1.0),  # what delays readings here are computers, in real time
         )
         self._sender = tip_sender(config, parts, self._tip)
-        self._acquisition = Acquisition(parts.links, parts.decoders, store, parts.clock, on_records=self._on_records)
+        before = previous_run(store) if parts.mode == "live" else None  # other clocks are none of the computer's
+        self._acquisition = Acquisition(
+            parts.links,
+            parts.decoders,
+            store,
+            parts.clock,
+            on_records=self._on_records,
+            expected=expected_of(config, parts.rig),
+            clock_watch=ClockWatch(before) if parts.mode == "live" else None,
+        )
         self._jobs = JobRunner(store, config, parts.rig.name, parts.clock, is_held=self._are_jobs_held)
-        self._gap = GapStatus(store, parts.rig.name, DriftTable(store, parts.rig.name, parts.clock))
+        drift = DriftTable(store, parts.rig.name, parts.clock)
+        self._gap = GapStatus(store, parts.rig.name, drift)
+        self._alarms = AlarmBoard(
+            AlarmTable(store),
+            Gatherer(self._acquisition.status, store, parts.rig.name, self._live_model, drift, parts.clock, before),
+            parts.clock,
+        )
         self._models = ModelRegistry(models, parts.rig.name, self._live_model, compare=self._jobs.compare)
         self._control = ControlServer(config.socket_path, self._commands())
 
@@ -127,8 +148,9 @@ class Daemon:
             log.info("acquiring rig %s; control socket %s", self._parts.rig.name, self._config.socket_path)
             while not stop.wait(beat_s):
                 self._acquisition.check()
-                self._watch.look()
                 self._sessions.aim_again()
+                self._watch.look()
+                self._alarms.evaluate()
                 # The watchdog hears of the writer, not of this loop: a hung disk must restart the service.
                 if self._acquisition.alive(within_s=notifier.watchdog_s or 60.0):
                     notifier.send("WATCHDOG=1")
@@ -194,6 +216,7 @@ class Daemon:
             "model.zeros-checked": models.zeros_checked_command,
             "model.compare": models.compare_command,
             "tip": self._tip.tip_command,
+            "alarms.list": self._alarms.list_command,
             "devices.configure": self._configure_devices,
             **({} if self._parts.visit is None else {"simulation.visit": self._visit}),
         }
@@ -203,6 +226,7 @@ class Daemon:
         return {
             "rig": self._parts.rig.name,
             "mode": self._parts.mode,
+            "alarms": self._alarms.status(),
             "acquisition": acquisition,
             "session": self._sessions.open_session(),
             "jobs": self._jobs.unfinished(),

@@ -69,7 +69,7 @@ class DeviceWatch(ABC):
             if self._descriptor is None:
                 stop.wait(left_s)
             elif self._is_readable(min(left_s, STOP_POLL_S)) and self._has_news():
-                stop.wait(SETTLE_S)
+                stop.wait(min(SETTLE_S, max(deadline - time.monotonic(), 0.0)))
                 self._has_news()
                 return not stop.is_set()
         return False

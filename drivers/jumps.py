@@ -8,7 +8,7 @@ from drivers.attendance import LATE_S
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import DeviceEvent, EventKind, Reading, Record, Status
 
-_MARGIN_NS = int(LATE_S * NS_PER_S)  # what samples may be read late by before they are given up
+_MARGIN_NS = int(LATE_S * NS_PER_S)  # what samples may be read late by before they are marked
 _BACKLOG_NS = 5 * NS_PER_S  # what has queued is read within this time, however long nobody read
 
 
@@ -21,7 +21,8 @@ class JumpWatch:
     A stamp says when a sample was read. What arrives while nobody reads (a busy computer, a program that is stopped)
     waits, and is stamped when it is read at last. So a sample that ends a silence, and those after it until the backlog
     is surely read, may have been taken at any time since the silence began. They are told from others by their stamps
-    alone: a log is judged as what came live. Bad samples are no silence: somebody read them.
+    alone: a log is judged as what came live. Bad samples are no silence: somebody read them. Samples of doubtful time
+    are passed over, as if they had not been sent.
 
     Args:
         max_rate_per_s: fastest motion of the joint, in the unit of the positions given to `jumped_from`.
@@ -40,10 +41,13 @@ class JumpWatch:
 
     def bad(self, stamp: Stamp) -> None:
         """Take a sample that carries no usable position."""
-        self._read(stamp.monotonic_ns)
+        if not stamp.is_doubtful:
+            self._read(stamp.monotonic_ns)
 
     def jumped_from(self, stamp: Stamp, position: float) -> float | None:
         """Take a good sample; the position before it if the joint cannot have moved so far since, else None."""
+        if stamp.is_doubtful:
+            return None
         now_ns = stamp.monotonic_ns
         self._read(now_ns)
         before, before_from_ns = self._good, self._good_from_ns

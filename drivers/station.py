@@ -5,11 +5,12 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from dataclasses import replace
 from typing import Literal, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from drivers.attendance import NOT_READ_IN_TIME, Attendance
+from drivers.attendance import NOT_READ_IN_TIME, Attendance, DoubtReport
 from drivers.bytestream import ByteTimes, Frame, Framer, Garbage
 from drivers.clock import NS_PER_S, Clock, Stamp
 from drivers.conversation import Conversation, Timing
@@ -26,6 +27,7 @@ from drivers.readings import (
     LinkItem,
     Record,
     SerialCapture,
+    Status,
 )
 from drivers.serialport import SerialConfig, SerialPort
 from drivers.sokkia.conversation import set_conversation
@@ -97,7 +99,7 @@ class StationConfig(BaseModel):
     jump_slack_m: float = Field(default=0.1, gt=0)
     relock_within_m: float = Field(default=2.0, gt=0)
     max_range_m: float = Field(default=6000.0, gt=0)
-    silence_timeout_s: float = Field(default=5.0, ge=0)
+    silence_timeout_s: float = Field(default=4.0, ge=0)
     ppm_scale: float = Field(default=0.1, gt=0)
     prism_scale_mm: float = Field(default=0.1, gt=0)
 
@@ -214,22 +216,29 @@ class StationLink:
                 pause_s = min(2 * pause_s, _LAST_PAUSE_S)
 
     def _converse(self, port: SerialPort, emit: Emit, stop: threading.Event) -> None:
+        doubts = DoubtReport(self.name, "bytes", self._clock.now())
+        try:
+            self._listen(port, emit, stop, doubts)
+        finally:
+            for item in doubts.end(self._clock.now()):
+                emit(item)
+
+    def _listen(self, port: SerialPort, emit: Emit, stop: threading.Event, doubts: DoubtReport) -> None:
         conversation = start_conversation(self._config)
-        attendance, late = Attendance(self._clock), 0
+        attendance = Attendance(self._clock)
         while not stop.is_set():
             wait_s = _LONGEST_READ_S if conversation is None else self._speak(port, conversation, emit)
             patience_s = self._clock.real_seconds(wait_s)
             data = port.read(patience_s)
             stamp = self._clock.now()
             if attendance.is_late(stamp, patience_s):
-                late += len(data)
+                stamp = stamp.doubted()
+                doubts.doubt(len(data), NOT_READ_IN_TIME)
             else:
-                if late:
-                    self._tell(emit, EventKind.FRAMES_DROPPED, f"{late} bytes lost, {NOT_READ_IN_TIME}")
-                    emit(Gap(self.name, GapReason.FRAMES_LOST, attendance.left, stamp))
-                    late = 0
-                if data:
-                    emit(SerialCapture(self.name, stamp, data))
+                for item in doubts.trust(stamp):
+                    emit(item)
+            if data:
+                emit(SerialCapture(self.name, stamp, data))
             if data and conversation is not None:
                 conversation.feed(data, stamp.monotonic_ns)
         if conversation is not None:
@@ -265,9 +274,9 @@ class Interpreter(Protocol):
 class StationDecoder:
     """Captures of a station's link to fixes, events, gaps and failures (`drivers.readings.Decoder`).
 
-    A fix is stamped with the arrival of its first byte. Transmitted captures yield nothing; an answer arrives after
-    them. What the passing of time alone causes is stamped with the instant at which it was due, so records do not
-    depend on how often `tick` is called.
+    A fix is stamped with the arrival of its first byte; where that is doubtful, the fix may not be used. Transmitted
+    captures yield nothing; an answer arrives after them. What the passing of time alone causes is stamped with the
+    instant at which it was due, so records do not depend on how often `tick` is called.
 
     Args:
         config: the station, as its link has it.
@@ -322,8 +331,15 @@ class StationDecoder:
         records: list[Record] = []
         for record in said:
             if isinstance(record, Fix):
-                fix = range_checked(record, self._max_range_m)
+                fix = range_checked(_without_time(record) if first.is_doubtful else record, self._max_range_m)
                 records += [*self._silence.heard(fix), *self._lock.see(fix), fix]
             else:
                 records.append(record)
         return records
+
+
+def _without_time(fix: Fix) -> Fix:
+    """A fix whose bytes were read late: it may not be used, because it is not known when it was measured."""
+    if fix.status is not Status.OK:
+        return fix
+    return replace(fix, status=Status.TIME_DOUBTFUL, reason=f"its time is doubtful: {NOT_READ_IN_TIME}")

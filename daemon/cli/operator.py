@@ -10,15 +10,19 @@ from typing import Any
 import click
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from daemon.cli.gap_lines import gap_lines
 from daemon.cli.model import model_lines
 from daemon.cli.output import Command, json_option
+from daemon.cli.status_lines import alarm_line, cleared_line, decoding_lines, gap_state_lines, station_line
 from daemon.cli.talk import ask, say, talks, utc
 from daemon.config import read_config
+from daemon.present_state import duration
 from daemon.scheduler import SESSION_KINDS
 
 SHOT_TIMEOUT_S = 600.0
+ALARMS_OLD_S = 30.0  # they are looked at every second
 
 
 # ---- status ----------------------------------------------------------------------------------------------------------
@@ -35,6 +39,9 @@ def status(frames: bool, **where: Any) -> Any:
 def _show_status(console: Console, status: dict[str, Any], *, frames: bool) -> None:
     console.print(f"rig [bold]{status['rig']}[/] ({status['mode']}), store {status['store']}", highlight=False)
     acquisition = status["acquisition"]
+    _show_alarms(console, status["alarms"])
+    for line in gap_state_lines(acquisition):
+        say(console, line)
     links = Table("link", "state", "captures", "per s", "queued", "dropped", title="links", title_justify="left")
     for link in acquisition["links"]:
         state = {True: "[green]up[/]", False: "[red]down[/]", None: "starting"}[link["up"]]
@@ -51,18 +58,15 @@ def _show_status(console: Console, status: dict[str, Any], *, frames: bool) -> N
     for channel in acquisition["channels"]:
         value = "" if channel["value"] is None else f"{channel['value']:.3f} {channel['unit']}"
         mark = "green" if channel["status"] == "ok" else "red"
-        channels.add_row(channel["name"], value, f"[{mark}]{channel['status']}[/]", f"{channel['age_s']:.1f}")
+        age = "never" if channel["age_s"] is None else f"{channel['age_s']:.1f}"
+        channels.add_row(channel["name"], value, f"[{mark}]{channel['status'].replace('_', ' ')}[/]", age)
     console.print(channels)
     if frames:
         console.print(_frame_table(acquisition["frames"]))
     for station in acquisition["stations"]:
-        why = f" ({station['reason']})" if station["reason"] else ""
-        last = f"last fix {station['status']}{why}"
-        say(console, f"station {station['name']}: {station['lock']}, {last}, {station['fixes']} fixes")
-    for device, n in acquisition["decode_failures"].items():
-        say(console, f"{n} captures of {device} could not be decoded")
-    if acquisition["error"]:
-        console.print(f"[red]{acquisition['error']}[/]")
+        say(console, station_line(station))
+    for line in decoding_lines(acquisition["decoding"]):
+        say(console, line)
     if status["session"]:
         _show_session(console, status["session"])
     for job in status["jobs"]:
@@ -71,6 +75,31 @@ def _show_status(console: Console, status: dict[str, Any], *, frames: bool) -> N
         say(console, sentence)
     for event in reversed(status["events"]):
         say(console, f"{utc(event['utc_ns'])} {event['device']} {event['kind']}: {event['text']}")
+
+
+def _show_alarms(console: Console, alarms: dict[str, Any]) -> None:
+    if alarms["looked_age_s"] > ALARMS_OLD_S:
+        say(console, f"alarms were last looked at {duration(alarms['looked_age_s'])} ago: the daemon is held up")
+    for alarm in alarms["active"]:
+        style = "bold red" if alarm["severity"] == "critical" else "yellow"
+        console.print(Text(alarm_line(alarm), style=style))
+        console.print(Text(f"  {alarm['remedy']}"))
+    if not alarms["active"]:
+        say(console, "no alarms")
+
+
+@click.command(cls=Command)
+@click.option("--all", "everything", is_flag=True, help="Also those that are over, newest first.")
+@talks
+def alarms(everything: bool, **where: Any) -> Any:
+    """What is wrong now, since when, and what to do about it."""
+
+    def show(console: Console, found: dict[str, Any]) -> None:
+        _show_alarms(console, found)
+        for alarm in found["cleared"]:
+            say(console, cleared_line(alarm))
+
+    return ask(where, "alarms.list", show, all=everything)
 
 
 def _frame_table(frames: list[dict[str, Any]]) -> Table:
@@ -374,4 +403,4 @@ def devices_configure(machine_is_parked: bool, **where: Any) -> Any:
     return ask(where, "devices.configure", lambda c, r: say(c, r["text"]), machine_is_parked=machine_is_parked)
 
 
-COMMANDS = {"status": status, "setup": setup, "session": session, "jobs": jobs, "devices": devices}
+COMMANDS = {"alarms": alarms, "status": status, "setup": setup, "session": session, "jobs": jobs, "devices": devices}

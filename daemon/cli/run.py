@@ -194,13 +194,12 @@ def replay(
     if prism is not None and session_file is not None:
         raise click.UsageError("give --prism or --session, not both")
     clock = ManualClock()
-    starts = first_captures(files, settings)  # a bad log is refused before a store is made
+    told = None if session_file is None else read_session_file(session_file)
+    doubtful = {} if told is None else told.doubtful
+    starts = first_captures(files, settings, doubtful)  # a bad log is refused before a store is made
     clock.set(min((capture.stamp for capture in starts.values()), key=lambda stamp: stamp.monotonic_ns))
     begin_ns = clock.monotonic_ns()
-    told = None
-    if session_file is not None:
-        told = read_session_file(session_file)
-    elif prism is not None:
+    if prism is not None:
         told = SessionFile(prism=prism, kind=kind, since_utc_ns=begin_ns, until_utc_ns=LATEST_UTC_NS, control_points={})
     made = decoders(settings, source)
     with storage_errors(path), contextlib.closing(Store(path)) as store:
@@ -230,7 +229,7 @@ def replay(
             operator.extend(sorted(words, key=lambda word: word[0]))
             operator.append((told.until_utc_ns, partial(keeper.stop_command, {})))
         acquisition = Acquisition((), made, store, clock, on_records=keeper.on_records)
-        acquisition.run_inline(_followed(merged(files, settings), clock, operator))
+        acquisition.run_inline(_followed(merged(files, settings, doubtful), clock, operator))
         for _, command in operator:  # what comes after the last capture
             command()
         session = keeper.list_command({})[0] if told is not None else None

@@ -19,12 +19,6 @@ NOTHING_BYTES = 2**20  # a disk with less than this has no room
 _UNWRITABLE = {sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN}
 
 
-def is_unwritable(error: BaseException) -> bool:
-    """True if the disk refused: it is full, faulty or read-only. The transaction was rolled back."""
-    code = getattr(error, "sqlite_errorcode", None) if isinstance(error, sqlite3.Error) else None
-    return code is not None and code & 0xFF in _UNWRITABLE  # the low byte; the rest says which read or write it was
-
-
 class StoreError(Exception):
     """The store cannot be opened or used; the message names the file and what to do."""
 
@@ -42,6 +36,12 @@ class StoreBusyError(StoreError):
             f"{path}: {holder} holds this store; stop it first (`rigcal status` shows it), or configure another file"
         )
         self.pid = pid
+
+
+def is_unwritable(error: BaseException) -> bool:
+    """True if the disk refused: it is full, faulty or read-only. The transaction was rolled back."""
+    code = getattr(error, "sqlite_errorcode", None) if isinstance(error, sqlite3.Error) else None
+    return code is not None and code & 0xFF in _UNWRITABLE  # the low byte; the rest says which read or write it was
 
 
 def storage_sentence(path: Path, error: sqlite3.Error | OSError) -> str:

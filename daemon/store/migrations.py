@@ -253,6 +253,20 @@ def m009_uncontrolled_sessions(db: Database) -> None:
 
 
 @MIGRATIONS()
+def m014_prism_confirmations(db: Database) -> None:
+    """Words that a session's stations are on its prism: fixes that looked like another one's count from then on."""
+    _create(
+        db,
+        # turning: nobody said so, but something turned the station to the prism; it may have measured what it was on
+        # before for a while.
+        f"""CREATE TABLE prism_confirmations (id INTEGER PRIMARY KEY,
+            session_id TEXT NOT NULL REFERENCES calibration_sessions(id), {_instant()},
+            operator TEXT NOT NULL DEFAULT '', turning INTEGER NOT NULL CHECK (turning IN (0, 1))) STRICT""",
+        "CREATE INDEX prism_confirmations_by_session ON prism_confirmations(session_id)",
+    )
+
+
+@MIGRATIONS()
 def m012_store_health(db: Database) -> None:
     """Checks of the store itself, and what the end of the computer did to jobs."""
     _create(
@@ -268,16 +282,25 @@ def m012_store_health(db: Database) -> None:
 
 
 @MIGRATIONS()
-def m014_prism_confirmations(db: Database) -> None:
-    """Words that a session's stations are on its prism: fixes that looked like another one's count from then on."""
+def m013_comparisons_know_the_live_model(db: Database) -> None:
+    """A comparison of a named model says with which change the model beside it had gone live."""
     _create(
         db,
-        # turning: nobody said so, but something turned the station to the prism; it may have measured what it was on
-        # before for a while.
-        f"""CREATE TABLE prism_confirmations (id INTEGER PRIMARY KEY,
-            session_id TEXT NOT NULL REFERENCES calibration_sessions(id), {_instant()},
-            operator TEXT NOT NULL DEFAULT '', turning INTEGER NOT NULL CHECK (turning IN (0, 1))) STRICT""",
-        "CREATE INDEX prism_confirmations_by_session ON prism_confirmations(session_id)",
+        "ALTER TABLE jobs ADD COLUMN live_since INTEGER REFERENCES model_states(id)",
+        "CREATE INDEX jobs_by_model ON jobs(model_id, live_since) WHERE model_id IS NOT NULL",
+    )
+
+
+@MIGRATIONS()
+def m013_alarms(db: Database) -> None:
+    """What is wrong, since when, and what to do about it."""
+    _create(
+        db,
+        # raised_: when it was noticed; cleared_ is NULL while it is active.
+        f"""CREATE TABLE alarms (id INTEGER PRIMARY KEY, kind TEXT NOT NULL, subject TEXT NOT NULL,
+            {_one_of("severity", "warning", "critical")}, text TEXT NOT NULL, remedy TEXT NOT NULL,
+            {_instant("raised_")}, {_instant("cleared_", optional=True)}) STRICT""",
+        "CREATE UNIQUE INDEX alarms_one_active ON alarms(kind, subject) WHERE cleared_utc_ns IS NULL",
     )
 
 
