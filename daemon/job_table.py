@@ -322,7 +322,7 @@ class JobTable:
                         self._set(waiting["id"], state="cancelled", error=error, **ended)
             return outcome
 
-    def interrupt_running(self, why: str, *, is_innocent: bool) -> None:
+    def interrupt_running(self, why: str, *, is_innocent: bool = False) -> None:
         """Jobs that the store takes for running, and that nobody runs, did not end: the scheduler offers them again.
 
         Args:
