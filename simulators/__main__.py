@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import secrets
 import signal
@@ -23,6 +24,7 @@ from simulators.rigs import load_rig
 from simulators.secret import Envelope, draw_secret
 from simulators.total_station import StationSettings
 from simulators.truth import RigTruth, replace_effects
+from simulators.wire_log import WireLog
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -47,6 +49,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--baud", type=int, default=9600, help="of the station's line")
     add("--latency-ms", type=float, default=20.0, help="how old a measurement is when its record starts")
     add("--push-s", type=float, help="the station sends records unasked at this interval")
+    add("--wire-log", type=Path, metavar="FILE", help="append what the rig puts on its links and measures to this file")
     return parser
 
 
@@ -107,22 +110,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
-    try:
-        simulator, envelope = _build(options)
-        live = LiveRig(simulator, ScaledClock(options.rate, origin), options.can_port, options.station_port, print_line)
-    except (RigError, ValueError, OSError) as error:
-        sys.stderr.write(f"simulators: {error}\n")
-        return 2
-    if envelope is not None:
-        envelope.begin(live.begin.utc_ns)
-    try:
-        live.run(sys.stdin.fileno(), wake_read)
-    except BrokenPipeError:  # nobody listens to the answers any more
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    finally:
-        live.close()
+    with contextlib.ExitStack() as stack:
+        try:
+            log = None if options.wire_log is None else stack.enter_context(WireLog(options.wire_log))
+            simulator, envelope = _build(options)
+            clock = ScaledClock(options.rate, origin)
+            live = LiveRig(simulator, clock, options.can_port, options.station_port, print_line, log)
+        except (RigError, ValueError, OSError) as error:
+            sys.stderr.write(f"simulators: {error}\n")
+            return 2
         if envelope is not None:
-            envelope.open()
+            envelope.begin(live.begin.utc_ns)
+        try:
+            live.run(sys.stdin.fileno(), wake_read)
+        except BrokenPipeError:  # nobody listens to the answers any more
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        finally:
+            live.close()
+            if envelope is not None:
+                envelope.open()
     return 0
 
 
