@@ -62,8 +62,15 @@ EVIDENCE: dict[str, tuple[Expected, ...]] = {
     "station speaks again": (Expected("fix"),),
     "node speaks again": (Expected("reading", ("ok",)),),
 }
-STATION_FAULTS = tuple(
-    ["lock_loss", "prism_jump", "bad_check", "dropped_ack", "joined_buffers", "clutter", "station_silent", "unplug"]
+STATION_FAULTS = (
+    "lock_loss",
+    "prism_jump",
+    "bad_check",
+    "dropped_ack",
+    "joined_buffers",
+    "clutter",
+    "station_silent",
+    "unplug",
 )
 RECOVERIES = ("can back", "station back", "store writable again", "station speaks again", "node speaks again")
 
