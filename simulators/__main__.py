@@ -26,6 +26,8 @@ from simulators.total_station import StationSettings
 from simulators.truth import RigTruth, replace_effects
 from simulators.wire_log import WireLog
 
+MAP_HELP = "what a commissioned node's TPDO carries, as hexadecimal words of object 1A00h: 38:60040020+65050010"
+
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m simulators", description=__doc__)
@@ -42,6 +44,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--faults", default="", help="scripted faults: KIND@SECONDS[:NAME=VALUE...],...")
     add("--random-faults", type=float, metavar="SECONDS", help="further faults at this mean interval")
     add("--bus-master", choices=("machine", "host"), default="machine", help="who starts the nodes and sends SYNC")
+    add("--map", action="append", default=[], type=_mapping, metavar="NODE:WORD+WORD...", help=MAP_HELP)
     add("--sync-ms", type=float, default=50.0, help="the machine's SYNC interval")
     add("--signal-ms", type=float, default=10.0, help="cycle of the machine's own signals")
     add("--setup", default="", help="name of the station set-up: decides where the machine stands")
@@ -51,6 +54,14 @@ def _parser() -> argparse.ArgumentParser:
     add("--push-s", type=float, help="the station sends records unasked at this interval")
     add("--wire-log", type=Path, metavar="FILE", help="append what the rig puts on its links and measures to this file")
     return parser
+
+
+def _mapping(text: str) -> tuple[int, tuple[int, ...]]:
+    try:
+        node, words = text.split(":")
+        return int(node), tuple(int(word, 16) for word in words.split("+"))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not NODE:WORD+WORD...") from None
 
 
 def _origin(text: str) -> Stamp:
@@ -80,6 +91,7 @@ def _build(options: argparse.Namespace) -> tuple[RigSimulator, Envelope | None]:
         signal_period_s=options.signal_ms / 1e3,
         station=station,
         setup=options.setup,
+        mappings=dict(options.map),
     )
     effects = parse_effects(options.effects)
     truth = RigTruth(load_rig(options.rig), options.seed, perturbation=options.perturbation, effects=effects)

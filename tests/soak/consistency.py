@@ -85,16 +85,22 @@ def _untruth(
 ) -> tuple[str, str] | None:
     if not near:
         return "never measured", "the station measured nothing near its instant"
-    nearest = min(near, key=lambda m: math.dist(m.place_mm, place))
-    off_mm = math.dist(nearest.place_mm, place)
-    if off_mm > PLACE_MM:
+    fitting = [m for m in near if math.dist(m.place_mm, place) <= PLACE_MM]
+    if not fitting:
+        nearest = min(near, key=lambda m: math.dist(m.place_mm, place))
+        off_mm = math.dist(nearest.place_mm, place)
         return "wrong place", f"{off_mm:.0f} mm from the nearest place that was measured then ({nearest.target})"
-    if nearest.target != prism:
-        return "wrong name", f"stored as prism {prism}, the station measured {nearest.target}"
+    fitting = [m for m in fitting if m.target == prism]
+    if not fitting:
+        return "wrong name", f"stored as prism {prism}, the station did not measure that prism then"
+    # A prism may stand still while joints beyond it move: any of the instants at which it was there may be the fix's.
     for joint in rig.joints:
         value = values.get(f"{joint.name}_{joint.unit}")
-        off = 0.0 if value is None else abs(value - nearest.pose[joint.name])
-        if off > JOINT[joint.unit] and joint.name not in jumped:
+        if value is None or joint.name in jumped:
+            continue
+        nearest = min(fitting, key=lambda m: abs(m.pose[joint.name] - value))
+        off = abs(nearest.pose[joint.name] - value)
+        if off > JOINT[joint.unit]:
             return (
                 "wrong pose",
                 f"{joint.name} stored as {value:.2f} {joint.unit}, it stood at {nearest.pose[joint.name]:.2f}",

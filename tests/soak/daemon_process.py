@@ -16,7 +16,7 @@ from typing import Any
 from daemon.control import CommandError, request
 from tests.soak.rig_process import RigProcess
 
-CONFIG = """rig = "swdt82"
+CONFIG = """rig = "{rig}"
 state_directory = "."
 
 [[can]]
@@ -78,7 +78,9 @@ class DaemonProcess:
         self.directory, self._rig, self._operator = directory, rig, operator
         self.store, self.socket = directory / "rigcal.sqlite", directory / "control.sock"
         self._config = directory / "rigcal.toml"
-        self._config.write_text(CONFIG.format(can=rig.can_port, station=rig.station_port), encoding="utf-8")
+        self._config.write_text(
+            CONFIG.format(rig=rig.rig_file, can=rig.can_port, station=rig.station_port), encoding="utf-8"
+        )
         self.life = 0
         self._process: subprocess.Popen[bytes] | None = None
         self._started_s = 0.0

@@ -31,7 +31,7 @@ class Fact:
     """Something that the daemon shows.
 
     Attributes:
-        kind: `event`, `gap`, `gap end`, `failure`, `fix`, `reading`, `missed`, `alarm`, `error`, `well`, `answer`.
+        kind: `event`, `gap`, `failure`, `fix`, `reading`, `missed`, `alarm`, `error`, `well`, `answer`.
         subject: device, channel, station or link.
         detail: event's kind, gap's reason, status, alarm's kind.
         seen_ns: when it was read, on the rig's clock.
@@ -140,7 +140,6 @@ class Watch:
     def look(self, stop: threading.Event) -> None:
         """Follow the store until `stop`."""
         last: dict[str, int] = {}
-        ended: set[int] = set()
         while not stop.wait(LOOK_REAL_S):
             with contextlib.suppress(sqlite3.Error), self._connection() as db:
                 if not last:
@@ -151,10 +150,8 @@ class Watch:
                     ):
                         last[table] = row[0]
                         self._take(Fact(kind, row[1], row[2], self.rig.now_ns(), row[3]))
-                for number, channel, reason, end_ns in db.execute(_ENDED_GAPS):
-                    if number not in ended:
-                        ended.add(number)
-                        self._take(Fact("gap end", channel, reason, self.rig.now_ns(), end_ns))
+                for channel, reason in db.execute(_OPEN_GAPS):  # they show a fault for as long as they are open
+                    self._take(Fact("gap", channel, reason, self.rig.now_ns()))
 
     def ask(self, stop: threading.Event) -> None:
         """Ask for `status` until `stop`."""
@@ -205,8 +202,7 @@ _TABLES = {
     "signals": ("(SELECT name FROM channels WHERE channels.id = channel_id), status, monotonic_ns", "reading"),
     "joint_samples": ("(SELECT name FROM channels WHERE channels.id = channel_id), status, monotonic_ns", "reading"),
 }
-_ENDED_GAPS = """SELECT id, channel, reason, end_monotonic_ns FROM gaps WHERE end_monotonic_ns IS NOT NULL
-    ORDER BY id DESC LIMIT 60"""
+_OPEN_GAPS = "SELECT channel, reason FROM gaps WHERE end_utc_ns IS NULL"
 
 
 def _newest(db: sqlite3.Connection, table: str) -> int:

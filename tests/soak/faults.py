@@ -18,7 +18,7 @@ from calibration.rig import Rig
 from drivers.clock import NS_PER_S
 from tests.soak.daemon_process import DaemonProcess
 from tests.soak.evidence import Blackout, Case, Expected, Watch
-from tests.soak.rig_process import RigProcess
+from tests.soak.rig_process import DIAGNOSED, RigProcess
 
 LINK, STATION = "boom", "station"
 AFTERWARDS_S = 6.0  # after a blackout, until faults can be seen again
@@ -39,7 +39,7 @@ EVIDENCE: dict[str, tuple[Expected, ...]] = {
     "node_reboot": (Expected("event", ("boot_up",)), _ALARM),
     "emergency": (Expected("event", ("emergency",)), _ALARM),
     "emergency_clear": (Expected("event", ("emergency_cleared",)),),
-    "alarm": (Expected("event", ("alarm",)), _ALARM),
+    "alarm": (Expected("event", ("alarm", "emergency")), _ALARM),
     "warning": (Expected("event", ("warning",)), _ALARM),
     "preset_jump": (Expected("event", ("preset_jump",)), Expected("reading", ("out_of_range",)), _ALARM),
     "preset_jump behind an alarm": (Expected("event", ("preset_jump",)),),
@@ -130,7 +130,7 @@ class Mischief:
             Lane("station", 5.0, self._station_fault),
             Lane("node", 4.0, self._node_fault),
             Lane("signals", 10.0, self._signal_fault),
-            Lane("bus", 14.0, self._bus_fault),
+            Lane("bus", 16.0, self._bus_fault),
             Lane("daemon", 50.0, self._daemon_fault),
             Lane("clients", 20.0, self._client_fault),
         )
@@ -194,8 +194,8 @@ class Mischief:
                 "preset_jump behind an alarm",
             )
         )
-        on = self._positions if kind in ("alarm", "warning") or "jump" in kind else self._nodes
-        node = self._rng.choice(sorted(on))
+        on = self._positions if kind == "alarm" or "jump" in kind else self._nodes
+        node = DIAGNOSED if kind == "warning" else self._rng.choice(sorted(on))
         names, lasts_s = self._nodes[node], self._rng.uniform(2.0, 8.0)
         counts = self._rng.choice((-1, 1)) * (12_000 if self._positions.get(node) else 4_000)
         if kind == "preset_jump behind an alarm":
@@ -236,7 +236,7 @@ class Mischief:
         self._wait(6.0)
 
     def _bus_fault(self) -> None:
-        if self._rng.random() < 0.4:
+        if self._rng.random() < 0.25:
             self._unplug("can", LINK, self._rng.uniform(1.0, 12.0))
             return
         state = self._rng.choice(("warning", "passive", "bus_off", "acknowledge"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from bisect import bisect_left
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -103,24 +103,33 @@ class Comparison:
     """Sent and stored items of one link, side by side.
 
     Attributes:
-        lost: sent, not stored.
+        stored_ns: for each sent item the stamp under which it was stored; None if it was lost.
         foreign: stored, never sent so.
-        delays_ns: of those that were stored, from the wire to the stamp.
     """
 
-    lost: list[Item]
+    stored_ns: list[int | None]
     foreign: list[Item]
-    delays_ns: list[int]
+
+    def blocks(self) -> list[tuple[int, int]]:
+        """Runs of lost items: from, until."""
+        blocks: list[tuple[int, int]] = []
+        for place, stored_ns in enumerate(self.stored_ns):
+            if stored_ns is not None:
+                continue
+            if blocks and blocks[-1][1] == place:
+                blocks[-1] = blocks[-1][0], place + 1
+            else:
+                blocks.append((place, place + 1))
+        return blocks
 
 
 def compare(sent: Sequence[Item], stored: Sequence[Item]) -> Comparison:
-    """Find every sent item among the stored ones, in order."""
+    """Find every stored item among the sent ones, in order, each as early as may be."""
     places: dict[str, list[int]] = {}
     for place, item in enumerate(sent):
         places.setdefault(item.what, []).append(place)
-    lost: list[Item] = []
+    stored_ns: list[int | None] = [None] * len(sent)
     foreign: list[Item] = []
-    delays: list[int] = []
     at = 0
     for number, item in enumerate(stored):
         if at >= len(sent) or sent[at].what != item.what:
@@ -128,11 +137,25 @@ def compare(sent: Sequence[Item], stored: Sequence[Item]) -> Comparison:
             if found is None:
                 foreign.append(item)
                 continue
-            lost += sent[at:found]
             at = found
-        delays.append(item.at_ns - sent[at].at_ns)
+        stored_ns[at] = item.at_ns
         at += 1
-    return Comparison(lost + list(sent[at:]), foreign, delays)
+    return Comparison(stored_ns, foreign)
+
+
+def _alternatives(sent: Sequence[Item], stored_ns: Sequence[int | None], block: tuple[int, int]) -> Iterator[range]:
+    """Where a run of lost items may lie: as it was found, or earlier where items repeat.
+
+    A station that searches says the same again and again: which of these records is missing, nobody can tell.
+    """
+    first, end = block
+    yield range(first, end)
+    while first > 0 and sent[first - 1].what == sent[end - 1].what:
+        told_ns = stored_ns[first - 1]
+        if told_ns is None or sent[end - 1].at_ns > told_ns - EARLIEST_NS:
+            return
+        first, end = first - 1, end - 1
+        yield range(first, end)
 
 
 def _resume(
@@ -213,18 +236,29 @@ def account(link: str, sent: Sequence[Item], stored: Sequence[Item], gaps: Seque
     """
     begin_ns = stored[0].at_ns + EARLIEST_NS if stored else 0
     begin = bisect_left([item.at_ns for item in sent], begin_ns - NS_PER_S)
-    compared = compare(sent[begin:], stored)
-    lost = [item for item in compared.lost if begin_ns <= item.at_ns <= until_ns]
+    sent = sent[begin:]
+    compared = compare(sent, stored)
     of_link = [gap for gap in gaps if gap.channel in (link, "daemon") and gap.reason in LOSSES]
-    untold = [item for item in lost if not any(gap.covers(item.at_ns) for gap in of_link)]
+    lost: list[Item] = []
+    untold: list[Item] = []
+    for block in compared.blocks():
+        tries = []
+        for places in _alternatives(sent, compared.stored_ns, block):
+            of_try = [sent[place] for place in places if begin_ns <= sent[place].at_ns <= until_ns]
+            tries.append((of_try, [item for item in of_try if not any(gap.covers(item.at_ns) for gap in of_link)]))
+            if not tries[-1][1]:
+                break
+        of_block, untold_of_block = min(tries, key=lambda one: len(one[1]))
+        lost += of_block
+        untold += untold_of_block
     understated = []
     for gap in of_link:
         alone = [item for item in lost if [g for g in of_link if g.covers(item.at_ns)] == [gap]]
         if gap.missed is not None and len(alone) > gap.missed:
             understated.append(f"{gap.reason} at {gap.start_ns / NS_PER_S:.1f} s: says {gap.missed}, lost {len(alone)}")
-    delays = sorted(compared.delays_ns)
+    delays = sorted(at - item.at_ns for at, item in zip(compared.stored_ns, sent, strict=True) if at is not None)
     return Account(
-        sent=len(sent) - begin,
+        sent=len(sent),
         stored=len(stored),
         lost=len(lost),
         told=len(lost) - len(untold),

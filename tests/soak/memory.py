@@ -11,7 +11,7 @@ import numpy as np
 from tests.soak.daemon_process import Usage
 
 MOST_GROWTH = 0.05
-MOST_MORE = 4  # descriptors and threads, of clients that come and go
+MOST_MORE = 4  # descriptors and threads
 WINDOW_S = 60.0  # what a store that cannot be written holds up for some seconds is no leak
 FEWEST = 12
 
@@ -24,7 +24,7 @@ class Growth:
         warm_s, end_s: from when to when it was looked at, real seconds since its start.
         base_kib, end_kib, most_kib: private memory at first, at last and at most: medians over a minute.
         trend: of a straight line through all samples from first to last, as a share of `base_kib`.
-        descriptors, threads: at first and at last.
+        descriptors, threads: at first and at last: the fewest within a minute, as clients come and go.
     """
 
     warm_s: float
@@ -33,8 +33,8 @@ class Growth:
     end_kib: float
     most_kib: float
     trend: float
-    descriptors: tuple[float, float]
-    threads: tuple[float, float]
+    descriptors: tuple[int, int]
+    threads: tuple[int, int]
 
     def faults(self) -> list[str]:
         """What is not flat, in words."""
@@ -48,7 +48,7 @@ class Growth:
             found.append(f"memory rises by {100 * self.trend:.1f} % from warm-up to end")
         for name, (first, last) in (("descriptors", self.descriptors), ("threads", self.threads)):
             if last > first + MOST_MORE:
-                found.append(f"{name} grew from {first:.0f} to {last:.0f}")
+                found.append(f"{name} grew from {first} to {last}")
         return found
 
 
@@ -83,6 +83,6 @@ def growth(samples: Sequence[Usage], warm_s: float) -> Growth | None:
         end_kib=medians[-1],
         most_kib=max(medians),
         trend=float(slope) * (end_s - begin_s) / medians[0],
-        descriptors=(median(s.descriptors for s in parts[0]), median(s.descriptors for s in parts[-1])),
-        threads=(median(s.threads for s in parts[0]), median(s.threads for s in parts[-1])),
+        descriptors=(min(s.descriptors for s in parts[0]), min(s.descriptors for s in parts[-1])),
+        threads=(min(s.threads for s in parts[0]), min(s.threads for s in parts[-1])),
     )

@@ -95,8 +95,8 @@ class Report:
             lines.append(
                 f"memory: {g.base_kib / 1024:.1f} MiB warm after {g.warm_s:.0f} s, at most {g.most_kib / 1024:.1f}, at "
                 f"the end {g.end_kib / 1024:.1f} after {g.end_s:.0f} s, trend {100 * g.trend:+.1f} %; "
-                f"descriptors {g.descriptors[0]:.0f} -> {g.descriptors[1]:.0f}, "
-                f"threads {g.threads[0]:.0f} -> {g.threads[1]:.0f}"
+                f"descriptors {g.descriptors[0]} -> {g.descriptors[1]}, "
+                f"threads {g.threads[0]} -> {g.threads[1]}"
             )
         else:
             lines.append("memory: not judged, the daemon did not live long enough after its warm-up")

@@ -1,4 +1,8 @@
-"""The simulated rig of a soak: a process that outlives the daemon, told what to do over its standard input."""
+"""The simulated rig of a soak: a process that outlives the daemon, told what to do over its standard input.
+
+It is swdt82 with one encoder more talkative: its TPDO carries alarms and warnings beside the position. Warnings of the
+others never reach the bus, as on most machines.
+"""
 
 from __future__ import annotations
 
@@ -7,18 +11,22 @@ import itertools
 import json
 import queue
 import random
+import shutil
 import subprocess
 import sys
 import threading
 import uuid
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from drivers.clock import NS_PER_S, ScaledClock, Stamp, SystemClock
+from drivers.clock import ScaledClock, Stamp, SystemClock
 
 ANSWER_S = 60.0
 SPEED = 0.45  # of the joints' greatest rates
 STANDS_S = (2.0, 6.0)
+DIAGNOSED = 38  # the node whose TPDO carries these objects
+DIAGNOSED_WORDS = (0x60040020, 0x65030010, 0x65050010)
 UNASKED = ("fault", "arrived", "plugged", "ready")
 
 
@@ -33,6 +41,7 @@ class RigProcess:
     Attributes:
         clock: shared by rig and daemon.
         origin: of the clock, as the processes' command lines have it.
+        rig_file: describes it.
         can_port, station_port, wire_log: see `simulators.live` and `simulators.wire_log`.
         aimed: what the station was last told to turn to.
     """
@@ -44,7 +53,9 @@ class RigProcess:
         self.origin = f"{stamp.utc_ns},{stamp.monotonic_ns},{stamp.boot_id}"
         self.can_port, self.station_port, self.wire_log = directory / "can", directory / "station", directory / "wire"
         self.aimed = ""
-        command = [sys.executable, "-m", "simulators", "--rig", "swdt82", "--seed", str(seed), "--rate", str(rate)]
+        self.rig_file = _write_rig(directory)
+        command = [sys.executable, "-m", "simulators", "--rig", str(self.rig_file), "--seed", str(seed)]
+        command += ["--rate", str(rate), "--map", f"{DIAGNOSED}:{'+'.join(f'{word:X}' for word in DIAGNOSED_WORDS)}"]
         command += ["--origin", self.origin, "--can-port", str(self.can_port), "--station-port", str(self.station_port)]
         command += ["--sync-ms", "200", "--signal-ms", "200", "--wire-log", str(self.wire_log)]
         self._process = subprocess.Popen(
@@ -109,6 +120,27 @@ class RigProcess:
                 self._answers.put(event)
 
 
-def seconds(ns: int) -> float:
-    """Nanoseconds as seconds."""
-    return ns / NS_PER_S
+def _write_rig(directory: Path) -> Path:
+    """The rig's file, with the files beside it that it names."""
+    shipped = Path(str(resources.files("calibration").joinpath("rigs")))
+    shutil.copy(shipped / "machine.dbc", directory)
+    text = (shipped / "swdt82.toml").read_text(encoding="utf-8")
+    line = f"node = {DIAGNOSED}\n"
+    assert text.count(line) == 1
+    (directory / "soak.toml").write_text(text.replace(line, line + 'eds = "diagnosed.eds"\n'), encoding="utf-8")
+    objects = [("1800", 0, 5), ("1800", 1, 0x180 + DIAGNOSED), ("1A00", 0, len(DIAGNOSED_WORDS))]
+    objects += [("1A00", sub, word) for sub, word in enumerate(DIAGNOSED_WORDS, 1)]
+    lines = [
+        "[MandatoryObjects]",
+        "SupportedObjects=0",
+        "[OptionalObjects]",
+        "SupportedObjects=2",
+        "1=0x1800",
+        "2=0x1A00",
+    ]
+    lines += [f"[{index}]\nParameterName={index}\nObjectType=0x9\nSubNumber=5" for index in ("1800", "1A00")]
+    for index, sub, value in objects:
+        lines.append(f"[{index}sub{sub}]\nParameterName={index}.{sub}\nObjectType=0x7\nDataType=0x0007")
+        lines.append(f"AccessType=rw\nDefaultValue={value:#x}\nPDOMapping=0")
+    (directory / "diagnosed.eds").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return directory / "soak.toml"

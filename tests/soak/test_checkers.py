@@ -56,6 +56,14 @@ def test_one_lost_frame_without_a_gap_is_found() -> None:
     assert len(account("boom", SENT, stored, [gap(12.0, 13.0)], UNTIL_NS).untold) == 1
 
 
+def test_which_of_many_equal_items_was_lost_is_left_open() -> None:
+    sent = [Item(n * NS_PER_S // 100, "same" if n < 1500 else str(n)) for n in range(2000)]
+    stored = [Item(item.at_ns + 1_000_000, item.what) for n, item in enumerate(sent) if not 700 <= n < 710]
+    assert account("boom", sent, stored, [gap(7.0, 7.1)], UNTIL_NS).untold == []
+    assert len(account("boom", sent, stored, [gap(6.0, 6.5)], UNTIL_NS).untold) > 0  # they were stored after that
+    assert len(account("boom", sent, stored, [gap(16.0, 16.5)], UNTIL_NS).untold) == 10
+
+
 def test_a_gap_that_says_too_few_is_found() -> None:
     stored = [item for number, item in enumerate(items(range(2000), 1_000_000)) if not 700 <= number < 800]
     result = account("boom", SENT, stored, [gap(7.0, 8.0, 50)], UNTIL_NS)
