@@ -2,7 +2,8 @@
 
 A fault's time to evidence is what it would be on a real rig: the time-outs of the program run on the rig's clock, which
 runs faster here, and what the computer itself takes runs in real time. So it is the rig's seconds from the fault to
-the stamp of what shows it, and the real seconds from that stamp until it could be read.
+the stamp of what shows it, and the real seconds from that stamp until it could be read. Alarms are raised once a real
+second; what that is more than a second of the rig is taken off.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import sqlite3
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,6 +23,7 @@ from tests.soak.rig_process import RigProcess
 DEADLINE_S = 5.0
 LOOK_REAL_S = 0.15  # how often the store is looked at
 ASK_REAL_S = 1.0  # how often `status` is asked for
+ALARMS_REAL_S = 1.0  # how often the daemon looks for alarms
 WAIT_NS = 40 * NS_PER_S  # how long evidence is looked for, to tell late from never
 JUST_BEFORE_NS = NS_PER_S // 5
 
@@ -106,6 +108,10 @@ class Case:
         if self.found is None:
             return None
         stamp_ns = self.found.stamp_ns
+        if self.found.kind == "alarm":
+            stamp_ns = self.found.seen_ns if stamp_ns is None else stamp_ns
+            stamp_ns = max(self.at_ns, stamp_ns - round((rate - 1) * ALARMS_REAL_S * NS_PER_S))
+            return (stamp_ns - self.at_ns) / NS_PER_S
         if stamp_ns is None or stamp_ns < self.at_ns:
             return (self.found.seen_ns - self.at_ns) / NS_PER_S
         return (stamp_ns - self.at_ns) / NS_PER_S + (self.found.seen_ns - stamp_ns) / NS_PER_S / rate
@@ -119,14 +125,16 @@ class Watch:
         daemon, rig: who is watched, whose clock counts.
         cases: all faults so far.
         answers_s: how long each answer to `status` took, real seconds.
-        on_fact: told of every fact besides.
+        alarms: whether the daemon has shown that it knows alarms.
+        has_session: whether a session was open when it was last asked.
     """
 
     daemon: DaemonProcess
     rig: RigProcess
     cases: list[Case] = field(default_factory=list)
     answers_s: list[float] = field(default_factory=list)
-    on_fact: Callable[[Fact], None] = lambda _fact: None
+    alarms: bool = False
+    has_session: bool = False
     _open: list[Case] = field(default_factory=list)
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _missed: dict[str, int] = field(default_factory=dict)
@@ -143,8 +151,11 @@ class Watch:
         while not stop.wait(LOOK_REAL_S):
             with contextlib.suppress(sqlite3.Error), self._connection() as db:
                 if not last:
-                    last = {table: _newest(db, table) for table in _TABLES}
+                    known = {row[0] for row in db.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")}
+                    last = {table: _newest(db, table) for table in _TABLES if table in known}
                 for table, (columns, kind) in _TABLES.items():
+                    if table not in last:
+                        continue
                     for row in db.execute(
                         f"SELECT id, {columns} FROM {table} WHERE id > ? ORDER BY id", (last[table],)
                     ):
@@ -175,12 +186,13 @@ class Watch:
             if missed > self._missed.get(key, missed):
                 facts += [Fact("missed", name, "", seen_ns) for name in frame["names"].split(", ")]
             self._missed[key] = missed
-        for alarm in status.get("alarms", ()):
-            facts.append(Fact("alarm", str(alarm["subject"]), str(alarm["kind"]), seen_ns))
+        self.has_session = status["session"] is not None
+        if "alarms" in status:
+            self.alarms = True
+            facts += [Fact("alarm", one["subject"], one["kind"], seen_ns) for one in status["alarms"]["active"]]
         return facts
 
     def _take(self, fact: Fact) -> None:
-        self.on_fact(fact)
         with self._lock:
             for case in self._open:
                 if case.shows(fact):
@@ -197,6 +209,7 @@ class Watch:
 _TABLES = {
     "device_events": ("device, kind, monotonic_ns", "event"),
     "gaps": ("channel, reason, start_monotonic_ns", "gap"),
+    "alarms": ("subject, kind, raised_monotonic_ns", "alarm"),
     "decode_failures": ("device, reason, monotonic_ns", "failure"),
     "fixes": ("station, status, monotonic_ns", "fix"),
     "signals": ("(SELECT name FROM channels WHERE channels.id = channel_id), status, monotonic_ns", "reading"),

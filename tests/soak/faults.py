@@ -62,6 +62,22 @@ EVIDENCE: dict[str, tuple[Expected, ...]] = {
     "station speaks again": (Expected("fix"),),
     "node speaks again": (Expected("reading", ("ok",)),),
 }
+# What alarm must stand while a fault lasts, where it lasts for long.
+ALARMS: dict[str, tuple[str, ...]] = {
+    "lock_loss": ("station_not_locked",),
+    "prism_jump": ("prism_jump",),
+    "station_silent": ("station_silent",),
+    "node_silent": ("joint_silent", "signal_silent", "heartbeat_lost"),
+    "emergency": ("emergency",),
+    "alarm": ("joint_not_usable", "signal_not_usable", "device_alarm", "emergency"),
+    "warning": ("device_warning",),
+    "not_available": ("signal_not_usable",),
+    "bus_error": ("bus_error_passive",),
+    "unplug can": ("link_down",),
+    "unplug station": ("link_down",),
+    "store not writable": ("not_storing",),
+}
+LONG_S = 10.0
 STATION_FAULTS = (
     "lock_loss",
     "prism_jump",
@@ -163,7 +179,7 @@ class Mischief:
 
     def _station_fault(self) -> None:
         kind = self._rng.choice(STATION_FAULTS)
-        lasts_s = self._rng.uniform(2.0, 12.0)
+        lasts_s = self._rng.uniform(2.0, 16.0)
         if kind == "unplug":
             self._unplug("station", STATION, lasts_s)
             return
@@ -174,6 +190,8 @@ class Mischief:
         elif kind == "prism_jump":
             given = {"to": self._rng.choice([p for p in self._prisms if p != self._rig.aimed])}
         self._fault(kind, (STATION,), STATION, **given)
+        if kind in ALARMS and (kind != "lock_loss" or self._watch.has_session):
+            self._expect_alarm(kind, (STATION,), STATION, lasts_s)
         self._wait(lasts_s)
         if kind == "station_silent":
             self._expect("station speaks again", (STATION,), STATION, is_bar=False)
@@ -196,7 +214,7 @@ class Mischief:
         )
         on = self._positions if kind == "alarm" or "jump" in kind else self._nodes
         node = DIAGNOSED if kind == "warning" else self._rng.choice(sorted(on))
-        names, lasts_s = self._nodes[node], self._rng.uniform(2.0, 8.0)
+        names, lasts_s = self._nodes[node], self._rng.uniform(2.0, 14.0)
         counts = self._rng.choice((-1, 1)) * (12_000 if self._positions.get(node) else 4_000)
         if kind == "preset_jump behind an alarm":
             self._rig.do("fault", kind="alarm", node=node, seconds=1.0)
@@ -210,18 +228,22 @@ class Mischief:
             self._fault(kind, names, LINK, node=node, counts=-counts)
         elif kind == "node_silent":
             self._fault(kind, names, LINK, node=node, seconds=lasts_s)
+            self._expect_alarm(kind, names, LINK, lasts_s)
             self._wait(lasts_s)
             self._expect("node speaks again", names, LINK, is_bar=False)
         elif kind == "emergency":
             code = self._rng.choice((0x5000, 0x8130, 0x3100))
             self._fault(kind, names, LINK, node=node, code=code)
+            self._expect_alarm(kind, names, LINK, lasts_s)
             self._wait(lasts_s)
             self._fault("emergency_clear", names, LINK, node=node)
         elif kind == "alarm":
             self._fault(kind, names, LINK, node=node, seconds=lasts_s)
+            self._expect_alarm(kind, names, LINK, lasts_s)
             self._wait(lasts_s)
         elif kind == "warning":
             self._fault(kind, names, LINK, node=node)
+            self._expect_alarm(kind, names, LINK, lasts_s)
             self._wait(lasts_s)
             self._fault(kind, names, LINK, node=node, bits=0)
         else:
@@ -232,18 +254,24 @@ class Mischief:
         if self._rng.random() < 0.5:
             self._fault("counter_gap", self._signals, LINK, count=self._rng.randint(1, 14))
         else:
-            self._fault("not_available", self._signals, LINK, seconds=self._rng.uniform(1.0, 5.0))
+            lasts_s = self._rng.uniform(1.0, 15.0)
+            self._fault("not_available", self._signals, LINK, seconds=lasts_s)
+            self._expect_alarm("not_available", self._signals, LINK, lasts_s)
+            self._wait(lasts_s)
         self._wait(6.0)
 
     def _bus_fault(self) -> None:
         if self._rng.random() < 0.25:
-            self._unplug("can", LINK, self._rng.uniform(1.0, 12.0))
+            self._unplug("can", LINK, self._rng.uniform(1.0, 16.0))
             return
         state = self._rng.choice(("warning", "passive", "bus_off", "acknowledge"))
         if state == "acknowledge":  # told at most every 10 s
             self._wait(10.0)
+        lasts_s = self._rng.uniform(2.0, 14.0)
         self._fault("bus_error", (LINK,), LINK, state=state)
-        self._wait(3.0)
+        if state == "passive":  # bus-off that is followed by frames is over
+            self._expect_alarm("bus_error", (LINK,), LINK, lasts_s)
+        self._wait(lasts_s)
         if state != "acknowledge":
             self._fault("bus_error", (LINK,), LINK, state="active")
         self._wait(3.0)
@@ -259,7 +287,9 @@ class Mischief:
             else:
                 self._daemon.allow_writing(allowed=False)
                 self._expect("store not writable", ("store",), "")
-                self._wait(self._rng.uniform(4.0, 16.0))
+                lasts_s = self._rng.uniform(4.0, 16.0)
+                self._expect_alarm("store not writable", ("store",), "", lasts_s)
+                self._wait(lasts_s)
                 self._daemon.allow_writing(allowed=True)
                 self._expect("store writable again", ("store",), "", is_bar=False)
                 self._wait(4.0)
@@ -284,6 +314,7 @@ class Mischief:
         begin_ns = self._rig.now_ns()
         self._rig.do("fault", kind="unplug", link=what, seconds=lasts_s)
         self._expect(f"unplug {what}", (link,), "", at_ns=begin_ns)
+        self._expect_alarm(f"unplug {what}", (link,), "", lasts_s)
         self._wait(lasts_s + 0.1)
         self._expect(f"{what} back", (link,), "", is_bar=False)
         self._wait(8.0)
@@ -293,6 +324,12 @@ class Mischief:
         at_ns = self._rig.now_ns()
         self._rig.do("fault", kind=kind, **given)
         self._expect(kind, subjects, on, at_ns=at_ns)
+
+    def _expect_alarm(self, fault: str, subjects: Sequence[str], link: str, lasts_s: float) -> None:
+        """The fault that has just begun lasts so long: if that is long, there must be an alarm."""
+        if self._watch.alarms and lasts_s >= LONG_S:
+            expected = (Expected("alarm", ALARMS[fault]),)
+            self._watch.expect(Case(f"{fault}: alarm", tuple(subjects), link, self._rig.now_ns(), expected))
 
     def _expect(
         self, name: str, subjects: Sequence[str], link: str, *, at_ns: int | None = None, is_bar: bool = True

@@ -131,6 +131,7 @@ def _write_rig(directory: Path) -> Path:
     objects = [("1800", 0, 5), ("1800", 1, 0x180 + DIAGNOSED), ("1A00", 0, len(DIAGNOSED_WORDS))]
     objects += [("1A00", sub, word) for sub, word in enumerate(DIAGNOSED_WORDS, 1)]
     lines = [
+        "[DeviceInfo]",
         "[MandatoryObjects]",
         "SupportedObjects=0",
         "[OptionalObjects]",
