@@ -104,6 +104,7 @@ def test_what_is_put_on_the_links_is_logged(tmp_path: Path) -> None:
     with serial.Serial(str(process.station), 9600, timeout=0.1) as port:
         for _ in range(10):  # the first ones come while it still turns
             read_until(port, b"\n")
+    assert process.do("tracked", do="tracked")["target"] == "r"
     process.do("accepted", do="fault", kind="bus_error", state="bus_off")
     process.next("fault")
     assert process.end() == (0, b"")
@@ -224,6 +225,7 @@ def test_an_unplugged_port_comes_back(rig: Process) -> None:
         (["--latency-ms", "-1"], b"latency-ms must not be negative"),
         (["--random-faults", "-1"], b"random-faults must be positive"),
         (["--origin", "now"], b"is not UTC_NS,MONOTONIC_NS,BOOT_ID"),
+        (["--map", "38"], b"is not NODE:WORD+WORD"),
         (["--can-port", "/nowhere/can"], b"No such file"),
     ],
 )

@@ -127,6 +127,7 @@ class Watch:
         answers_s: how long each answer to `status` took, real seconds.
         alarms: whether the daemon has shown that it knows alarms.
         has_session: whether a session was open when it was last asked.
+        channels: name -> status of its last reading, likewise.
     """
 
     daemon: DaemonProcess
@@ -135,6 +136,7 @@ class Watch:
     answers_s: list[float] = field(default_factory=list)
     alarms: bool = False
     has_session: bool = False
+    channels: dict[str, str] = field(default_factory=dict)
     _open: list[Case] = field(default_factory=list)
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _missed: dict[str, int] = field(default_factory=dict)
@@ -186,6 +188,7 @@ class Watch:
             if missed > self._missed.get(key, missed):
                 facts += [Fact("missed", name, "", seen_ns) for name in frame["names"].split(", ")]
             self._missed[key] = missed
+        self.channels = {channel["name"]: channel["status"] for channel in acquisition["channels"]}
         self.has_session = status["session"] is not None
         if "alarms" in status:
             self.alarms = True

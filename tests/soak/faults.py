@@ -188,6 +188,8 @@ class Mischief:
             lasts_s = max(lasts_s, 2.0 if kind == "lock_loss" else 6.0)  # shorter ones leave no trace, and no harm
             given = {"seconds": lasts_s}
         elif kind == "prism_jump":
+            if not self._watch.has_session or self._rig.aimed not in self._prisms:
+                return  # only a session has a prism that the station could have left
             given = {"to": self._rng.choice([p for p in self._prisms if p != self._rig.aimed])}
         self._fault(kind, (STATION,), STATION, **given)
         if kind in ALARMS and (kind != "lock_loss" or self._watch.has_session):
@@ -249,6 +251,9 @@ class Mischief:
         else:
             self._fault(kind, names, LINK, node=node)
         self._wait(7.0)
+        if any(self._watch.channels.get(name) == "device_alarm" for name in names):
+            # What took it back was not heard, the link being down. An operator switches the device off and on.
+            self._rig.do("fault", kind="node_reboot", node=node)
 
     def _signal_fault(self) -> None:
         if self._rng.random() < 0.5:

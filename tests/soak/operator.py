@@ -58,6 +58,7 @@ class Operator:
         for _ in range(self._rng.randint(1, 4)):
             self._pause(4.0, 15.0)
             self._ask()
+            self._look_after_the_prism()
         if self._rng.random() < 0.7:
             self._shoot()
         self._pause(1.0, 5.0)
@@ -67,6 +68,18 @@ class Operator:
         for point in CONTROL_POINTS:
             if not self._stop.is_set():
                 self._say("session.shoot", point=point)
+
+    def _look_after_the_prism(self) -> None:
+        """Aim anew where the station's fixes are doubted, and say so when the prism is seen to be the session's."""
+        status = self._say("status")
+        session = status and status["session"]
+        if not session or not session.get("prism_suspicions"):
+            return
+        if self._rig.tracked() != session["prism"]:
+            self._rig.aim(session["prism"])
+            self._pause(3.0, 6.0)
+        if self._rig.tracked() == session["prism"]:
+            self._say("session.confirm-prism", operator="soak")
 
     def _ask(self) -> None:
         question = self._rng.choice(QUESTIONS)

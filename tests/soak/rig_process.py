@@ -89,6 +89,11 @@ class RigProcess:
         self.do("aim", target=target)
         self.aimed = target
 
+    def tracked(self) -> str | None:
+        """What the station is locked on, as whoever looks through the telescope sees."""
+        target: str | None = self.do("tracked")["target"]
+        return target
+
     def drive(self, stop: threading.Event, rng: random.Random) -> None:
         """Move the boom from one random pose to the next until `stop`."""
         for seed in itertools.count(rng.randrange(1 << 30)):
