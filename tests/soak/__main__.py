@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import json
 import random
 import sys
 import tempfile
 import threading
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 from calibration.rig import shipped_rig
@@ -90,6 +92,7 @@ def soak(directory: Path, minutes: float, rate: float, seed: int) -> Report:
         daemon.close()
         hands.close()
         rig.close()
+    (directory / "usage.json").write_text(json.dumps([asdict(sample) for sample in samples]), encoding="utf-8")
     wire = read_wire_log(rig.wire_log)
     with Reader(daemon.store) as reader:
         gaps = stored_gaps(reader)
