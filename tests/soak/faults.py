@@ -51,7 +51,11 @@ EVIDENCE: dict[str, tuple[Expected, ...]] = {
     ),
     "unplug can": (Expected("event", ("link_lost",)), Expected("gap", ("link_down",)), _ALARM),
     "unplug station": (Expected("event", ("link_lost",)), Expected("gap", ("link_down",)), _ALARM),
-    "daemon held": (Expected("event", ("frames_dropped",)), Expected("gap", ("frames_lost",)), _ALARM),
+    "daemon held": (
+        Expected("event", ("frames_dropped", "time_doubtful")),
+        Expected("gap", ("frames_lost", "time_doubtful")),
+        _ALARM,
+    ),
     "daemon killed": (Expected("gap", ("not_running",), subject="daemon"),),
     "store not writable": (Expected("error", subject="store"), Expected("alarm", subject="store")),
     "clients that hang": (Expected("answer", subject="daemon"),),

@@ -190,7 +190,8 @@ class Gap:
         return self.start_ns - EDGE_NS <= at_ns and (self.end_ns is None or at_ns <= self.end_ns + EDGE_NS)
 
 
-LOSSES = ("link_down", "not_running", "frames_lost")
+# Of a stretch of doubtful time nothing may be used: what an adapter's buffer did not hold meanwhile is told by it as well.
+LOSSES = ("link_down", "not_running", "frames_lost", "time_doubtful")
 
 
 def stored_gaps(reader: Reader) -> list[Gap]:
