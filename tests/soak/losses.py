@@ -190,7 +190,7 @@ class Gap:
         return self.start_ns - EDGE_NS <= at_ns and (self.end_ns is None or at_ns <= self.end_ns + EDGE_NS)
 
 
-# Of a stretch of doubtful time nothing may be used: what an adapter's buffer did not hold meanwhile is told by it as well.
+# Nothing of a stretch of doubtful time may be used: it tells as well of what an adapter could not hold meanwhile.
 LOSSES = ("link_down", "not_running", "frames_lost", "time_doubtful")
 
 
