@@ -78,6 +78,7 @@ class Store:
 
     Attributes:
         run_id: row of `daemon_runs`, 0 while no run has begun.
+        begun: when the run began; None while none has.
 
     Raises:
         StoreBusyError: another process writes to it.
@@ -112,6 +113,7 @@ class Store:
         self._channels: dict[tuple[str, str], tuple[int, ChannelKind]] = {}
         self._joints: frozenset[str] = frozenset()
         self.run_id = 0
+        self.begun: Stamp | None = None
         log.info("store %s open, SQLite %s", path, sqlite3.sqlite_version)
 
     def _prepare(self, connection: sqlite3.Connection) -> None:
@@ -237,6 +239,7 @@ class Store:
                 "sqlite_version": sqlite3.sqlite_version,
             }
             self.run_id = self.insert("daemon_runs", run | self.instant(now, "started_") | self.instant(now, "alive_"))
+            self.begun = now
 
     def _last_alive(self) -> Stamp | None:
         """When the last run was last known to be alive; None before the first."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from bisect import bisect_left
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from bisect import bisect_left, bisect_right
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -143,21 +144,6 @@ def compare(sent: Sequence[Item], stored: Sequence[Item]) -> Comparison:
     return Comparison(stored_ns, foreign)
 
 
-def _alternatives(sent: Sequence[Item], stored_ns: Sequence[int | None], block: tuple[int, int]) -> Iterator[range]:
-    """Where a run of lost items may lie: as it was found, or earlier where items repeat.
-
-    A station that searches says the same again and again: which of these records is missing, nobody can tell.
-    """
-    first, end = block
-    yield range(first, end)
-    while first > 0 and sent[first - 1].what == sent[end - 1].what:
-        told_ns = stored_ns[first - 1]
-        if told_ns is None or sent[end - 1].at_ns > told_ns - EARLIEST_NS:
-            return
-        first, end = first - 1, end - 1
-        yield range(first, end)
-
-
 def _resume(
     sent: Sequence[Item], stored: Sequence[Item], places: Mapping[str, list[int]], at: int, number: int
 ) -> int | None:
@@ -226,6 +212,38 @@ class Account:
     delay_p99_s: float
 
 
+def _told(sent: Sequence[Item], gaps: Sequence[Gap]) -> list[bool]:
+    """Whether each item lies in a gap."""
+    told = [False] * len(sent)
+    at_ns = [item.at_ns for item in sent]
+    for gap in gaps:
+        first = bisect_left(at_ns, gap.start_ns - EDGE_NS)
+        end = len(sent) if gap.end_ns is None else bisect_right(at_ns, gap.end_ns + EDGE_NS)
+        told[first:end] = [True] * max(0, end - first)
+    return told
+
+
+def _best_place(
+    sent: Sequence[Item], stored_ns: Sequence[int | None], untold: Sequence[bool], block: tuple[int, int]
+) -> tuple[int, int]:
+    """Where a run of lost items lies: as it was found, or earlier where items repeat and fewer of them are untold.
+
+    A station that searches says the same again and again: which of these records is missing, nobody can tell.
+    """
+    first, end = block
+    best, fewest = block, sum(untold[first:end])
+    number = fewest
+    while fewest > 0 and first > 0 and sent[first - 1].what == sent[end - 1].what:
+        told_ns = stored_ns[first - 1]
+        if told_ns is None or sent[end - 1].at_ns > told_ns - EARLIEST_NS:
+            break
+        first, end = first - 1, end - 1
+        number += untold[first] - untold[end]
+        if number < fewest:
+            best, fewest = (first, end), number
+    return best
+
+
 def account(link: str, sent: Sequence[Item], stored: Sequence[Item], gaps: Sequence[Gap], until_ns: int) -> Account:
     """Hold what was sent on a link until `until_ns` against what was stored, and against the gaps.
 
@@ -240,23 +258,20 @@ def account(link: str, sent: Sequence[Item], stored: Sequence[Item], gaps: Seque
     sent = sent[begin:]
     compared = compare(sent, stored)
     of_link = [gap for gap in gaps if gap.channel in (link, "daemon") and gap.reason in LOSSES]
+    counts = [begin_ns <= item.at_ns <= until_ns for item in sent]
+    untold_flags = [is_counted and not told for is_counted, told in zip(counts, _told(sent, of_link), strict=True)]
     lost: list[Item] = []
     untold: list[Item] = []
     for block in compared.blocks():
-        tries = []
-        for places in _alternatives(sent, compared.stored_ns, block):
-            of_try = [sent[place] for place in places if begin_ns <= sent[place].at_ns <= until_ns]
-            tries.append((of_try, [item for item in of_try if not any(gap.covers(item.at_ns) for gap in of_link)]))
-            if not tries[-1][1]:
-                break
-        of_block, untold_of_block = min(tries, key=lambda one: len(one[1]))
-        lost += of_block
-        untold += untold_of_block
-    understated = []
-    for gap in of_link:
-        alone = [item for item in lost if [g for g in of_link if g.covers(item.at_ns)] == [gap]]
-        if gap.missed is not None and len(alone) > gap.missed:
-            understated.append(f"{gap.reason} at {gap.start_ns / NS_PER_S:.1f} s: says {gap.missed}, lost {len(alone)}")
+        first, end = _best_place(sent, compared.stored_ns, untold_flags, block)
+        lost += [sent[place] for place in range(first, end) if counts[place]]
+        untold += [sent[place] for place in range(first, end) if untold_flags[place]]
+    alone = Counter(gaps_of[0] for item in lost if len(gaps_of := [g for g in of_link if g.covers(item.at_ns)]) == 1)
+    understated = [
+        f"{gap.reason} at {gap.start_ns / NS_PER_S:.1f} s: says {gap.missed}, lost {n}"
+        for gap, n in alone.items()
+        if gap.missed is not None and n > gap.missed
+    ]
     delays = sorted(at - item.at_ns for at, item in zip(compared.stored_ns, sent, strict=True) if at is not None)
     return Account(
         sent=len(sent),
