@@ -102,7 +102,7 @@ def soak(directory: Path, minutes: float, rate: float, seed: int) -> Report:
             for link in sent
         }
         faults = inconsistencies(reader)
-        observations, examples = untruths(reader, machine, wire)
+        observations, examples = untruths(reader, machine, wire, rate)
     return Report(
         minutes=minutes,
         rate=rate,

@@ -18,6 +18,7 @@ PLACE_MM = 15.0  # six times the noise of circles, distance and target
 JOINT = {"deg": 1.5, "mm": 25.0}  # what zeros and build errors of a machine come to; other poses differ by far more
 BEFORE_NS, AFTER_NS = 3 * NS_PER_S, NS_PER_S // 2  # a fix's stamp lies this close to its measurement
 JUMP_EDGE_NS = 2 * NS_PER_S
+LATE_S = 0.25  # real: what a port's bytes and frames may be read late by, unmarked, where no kernel stamps them
 
 
 def inconsistencies(reader: Reader) -> list[str]:
@@ -51,8 +52,13 @@ _STRAY = """SELECT s.id, count(*) AS n,
     GROUP BY s.id, what"""
 
 
-def untruths(reader: Reader, rig: Rig, wire: Wire) -> tuple[Counter[str], list[str]]:
+def untruths(reader: Reader, rig: Rig, wire: Wire, rate: float) -> tuple[Counter[str], list[str]]:
     """Observations that calibration may use, beside the truth.
+
+    Args:
+        reader, rig: of the store.
+        wire: what the rig sent and measured.
+        rate: simulated seconds per real second: joints that move may be off by what they move while they are read late.
 
     Returns:
         Fault -> how many observations have it, with their number as `observations`; and some of them in words.
@@ -65,7 +71,9 @@ def untruths(reader: Reader, rig: Rig, wire: Wire) -> tuple[Counter[str], list[s
         counts["observations"] += 1
         at_ns, place = row["monotonic_ns"], (row["x_mm"], row["y_mm"], row["z_mm"])
         near = wire.measured[bisect_left(measured_ns, at_ns - BEFORE_NS) : bisect_left(measured_ns, at_ns + AFTER_NS)]
-        fault = _untruth(row["prism"], place, near, json.loads(row["values_json"]), rig, _jumped(jumps, at_ns))
+        fault = _untruth(
+            row["prism"], place, near, json.loads(row["values_json"]), rig, _jumped(jumps, at_ns), LATE_S * rate
+        )
         if fault:
             kind, text = fault
             counts[kind] += 1
@@ -82,6 +90,7 @@ def _untruth(
     values: Mapping[str, float],
     rig: Rig,
     jumped: set[str],
+    late_s: float,
 ) -> tuple[str, str] | None:
     if not near:
         return "never measured", "the station measured nothing near its instant"
@@ -100,7 +109,7 @@ def _untruth(
             continue
         nearest = min(fitting, key=lambda m: abs(m.pose[joint.name] - value))
         off = abs(nearest.pose[joint.name] - value)
-        if off > JOINT[joint.unit]:
+        if off > JOINT[joint.unit] + late_s * abs(values.get(f"{joint.name}_rate", 0.0)):
             return (
                 "wrong pose",
                 f"{joint.name} stored as {value:.2f} {joint.unit}, it stood at {nearest.pose[joint.name]:.2f}",

@@ -7,7 +7,7 @@ from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path
 
 from daemon.store.reader import Reader
@@ -15,6 +15,7 @@ from drivers.clock import NS_PER_S
 from drivers.readings import CanCapture, Capture
 
 EARLIEST_NS = -NS_PER_S // 20  # a stored stamp may lie this much before the log's: neither clock is read on the wire
+LATEST_NS = 4 * NS_PER_S  # and this much behind it, where the computer is busy
 RUN_LENGTHS = (24, 8, 3)  # after a loss: this many in a row must fit again, the longest run first
 EDGE_NS = NS_PER_S // 4  # the ends of gaps are known to a quarter of a second: the links look that often
 
@@ -110,18 +111,6 @@ class Comparison:
 
     stored_ns: list[int | None]
     foreign: list[Item]
-
-    def blocks(self) -> list[tuple[int, int]]:
-        """Runs of lost items: from, until."""
-        blocks: list[tuple[int, int]] = []
-        for place, stored_ns in enumerate(self.stored_ns):
-            if stored_ns is not None:
-                continue
-            if blocks and blocks[-1][1] == place:
-                blocks[-1] = blocks[-1][0], place + 1
-            else:
-                blocks.append((place, place + 1))
-        return blocks
 
 
 def compare(sent: Sequence[Item], stored: Sequence[Item]) -> Comparison:
@@ -223,25 +212,29 @@ def _told(sent: Sequence[Item], gaps: Sequence[Gap]) -> list[bool]:
     return told
 
 
-def _best_place(
-    sent: Sequence[Item], stored_ns: Sequence[int | None], untold: Sequence[bool], block: tuple[int, int]
-) -> tuple[int, int]:
-    """Where a run of lost items lies: as it was found, or earlier where items repeat and fewer of them are untold.
+def _untold(
+    sent: Sequence[Item], stored: Sequence[Item], must_be_there: Sequence[bool], stored_ns: Sequence[int | None]
+) -> list[Item]:
+    """Items that must be there and are not.
 
-    A station that searches says the same again and again: which of these records is missing, nobody can tell.
+    Between two gaps everything that was sent must be found in one piece. Only where it is not, single items are looked
+    at: a station that searches says the same again and again, and which of these records is missing, nobody can tell.
     """
-    first, end = block
-    best, fewest = block, sum(untold[first:end])
-    number = fewest
-    while fewest > 0 and first > 0 and sent[first - 1].what == sent[end - 1].what:
-        told_ns = stored_ns[first - 1]
-        if told_ns is None or sent[end - 1].at_ns > told_ns - EARLIEST_NS:
-            break
-        first, end = first - 1, end - 1
-        number += untold[first] - untold[end]
-        if number < fewest:
-            best, fewest = (first, end), number
-    return best
+    untold: list[Item] = []
+    stamps = [item.at_ns for item in stored]
+    for is_wanted, run in groupby(range(len(sent)), key=lambda place: must_be_there[place]):
+        if not is_wanted:
+            continue
+        places = list(run)
+        first = bisect_left(stamps, sent[places[0]].at_ns + EARLIEST_NS)
+        end = bisect_right(stamps, sent[places[-1]].at_ns + LATEST_NS)
+        if _text(sent[places[0] : places[-1] + 1]) not in _text(stored[first:end]):
+            untold += [sent[place] for place in places if stored_ns[place] is None]
+    return untold
+
+
+def _text(items: Sequence[Item]) -> str:
+    return "\n" + "\n".join(item.what for item in items) + "\n"
 
 
 def account(link: str, sent: Sequence[Item], stored: Sequence[Item], gaps: Sequence[Gap], until_ns: int) -> Account:
@@ -259,13 +252,12 @@ def account(link: str, sent: Sequence[Item], stored: Sequence[Item], gaps: Seque
     compared = compare(sent, stored)
     of_link = [gap for gap in gaps if gap.channel in (link, "daemon") and gap.reason in LOSSES]
     counts = [begin_ns <= item.at_ns <= until_ns for item in sent]
-    untold_flags = [is_counted and not told for is_counted, told in zip(counts, _told(sent, of_link), strict=True)]
-    lost: list[Item] = []
-    untold: list[Item] = []
-    for block in compared.blocks():
-        first, end = _best_place(sent, compared.stored_ns, untold_flags, block)
-        lost += [sent[place] for place in range(first, end) if counts[place]]
-        untold += [sent[place] for place in range(first, end) if untold_flags[place]]
+    told = _told(sent, of_link)
+    must_be_there = [is_counted and not is_told for is_counted, is_told in zip(counts, told, strict=True)]
+    untold = _untold(sent, stored, must_be_there, compared.stored_ns)
+    lost = [
+        item for item, at, is_counted in zip(sent, compared.stored_ns, counts, strict=True) if at is None and is_counted
+    ]
     alone = Counter(gaps_of[0] for item in lost if len(gaps_of := [g for g in of_link if g.covers(item.at_ns)]) == 1)
     understated = [
         f"{gap.reason} at {gap.start_ns / NS_PER_S:.1f} s: says {gap.missed}, lost {n}"

@@ -197,7 +197,7 @@ def test_observations_that_are_not_true_are_found(store: Store, tmp_path: Path) 
     add_observation(store, "s1", 30.0)
     store.close()
     with Reader(store.path) as reader:
-        counts, _ = untruths(reader, shipped_rig("swdt82"), read_wire_log(tmp_path / "wire"))
+        counts, _ = untruths(reader, shipped_rig("swdt82"), read_wire_log(tmp_path / "wire"), RATE)
     wrong = {"wrong place": 1, "wrong pose": 1, "wrong name": 1, "never measured": 1}
     assert counts == {"observations": 5, **wrong}
 
@@ -222,4 +222,4 @@ def test_sessions_and_observations_that_do_not_fit_together_are_found(store: Sto
 def test_a_rig_that_nobody_measured_has_no_observations(store: Store) -> None:
     store.close()
     with Reader(store.path) as reader:
-        assert untruths(reader, shipped_rig("swdt82"), Wire()) == ({}, [])
+        assert untruths(reader, shipped_rig("swdt82"), Wire(), RATE) == ({}, [])
