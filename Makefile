@@ -14,7 +14,7 @@ export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 # The tests start a hundred processes: each would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help environment setup demo test lint blind bench lock clean
+.PHONY: help environment setup demo test lint blind bench soak lock clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -56,6 +56,9 @@ bench: setup ## speed and accuracy beside the peers', as ratios; an hour on two 
 	$(BIN)/python -m tests.calibration.interval_coverage
 	$(BIN)/python -m tests.calibration.held_out_coverage
 	$(BIN)/rigcal bench gap
+
+soak: setup ## the daemon on a simulated rig at 4x with every fault at random; 30 minutes (SOAK="--seed 7 --minutes 5")
+	$(BIN)/python -m tests.soak $(SOAK)
 
 # The rig gets requirements.lock, with the build backend that installs the project itself; requirements-dev.lock holds
 # the same versions and the tools besides. Versions stay as they are unless pyproject.toml forces a change;

@@ -100,7 +100,7 @@ class Acquisition:
     ) -> None:
         self._store, self._clock, self._on_records = store, clock, on_records
         self._batch_seconds = batch_seconds
-        self._intakes = [LinkIntake(link, clock, queue_captures) for link in links]
+        self._intakes = [LinkIntake(link, clock, queue_captures, store.begun or clock.now()) for link in links]
         self._factories = decoders
         self._decoding = _Decoding(decoders)
         self._backlog = Backlog(store, clock)

@@ -74,9 +74,17 @@ class Parts:
     is_over: Callable[[], bool] = _never
 
 
-def live(config: Config, source: RigSource) -> Parts:
-    """A real rig."""
-    return _parts("live", config, source, SystemClock())
+def live(
+    config: Config, source: RigSource, clock: Clock | None = None, aim: Callable[[str], None] | None = None
+) -> Parts:
+    """A real rig.
+
+    Args:
+        config, source: links and rig.
+        clock: the host's by default; another one for a rig that somebody simulates at the configured ports.
+        aim: turns the station where something else than the operator can.
+    """
+    return _parts("live", config, source, clock or SystemClock(), aim=aim)
 
 
 @contextlib.contextmanager

@@ -83,6 +83,7 @@ class Store:
 
     Attributes:
         run_id: row of `daemon_runs`, 0 while no run has begun.
+        begun: when the run began; None while none has.
         ended_in_order: whether the run before this one did; known once a run has begun, true before and without one.
         files: which files it is made of, as they were when it was opened.
 
@@ -120,6 +121,7 @@ class Store:
         self._channels: dict[tuple[str, str], tuple[int, ChannelKind]] = {}
         self._joints: frozenset[str] = frozenset()
         self.run_id = 0
+        self.begun: Stamp | None = None
         self.ended_in_order = True
         self.files = StoreFiles.of(path)
         log.info("store %s open, SQLite %s", path, sqlite3.sqlite_version)
@@ -258,6 +260,7 @@ class Store:
             }
             run_id = self.insert("daemon_runs", run | self.instant(now, "started_") | self.instant(now, "alive_"))
         self.run_id = run_id
+        self.begun = now
 
     def _last_alive(self) -> Stamp | None:
         """When the last run was last known to be alive; None before the first."""
