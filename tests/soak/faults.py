@@ -134,16 +134,12 @@ class Mischief:
         self._stop = threading.Event()
         self._process = threading.Lock()  # what is done to the daemon's process comes one after the other
         self.blackouts: list[Blackout] = []
-        nodes: dict[int, list[str]] = {}
-        positions: dict[int, bool] = {}
-        for channel in machine.channels:
-            if isinstance(channel, Cia406Encoder | Cia406Linear | Cia404Analogue):
-                nodes.setdefault(channel.node, []).append(channel.name)
-                if not isinstance(channel, Cia404Analogue):
-                    positions[channel.node] = isinstance(channel, Cia406Encoder)
-        self._nodes = {node: tuple(names) for node, names in nodes.items()}
-        self._positions = positions
-        numbered = {name for names in nodes.values() for name in names}
+        on_bus = [c for c in machine.channels if isinstance(c, Cia406Encoder | Cia406Linear | Cia404Analogue)]
+        self._nodes = {channel.node: (channel.name,) for channel in on_bus}
+        self._positions = {c.node for c in on_bus if not isinstance(c, Cia404Analogue)}
+        self._joints = {c.node for c in on_bus if c.name in machine.joint_names}
+        self._encoders = {c.node for c in on_bus if isinstance(c, Cia406Encoder)}
+        numbered = {channel.name for channel in on_bus}
         self._signals = tuple(c.name for c in machine.channels if c.name not in numbered)
         self._prisms = machine.prism_names
         self._lanes = (
@@ -218,10 +214,11 @@ class Mischief:
                 "preset_jump behind an alarm",
             )
         )
-        on = self._positions if kind == "alarm" or "jump" in kind else self._nodes
-        node = DIAGNOSED if kind == "warning" else self._rng.choice(sorted(on))
+        # What drives no joint may stand anywhere. Behind an alarm, a transducer may have come that far by itself.
+        on = {"alarm": self._positions, "preset_jump": self._joints, "preset_jump behind an alarm": self._encoders}
+        node = DIAGNOSED if kind == "warning" else self._rng.choice(sorted(on.get(kind, self._nodes)))
         names, lasts_s = self._nodes[node], self._rng.uniform(2.0, 14.0)
-        counts = self._rng.choice((-1, 1)) * (12_000 if self._positions.get(node) else 4_000)
+        counts = self._rng.choice((-1, 1)) * (12_000 if node in self._encoders else 4_000)
         if kind == "preset_jump behind an alarm":
             self._rig.do("fault", kind="alarm", node=node, seconds=1.0)
             self._rig.do("fault", kind="preset_jump", node=node, counts=counts, in_s=0.5)
