@@ -13,7 +13,8 @@ from calibration.rig import Rig
 from daemon.acquisition import Acquisition
 from daemon.composition import Parts
 from daemon.config import Config
-from daemon.control import FAILED, REFUSED, CommandError, ControlServer, Handler
+from daemon.control import FAILED, REFUSED, CommandError, Handler, reading_socket
+from daemon.control_server import ControlServer
 from daemon.drift_table import DriftTable
 from daemon.gap_status import GapStatus
 from daemon.jobs import JobRunner
@@ -22,6 +23,7 @@ from daemon.live_tip import FRESH_S, LiveTip
 from daemon.model_table import ModelTable
 from daemon.notify import Notifier
 from daemon.registry import ModelRegistry
+from daemon.rights import reading_only
 from daemon.sessions import SessionKeeper
 from daemon.setups import SetupBook
 from daemon.store.store import Store
@@ -76,7 +78,7 @@ class Daemon:
         self._jobs = JobRunner(store, config, parts.rig.name, parts.clock)
         self._gap = GapStatus(store, parts.rig.name, DriftTable(store, parts.rig.name, parts.clock))
         self._models = ModelRegistry(models, parts.rig.name, self._live_model, compare=self._jobs.compare)
-        self._control = ControlServer(config.socket_path, self._commands())
+        self._servers = control_servers(config, self._commands())
 
     def run(self, stop: threading.Event, notifier: Notifier) -> None:
         """Acquire until `stop` is set or a replay has ended; then stop everything in order.
@@ -96,8 +98,10 @@ class Daemon:
             log.info("acquiring rig %s; control socket %s", self._parts.rig.name, self._config.socket_path)
             while not stop.wait(beat_s):
                 self._acquisition.check()
-                # The watchdog hears of the writer, not of this loop: a hung disk must restart the service.
-                if self._acquisition.alive(within_s=notifier.watchdog_s or 60.0):
+                # The watchdog hears of the writer and of the control sockets, not of this loop: a hung disk must
+                # restart the service, and so must a daemon that no one can reach.
+                within_s = notifier.watchdog_s or 60.0
+                if self._acquisition.alive(within_s) and all(server.alive(within_s) for server in self._servers):
                     notifier.send("WATCHDOG=1")
                 if self._parts.is_over():
                     log.info("the replay has ended")
@@ -108,7 +112,8 @@ class Daemon:
 
     def close(self) -> None:
         """Stop all parts; what was captured is stored first."""
-        self._control.close()
+        for server in self._servers:
+            server.close()
         if self._sender is not None:
             self._sender.stop()
         self._live_model.stop()
@@ -204,6 +209,22 @@ def tip_sender(config: Config, parts: Parts, tip: LiveTip) -> TipSender | None:
         return None
     link = next((link for link in parts.can_links if link.name == config.tip.can.link), None)
     return None if link is None else TipSender(tip, config.tip, config.tip.can, link)
+
+
+def control_servers(config: Config, commands: Mapping[str, Handler]) -> list[ControlServer]:
+    """Start the control socket, and the one for those who may only look where a group of them is configured.
+
+    Raises:
+        CommandError: the control socket cannot be made.
+    """
+    servers = [ControlServer(config.socket_path, commands)]
+    if config.read_group is not None:
+        path = reading_socket(config.socket_path)
+        try:
+            servers.append(ControlServer(path, reading_only(commands, config.socket_path), group=config.read_group))
+        except CommandError as error:
+            log.error("members of read_group %s cannot look: %s", config.read_group, error)
+    return servers
 
 
 def declare_channels(store: Store, rig: Rig) -> None:

@@ -15,12 +15,14 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from calibration.rig import Rig
+from daemon.arguments import identifier, text_argument
+from daemon.caller import caller_columns
 from daemon.config import SessionsSection
 from daemon.control import FAILED, CommandError
 from daemon.joiner import JoinedFix, ObservationJoiner
 from daemon.open_session import OpenSession, Shot, within
 from daemon.scheduler import CHECK, SESSION_KINDS
-from daemon.setups import AXES, Place, SetupBook, identifier
+from daemon.setups import AXES, Place, SetupBook
 from daemon.store.store import Store
 from drivers.clock import Clock
 from drivers.readings import DeviceEvent, EventKind, Fix, Record, Status
@@ -145,10 +147,10 @@ class SessionKeeper:
             prism, kind = str(arguments.get("prism", "")), str(arguments.get("kind", "static_poses"))
             if prism not in self._rig.prism_names:
                 raise CommandError(
-                    f"rig {self._rig.name!r} has no prism {prism!r}; it has {', '.join(self._rig.prism_names)}"
+                    f"rig {self._rig.name!r} has no prism {prism!r:.80}; it has {', '.join(self._rig.prism_names)}"
                 )
             if kind not in SESSION_KINDS:
-                raise CommandError(f"there is no kind {kind!r}; kinds: {', '.join(SESSION_KINDS)}")
+                raise CommandError(f"there is no kind {kind!r:.80}; kinds: {', '.join(SESSION_KINDS)}")
             setup_id = self._setups.usable(arguments.get("setup"))
             taken = {row["id"] for row in self._store.rows("SELECT id FROM calibration_sessions")}
             free = next(name for n in itertools.count(len(taken) + 1) if (name := f"s{n:03d}-{prism}") not in taken)
@@ -165,10 +167,11 @@ class SessionKeeper:
                 "rig_text": self._rig_text,
                 "setup_id": setup_id,
                 "prism": prism,
-                "operator": str(arguments.get("operator", "")),
+                "operator": text_argument(arguments, "operator"),
+                **caller_columns(),
                 "kind": kind,
                 "state": "open",
-                "note": str(arguments.get("note", "")),
+                "note": text_argument(arguments, "note"),
                 **self._store.instant(now, "started_"),
             }
             self._store.insert("calibration_sessions", row)
@@ -225,7 +228,7 @@ class SessionKeeper:
         """One session: what it holds, what was excluded and why, how its set-up kept its place, and its jobs."""
         session_id = str(arguments.get("id", ""))
         if not self._store.rows("SELECT id FROM calibration_sessions WHERE id = ?", (session_id,)):
-            raise CommandError(f"there is no session {session_id!r}; `rigcal session list` shows them")
+            raise CommandError(f"there is no session {session_id!r:.80}; `rigcal session list` shows them")
         jobs = self._store.rows(
             "SELECT id, kind, state, progress, message, error FROM jobs WHERE session_id = ? ORDER BY id", (session_id,)
         )
@@ -299,8 +302,8 @@ class SessionKeeper:
 
     def _summary(self, session_id: str) -> dict[str, Any]:
         row = self._store.rows(
-            "SELECT id, rig, setup_id AS setup, prism, operator, kind, state, note, started_utc_ns, ended_utc_ns "
-            "FROM calibration_sessions WHERE id = ?",
+            "SELECT id, rig, setup_id AS setup, prism, operator, caller_user AS user, kind, state, note, "
+            "started_utc_ns, ended_utc_ns FROM calibration_sessions WHERE id = ?",
             (session_id,),
         )[0]
         counts = self._store.rows(

@@ -207,6 +207,21 @@ def m007_checks_show_drift(db: Database) -> None:
     )
 
 
+@MIGRATIONS()
+def m010_who_said_so(db: Database) -> None:
+    """Which user's process gave a command, as the kernel tells, beside the operator that it names."""
+    _create(
+        db,
+        # NULL where no command caused the row, and in rows from before this migration. caller_user: "" where the
+        # computer knew no name for caller_uid.
+        *(
+            f"ALTER TABLE {table} ADD COLUMN {column}"
+            for table in ("calibration_sessions", "model_states")
+            for column in ("caller_user TEXT", "caller_uid INTEGER", "caller_pid INTEGER")
+        ),
+    )
+
+
 def unknown_migrations(db: Database) -> list[str]:
     """Migrations that `db` has and this program does not know: it was made by a newer one."""
     empty = Database(memory=True)
