@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import socket
 
+from daemon.plain_text import shown
+
 
 class Notifier:
     """Tells systemd how the service is; does nothing when not started by systemd.
@@ -26,4 +28,4 @@ class Notifier:
         address = "\0" + self._address[1:] if self._address.startswith("@") else self._address
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as channel:
             channel.connect(address)
-            channel.sendall("\n".join(states).encode())
+            channel.sendall("\n".join(map(shown, states)).encode())
