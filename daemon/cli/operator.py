@@ -14,7 +14,8 @@ from rich.table import Table
 from daemon.cli.gap_lines import gap_lines
 from daemon.cli.model import model_lines
 from daemon.cli.output import Command, json_option
-from daemon.cli.talk import ask, say, talks, utc
+from daemon.cli.talk import ask, say, talks, utc, who
+from daemon.cli.terminal import coloured, echo
 from daemon.config import read_config
 from daemon.scheduler import SESSION_KINDS
 
@@ -33,14 +34,14 @@ def status(frames: bool, **where: Any) -> Any:
 
 
 def _show_status(console: Console, status: dict[str, Any], *, frames: bool) -> None:
-    console.print(f"rig [bold]{status['rig']}[/] ({status['mode']}), store {status['store']}", highlight=False)
+    say(console, f"rig {status['rig']} ({status['mode']}), store {status['store']}")
     acquisition = status["acquisition"]
     links = Table("link", "state", "captures", "per s", "queued", "dropped", title="links", title_justify="left")
     for link in acquisition["links"]:
-        state = {True: "[green]up[/]", False: "[red]down[/]", None: "starting"}[link["up"]]
+        state = coloured("up", "green") if link["up"] else coloured("down", "red")
         links.add_row(
             link["name"],
-            state,
+            "starting" if link["up"] is None else state,
             f"{link['captures']}",
             f"{link['captures_per_s']:.0f}",
             f"{link['queued']}",
@@ -51,7 +52,7 @@ def _show_status(console: Console, status: dict[str, Any], *, frames: bool) -> N
     for channel in acquisition["channels"]:
         value = "" if channel["value"] is None else f"{channel['value']:.3f} {channel['unit']}"
         mark = "green" if channel["status"] == "ok" else "red"
-        channels.add_row(channel["name"], value, f"[{mark}]{channel['status']}[/]", f"{channel['age_s']:.1f}")
+        channels.add_row(channel["name"], value, coloured(channel["status"], mark), f"{channel['age_s']:.1f}")
     console.print(channels)
     if frames:
         console.print(_frame_table(acquisition["frames"]))
@@ -62,7 +63,7 @@ def _show_status(console: Console, status: dict[str, Any], *, frames: bool) -> N
     for device, n in acquisition["decode_failures"].items():
         say(console, f"{n} captures of {device} could not be decoded")
     if acquisition["error"]:
-        console.print(f"[red]{acquisition['error']}[/]")
+        console.print(acquisition["error"], style="red")
     if status["session"]:
         _show_session(console, status["session"])
     for job in status["jobs"]:
@@ -207,8 +208,8 @@ def session_shoot(point: str, **where: Any) -> Any:
         if result["misclosure_mm"] is None:
             say(console, f"{result['point']} is known from now on")
             return
-        verdict = "[red]the set-up has moved[/]" if result["moved"] else "the set-up holds"
-        console.print(f"{result['point']}: misclosure {result['misclosure_mm']:.1f} mm, {verdict}", highlight=False)
+        verdict, style = ("the set-up has moved", "red") if result["moved"] else ("the set-up holds", None)
+        console.print(f"{result['point']}: misclosure {result['misclosure_mm']:.1f} mm, {verdict}", style=style)
 
     return ask(where, "session.shoot", show, timeout_s=SHOT_TIMEOUT_S, point=point)
 
@@ -222,7 +223,7 @@ def session_list(**where: Any) -> Any:
         table = Table("session", "kind", "prism", "set-up", "state", "poses", "observations", "operator")
         for s in sessions:
             counts = (str(s["poses"]), str(s["observations"]))
-            table.add_row(s["id"], s["kind"], s["prism"], s["setup"], s["state"], *counts, s["operator"])
+            table.add_row(s["id"], s["kind"], s["prism"], s["setup"], s["state"], *counts, who(s))
         console.print(table)
 
     return ask(where, "session.list", show)
@@ -255,7 +256,7 @@ def session_export(name: str, config: Path, out: Path, can_format: Any, *, as_js
     files = export_session(read_config(config), name, out, can_format)
     if not as_json:
         for file in files:
-            click.echo(file)
+            echo(file)
     return {"files": [str(file) for file in files]}
 
 
@@ -271,7 +272,7 @@ def _show_session(console: Console, session: dict[str, Any]) -> None:
         size = "defined" if shot["misclosure_mm"] is None else f"misclosure {shot['misclosure_mm']:.1f} mm"
         say(console, f"  control point {shot['point']} at the {shot['phase']}: {size}")
     if session["setup_moved"]:
-        console.print("  [red]the set-up has moved: its sessions are doubtful[/]")
+        console.print("  the set-up has moved: its sessions are doubtful", style="red")
 
 
 def _advise(console: Console, advice: list[str]) -> None:

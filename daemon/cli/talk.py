@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import click
 from rich.console import Console
 
 from daemon.cli.output import json_option
+from daemon.cli.terminal import Terminal
 from daemon.config import read_config
 from daemon.control import request
 
@@ -43,13 +44,21 @@ def ask(where: dict[str, Any], command: str, show: Show, timeout_s: float = 120.
     given = {key: value for key, value in arguments.items() if value is not None}
     result = request(socket_of(where["socket"], where["config"]), command, given, timeout_s=timeout_s)
     if not where["as_json"]:
-        show(Console(), result)
+        show(Terminal(), result)
     return result if isinstance(result, dict) else {"result": result}
 
 
 def say(console: Console, text: Any) -> None:
     """Print a line as it is."""
-    console.print(str(text), highlight=False, markup=False)
+    console.print(str(text))
+
+
+def who(row: Mapping[str, Any]) -> str:
+    """Return the operator that a row names, and the user that the computer knew, where that is another name."""
+    operator, user = row["operator"], row["user"]
+    if not user or user == operator:
+        return str(operator)
+    return f"{operator} (user {user})" if operator else f"user {user}"
 
 
 def utc(utc_ns: int) -> str:

@@ -37,6 +37,7 @@ _STYLE: Any = {
     "grid.color": GRID,
     "grid.linewidth": 0.8,
     "text.color": INK,
+    "text.parse_math": False,  # a dollar sign in a name is a dollar sign
     "xtick.color": SOFT,
     "ytick.color": SOFT,
     "xtick.major.size": 3,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from daemon.plain_text import shown
 from daemon.report.build import headline
 from daemon.report.drawing import AFTER, BEFORE, SOFT, new_figure, png_bytes, styled
 from daemon.report.figures import draw_error_map, draw_errors_by_prism
@@ -14,7 +15,7 @@ def summary_png(report: ReportInput) -> bytes:
     with styled():
         figure = new_figure(7.0, 10.5)
         figure.suptitle(
-            f"{report.rig}. {headline(report)}", x=0.012, ha="left", fontsize=13, fontweight="bold", wrap=True
+            f"{shown(report.rig)}. {headline(report)}", x=0.012, ha="left", fontsize=13, fontweight="bold", wrap=True
         )
         halves = figure.subfigures(2, 1, height_ratios=[1.0, 1.05], squeeze=False)
         top, bottom = halves[0, 0], halves[1, 0]
