@@ -36,7 +36,8 @@ def talks(command: Callable[..., Any]) -> Callable[..., Any]:
     command = click.option(
         "--config", type=click.Path(path_type=Path), help="Configuration of the daemon to talk to (gives its socket)."
     )(command)
-    return click.option("--socket", type=click.Path(path_type=Path), help="Control socket of the daemon.")(command)
+    at = click.Path(path_type=Path, readable=False)  # who may only look is told what to do, by `request`
+    return click.option("--socket", type=at, help="Control socket of the daemon.")(command)
 
 
 def ask(where: dict[str, Any], command: str, show: Show, timeout_s: float = 120.0, **arguments: Any) -> Any:

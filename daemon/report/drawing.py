@@ -50,6 +50,7 @@ _STYLE: Any = {
 }
 RASTER_DPI = 150
 WIDTH_IN = 9.6
+LABEL_CHARACTERS = 60  # of a name beside an axis
 MINUS = "\N{MINUS SIGN}"
 
 

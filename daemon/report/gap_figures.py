@@ -14,7 +14,7 @@ from calibration.gap.workflow import rms
 from calibration.observations import Floats
 from calibration.rig import Joint
 from daemon.plain_text import shown
-from daemon.report.drawing import AFTER, INK, MIDDLE, SOFT, WARN, new_figure
+from daemon.report.drawing import AFTER, INK, LABEL_CHARACTERS, MIDDLE, SOFT, WARN, new_figure
 from daemon.report.figures import forward_axis, key, robust_reach, running_median, scatter, sizes_mm, views
 from daemon.report.markup import number, signed
 
@@ -103,7 +103,7 @@ def steps(bars: Sequence[Bar], noise_mm: float) -> Figure:
         color=INK,
         fontsize=8.5,
     )
-    axes.set_yticks(range(len(bars)), [shown(bar.label) for bar in bars])
+    axes.set_yticks(range(len(bars)), [shown(bar.label, LABEL_CHARACTERS) for bar in bars])
     axes.tick_params(axis="y", length=0, labelcolor=INK, labelsize=10)
     axes.set_ylim(len(bars) - 0.05, -0.5)
     axes.set_xlim(0.0, reach)
@@ -139,7 +139,7 @@ def coefficients(intervals: Sequence[Interval]) -> Figure:
                 color=SOFT, ha="right" if side < 0 else "left", va="bottom",
             )  # fmt: skip
     axes.axvline(0.0, color=SOFT, linewidth=0.8)
-    axes.set_yticks(range(len(intervals)), [shown(line.label) for line in intervals])
+    axes.set_yticks(range(len(intervals)), [shown(line.label, LABEL_CHARACTERS) for line in intervals])
     axes.tick_params(axis="y", length=0, labelcolor=INK)
     axes.set_ylim(len(intervals) - 0.4, -0.65)
     axes.set_xlim(least - 0.14, 1.13 + _VALUES / (1.0 - _VALUES) * (1.27 - least))

@@ -260,9 +260,10 @@ def test_the_watchdog_hears_nothing_of_a_daemon_that_takes_no_commands(tmp_path:
                 pass
             break_listener(config.socket_path)
             manager.settimeout(3.0)  # a beat comes every 0.75 s, the last one 1.5 s after the thread's last round
-            with pytest.raises(TimeoutError):
-                for _ in range(10):
-                    manager.recv(1000)
+            with contextlib.suppress(TimeoutError):
+                for _ in range(20):
+                    heard = manager.recv(1000)
+                raise AssertionError(f"still {heard!r}")
 
 
 def test_a_server_that_accepts_is_alive(tmp_path: Path) -> None:
