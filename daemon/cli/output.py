@@ -20,7 +20,7 @@ from daemon.config import ConfigError
 from daemon.control import CommandError
 from daemon.numba_cache import is_compiled
 from daemon.plain_json import json_line
-from daemon.plain_text import shown
+from daemon.plain_text import shown, shown_lines
 from drivers.errors import DescriptionError
 
 DONE, FAILED, WRONG_INPUT, REFUSED = 0, 1, 2, 3
@@ -77,7 +77,10 @@ class Command(click.Command):
         except click.UsageError as error:
             if as_json:
                 print_json({"error": error_sentence(error), "kind": type(error).__name__})
-            raise
+            sentence = error.format_message()
+            if shown_lines(sentence) == sentence:
+                raise
+            raise click.UsageError(shown_lines(sentence), error.ctx) from None
 
     def invoke(self, ctx: click.Context) -> Any:
         as_json = bool(ctx.params.get("as_json"))

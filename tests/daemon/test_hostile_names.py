@@ -257,6 +257,9 @@ def test_names_in_files_reach_errors_as_plain_text(tmp_path: Path, name: str) ->
         ("config", "check", str(rig)),
         ("config", "check", str(tmp_path / f"none{file}")),
         ("session", "show", name, "--socket", str(tmp_path / f"none{file}")),
+        ("session", "show", "s", name),
+        ("session", "show", f"--{name}"),
+        ("calibrate", "--rig", "swdt82", "--data", str(tmp_path / f"none{file}"), "--out", "out"),
     ):
         said = CliRunner().invoke(main, command)
         assert said.exit_code in {1, 2}, said.output
