@@ -48,7 +48,7 @@ lint: environment ## style, types and import floors
 blind: setup ## a few blind cases of every kind for the gap workflow; two minutes on two cores
 	$(BIN)/rigcal bench gap --short
 
-BENCHES := acquisition kernels refinement evolution peers far_starts design ur10 table4 zhou2022 prediction gate promotion drift residual gap
+BENCHES := acquisition socketcan kernels refinement evolution peers far_starts design ur10 table4 zhou2022 prediction gate promotion drift residual gap
 
 bench: setup ## speed and accuracy beside the peers', as ratios; an hour on two cores
 	@for name in $(BENCHES); do echo "== $$name"; $(BIN)/python -m tests.bench.$$name || exit 1; done

@@ -39,12 +39,11 @@ def current_caller() -> Caller | None:
     return _current.get()
 
 
-def caller_columns() -> dict[str, str | int | None]:
-    """Return the columns `caller_user`, `caller_uid` and `caller_pid` of a row that a command makes."""
+def caller_columns(prefix: str = "") -> dict[str, str | int | None]:
+    """Return the columns `<prefix>caller_user`, `..._uid` and `..._pid` of a row that a command makes or changes."""
     caller = current_caller()
-    if caller is None:
-        return {"caller_user": None, "caller_uid": None, "caller_pid": None}
-    return {"caller_user": caller.user, "caller_uid": caller.uid, "caller_pid": caller.pid}
+    user, uid, pid = (None, None, None) if caller is None else (caller.user, caller.uid, caller.pid)
+    return {f"{prefix}caller_user": user, f"{prefix}caller_uid": uid, f"{prefix}caller_pid": pid}
 
 
 @contextlib.contextmanager

@@ -28,6 +28,7 @@ from daemon.control import (
     refusal_line,
 )
 from daemon.rights import READING
+from daemon.store.errors import is_unwritable
 from drivers.clock import NS_PER_S, SystemClock
 
 log = logging.getLogger(__name__)
@@ -84,6 +85,9 @@ class ControlServer:
         group: whose members may connect; those of the process's own group when None.
         limits: on its clients.
 
+    Attributes:
+        path: the socket.
+
     Raises:
         CommandError: the socket cannot be made there, or another process listens on it.
     """
@@ -91,7 +95,7 @@ class ControlServer:
     def __init__(
         self, path: Path, handlers: Mapping[str, Handler], *, group: str | None = None, limits: Limits | None = None
     ) -> None:
-        self._path, self._handlers, self._group = path, handlers, group
+        self.path, self._handlers, self._group = path, handlers, group
         self._limits = limits or Limits()
         self._clock = SystemClock()  # people and sockets wait in real time, whatever the rig's clock does
         self._stopping = threading.Event()
@@ -109,7 +113,9 @@ class ControlServer:
         return self._acceptor.is_alive() and age_ns <= within_s * NS_PER_S
 
     def trouble(self) -> str | None:
-        """Return why no one can connect just now, in a sentence; None where all is well."""
+        """Return why no one can connect just now, in a clause; None where all is well."""
+        if not self._acceptor.is_alive():
+            return f"the thread that takes clients at {self.path} has ended"
         return self._trouble
 
     def close(self) -> None:
@@ -126,51 +132,51 @@ class ControlServer:
         for client in clients:
             if client.thread is not None:
                 client.thread.join(timeout=max(deadline_ns - self._clock.monotonic_ns(), 0) / NS_PER_S)
-        if _identity(self._path) == self._file:
-            self._path.unlink(missing_ok=True)
+        if _identity(self.path) == self._file:
+            self.path.unlink(missing_ok=True)
 
     # ---- the socket --------------------------------------------------------------------------------------------------
 
     def _bind(self) -> tuple[socket.socket, tuple[int, int] | None]:
         """Return a new listening socket, and which file it is."""
         try:
-            if self._path.is_socket():
-                if _is_served(self._path):
+            if self.path.is_socket():
+                if _is_served(self.path):
                     raise CommandError(
-                        f"another process listens at {self._path}; stop it, or give this daemon another `socket`",
+                        f"another process listens at {self.path}; stop it, or give this daemon another `socket`",
                         FAILED,
                     )
-                self._path.unlink()
+                self.path.unlink()
             gid = -1 if self._group is None else grp.getgrnam(self._group).gr_gid
             listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         except KeyError:
-            raise CommandError(f"{self._path}: there is no group {self._group!r}", FAILED) from None
+            raise CommandError(f"{self.path}: there is no group {self._group!r}", FAILED) from None
         except OSError as error:
             raise self._unmade(error) from error
         made = False
         try:
-            listener.bind(str(self._path))
+            listener.bind(str(self.path))
             made = True
-            os.chown(self._path, -1, gid)
-            os.chmod(self._path, 0o660)
+            os.chown(self.path, -1, gid)
+            os.chmod(self.path, 0o660)
             listener.listen(128)
             listener.settimeout(POLL_S)
         except OSError as error:
             listener.close()
             if made:
-                self._path.unlink(missing_ok=True)
+                self.path.unlink(missing_ok=True)
             raise self._unmade(error) from error
-        return listener, _identity(self._path)
+        return listener, _identity(self.path)
 
     def _unmade(self, error: OSError) -> CommandError:
-        return CommandError(f"the control socket {self._path} cannot be made: {error.strerror}", FAILED)
+        return CommandError(f"the control socket {self.path} cannot be made: {error.strerror}", FAILED)
 
     def _keep_bound(self) -> None:
         """Bind the socket anew where its file was removed or replaced: no client would ever find it again."""
-        if _identity(self._path) == self._file:
+        if _identity(self.path) == self._file:
             return
         listener, self._file = self._bind()
-        log.warning("the control socket %s was removed or replaced; it is made anew", self._path)
+        log.warning("the control socket %s was removed or replaced; it is made anew", self.path)
         self._listener.close()
         self._listener = listener
 
@@ -186,11 +192,11 @@ class ControlServer:
             except CommandError as error:
                 trouble = str(error)
             except OSError as error:
-                trouble = f"the control socket {self._path} takes no client: {error.strerror}"
+                trouble = f"the control socket {self.path} takes no client: {error.strerror}"
                 is_passing = error.errno in _PASSING
             except Exception as error:
                 log.exception("the control socket stumbled")
-                trouble = f"the control socket {self._path} takes no client: {error}"
+                trouble = f"the control socket {self.path} takes no client: {error}"
                 is_passing = False
             if self._stopping.is_set():
                 break
@@ -206,7 +212,7 @@ class ControlServer:
             return
         self._trouble = trouble
         if trouble is None:
-            log.warning("the control socket %s serves again", self._path)
+            log.warning("the control socket %s serves again", self.path)
         else:
             log.error("%s; it is tried again", trouble)
 
@@ -305,6 +311,13 @@ class ControlServer:
         except CommandError as error:
             return refusal_line(str(error), error.status)
         except Exception as error:  # a fault in one command must not end the daemon
+            if is_unwritable(error):
+                log.error("command %s: the store cannot be written (%s)", command, error)
+                return refusal_line(
+                    f"the store cannot be written ({error}), so nothing was changed; free space on its disk, then say "
+                    "it again",
+                    FAILED,
+                )
             log.exception("command %s failed", command)
             return refusal_line(f"{command} failed inside the daemon: {error}; see its log", FAILED)
 

@@ -13,7 +13,6 @@ from drivers.readings import CanCapture, DeviceEvent, EventKind, Gap, GapReason,
 log = logging.getLogger(__name__)
 
 RESTART_S = 1.0
-JOIN_S = 10.0  # link loops look at `stop` several times a second
 
 
 @dataclass(slots=True)
@@ -50,12 +49,12 @@ class LinkIntake:
         self._thread = threading.Thread(target=self._run, args=(stop,), name=f"link-{self.name}", daemon=True)
         self._thread.start()
 
-    def join(self) -> None:
-        """Wait until the thread has ended, after `stop` was set."""
+    def join(self, timeout_s: float) -> None:
+        """Wait at most that long for the thread's end, after `stop` was set."""
         if self._thread is not None:
-            self._thread.join(JOIN_S)
+            self._thread.join(timeout_s)
             if self._thread.is_alive():
-                log.error("link %s did not stop within %g s; it is left behind", self.name, JOIN_S)
+                log.error("link %s did not stop within %.1f s; it is left behind", self.name, timeout_s)
 
     @property
     def queued(self) -> int:

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import socket
+import threading
 import weakref
+from collections.abc import Iterator
 
 from daemon.plain_text import shown
+from daemon.time_budget import TimeBudget
+
+EXTEND_EVERY_S = 20.0
+EXTEND_BY_S = 60
+EXTEND_LIMIT_S = 1800.0  # a start that takes longer hangs
 
 log = logging.getLogger(__name__)
 
@@ -43,3 +51,32 @@ class Notifier:
             self._is_heard = False
         else:
             self._is_heard = True
+
+    @contextlib.contextmanager
+    def extending(self, status: str) -> Iterator[None]:
+        """While the block runs, systemd waits for READY beyond its TimeoutStartSec.
+
+        A store that a new version brings up to date, or that a power cut left with a long log, takes its time to open.
+
+        Args:
+            status: what is being done, for `systemctl status`.
+        """
+        if not self._address:
+            yield
+            return
+        done = threading.Event()
+
+        def extend() -> None:
+            limit = TimeBudget(EXTEND_LIMIT_S)
+            while not limit.is_over:
+                self.send(f"EXTEND_TIMEOUT_USEC={EXTEND_BY_S * 1_000_000}", f"STATUS={status}")
+                if done.wait(EXTEND_EVERY_S):
+                    return
+
+        thread = threading.Thread(target=extend, name="start-time", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()

@@ -20,6 +20,7 @@ READING = frozenset(
         "model.list",
         "model.show",
         "tip",
+        "alarms.list",
     }
 )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -54,11 +54,10 @@ def say(console: Console, text: Any) -> None:
     console.print(str(text))
 
 
-def who(row: Mapping[str, Any]) -> str:
-    """Return the operator that a row names, and the user that the computer knew, where that is another name."""
-    operator, user = row["operator"], row["user"]
+def who(operator: str, user: str | None) -> str:
+    """Return the operator that somebody named, and the user that the computer knew, where that is another name."""
     if not user or user == operator:
-        return str(operator)
+        return operator
     return f"{operator} (user {user})" if operator else f"user {user}"
 
 

@@ -1,6 +1,7 @@
 """The control socket goes on: without descriptors, with clients that only wait, and when its file is taken away."""
 
 import contextlib
+import grp
 import json
 import os
 import socket
@@ -14,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from daemon.control import CommandError, request
+from daemon.control import CommandError, reading_socket, request
 from daemon.control_server import ControlServer, Limits
 from daemon.notify import Notifier
 from tests.daemon.idle_daemon import idle_daemon
@@ -264,6 +265,20 @@ def test_the_watchdog_hears_nothing_of_a_daemon_that_takes_no_commands(tmp_path:
                 for _ in range(20):
                     heard = manager.recv(1000)
                 raise AssertionError(f"still {heard!r}")
+
+
+def test_a_control_socket_that_was_taken_is_an_alarm_until_it_is_back(tmp_path: Path) -> None:
+    def alarms(path: Path) -> list[tuple[str, str]]:
+        return [(a["kind"], a["subject"]) for a in request(path, "alarms.list")["active"]]
+
+    with idle_daemon(tmp_path, read_group=grp.getgrgid(os.getegid()).gr_name) as config:
+        reading = reading_socket(config.socket_path)
+        config.socket_path.unlink()
+        config.socket_path.write_text("not a socket", encoding="utf-8")
+        wait("the alarm", lambda: ("control_dead", "control.sock") in alarms(reading))
+        config.socket_path.unlink()
+        wait("its end", lambda: ("control_dead", "control.sock") not in alarms(reading))
+        assert request(config.socket_path, "setup.list") == []
 
 
 def test_a_server_that_accepts_is_alive(tmp_path: Path) -> None:

@@ -107,6 +107,7 @@ TEXTS = {
     "set-up's note": ("setup.new", {"id": "S1", "note": None}),
     "operator": ("session.start", {"prism": "r", "operator": None}),
     "session's note": ("session.start", {"prism": "r", "note": None}),
+    "who accepts": ("session.accept", {"id": "s", "operator": None}),
 }
 NAMES = {
     "set-up": ("setup.new", {"id": None}),
@@ -115,6 +116,7 @@ NAMES = {
     "set-up of a session": ("session.start", {"prism": "r", "setup": None}),
     "session": ("session.start", {"prism": "r", "id": None}),
     "shown session": ("session.show", {"id": None}),
+    "accepted session": ("session.accept", {"id": None}),
     "job": ("jobs.cancel", {"id": None}),
     "model": ("model.show", {"id": None}),
     "tip": ("tip", {"prism": None}),
@@ -216,7 +218,15 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Config]:
 
 @pytest.mark.parametrize(
     "command",
-    [("setup", "list"), ("session", "list"), ("jobs", "list"), ("model", "list"), ("status",), ("status", "--frames")],
+    [
+        ("setup", "list"),
+        ("session", "list"),
+        ("jobs", "list"),
+        ("model", "list"),
+        ("status",),
+        ("status", "--frames"),
+        ("alarms", "--all"),
+    ],
     ids=" ".join,
 )
 def test_one_bad_name_in_the_store_spoils_no_list(full: Config, command: tuple[str, ...]) -> None:

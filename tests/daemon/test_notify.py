@@ -63,3 +63,15 @@ def test_a_service_manager_that_is_gone_ends_no_daemon(tmp_path: Path, caplog: p
         manager.bind(str(tmp_path / "notify"))
         notifier.send("WATCHDOG=1")
         assert manager.recv(100) == b"WATCHDOG=1"
+
+
+def test_a_start_that_takes_its_time_asks_the_service_manager_for_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daemon.notify.EXTEND_EVERY_S", 0.01)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        notifier = Notifier({"NOTIFY_SOCKET": str(tmp_path / "notify")})
+        with notifier.extending("opening the store"):
+            for _ in range(2):
+                assert manager.recv(100) == b"EXTEND_TIMEOUT_USEC=60000000\nSTATUS=opening the store"

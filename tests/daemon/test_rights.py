@@ -73,6 +73,18 @@ def test_a_session_is_kept_with_the_user_behind_the_name_that_is_said(tmp_path: 
         assert f"the King (user {OWN_USER})" in listed.stdout
 
 
+def test_words_about_a_session_are_kept_with_the_user_who_gave_them(tmp_path: Path) -> None:
+    with idle_daemon(tmp_path) as config:
+        request(config.socket_path, "setup.new", {"id": "S1"})
+        name = request(config.socket_path, "session.start", {"prism": "r"})["id"]
+        request(config.socket_path, "session.confirm-prism", {"operator": "the King"})
+        request(config.socket_path, "session.stop")
+        accepted = request(config.socket_path, "session.accept", {"id": name, "operator": "the King"})["accepted"]
+        assert (accepted["by"], accepted["user"]) == ("the King", OWN_USER)
+        (word,) = rows(config, "SELECT operator, caller_uid FROM prism_confirmations")
+        assert word == {"operator": "the King", "caller_uid": os.geteuid()}
+
+
 def test_a_change_of_the_live_model_is_kept_with_the_user_who_made_it(tmp_path: Path) -> None:
     made = ModelRig(tmp_path)
     made.accepted()
