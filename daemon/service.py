@@ -17,7 +17,8 @@ from daemon.alarms.gather import Gatherer
 from daemon.clock_watch import ClockWatch
 from daemon.composition import Parts, motion_limits
 from daemon.config import Config
-from daemon.control import FAILED, REFUSED, CommandError, ControlServer, Handler
+from daemon.control import FAILED, REFUSED, CommandError, Handler, reading_socket
+from daemon.control_server import ControlServer
 from daemon.drift_table import DriftTable
 from daemon.gap_status import GapStatus
 from daemon.jobs import JobRunner
@@ -27,6 +28,7 @@ from daemon.model_table import ModelTable
 from daemon.notify import Notifier
 from daemon.present_state import expected_of
 from daemon.registry import ModelRegistry
+from daemon.rights import reading_only
 from daemon.sessions import SessionKeeper
 from daemon.setups import SetupBook
 from daemon.store.alarms import AlarmTable
@@ -111,6 +113,7 @@ class Daemon:
         self._jobs = JobRunner(store, config, parts.rig.name, parts.clock, is_held=self._are_jobs_held)
         drift = DriftTable(store, parts.rig.name, parts.clock)
         self._gap = GapStatus(store, parts.rig.name, drift)
+        self._servers: list[ControlServer] = []
         self._alarms = AlarmBoard(
             AlarmTable(store),
             Gatherer(
@@ -123,12 +126,17 @@ class Daemon:
                 acquisition=self._acquisition.status,
                 health=lambda: self._watch.health,
                 suspicions=self._sessions.prism_suspicions,
-                is_control_served=lambda: True,
+                control_faults=self._control_faults,
             ),
             parts.clock,
         )
         self._models = ModelRegistry(models, parts.rig.name, self._live_model, compare=self._jobs.compare)
-        self._control = ControlServer(config.socket_path, self._commands())
+        self._servers = control_servers(config, self._commands())
+
+    def _control_faults(self) -> dict[str, str]:
+        """Control sockets on which no one can connect, and why."""
+        found = {server.path.name: server.trouble() for server in self._servers}
+        return {name: trouble for name, trouble in found.items() if trouble is not None}
 
     @property
     def store_health(self) -> StoreHealth:
@@ -162,8 +170,10 @@ class Daemon:
                 self._sessions.aim_again()
                 self._watch.look()
                 self._alarms.evaluate()
-                # The watchdog hears of the writer, not of this loop: a hung disk must restart the service.
-                if self._acquisition.alive(within_s=notifier.watchdog_s or 60.0):
+                # The watchdog hears of the writer and of the control sockets, not of this loop: a hung disk must
+                # restart the service, and so must a daemon that no one can reach.
+                within_s = notifier.watchdog_s or 60.0
+                if self._acquisition.alive(within_s) and all(server.alive(within_s) for server in self._servers):
                     notifier.send("WATCHDOG=1")
                 if self._parts.is_over():
                     log.info("the replay has ended")
@@ -176,7 +186,8 @@ class Daemon:
     def close(self) -> None:
         """Stop all parts within `STOP_S`, side by side, so that no one's stop delays what was captured."""
         budget = TimeBudget(STOP_S)
-        stops = [self._control.close, self._live_model.stop, self._jobs.stop, self._watch.stop]
+        stops = [server.close for server in self._servers]
+        stops += [self._live_model.stop, self._jobs.stop, self._watch.stop]
         if self._sender is not None:
             stops.append(self._sender.stop)
         others = [threading.Thread(target=_stop_part, args=(stop,), daemon=True) for stop in stops]
@@ -301,6 +312,22 @@ def tip_sender(config: Config, parts: Parts, tip: LiveTip) -> TipSender | None:
         return None
     link = next((link for link in parts.can_links if link.name == config.tip.can.link), None)
     return None if link is None else TipSender(tip, config.tip, config.tip.can, link)
+
+
+def control_servers(config: Config, commands: Mapping[str, Handler]) -> list[ControlServer]:
+    """Start the control socket, and the one for those who may only look where a group of them is configured.
+
+    Raises:
+        CommandError: the control socket cannot be made.
+    """
+    servers = [ControlServer(config.socket_path, commands)]
+    if config.read_group is not None:
+        path = reading_socket(config.socket_path)
+        try:
+            servers.append(ControlServer(path, reading_only(commands, config.socket_path), group=config.read_group))
+        except CommandError as error:
+            log.error("members of read_group %s cannot look: %s", config.read_group, error)
+    return servers
 
 
 def declare_channels(store: Store, rig: Rig) -> None:

@@ -16,6 +16,8 @@ from functools import partial
 from typing import Any
 
 from calibration.rig import Rig
+from daemon.arguments import identifier, text_argument
+from daemon.caller import caller_columns
 from daemon.config import SessionsSection
 from daemon.control import FAILED, CommandError
 from daemon.joiner import JoinedFix, ObservationJoiner
@@ -24,7 +26,7 @@ from daemon.prism_guard import MotionLimit, Suspicion
 from daemon.prism_watch import PrismWatch, as_dict
 from daemon.scheduler import CHECK, SESSION_KINDS
 from daemon.session_table import SessionTable
-from daemon.setups import AXES, Place, SetupBook, identifier, text_argument
+from daemon.setups import AXES, Place, SetupBook
 from daemon.standstill_places import StandstillPlaces
 from daemon.store.errors import is_unwritable
 from daemon.store.store import Store
@@ -192,10 +194,10 @@ class SessionKeeper:
             prism, kind = str(arguments.get("prism", "")), str(arguments.get("kind", "static_poses"))
             if prism not in self._rig.prism_names:
                 raise CommandError(
-                    f"rig {self._rig.name!r} has no prism {prism!r}; it has {', '.join(self._rig.prism_names)}"
+                    f"rig {self._rig.name!r} has no prism {prism!r:.80}; it has {', '.join(self._rig.prism_names)}"
                 )
             if kind not in SESSION_KINDS:
-                raise CommandError(f"there is no kind {kind!r}; kinds: {', '.join(SESSION_KINDS)}")
+                raise CommandError(f"there is no kind {kind!r:.80}; kinds: {', '.join(SESSION_KINDS)}")
             setup_id = self._setups.usable(arguments.get("setup"))
             free = self._table.free_id(prism)
             session_id = identifier(arguments, "id", "a session's id", default=free)
@@ -211,9 +213,10 @@ class SessionKeeper:
                 "rig_text": self._rig_text,
                 "setup_id": setup_id,
                 "prism": prism,
-                "operator": str(arguments.get("operator", "")),
+                "operator": text_argument(arguments, "operator"),
+                **caller_columns(),
                 "kind": kind,
-                "note": str(arguments.get("note", "")),
+                "note": text_argument(arguments, "note"),
             }
             self._table.start(row, now)
             self._open = session = OpenSession(session_id, setup_id, prism, kind, now, control_points=points)
