@@ -8,7 +8,7 @@ import sqlite3
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import Any, TypeVar
 
 from calibration.rig import Rig
 from daemon.acquisition import Acquisition
@@ -43,9 +43,12 @@ from drivers.readings import Record
 
 log = logging.getLogger(__name__)
 
+T = TypeVar("T")
+
 BEAT_S = 1.0
 STOP_S = 20.0  # real seconds for all parts together, well within the unit's TimeoutStopSec
 STORE_END_S = 3.0  # of them for the store's last commits
+_EVENTS = "SELECT device, utc_ns, kind, text FROM device_events ORDER BY id DESC LIMIT 12"
 
 
 class Daemon:
@@ -244,21 +247,28 @@ class Daemon:
         }
 
     def _status(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
-        acquisition = asdict(self._acquisition.status())
+        unreadable: dict[str, str] = {}  # a table that is damaged must not hide the rest
+
+        def stored(part: str, read: Callable[[], T]) -> T | None:
+            try:
+                return read()
+            except sqlite3.Error as error:
+                unreadable[part] = str(error)
+                return None
+
         return {
             "rig": self._parts.rig.name,
             "mode": self._parts.mode,
             "alarms": self._alarms.status(),
-            "acquisition": acquisition,
-            "session": self._sessions.open_session(),
-            "jobs": self._jobs.unfinished(),
-            "models": self._models.status(),
-            "gap": self._gap.now(),
-            "events": self._store.rows(
-                "SELECT device, utc_ns, kind, text FROM device_events ORDER BY id DESC LIMIT 12"
-            ),
+            "acquisition": asdict(self._acquisition.status()),
+            "session": stored("session", self._sessions.open_session),
+            "jobs": stored("jobs", self._jobs.unfinished) or [],
+            "models": stored("models", self._models.status),
+            "gap": stored("gap", self._gap.now),
+            "events": stored("events", lambda: self._store.rows(_EVENTS)) or [],
             "store": str(self._config.store_path),
             "store_health": self._watch.health.as_dict(),
+            "unreadable": unreadable,
         }
 
     def _visit(self, arguments: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,8 @@ def _show_status(console: Console, status: dict[str, Any], *, frames: bool) -> N
     say(console, f"rig {status['rig']} ({status['mode']}), store {status['store']}")
     acquisition = status["acquisition"]
     _show_alarms(console, status["alarms"])
+    for sentence in _store_lines(status):
+        say(console, sentence)
     for line in gap_state_lines(acquisition):
         say(console, line)
     links = Table("link", "state", "captures", "per s", "queued", "dropped", title="links", title_justify="left")
@@ -72,10 +75,21 @@ def _show_status(console: Console, status: dict[str, Any], *, frames: bool) -> N
         _show_session(console, status["session"])
     for job in status["jobs"]:
         say(console, _job_line(job))
-    for sentence in (*model_lines(status["models"]), *gap_lines(status["gap"])):
+    models, gap = status["models"], status["gap"]
+    for sentence in (*(model_lines(models) if models else ()), *(gap_lines(gap) if gap else ())):
         say(console, sentence)
     for event in reversed(status["events"]):
         say(console, f"{utc(event['utc_ns'])} {event['device']} {event['kind']}: {event['text']}")
+
+
+def _store_lines(status: dict[str, Any]) -> Iterator[str]:
+    """What the store is busy with, and what cannot be read from it; its faults are alarms."""
+    if status["store_health"]["state"] == "checking":
+        yield status["store_health"]["text"]
+    if status["acquisition"]["is_behind"]:
+        yield "captures of the last run are still being decoded: readings and fixes come late, and jobs wait"
+    for part, reason in status["unreadable"].items():
+        yield f"{part}: cannot be read from the store ({reason})"
 
 
 def _show_alarms(console: Console, alarms: dict[str, Any]) -> None:
