@@ -170,9 +170,9 @@ class Daemon:
             log.info("acquiring rig %s; control socket %s", self._parts.rig.name, self._config.socket_path)
             while not stop.wait(beat_s):
                 self._acquisition.check()
-                self._sessions.aim_again()
                 self._watch.look()
                 self._alarms.evaluate()
+                self._sessions.aim_again()  # after the alarm that somebody should
                 # The watchdog hears of the writer and of the control sockets, not of this loop: a hung disk must
                 # restart the service, and so must a daemon that no one can reach.
                 within_s = notifier.watchdog_s or 60.0

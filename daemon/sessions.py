@@ -30,7 +30,7 @@ from daemon.setups import AXES, Place, SetupBook
 from daemon.standstill_places import StandstillPlaces
 from daemon.store.errors import is_unwritable
 from daemon.store.store import Store
-from drivers.clock import NS_PER_S, Clock
+from drivers.clock import Clock
 from drivers.readings import DeviceEvent, EventKind, Fix, Record, Status
 from drivers.station import position_mm
 
@@ -38,7 +38,6 @@ log = logging.getLogger(__name__)
 
 STANDING_KINDS = ("static_poses", CHECK)
 CHECK_POSES = (3, 5)
-AIM_AGAIN_NS = 10 * NS_PER_S
 SHOT_SPREAD_MM = 20.0  # fixes of one shot that lie further apart are not of one standing target
 
 
@@ -307,11 +306,9 @@ class SessionKeeper:
         return self._table.summary(session.id) | {"prism_suspicions": suspicions}
 
     def aim_again(self) -> None:
-        """Where something can aim the station, do what an operator would when it has been suspected for a while."""
-        session, now = self._open, self._clock.now()
-        if self._aim is None or session is None:
-            return
-        if not any(now.since(s.since) > AIM_AGAIN_NS for s in self._prisms.suspicions(session)):
+        """Where something can aim the station, do what an operator would when it may be on another prism."""
+        session = self._open
+        if self._aim is None or session is None or not self._prisms.suspicions(session):
             return
         if self._commands.acquire(blocking=False):  # else a command is at work on the session: another time
             try:
