@@ -12,8 +12,13 @@ from cantools.database.can import Database, Message, Signal
 from cantools.database.errors import Error as CantoolsError
 
 from drivers.canframe import DATA_MAX
+from drivers.dbc_sizes import check_sizes
 from drivers.errors import DescriptionError
+from drivers.files import read_whole
 from drivers.raw_signal import BitField, Multiplexing, SignalChannel
+
+_FILE_MAX_BYTES = 2 << 20  # cantools takes more than a second for a megabyte
+_EXCERPT = 300  # characters of cantools' messages, which quote the line
 
 _COUNTER_NAME = re.compile(r"counter|alive", re.IGNORECASE)
 _NO_VALUE_TEXT = re.compile(r"^(sna|(signal )?not available|invalid)$", re.IGNORECASE)
@@ -32,11 +37,14 @@ class DbcFile:
     def __init__(self, path: Path) -> None:
         self._where = str(path)
         try:
-            database = cantools.database.load_file(str(path), database_format="dbc", encoding="cp1252")
+            text = read_whole(path, _FILE_MAX_BYTES).decode("cp1252", errors="replace")
+            check_sizes(text, self._where)
+            database = cantools.database.load_string(text, database_format="dbc")
         except OSError as error:
             raise DescriptionError(self._where, f"cannot be read: {error.strerror}") from error
-        except CantoolsError as error:
-            raise DescriptionError(self._where, f"not a valid DBC file: {' '.join(str(error).split())}") from error
+        # Beside its own errors, what cantools lets through from parsing numbers and names
+        except (CantoolsError, ArithmeticError, LookupError, RecursionError, TypeError, ValueError) as error:
+            raise DescriptionError(self._where, f"not a valid DBC file: {_excerpt(error)}") from error
         assert isinstance(database, Database)  # database_format="dbc" gives no other
         self._database = database
 
@@ -136,6 +144,11 @@ class DbcFile:
                 self._where, f"signal {signal.name!r}: a multiplexer behind a multiplexer is not supported"
             )
         return Multiplexing(_field(selector), frozenset(signal.multiplexer_ids))
+
+
+def _excerpt(error: Exception) -> str:
+    text = " ".join(str(error)[: 2 * _EXCERPT].split()) or type(error).__name__
+    return text if len(text) <= _EXCERPT else f"{text[:_EXCERPT]}..."
 
 
 def _plain(text: object) -> str:
