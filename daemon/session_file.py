@@ -7,6 +7,9 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from drivers.errors import DescriptionError
+from drivers.files import read_whole
+
+_FILE_MAX_BYTES = 1 << 20
 
 
 class SessionFile(BaseModel):
@@ -34,7 +37,7 @@ def read_session_file(path: Path) -> SessionFile:
         DescriptionError: it cannot be read, or is no such file.
     """
     try:
-        return SessionFile.model_validate_json(path.read_bytes())
+        return SessionFile.model_validate_json(read_whole(path, _FILE_MAX_BYTES))
     except OSError as error:
         raise DescriptionError(str(path), f"cannot be read: {error.strerror}") from error
     except ValidationError as error:

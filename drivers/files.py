@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, AnyStr
@@ -21,6 +22,16 @@ def read_whole(path: Path, most_bytes: int) -> bytes:
     if len(data) > most_bytes:
         raise OSError(errno.EFBIG, f"it is larger than the {most_bytes:,} bytes that such a file may have", str(path))
     return data
+
+
+def read_text(path: Path, most_bytes: int) -> str:
+    """The text of a UTF-8 file, with line ends as Python has them.
+
+    Raises:
+        OSError: see `read_whole`.
+        UnicodeDecodeError: not UTF-8.
+    """
+    return io.TextIOWrapper(io.BytesIO(read_whole(path, most_bytes)), encoding="utf-8").read()
 
 
 def bounded_lines(file: IO[AnyStr], most: int = LINE_MAX) -> Iterator[AnyStr]:
