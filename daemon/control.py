@@ -14,7 +14,7 @@ import socket
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 log = logging.getLogger(__name__)
 
@@ -123,8 +123,9 @@ class ControlServer:
         if len(line) > MAX_LINE_BYTES:
             raise CommandError(f"request longer than {MAX_LINE_BYTES} bytes")
         try:
-            request = json.loads(line)
-        except ValueError:
+            request = json.loads(line, parse_int=_int, parse_constant=_no_constant)
+            json.dumps(request, ensure_ascii=False).encode()  # half a surrogate pair can neither be stored nor shown
+        except (ValueError, RecursionError):
             request = None
         if not isinstance(request, dict) or not isinstance(request.get("command"), str):
             raise CommandError('a request is one JSON object a line: {"command": NAME, "arguments": {...}}')
@@ -134,6 +135,18 @@ class ControlServer:
         if not isinstance(arguments, dict):
             raise CommandError("arguments must be a JSON object")
         return command, arguments
+
+
+def _int(digits: str) -> int:
+    """A whole number that the store can hold; ValueError for one that it cannot."""
+    number = int(digits)
+    if not -(1 << 63) <= number < 1 << 63:
+        raise ValueError("a whole number beyond 64 bits")
+    return number
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no JSON")
 
 
 def _refusal(message: str, status: int) -> dict[str, Any]:

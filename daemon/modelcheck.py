@@ -39,8 +39,11 @@ def main() -> int:
     sizes = json.loads(sys.stdin.buffer.readline())
     files = {name: sys.stdin.buffer.read(size) for name, size in sizes.items()}
     prepare()
+    import calibration.model  # noqa: F401 - so that it counts as the program's own memory
+
+    limit_memory(MEMORY_MAX_BYTES)
     try:
-        _smoke_test(files)
+        smoke_test(files)
     except MemoryError:
         print(f"the model needs more than {MEMORY_MAX_BYTES >> 20} MiB of memory; restore it", file=sys.stderr)
         return IS_NO_MODEL
@@ -63,11 +66,15 @@ def limit_memory(more_bytes: int) -> None:
     resource.setrlimit(resource.RLIMIT_DATA, ((taken_kib << 10) + more_bytes,) * 2)
 
 
-def _smoke_test(files: Mapping[str, bytes]) -> None:
-    """Every prism at every set-up, at the middle of the joints' limits and where the residual was trained."""
+def smoke_test(files: Mapping[str, bytes]) -> None:
+    """Load a model, and predict every prism at every set-up, mid-way between the joints' limits and where it was trained.
+
+    Raises:
+        ModelError: the files are no model, or one that cannot predict.
+        CalibrationError: this machine lacks what loading it needs.
+    """
     from calibration.model import CalibratedModel
 
-    limit_memory(MEMORY_MAX_BYTES)
     model = CalibratedModel.from_files(files)
     poses = np.array([[sum(joint.limits) / 2 for joint in model.rig.joints]])
     if model.residual is not None:
