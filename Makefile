@@ -14,7 +14,7 @@ export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 # The tests start a hundred processes: each would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help environment setup demo test lint blind bench lock clean
+.PHONY: help environment setup demo test lint blind bench fuzz lock clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -57,6 +57,10 @@ bench: setup ## speed and accuracy beside the peers', as ratios; an hour on two 
 	$(BIN)/python -m tests.calibration.held_out_coverage
 	$(BIN)/rigcal bench gap
 
+# One target after the other, each at most an hour; FUZZ="dbc eds --seconds 60" chooses. Inputs that find faults: fuzz-faults/
+fuzz: setup ## a million hostile inputs for every decoder, file reader and socket command; up to a day
+	nice $(BIN)/python -m tests.fuzz $(FUZZ)
+
 # The rig gets requirements.lock, with the build backend that installs the project itself; requirements-dev.lock holds
 # the same versions and the tools besides. Versions stay as they are unless pyproject.toml forces a change;
 # `make lock UPGRADE=--upgrade` takes the newest.
@@ -68,6 +72,6 @@ lock: environment ## write the lock files anew from pyproject.toml
 	$(COMPILE) pyproject.toml --extra dev --extra bench --constraints requirements.lock --output-file requirements-dev.lock
 
 clean: ## remove everything that make has made
-	rm -rf .venv .cache build rigcal-demo rigcal-sim htmlcov .coverage* *.egg-info
+	rm -rf .venv .cache build rigcal-demo rigcal-sim fuzz-faults htmlcov .coverage* *.egg-info
 	rm -rf .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -45,6 +45,8 @@ Plausible = Annotated[float, Field(ge=1e-30, le=LARGEST, allow_inf_nan=False)]  
 Count = Annotated[int, Field(ge=0)]
 Triple = tuple[Bounded, Bounded, Bounded]
 
+_DOCUMENT_MAX_BYTES = 8 << 20  # 300 joints, prisms and set-ups take a tenth of it
+
 # Beside KeyError: what the parsers of JSON and TOML and the learners end with on hostile bytes.
 _UNREADABLE = (ArithmeticError, AttributeError, IndexError, MemoryError, RuntimeError, TypeError, ValueError, RigError)
 
@@ -277,6 +279,8 @@ def check_manifest(files: Mapping[str, bytes]) -> dict[str, bytes]:
 def read_model(files: Mapping[str, bytes]) -> CalibratedModel:
     """Read a model; ModelError in one sentence for anything that is wrong with it."""
     checked = check_manifest(files)
+    if len(checked.get("model.json", b"")) > _DOCUMENT_MAX_BYTES:
+        raise ModelError(f"model.json is larger than {_DOCUMENT_MAX_BYTES:,} bytes; this is not a model")
     try:
         document = _Document.model_validate_json(checked["model.json"])
         rig_text = checked["rig.toml"].decode()

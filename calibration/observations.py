@@ -162,7 +162,7 @@ def parse_observations(data: bytes, rig: Rig, source: str, *, positions_required
             if row:
                 table.append(row, reader.line_num)
     except csv.Error as error:
-        raise DataError(source, f"not a CSV file: {error}", reader.line_num) from error
+        raise DataError(source, f"not a CSV file: {error}", text.line) from error
     except UnicodeDecodeError:
         raise _not_utf8(data, source) from None
     if not len(table.lines):
@@ -184,11 +184,13 @@ class _Lines:
 
     Attributes:
         taken: characters since it was last set to 0.
+        line: number of the last line.
     """
 
     def __init__(self, data: bytes) -> None:
         self._text = io.TextIOWrapper(io.BytesIO(data), "utf-8-sig", newline="")
         self.taken = 0
+        self.line = 0
 
     def __iter__(self) -> Iterator[str]:
         return self
@@ -197,6 +199,7 @@ class _Lines:
         line = self._text.readline(_LONGEST_ROW + 1)
         if not line:
             raise StopIteration
+        self.line += 1
         self.taken += len(line)
         if self.taken > _LONGEST_ROW:
             raise csv.Error(f"a row of more than {_LONGEST_ROW:,} characters")

@@ -11,7 +11,7 @@ from typing import Any
 
 LONGEST = 1 << 19  # characters; the largest rig that is known has 6,000
 _PARTS_MAX = 100  # of the dotted keys of a line
-_PART = re.compile(r"""[\w"'-][ \t]*\.[ \t]*[\w"'-]""")
+_PART = re.compile(r"""[\w"'-][ \t]*\.(?=[ \t]*[\w"'-])""")
 _INTEGER_MAX = 1 << 63
 
 

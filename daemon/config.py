@@ -15,6 +15,7 @@ from drivers.files import read_text
 from drivers.station import StationConfig
 from drivers.tip_frames import FRAMES
 
+_QUOTED = 100  # characters of a key
 MAX_SOCKET_PATH_BYTES = 107  # unix(7): sun_path holds 108 bytes with the closing zero
 
 
@@ -243,8 +244,8 @@ def read_config(path: Path) -> Config:
 
 def _sentence(error: Any) -> str:
     """One pydantic error as `key: what is wrong (allowed: ...)`."""
-    key = ".".join(str(part + 1) if isinstance(part, int) else str(part) for part in error["loc"]) or "file"
-    message = error["msg"].removeprefix("Value error, ")
+    key = ".".join(str(part + 1) if isinstance(part, int) else str(part)[:_QUOTED] for part in error["loc"]) or "file"
+    message = error["msg"].removeprefix("Value error, ")[: 4 * _QUOTED]
     if error["type"] == "extra_forbidden":
         section: type[BaseModel] = Config
         for part in error["loc"][:-1]:

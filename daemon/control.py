@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 log = logging.getLogger(__name__)
 
 MAX_LINE_BYTES = 1 << 20
+MESSAGE_MAX = 1000  # characters of an error
 FAILED, WRONG_USE, REFUSED = 1, 2, 3
 
 
@@ -30,7 +31,8 @@ class CommandError(Exception):
     """
 
     def __init__(self, message: str, status: int = WRONG_USE) -> None:
-        super().__init__(message)
+        # What was asked for is quoted, and may be anything
+        super().__init__(message if len(message) <= MESSAGE_MAX else f"{message[:MESSAGE_MAX]}...")
         self.status = status
 
 

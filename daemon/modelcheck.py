@@ -67,7 +67,7 @@ def limit_memory(more_bytes: int) -> None:
 
 
 def smoke_test(files: Mapping[str, bytes]) -> None:
-    """Load a model, and predict every prism at every set-up, mid-way between the joints' limits and where it was trained.
+    """Load a model, and predict every prism at every set-up: between the joints' limits, and where it was trained.
 
     Raises:
         ModelError: the files are no model, or one that cannot predict.

@@ -21,7 +21,7 @@ _BRANCH_CHECKS_MAX = 5_000_000
 
 _STRING = re.compile(r'"(?:[^"\\]|\\.)*"', re.DOTALL)
 _WORD = re.compile(r"\w+|[^\s\w]")
-_NODES = re.compile(r"\bBU_\s*:([\s\w]*)")
+_NODES = re.compile(r"\bBU_\s*:((?:\s+(?!BU_\s*:)\w+)*)")
 _BEYOND = re.compile(r"(?<![\w.])[\d.]+[eE][+-]?\d{4,}")
 _MESSAGE = r"\bBO_\s+(?P<id>\d+)\s+(?P<message>\w+)\s*:\s*(?P<bytes>\w+)"
 _SIGNAL = r"\bSG_\s+(?P<signal>\w+)(?:\s+(?P<mux>\w+))?\s*:\s*(?P<start>\d+)\s*\|\s*(?P<bits>\d+)"

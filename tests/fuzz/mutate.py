@@ -94,7 +94,9 @@ def _run(rng: random.Random, data: bytes) -> tuple[int, int]:
     return start, min(len(data), start + int(rng.expovariate(0.1)) + 1)
 
 
-def _changed_bytes(rng: random.Random, data: bytes, corpus: list[bytes], words: tuple[bytes, ...]) -> bytes:
+def _changed_bytes(  # noqa: PLR0911 - one change a case
+    rng: random.Random, data: bytes, corpus: list[bytes], words: tuple[bytes, ...]
+) -> bytes:
     start, end = _run(rng, data)
     match rng.randrange(10):
         case 0:
@@ -159,7 +161,7 @@ def _changed_lines(rng: random.Random, data: bytes, corpus: list[bytes]) -> byte
     return b"".join(lines)
 
 
-def value(rng: random.Random, depth: int = 0) -> Any:
+def value(rng: random.Random, depth: int = 0) -> Any:  # noqa: PLR0911 - one kind a case
     """Any JSON value."""
     match rng.randrange(8 if depth < 3 else 6):
         case 0:

@@ -1,4 +1,4 @@
-"""Makes the seeds of the corpus anew, from the golden logs, the shipped files and small models: `python -m tests.fuzz.seeds`.
+"""Makes the seeds of the corpus anew (`python -m tests.fuzz.seeds`): golden logs, shipped files, small models.
 
 Seeds are called `seed-*`; inputs that found a fault have other names, and stay.
 """
@@ -278,7 +278,8 @@ prism = "r"
 rate_hz = 5.0
 can = { link = "boom", arbitration_id = 0x680 }
 """
-_OBSERVATIONS = b"""\xef\xbb\xbfprism,setup,session,pose,time_s,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,x_mm,y_mm,z_mm,\
+_OBSERVATIONS = b"""\xef\xbb\xbfprism,setup,session,pose,time_s,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,\
+x_mm,y_mm,z_mm,\
 sigma_x_mm,sigma_y_mm,sigma_z_mm,q1_dir,q1_rate,q1_Nm,dwell_s,temperature_degC,payload_kg,boom_bar,valve_mA,other\r
 tmac,S1,a,1,0.5,1,2,3,4,5,6,1000,2000.5,-300,0.1,0.1,0.1,1,0.5,10,3,20,5,100,5,x\r
 "tmac",S1,a,"2\xc3\xa9",1.5,1,2,3,4,5,7,1000,2000.5,-3e2,,,,-1,,,,,,,,"a ""b"",\nc"\r

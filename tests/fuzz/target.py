@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import random
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +28,8 @@ class Target:
         prepare: gives the function that takes one input; what it raises is a fault. Called once a process.
         kind: how inputs are changed: as bytes, as lines of text, as JSON.
         words: that mean something in an input.
-        change: in place of the general changes, or after them (`repair`): makes check sums right again, most of the time.
+        change: in place of the general changes: random numbers, an input, the corpus.
+        repair: makes check sums right again, most of the time.
         is_slow: an input takes over 50 us, so that time rather than a number of inputs says when it is enough.
         inputs_per_process: a fresh process after so many, for targets that keep state.
     """
@@ -53,7 +55,14 @@ def find_targets(module: str | None = None) -> dict[str, Target]:
     return {target.name: target for target in sorted(found, key=lambda t: t.name)}
 
 
-def check_refusal(error: Exception) -> None:
-    """A refusal is one sentence that fits on a screen."""
+def check_refusal(error: Exception, place: str = "") -> None:
+    """A refusal is one sentence that fits on a screen, and says which file it is about."""
     text = str(error)
+    assert place in text, f"{place} is not named: {text}"
     assert 0 < len(text) <= MESSAGE_MAX, f"a refusal of {len(text)} characters: {text[:200]}"
+
+
+def scratch_directory() -> tempfile.TemporaryDirectory[str]:
+    """A directory in memory where there is one: a disk would be what is tried."""
+    memory = Path("/dev/shm")
+    return tempfile.TemporaryDirectory(prefix="rigcal-fuzz-", dir=memory if memory.is_dir() else None)

@@ -62,7 +62,7 @@ def _setup() -> Run:
     return run
 
 
-def _answer(data: bytes, at: int, asked: bytes) -> tuple[bytes, int]:
+def _answer(data: bytes, at: int, asked: bytes) -> tuple[bytes, int]:  # noqa: PLR0911 - one answer a case
     """What a node says to a request: right in form and of any content, or anything; bytes of `data` used up."""
     content, place = data[at + 1 : at + 5].ljust(4, b"\0"), asked[1:4]
     match data[at] & 7:

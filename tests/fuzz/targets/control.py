@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import logging
 import socket
-import tempfile
 import threading
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from daemon.notify import Notifier
 from daemon.rigs import load_rig
 from daemon.service import Daemon
 from daemon.store.store import Store
-from tests.fuzz.target import Run, Target, check_refusal
+from tests.fuzz.target import Run, Target, check_refusal, scratch_directory
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "standing"
 _CONFIG = """rig = "swdt82"
@@ -41,11 +41,11 @@ class _Rig:
 
     def __init__(self) -> None:
         logging.disable(logging.CRITICAL)
-        self.folder = tempfile.TemporaryDirectory(prefix="rigcal-fuzz-")
+        self.folder = scratch_directory()
         config = parse_config(_CONFIG, Path(self.folder.name) / "rigcal.toml")
         parts = replayed(config, load_rig("swdt82"), [GOLDEN / "boom.log", GOLDEN / "station.serial"], _REPLAY_SPEED)
         self.store = Store(config.store_path)
-        self.daemon = Daemon(config, self.store, _kept_running(parts))
+        self.daemon = Daemon(config, self.store, replace(parts, is_over=lambda: False))
         self._add_models()
         self.stop = threading.Event()
         self.thread = threading.Thread(target=self.daemon.run, args=(self.stop, Notifier()), daemon=True)
@@ -54,7 +54,7 @@ class _Rig:
         self._connect()
 
     def close(self) -> None:
-        self._connection.close()
+        self._disconnect()
         self.stop.set()
         self.thread.join(timeout=30)
         self.store.close()
@@ -66,12 +66,16 @@ class _Rig:
         self._connection.connect(self._path)
         self._stream = self._connection.makefile("rwb")
 
+    def _disconnect(self) -> None:
+        self._stream.close()
+        self._connection.close()
+
     def ask(self, line: bytes) -> bytes:
         self._stream.write(line)
         self._stream.flush()
         answer = self._stream.readline()
         if len(line) > MAX_LINE_BYTES:
-            self._connection.close()
+            self._disconnect()
             self._connect()
         return answer
 
@@ -82,12 +86,6 @@ class _Rig:
             row = {"rig": "swdt82", "path": f"/nowhere/{state}", "manifest_sha256": "0" * 64, "stage": "geometric"}
             with self.store.transaction():
                 self.store.insert("models", row | {"state": state, **self.store.instant(now, "created_")})
-
-
-def _kept_running(parts):  # type: ignore[no-untyped-def]
-    from dataclasses import replace
-
-    return replace(parts, is_over=lambda: False)
 
 
 def _control() -> Run:

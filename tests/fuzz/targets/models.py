@@ -7,6 +7,8 @@ import io
 import json
 import random
 from collections.abc import Mapping
+from contextlib import suppress
+from typing import Any
 
 import numpy as np
 
@@ -88,31 +90,31 @@ def _changed_arrays(rng: random.Random, data: bytes) -> bytes:
         return data
     name = rng.choice(sorted(arrays))
     array = arrays[name]
-    match rng.randrange(5):
-        case 0 if array.size and array.dtype.kind == "f":
-            flat = array.copy().reshape(-1)
-            flat[rng.randrange(flat.size)] = rng.choice(_VALUES)
-            array = flat.reshape(array.shape)
-        case 1:
-            array = array[: rng.randrange(3)] if array.ndim else array
-        case 2:
-            array = np.concatenate([array] * rng.choice((2, 5))) if array.ndim else array
-        case 3:
-            array = (
-                array.astype(rng.choice(("<f4", "<i8", "<U3", "?", "<c16", ">f8")), copy=True) if array.size else array
-            )
-        case _:
-            array = (
-                array.T.reshape(-1)
-                if rng.random() < 0.5
-                else array * array.dtype.type(rng.choice((-1, 1e9)))
-                if array.dtype.kind == "f"
-                else array
-            )
+    with suppress(ValueError):
+        array = _changed_array(rng, array)
     out = io.BytesIO()
     save = np.savez if rng.random() < 0.95 else np.savez_compressed
     save(out, allow_pickle=False, **{**arrays, name: array})
     return out.getvalue()
+
+
+def _changed_array(rng: random.Random, array: Any) -> Any:
+    if array.dtype.kind == "f" and rng.random() < 0.5:
+        flat = array.copy().reshape(-1)
+        if flat.size and rng.random() < 0.7:
+            flat[rng.randrange(flat.size)] = rng.choice(_VALUES)
+        else:
+            flat *= rng.choice((-1.0, 0.0, 1e9, 1e200))
+        return flat.reshape(array.shape)
+    match rng.randrange(4):
+        case 0:
+            return array[: rng.randrange(3)]
+        case 1:
+            return np.concatenate([array] * rng.choice((2, 5)))
+        case 2:
+            return array.astype(rng.choice(("<f4", "<i8", "<U3", "?", "<c16", ">f8")))
+        case _:
+            return array.T.reshape(-1)
 
 
 def _model() -> Run:
