@@ -14,7 +14,7 @@ export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 # The tests start a hundred processes: each would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help environment setup demo test lint blind bench fuzz lock clean
+.PHONY: help environment setup demo test lint blind bench soak fuzz lock clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -48,7 +48,7 @@ lint: environment ## style, types and import floors
 blind: setup ## a few blind cases of every kind for the gap workflow; two minutes on two cores
 	$(BIN)/rigcal bench gap --short
 
-BENCHES := acquisition kernels refinement evolution peers far_starts design ur10 table4 zhou2022 prediction gate promotion drift residual gap
+BENCHES := acquisition socketcan kernels refinement evolution peers far_starts design ur10 table4 zhou2022 prediction gate promotion drift residual gap
 
 bench: setup ## speed and accuracy beside the peers', as ratios; an hour on two cores
 	@for name in $(BENCHES); do echo "== $$name"; $(BIN)/python -m tests.bench.$$name || exit 1; done
@@ -56,6 +56,9 @@ bench: setup ## speed and accuracy beside the peers', as ratios; an hour on two 
 	$(BIN)/python -m tests.calibration.interval_coverage
 	$(BIN)/python -m tests.calibration.held_out_coverage
 	$(BIN)/rigcal bench gap
+
+soak: setup ## the daemon on a simulated rig at 4x with every fault at random; 30 minutes (SOAK="--seed 7 --minutes 5")
+	$(BIN)/python -m tests.soak $(SOAK)
 
 # One target after the other, each at most an hour; FUZZ="dbc eds --seconds 60" chooses. Inputs that find faults: fuzz-faults/
 fuzz: setup ## a million hostile inputs for every decoder, file reader and socket command; up to a day

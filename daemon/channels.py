@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TypedDict, assert_never
 
@@ -99,6 +100,7 @@ def _factory(
                 decimal_digits=channel.decimal_digits,
                 scale=channel.scale,
                 offset=channel.offset,
+                max_rate_per_s=_max_rate(rig, channel.name),
             )
             return lambda: AnalogueDecoder(analogue)
         case DbcSignal():
@@ -111,6 +113,7 @@ def _factory(
                 offset=channel.offset,
                 timeout_s=channel.timeout_s,
             )
+            signal = replace(signal, max_rate_per_s=_max_rate(rig, channel.name))
             return lambda: SignalDecoder(signal)
         case RawSignal():
             raw = SignalChannel(
@@ -123,6 +126,7 @@ def _factory(
                 offset=channel.offset,
                 not_available=frozenset(channel.not_available),
                 timeout_s=channel.timeout_s,
+                max_rate_per_s=_max_rate(rig, channel.name),
             )
             return lambda: SignalDecoder(raw)
         case _:

@@ -20,6 +20,7 @@ from daemon.channels import decoder_factories, node_setups
 from daemon.config import CanSection, Config, ConfigError
 from daemon.control import CommandError
 from daemon.joiner import ObservationJoiner, joint_inputs, signal_inputs
+from daemon.prism_guard import MotionLimit
 from daemon.replay import captures_of, first_captures
 from daemon.rigs import RigSource
 from daemon.simulation import SimulatedRig, SimulationError, stops_of
@@ -73,9 +74,17 @@ class Parts:
     is_over: Callable[[], bool] = _never
 
 
-def live(config: Config, source: RigSource) -> Parts:
-    """A real rig."""
-    return _parts("live", config, source, SystemClock())
+def live(
+    config: Config, source: RigSource, clock: Clock | None = None, aim: Callable[[str], None] | None = None
+) -> Parts:
+    """A real rig.
+
+    Args:
+        config, source: links and rig.
+        clock: the host's by default; another one for a rig that somebody simulates at the configured ports.
+        aim: turns the station where something else than the operator can.
+    """
+    return _parts("live", config, source, clock or SystemClock(), aim=aim)
 
 
 @contextlib.contextmanager
@@ -206,6 +215,11 @@ def joiner(config: Config, rig: Rig) -> ObservationJoiner:
         link_delay_s={station.name: station.link_delay_s for station in config.station},
         settle_s=config.sessions.settle_s,
     )
+
+
+def motion_limits(config: Config) -> dict[str, MotionLimit]:
+    """For each configured station, what motion can do to its prism."""
+    return {station.name: MotionLimit.of_station(station) for station in config.station}
 
 
 def _check_identifiers(link: str, own: Sequence[int], factories: Sequence[Callable[[], ChannelDecoder]]) -> None:

@@ -16,6 +16,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
+from daemon.store.errors import is_unwritable
+
 log = logging.getLogger(__name__)
 
 MAX_LINE_BYTES = 1 << 20
@@ -118,6 +120,13 @@ class ControlServer:
         except CommandError as error:
             return _refusal(str(error), error.status)
         except Exception as error:  # a fault in one command must not end the daemon
+            if is_unwritable(error):
+                log.error("command %s: the store cannot be written (%s)", command, error)
+                return _refusal(
+                    f"the store cannot be written ({error}), so nothing was changed; free space on its disk, then say "
+                    "it again",
+                    FAILED,
+                )
             log.exception("command %s failed", command)
             return _refusal(f"{command} failed inside the daemon: {error}; see its log", FAILED)
 

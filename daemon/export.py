@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -11,12 +12,12 @@ from daemon.config import Config, ConfigError
 from daemon.control import CommandError
 from daemon.files import write_file
 from daemon.session_data import sessions_csv
-from daemon.session_file import SessionFile
+from daemon.session_file import DoubtfulCaptures, SessionFile
 from daemon.steady_time import SteadyTime
 from daemon.store.reader import Reader
 from drivers.canlog import write_can_log
 from drivers.clock import NS_PER_S, Stamp
-from drivers.readings import CanCapture, SerialCapture
+from drivers.readings import CanCapture, Capture, SerialCapture
 from drivers.seriallog import SerialLogHeader, SerialLogWriter
 
 CanFormat = Literal["log", "asc", "blf"]
@@ -28,7 +29,8 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
     """Write a session's captures, a file a link, what the operator said of it, and its observations.
 
     Logs know UTC alone, so the captures' is made steady: what was recorded while the computer's clock was set must not
-    come again at another time than what came before and after it.
+    come again at another time than what came before and after it. Nor can logs say that a capture's time is doubtful:
+    the session file does.
 
     Args:
         config: of the daemon whose store it is; gives the stations' profiles and speeds.
@@ -56,9 +58,11 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
         files = []
         steady = SteadyTime()
         steady.of(since)
+        doubtful: dict[str, DoubtfulCaptures] = {}
         for link in list(reader.rows("SELECT name, kind FROM links ORDER BY id")):
             stored = reader.captures(link["name"], since, until)
-            captures = (replace(capture, stamp=steady.of(capture.stamp)) for capture in stored)
+            doubts = _Doubts()
+            captures = doubts.noted(replace(capture, stamp=steady.of(capture.stamp)) for capture in stored)
             if link["kind"] == "can":
                 path = out / f"{session_id}-{link['name']}.{can_format}"
                 write_can_log(path, (c for c in captures if isinstance(c, CanCapture)))
@@ -70,20 +74,46 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
                         if isinstance(capture, SerialCapture):
                             writer.write(capture)
             files.append(path)
+            if doubts.runs:
+                doubtful[link["name"]] = DoubtfulCaptures(captures=doubts.captures, runs=tuple(doubts.runs))
         points = reader.rows("SELECT * FROM control_points WHERE setup_id = ?", (session["setup_id"],))
+        sql = "SELECT * FROM prism_confirmations WHERE session_id = ? ORDER BY id"
+        words = [
+            (row["turning"], steady.of(_stamp(reader, row, "")).utc_ns) for row in list(reader.rows(sql, (session_id,)))
+        ]
         told = SessionFile(
             prism=session["prism"],
             kind=session["kind"],
             since_utc_ns=steady.of(started).utc_ns,
             until_utc_ns=steady.of(ended).utc_ns,
+            prism_confirmed_utc_ns=tuple(at_ns for turning, at_ns in words if not turning),
+            prism_turned_utc_ns=tuple(at_ns for turning, at_ns in words if turning),
             control_points={point["name"]: (point["x_mm"], point["y_mm"], point["z_mm"]) for point in points},
+            doubtful=doubtful,
         )
         path = out / f"{session_id}.json"
-        write_file(path, told.model_dump_json(indent=2).encode() + b"\n")
+        write_file(path, told.model_dump_json(indent=2, exclude_defaults=True).encode() + b"\n")
         files.append(path)
         table = out / f"{session_id}.csv"
         write_file(table, sessions_csv(reader, parse_rig(session["rig_text"], "the session's rig"), [session_id]))
         return [*files, table]
+
+
+class _Doubts:
+    """Notes which of the captures that pass are of doubtful time, as DoubtfulCaptures has it."""
+
+    def __init__(self) -> None:
+        self.captures = 0
+        self.runs: list[tuple[int, int]] = []
+
+    def noted(self, captures: Iterable[Capture]) -> Iterator[Capture]:
+        for capture in captures:
+            if capture.stamp.is_doubtful:
+                number = self.captures
+                first = self.runs.pop()[0] if self.runs and self.runs[-1][1] == number - 1 else number
+                self.runs.append((first, number))
+            self.captures += 1
+            yield capture
 
 
 def _stamp(reader: Reader, session: dict[str, Any], prefix: str) -> Stamp:

@@ -27,6 +27,7 @@ from daemon.numba_cache import prepare
 from daemon.order import Order
 from daemon.session_data import sessions_csv, setup_lines
 from daemon.store.errors import StoreError
+from daemon.store.identity import FileIdentity
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S, SystemClock
 
@@ -180,7 +181,7 @@ def _report(order: Order, progress: Progress) -> dict[str, Any]:
         known = bool(np.isin(checks.setup, training.observations.setup).all())
         held_out = pipeline.evaluate(model, checks, refit_base=not known)
     progress(0.3, "drawing")
-    with Reader(Path(order.store)) as reader:
+    with _store(order) as reader:
         setups = setup_lines(reader, (*order.train_ids, *order.session_ids))
     page = build_report(report_input(training, held_out, setups=setups))
     path = directory / REPORT
@@ -245,15 +246,19 @@ def _check_drift(order: Order, progress: Progress) -> dict[str, Any]:
     return {"drift": {"live": order.live_id, "live_since": order.live_since, "checks": checks}}
 
 
+def _store(order: Order) -> Reader:
+    return Reader(Path(order.store), FileIdentity(*order.store_file) if order.store_file else None)
+
+
 def _rig_text(order: Order) -> str:
     """The rig file of the newest session: the sessions carry what they were recorded with."""
-    with Reader(Path(order.store)) as reader:
+    with _store(order) as reader:
         rows = reader.rows("SELECT rig_text FROM calibration_sessions WHERE id = ?", (order.session_ids[-1],))
         return str(next(iter(rows))["rig_text"])
 
 
 def _observations(order: Order, rig: Rig, session_ids: tuple[str, ...]) -> Observations:
-    with Reader(Path(order.store)) as reader:
+    with _store(order) as reader:
         data = sessions_csv(reader, rig, session_ids)
     return parse_observations(data, rig, f"sessions {', '.join(session_ids)}")
 

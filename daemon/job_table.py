@@ -7,11 +7,12 @@ process does meet here, and the second of the two finds what the first one did.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
 from daemon.config import Config
 from daemon.control import REFUSED, CommandError
-from daemon.drift_table import DriftTable
+from daemon.drift_table import DriftTable, LiveRun
 from daemon.model_table import ModelRow, ModelTable, trained_on
 from daemon.order import Order, Outcome, Progress
 from daemon.scheduler import CHECK, CHECKS, DueChain, JobFacts, JobKind, SessionFacts, State
@@ -27,26 +28,31 @@ SHOWN = "id, kind, session_id, state, progress, message, attempts, error"
 
 # These run twice a second beside acquisition, for months: CROSS JOIN and NOT INDEXED keep SQLite's planner from
 # starting with all of a rig's sessions.
-# The newest session of each kind and state; the index by kind holds all that it asks for.
+# The newest session of each kind and state that calibration may use; the index holds all that it asks for.
 _SESSIONS = """SELECT id, rowid AS number, kind, state, ended_utc_ns, ended_monotonic_ns, ended_boot_id
     FROM calibration_sessions WHERE rowid IN
-        (SELECT max(rowid) FROM calibration_sessions WHERE rig = ? AND state IN ('open', 'closed') GROUP BY state, kind)
+        (SELECT max(rowid) FROM calibration_sessions
+            WHERE rig = ? AND state IN ('open', 'closed') AND excluded IS NULL GROUP BY state, kind)
     ORDER BY rowid"""
 _JOBS = """SELECT job.id, job.kind, job.session_id, job.state, job.attempts,
         job.depends_on IS NULL OR before.state = 'done' AS is_ready,
-        job.ended_utc_ns, job.ended_monotonic_ns, job.ended_boot_id
+        job.ended_utc_ns, job.ended_monotonic_ns, job.ended_boot_id, job.interruptions
     FROM jobs AS job CROSS JOIN calibration_sessions AS session ON session.id = job.session_id
         LEFT JOIN jobs AS before ON before.id = job.depends_on
     WHERE job.state IN ('queued', 'running', 'interrupted') AND session.rig = ? ORDER BY job.id"""
-# Walks back from the newest session to one that a job of this kind was queued through, or that no longer matters.
-_COVERED = """SELECT session.rowid AS number FROM calibration_sessions AS session NOT INDEXED
-    WHERE session.rig = ? AND session.rowid > ?
-        AND EXISTS (SELECT 1 FROM jobs WHERE jobs.through_session_id = session.id AND jobs.kind = ?)
+# Walks back from the newest session to one that a job of this kind was queued through, or that no longer matters. A job
+# that was queued before an operator accepted a session does not work on that one, and covers nothing any more.
+_COVERED = f"""SELECT session.rowid AS number FROM calibration_sessions AS session NOT INDEXED
+    WHERE session.rig = ?1 AND session.rowid > ?2
+        AND EXISTS (SELECT 1 FROM jobs WHERE jobs.through_session_id = session.id AND jobs.kind = ?3 AND jobs.id >
+            (SELECT coalesce(max(accepted_after_job), 0) FROM calibration_sessions
+                WHERE rig = ?1 AND accepted_after_job IS NOT NULL AND (kind = '{CHECK}') = ?4))
     ORDER BY session.rowid DESC LIMIT 1"""
 _NEWEST_MODEL = """SELECT job.result_json FROM jobs AS job
     JOIN calibration_sessions AS session ON session.id = job.session_id
     WHERE job.state = 'done' AND job.kind = 'residual' AND session.rig = ? ORDER BY job.id DESC LIMIT 1"""
 _WORKED_ON = """SELECT rowid AS number, id, kind FROM calibration_sessions WHERE rig = ? AND state = 'closed'
+        AND excluded IS NULL AND coalesce(accepted_after_job, 0) < ?
         AND rowid <= (SELECT rowid FROM calibration_sessions WHERE id = ?)
     ORDER BY rowid"""
 _CHAIN = """WITH RECURSIVE chain(id) AS (VALUES (?) UNION SELECT jobs.id FROM jobs JOIN chain ON depends_on = chain.id)
@@ -68,7 +74,6 @@ class JobTable:
         self._clock = clock
         self._models = ModelTable(store, rig_name, clock)
         self._drift = DriftTable(store, rig_name, clock)
-        self._cancelled: set[int] = set()  # running jobs that the operator wants to end
 
     # ---- what is there -----------------------------------------------------------------------------------------------
 
@@ -79,7 +84,7 @@ class JobTable:
         covered = {
             kind: rows[0]["number"]
             for kind, after in back_to.items()
-            if (rows := self._store.rows(_COVERED, (self._rig, after, kind)))
+            if (rows := self._store.rows(_COVERED, (self._rig, after, kind, kind is not JobKind.GAP)))
         }
         return State(
             [
@@ -95,6 +100,7 @@ class JobTable:
                     row["attempts"],
                     bool(row["is_ready"]),
                     self._store.stamp(row, "ended_"),
+                    row["interruptions"],
                 )
                 for row in self._store.rows(_JOBS, (self._rig,))
             ],
@@ -102,11 +108,23 @@ class JobTable:
             has_model=bool(self._store.rows(_NEWEST_MODEL, (self._rig,))),
             live_from=run.after_session if run else None,
             drifted=self._drift.drifted(run) if run else None,
+            stale_candidate=self._stale_candidate(run) if run else None,
         )
+
+    def _stale_candidate(self, run: LiveRun) -> int | None:
+        """See `State.stale_candidate`; one comparison for each model that goes live, as what fails must not loop."""
+        candidate = self._models.waiting()
+        if candidate is None or candidate.comparison is None or candidate.comparison["live"] == run.model_id:
+            return None
+        queued = self._store.rows(
+            "SELECT 1 FROM jobs WHERE kind = 'comparison' AND model_id = ? AND live_since = ? LIMIT 1",
+            (candidate.id, run.since),
+        )
+        return None if queued else candidate.id
 
     def all(self) -> list[dict[str, Any]]:
         """All jobs with their results, newest last. Read beside the writing connection, which must not wait."""
-        with Reader(self._store.path) as reader:
+        with Reader(self._store.path, self._store.files.database) as reader:
             rows = list(reader.rows(f"SELECT {SHOWN}, result_json FROM jobs ORDER BY id"))
         return [row | {"result": json.loads(row.pop("result_json") or "null")} for row in rows]
 
@@ -119,7 +137,7 @@ class JobTable:
     def order(self, job: JobFacts, config: Config) -> Order:
         """What a job's process is asked to do: the sessions were settled when the job was queued."""
         (row,) = self._store.rows("SELECT depends_on, through_session_id, model_id FROM jobs WHERE id = ?", (job.id,))
-        sessions = self._store.rows(_WORKED_ON, (self._rig, row["through_session_id"]))
+        sessions = self._store.rows(_WORKED_ON, (self._rig, job.id, row["through_session_id"]))
         training = tuple(s["id"] for s in sessions if s["kind"] != CHECK)
         checks = tuple(s["id"] for s in sessions if s["kind"] == CHECK)
         if row["model_id"] is not None:
@@ -184,6 +202,7 @@ class JobTable:
         live: ModelRow | None = None,
         **more: Any,
     ) -> Order:
+        file = self._store.files.database
         return Order(
             kind=job.kind.value,
             job_id=job.id,
@@ -197,6 +216,7 @@ class JobTable:
             live_model=str(live.path) if live else None,
             live_sha256=live.manifest_sha256 if live else None,
             live_id=live.id if live else None,
+            store_file=(file.device, file.inode) if file else None,
             **more,
         )
 
@@ -218,8 +238,14 @@ class JobTable:
         """Queue an interrupted job again; False if it is interrupted no more."""
         return bool(self._store.update("jobs", {"id": job_id, "state": "interrupted"}, {"state": "queued"}))
 
-    def begin(self, job: JobFacts, time_limit_s: float) -> bool:
-        """A queued job runs from now on, and shows nothing of earlier runs; False if it is queued no more."""
+    def begin(self, job: JobFacts, time_limit_s: float, host_boot: str | None = None) -> bool:
+        """A queued job runs from now on, and shows nothing of earlier runs; False if it is queued no more.
+
+        Args:
+            job: which.
+            time_limit_s: how long it may run.
+            host_boot: the computer's boot; None where it is unknown.
+        """
         with self._store.transaction():
             if self._job(job.id)["state"] != "queued":
                 return False
@@ -228,6 +254,7 @@ class JobTable:
                 state="running",
                 attempts=job.attempts + 1,
                 time_limit_s=time_limit_s,
+                host_boot=host_boot,
                 progress=0.0,
                 message="",
                 error=None,
@@ -249,28 +276,33 @@ class JobTable:
 
     def is_cancelled(self, job_id: int) -> bool:
         """Whether the operator wants a running job to end."""
-        return job_id in self._cancelled
+        return _is_cancelled(self._job(job_id))
 
-    def end(self, job_id: int, outcome: Outcome) -> Outcome:
+    def end(self, job_id: int, outcome: Outcome, *, is_innocent: bool = False) -> Outcome:
         """A job has ended; with one that failed or was cancelled end those that wait for it.
 
         An orderly stop of the daemon is no fault of the job's and no attempt.
+
+        Args:
+            job_id: which.
+            outcome: how.
+            is_innocent: what interrupted it was not the job's doing: it is counted as that, and as no attempt.
 
         Returns:
             how it ended in the end: what the operator said goes before what the process said.
         """
         with self._store.transaction():
-            if job_id in self._cancelled:
-                self._cancelled.discard(job_id)
-                outcome = CANCELLED
+            job = self._job(job_id)
+            if _is_cancelled(job):
+                outcome, is_innocent = CANCELLED, False
             ended = self._store.instant(self._clock.now(), "ended_")
             is_done = outcome.state == "done"
-            attempts = self._job(job_id)["attempts"]
             self._set(
                 job_id,
                 state=outcome.state,
                 error=outcome.error,
-                attempts=attempts - 1 if outcome == STOPPED else attempts,
+                attempts=job["attempts"] - 1 if outcome == STOPPED or is_innocent else job["attempts"],
+                interruptions=job["interruptions"] + is_innocent,
                 result_json=outcome.result,
                 progress=1.0 if is_done else 0.0,
                 message="",  # what it was doing is no news any more
@@ -290,10 +322,33 @@ class JobTable:
                         self._set(waiting["id"], state="cancelled", error=error, **ended)
             return outcome
 
-    def interrupt_running(self, why: str) -> None:
-        """Jobs that the store takes for running, and that nobody runs, did not end: the scheduler offers them again."""
+    def interrupt_running(self, why: str, *, is_innocent: bool = False) -> None:
+        """Jobs that the store takes for running, and that nobody runs, did not end: the scheduler offers them again.
+
+        Args:
+            why: they did not.
+            is_innocent: as for `end`.
+        """
         for row in self._store.rows("SELECT id FROM jobs WHERE state = 'running'"):
-            self.end(row["id"], Outcome("interrupted", why))
+            self.end(row["id"], Outcome("interrupted", why), is_innocent=is_innocent)
+
+    def interrupt_left_over(self, host_boot: str) -> None:
+        """Interrupt the jobs that the daemon before this one left running.
+
+        One that a stop had no time to write down was stopped in order. One of another boot was cut off with the
+        computer. Of the rest the daemon was killed, which may have been the job's doing, and is an attempt.
+
+        Args:
+            host_boot: the computer's boot.
+        """
+        for row in self._store.rows("SELECT id, host_boot FROM jobs WHERE state = 'running'"):
+            if row["host_boot"] not in (host_boot, None):
+                cut = Outcome("interrupted", "the computer was switched off or restarted while it ran")
+                self.end(row["id"], cut, is_innocent=True)
+            elif self._store.ended_in_order:
+                self.end(row["id"], STOPPED)
+            else:
+                self.end(row["id"], Outcome("interrupted", "the daemon ended while it ran"))
 
     # ---- what the operator does --------------------------------------------------------------------------------------
 
@@ -311,7 +366,7 @@ class JobTable:
             if job["state"] not in CANCELLABLE:
                 raise CommandError(f"job {job['id']} is {job['state']}; only one that has not ended can be cancelled")
             if job["state"] == "running":
-                self._cancelled.add(job["id"])
+                self._set(job["id"], error=CANCELLED.error)  # whoever runs it, now or after a restart, finds it there
                 return f"job {job['id']} ({job['kind']}) is being cancelled"
             self.end(job["id"], CANCELLED)
             return f"job {job['id']} ({job['kind']}) is cancelled"
@@ -337,30 +392,41 @@ class JobTable:
                         "those that wait for it follow"
                     )
             for waiting in self._chain(job["id"]):
-                self._set(waiting["id"], state="queued", progress=0.0, message="", error=None, attempts=0)
+                self._set(
+                    waiting["id"], state="queued", progress=0.0, message="", error=None, attempts=0, interruptions=0
+                )
             return f"job {job['id']} ({job['kind']}) is queued again"
 
     def compare(self, model: ModelRow) -> str:
-        """Queue a comparison of a model with the live one, on all check sessions that are closed.
+        """Queue a comparison of a model with the live one, on all check sessions that are closed and used.
 
         Returns:
             a sentence for the operator.
 
         Raises:
-            CommandError: no check session is closed.
+            CommandError: there is none.
         """
         closed = self._store.rows(
-            "SELECT id, kind FROM calibration_sessions WHERE rig = ? AND state = 'closed' ORDER BY rowid", (self._rig,)
+            "SELECT id, kind FROM calibration_sessions WHERE rig = ? AND state = 'closed' AND excluded IS NULL "
+            "ORDER BY rowid",
+            (self._rig,),
         )
         checks = [session["id"] for session in closed if session["kind"] == CHECK]
         if not checks:
             raise CommandError(
-                "no check session is closed, so nothing is held out to compare on; hold one with `rigcal session "
-                "start --kind check`",
+                "no check session is closed and used, so nothing is held out to compare on; hold one with `rigcal "
+                "session start --kind check`",
                 REFUSED,
             )
-        job_id = self._add(JobKind.COMPARISON, checks[-1], closed[-1]["id"], model_id=model.id)
+        run = self._drift.run()
+        job_id = self._add(
+            JobKind.COMPARISON, checks[-1], closed[-1]["id"], model_id=model.id, live_since=run.since if run else None
+        )
         return f"job {job_id} will compare model {model.id} with the live one"
+
+    def compare_again(self, model_id: int) -> str:
+        """Queue a comparison of the model of that number, as `compare` does."""
+        return self.compare(self._models.get(model_id))
 
     # ---- parts -------------------------------------------------------------------------------------------------------
 
@@ -372,6 +438,7 @@ class JobTable:
         *,
         depends_on: int | None = None,
         model_id: int | None = None,
+        live_since: int | None = None,
     ) -> int:
         """Queue a job; its number."""
         row = {
@@ -381,13 +448,14 @@ class JobTable:
             "state": "queued",
             "depends_on": depends_on,
             "model_id": model_id,
+            "live_since": live_since,
             **self._store.instant(self._clock.now(), "created_"),
         }
         return self._store.insert("jobs", row)
 
     def _job(self, job_id: object) -> dict[str, Any]:
         found = isinstance(job_id, int) and self._store.rows(
-            "SELECT id, kind, state, attempts, depends_on FROM jobs WHERE id = ?", (job_id,)
+            "SELECT id, kind, state, attempts, interruptions, depends_on, error FROM jobs WHERE id = ?", (job_id,)
         )
         if not found:
             raise CommandError(f"there is no job {job_id!r}; `rigcal jobs list` shows them")
@@ -399,3 +467,8 @@ class JobTable:
 
     def _set(self, job_id: int, **columns: object) -> None:
         self._store.update("jobs", {"id": job_id}, columns)
+
+
+def _is_cancelled(job: Mapping[str, Any]) -> bool:
+    """True if the operator wants a running job to end; one that runs has no other error."""
+    return (job["state"], job["error"]) == ("running", CANCELLED.error)

@@ -7,8 +7,9 @@ result on its standard output; only the daemon writes.
 from __future__ import annotations
 
 import logging
+import sqlite3
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from daemon.config import Config
@@ -17,7 +18,7 @@ from daemon.job_child import JOB_COMMAND, JobChild
 from daemon.job_table import CANCELLED, STOPPED, JobTable
 from daemon.model_table import ModelRow
 from daemon.order import Outcome
-from daemon.scheduler import DueChain, JobFacts, due_jobs, next_job, spent_jobs
+from daemon.scheduler import DueChain, DueComparison, JobFacts, due_jobs, next_job, spent_jobs
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, Clock, SystemClock
 
@@ -37,20 +38,33 @@ class JobRunner:
         rig_name: whose sessions are used.
         clock: time.
         command: what carries out an order, with the protocol of `daemon.order`.
+        is_held: true while nothing may be started.
+        work_clock: of the computer; work takes real time, whatever the rig's clock does.
     """
 
     def __init__(
-        self, store: Store, config: Config, rig_name: str, clock: Clock, *, command: Sequence[str] = JOB_COMMAND
+        self,
+        store: Store,
+        config: Config,
+        rig_name: str,
+        clock: Clock,
+        *,
+        command: Sequence[str] = JOB_COMMAND,
+        is_held: Callable[[], bool] = lambda: False,
+        work_clock: Clock | None = None,
     ) -> None:
         self._settings = config.jobs
         self._config = config
         self._clock = clock
         self._command = command
-        self._work_clock = SystemClock()  # work takes real time, whatever the rig's clock does
+        self._is_held = is_held
+        self._work_clock = work_clock or SystemClock()
+        self._host_boot = self._work_clock.now().boot_id
         self._table = JobTable(store, rig_name, clock)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="jobs", daemon=True)
-        self._table.interrupt_running("the daemon ended while it ran")
+        self._is_store_at_fault = False  # for a step that stumbled
+        self._table.interrupt_left_over(self._host_boot)
 
     def start(self) -> None:
         """Begin to queue and run."""
@@ -100,7 +114,8 @@ class JobRunner:
         while not self._stopping.is_set():
             try:
                 did_something = self._step()
-            except Exception:
+            except Exception as error:
+                self._is_store_at_fault = isinstance(error, sqlite3.Error)
                 log.exception("the scheduler stumbled; it goes on")
                 did_something = False
             if not did_something:
@@ -110,8 +125,12 @@ class JobRunner:
         """Queue what is due and run what is next; whether a job ran."""
         state = self._table.state()
         if any(job.state == "running" for job in state.jobs):
-            # None runs between two steps: the last step stumbled, over a full disk for example.
-            self._table.interrupt_running("the daemon could not see it through; its log may tell why")
+            # None runs between two steps: the last step stumbled. A full disk is not the job's doing.
+            self._table.interrupt_running(
+                "the daemon could not see it through; its log may tell why", is_innocent=self._is_store_at_fault
+            )
+            return False
+        if self._is_held():
             return False
         for job in spent_jobs(state, max_attempts=self._settings.max_attempts):
             self._give_up(job)
@@ -119,19 +138,24 @@ class JobRunner:
         for item in due:
             if isinstance(item, DueChain):
                 self._table.queue(item)
+            elif isinstance(item, DueComparison):
+                log.info("another model is live: %s", self._table.compare_again(item.model_id))
             elif self._table.offer_again(item.job_id):
                 log.info("job %d is offered again after an interruption", item.job_id)
         next_one = next_job(self._table.state() if due else state)
-        if next_one is None or not self._table.begin(next_one, self._settings.time_limit_s):
+        if next_one is None or not self._table.begin(next_one, self._settings.time_limit_s, self._host_boot):
             return False
         self._perform(next_one)
         return True
 
     def _give_up(self, job: JobFacts) -> None:
-        error = (
-            f"interrupted {job.attempts} times, as often as [jobs] max_attempts allows; "
-            f"`rigcal jobs retry {job.id}` tries once more"
-        )
+        if job.attempts >= self._settings.max_attempts:
+            often = f"interrupted {job.attempts} times, as often as [jobs] max_attempts allows"
+        else:
+            often = (
+                f"cut off {job.interruptions} times by what is not its own fault; something is wrong with the computer"
+            )
+        error = f"{often}; `rigcal jobs retry {job.id}` tries once more"
         log.warning("job %d (%s) is given up: %s", job.id, job.kind, error)
         self._table.end(job.id, Outcome("failed", error))
 

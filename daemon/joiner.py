@@ -129,7 +129,8 @@ class ObservationJoiner:
         """Take records and return the fixes that they complete, refused ones included.
 
         The records of one call may be in any order, and those of a link may come calls after those of another. Fixes
-        whose own status is not OK are passed over. Records of another boot end what was pending.
+        whose own status is not OK are passed over, and so are readings of doubtful time: they tell nothing of any
+        instant. Records of another boot end what was pending.
         """
         done: list[JoinedFix] = []
         timed = [(r.stamp, r) for r in records if isinstance(r, Reading | Fix | DeviceEvent)]
@@ -170,6 +171,8 @@ class ObservationJoiner:
 
     def _take(self, record: Reading | Fix | DeviceEvent, at_ns: int) -> None:
         if isinstance(record, Reading):
+            if record.status is Status.TIME_DOUBTFUL:
+                return
             joint = self._joints.get(record.channel)
             if joint is not None:
                 if joint.add(at_ns, record):

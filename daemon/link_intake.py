@@ -1,4 +1,7 @@
-"""One link's thread and the bounded queue behind it: what does not fit is counted, and the loss is a record."""
+"""One link's thread and the bounded queue behind it: what does not fit is counted, and the loss is a record.
+
+So is what the bus carried before the link was open: a run begins some time before its ports are.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,6 @@ from drivers.readings import CanCapture, DeviceEvent, EventKind, Gap, GapReason,
 log = logging.getLogger(__name__)
 
 RESTART_S = 1.0
-JOIN_S = 10.0  # link loops look at `stop` several times a second
 
 
 @dataclass(slots=True)
@@ -32,13 +34,15 @@ class LinkIntake:
         loop: the link.
         clock: for the restart's delay and stamp.
         limit: captures that may wait; events and gaps, being few, are always taken.
+        begun: when the run began; nothing is known of the link from then until its loop first tells of its port.
     """
 
-    def __init__(self, loop: LinkLoop, clock: Clock, limit: int) -> None:
+    def __init__(self, loop: LinkLoop, clock: Clock, limit: int, begun: Stamp) -> None:
         self.name = loop.name
         self.dropped = 0
         self.restarts = 0
         self._loop, self._clock, self._limit = loop, clock, limit
+        self._begun: Stamp | None = begun  # until the loop's first word
         # Appends and pops of a deque are atomic: one thread emits, one drains, and only the loss needs a lock.
         self._queue: deque[LinkItem] = deque()
         self._loss: _Loss | None = None
@@ -50,12 +54,12 @@ class LinkIntake:
         self._thread = threading.Thread(target=self._run, args=(stop,), name=f"link-{self.name}", daemon=True)
         self._thread.start()
 
-    def join(self) -> None:
-        """Wait until the thread has ended, after `stop` was set."""
+    def join(self, timeout_s: float) -> None:
+        """Wait at most that long for the thread's end, after `stop` was set."""
         if self._thread is not None:
-            self._thread.join(JOIN_S)
+            self._thread.join(timeout_s)
             if self._thread.is_alive():
-                log.error("link %s did not stop within %g s; it is left behind", self.name, JOIN_S)
+                log.error("link %s did not stop within %.1f s; it is left behind", self.name, timeout_s)
 
     @property
     def queued(self) -> int:
@@ -75,6 +79,11 @@ class LinkIntake:
         return items
 
     def _emit(self, item: LinkItem) -> None:
+        if self._begun is not None:
+            begun, self._begun = self._begun, None
+            first = _first_word(item)
+            if first is not None and first.since(begun) > 0:
+                self._queue.append(Gap(self.name, GapReason.LINK_DOWN, begun, first))
         if len(self._queue) < self._limit or not isinstance(item, CanCapture | SerialCapture):
             self._queue.append(item)
             return
@@ -100,3 +109,12 @@ class LinkIntake:
                 text = f"{self.name}: the link's loop ended ({reason}); it is started again in {RESTART_S:g} s"
                 self._emit(DeviceEvent(self.name, self._clock.now(), EventKind.LINK_LOST, text))
                 self._clock.wait(stop, RESTART_S)
+
+
+def _first_word(item: LinkItem) -> Stamp | None:
+    """When a link tells for the first time whether its port is open; None where it just begins, as a replay does."""
+    if isinstance(item, Gap):
+        return item.start if item.reason is GapReason.LINK_DOWN else None
+    if isinstance(item, DeviceEvent) and item.kind in (EventKind.LINK_UP, EventKind.LINK_LOST):
+        return item.stamp
+    return None

@@ -2,8 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
+import threading
+from collections.abc import Iterator
+
+from daemon.time_budget import TimeBudget
+
+EXTEND_EVERY_S = 20.0
+EXTEND_BY_S = 60
+EXTEND_LIMIT_S = 1800.0  # a start that takes longer hangs
 
 
 class Notifier:
@@ -27,3 +36,32 @@ class Notifier:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as channel:
             channel.connect(address)
             channel.sendall("\n".join(states).encode())
+
+    @contextlib.contextmanager
+    def extending(self, status: str) -> Iterator[None]:
+        """While the block runs, systemd waits for READY beyond its TimeoutStartSec.
+
+        A store that a new version brings up to date, or that a power cut left with a long log, takes its time to open.
+
+        Args:
+            status: what is being done, for `systemctl status`.
+        """
+        if not self._address:
+            yield
+            return
+        done = threading.Event()
+
+        def extend() -> None:
+            limit = TimeBudget(EXTEND_LIMIT_S)
+            while not limit.is_over:
+                self.send(f"EXTEND_TIMEOUT_USEC={EXTEND_BY_S * 1_000_000}", f"STATUS={status}")
+                if done.wait(EXTEND_EVERY_S):
+                    return
+
+        thread = threading.Thread(target=extend, name="start-time", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()

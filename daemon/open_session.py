@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 
+from daemon.prism_guard import PrismGuard, Word
 from daemon.setups import Place
 from drivers.clock import Stamp
 from drivers.readings import Fix
+
+CONTROL_POINT_RADIUS_MM = 300.0  # a fix this close to a control point is of the control point, not of the boom
 
 
 @dataclass
@@ -41,6 +45,8 @@ class OpenSession:
         shots: when the station was on control points instead.
         jumped: joints whose encoder jumped in it, since when; None: in an earlier run.
         control_points: where those of its set-up are, mm.
+        words: who said when that its stations are on its prism.
+        guards: station -> what watches that it stays there; for the writer's thread.
     """
 
     id: str
@@ -52,6 +58,8 @@ class OpenSession:
     shots: list[Shot] = field(default_factory=list)
     jumped: dict[str, Stamp | None] = field(default_factory=dict)
     control_points: list[Place] = field(default_factory=list)
+    words: list[Word] = field(default_factory=list)
+    guards: dict[str, PrismGuard] = field(default_factory=dict)
 
     def lasted(self, stamp: Stamp) -> bool:
         """Whether that instant lies in it."""
@@ -60,6 +68,10 @@ class OpenSession:
     def has(self, stamp: Stamp) -> bool:
         """Whether what the station measured then is its prism."""
         return self.lasted(stamp) and not any(within(stamp, shot.since, shot.until) for shot in self.shots)
+
+    def is_control_point(self, place_mm: Place) -> bool:
+        """Whether a control point of its set-up is there."""
+        return any(math.dist(place_mm, point) < CONTROL_POINT_RADIUS_MM for point in self.control_points)
 
 
 def within(stamp: Stamp, since: Stamp | None, until: Stamp | None) -> bool:

@@ -33,6 +33,7 @@ class Order:
         live_id: its number in the store (comparison, drift).
         live_since: number of the change by which it went live (drift).
         held_out_ids: sessions that nothing is fitted to, to judge by (gap).
+        store_file: device and inode of the store that the daemon has open: another file of that name is none of its.
     """
 
     kind: str
@@ -49,6 +50,7 @@ class Order:
     live_id: int | None = None
     live_since: int | None = None
     held_out_ids: tuple[str, ...] = ()
+    store_file: tuple[int, int] | None = None
 
     def to_line(self) -> bytes:
         """The line that the process reads."""
@@ -58,7 +60,8 @@ class Order:
     def from_line(cls, line: str) -> Order:
         """The order in a line that `to_line` made."""
         order = json.loads(line)
-        return cls(**order | {key: tuple(order[key]) for key in ("session_ids", "train_ids", "held_out_ids")})
+        lists = ("session_ids", "train_ids", "held_out_ids", "store_file")
+        return cls(**order | {key: tuple(order[key]) for key in lists if order[key] is not None})
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,9 @@ model's files are checked against their manifest, and its sum against the store,
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 from calibration.errors import CalibrationError
@@ -18,6 +20,8 @@ from daemon.model_table import ModelRow, ModelTable
 from daemon.setups import text_argument
 
 log = logging.getLogger(__name__)
+
+_Files = tuple[tuple[str, int, int], ...]
 
 
 class ModelRegistry:
@@ -39,12 +43,15 @@ class ModelRegistry:
         compare: Callable[[ModelRow], str],
     ) -> None:
         self._table, self._rig, self._live, self._compare = table, rig_name, live, compare
+        # The candidate that was last loaded for `status`, its files as they lay there, and why it cannot go live.
+        self._loaded: tuple[tuple[int, _Files], str | None] | None = None
 
     # ---- commands of the operator ------------------------------------------------------------------------------------
 
     def list_command(self, _arguments: Mapping[str, Any]) -> list[dict[str, Any]]:
         """All models, oldest first."""
-        return [_brief(model) for model in self._table.all()]
+        live = self._table.live()
+        return [_brief(model, live) for model in self._table.all()]
 
     def show_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """One model, the live one by default, with its comparison and every change of its state."""
@@ -100,7 +107,17 @@ class ModelRegistry:
     def status(self) -> dict[str, Any]:
         """What `status` shows: the live model, and the newest candidate that waits to be accepted."""
         live, waiting = self._table.live(), self._table.waiting()
-        return {"live": live and _brief(live), "candidate": waiting and _brief(waiting)}
+        return {"live": live and _brief(live, live), "candidate": waiting and self._candidate(waiting, live)}
+
+    def _candidate(self, model: ModelRow, live: ModelRow | None) -> dict[str, Any]:
+        """A model that waits, with whether `accept_command` would take it now, and why it would not."""
+        refusal: str | None = None
+        try:
+            _reason_to_accept(model, live)
+            self._require_loads(model)
+        except CommandError as error:
+            refusal = str(error)
+        return _brief(model, live) | {"is_acceptable": refusal is None, "refused_because": refusal}
 
     # ---- parts -------------------------------------------------------------------------------------------------------
 
@@ -119,13 +136,30 @@ class ModelRegistry:
 
     def _make_live(self, model: ModelRow, live: ModelRow | None, arguments: Mapping[str, Any], reason: str) -> None:
         operator = text_argument(arguments, "operator")
+        self._load(model)
+        self._table.go_live(model, live, operator, reason)
+        log.warning("model %d is live (%s), by %s", model.id, reason, operator or "an operator without a name")
+        self._live.changed()
+
+    def _load(self, model: ModelRow) -> None:
         try:
             self._live.load(model)
         except CalibrationError as error:
             raise CommandError(f"model {model.id} cannot go live: {error}", REFUSED) from error
-        self._table.go_live(model, live, operator, reason)
-        log.warning("model %d is live (%s), by %s", model.id, reason, operator or "an operator without a name")
-        self._live.changed()
+
+    def _require_loads(self, model: ModelRow) -> None:
+        """As `_load`, which takes a second, but once for the model's files as they lie there."""
+        files = model.id, _files(model.path)
+        loaded = self._loaded
+        if loaded is None or loaded[0] != files:
+            refusal = None
+            try:
+                self._load(model)
+            except CommandError as error:
+                refusal = str(error)
+            self._loaded = loaded = files, refusal
+        if loaded[1] is not None:
+            raise CommandError(loaded[1], REFUSED)
 
     def _changed(self, model: ModelRow, live: ModelRow | None) -> dict[str, Any]:
         return {"live": model.id, "retired": live and live.id, "path": str(model.path)}
@@ -141,7 +175,7 @@ def _reason_to_accept(model: ModelRow, live: ModelRow | None) -> str:
             f"--kind check`){again}",
             REFUSED,
         )
-    if compared["live"] != (live and live.id):
+    if _is_stale(compared, live):
         now = f"model {live.id} is live now" if live else "none is live now"
         then = "no model was live" if compared["live"] is None else f"model {compared['live']} was live"
         raise CommandError(f"model {model.id} was compared when {then}, and {now}{again}", REFUSED)
@@ -150,8 +184,22 @@ def _reason_to_accept(model: ModelRow, live: ModelRow | None) -> str:
     return str(compared["sentence"])
 
 
-def _brief(model: ModelRow) -> dict[str, Any]:
+def _is_stale(compared: Mapping[str, Any], live: ModelRow | None) -> bool:
+    """Whether a comparison is with another model than the one that is live."""
+    return bool(compared["live"] != (live and live.id))
+
+
+def _files(directory: Path) -> _Files:
+    """Name, size and time of change of a model's files; nothing where they cannot be looked at."""
+    try:
+        return tuple(sorted((e.name, e.stat().st_size, e.stat().st_mtime_ns) for e in os.scandir(directory)))
+    except OSError:
+        return ()
+
+
+def _brief(model: ModelRow, live: ModelRow | None) -> dict[str, Any]:
     compared = model.comparison
+    waits = model.state == "candidate"
     return {
         "id": model.id,
         "rig": model.rig,
@@ -160,5 +208,9 @@ def _brief(model: ModelRow) -> dict[str, Any]:
         "created_utc_ns": model.created_utc_ns,
         "path": str(model.path),
         "sessions": len(model.sessions),
-        "comparison": compared and {key: compared[key] for key in ("live", "is_better", "sentence")},
+        "comparison": compared
+        and {
+            **{key: compared[key] for key in ("live", "is_better", "sentence")},
+            "is_stale": waits and _is_stale(compared, live),
+        },
     }

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import heapq
 import json
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from daemon.config import Config, ConfigError
+from daemon.session_file import DoubtfulCaptures
 from daemon.store.reader import Reader
 from drivers.canlog import read_can_log
 from drivers.clock import NS_PER_S, Stamp
@@ -22,7 +24,10 @@ BOOT_ID = "replayed"
 LATEST_UTC_NS = 4_102_444_800 * NS_PER_S  # the year 2100
 
 
-def captures_of(path: Path, config: Config) -> Iterator[Capture]:
+NO_DOUBTS: Mapping[str, DoubtfulCaptures] = {}
+
+
+def captures_of(path: Path, config: Config, doubtful: Mapping[str, DoubtfulCaptures] = NO_DOUBTS) -> Iterator[Capture]:
     """Captures of one file, in order, with the link names of the configuration.
 
     A CAN log's channels are matched with the configured links' names, then with their channels (`can0`); a log of one
@@ -31,8 +36,14 @@ def captures_of(path: Path, config: Config) -> Iterator[Capture]:
     A log knows UTC alone, so all stamps are put on one monotonic axis: that of UTC. Recorded time that steps back
     stands still until it is past again.
 
+    Args:
+        path: the file.
+        config: names the links.
+        doubtful: link -> its captures of doubtful time, as a session file tells them.
+
     Raises:
-        DescriptionError: the file is malformed (file and line), or is no captured log.
+        DescriptionError: the file is malformed (file and line), or is no captured log; or it is not the one that
+            `doubtful` speaks of.
         ConfigError: a link of the file is not configured.
     """
     captures: Iterator[Capture]
@@ -49,6 +60,7 @@ def captures_of(path: Path, config: Config) -> Iterator[Capture]:
         allowed = ", ".join((*CAN_SUFFIXES, SERIAL_SUFFIX))
         raise DescriptionError(str(path), f"not a captured log by its name; allowed endings: {allowed}")
     latest_ns = 0
+    counts: Counter[str] = Counter()
     for capture in captures:
         link = known.get(capture.link, only)
         if link is None:
@@ -56,10 +68,21 @@ def captures_of(path: Path, config: Config) -> Iterator[Capture]:
         if not 0 <= capture.stamp.utc_ns < LATEST_UTC_NS:
             raise DescriptionError(str(path), f"a capture at {capture.stamp.utc_ns / NS_PER_S:.0f} s is beyond 2100")
         latest_ns = max(latest_ns, capture.stamp.utc_ns)
-        yield replace(capture, link=link, stamp=Stamp(capture.stamp.utc_ns, latest_ns, BOOT_ID))
+        told = doubtful.get(link)
+        is_doubtful = told is not None and told.is_among(counts[link])
+        counts[link] += 1
+        yield replace(capture, link=link, stamp=Stamp(capture.stamp.utc_ns, latest_ns, BOOT_ID, is_doubtful))
+    for link, count in counts.items():
+        if link in doubtful and doubtful[link].captures != count:
+            expected = f"the session file is of one with {doubtful[link].captures}"
+            raise DescriptionError(
+                str(path), f"has {count} captures of link {link!r}, {expected}: give the log that was exported with it"
+            )
 
 
-def first_captures(paths: Sequence[Path], config: Config) -> dict[Path, Capture]:
+def first_captures(
+    paths: Sequence[Path], config: Config, doubtful: Mapping[str, DoubtfulCaptures] = NO_DOUBTS
+) -> dict[Path, Capture]:
     """The first capture of each file; every file is read through, so that a bad one is refused before anything runs.
 
     Raises:
@@ -67,16 +90,19 @@ def first_captures(paths: Sequence[Path], config: Config) -> dict[Path, Capture]
     """
     firsts: dict[Path, Capture] = {}
     for path in paths:
-        for capture in captures_of(path, config):
+        for capture in captures_of(path, config, doubtful):
             firsts.setdefault(path, capture)
         if path not in firsts:
             raise DescriptionError(str(path), "holds no captures")
     return firsts
 
 
-def merged(paths: Sequence[Path], config: Config) -> Iterator[Capture]:
+def merged(
+    paths: Sequence[Path], config: Config, doubtful: Mapping[str, DoubtfulCaptures] = NO_DOUBTS
+) -> Iterator[Capture]:
     """Captures of several files in the order of their instants; at one instant in the order of the files."""
-    return heapq.merge(*(captures_of(p, config) for p in paths), key=lambda capture: capture.stamp.monotonic_ns)
+    files = (captures_of(path, config, doubtful) for path in paths)
+    return heapq.merge(*files, key=lambda capture: capture.stamp.monotonic_ns)
 
 
 def stored_readings(reader: Reader) -> Iterator[str]:

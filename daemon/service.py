@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import signal
+import sqlite3
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
@@ -11,7 +12,10 @@ from typing import Any
 
 from calibration.rig import Rig
 from daemon.acquisition import Acquisition
-from daemon.composition import Parts
+from daemon.alarms.board import AlarmBoard
+from daemon.alarms.gather import Gatherer
+from daemon.clock_watch import ClockWatch
+from daemon.composition import Parts, motion_limits
 from daemon.config import Config
 from daemon.control import FAILED, REFUSED, CommandError, ControlServer, Handler
 from daemon.drift_table import DriftTable
@@ -21,10 +25,16 @@ from daemon.live_model import LiveModel
 from daemon.live_tip import FRESH_S, LiveTip
 from daemon.model_table import ModelTable
 from daemon.notify import Notifier
+from daemon.present_state import expected_of
 from daemon.registry import ModelRegistry
 from daemon.sessions import SessionKeeper
 from daemon.setups import SetupBook
+from daemon.store.alarms import AlarmTable
+from daemon.store.errors import storage_errors, storage_sentence
+from daemon.store.health import StoreHealth, StoreWatch
+from daemon.store.runs import previous_run
 from daemon.store.store import Store
+from daemon.time_budget import TimeBudget
 from daemon.tip_sender import TipSender
 from drivers.errors import DeviceError, TransmitForbiddenError
 from drivers.readings import Record
@@ -32,6 +42,8 @@ from drivers.readings import Record
 log = logging.getLogger(__name__)
 
 BEAT_S = 1.0
+STOP_S = 20.0  # real seconds for all parts together, well within the unit's TimeoutStopSec
+STORE_END_S = 3.0  # of them for the store's last commits
 
 
 class Daemon:
@@ -41,12 +53,25 @@ class Daemon:
         config: as checked.
         store: open for writing; the caller closes it.
         parts: links, decoders, clock and hands, as composed for a real, a simulated or a replayed rig.
+
+    Raises:
+        StoreError: the store cannot be written to; the message says why and what to do.
+        CommandError: the control socket cannot be made.
     """
 
     def __init__(self, config: Config, store: Store, parts: Parts) -> None:
         self._config, self._store, self._parts = config, store, parts
-        store.begin_run(parts.clock.now())
+        with storage_errors(store.path):
+            store.begin_run(parts.clock.now())
+            try:
+                self._compose(config, store, parts)
+            except BaseException:
+                self._end_run()  # in order: nothing was captured
+                raise
+
+    def _compose(self, config: Config, store: Store, parts: Parts) -> None:
         declare_channels(store, parts.rig)
+        self._watch = StoreWatch(store, parts.clock)
         self._setups = SetupBook(parts.rig, store, parts.clock, config.sessions.control_tolerance_mm)
         self._sessions = SessionKeeper(
             parts.rig,
@@ -58,6 +83,7 @@ class Daemon:
             parts.clock,
             run_id=store.run_id,
             aim=parts.aim,
+            limits=motion_limits(config),
         )
         models = ModelTable(store, parts.rig.name, parts.clock)
         self._live_model = LiveModel(models, parts.rig)
@@ -66,28 +92,65 @@ class Daemon:
             parts.rig,
             parts.joiner,
             self._live_model,
-            self._setups.newest_usable,
+            self._setups.current,
             parts.clock,
             prism,
             fresh_s=FRESH_S / parts.clock.real_seconds(1.0),  # what delays readings here are computers, in real time
         )
         self._sender = tip_sender(config, parts, self._tip)
-        self._acquisition = Acquisition(parts.links, parts.decoders, store, parts.clock, on_records=self._on_records)
-        self._jobs = JobRunner(store, config, parts.rig.name, parts.clock)
-        self._gap = GapStatus(store, parts.rig.name, DriftTable(store, parts.rig.name, parts.clock))
+        before = previous_run(store) if parts.mode == "live" else None  # other clocks are none of the computer's
+        self._acquisition = Acquisition(
+            parts.links,
+            parts.decoders,
+            store,
+            parts.clock,
+            on_records=self._on_records,
+            expected=expected_of(config, parts.rig),
+            clock_watch=ClockWatch(before) if parts.mode == "live" else None,
+        )
+        self._jobs = JobRunner(store, config, parts.rig.name, parts.clock, is_held=self._are_jobs_held)
+        drift = DriftTable(store, parts.rig.name, parts.clock)
+        self._gap = GapStatus(store, parts.rig.name, drift)
+        self._alarms = AlarmBoard(
+            AlarmTable(store),
+            Gatherer(
+                store,
+                parts.rig.name,
+                self._live_model,
+                drift,
+                parts.clock,
+                before,
+                acquisition=self._acquisition.status,
+                health=lambda: self._watch.health,
+                suspicions=self._sessions.prism_suspicions,
+                is_control_served=lambda: True,
+            ),
+            parts.clock,
+        )
         self._models = ModelRegistry(models, parts.rig.name, self._live_model, compare=self._jobs.compare)
         self._control = ControlServer(config.socket_path, self._commands())
+
+    @property
+    def store_health(self) -> StoreHealth:
+        """How the store is; from any thread."""
+        return self._watch.health
+
+    def _are_jobs_held(self) -> bool:
+        """Nothing is made of a store that cannot be trusted, or while what was measured is still being decoded."""
+        return self._watch.health.state != "ok" or self._acquisition.is_behind
 
     def run(self, stop: threading.Event, notifier: Notifier) -> None:
         """Acquire until `stop` is set or a replay has ended; then stop everything in order.
 
         Raises:
-            AcquisitionError: nothing is stored any more; the process should end, and be started again.
+            AcquisitionError: nothing is stored any more, and the process should end and be started again; or captures
+                could not be stored before the end.
         """
         beat_s = min(BEAT_S, (notifier.watchdog_s or BEAT_S) / 2)
         try:
             self._live_model.start()
             self._acquisition.start()
+            self._watch.start()
             if self._sender is not None:
                 self._sender.start()
             if self._config.jobs.enabled:
@@ -96,26 +159,43 @@ class Daemon:
             log.info("acquiring rig %s; control socket %s", self._parts.rig.name, self._config.socket_path)
             while not stop.wait(beat_s):
                 self._acquisition.check()
+                self._sessions.aim_again()
+                self._watch.look()
+                self._alarms.evaluate()
                 # The watchdog hears of the writer, not of this loop: a hung disk must restart the service.
                 if self._acquisition.alive(within_s=notifier.watchdog_s or 60.0):
                     notifier.send("WATCHDOG=1")
                 if self._parts.is_over():
                     log.info("the replay has ended")
-                    return
+                    break
         finally:
             notifier.send("STOPPING=1")
             self.close()
+        self._acquisition.check()
 
     def close(self) -> None:
-        """Stop all parts; what was captured is stored first."""
-        self._control.close()
+        """Stop all parts within `STOP_S`, side by side, so that no one's stop delays what was captured."""
+        budget = TimeBudget(STOP_S)
+        stops = [self._control.close, self._live_model.stop, self._jobs.stop, self._watch.stop]
         if self._sender is not None:
-            self._sender.stop()
-        self._live_model.stop()
-        self._jobs.stop()
-        self._acquisition.stop()
-        self._store.end_run(self._parts.clock.now())
+            stops.append(self._sender.stop)
+        others = [threading.Thread(target=_stop_part, args=(stop,), daemon=True) for stop in stops]
+        for thread in others:
+            thread.start()
+        is_store_free = self._acquisition.stop(TimeBudget(budget.left_s - STORE_END_S))
+        for thread, stop in zip(others, stops, strict=True):
+            thread.join(budget.left_s)
+            if thread.is_alive():
+                log.error("%s did not end within %g s; it is left behind", _name(stop), STOP_S)
+        if is_store_free and self._acquisition.has_stored_all:
+            self._end_run()
         log.info("stopped")
+
+    def _end_run(self) -> None:
+        try:
+            self._store.end_run(self._parts.clock.now())
+        except sqlite3.Error as error:
+            log.error("the end of this run could not be stored: %s", storage_sentence(self._store.path, error))
 
     def _on_records(self, records: Sequence[Record]) -> None:
         try:
@@ -133,6 +213,8 @@ class Daemon:
             "session.stop": sessions.stop_command,
             "session.abort": sessions.abort_command,
             "session.shoot": sessions.shoot_command,
+            "session.confirm-prism": sessions.confirm_prism_command,
+            "session.accept": sessions.accept_command,
             "session.list": sessions.list_command,
             "session.show": sessions.show_command,
             "jobs.list": jobs.list_command,
@@ -145,6 +227,7 @@ class Daemon:
             "model.zeros-checked": models.zeros_checked_command,
             "model.compare": models.compare_command,
             "tip": self._tip.tip_command,
+            "alarms.list": self._alarms.list_command,
             "devices.configure": self._configure_devices,
             **({} if self._parts.visit is None else {"simulation.visit": self._visit}),
         }
@@ -154,6 +237,7 @@ class Daemon:
         return {
             "rig": self._parts.rig.name,
             "mode": self._parts.mode,
+            "alarms": self._alarms.status(),
             "acquisition": acquisition,
             "session": self._sessions.open_session(),
             "jobs": self._jobs.unfinished(),
@@ -163,6 +247,7 @@ class Daemon:
                 "SELECT device, utc_ns, kind, text FROM device_events ORDER BY id DESC LIMIT 12"
             ),
             "store": str(self._config.store_path),
+            "store_health": self._watch.health.as_dict(),
         }
 
     def _visit(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -196,6 +281,18 @@ class Daemon:
             "links": names,
             "text": f"the nodes on {names} are being set up; `rigcal status` shows what comes of it",
         }
+
+
+def _stop_part(stop: Callable[[], None]) -> None:
+    try:
+        stop()
+    except Exception:
+        # Of parts that go away together, one that stumbles must keep no other from ending.
+        log.exception("%s failed", _name(stop))
+
+
+def _name(stop: Callable[[], None]) -> str:
+    return getattr(stop, "__qualname__", repr(stop))
 
 
 def tip_sender(config: Config, parts: Parts, tip: LiveTip) -> TipSender | None:

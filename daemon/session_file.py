@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -9,7 +10,26 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from drivers.errors import DescriptionError
 from drivers.files import read_whole
 
-_FILE_MAX_BYTES = 1 << 20
+_FILE_MAX_BYTES = 8 << 20  # every run of doubtful captures takes some 20
+
+
+class DoubtfulCaptures(BaseModel):
+    """Which captures of a link's log are of doubtful time: logs cannot say it.
+
+    Attributes:
+        captures: how many the log has in all, so that another one is noticed.
+        runs: the first and the last of each run, counted from 0 in the order of the log.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    captures: int = Field(gt=0)
+    runs: tuple[tuple[int, int], ...]
+
+    def is_among(self, number: int) -> bool:
+        """Whether the capture of that number is of doubtful time."""
+        at = bisect_right(self.runs, number, key=lambda run: run[0]) - 1
+        return at >= 0 and number <= self.runs[at][1]
 
 
 class SessionFile(BaseModel):
@@ -18,7 +38,10 @@ class SessionFile(BaseModel):
     Attributes:
         prism, kind: as the session was started.
         since_utc_ns, until_utc_ns: from when to when it took fixes, on the time of its captures' logs.
+        prism_confirmed_utc_ns: when an operator said that the station was on the prism, on the same time.
+        prism_turned_utc_ns: when something turned the station to the prism, on the same time.
         control_points: name -> place, mm, of those of its set-up: fixes there are not of the prism.
+        doubtful: link -> its captures of doubtful time; links without any are not there.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -28,6 +51,9 @@ class SessionFile(BaseModel):
     since_utc_ns: int = Field(ge=0)
     until_utc_ns: int = Field(ge=0)
     control_points: dict[str, tuple[float, float, float]]
+    prism_confirmed_utc_ns: tuple[int, ...] = ()
+    prism_turned_utc_ns: tuple[int, ...] = ()
+    doubtful: dict[str, DoubtfulCaptures] = Field(default_factory=dict)
 
 
 def read_session_file(path: Path) -> SessionFile:

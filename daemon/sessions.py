@@ -1,17 +1,18 @@
 """Calibration sessions: what the operator says, joined with what the instruments give.
 
-All state lives in the store; this module holds only what an open session needs between two fixes. `on_records` runs in
-the writer thread; methods named `*_command` are called by the control socket's threads.
+All state lives in the store; this module holds only what an open session needs between two fixes, and changes it after
+the store: what the store has refused has not happened. `on_records` runs in the writer thread; methods named
+`*_command` are called by the control socket's threads.
 """
 
 from __future__ import annotations
 
 import hashlib
-import itertools
 import logging
 import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from calibration.rig import Rig
@@ -19,10 +20,15 @@ from daemon.config import SessionsSection
 from daemon.control import FAILED, CommandError
 from daemon.joiner import JoinedFix, ObservationJoiner
 from daemon.open_session import OpenSession, Shot, within
+from daemon.prism_guard import MotionLimit, Suspicion
+from daemon.prism_watch import PrismWatch, as_dict
 from daemon.scheduler import CHECK, SESSION_KINDS
-from daemon.setups import AXES, Place, SetupBook, identifier
+from daemon.session_table import SessionTable
+from daemon.setups import AXES, Place, SetupBook, identifier, text_argument
+from daemon.standstill_places import StandstillPlaces
+from daemon.store.errors import is_unwritable
 from daemon.store.store import Store
-from drivers.clock import Clock
+from drivers.clock import NS_PER_S, Clock
 from drivers.readings import DeviceEvent, EventKind, Fix, Record, Status
 from drivers.station import position_mm
 
@@ -30,7 +36,7 @@ log = logging.getLogger(__name__)
 
 STANDING_KINDS = ("static_poses", CHECK)
 CHECK_POSES = (3, 5)
-CONTROL_POINT_RADIUS_MM = 300.0  # a fix this close to a control point is of the control point, not of the boom
+AIM_AGAIN_NS = 10 * NS_PER_S
 SHOT_SPREAD_MM = 20.0  # fixes of one shot that lie further apart are not of one standing target
 
 
@@ -47,6 +53,7 @@ class SessionKeeper:
         run_id: of this run of the daemon; poses are numbered within it.
         aim: turns the station to a prism or control point where something can (a simulated rig); None where the
             operator does it.
+        limits: station -> what motion can do to its prism.
     """
 
     def __init__(
@@ -61,14 +68,20 @@ class SessionKeeper:
         *,
         run_id: int,
         aim: Callable[[str], None] | None = None,
+        limits: Mapping[str, MotionLimit] | None = None,
     ) -> None:
         self._rig, self._rig_text = rig, rig_text
         self._store, self._joiner, self._settings, self._clock = store, joiner, settings, clock
         self._setups, self._run_id = setups, run_id
+        self._table = SessionTable(store, rig.name, clock, settings.control_tolerance_mm)
         self._aim = aim
         self._commands = threading.Lock()
         self._shot: Shot | None = None
         self._ended: OpenSession | None = None  # the last one: fixes measured in it may still wait for their joints
+        self._places = StandstillPlaces(rig)
+        self._prisms = PrismWatch(store, clock, limits or {})
+        self._unstored: list[Callable[[], object]] = []  # observations that the store has yet to take, in their order
+        self._is_waiting = False
         self._open = self._reopen()
 
     # ---- the writer thread -------------------------------------------------------------------------------------------
@@ -78,12 +91,15 @@ class SessionKeeper:
         for record in records:
             if isinstance(record, Fix):
                 self._feed_shot(record)
+                self._watch_prism(record)
             elif isinstance(record, DeviceEvent) and record.kind is EventKind.PRESET_JUMP:
                 for session in (self._ended, self._open):
                     if session is not None and session.lasted(record.stamp):
                         session.jumped.setdefault(record.device, record.stamp)
         for joined in self._joiner.feed(records):
             self._observe(joined)
+        if self._unstored:
+            self._store_observations()
 
     def _feed_shot(self, fix: Fix) -> None:
         shot = self._shot
@@ -100,28 +116,56 @@ class SessionKeeper:
         if len(shot.fixes) == shot.wanted:
             shot.done.set_result(None)
 
+    def _watch_prism(self, fix: Fix) -> None:
+        for session in (self._ended, self._open):
+            if session is not None and session.lasted(fix.stamp):
+                event = self._prisms.see(session, fix)
+                if event is not None:
+                    self._unstored.append(partial(self._store.insert_records, [event]))
+
     def _observe(self, joined: JoinedFix) -> None:
         session = next((s for s in (self._ended, self._open) if s is not None and s.has(joined.stamp)), None)
         place_mm = position_mm(joined.fix)
         if session is None or place_mm is None:
             return
         standing = joined.standstill is not None
-        self._store.insert(
-            "observations",
-            {
-                "session_id": session.id,
-                "fix_id": self._store.fix_id(joined.fix),
-                "setup_id": session.setup_id,
-                "prism": session.prism,
-                "pose": f"{self._run_id}.{joined.standstill}" if standing else None,
-                **self._store.instant(joined.stamp),
-                **dict(zip(AXES, place_mm, strict=True)),
-                "dwell_s": joined.dwell_s,
-                "moving": not standing,
-                "values_json": joined.values,
-                "excluded": self._exclusion(session, joined, place_mm),
-            },
-        )
+        excluded = self._exclusion(session, joined, place_mm)
+        if standing and excluded is None:
+            at_ns = joined.stamp.monotonic_ns
+            standstill = (session.id, joined.standstill)
+            changed = self._places.add(standstill, at_ns, place_mm, joined.values)
+            excluded = changed.pop(at_ns)
+            if changed:
+                self._unstored.append(partial(self._table.exclude, session.id, changed, joined.stamp))
+        row = {
+            "session_id": session.id,
+            "setup_id": session.setup_id,
+            "prism": session.prism,
+            "pose": f"{self._run_id}.{joined.standstill}" if standing else None,
+            **dict(zip(AXES, place_mm, strict=True)),
+            "dwell_s": joined.dwell_s,
+            "moving": not standing,
+            "values_json": joined.values,
+            "excluded": excluded,
+        }
+        self._unstored.append(partial(self._table.add_observation, row, joined.fix, joined.stamp))
+
+    def _store_observations(self) -> None:
+        """Store what was observed; while the disk is full it waits, with what comes after it."""
+        try:
+            with self._store.transaction():
+                for store in self._unstored:
+                    store()
+        except Exception as error:
+            if is_unwritable(error):
+                if not self._is_waiting:
+                    log.error("observations cannot be stored (%s); they wait and are tried again", error)
+                self._is_waiting = True
+                return
+            self._unstored.clear()  # one that can never be stored must not keep out all that follow
+            raise
+        self._unstored.clear()
+        self._is_waiting = False
 
     def _exclusion(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> str | None:
         if joined.refused:
@@ -129,8 +173,11 @@ class SessionKeeper:
         for joint in self._rig.joint_names:
             if joint in session.jumped and within(joined.stamp, session.jumped[joint], None):
                 return f"{joint} jumped: its readings from then on do not fit those before"
-        if any(math.dist(place_mm, p) < CONTROL_POINT_RADIUS_MM for p in session.control_points):
+        if session.is_control_point(place_mm):
             return "a control point, not the prism"
+        doubt = self._prisms.doubt(session, joined.fix)
+        if doubt is not None:
+            return doubt
         if session.kind in STANDING_KINDS and joined.standstill is None:
             return "moving"
         return None
@@ -150,46 +197,54 @@ class SessionKeeper:
             if kind not in SESSION_KINDS:
                 raise CommandError(f"there is no kind {kind!r}; kinds: {', '.join(SESSION_KINDS)}")
             setup_id = self._setups.usable(arguments.get("setup"))
-            taken = {row["id"] for row in self._store.rows("SELECT id FROM calibration_sessions")}
-            free = next(name for n in itertools.count(len(taken) + 1) if (name := f"s{n:03d}-{prism}") not in taken)
+            free = self._table.free_id(prism)
             session_id = identifier(arguments, "id", "a session's id", default=free)
-            if session_id in taken:
+            if session_id in self._table.ids():
                 raise CommandError(f"session {session_id!r} exists already; choose another --id")
+            points = self._setups.control_points(setup_id)
             if self._aim is not None:
                 self._aim(prism)
             now = self._clock.now()
             row = {
                 "id": session_id,
-                "rig": self._rig.name,
                 "rig_sha256": hashlib.sha256(self._rig_text.encode()).hexdigest(),
                 "rig_text": self._rig_text,
                 "setup_id": setup_id,
                 "prism": prism,
                 "operator": str(arguments.get("operator", "")),
                 "kind": kind,
-                "state": "open",
                 "note": str(arguments.get("note", "")),
-                **self._store.instant(now, "started_"),
             }
-            self._store.insert("calibration_sessions", row)
-            points = self._setups.control_points(setup_id)
-            self._open = OpenSession(session_id, setup_id, prism, kind, now, control_points=points)
-            return {"id": session_id, "setup": setup_id, "prism": prism, "kind": kind, "advice": self._advice("start")}
+            self._table.start(row, now)
+            self._open = session = OpenSession(session_id, setup_id, prism, kind, now, control_points=points)
+            if self._aim is not None:
+                self._prisms.turned(session, now)
+            return {
+                "id": session_id,
+                "setup": setup_id,
+                "prism": prism,
+                "kind": kind,
+                "advice": self._advice(session, "start"),
+            }
 
     def stop_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Close the open session; its jobs follow by themselves."""
         with self._commands:
-            session = self._needs_open()
-            advice = self._advice("end")
-            self._close("closed")
-            return self._summary(session.id) | {"advice": advice}
+            session = self._close("closed")
+            return self._table.summary(session.id) | {"advice": self._advice(session, "end")}
 
     def abort_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Close the open session as unusable: kept, never calibrated with."""
         with self._commands:
-            session = self._needs_open()
-            self._close("aborted")
-            return self._summary(session.id)
+            return self._table.summary(self._close("aborted").id)
+
+    def accept_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Let calibration use a closed session although nothing shows that the station stood still."""
+        with self._commands:
+            session_id, operator = str(arguments.get("id", "")), text_argument(arguments, "operator")
+            despite = self._table.accept(session_id, operator)
+            log.warning("session %s is used, by the word of %s: %s", session_id, operator or "an operator", despite)
+            return self._table.summary(session_id)
 
     def shoot_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Measure a control point: the mean of the next good fixes. The first shot of a point defines its place."""
@@ -206,35 +261,69 @@ class SessionKeeper:
                 shot.aimed = self._clock.now()
                 self._shot = shot
                 self._await(shot)
+                phase = self._table.phase(session.id, name)
+                result = self._setups.store_shot(session.setup_id, session.id, name, phase, shot.fixes, shot.places_mm)
+                # Before the shot is over: fixes that come late are of the point, and known to be
+                session.control_points = self._setups.control_points(session.setup_id)
             finally:
                 self._shot = None
                 if self._aim is not None:
                     self._aim(session.prism)
                 shot.until = self._clock.now()
-            phase = self._phase(session, name)
-            result = self._setups.store_shot(session.setup_id, session.id, name, phase, shot.fixes, shot.places_mm)
-            session.control_points = self._setups.control_points(session.setup_id)
-            return result
+                if self._aim is not None:
+                    self._prisms.turned(session, shot.until)
+            return result | {"advice": _after_a_move(session) if result["moved"] else []}
+
+    def confirm_prism_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Take the operator's word that the station is on the session's prism: its fixes count from now on."""
+        with self._commands:
+            return self._prisms.confirm(self._needs_open(), text_argument(arguments, "operator"))
+
+    def turned_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """In a replay: the station was turned to the session's prism at this instant."""
+        with self._commands:
+            session = self._needs_open()
+            self._prisms.turned(session, self._clock.now())
+            return {"session": session.id}
 
     def list_command(self, _arguments: Mapping[str, Any]) -> list[dict[str, Any]]:
         """All sessions with what they hold, oldest first."""
-        ids = self._store.rows("SELECT id FROM calibration_sessions ORDER BY rowid")
-        return [self._summary(row["id"]) for row in ids]
+        return self._table.all()
 
     def show_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """One session: what it holds, what was excluded and why, how its set-up kept its place, and its jobs."""
         session_id = str(arguments.get("id", ""))
-        if not self._store.rows("SELECT id FROM calibration_sessions WHERE id = ?", (session_id,)):
-            raise CommandError(f"there is no session {session_id!r}; `rigcal session list` shows them")
-        jobs = self._store.rows(
-            "SELECT id, kind, state, progress, message, error FROM jobs WHERE session_id = ? ORDER BY id", (session_id,)
-        )
-        return self._summary(session_id) | {"jobs": jobs}
+        return self._table.summary(session_id) | {"jobs": self._table.jobs(session_id)}
 
     def open_session(self) -> dict[str, Any] | None:
         """What `status` shows of the open session."""
         session = self._open
-        return None if session is None else self._summary(session.id)
+        if session is None:
+            return None
+        suspicions = [as_dict(suspicion) for suspicion in self._prisms.suspicions(session)]
+        return self._table.summary(session.id) | {"prism_suspicions": suspicions}
+
+    def aim_again(self) -> None:
+        """Where something can aim the station, do what an operator would when it has been suspected for a while."""
+        session, now = self._open, self._clock.now()
+        if self._aim is None or session is None:
+            return
+        if not any(now.since(s.since) > AIM_AGAIN_NS for s in self._prisms.suspicions(session)):
+            return
+        if self._commands.acquire(blocking=False):  # else a command is at work on the session: another time
+            try:
+                if session is self._open:
+                    self._aim(session.prism)
+                    self._prisms.turned(session, self._clock.now())
+            except CommandError as error:
+                log.warning("station not aimed at prism %s again: %s", session.prism, error)
+            finally:
+                self._commands.release()
+
+    def prism_suspicions(self) -> list[Suspicion]:
+        """Stations that may be on another prism than that of the open session; from any thread."""
+        session = self._open
+        return [] if session is None else self._prisms.suspicions(session)
 
     # ---- parts -------------------------------------------------------------------------------------------------------
 
@@ -249,89 +338,45 @@ class SessionKeeper:
                 FAILED,
             )
 
-    def _phase(self, session: OpenSession, point: str) -> str:
-        """`end` for a point that was shot before the observations so far, else `start`."""
-        between = self._store.rows(
-            "SELECT 1 FROM observations AS o JOIN control_shots AS c ON c.session_id = o.session_id AND c.name = ? "
-            "WHERE o.session_id = ? AND o.excluded IS NULL "
-            "AND (o.boot_id, o.monotonic_ns) > (c.boot_id, c.monotonic_ns) LIMIT 1",
-            (point, session.id),
-        )
-        return "end" if between else "start"
-
-    def _advice(self, phase: str) -> list[str]:
+    def _advice(self, session: OpenSession, phase: str) -> list[str]:
         """What the operator should still do, in sentences."""
-        session = self._needs_open()
-        points = self._store.rows("SELECT name FROM control_points WHERE setup_id = ?", (session.setup_id,))
-        shot = {
-            row["name"]
-            for row in self._store.rows(
-                "SELECT name FROM control_shots WHERE session_id = ? AND phase = ?", (session.id, phase)
-            )
-        }
+        points = self._setups.control_point_names(session.setup_id)
+        shot = self._table.shot(session.id, phase)
         advice = []
-        missing = [p["name"] for p in points if p["name"] not in shot]
+        missing = [name for name in points if name not in shot]
         if missing or not points:
             names = ", ".join(missing) if missing else "at least one"
-            advice.append(f"control points not shot at the session's {phase}: {names} (`rigcal session shoot NAME`)")
+            how = " (`rigcal session shoot NAME`)" if phase == "start" else ""
+            advice.append(f"control points not shot at the session's {phase}: {names}{how}")
         advice += [
             f"{joint} jumped during the session, and nothing after that is used: if its encoder was preset, start anew"
             for joint in self._rig.joint_names
             if joint in session.jumped
         ]
+        advice += [
+            f"{suspicion.reason}; its fixes since then do not count: {suspicion.remedy}"
+            for suspicion in self._prisms.suspicions(session)
+        ]
         if phase == "start":
             advice.append("stand still at every pose until status counts it; move all joints through their ranges")
-        elif session.kind == CHECK:
-            poses = self._summary(session.id)["poses"]
-            if not CHECK_POSES[0] <= poses <= CHECK_POSES[1]:
-                advice.append(f"a check wants {CHECK_POSES[0]} to {CHECK_POSES[1]} poses; this one has {poses}")
+            return advice
+        summary = self._table.summary(session.id)
+        if session.kind == CHECK and not CHECK_POSES[0] <= summary["poses"] <= CHECK_POSES[1]:
+            advice.append(f"a check wants {CHECK_POSES[0]} to {CHECK_POSES[1]} poses; this one has {summary['poses']}")
+        advice += [
+            f"the computer's clock was set back by {-step['step_s']:.1f} s during the session: its rows keep the times "
+            "that it showed, and calibration goes by the monotonic clock"
+            for step in summary["clock_steps"]
+            if step["step_s"] < 0
+        ]
         return advice
 
-    def _earlier_jumps(self, session_id: str) -> list[str]:
-        """Devices whose encoders an earlier run of the daemon has seen jump in a session."""
-        rows = self._store.rows(
-            "SELECT DISTINCT e.device FROM device_events AS e JOIN calibration_sessions AS s ON s.id = ? "
-            "WHERE e.kind = 'preset_jump' "
-            "AND (e.boot_id, e.monotonic_ns) >= (s.started_boot_id, s.started_monotonic_ns)",
-            (session_id,),
-        )
-        return [row["device"] for row in rows]
-
-    def _summary(self, session_id: str) -> dict[str, Any]:
-        row = self._store.rows(
-            "SELECT id, rig, setup_id AS setup, prism, operator, kind, state, note, started_utc_ns, ended_utc_ns "
-            "FROM calibration_sessions WHERE id = ?",
-            (session_id,),
-        )[0]
-        counts = self._store.rows(
-            "SELECT count(*) FILTER (WHERE excluded IS NULL) AS observations, "
-            "count(DISTINCT pose) FILTER (WHERE excluded IS NULL) AS poses FROM observations WHERE session_id = ?",
-            (session_id,),
-        )[0]
-        excluded = self._store.rows(
-            "SELECT excluded AS reason, count(*) AS n FROM observations WHERE session_id = ? AND excluded IS NOT NULL "
-            "GROUP BY excluded ORDER BY n DESC",
-            (session_id,),
-        )
-        shots = self._store.rows(
-            "SELECT name AS point, phase, misclosure_mm FROM control_shots WHERE session_id = ? ORDER BY id",
-            (session_id,),
-        )
-        moved = self._store.rows("SELECT state FROM station_setups WHERE id = ?", (row["setup"],))[0]["state"]
-        return {
-            **row,
-            **counts,
-            "excluded": {e["reason"]: e["n"] for e in excluded},
-            "control_shots": shots,
-            "setup_moved": moved == "moved",
-        }
-
-    def _close(self, state: str) -> None:
+    def _close(self, state: str) -> OpenSession:
+        """End the open session, in the store and then here; what the store refuses leaves it open in both."""
         session = self._needs_open()
-        session.until = self._clock.now()
+        session.until = self._table.end(session.id, state)
         self._ended, self._open = session, None
-        ended = self._store.instant(session.until, "ended_")
-        self._store.update("calibration_sessions", {"id": session.id}, {"state": state, **ended})
+        return session
 
     def _needs_open(self) -> OpenSession:
         if self._open is None:
@@ -340,16 +385,30 @@ class SessionKeeper:
 
     def _reopen(self) -> OpenSession | None:
         """The session that was open when an earlier run ended goes on."""
-        rows = self._store.rows(
-            "SELECT id, setup_id, prism, kind FROM calibration_sessions WHERE state = 'open' AND rig = ?",
-            (self._rig.name,),
-        )
-        if not rows:
+        open_ones = {row.pop("rig"): row for row in self._table.open()}
+        row = open_ones.pop(self._rig.name, None)
+        for rig, other in open_ones.items():
+            log.warning("session %s of rig %s is open too; it goes on when rigcal runs that rig", other["id"], rig)
+        if row is None:
             return None
-        session = OpenSession(rows[0]["id"], rows[0]["setup_id"], rows[0]["prism"], rows[0]["kind"], since=None)
+        session = OpenSession(**row, since=None)
         log.warning("session %s (prism %s) was open when rigcal last ended; it goes on", session.id, session.prism)
         if self._aim is not None:
             self._aim(session.prism)  # what aims may have forgotten; an operator's station has kept its lock
         session.control_points = self._setups.control_points(session.setup_id)
-        session.jumped = dict.fromkeys(self._earlier_jumps(session.id))
+        session.jumped = dict.fromkeys(self._table.jumped(session.id))
+        if self._aim is None:
+            self._prisms.restore(session)
+        else:
+            self._prisms.turned(session, self._clock.now())
         return session
+
+
+def _after_a_move(session: OpenSession) -> list[str]:
+    """What to do when a control point shows that the station moved."""
+    return [
+        "the station has moved, and nothing measured from now on fits what was measured before: stop the session, "
+        "describe where the station stands now with `rigcal setup new`, then start the next session",
+        f"session {session.id} is kept and not used; if you know that only the control point was wrong, say so after "
+        f"its end with `rigcal session accept {session.id}`",
+    ]

@@ -86,17 +86,23 @@ class SetupBook:
         ]
 
     def usable(self, wanted: object) -> str:
-        """The set-up that is asked for, or the newest that has not moved.
+        """The set-up that is asked for, or the newest: where the station stood before that one it stands no more.
 
         Raises:
             CommandError: there is none, or it has moved.
         """
         setups = self._store.rows("SELECT id, state FROM station_setups ORDER BY rowid")
         if wanted is None:
-            usable = [s["id"] for s in setups if s["state"] == "ok"]
-            if not usable:
-                raise CommandError("there is no usable station set-up; describe one with `rigcal setup new`")
-            return str(usable[-1])
+            if not setups:
+                raise CommandError("there is no station set-up; describe one with `rigcal setup new`")
+            newest = setups[-1]
+            if newest["state"] != "ok":
+                raise CommandError(
+                    f"set-up {newest['id']!r}, the newest, has {newest['state']}; describe a new one (`rigcal setup "
+                    "new`), or name one with --setup if the station stands there again",
+                    REFUSED,
+                )
+            return str(newest["id"])
         for setup in setups:
             if setup["id"] == wanted:
                 if setup["state"] != "ok":
@@ -108,10 +114,10 @@ class SetupBook:
                 return str(wanted)
         raise CommandError(f"there is no set-up {wanted!r}; known: {', '.join(s['id'] for s in setups) or 'none'}")
 
-    def newest_usable(self) -> str | None:
-        """The newest set-up that has not moved; None if there is none."""
-        found = self._store.rows("SELECT id FROM station_setups WHERE state = 'ok' ORDER BY rowid DESC LIMIT 1")
-        return str(found[0]["id"]) if found else None
+    def current(self) -> str | None:
+        """The newest set-up; None where there is none, and where it has moved."""
+        found = self._store.rows("SELECT id, state FROM station_setups ORDER BY rowid DESC LIMIT 1")
+        return str(found[0]["id"]) if found and found[0]["state"] == "ok" else None
 
     def store_shot(
         self, setup_id: str, session_id: str, name: str, phase: str, fixes: Sequence[Fix], places_mm: Sequence[Place]
@@ -174,6 +180,11 @@ class SetupBook:
         key = {"setup_id": setup_id, "name": name}
         if not self._store.update("control_points", key, place):
             self._store.insert("control_points", {**key, **place})
+
+    def control_point_names(self, setup_id: str) -> list[str]:
+        """Names of a set-up's control points."""
+        rows = self._store.rows("SELECT name FROM control_points WHERE setup_id = ?", (setup_id,))
+        return [row["name"] for row in rows]
 
     def control_points(self, setup_id: str) -> list[Place]:
         """Places of a set-up's control points, mm in the station's frame."""

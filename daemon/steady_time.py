@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from drivers.clock import Stamp
 
 
@@ -18,4 +20,4 @@ class SteadyTime:
             self._offsets_ns[stamp.boot_id] = max(stamp.utc_ns, self._latest_ns) - stamp.monotonic_ns
         utc_ns = stamp.monotonic_ns + self._offsets_ns[stamp.boot_id]
         self._latest_ns = max(self._latest_ns, utc_ns)
-        return Stamp(utc_ns, stamp.monotonic_ns, stamp.boot_id)
+        return replace(stamp, utc_ns=utc_ns)

@@ -3,28 +3,28 @@
 from __future__ import annotations
 
 from drivers.clock import NS_PER_S, Clock, Stamp
+from drivers.readings import DeviceEvent, EventKind, Gap, GapReason
 
-LATE_S = 0.25  # what is read later than this is given up, where nothing says when it came
+LATE_S = 0.25  # what is read later than this is marked as of doubtful time, where nothing says when it came
 NOT_READ_IN_TIME = "nobody read for a while: rigcal was stopped, or the computer too busy"
+CLOCK_WAS_SET = "the computer's clock was set at that time"
+_REPORT_NS = NS_PER_S
 
 
 class Attendance:
     """Notices that a loop has come back after it was away: its program stopped or starved, or held up by a device.
 
-    What has queued meanwhile, at a port whose kernel does not say when it came, would be stamped with the instant of
-    reading: a fix would be joined with the joints of another pose. It must be discarded, as what waited at a port
-    before it was opened is, and so must what an adapter still holds, which follows at once.
+    What has queued meanwhile, at a port whose kernel does not say when it came, is stamped with the instant of reading:
+    a fix would be joined with the joints of another pose. Its stamp must be marked as doubtful, and so must that of
+    what an adapter still holds, which follows at once.
 
     Args:
         clock: of the stamps; how long the loop was away counts in real seconds, which is what computers take.
-
-    Attributes:
-        left: when the loop was last there before it was away; when it began if it never was.
     """
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
-        self._looked = self.left = clock.now()
+        self._looked = clock.now()
         self._back: Stamp | None = None
 
     def is_late(self, now: Stamp, waited_s: float) -> bool:
@@ -35,9 +35,49 @@ class Attendance:
             waited_s: how long the read may have waited, real seconds.
         """
         if self._real_s(now, self._looked) > waited_s + LATE_S:
-            self.left, self._back = self._looked, now
+            self._back = now
         self._looked = now
         return self._back is not None and self._real_s(now, self._back) <= LATE_S
 
     def _real_s(self, now: Stamp, since: Stamp) -> float:
         return self._clock.real_seconds(now.since(since) / NS_PER_S)
+
+
+class DoubtReport:
+    """Tells of captures that were stored with a doubtful time: an event and a gap, at most once a second.
+
+    Args:
+        link: name of the link.
+        what: is counted, `frames` or `bytes`.
+        start: when the link began to read.
+    """
+
+    def __init__(self, link: str, what: str, start: Stamp) -> None:
+        self._link = link
+        self._what = what
+        self._known = start  # the last instant before which nothing was doubtful
+        self._count = 0
+        self._reason = ""
+
+    def doubt(self, count: int, reason: str) -> None:
+        """`count` more captures, or bytes of them, were marked, because of `reason`."""
+        self._count += count
+        self._reason = reason
+
+    def trust(self, now: Stamp) -> list[DeviceEvent | Gap]:
+        """What was read until `now` has a time again that is known; what there is to tell of the stretch before."""
+        if self._count and now.since(self._known) < _REPORT_NS:
+            return []
+        return self.end(now)
+
+    def end(self, now: Stamp) -> list[DeviceEvent | Gap]:
+        """What there is left to tell when nothing more is read."""
+        start, self._known = self._known, now
+        count, self._count = self._count, 0
+        if not count:
+            return []
+        text = f"{self._link}: {count} {self._what} are stored, but marked, as their time is doubtful: {self._reason}"
+        return [
+            DeviceEvent(self._link, now, EventKind.TIME_DOUBTFUL, text, count),
+            Gap(self._link, GapReason.TIME_DOUBTFUL, start, now),
+        ]

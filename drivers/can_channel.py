@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from drivers.clock import Stamp
@@ -35,7 +35,7 @@ class ChannelDecoder(Protocol):
         """Frames that did not arrive so far, by the counter that they carry; None if they carry none that counts."""
 
     def decode(self, stamp: Stamp, data: bytes) -> list[Record]:
-        """Records of one frame, sampled at `stamp`."""
+        """Records of one frame, sampled at `stamp`; if that is doubtful, no motion is judged by it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,3 +111,10 @@ def value_reading(name: str, unit: str, stamp: Stamp, value: float, raw_counts: 
     if math.isfinite(value):
         return Reading(name, stamp, value, unit, Status.OK, raw_counts)
     return Reading(name, stamp, None, unit, Status.OUT_OF_RANGE, raw_counts)
+
+
+def without_time(record: Record) -> Record:
+    """A record of a frame whose time is doubtful: a reading has no value, because it is not known when it had it."""
+    if isinstance(record, Reading) and record.status is Status.OK:
+        return replace(record, value=None, status=Status.TIME_DOUBTFUL)
+    return record

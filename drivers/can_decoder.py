@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Sequence
 
-from drivers.can_channel import ChannelDecoder, PdoChannelDecoder
+from drivers.can_channel import ChannelDecoder, PdoChannelDecoder, without_time
 from drivers.can_errors import BusErrors
 from drivers.can_summary import CanSummary, IdSummary, RateWindow
 from drivers.canopen_supervision import NodeSupervision
@@ -198,11 +198,13 @@ class _ChannelState:
         sampled = stamp
         if self._is_synchronous and sync is not None and sync is not self._sync_used:
             self._sync_used = sync
-            if 0 <= stamp.since(sync) <= SYNC_WINDOW_NS:
+            if 0 <= stamp.since(sync) <= SYNC_WINDOW_NS and not (stamp.is_doubtful or sync.is_doubtful):
                 sampled = sync
         decoded = self._decoder.decode(sampled, data)
         if not decoded:
             return
+        if stamp.is_doubtful:
+            decoded = [without_time(record) for record in decoded]
         last_seen = self.last_seen
         if last_seen is not None and (self._is_silent or stamp.since(last_seen) > self._timeout_ns):
             self.tick(stamp, records)

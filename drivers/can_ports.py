@@ -59,10 +59,22 @@ class Received(NamedTuple):
     kernel_utc_ns: int | None
 
 
+class Batch(NamedTuple):
+    """What one read gave.
+
+    Attributes:
+        received: the frames, in order.
+        is_last: nothing was left to be read.
+    """
+
+    received: list[Received]
+    is_last: bool
+
+
 class CanPort(Protocol):
     """An open way to a bus. Any failure of the bus or its adapter is a LinkError."""
 
-    def receive(self, timeout_s: float) -> list[Received]:
+    def receive(self, timeout_s: float) -> Batch:
         """Wait for a frame for at most `timeout_s` real seconds; all frames that are there, up to BATCH_MAX."""
 
     def send(self, frame: Frame) -> None:
@@ -200,9 +212,10 @@ class _DatagramPort(_BusPort, abc.ABC):
         self._socket.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
         self._overflows = 0
 
-    def receive(self, timeout_s: float) -> list[Received]:
+    def receive(self, timeout_s: float) -> Batch:
         received: list[Received] = []
         receive_message = self._socket.recvmsg
+        is_last = True
         try:
             ready = self._failure is None and select.select([self._socket], [], [], timeout_s)[0]
             for _ in range(BATCH_MAX if ready else 0):
@@ -217,6 +230,7 @@ class _DatagramPort(_BusPort, abc.ABC):
                 frame = self._parse(datagram)
                 if frame is not None:
                     received.append(Received(frame, kernel_utc_ns))
+            is_last = not ready
         except BlockingIOError:
             pass  # all read
         except OSError as error:
@@ -224,7 +238,7 @@ class _DatagramPort(_BusPort, abc.ABC):
         # The kernel reports a failure once, and what came before it is given first
         if self._failure is not None and not received:
             raise self._failure
-        return received
+        return Batch(received, is_last)
 
     def close(self) -> None:
         super().close()
@@ -313,10 +327,10 @@ class SlcanPort(_BusPort):
         fcntl.ioctl(self._fd, termios.TIOCEXCL)
         self._lines = SlcanLines()
 
-    def receive(self, timeout_s: float) -> list[Received]:
+    def receive(self, timeout_s: float) -> Batch:
         try:
             if not select.select([self._fd], [], [], timeout_s)[0]:
-                return []
+                return Batch([], True)
             data = os.read(self._fd, 65536)
         except OSError as error:
             raise self._lost(error) from error
@@ -326,7 +340,7 @@ class SlcanPort(_BusPort):
         if self._lines.malformed:
             self._lose(ADAPTER_LINE, self._lines.malformed)
             self._lines.malformed = 0
-        return [Received(frame, None) for frame in frames]
+        return Batch([Received(frame, None) for frame in frames], True)
 
     def close(self) -> None:
         super().close()
@@ -341,8 +355,9 @@ class VirtualPort(_BusPort):
         super().__init__(where, bus)
         self._queue = bus.queue
 
-    def receive(self, timeout_s: float) -> list[Received]:
+    def receive(self, timeout_s: float) -> Batch:
         received: list[Received] = []
+        is_last = True
         take: Callable[[], can.Message] = self._queue.get_nowait
         with contextlib.suppress(queue.Empty):
             message = self._queue.get(timeout=timeout_s) if timeout_s > 0 else take()
@@ -352,9 +367,10 @@ class VirtualPort(_BusPort):
                 else:
                     received.append(Received(_frame(message), None))
                 if len(received) >= BATCH_MAX:
+                    is_last = False
                     break
                 message = take()
-        return received
+        return Batch(received, is_last)
 
 
 def _frame(message: can.Message) -> Frame:

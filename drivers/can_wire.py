@@ -48,6 +48,21 @@ def parse_multicast(datagram: bytes) -> tuple[Frame, float] | None:
     return Frame(identifier, data, bool(is_extended and not is_error), bool(is_remote), bool(is_error)), timestamp
 
 
+# Lines in which slcan adapters tell of errors (Linux, drivers/net/can/slcan), as SocketCAN's error frames say the same:
+# linux/can/error.h. The controller's state -> class bits and data[1]; one error -> class bits, index into data, bits.
+_SLCAN_STATES = {b"a": (0x004, 0x40), b"w": (0x004, 0x0C), b"p": (0x004, 0x30), b"b": (0x040, 0x00)}
+_SLCAN_ERRORS = {
+    b"a": (0x020, 0, 0x00),
+    b"b": (0x088, 2, 0x08),
+    b"B": (0x088, 2, 0x10),
+    b"c": (0x088, 3, 0x08),
+    b"f": (0x088, 2, 0x02),
+    b"s": (0x088, 2, 0x04),
+    b"o": (0x004, 1, 0x01),
+    b"O": (0x004, 1, 0x02),
+}
+
+
 class SlcanLines:
     """Cuts an adapter's bytes into lines and lines into frames. Pure.
 
@@ -56,6 +71,8 @@ class SlcanLines:
     """
 
     _FRAME = re.compile(rb"(?:t([0-9A-F]{3})|T([0-9A-F]{8})|r([0-9A-F]{3})|R([0-9A-F]{8}))([0-8])([0-9A-F]*)", re.I)
+    _STATE = re.compile(rb"s([awpb])(\d{3})(\d{3})")
+    _ERRORS = re.compile(rb"e(\d)([abBcfsoO]+)")
     _LINE_MAX = 64  # bytes: more without an end is noise
 
     def __init__(self) -> None:
@@ -81,7 +98,7 @@ class SlcanLines:
     def _frame(self, line: bytes) -> Frame | None:
         match = self._FRAME.match(line)
         if match is None:
-            return None
+            return self._error_frame(line)
         standard, extended, remote_standard, remote_extended, length, digits = match.groups()
         identifier = int(standard or extended or remote_standard or remote_extended, 16)
         is_extended = bool(extended or remote_extended)
@@ -93,3 +110,20 @@ class SlcanLines:
         if len(digits) not in (end, end + 4):  # with the adapter's time stamp switched on, four digits more
             return None
         return Frame(identifier, bytes.fromhex(digits[:end].decode("ascii")), is_extended)
+
+    def _error_frame(self, line: bytes) -> Frame | None:
+        """The error frame that an adapter's line about errors stands for; None if it is no such line."""
+        data = bytearray(8)
+        if state := self._STATE.fullmatch(line):
+            identifier, data[1] = _SLCAN_STATES[state[1]]
+            data[7], data[6] = (min(int(count), 255) for count in state.groups()[1:])
+            return Frame(identifier, bytes(data), is_error=True)
+        errors = self._ERRORS.fullmatch(line)
+        if errors is None or int(errors[1]) != len(errors[2]):
+            return None
+        identifier = 0
+        for letter in errors[2]:
+            bits, at, value = _SLCAN_ERRORS[bytes([letter])]
+            identifier |= bits
+            data[at] |= value
+        return Frame(identifier, bytes(data), is_error=True)

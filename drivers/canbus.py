@@ -9,21 +9,22 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from drivers.attendance import NOT_READ_IN_TIME, Attendance
-from drivers.can_ports import BATCH_MAX, OVERFLOW, CanPort, Interface, PortSettings, Received, open_port
+from drivers.attendance import CLOCK_WAS_SET, NOT_READ_IN_TIME, Attendance, DoubtReport
+from drivers.can_ports import OVERFLOW, Batch, CanPort, Interface, PortSettings, open_port
 from drivers.can_stamps import ReceiveStamps
 from drivers.can_sync import SyncProducer
 from drivers.can_transmit import TransmitPermission
 from drivers.canframe import Frame
 from drivers.canopen_setup import NodeSetup, SetupConversation
 from drivers.clock import NS_PER_S, Clock, Stamp
+from drivers.device_watch import DeviceWatch, no_watch, watch_interface, watch_path
 from drivers.errors import DeviceError, LinkError
 from drivers.readings import CanCapture, Capture, DeviceEvent, EventKind, Gap, GapReason
 
 POLL_S = 0.05  # how long a stop or a set-up request may go unnoticed
 LOSS_CHECK_NS = NS_PER_S
 BACKOFF_FIRST_S = 0.5
-BACKOFF_MAX_S = 30.0
+BACKOFF_MAX_S = 2.0  # a device that is back is found within this, even where nothing tells that it is
 
 Emit = Callable[[Capture | DeviceEvent | Gap], None]
 
@@ -176,14 +177,17 @@ class CanLink:
         """Receive until `stop` is set, opening the bus again whenever it is lost."""
         backoff = Backoff()
         outage = _Outage(self.name, emit, self._clock.now())
-        while not stop.is_set():
-            try:
-                self._serve(emit, stop, outage, backoff)
-            except LinkError as error:
-                outage.begin(str(error), self._clock.now())
-                self._clock.wait(stop, backoff.next_s())
+        with contextlib.closing(_watch(self._config)) as watch:
+            while not stop.is_set():
+                try:
+                    self._serve(emit, stop, outage, backoff, watch)
+                except LinkError as error:
+                    outage.begin(str(error), self._clock.now())
+                    wait_s = backoff.next_s()
+                    # Of real seconds, for devices are plugged in by people; fewer where time is made to run faster
+                    watch.wait(stop, min(wait_s, self._clock.real_seconds(wait_s)))
 
-    def _serve(self, emit: Emit, stop: threading.Event, outage: _Outage, backoff: Backoff) -> None:
+    def _serve(self, emit: Emit, stop: threading.Event, outage: _Outage, backoff: Backoff, watch: DeviceWatch) -> None:
         """One life of the bus, from opening to `stop` or LinkError."""
         config = self._config
         settings = PortSettings(
@@ -194,22 +198,24 @@ class CanLink:
             receive_buffer_bytes=config.receive_buffer_bytes,
             options=config.options,
         )
+        opened = self._clock.host.now()
         with contextlib.closing(open_port(self.name, settings)) as port:
+            session = _Session(self.name, config, self._clock, self._permission, port, emit, opened)
             # An interface that is down opens all the same, and fails at the first read
-            received = port.receive(0.0)
-            session = _Session(self.name, config, self._clock, self._permission, port, emit)
+            read = session.read(0.0)
+            watch.close()
             at_start, self._at_start = self._at_start, []
             self._requests.open(at_start)
             try:
                 outage.end(self._clock.now())
                 while True:
-                    session.take(received)
-                    if received:
+                    session.take(read)
+                    if read.batch.received:
                         backoff.reset()
                     session.serve(self._requests.take(), self._take_published())
                     if stop.is_set():
                         return
-                    received = port.receive(session.patience_s())
+                    read = session.read(session.patience_s())
             finally:
                 cause = "rigcal was stopped" if stop.is_set() else "the link was lost"
                 session.close(self._requests.close(), cause)
@@ -220,6 +226,15 @@ class CanLink:
             return self._published.popleft()
         except IndexError:
             return ()
+
+
+def _watch(config: CanLinkConfig) -> DeviceWatch:
+    """What tells that the link's device is back."""
+    if config.interface == "socketcan":
+        return watch_interface(config.channel)
+    if config.interface == "slcan":
+        return watch_path(config.channel.partition("@")[0])  # python-can's slcan takes PORT@BAUD
+    return no_watch()
 
 
 class _SetupRequests:
@@ -278,6 +293,15 @@ class _Outage:
             self._reason = None
 
 
+@dataclass(frozen=True, slots=True)
+class _Read:
+    """What one read gave, and the host's time just before and just after it."""
+
+    batch: Batch
+    began: Stamp
+    ended: Stamp
+
+
 class _Session:
     """What happens while the bus is open."""
 
@@ -289,6 +313,7 @@ class _Session:
         permission: TransmitPermission,
         port: CanPort,
         emit: Emit,
+        opened: Stamp,
     ) -> None:
         self._name = name
         self._clock = clock
@@ -297,41 +322,57 @@ class _Session:
         self._emit = emit
         self._setup = SetupConversation()
         self._losses: dict[str, int] = {}
-        opened = clock.now()
-        self._stamps = ReceiveStamps(opened)
+        self._stamps = ReceiveStamps(clock, opened)
         self._attendance = Attendance(clock)
-        self._late = 0  # frames that nobody read in time
-        self._check_losses_ns = opened.monotonic_ns + LOSS_CHECK_NS
-        self._checked = self._heard_then = opened  # when losses were last looked for, and the last frame before that
+        self._sent: deque[CanCapture] = deque()  # what was received before it may still have to be read
+        now = clock.now()
+        self._doubts = DoubtReport(name, "frames", now)
+        self._check_losses_ns = now.monotonic_ns + LOSS_CHECK_NS
+        self._checked = self._heard_then = now  # when losses were last looked for, and the last frame before that
         self._sync: SyncProducer | None = None
         if config.sync_period_ms is not None:
             period_ns = round(config.sync_period_ms * 1e6)
-            self._sync = SyncProducer(period_ns, opened.monotonic_ns, config.sync_counter)
+            self._sync = SyncProducer(period_ns, now.monotonic_ns, config.sync_counter)
 
     @property
     def last_frame(self) -> Stamp:
         """When the last frame was received; when the bus was opened if there was none."""
         return self._stamps.latest
 
-    def take(self, received: list[Received]) -> None:
-        """Stamp and emit what one read gave, but for what was not read in time and has no stamp but that of reading."""
-        now = self._clock.now()
+    def read(self, timeout_s: float) -> _Read:
+        """Wait for frames, at most `timeout_s` real seconds."""
+        host = self._clock.host
+        began = host.now()
+        batch = self._port.receive(timeout_s)
+        return _Read(batch, began, host.now())
+
+    def take(self, read: _Read) -> None:
+        """Stamp and emit what one read gave; what may have waited unread, and was not stamped before, is marked."""
+        now = self._clock.of_host(read.ended)
         is_late = self._attendance.is_late(now, POLL_S)
-        name, emit, stamp_of = self._name, self._emit, self._stamps.stamp
-        stamps = []
-        for frame, kernel_utc_ns in received:
-            stamp = stamp_of(kernel_utc_ns, now)
-            stamps.append(stamp)
-            if is_late and stamp == now:
-                self._late += 1
-                continue
+        stamps = self._stamps.of(read.batch, read.began, read.ended, is_late=is_late)
+        name, emit, sent, doubtful = self._name, self._emit, self._sent, 0
+        for (frame, _), stamp in zip(read.batch.received, stamps, strict=True):
+            while sent and sent[0].stamp.monotonic_ns <= stamp.monotonic_ns:
+                emit(sent.popleft())
+            doubtful += stamp.is_doubtful
             arbitration_id, data, is_extended, is_remote, is_error = frame
             emit(CanCapture(name, stamp, arbitration_id, data, is_extended, is_remote, is_error))
-        if len(received) < BATCH_MAX:
-            self._stamps.emptied(now)
+        if sent and read.batch.is_last:
+            self._emit_sent(self._clock.of_host(read.began))
+        if doubtful:
+            self._doubts.doubt(doubtful, NOT_READ_IN_TIME if is_late else CLOCK_WAS_SET)
+        elif not is_late:
+            for item in self._doubts.trust(now):
+                emit(item)
         if self._setup.is_active:
-            for (frame, _), stamp in zip(received, stamps, strict=True):
+            for (frame, _), stamp in zip(read.batch.received, stamps, strict=True):
                 self._setup.feed(frame, stamp)
+
+    def _emit_sent(self, until: Stamp) -> None:
+        """Emit what was sent until then; what is still to be read was received later."""
+        while self._sent and self._sent[0].stamp.monotonic_ns <= until.monotonic_ns:
+            self._emit(self._sent.popleft())
 
     def serve(self, requests: Iterable[NodeSetup], published: Iterable[Frame]) -> None:
         """Send what is due; look after lost frames.
@@ -370,7 +411,10 @@ class _Session:
 
     def close(self, requests: Iterable[NodeSetup], cause: str) -> None:
         """The bus is given up because of `cause`: say what is left to say."""
+        self._emit_sent(self._clock.now())
         self._report_losses()
+        for item in self._doubts.end(self._clock.now()):
+            self._emit(item)
         for request in requests:
             self._setup.add(request)
         self._setup.abort(self._clock.now(), cause)
@@ -380,14 +424,14 @@ class _Session:
         self._permission.check(frame)
         stamp = self._clock.now()
         self._port.send(frame)
-        self._emit(CanCapture(self._name, stamp, frame.arbitration_id, frame.data, is_transmitted=True))
+        self._sent.append(CanCapture(self._name, stamp, frame.arbitration_id, frame.data, is_transmitted=True))
 
     def _emit_setup_events(self) -> None:
         for event in self._setup.take_events():
             self._emit(event)
 
     def _report_losses(self) -> None:
-        now, losses = self._clock.now(), self._port.losses() | {NOT_READ_IN_TIME: self._late}
+        now, losses = self._clock.now(), self._port.losses()
         start, missed = self._checked, 0
         for reason, total in losses.items():
             lost = total - self._losses.get(reason, 0)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from drivers.can_channel import PdoChannel, PdoChannelDecoder, value_reading
 from drivers.clock import Stamp
 from drivers.errors import DescriptionError
+from drivers.jumps import checked_reading, joint_watch
 from drivers.readings import Reading, Record, Status
 
 PROCESS_VALUE_REAL32 = 0x6130
@@ -29,12 +30,14 @@ class AnalogueChannel(PdoChannel):
         process_value: PROCESS_VALUE_REAL32 (6130h), PROCESS_VALUE_I16 (7130h) or PROCESS_VALUE_I32 (9130h).
         decimal_digits: object 6132h: 1234 with 2 is 12.34; does not apply to REAL32.
         scale, offset: from the device's unit to the channel's.
+        max_rate_per_s: fastest motion of the joint in units per second; None: jumps are not looked for.
     """
 
     process_value: int = PROCESS_VALUE_I16
     decimal_digits: int = 0
     scale: float = 1.0
     offset: float = 0.0
+    max_rate_per_s: float | None = None
 
 
 class AnalogueDecoder(PdoChannelDecoder):
@@ -61,11 +64,16 @@ class AnalogueDecoder(PdoChannelDecoder):
         self._is_real = channel.process_value == PROCESS_VALUE_REAL32
         self._divisor = 10.0**channel.decimal_digits
         self._scale, self._offset = channel.scale, channel.offset
+        step = 0.0 if self._is_real else channel.scale / self._divisor
+        self._jumps = joint_watch(channel.max_rate_per_s, step, channel.unit)
 
     def decode(self, stamp: Stamp, data: bytes) -> list[Record]:
         if len(data) * 8 < self._needed_bits:
             return self._too_short(stamp, data, self._needed_bits)
-        bits = int.from_bytes(data, "little")
+        reading = self._reading(stamp, int.from_bytes(data, "little"))
+        return [reading] if self._jumps is None else checked_reading(self._jumps, reading)
+
+    def _reading(self, stamp: Stamp, bits: int) -> Reading:
         counts: int | None
         if self._is_real:
             counts = None
@@ -75,9 +83,9 @@ class AnalogueDecoder(PdoChannelDecoder):
             value = counts / self._divisor
         status = self._status.extract(bits) if self._status else 0
         if self.is_void:
-            return [Reading(self.name, stamp, None, self._unit, Status.DEVICE_ALARM, counts)]
+            return Reading(self.name, stamp, None, self._unit, Status.DEVICE_ALARM, counts)
         if status & 0b110:
-            return [Reading(self.name, stamp, None, self._unit, Status.OUT_OF_RANGE, counts)]
+            return Reading(self.name, stamp, None, self._unit, Status.OUT_OF_RANGE, counts)
         if status or value - value != 0.0:  # infinite or not a number
-            return [Reading(self.name, stamp, None, self._unit, Status.NOT_AVAILABLE, counts)]
-        return [value_reading(self.name, self._unit, stamp, value * self._scale + self._offset, counts)]
+            return Reading(self.name, stamp, None, self._unit, Status.NOT_AVAILABLE, counts)
+        return value_reading(self.name, self._unit, stamp, value * self._scale + self._offset, counts)

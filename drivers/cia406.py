@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
-from drivers.attendance import LATE_S
 from drivers.can_channel import PdoChannel, PdoChannelDecoder, value_reading
-from drivers.clock import NS_PER_S, Stamp
+from drivers.clock import Stamp
 from drivers.errors import DescriptionError
+from drivers.jumps import JumpWatch, jump_event
 from drivers.pdo import PdoField
 from drivers.readings import DecodeFailure, DeviceEvent, EventKind, Reading, Record, Status
 
@@ -46,10 +46,6 @@ def _bit_words(bits: int, names: dict[int, str]) -> str:
         if bits >> bit & 1
     ]
     return ", ".join(words) or "none"
-
-
-_MARGIN_NS = int(LATE_S * NS_PER_S)  # what samples may be read late by before they are given up
-_BACKLOG_NS = 5 * NS_PER_S  # what has queued is read within this time, however long nobody read
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,40 +98,15 @@ class LinearChannel(PositionChannel):
     range_mm: tuple[float, float] = (-1e5, 1e5)
 
 
-class _SampleTimes:
-    """Within what time a joint may have moved from one sample to the next.
-
-    A stamp says when a sample was read. What arrives while nobody reads (a busy computer, a program that is stopped)
-    waits, and is stamped when it is read at last. So a sample that ends a silence, and those after it until the backlog
-    is surely read, may have been taken at any time since the silence began. They are told from others by their stamps
-    alone: a log is judged as what came live.
-    """
-
-    def __init__(self) -> None:
-        self._read_ns: int | None = None
-        self._from_ns = self._late_until_ns = 0
-
-    def since_before(self, stamp: Stamp) -> int:
-        """Take a sample; the longest time, ns, that can lie between the sample before and this one."""
-        now_ns = stamp.monotonic_ns
-        before_ns, self._read_ns = self._read_ns, now_ns
-        if before_ns is None:  # what waited at a port is discarded when it is opened
-            self._from_ns = self._late_until_ns = now_ns
-            return 0
-        within_ns = max(now_ns - self._from_ns, 0) + _MARGIN_NS
-        silence_ns = now_ns - before_ns
-        is_late = silence_ns > _MARGIN_NS
-        if now_ns >= self._late_until_ns:
-            self._from_ns = before_ns if is_late else now_ns
-        if is_late:
-            self._late_until_ns = max(self._late_until_ns, now_ns + min(silence_ns // 2, _BACKLOG_NS))
-        return within_ns
+_JUMP_SLACK_COUNTS = 2.0
 
 
 class _PositionDecoder(PdoChannelDecoder):
     """Alarms, warnings, speed and jumps; the position itself is the subclasses'."""
 
-    def __init__(self, channel: PositionChannel, position_object: int, counts_per_unit: float) -> None:
+    def __init__(
+        self, channel: PositionChannel, position_object: int, counts_per_unit: float, modulus: int | None = None
+    ) -> None:
         super().__init__(channel)
         mapping = channel.pdo.mapping
         self._position = _field(channel, position_object)
@@ -149,9 +120,7 @@ class _PositionDecoder(PdoChannelDecoder):
         self._alarm_bits = 0
         self._warning_bits = 0
         rate = channel.max_rate_per_s
-        self._jump_rate = None if rate is None else rate * counts_per_unit / NS_PER_S
-        self._times = _SampleTimes()
-        self._last: int | None = None
+        self._jumps = None if rate is None else JumpWatch(rate * counts_per_unit, _JUMP_SLACK_COUNTS, modulus)
 
     def object_read(self, stamp: Stamp, index: int, value: int) -> list[Record]:
         records: list[Record] = []
@@ -164,6 +133,11 @@ class _PositionDecoder(PdoChannelDecoder):
     def node_restarted(self) -> None:
         super().node_restarted()
         self._alarm_bits = self._warning_bits = 0
+
+    def _too_short(self, stamp: Stamp, data: bytes, needed_bits: int) -> list[Record]:
+        if self._jumps is not None:
+            self._jumps.bad(stamp)
+        return super()._too_short(stamp, data, needed_bits)
 
     def _take_extras(self, stamp: Stamp, bits: int, records: list[Record]) -> None:
         if self._alarms is not None:
@@ -190,22 +164,31 @@ class _PositionDecoder(PdoChannelDecoder):
             records.append(DeviceEvent(self.name, stamp, EventKind.WARNING, text, bits))
             self._warning_bits = bits
 
-    def _is_jump(self, within_ns: int, moved_counts: int) -> bool:
-        """Whether the joint cannot have moved so far within that time."""
-        return self._jump_rate is not None and abs(moved_counts) > self._jump_rate * within_ns + 2.0
+    def _without_value(self, stamp: Stamp, status: Status, counts: int, records: list[Record]) -> list[Record]:
+        """The records of a sample that gives no position."""
+        if self._jumps is not None:
+            self._jumps.bad(stamp)
+        records.append(Reading(self.name, stamp, None, self._unit, status, counts))
+        return records
 
-    def _jumped(self, stamp: Stamp, counts: int, before: float, after: float, records: list[Record]) -> None:
-        """A sample that no motion explains: one event, and no value, because it is not known which zero it counts from.
+    def _with_value(self, stamp: Stamp, counts: int, records: list[Record]) -> list[Record]:
+        """The records of a sample that gives a position.
 
-        The samples after it are given as the device gives them: whoever relies on the joint's zero has the event to
-        tell that it must be checked.
+        One that no motion explains is an event, and no value, because it is not known which zero it counts from. The
+        samples after it are given as the device gives them: whoever relies on the joint's zero has the event to tell
+        that it must be checked.
         """
-        text = (
-            f"position jumped from {before:.4f} to {after:.4f} {self._unit}, more than the joint can move: "
-            "a preset was written, or the encoder lost its place; check the joint's zero"
-        )
-        records.append(DeviceEvent(self.name, stamp, EventKind.PRESET_JUMP, text, counts))
-        records.append(Reading(self.name, stamp, None, self._unit, Status.OUT_OF_RANGE, counts))
+        reading = Reading(self.name, stamp, self._value(counts), self._unit, Status.OK, counts)
+        before = None if self._jumps is None else self._jumps.jumped_from(stamp, counts)
+        if before is not None:
+            records.append(jump_event(reading, self._value(int(before))))
+            reading = replace(reading, value=None, status=Status.OUT_OF_RANGE)
+        records.append(reading)
+        return records
+
+    def _value(self, counts: int) -> float:
+        """The joint's value at a position."""
+        raise NotImplementedError
 
 
 class EncoderDecoder(_PositionDecoder):
@@ -220,7 +203,7 @@ class EncoderDecoder(_PositionDecoder):
             raise DescriptionError(
                 channel.name, "units_per_revolution must be at least 1 and total_units 1 to 2**32 (a U32)"
             )
-        super().__init__(channel, POSITION, channel.units_per_revolution / 360.0)
+        super().__init__(channel, POSITION, channel.units_per_revolution / 360.0, channel.total_units)
         total = channel.total_units
         self._total = total
         self._is_power_of_two = total & (total - 1) == 0
@@ -242,26 +225,14 @@ class EncoderDecoder(_PositionDecoder):
             self._take_extras(stamp, bits, records)
         counts = bits >> self._shift & self._mask
         if self._alarm_bits or self.is_void:
-            self._last = None
-            records.append(Reading(self.name, stamp, None, self._unit, Status.DEVICE_ALARM, counts))
-            return records
-        total = self._total
-        if counts >= total:
-            records.append(Reading(self.name, stamp, None, self._unit, Status.OUT_OF_RANGE, counts))
-            return records
+            return self._without_value(stamp, Status.DEVICE_ALARM, counts, records)
+        if counts >= self._total:
+            return self._without_value(stamp, Status.OUT_OF_RANGE, counts, records)
+        return self._with_value(stamp, counts, records)
+
+    def _value(self, counts: int) -> float:
         half = self._half
-        value = ((counts - self._zero + half) % total - half) * self._deg_per_count
-        if self._jump_rate is not None:
-            within_ns = self._times.since_before(stamp)
-            last, self._last = self._last, counts
-            if last is not None:
-                moved = (counts - last + total // 2) % total - total // 2
-                if self._is_jump(within_ns, moved):
-                    before = ((last - self._zero + half) % total - half) * self._deg_per_count
-                    self._jumped(stamp, counts, before, value, records)
-                    return records
-        records.append(Reading(self.name, stamp, value, self._unit, Status.OK, counts))
-        return records
+        return ((counts - self._zero + half) % self._total - half) * self._deg_per_count
 
 
 class LinearDecoder(_PositionDecoder):
@@ -292,29 +263,18 @@ class LinearDecoder(_PositionDecoder):
             self._take_extras(stamp, bits, records)
         counts = self._position.extract_signed(bits)
         if self._alarm_bits or self.is_void:
-            self._last = None
-            records.append(Reading(self.name, stamp, None, self._unit, Status.DEVICE_ALARM, counts))
-            return records
+            return self._without_value(stamp, Status.DEVICE_ALARM, counts, records)
         if counts < 0 and self._may_be_unsigned:
             unsigned = self._position.extract(bits)
             if self._is_in_range(unsigned):
                 if self._is_in_range(counts):
                     reason = f"{unsigned} and {counts} counts both lie in range_mm: narrow it to the transducer's"
                     records.append(DecodeFailure(self.name, stamp, reason, data))
-                    records.append(Reading(self.name, stamp, None, self._unit, Status.MALFORMED, counts))
-                    return records
+                    return self._without_value(stamp, Status.MALFORMED, counts, records)
                 counts = unsigned
         if not self._is_in_range(counts):
-            records.append(Reading(self.name, stamp, None, self._unit, Status.OUT_OF_RANGE, counts))
-            return records
-        if self._jump_rate is not None:
-            within_ns = self._times.since_before(stamp)
-            last, self._last = self._last, counts
-            if last is not None and self._is_jump(within_ns, counts - last):
-                self._jumped(stamp, counts, self._value(last), self._value(counts), records)
-                return records
-        records.append(Reading(self.name, stamp, self._value(counts), self._unit, Status.OK, counts))
-        return records
+            return self._without_value(stamp, Status.OUT_OF_RANGE, counts, records)
+        return self._with_value(stamp, counts, records)
 
     def _value(self, counts: int) -> float:
         return (counts - self._zero) * self._nm_per_count / 1e6

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
 NS_PER_S = 1_000_000_000
+
+_TIGHT_NS = 20_000  # three readings of clocks within this were not interrupted; they take a tenth of it
+_READINGS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,15 +23,21 @@ class Stamp:
         utc_ns: nanoseconds since 1970-01-01 UTC; may step when the host's clock is set.
         monotonic_ns: nanoseconds of the host's monotonic clock; never steps, restarts at boot.
         boot_id: which boot `monotonic_ns` belongs to.
+        is_doubtful: what is stamped may have happened long before or after; nothing may rely on its time.
     """
 
     utc_ns: int
     monotonic_ns: int
     boot_id: str
+    is_doubtful: bool = False
 
     def shifted(self, nanoseconds: int) -> Stamp:
         """The instant `nanoseconds` later (negative: earlier) on the same clocks."""
-        return Stamp(self.utc_ns + nanoseconds, self.monotonic_ns + nanoseconds, self.boot_id)
+        return Stamp(self.utc_ns + nanoseconds, self.monotonic_ns + nanoseconds, self.boot_id, self.is_doubtful)
+
+    def doubted(self) -> Stamp:
+        """The same instant, marked as doubtful."""
+        return replace(self, is_doubtful=True)
 
     def since(self, earlier: Stamp) -> int:
         """Nanoseconds from `earlier` to this instant: monotonic within one boot, UTC from one boot to another."""
@@ -54,6 +64,13 @@ class Clock(Protocol):
     def real_seconds(self, seconds: float) -> float:
         """How long `seconds` of this clock last on the wall: the time-out to give to an operating-system call."""
 
+    @property
+    def host(self) -> Clock:
+        """The host's own clocks, by which the kernel stamps what it receives."""
+
+    def of_host(self, stamp: Stamp) -> Stamp:
+        """What this clock shows at an instant of the host's clocks."""
+
 
 def read_boot_id() -> str:
     """The kernel's boot identifier (Linux, random(4)); "unknown" where there is none."""
@@ -64,16 +81,38 @@ def read_boot_id() -> str:
 
 
 class SystemClock:
-    """The host's clocks."""
+    """The host's clocks.
 
-    def __init__(self) -> None:
+    Args:
+        utc_ns, monotonic_ns: read them.
+    """
+
+    def __init__(
+        self, utc_ns: Callable[[], int] = time.time_ns, monotonic_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self._utc_ns = utc_ns
+        self._monotonic_ns = monotonic_ns
         self._boot_id = read_boot_id()
 
     def now(self) -> Stamp:
-        return Stamp(time.time_ns(), time.monotonic_ns(), self._boot_id)
+        """This instant on all three clocks.
+
+        A thread can be interrupted between the readings of two clocks, for as long as the computer is busy. UTC is
+        therefore read between two readings of the monotonic clock, and again if they lie apart; of several the tightest
+        counts.
+        """
+        tightest_ns, ahead_ns = 1 << 63, 0
+        after_ns = self._monotonic_ns()
+        for _ in range(_READINGS):
+            before_ns, utc_ns, after_ns = after_ns, self._utc_ns(), self._monotonic_ns()
+            if after_ns - before_ns < tightest_ns:
+                tightest_ns, ahead_ns = after_ns - before_ns, utc_ns - (before_ns + after_ns) // 2
+                if tightest_ns <= _TIGHT_NS:
+                    break
+        return Stamp(after_ns + ahead_ns, after_ns, self._boot_id)
 
     def monotonic_ns(self) -> int:
-        return time.monotonic_ns()
+        return self._monotonic_ns()
 
     def sleep(self, seconds: float) -> None:
         time.sleep(seconds)
@@ -83,6 +122,13 @@ class SystemClock:
 
     def real_seconds(self, seconds: float) -> float:
         return seconds
+
+    @property
+    def host(self) -> Clock:
+        return self
+
+    def of_host(self, stamp: Stamp) -> Stamp:
+        return stamp
 
 
 class ScaledClock:
@@ -102,13 +148,16 @@ class ScaledClock:
         self.rate = rate
         self.origin = origin
         self._real_origin_ns = origin.monotonic_ns if real_origin_ns is None else real_origin_ns
+        self._host = SystemClock()
 
     def now(self) -> Stamp:
         return self.origin.shifted(self.monotonic_ns() - self.origin.monotonic_ns)
 
     def monotonic_ns(self) -> int:
-        elapsed_ns = time.monotonic_ns() - self._real_origin_ns
-        return self.origin.monotonic_ns + int(elapsed_ns * self.rate)
+        return self._at(time.monotonic_ns())
+
+    def _at(self, real_ns: int) -> int:
+        return self.origin.monotonic_ns + int((real_ns - self._real_origin_ns) * self.rate)
 
     def sleep(self, seconds: float) -> None:
         time.sleep(seconds / self.rate)
@@ -118,6 +167,14 @@ class ScaledClock:
 
     def real_seconds(self, seconds: float) -> float:
         return seconds / self.rate
+
+    @property
+    def host(self) -> Clock:
+        return self._host
+
+    def of_host(self, stamp: Stamp) -> Stamp:
+        scaled = self.origin.shifted(self._at(stamp.monotonic_ns) - self.origin.monotonic_ns)
+        return scaled.doubted() if stamp.is_doubtful else scaled
 
 
 class ManualClock:
@@ -129,6 +186,7 @@ class ManualClock:
 
     def __init__(self, start: Stamp = Stamp(1_700_000_000 * NS_PER_S, NS_PER_S, "manual")) -> None:
         self._now = start
+        self._host = SystemClock()
         self._lock = threading.Lock()
 
     def now(self) -> Stamp:
@@ -157,3 +215,10 @@ class ManualClock:
 
     def real_seconds(self, seconds: float) -> float:  # noqa: ARG002 - no real time passes
         return 0.0
+
+    @property
+    def host(self) -> Clock:
+        return self._host
+
+    def of_host(self, stamp: Stamp) -> Stamp:
+        return self._now.doubted() if stamp.is_doubtful else self._now

@@ -10,6 +10,7 @@ from drivers.can_channel import too_short, value_reading
 from drivers.canframe import DATA_MAX
 from drivers.clock import NS_PER_S, Stamp
 from drivers.errors import DescriptionError
+from drivers.jumps import checked_reading, joint_watch
 from drivers.readings import Gap, GapReason, Reading, Record, Status
 
 _FLOATS = {16: ("<e", 2), 32: ("<f", 4), 64: ("<d", 8)}
@@ -98,6 +99,7 @@ class SignalChannel:
         counter: a message counter in the same frame that rises by one with every frame.
         multiplexing: when the signal is there; None: always.
         timeout_s: silent for longer than this is a gap.
+        max_rate_per_s: fastest motion of the joint in units per second; None: jumps are not looked for.
     """
 
     name: str
@@ -118,6 +120,7 @@ class SignalChannel:
     counter: BitField | None = None
     multiplexing: Multiplexing | None = None
     timeout_s: float = 1.0
+    max_rate_per_s: float | None = None
 
 
 class SignalDecoder:
@@ -147,6 +150,8 @@ class SignalDecoder:
         self._not_available = _not_available(channel)
         self._error_prefix = _ErrorPrefix(channel.field) if channel.is_j1939 and not channel.field.is_signed else None
         self._last: tuple[Stamp, int] | None = None
+        step = 0.0 if channel.is_float else channel.factor * channel.scale
+        self._jumps = joint_watch(channel.max_rate_per_s, step, channel.unit)
 
     def decode(self, stamp: Stamp, data: bytes) -> list[Record]:
         records: list[Record] = []
@@ -162,8 +167,8 @@ class SignalDecoder:
         unsigned = self._field.extract(data)
         if unsigned is None:
             return records + too_short(self.name, self._unit, stamp, data, self._field.end_bit)
-        records.append(self._reading(stamp, unsigned))
-        return records
+        reading = self._reading(stamp, unsigned)
+        return records + (checked_reading(self._jumps, reading) if self._jumps is not None else [reading])
 
     def _reading(self, stamp: Stamp, unsigned: int) -> Reading:
         channel = self._channel

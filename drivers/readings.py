@@ -21,7 +21,7 @@ class CanCapture:
 
     Attributes:
         link: name of the CAN link.
-        stamp: when the frame was received or sent.
+        stamp: when the frame was received or sent; marked as doubtful where it may have been received long before.
         arbitration_id: 11-bit, or 29-bit if `is_extended`; the error class bits of SocketCAN if `is_error`.
         data: 0 to 8 bytes.
         is_extended, is_remote, is_error: the frame's flags.
@@ -44,7 +44,8 @@ class SerialCapture:
 
     Attributes:
         link: name of the serial link.
-        stamp: the instant just after the read returned (the last byte had arrived), or just before the write.
+        stamp: the instant just after the read returned (the last byte had arrived), or just before the write; marked
+            as doubtful where the bytes may have arrived long before.
         data: at least one byte.
         is_transmitted: rigcal sent them.
     """
@@ -66,6 +67,7 @@ class Status(StrEnum):
     OUT_OF_RANGE = "out_of_range"  # beyond the device's measuring range or the signal's declared range
     DEVICE_ALARM = "device_alarm"  # the device reports an alarm (6503h, EMCY) that makes its value void
     MALFORMED = "malformed"  # arrived, could not be decoded; a DecodeFailure says why
+    TIME_DOUBTFUL = "time_doubtful"  # nothing else is wrong, but it was read late: when it was measured is not known
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,6 +157,7 @@ class EventKind(StrEnum):
     BUS_OFF = "bus_off"
     BUS_ERROR = "bus_error"  # a protocol violation on the wire; error counters not yet beyond a limit
     FRAMES_DROPPED = "frames_dropped"  # the kernel, the adapter or a full queue lost frames
+    TIME_DOUBTFUL = "time_doubtful"  # captures are stored, but when they were received is not known
     BOOT_UP = "boot_up"
     NMT_STATE = "nmt_state"
     HEARTBEAT_LOST = "heartbeat_lost"
@@ -167,9 +170,11 @@ class EventKind(StrEnum):
     CONFIGURED = "configured"
     LOCK_ACQUIRED = "lock_acquired"
     LOCK_LOST = "lock_lost"
-    PRISM_JUMP = "prism_jump"  # the station's target jumped: it follows another prism
+    PRISM_JUMP = "prism_jump"  # the station's target jumped: it may follow another prism
+    PRISM_CONFIRMED = "prism_confirmed"  # an operator says that the station is on the prism that is meant
     STATION_SILENT = "station_silent"
     INSTRUMENT_ERROR = "instrument_error"
+    CLOCK_STEP = "clock_step"  # the computer's clock was set; the code is by how many milliseconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,6 +219,7 @@ class GapReason(StrEnum):
     SILENT = "silent"  # the device is there no more, or was never
     LINK_DOWN = "link_down"
     FRAMES_LOST = "frames_lost"  # sequence or rate shows that some did not arrive
+    TIME_DOUBTFUL = "time_doubtful"  # captures are stored, but none of them may be used: their time is not known
     LOCK_LOST = "lock_lost"
     NOT_RUNNING = "not_running"  # the daemon itself was not there
 

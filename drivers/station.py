@@ -5,14 +5,16 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from dataclasses import replace
 from typing import Literal, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from drivers.attendance import NOT_READ_IN_TIME, Attendance
+from drivers.attendance import NOT_READ_IN_TIME, Attendance, DoubtReport
 from drivers.bytestream import ByteTimes, Frame, Framer, Garbage
 from drivers.clock import NS_PER_S, Clock, Stamp
 from drivers.conversation import Conversation, Timing
+from drivers.device_watch import DeviceWatch, watch_path
 from drivers.errors import LinkError
 from drivers.readings import (
     Capture,
@@ -25,13 +27,14 @@ from drivers.readings import (
     LinkItem,
     Record,
     SerialCapture,
+    Status,
 )
 from drivers.serialport import SerialConfig, SerialPort
 from drivers.sokkia.conversation import set_conversation
 from drivers.sokkia.interpreter import SetInterpreter
-from drivers.sokkia.set import SetFramer
-from drivers.survey import RecordError, position_mm
-from drivers.target import JumpGuard, LockWatch, MotionLimit, SilenceWatch
+from drivers.sokkia.set import TRACKING, SetFramer
+from drivers.survey import RecordError, position_mm, range_checked
+from drivers.target import LockWatch, SilenceWatch
 from drivers.topcon.codec import GtsFramer
 from drivers.topcon.conversation import classic_conversation, tracking_conversation
 from drivers.topcon.interpreter import GtsInterpreter
@@ -43,8 +46,8 @@ _LONGEST_READ_S = 0.5  # how soon a loop with nothing to do notices that it is t
 _LONGEST_WRITE_S = 5.0
 _SET_PAUSE_S = 0.7  # SET600: the next command comes this long after ACK or NAK
 _UNFINISHED_NS = 2 * NS_PER_S  # an unfinished record is given up after this; the slowest takes 0.6 s at 1200 baud
-_FIRST_RETRY_S = 0.5
-_LAST_RETRY_S = 10.0
+_FIRST_PAUSE_S = 0.5
+_LAST_PAUSE_S = 2.0  # a device is back for no longer than this before it is opened, also where nothing can be watched
 
 Emit = Callable[[LinkItem], None]
 
@@ -67,7 +70,12 @@ class StationConfig(BaseModel):
         link_delay_s: constant delay from the measurement to the first byte on the host. Fixes do not contain it; who
             joins them with the joints takes it off.
         ack_timeout_s, reply_timeout_s, give_up_s, relock_after_s: see `drivers.conversation.Timing`.
-        max_speed_m_s, jump_slack_m, new_target_after_s: see `drivers.target.MotionLimit`.
+        max_speed_m_s, jump_slack_m, relock_within_m: a target that moves by more than the first two allow from one fix
+            to the next may be another prism, and so may one that is locked, after the prism was lost, further than the
+            third from where that was. In a session such fixes do not count until the station is back or an operator
+            confirms the prism.
+        max_range_m: a fix further away is refused. The default is the longest that distance meters of these families
+            measure to a single prism, under good conditions.
         silence_timeout_s: no record for longer than this is a gap; 0 for a station that speaks when it is told to.
         ppm_scale, prism_scale_mm: see `drivers.topcon.records.CorrectionScales`.
     """
@@ -89,10 +97,21 @@ class StationConfig(BaseModel):
     relock_after_s: float = Field(default=30.0, gt=0)
     max_speed_m_s: float = Field(default=5.0, gt=0)
     jump_slack_m: float = Field(default=0.1, gt=0)
-    new_target_after_s: float = Field(default=30.0, gt=0)
-    silence_timeout_s: float = Field(default=5.0, ge=0)
+    relock_within_m: float = Field(default=2.0, gt=0)
+    max_range_m: float = Field(default=6000.0, gt=0)
+    silence_timeout_s: float = Field(default=4.0, ge=0)
     ppm_scale: float = Field(default=0.1, gt=0)
     prism_scale_mm: float = Field(default=0.1, gt=0)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_prism_is_accepted_by_time(cls, given: object) -> object:
+        if isinstance(given, dict) and "new_target_after_s" in given:
+            raise ValueError(
+                "new_target_after_s is gone, remove it: another prism is never taken for the one that is meant because "
+                "time has passed; `rigcal session confirm-prism` says that it is"
+            )
+        return given
 
     @field_validator("init")
     @classmethod
@@ -112,6 +131,11 @@ class StationConfig(BaseModel):
     def is_sokkia(self) -> bool:
         """Whether the station's records are those of the SET family."""
         return self.profile == "sokkia_set" or (self.profile == "passive" and self.listen_to == "sokkia")
+
+    @property
+    def tracks_silently(self) -> bool:
+        """Whether the station follows its prism by itself although its records say nothing of its lock."""
+        return self.is_sokkia and TRACKING.decode() in self.init
 
 
 def start_conversation(config: StationConfig) -> Conversation | None:
@@ -156,49 +180,65 @@ class StationLink:
 
         Emits captures at once, LINK_UP, LINK_LOST, CONFIGURED and INSTRUMENT_ERROR events, and the LINK_DOWN gap.
         """
-        retry_s = _FIRST_RETRY_S
-        opened: Stamp | None = None
+        with closing(watch_path(self._config.serial.path)) as watch:
+            self._run(watch, emit, stop)
+
+    def _run(self, watch: DeviceWatch, emit: Emit, stop: threading.Event) -> None:
+        pause_s = _FIRST_PAUSE_S
         down_since: Stamp | None = None
         told = ""
         while not stop.is_set():
+            opened: Stamp | None = None
             try:
                 port = SerialPort(self._config.serial, self.name, self._clock.real_seconds(_LONGEST_WRITE_S))
                 with closing(port):
+                    watch.close()
                     self._tell(emit, EventKind.LINK_UP, f"{self._config.serial.path} opened")
                     if down_since is not None:
                         emit(Gap(self.name, GapReason.LINK_DOWN, down_since, self._clock.now()))
                     down_since, told, opened = None, "", self._clock.now()
                     self._converse(port, emit, stop)
             except LinkError as error:
-                if opened is not None and self._clock.now().since(opened) > _LAST_RETRY_S * NS_PER_S:
-                    retry_s = _FIRST_RETRY_S  # a port that fails as soon as it is open is tried ever more rarely
-                opened = None
                 if down_since is None:
                     down_since = self._clock.now()
                     emit(Gap(self.name, GapReason.LINK_DOWN, down_since))
                 if str(error) != told:  # once a cause, not once an attempt
                     told = str(error)
                     self._tell(emit, EventKind.LINK_LOST, told)
-                self._clock.wait(stop, retry_s)
-                retry_s = min(2 * retry_s, _LAST_RETRY_S)
+                is_short_lived = opened is not None and self._clock.now().since(opened) < _LAST_PAUSE_S * NS_PER_S
+                if opened is not None and not is_short_lived:
+                    pause_s = _FIRST_PAUSE_S
+                real_s = min(pause_s, self._clock.real_seconds(pause_s))
+                if is_short_lived:
+                    stop.wait(real_s)  # it comes and goes by itself: to try whenever it comes would be to spin
+                else:
+                    watch.wait(stop, real_s)
+                pause_s = min(2 * pause_s, _LAST_PAUSE_S)
 
     def _converse(self, port: SerialPort, emit: Emit, stop: threading.Event) -> None:
+        doubts = DoubtReport(self.name, "bytes", self._clock.now())
+        try:
+            self._listen(port, emit, stop, doubts)
+        finally:
+            for item in doubts.end(self._clock.now()):
+                emit(item)
+
+    def _listen(self, port: SerialPort, emit: Emit, stop: threading.Event, doubts: DoubtReport) -> None:
         conversation = start_conversation(self._config)
-        attendance, late = Attendance(self._clock), 0
+        attendance = Attendance(self._clock)
         while not stop.is_set():
             wait_s = _LONGEST_READ_S if conversation is None else self._speak(port, conversation, emit)
             patience_s = self._clock.real_seconds(wait_s)
             data = port.read(patience_s)
             stamp = self._clock.now()
             if attendance.is_late(stamp, patience_s):
-                late += len(data)
+                stamp = stamp.doubted()
+                doubts.doubt(len(data), NOT_READ_IN_TIME)
             else:
-                if late:
-                    self._tell(emit, EventKind.FRAMES_DROPPED, f"{late} bytes lost, {NOT_READ_IN_TIME}")
-                    emit(Gap(self.name, GapReason.FRAMES_LOST, attendance.left, stamp))
-                    late = 0
-                if data:
-                    emit(SerialCapture(self.name, stamp, data))
+                for item in doubts.trust(stamp):
+                    emit(item)
+            if data:
+                emit(SerialCapture(self.name, stamp, data))
             if data and conversation is not None:
                 conversation.feed(data, stamp.monotonic_ns)
         if conversation is not None:
@@ -234,9 +274,9 @@ class Interpreter(Protocol):
 class StationDecoder:
     """Captures of a station's link to fixes, events, gaps and failures (`drivers.readings.Decoder`).
 
-    A fix is stamped with the arrival of its first byte. Transmitted captures yield nothing; an answer arrives after
-    them. What the passing of time alone causes is stamped with the instant at which it was due, so records do not
-    depend on how often `tick` is called.
+    A fix is stamped with the arrival of its first byte; where that is doubtful, the fix may not be used. Transmitted
+    captures yield nothing; an answer arrives after them. What the passing of time alone causes is stamped with the
+    instant at which it was due, so records do not depend on how often `tick` is called.
 
     Args:
         config: the station, as its link has it.
@@ -252,9 +292,7 @@ class StationDecoder:
         )
         self._times = ByteTimes(config.serial.character_s)
         self._lock = LockWatch(config.name)
-        self._guard = JumpGuard(
-            config.name, MotionLimit(config.max_speed_m_s, config.jump_slack_m, config.new_target_after_s)
-        )
+        self._max_range_m = config.max_range_m
         self._silence = SilenceWatch(config.name, config.silence_timeout_s)
         self._last_byte: Stamp | None = None
 
@@ -293,9 +331,15 @@ class StationDecoder:
         records: list[Record] = []
         for record in said:
             if isinstance(record, Fix):
-                fix, jump = self._guard.see(record)
-                records += [*self._silence.heard(record), *self._lock.see(record)]
-                records += [fix] if jump is None else [jump, fix]
+                fix = range_checked(_without_time(record) if first.is_doubtful else record, self._max_range_m)
+                records += [*self._silence.heard(fix), *self._lock.see(fix), fix]
             else:
                 records.append(record)
         return records
+
+
+def _without_time(fix: Fix) -> Fix:
+    """A fix whose bytes were read late: it may not be used, because it is not known when it was measured."""
+    if fix.status is not Status.OK:
+        return fix
+    return replace(fix, status=Status.TIME_DOUBTFUL, reason=f"its time is doubtful: {NOT_READ_IN_TIME}")

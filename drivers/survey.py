@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Literal
 
 from drivers.readings import Fix, Status
@@ -75,6 +76,28 @@ def check_horizontal_distance(slope_m: float, zenith_angle_rad: float, horizonta
             f"horizontal distance {horizontal_m:.4f} m contradicts slope distance and zenith angle, which give "
             f"{computed_m:.4f} m"
         )
+
+
+def range_checked(fix: Fix, max_range_m: float) -> Fix:
+    """The fix; out of range when it lies further away than the instrument can measure.
+
+    A three-digit XOR lets pairs of bit errors pass, and coordinates carry no redundant digits at all.
+    """
+    if fix.status is not Status.OK:
+        return fix
+    if fix.slope_distance_m is not None:
+        if fix.slope_distance_m <= max_range_m:
+            return fix
+        reason = f"slope distance {fix.slope_distance_m:.3f} m is beyond max_range_m = {max_range_m:g}"
+    else:
+        away_m = math.hypot(fix.north_m or 0.0, fix.east_m or 0.0, fix.up_m or 0.0)
+        if away_m <= max_range_m:
+            return fix
+        reason = (
+            f"coordinates {away_m:.3f} m from their origin are beyond max_range_m = {max_range_m:g}: set the station's "
+            "own coordinates to 0 on the instrument"
+        )
+    return replace(fix, status=Status.OUT_OF_RANGE, reason=reason)
 
 
 def position_mm(fix: Fix) -> tuple[float, float, float] | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import secrets
 import signal
@@ -23,6 +24,9 @@ from simulators.rigs import load_rig
 from simulators.secret import Envelope, draw_secret
 from simulators.total_station import StationSettings
 from simulators.truth import RigTruth, replace_effects
+from simulators.wire_log import WireLog
+
+MAP_HELP = "what a commissioned node's TPDO carries, as hexadecimal words of object 1A00h: 38:60040020+65050010"
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -40,6 +44,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--faults", default="", help="scripted faults: KIND@SECONDS[:NAME=VALUE...],...")
     add("--random-faults", type=float, metavar="SECONDS", help="further faults at this mean interval")
     add("--bus-master", choices=("machine", "host"), default="machine", help="who starts the nodes and sends SYNC")
+    add("--map", action="append", default=[], type=_mapping, metavar="NODE:WORD+WORD...", help=MAP_HELP)
     add("--sync-ms", type=float, default=50.0, help="the machine's SYNC interval")
     add("--signal-ms", type=float, default=10.0, help="cycle of the machine's own signals")
     add("--setup", default="", help="name of the station set-up: decides where the machine stands")
@@ -47,7 +52,16 @@ def _parser() -> argparse.ArgumentParser:
     add("--baud", type=int, default=9600, help="of the station's line")
     add("--latency-ms", type=float, default=20.0, help="how old a measurement is when its record starts")
     add("--push-s", type=float, help="the station sends records unasked at this interval")
+    add("--wire-log", type=Path, metavar="FILE", help="append what the rig puts on its links and measures to this file")
     return parser
+
+
+def _mapping(text: str) -> tuple[int, tuple[int, ...]]:
+    try:
+        node, words = text.split(":")
+        return int(node), tuple(int(word, 16) for word in words.split("+"))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not NODE:WORD+WORD...") from None
 
 
 def _origin(text: str) -> Stamp:
@@ -77,6 +91,7 @@ def _build(options: argparse.Namespace) -> tuple[RigSimulator, Envelope | None]:
         signal_period_s=options.signal_ms / 1e3,
         station=station,
         setup=options.setup,
+        mappings=dict(options.map),
     )
     effects = parse_effects(options.effects)
     truth = RigTruth(load_rig(options.rig), options.seed, perturbation=options.perturbation, effects=effects)
@@ -107,22 +122,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
-    try:
-        simulator, envelope = _build(options)
-        live = LiveRig(simulator, ScaledClock(options.rate, origin), options.can_port, options.station_port, print_line)
-    except (RigError, ValueError, OSError) as error:
-        sys.stderr.write(f"simulators: {error}\n")
-        return 2
-    if envelope is not None:
-        envelope.begin(live.begin.utc_ns)
-    try:
-        live.run(sys.stdin.fileno(), wake_read)
-    except BrokenPipeError:  # nobody listens to the answers any more
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    finally:
-        live.close()
+    with contextlib.ExitStack() as stack:
+        try:
+            log = None if options.wire_log is None else stack.enter_context(WireLog(options.wire_log))
+            simulator, envelope = _build(options)
+            clock = ScaledClock(options.rate, origin)
+            live = LiveRig(simulator, clock, options.can_port, options.station_port, print_line, log)
+        except (RigError, ValueError, OSError) as error:
+            sys.stderr.write(f"simulators: {error}\n")
+            return 2
         if envelope is not None:
-            envelope.open()
+            envelope.begin(live.begin.utc_ns)
+        try:
+            live.run(sys.stdin.fileno(), wake_read)
+        except BrokenPipeError:  # nobody listens to the answers any more
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        finally:
+            live.close()
+            if envelope is not None:
+                envelope.open()
     return 0
 
 

@@ -6,6 +6,7 @@ Sans-IO: frames and the time go in, frames come out. Times are simulated seconds
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from enum import IntEnum
 from functools import partial
 
@@ -106,8 +107,16 @@ class CanopenNode:
             data = code.to_bytes(2, "little") + bytes([self._error_register]) + manufacturer[:5].ljust(5, b"\0")
             self._out.append(Frame(0x80 + self.node, data))
 
-    def commission(self, *, sync: bool, pdo: int, period_ms: int, heartbeat_ms: int) -> None:
-        """Set and store what a fitter sets at the first start: one TPDO on SYNC or on its timer, the others off."""
+    def commission(
+        self, *, sync: bool, pdo: int, period_ms: int, heartbeat_ms: int, mapping: Sequence[int] = ()
+    ) -> None:
+        """Set and store what a fitter sets at the first start: one TPDO on SYNC or on its timer, the others off.
+
+        Args:
+            sync, pdo, period_ms: the TPDO that is on, and when it is sent.
+            heartbeat_ms: producer time.
+            mapping: what that TPDO carries, as words of object 1A00h; what the factory has mapped if there are none.
+        """
         for tpdo in self.tpdos:
             index, wanted = 0x1800 + tpdo.number - 1, tpdo.number == pdo
             cob_id = self.dictionary.value(index, 1) & 0x7FFFFFFF
@@ -115,6 +124,8 @@ class CanopenNode:
             if wanted:
                 self.dictionary.put(index, 2, 1 if sync else 254)
                 self.dictionary.put(index, 5, 0 if sync else period_ms)
+                for sub, word in enumerate((len(mapping), *mapping) if mapping else ()):
+                    self.dictionary.put(0x1A00 + tpdo.number - 1, sub, word)
         self.dictionary.put(0x1017, 0, heartbeat_ms)
         self._stored = self.dictionary.stored()
 

@@ -6,6 +6,7 @@
     {"do": "truth", "prism": "r", "pose": {...}, "columns": {...}}  -> {"event": "truth", "x_mm": ..., ...}
     {"do": "control_points"}                                        -> {"event": "control_points", "points": {...}}
     {"do": "poses", "n": 5, "seed": 1}                              -> {"event": "poses", "poses": [{...}, ...]}
+    {"do": "tracked"}                                               -> {"event": "tracked", "target": "r" or null}
     {"do": "quit"}                                                  -> {"event": "bye"}
 
 What cannot be done is answered by {"event": "error", "text": ...}.
@@ -46,6 +47,7 @@ class Control:
             "truth": self._truth,
             "control_points": self._control_points,
             "poses": self._poses,
+            "tracked": self._tracked,
             "quit": self._quit,
         }
 
@@ -105,6 +107,10 @@ class Control:
         if seed < 0:
             raise ValueError(f"poses: seed = {seed}; it must not be negative")
         return {"event": "poses", "poses": self._simulator.machine.random_poses(n, seed)}
+
+    def _tracked(self, command: Message, now_s: float) -> Message:
+        del command
+        return {"event": "tracked", "target": self._simulator.station.tracker.target(now_s)}
 
     def _quit(self, command: Message, now_s: float) -> Message:
         del command, now_s

@@ -14,6 +14,7 @@ from simulators.control import Control
 from simulators.pty_port import PtyPort
 from simulators.rig_simulator import Output, RigSimulator
 from simulators.slcan_adapter import Channel, SlcanAdapter
+from simulators.wire_log import WireLog
 
 _SHORTEST_SLEEP_S = 0.001  # real: finer would only cost
 _LONGEST_SLEEP_S = 0.5
@@ -31,6 +32,7 @@ class LiveRig:
         clock: the time that it shares with whoever listens.
         can_port, station_port: where the ports appear.
         send: takes each answer and event.
+        log: takes what the rig puts on its links; None: nobody asks.
 
     Raises:
         OSError: a port cannot be made.
@@ -43,6 +45,7 @@ class LiveRig:
         can_port: Path,
         station_port: Path,
         send: Callable[[Mapping[str, object]], None],
+        log: WireLog | None = None,
     ) -> None:
         self._simulator, self._clock, self._send = simulator, clock, send
         self.begin = clock.now()
@@ -56,6 +59,9 @@ class LiveRig:
         self._replug: dict[PtyPort, float] = {}
         self._control = Control(simulator)
         self._lines = bytearray()
+        self._log = log
+        if log is not None:
+            simulator.station.on_measured = self._log_measured
 
     def close(self) -> None:
         """Take both ports away."""
@@ -64,6 +70,15 @@ class LiveRig:
 
     def _now_s(self) -> float:
         return (self._clock.monotonic_ns() - self.begin.monotonic_ns) / NS_PER_S
+
+    def _monotonic_ns(self, at_s: float) -> int:
+        return self.begin.monotonic_ns + round(at_s * NS_PER_S)
+
+    def _log_measured(self, target: str, at_s: float) -> None:
+        assert self._log is not None
+        machine = self._simulator.machine
+        place = self._simulator.in_instrument_frame_mm(machine.place_mm(target, at_s))
+        self._log.measured(self._monotonic_ns(at_s), target, place, machine.motion.values(at_s))
 
     def run(self, commands: int, wake: int) -> None:
         """Run until the commands end (`quit`, end of file) or a byte arrives at `wake`.
@@ -113,6 +128,10 @@ class LiveRig:
         self._simulator.receive_station(self._station.read(), now_s)
 
     def _speak(self, output: Output, now_s: float) -> None:
+        if self._log is not None:
+            at_ns = self._monotonic_ns(now_s)
+            self._log.frames(at_ns, output.frames)
+            self._log.station(at_ns, output.station)
         self._can.write(b"".join(self._adapter.encode(frame) for frame in output.frames))
         self._station.write(output.station)
         for event in output.events:
@@ -120,14 +139,19 @@ class LiveRig:
                 port = self._can if event["link"] == "can" else self._station
                 port.unplug()
                 self._replug[port] = now_s + float(str(event["seconds"]))
-            self._send(event)
+            self._tell(event, now_s)
         for port, at_s in list(self._replug.items()):
             if now_s >= at_s:
                 del self._replug[port]
                 if port is self._can:
                     self._adapter = SlcanAdapter()
                 port.plug()
-                self._send({"event": "plugged", "link": "can" if port is self._can else "station"})
+                self._tell({"event": "plugged", "link": "can" if port is self._can else "station"}, now_s)
+
+    def _tell(self, event: Mapping[str, object], now_s: float) -> None:
+        if self._log is not None:
+            self._log.event(self._monotonic_ns(now_s), event)
+        self._send(event)
 
 
 def print_line(message: Mapping[str, object]) -> None:

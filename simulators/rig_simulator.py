@@ -56,6 +56,8 @@ class SimulatorSettings:
         signal_period_s: cycle of the machine controller's signals; machine.dbc says 10 ms.
         station: the instrument.
         setup: station set-up, decides where the machine stands.
+        mappings: node -> what its TPDO carries where the machine has commissioned it otherwise than the factory, as
+            words of object 1A00h.
     """
 
     bus_master: Literal["machine", "host"] = "machine"
@@ -63,6 +65,7 @@ class SimulatorSettings:
     signal_period_s: float = 0.01
     station: StationSettings = field(default_factory=StationSettings)
     setup: str = ""
+    mappings: Mapping[int, Sequence[int]] = field(default_factory=dict)
 
 
 @dataclass
@@ -110,7 +113,7 @@ class RigSimulator:
         self.settings = settings = settings or SimulatorSettings()
         rig = truth.rig
         self.machine = Machine(truth, seed, BoomMotion(rig, start), setup=settings.setup)
-        self.nodes = _nodes(rig, self.machine, seed, commissioned=settings.bus_master == "machine")
+        self.nodes = _nodes(rig, self.machine, seed, settings.mappings if settings.bus_master == "machine" else None)
         self.station = _station(rig, self.machine, seed, settings.station)
         self.signals = _signals(rig, self.machine, seed, settings.signal_period_s)
         self.faults = FaultSchedule()
@@ -231,7 +234,10 @@ class RigSimulator:
         return min([*self._due, arrival, self.station.next_deadline(), self.faults.next_deadline()])
 
 
-def _nodes(rig: Rig, machine: Machine, seed: int, *, commissioned: bool) -> tuple[CanopenNode, ...]:
+def _nodes(
+    rig: Rig, machine: Machine, seed: int, mappings: Mapping[int, Sequence[int]] | None
+) -> tuple[CanopenNode, ...]:
+    """The nodes, fresh from the factory if there are no mappings, else commissioned with them."""
     nodes: list[CanopenNode] = []
     for number, channel in enumerate(rig.channels):
         serial = 100_000 + 1000 * (seed % 1000) + number
@@ -245,12 +251,13 @@ def _nodes(rig: Rig, machine: Machine, seed: int, *, commissioned: bool) -> tupl
             node = linear_of(channel, source, serial)
         else:
             node = pressure_of(channel, source, serial)
-        if commissioned:
+        if mappings is not None:
             node.commission(
                 sync=channel.mode == "sync",
                 pdo=channel.pdo,
                 period_ms=channel.period_ms,
                 heartbeat_ms=channel.heartbeat_ms,
+                mapping=mappings.get(channel.node, ()),
             )
         nodes.append(node)
     return tuple(sorted(nodes, key=lambda n: n.node))

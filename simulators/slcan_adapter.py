@@ -2,7 +2,8 @@
 
 Commands end with CR; CR answers "done", BEL answers "refused". O opens, L opens listen-only (nothing may be sent),
 C closes, Sn sets the bit rate, sxxyy the bit timing registers, t/T/r/R send, F reads the status, V and N identify.
-Sans-IO. (CAN232 manual, Lawicel AB)
+Unasked it tells of errors on the bus: sbRRRTTT of the controller's state (active, warning, passive, bus-off) with its
+counters, eNccc of N errors. Sans-IO. (CAN232 manual, Lawicel AB; error lines: Linux, drivers/net/can/slcan)
 """
 
 from __future__ import annotations
@@ -15,6 +16,14 @@ OK = b"\r"
 REFUSED = b"\a"
 BIT_RATES = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000, 83_300)
 _LONGEST_COMMAND = 64
+# SocketCAN error frames (linux/can/error.h): class bits and data[1] -> the adapter's line
+_ERROR_LINES = {
+    (0x004, 0x04): b"sw000000\r",
+    (0x004, 0x10): b"sp000000\r",
+    (0x004, 0x40): b"sa000000\r",
+    (0x040, 0x00): b"sb000000\r",
+    (0x020, 0x00): b"e1a\r",
+}
 
 
 class Channel(Enum):
@@ -67,8 +76,10 @@ class SlcanAdapter:
 
     def encode(self, frame: Frame) -> bytes:
         """A frame on the bus as the host gets it; nothing while the channel is closed or set to another bit rate."""
-        if self.channel is Channel.CLOSED or frame.is_error or self._bit_rate != self._bus_bit_rate:
+        if self.channel is Channel.CLOSED or self._bit_rate != self._bus_bit_rate:
             return b""
+        if frame.is_error:
+            return _ERROR_LINES.get((frame.arbitration_id, frame.data[1]), b"")
         head = f"{frame.arbitration_id:08X}" if frame.is_extended else f"{frame.arbitration_id:03X}"
         if frame.is_remote:
             return f"{'R' if frame.is_extended else 'r'}{head}{len(frame.data)}\r".encode("ascii")

@@ -55,11 +55,16 @@ class TrackerSettings:
 
 @dataclass(frozen=True)
 class Pointing:
-    """A direction, and the distance along it if there is an echo: deg from north, deg from up, mm."""
+    """A direction, and the distance along it if there is an echo: deg from north, deg from up, mm.
+
+    Attributes:
+        target: what echoes.
+    """
 
     hz_deg: float
     zenith_deg: float
     range_mm: float | None
+    target: str | None = None
 
 
 class Tracker:
@@ -179,7 +184,7 @@ class Tracker:
         circle = math.degrees(noise.angle_sigma_arcsec * ARCSEC)
         sigma_mm = noise.distance_sigma_mm + noise.distance_sigma_ppm * 1e-6 * range_mm
         e_hz, e_zenith, e_range = rng.normal(0.0, 1.0, 3)
-        return Pointing((hz + e_hz * circle) % 360, zenith + e_zenith * circle, range_mm + e_range * sigma_mm)
+        return Pointing((hz + e_hz * circle) % 360, zenith + e_zenith * circle, range_mm + e_range * sigma_mm, name)
 
     def _direction(self, name: str, now_s: float) -> tuple[float, float, float]:
         return _spherical(self._position(name, now_s))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -86,6 +87,7 @@ class TotalStation(ABC):
         settings, faults: see there.
         tracker: the telescope.
         circle_zero_deg: direction from north at which the horizontal circle reads 0.
+        on_measured: told the target and the instant of each distance that is measured; None: nobody asks.
     """
 
     def __init__(self, settings: StationSettings, tracker: Tracker, rng: np.random.Generator) -> None:
@@ -93,6 +95,7 @@ class TotalStation(ABC):
         self.faults = StationFaults()
         self.tracker = tracker
         self.circle_zero_deg = 0.0
+        self.on_measured: Callable[[str, float], None] | None = None
         self._rng = rng
         self._line = Line(settings.baud)
         self._face = 1
@@ -136,6 +139,8 @@ class TotalStation(ABC):
             shown_mm = pointing.range_mm * (1 + (settings.ppm - settings.ppm_true) * 1e-6)
             slope_m = (shown_mm + settings.prism_mm - settings.prism_true_mm) / 1e3
             self._last_slope_m = slope_m
+            if self.on_measured is not None and pointing.target is not None:
+                self.on_measured(pointing.target, now_s)
         elif flag is Flag.LOCKED and settings.stale_distance:
             slope_m = self._last_slope_m
         hz, zenith = pointing.hz_deg - self.circle_zero_deg, pointing.zenith_deg

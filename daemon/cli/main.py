@@ -8,6 +8,7 @@ import click
 
 # Command -> where it is defined. Imported when used: status must not wait for what only calibration needs.
 COMMANDS = {
+    "alarms": "operator",
     "bench": "bench",
     "calibrate": "offline",
     "compare": "compare",

@@ -34,7 +34,11 @@ def model_list(**where: Any) -> Any:
     def show(console: Console, models: list[dict[str, Any]]) -> None:
         table = Table("model", "state", "stage", "made (UTC)", "sessions", "comparison")
         for m in models:
-            verdict = (m["comparison"] or {}).get("sentence", "not compared yet")
+            compared = m["comparison"]
+            verdict = compared["sentence"] if compared else "not compared yet"
+            if compared and compared["is_stale"]:
+                then = "when none was live" if compared["live"] is None else f"with model {compared['live']}, live then"
+                verdict = f"out of date, compared {then}: {verdict}"
             table.add_row(str(m["id"]), m["state"], m["stage"], utc(m["created_utc_ns"]), str(m["sessions"]), verdict)
         console.print(table)
 
@@ -156,11 +160,12 @@ def model_lines(models: Mapping[str, Any]) -> list[str]:
     live, candidate = models["live"], models["candidate"]
     lines = [f"model {live['id']} ({live['stage']}) is live" if live else "no model is live"]
     if candidate is not None:
-        compared = candidate["comparison"]
-        verdict = compared["sentence"] if compared else "not compared yet"
-        lines.append(f"model {candidate['id']} ({candidate['stage']}) is a candidate: {verdict}")
-        if compared and compared["is_better"]:
+        start = f"model {candidate['id']} ({candidate['stage']}) is a candidate"
+        if candidate["is_acceptable"]:
+            lines.append(f"{start}: {candidate['comparison']['sentence']}")
             lines.append(f"  `rigcal model accept {candidate['id']}` makes it the live one")
+        else:
+            lines.append(f"{start}, and would be refused now: {candidate['refused_because']}")
     return lines
 
 

@@ -10,15 +10,19 @@ from typing import Any
 import click
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from daemon.cli.gap_lines import gap_lines
 from daemon.cli.model import model_lines
 from daemon.cli.output import Command, json_option
+from daemon.cli.status_lines import alarm_line, cleared_line, decoding_lines, gap_state_lines, station_line
 from daemon.cli.talk import ask, say, talks, utc
 from daemon.config import read_config
+from daemon.present_state import duration
 from daemon.scheduler import SESSION_KINDS
 
 SHOT_TIMEOUT_S = 600.0
+ALARMS_OLD_S = 30.0  # they are looked at every second
 
 
 # ---- status ----------------------------------------------------------------------------------------------------------
@@ -35,6 +39,9 @@ def status(frames: bool, **where: Any) -> Any:
 def _show_status(console: Console, status: dict[str, Any], *, frames: bool) -> None:
     console.print(f"rig [bold]{status['rig']}[/] ({status['mode']}), store {status['store']}", highlight=False)
     acquisition = status["acquisition"]
+    _show_alarms(console, status["alarms"])
+    for line in gap_state_lines(acquisition):
+        say(console, line)
     links = Table("link", "state", "captures", "per s", "queued", "dropped", title="links", title_justify="left")
     for link in acquisition["links"]:
         state = {True: "[green]up[/]", False: "[red]down[/]", None: "starting"}[link["up"]]
@@ -51,18 +58,15 @@ def _show_status(console: Console, status: dict[str, Any], *, frames: bool) -> N
     for channel in acquisition["channels"]:
         value = "" if channel["value"] is None else f"{channel['value']:.3f} {channel['unit']}"
         mark = "green" if channel["status"] == "ok" else "red"
-        channels.add_row(channel["name"], value, f"[{mark}]{channel['status']}[/]", f"{channel['age_s']:.1f}")
+        age = "never" if channel["age_s"] is None else f"{channel['age_s']:.1f}"
+        channels.add_row(channel["name"], value, f"[{mark}]{channel['status'].replace('_', ' ')}[/]", age)
     console.print(channels)
     if frames:
         console.print(_frame_table(acquisition["frames"]))
     for station in acquisition["stations"]:
-        why = f" ({station['reason']})" if station["reason"] else ""
-        last = f"last fix {station['status']}{why}"
-        say(console, f"station {station['name']}: {station['lock']}, {last}, {station['fixes']} fixes")
-    for device, n in acquisition["decode_failures"].items():
-        say(console, f"{n} captures of {device} could not be decoded")
-    if acquisition["error"]:
-        console.print(f"[red]{acquisition['error']}[/]")
+        say(console, station_line(station))
+    for line in decoding_lines(acquisition["decoding"]):
+        say(console, line)
     if status["session"]:
         _show_session(console, status["session"])
     for job in status["jobs"]:
@@ -71,6 +75,31 @@ def _show_status(console: Console, status: dict[str, Any], *, frames: bool) -> N
         say(console, sentence)
     for event in reversed(status["events"]):
         say(console, f"{utc(event['utc_ns'])} {event['device']} {event['kind']}: {event['text']}")
+
+
+def _show_alarms(console: Console, alarms: dict[str, Any]) -> None:
+    if alarms["looked_age_s"] > ALARMS_OLD_S:
+        say(console, f"alarms were last looked at {duration(alarms['looked_age_s'])} ago: the daemon is held up")
+    for alarm in alarms["active"]:
+        style = "bold red" if alarm["severity"] == "critical" else "yellow"
+        console.print(Text(alarm_line(alarm), style=style))
+        console.print(Text(f"  {alarm['remedy']}"))
+    if not alarms["active"]:
+        say(console, "no alarms")
+
+
+@click.command(cls=Command)
+@click.option("--all", "everything", is_flag=True, help="Also those that are over, newest first.")
+@talks
+def alarms(everything: bool, **where: Any) -> Any:
+    """What is wrong now, since when, and what to do about it."""
+
+    def show(console: Console, found: dict[str, Any]) -> None:
+        _show_alarms(console, found)
+        for alarm in found["cleared"]:
+            say(console, cleared_line(alarm))
+
+    return ask(where, "alarms.list", show, all=everything)
 
 
 def _frame_table(frames: list[dict[str, Any]]) -> Table:
@@ -160,7 +189,7 @@ def session() -> None:
 @session.command(cls=Command, name="start")
 @click.option("--prism", required=True, help="The prism that the station follows.")
 @click.option("--kind", type=click.Choice(SESSION_KINDS), default="static_poses", show_default=True)
-@click.option("--setup", help="Station set-up; the newest usable one when not given.")
+@click.option("--setup", help="Station set-up; the newest when not given.")
 @click.option("--operator", default=lambda: os.environ.get("USER", ""), help="Who is responsible.")
 @click.option("--id", help="Name of the session.")
 @click.option("--note", default="")
@@ -197,6 +226,15 @@ def session_abort(**where: Any) -> Any:
     return ask(where, "session.abort", _show_session)
 
 
+@session.command(cls=Command, name="accept")
+@click.argument("name")
+@click.option("--operator", default=lambda: os.environ.get("USER", ""), help="Who is responsible.")
+@talks
+def session_accept(name: str, operator: str, **where: Any) -> Any:
+    """Use closed session NAME although its control points were not shot at both ends, or did not hold."""
+    return ask(where, "session.accept", _show_session, id=name, operator=operator)
+
+
 @session.command(cls=Command, name="shoot")
 @click.argument("point")
 @talks
@@ -205,12 +243,24 @@ def session_shoot(point: str, **where: Any) -> Any:
 
     def show(console: Console, result: dict[str, Any]) -> None:
         if result["misclosure_mm"] is None:
-            say(console, f"{result['point']} is known from now on")
+            say(console, f"{result['point']} is known from now on; shoot it again before you stop the session")
             return
         verdict = "[red]the set-up has moved[/]" if result["moved"] else "the set-up holds"
         console.print(f"{result['point']}: misclosure {result['misclosure_mm']:.1f} mm, {verdict}", highlight=False)
+        _advise(console, result["advice"])
 
     return ask(where, "session.shoot", show, timeout_s=SHOT_TIMEOUT_S, point=point)
+
+
+@session.command(cls=Command, name="confirm-prism")
+@click.option("--operator", default=lambda: os.environ.get("USER", ""), help="Who says so.")
+@talks
+def session_confirm_prism(operator: str, **where: Any) -> Any:
+    """Say that the station is on the prism of the open session, although it looks like another one.
+
+    Fixes count from now on; those that were in doubt before stay excluded.
+    """
+    return ask(where, "session.confirm-prism", lambda c, r: say(c, r["text"]), operator=operator)
 
 
 @session.command(cls=Command, name="list")
@@ -222,7 +272,8 @@ def session_list(**where: Any) -> Any:
         table = Table("session", "kind", "prism", "set-up", "state", "poses", "observations", "operator")
         for s in sessions:
             counts = (str(s["poses"]), str(s["observations"]))
-            table.add_row(s["id"], s["kind"], s["prism"], s["setup"], s["state"], *counts, s["operator"])
+            state = s["state"] if s["not_used"] is None else f"{s['state']}, not used"
+            table.add_row(s["id"], s["kind"], s["prism"], s["setup"], state, *counts, s["operator"])
         console.print(table)
 
     return ask(where, "session.list", show)
@@ -267,11 +318,23 @@ def _show_session(console: Console, session: dict[str, Any]) -> None:
     )
     for reason, n in session["excluded"].items():
         say(console, f"  {n} excluded: {reason}")
+    for suspicion in session.get("prism_suspicions", ()):
+        console.print(f"  [red]since {utc(suspicion['since_utc_ns'])}[/]", end=" ", highlight=False)
+        say(console, f"{suspicion['text']}; its fixes do not count: {suspicion['remedy']}")
     for shot in session["control_shots"]:
         size = "defined" if shot["misclosure_mm"] is None else f"misclosure {shot['misclosure_mm']:.1f} mm"
         say(console, f"  control point {shot['point']} at the {shot['phase']}: {size}")
+    for step in session["clock_steps"]:
+        back = "back" if step["step_s"] < 0 else "forward"
+        say(console, f"  {utc(step['at_utc_ns'])}: the computer's clock was set {back} by {abs(step['step_s']):.1f} s")
     if session["setup_moved"]:
-        console.print("  [red]the set-up has moved: its sessions are doubtful[/]")
+        console.print("  [red]the station has moved since this set-up was described[/]")
+    if session["not_used"] is not None:
+        console.print("  [red]calibration does not use this session:[/]", end=" ")
+        say(console, f"{session['not_used']}; to use it anyway: `rigcal session accept {session['id']}`")
+    if session["accepted"] is not None:
+        accepted = session["accepted"]
+        say(console, f"  accepted by {accepted['by'] or 'an operator'}, although {accepted['despite']}")
 
 
 def _advise(console: Console, advice: list[str]) -> None:
@@ -340,4 +403,4 @@ def devices_configure(machine_is_parked: bool, **where: Any) -> Any:
     return ask(where, "devices.configure", lambda c, r: say(c, r["text"]), machine_is_parked=machine_is_parked)
 
 
-COMMANDS = {"status": status, "setup": setup, "session": session, "jobs": jobs, "devices": devices}
+COMMANDS = {"alarms": alarms, "status": status, "setup": setup, "session": session, "jobs": jobs, "devices": devices}

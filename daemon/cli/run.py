@@ -16,7 +16,7 @@ import click
 
 from daemon.acquisition import Acquisition
 from daemon.cli.output import Command, json_option
-from daemon.composition import decoders, joiner, live, replayed, simulated
+from daemon.composition import decoders, joiner, live, motion_limits, replayed, simulated
 from daemon.config import Config, parse_config, read_config
 from daemon.files import write_file
 from daemon.notify import Notifier
@@ -27,6 +27,7 @@ from daemon.service import Daemon, declare_channels, stop_on_signals
 from daemon.session_file import SessionFile, read_session_file
 from daemon.sessions import SessionKeeper
 from daemon.setups import SetupBook
+from daemon.store.errors import storage_errors
 from daemon.store.reader import Reader
 from daemon.store.store import Store
 from drivers.clock import ManualClock, Stamp
@@ -101,20 +102,22 @@ def run(
     source = load_rig(settings.rig)
     if is_replay:
         settings = _apart(settings)
-    stop = threading.Event()
-    settings.state_directory.mkdir(parents=True, exist_ok=True)
+    stop, notifier = threading.Event(), Notifier()
     with contextlib.ExitStack() as stack:
         stack.callback(stop_on_signals(stop))
-        # The store first: it is what keeps a second daemon from touching anything of the first one's.
-        store = stack.enter_context(contextlib.closing(Store(settings.store_path)))
-        if sim:
-            rig = simulated(settings, source, rate=rate, seed=seed, effects=effects, secret=secret, dwell_s=dwell_s)
-            parts = stack.enter_context(rig)
-        elif is_replay:
-            parts = replayed(settings, source, files, rate)
-        else:
-            parts = live(settings, source)
-        Daemon(settings, store, parts).run(stop, Notifier())
+        with notifier.extending(f"opening the store {settings.store_path}"):
+            _make_directory(settings)
+            # The store first: it is what keeps a second daemon from touching anything of the first one's.
+            store = stack.enter_context(contextlib.closing(Store(settings.store_path)))
+            if sim:
+                rig = simulated(settings, source, rate=rate, seed=seed, effects=effects, secret=secret, dwell_s=dwell_s)
+                parts = stack.enter_context(rig)
+            elif is_replay:
+                parts = replayed(settings, source, files, rate)
+            else:
+                parts = live(settings, source)
+            daemon = Daemon(settings, store, parts)
+        daemon.run(stop, notifier)
     if not as_json:
         click.echo(f"the store is {settings.store_path}")
     return {"rig": source.rig.name, "mode": parts.mode, "store": str(settings.store_path)}
@@ -128,9 +131,14 @@ def _settings(config: Path | None, *, sim: bool) -> Config:
     return parse_config(SIMULATED_CONFIG, Path("simulated").resolve())
 
 
+def _make_directory(settings: Config) -> None:
+    with storage_errors(settings.store_path):
+        settings.state_directory.mkdir(parents=True, exist_ok=True)
+
+
 def _apart(settings: Config) -> Config:
     """The configuration with a new directory for its state: what was recorded elsewhere stays apart from the rig's."""
-    settings.state_directory.mkdir(parents=True, exist_ok=True)
+    _make_directory(settings)
     directory = Path(tempfile.mkdtemp(prefix="replay-", dir=settings.state_directory))
     return settings.model_copy(update={"state_directory": directory, "socket": directory / "control.sock"})
 
@@ -186,16 +194,15 @@ def replay(
     if prism is not None and session_file is not None:
         raise click.UsageError("give --prism or --session, not both")
     clock = ManualClock()
-    starts = first_captures(files, settings)  # a bad log is refused before a store is made
+    told = None if session_file is None else read_session_file(session_file)
+    doubtful = {} if told is None else told.doubtful
+    starts = first_captures(files, settings, doubtful)  # a bad log is refused before a store is made
     clock.set(min((capture.stamp for capture in starts.values()), key=lambda stamp: stamp.monotonic_ns))
     begin_ns = clock.monotonic_ns()
-    told = None
-    if session_file is not None:
-        told = read_session_file(session_file)
-    elif prism is not None:
+    if prism is not None:
         told = SessionFile(prism=prism, kind=kind, since_utc_ns=begin_ns, until_utc_ns=LATEST_UTC_NS, control_points={})
     made = decoders(settings, source)
-    with contextlib.closing(Store(path)) as store:
+    with storage_errors(path), contextlib.closing(Store(path)) as store:
         declare_channels(store, source.rig)
         setups = SetupBook(source.rig, store, clock, settings.sessions.control_tolerance_mm)
         keeper = SessionKeeper(
@@ -208,6 +215,7 @@ def replay(
             clock,
             run_id=0,
             aim=None,
+            limits=motion_limits(settings),
         )
         operator: deque[tuple[int, Callable[[], object]]] = deque()
         if told is not None:
@@ -215,9 +223,13 @@ def replay(
             setups.new_command({"id": REPLAYED, "instrument": "replayed", "control_points": points})
             start = {"id": REPLAYED, "prism": told.prism, "kind": told.kind, "operator": "replay"}
             operator.append((told.since_utc_ns, partial(keeper.start_command, start)))
+            confirm = partial(keeper.confirm_prism_command, {"operator": "replay"})
+            words = [(at_ns, confirm) for at_ns in told.prism_confirmed_utc_ns]
+            words += [(at_ns, partial(keeper.turned_command, {})) for at_ns in told.prism_turned_utc_ns]
+            operator.extend(sorted(words, key=lambda word: word[0]))
             operator.append((told.until_utc_ns, partial(keeper.stop_command, {})))
         acquisition = Acquisition((), made, store, clock, on_records=keeper.on_records)
-        acquisition.run_inline(_followed(merged(files, settings), clock, operator))
+        acquisition.run_inline(_followed(merged(files, settings, doubtful), clock, operator))
         for _, command in operator:  # what comes after the last capture
             command()
         session = keeper.list_command({})[0] if told is not None else None

@@ -108,10 +108,12 @@ class Operator:
         """
         name = str(self.say("session.start", prism=prism, kind=kind, operator="demo")["id"])
         self._shoot_control_points()
-        seen = 0
+        seen = early = 0
 
         def recorded() -> int:
-            return int(self.say("session.show", id=name)["poses"])
+            return int(self.say("session.show", id=name)["poses"]) - early
+
+        early = recorded()  # a busy computer may be slow to shoot the control points: those poses lie before them
 
         if planned:
             # Back from the control points, the station's first fixes count only once they are known to be of the prism.

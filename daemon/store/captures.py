@@ -2,14 +2,15 @@
 
 A chunk holds captures of one link and one boot. Layout, little endian:
 
-    magic "RCAP", version u8 = 1, kind u8 (1 CAN, 2 serial), packing u8 (0 plain, 1 zlib), u8 = 0,
+    magic "RCAP", version u8 = 1 or 2, kind u8 (1 CAN, 2 serial), packing u8 (0 plain, 1 zlib), u8 = 0,
     count u32, body length u32 (before packing), link length u16, boot length u16, link UTF-8, boot UTF-8,
     body (packed), CRC-32 of all that precedes u32
 
 The body is columns, not rows, and each column of integers is stored byte plane by byte plane, first all lowest bytes:
 neighbours resemble each other, which is what makes a fast compressor effective. Columns: differences of monotonic_ns
 i64 (the first from zero), differences of utc_ns - monotonic_ns i64 (the first from zero), CAN only: arbitration_id
-u32; flags u8; data length u32; then the data of all captures.
+u32; flags u8; data length u32; then the data of all captures. Version 2 is that of chunks in which a capture has the
+flag 16, its time is doubtful: a program that does not know the flag must not take the time for known.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ from drivers.clock import Stamp
 from drivers.readings import CanCapture, Capture, SerialCapture
 
 _MAGIC = b"RCAP"
-_VERSION = 1
+_VERSION, _VERSION_WITH_DOUBTS = 1, 2
 _CAN, _SERIAL = 1, 2
 _PLAIN, _ZLIB = 0, 1
 _HEADER = struct.Struct("<4sBBBxIIHH")
 _CRC = struct.Struct("<I")
-_EXTENDED, _REMOTE, _ERROR, _TRANSMITTED = 1, 2, 4, 8
+_EXTENDED, _REMOTE, _ERROR, _TRANSMITTED, _TIME_DOUBTFUL = 1, 2, 4, 8, 16
 _FASTEST = 1  # zlib level: three quarters of what level 6 gains, in a fifth of its time
 
 
@@ -100,7 +101,8 @@ def _encode(link: str, captures: list[Capture]) -> Chunk:
         packing, packed = _PLAIN, body
     names = link.encode(), first.boot_id.encode()
     kind = _CAN if is_can else _SERIAL
-    head = _HEADER.pack(_MAGIC, _VERSION, kind, packing, len(captures), len(body), *map(len, names)) + b"".join(names)
+    version = _VERSION_WITH_DOUBTS if any(s.is_doubtful for s in stamps) else _VERSION
+    head = _HEADER.pack(_MAGIC, version, kind, packing, len(captures), len(body), *map(len, names)) + b"".join(names)
     blob = head + packed
     blob += _CRC.pack(zlib.crc32(blob))
     return Chunk(link, "can" if is_can else "serial", first, last, len(captures), len(payload), blob)
@@ -108,6 +110,8 @@ def _encode(link: str, captures: list[Capture]) -> Chunk:
 
 def _flags(capture: Capture) -> int:
     flags = _TRANSMITTED if capture.is_transmitted else 0
+    if capture.stamp.is_doubtful:
+        flags |= _TIME_DOUBTFUL
     if isinstance(capture, CanCapture):
         if capture.is_extended:
             flags |= _EXTENDED
@@ -132,8 +136,9 @@ def decode_captures(blob: bytes) -> list[Capture]:
     """
     if len(blob) < _HEADER.size + _CRC.size or blob[:4] != _MAGIC:
         raise StoreError(f"not a chunk of captures ({len(blob)} bytes)")
-    if blob[4] != _VERSION:
-        raise StoreError(f"chunk of captures has version {blob[4]}, this program reads {_VERSION}; use a newer one")
+    if blob[4] not in (_VERSION, _VERSION_WITH_DOUBTS):
+        known = f"{_VERSION} and {_VERSION_WITH_DOUBTS}"
+        raise StoreError(f"chunk of captures has version {blob[4]}, this program reads {known}; use a newer one")
     if _CRC.unpack_from(blob, len(blob) - _CRC.size)[0] != zlib.crc32(blob[: -_CRC.size]):
         raise StoreError("chunk of captures is damaged (its CRC-32 does not match); restore the store from a backup")
     try:
@@ -157,9 +162,12 @@ def _decode(blob: bytes) -> list[Capture]:
     columns = _Columns(body, count)
     monotonic = np.cumsum(columns.take("<i8"))
     utc = np.cumsum(columns.take("<i8")) + monotonic
-    stamps = [Stamp(u, m, boot_id) for u, m in zip(utc.tolist(), monotonic.tolist(), strict=True)]
     identifiers = columns.take("<u4").tolist() if kind == _CAN else []
     flags = columns.take("u1").tolist()
+    stamps = [
+        Stamp(u, m, boot_id, bool(f & _TIME_DOUBTFUL))
+        for u, m, f in zip(utc.tolist(), monotonic.tolist(), flags, strict=True)
+    ]
     data = list(columns.slices(columns.take("<u4")))
     if kind == _CAN:
         return [

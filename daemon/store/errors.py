@@ -1,6 +1,22 @@
-"""What can go wrong with the store."""
+"""What can go wrong with the store, and how to say it."""
 
 from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import pwd
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_READ_ONLY = {errno.EROFS}
+_NO_PLACE = {errno.ENOENT, errno.ENOTDIR, errno.EACCES, errno.EPERM}
+
+NOTHING_BYTES = 2**20  # a disk with less than this has no room
+_UNWRITABLE = {sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN}
 
 
 class StoreError(Exception):
@@ -20,3 +36,84 @@ class StoreBusyError(StoreError):
             f"{path}: {holder} holds this store; stop it first (`rigcal status` shows it), or configure another file"
         )
         self.pid = pid
+
+
+def is_unwritable(error: BaseException) -> bool:
+    """True if the disk refused: it is full, faulty or read-only. The transaction was rolled back."""
+    code = getattr(error, "sqlite_errorcode", None) if isinstance(error, sqlite3.Error) else None
+    return code is not None and code & 0xFF in _UNWRITABLE  # the low byte; the rest says which read or write it was
+
+
+def storage_sentence(path: Path, error: sqlite3.Error | OSError) -> str:
+    """What the disk or SQLite refused to do with a file, and what to do about it, in one sentence.
+
+    Args:
+        path: of the store; an OSError that names a file is told with that name.
+        error: what was raised.
+    """
+    if isinstance(error, OSError):
+        path, reason, code = Path(error.filename or path), error.strerror or str(error), error.errno
+        name = ""
+    else:
+        reason, code = str(error), None
+        name = getattr(error, "sqlite_errorname", "") or ""  # the module's own errors have none
+    place = _existing(path.parent)
+    free_bytes = _free_bytes(place)
+    free = "free space is unknown" if free_bytes is None else f"{free_bytes / 2**20:.0f} MiB free in {place}"
+    # On a full disk SQLite speaks of an I/O error where the log's index cannot grow.
+    is_full = name.startswith("SQLITE_IOERR") and free_bytes is not None and free_bytes < NOTHING_BYTES
+    if is_full or code in _FULL or name == "SQLITE_FULL":
+        return (
+            f"{path}: cannot be written, the disk is full ({reason}; {free}): delete files there that are not "
+            "rigcal's, or move the state directory to a larger disk"
+        )
+    if code in _READ_ONLY or name.startswith("SQLITE_READONLY"):
+        return (
+            f"{path}: cannot be written ({reason}): {place} or the file is read-only; mount it for writing (`dmesg` "
+            f"tells whether the kernel found a fault of the disk) and let user {_user()} write to it"
+        )
+    if code in _NO_PLACE or name.startswith("SQLITE_CANTOPEN") or name == "SQLITE_PERM":
+        return (
+            f"{path}: cannot be made or opened ({reason}): the directory must exist, and user {_user()} must be "
+            "allowed to write to it"
+        )
+    if name.startswith(("SQLITE_CORRUPT", "SQLITE_NOTADB")):
+        return f"{path}: cannot be used as a store ({reason}): move it away and restore the store from a backup"
+    if name.startswith(("SQLITE_BUSY", "SQLITE_LOCKED")):
+        return f"{path}: another program holds it locked ({reason}): end that program (a `sqlite3` shell, a backup)"
+    return f"{path}: cannot be used ({reason}; {free}): check the disk, `dmesg` may tell what is wrong with it"
+
+
+@contextlib.contextmanager
+def storage_errors(path: Path) -> Iterator[None]:
+    """Raise what disk and SQLite refuse as a StoreError that says what to do.
+
+    Args:
+        path: of the store.
+
+    Raises:
+        StoreError: in place of sqlite3.Error and OSError.
+    """
+    try:
+        yield
+    except (sqlite3.Error, OSError) as error:
+        raise StoreError(storage_sentence(path, error)) from error
+
+
+def _existing(directory: Path) -> Path:
+    """The directory, or the nearest one above it that can be looked at."""
+    return next((place for place in (directory, *directory.parents) if os.access(place, os.F_OK)), Path("/"))
+
+
+def _free_bytes(directory: Path) -> int | None:
+    try:
+        return shutil.disk_usage(directory).free
+    except OSError:
+        return None
+
+
+def _user() -> str:
+    try:
+        return pwd.getpwuid(os.getuid()).pw_name
+    except KeyError:
+        return str(os.getuid())

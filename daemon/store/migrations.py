@@ -207,6 +207,103 @@ def m007_checks_show_drift(db: Database) -> None:
     )
 
 
+@MIGRATIONS()
+def m008_one_open_session(db: Database) -> None:
+    """At most one session of a rig is open."""
+    _create(
+        db,
+        # Two were left open where a session was started after the end of another could not be stored. The newest goes
+        # on; fixes of the newer ones may be stored as observations of the others.
+        """UPDATE calibration_sessions AS old SET state = 'aborted',
+            note = ltrim(old.note || '; ', '; ') || 'aborted by rigcal: it was still open when session ' || newest.id
+                || ' was started, and may hold fixes of that one',
+            ended_utc_ns = newest.started_utc_ns, ended_monotonic_ns = newest.started_monotonic_ns,
+            ended_boot_id = newest.started_boot_id
+            FROM calibration_sessions AS newest
+            WHERE old.state = 'open' AND newest.rig = old.rig AND old.rowid < newest.rowid AND newest.rowid =
+                (SELECT max(rowid) FROM calibration_sessions WHERE state = 'open' AND rig = old.rig)""",
+        "CREATE UNIQUE INDEX calibration_sessions_one_open ON calibration_sessions(rig) WHERE state = 'open'",
+    )
+
+
+@MIGRATIONS()
+def m009_uncontrolled_sessions(db: Database) -> None:
+    """Sessions that calibration must not use, until an operator accepts them."""
+    _create(
+        db,
+        # As of an observation: why calibration must not use it, NULL when it may. Decided when it is closed.
+        "ALTER TABLE calibration_sessions ADD COLUMN excluded TEXT",
+        # An operator's word that it may be used, despite what `excluded` said; after_job: number of the newest job
+        # then, which did not know of it.
+        "ALTER TABLE calibration_sessions ADD COLUMN accepted_despite TEXT",
+        "ALTER TABLE calibration_sessions ADD COLUMN accepted_by TEXT NOT NULL DEFAULT ''",
+        "ALTER TABLE calibration_sessions ADD COLUMN accepted_utc_ns INTEGER",
+        "ALTER TABLE calibration_sessions ADD COLUMN accepted_monotonic_ns INTEGER",
+        "ALTER TABLE calibration_sessions ADD COLUMN accepted_boot_id INTEGER REFERENCES boots(id)",
+        "ALTER TABLE calibration_sessions ADD COLUMN accepted_after_job INTEGER",
+        "DROP INDEX calibration_sessions_by_kind",
+        "CREATE INDEX calibration_sessions_used ON calibration_sessions(rig, state, kind) WHERE excluded IS NULL",
+        """CREATE INDEX calibration_sessions_accepted ON calibration_sessions(rig, kind, accepted_after_job)
+            WHERE accepted_after_job IS NOT NULL""",
+        # All that a session's summary asks of its observations, in the order that they were measured in.
+        "DROP INDEX observations_by_session",
+        """CREATE INDEX observations_by_session
+            ON observations(session_id, boot_id, monotonic_ns, utc_ns, excluded, pose)""",
+    )
+
+
+@MIGRATIONS()
+def m014_prism_confirmations(db: Database) -> None:
+    """Words that a session's stations are on its prism: fixes that looked like another one's count from then on."""
+    _create(
+        db,
+        # turning: nobody said so, but something turned the station to the prism; it may have measured what it was on
+        # before for a while.
+        f"""CREATE TABLE prism_confirmations (id INTEGER PRIMARY KEY,
+            session_id TEXT NOT NULL REFERENCES calibration_sessions(id), {_instant()},
+            operator TEXT NOT NULL DEFAULT '', turning INTEGER NOT NULL CHECK (turning IN (0, 1))) STRICT""",
+        "CREATE INDEX prism_confirmations_by_session ON prism_confirmations(session_id)",
+    )
+
+
+@MIGRATIONS()
+def m012_store_health(db: Database) -> None:
+    """Checks of the store itself, and what the end of the computer did to jobs."""
+    _create(
+        db,
+        # result: `ok`, or what is damaged; NULL while a check runs, and where it never came to its end.
+        f"""CREATE TABLE store_checks (id INTEGER PRIMARY KEY, {_instant("started_")},
+            {_instant("ended_", optional=True)}, result TEXT) STRICT""",
+        # host_boot: the kernel's boot in which the job was started, whatever the rig's clock says (a simulated one has
+        # boots of its own). interruptions: how often something interrupted it that was none of its attempts.
+        "ALTER TABLE jobs ADD COLUMN host_boot TEXT",
+        "ALTER TABLE jobs ADD COLUMN interruptions INTEGER NOT NULL DEFAULT 0",
+    )
+
+
+@MIGRATIONS()
+def m013_comparisons_know_the_live_model(db: Database) -> None:
+    """A comparison of a named model says with which change the model beside it had gone live."""
+    _create(
+        db,
+        "ALTER TABLE jobs ADD COLUMN live_since INTEGER REFERENCES model_states(id)",
+        "CREATE INDEX jobs_by_model ON jobs(model_id, live_since) WHERE model_id IS NOT NULL",
+    )
+
+
+@MIGRATIONS()
+def m013_alarms(db: Database) -> None:
+    """What is wrong, since when, and what to do about it."""
+    _create(
+        db,
+        # raised_: when it was noticed; cleared_ is NULL while it is active.
+        f"""CREATE TABLE alarms (id INTEGER PRIMARY KEY, kind TEXT NOT NULL, subject TEXT NOT NULL,
+            {_one_of("severity", "warning", "critical")}, text TEXT NOT NULL, remedy TEXT NOT NULL,
+            {_instant("raised_")}, {_instant("cleared_", optional=True)}) STRICT""",
+        "CREATE UNIQUE INDEX alarms_one_active ON alarms(kind, subject) WHERE cleared_utc_ns IS NULL",
+    )
+
+
 def unknown_migrations(db: Database) -> list[str]:
     """Migrations that `db` has and this program does not know: it was made by a newer one."""
     empty = Database(memory=True)

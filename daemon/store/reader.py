@@ -10,6 +10,7 @@ from typing import Any
 
 from daemon.store.captures import decode_captures
 from daemon.store.errors import StoreError
+from daemon.store.identity import FileIdentity
 from daemon.store.rows import sql_value, stamp_of
 from drivers.clock import Stamp
 from drivers.readings import Capture
@@ -20,15 +21,21 @@ class Reader:
 
     Args:
         path: the database.
+        identity: which file it must be; any when None.
 
     Raises:
-        StoreError: there is no store at `path`.
+        StoreError: there is no store at `path`, or it is another one.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, identity: FileIdentity | None = None) -> None:
         self.path = path
         if not path.is_file():
             raise StoreError(f"{path}: there is no store; start the daemon, or give the file with --store")
+        if identity is not None and FileIdentity.of(path) != identity:
+            raise StoreError(
+                f"{path}: this is not the store that the daemon writes to: the file was replaced while it ran; "
+                "`rigcal status` says what to do"
+            )
         # Never immutable=1: the file changes under a live daemon.
         self._connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
         self._connection.row_factory = sqlite3.Row

@@ -20,7 +20,8 @@ from typing import Any, Literal, TypeVar, cast
 from sqlite_utils import Database
 
 from daemon.store.captures import decode_captures, encode_captures
-from daemon.store.errors import StoreError
+from daemon.store.errors import StoreError, storage_sentence
+from daemon.store.identity import StoreFiles
 from daemon.store.lock import WriterLock
 from daemon.store.migrations import MIGRATIONS, unknown_migrations
 from daemon.store.rows import (
@@ -43,6 +44,7 @@ T = TypeVar("T")
 ChannelKind = Literal["joint", "signal"]
 
 OLDEST_SQLITE = (3, 38, 0)  # STRICT tables (3.37) and JSON built in (3.38)
+CLOSE_TIMEOUT_S = 5.0  # a thread that hangs in a commit keeps its turn for ever
 WHOLE_DAEMON = "daemon"  # the channel of gaps in which rigcal itself was not there
 
 _SAMPLE_COLUMNS = "(channel_id, utc_ns, monotonic_ns, boot_id, value, status, raw_counts) VALUES (?, ?, ?, ?, ?, ?, ?)"
@@ -67,6 +69,9 @@ _GAPS = """INSERT INTO gaps (channel, reason, start_utc_ns, start_monotonic_ns, 
 _CHUNKS = """INSERT INTO raw_chunks (link_id, first_utc_ns, first_monotonic_ns, first_boot_id,
     last_utc_ns, last_monotonic_ns, last_boot_id, captures, bytes, chunk) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"""
 
+_UNDECODED = """SELECT chunk_id, captures FROM undecoded_chunks LEFT JOIN raw_chunks ON raw_chunks.id = chunk_id
+    WHERE chunk_id > ? ORDER BY chunk_id"""
+
 
 class Store:
     """A store opened for writing, exclusively, created or migrated as needed.
@@ -78,10 +83,14 @@ class Store:
 
     Attributes:
         run_id: row of `daemon_runs`, 0 while no run has begun.
+        begun: when the run began; None while none has.
+        ended_in_order: whether the run before this one did; known once a run has begun, true before and without one.
+        files: which files it is made of, as they were when it was opened.
 
     Raises:
         StoreBusyError: another process writes to it.
-        StoreError: it is no such database, is damaged, was made by a newer rigcal, or its directory cannot be used.
+        StoreError: it is no such database, is damaged, was made by a newer rigcal, its directory cannot be used, or
+            the disk is full.
     """
 
     def __init__(self, path: Path) -> None:
@@ -102,7 +111,7 @@ class Store:
                 raise
         except sqlite3.Error as error:
             self._lock.release()
-            raise StoreError(f"{path}: cannot be opened as a store: {error}; restore it from a backup") from error
+            raise StoreError(storage_sentence(path, error)) from error
         except BaseException:
             self._lock.release()
             raise
@@ -112,6 +121,9 @@ class Store:
         self._channels: dict[tuple[str, str], tuple[int, ChannelKind]] = {}
         self._joints: frozenset[str] = frozenset()
         self.run_id = 0
+        self.begun: Stamp | None = None
+        self.ended_in_order = True
+        self.files = StoreFiles.of(path)
         log.info("store %s open, SQLite %s", path, sqlite3.sqlite_version)
 
     def _prepare(self, connection: sqlite3.Connection) -> None:
@@ -124,10 +136,18 @@ class Store:
         MIGRATIONS.apply(self._db)
 
     def close(self) -> None:
-        """Close the database and let others write to it; harmless when it was closed before."""
-        with self._turn:
+        """Close the database and let others write to it; harmless when it was closed before.
+
+        Where a thread hangs in a commit, the database stays open and locked until the process ends.
+        """
+        if not self._turn.acquire(timeout=CLOSE_TIMEOUT_S):
+            log.error("%s: a write does not end; the store is left open", self.path)
+            return
+        try:
             self._db.close()
             self._lock.release()
+        finally:
+            self._turn.release()
 
     # ---- transactions and rows -------------------------------------------------------------------------------------
 
@@ -225,6 +245,8 @@ class Store:
     def begin_run(self, now: Stamp) -> None:
         """A run of the daemon begins: the time since the last one ended is a gap, and ends all gaps left open."""
         with self.transaction() as db:
+            before = self.rows("SELECT clean FROM daemon_runs ORDER BY id DESC LIMIT 1")
+            self.ended_in_order = not before or bool(before[0]["clean"])
             last = self._last_alive()
             if last is not None:
                 ended = self.instant(last, "end_")
@@ -236,7 +258,9 @@ class Store:
                 "software_version": importlib.metadata.version("rigcal"),
                 "sqlite_version": sqlite3.sqlite_version,
             }
-            self.run_id = self.insert("daemon_runs", run | self.instant(now, "started_") | self.instant(now, "alive_"))
+            run_id = self.insert("daemon_runs", run | self.instant(now, "started_") | self.instant(now, "alive_"))
+        self.run_id = run_id
+        self.begun = now
 
     def _last_alive(self) -> Stamp | None:
         """When the last run was last known to be alive; None before the first."""
@@ -301,21 +325,42 @@ class Store:
         with self.transaction() as db:
             db.conn.executemany("DELETE FROM undecoded_chunks WHERE chunk_id = ?", [(i,) for i in chunk_ids])
 
-    def undecoded_chunks(self) -> list[int]:
-        """Ids of the chunks that wait to be decoded, oldest first: those that a killed run left behind."""
-        return [row["chunk_id"] for row in self.rows("SELECT chunk_id FROM undecoded_chunks ORDER BY chunk_id")]
+    def undecoded_chunks(self, after: int = 0, captures: int = 2**62) -> list[int]:
+        """Ids of chunks that wait to be decoded, oldest first.
+
+        Args:
+            after: only those with a greater id.
+            captures: no more of them than hold this many, and at least one.
+        """
+        ids: list[int] = []
+        with self._turn:
+            for chunk_id, held in self._db.execute(_UNDECODED, [after]):
+                ids.append(chunk_id)
+                captures -= held or 0  # none: the chunk itself is gone, which reading it will tell
+                if captures <= 0:
+                    break
+        return ids
+
+    def newest_undecoded(self) -> int:
+        """Id of the newest chunk that waits to be decoded; 0 where none does."""
+        return self._number("SELECT coalesce(max(chunk_id), 0) FROM undecoded_chunks", []) or 0
 
     def chunk_captures(self, chunk_id: int) -> list[Capture]:
         """The captures of one chunk.
 
         Raises:
-            StoreError: the chunk is damaged; it stays in the store, and the message names it.
+            StoreError: the chunk is damaged; the message names it.
+            sqlite3.OperationalError: the disk does not give it at present.
         """
-        (row,) = self.rows("SELECT chunk FROM raw_chunks WHERE id = ?", [chunk_id])
         try:
+            (row,) = self.rows("SELECT chunk FROM raw_chunks WHERE id = ?", [chunk_id])
             return decode_captures(row["chunk"])
-        except StoreError as error:
+        except (StoreError, ValueError) as error:
             raise StoreError(f"{self.path}: raw chunk {chunk_id}: {error}") from error
+        except sqlite3.OperationalError:
+            raise
+        except sqlite3.DatabaseError as error:
+            raise StoreError(f"{self.path}: raw chunk {chunk_id}: {error}; restore the store from a backup") from error
 
     # ---- records ---------------------------------------------------------------------------------------------------
 

@@ -37,6 +37,11 @@ def checksum(data: bytes) -> bytes:
     return b"%02X" % (sum(data) % 256)
 
 
+def carries_sum(data: bytes) -> bool:
+    """Whether a sound line, a reply or an identity, ends with its SUM."""
+    return data.count(b",") == 4 if data.startswith(b"A ") else data.count(b" ") == 3
+
+
 class SetFramer:
     """Cuts what a station sends into lines and single ACK or NAK characters. Holds at most 128 bytes."""
 

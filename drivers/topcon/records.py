@@ -32,9 +32,11 @@ _SLOPE_TENTH_MM = (
 _SLOPE_FINE = re.compile(r"\(" + _SLOPE_TENTH_MM + r"[!-~]{2}")  # two characters of unknown meaning, `**` as seen
 _TRACKING = re.compile(r"Q" + _SLOPE_TENTH_MM + r"(?P<battery>\d)(?P<edm>\d)(?P<flag>\d)(?P<face>[rl])")
 _ANGLES = re.compile(r"<(?P<v>\d{7})(?P<h>[+-]\d{7})(?P<tilt>[+-]\d{4})(?P<angle>[dg])")
+# Coordinates have ten digits each, or eight each; beside those of eight, ten where eight do not hold the number.
+_LONG, _SHORT = r"[+-]\d{10}", r"[+-](?:\d{8}|(?!00)\d{10})"
 _COORDINATES = re.compile(
-    r"(?P<header>[U/])(?P<n>[+-]\d{10}|[+-]\d{8})(?P<e>[+-]\d{10}|[+-]\d{8})(?P<z>[+-]\d{10}|[+-]\d{8})"
-    r"(?P<unit>[mfi])(?P<h>[+-]\d{7,8})(?P<angle>[dg])"
+    rf"(?P<header>[U/])(?={_LONG}{_LONG}{_LONG}[mfi]|{_SHORT}{_SHORT}{_SHORT}[mfi])"
+    r"(?P<n>[+-]\d+)(?P<e>[+-]\d+)(?P<z>[+-]\d+)(?P<unit>[mfi])(?P<h>[+-]\d{7,8})(?P<angle>[dg])"
 )
 
 _TRACKING_FLAG = {
@@ -192,15 +194,17 @@ def _coordinates(match: re.Match[str], station: str, first_byte: Stamp, last_byt
     """`U` (1 mm) and `/` (0.1 mm): the instrument's own N, E, Z and its horizontal circle."""
     counts_per_unit = 1000 if match["header"] == "U" else 10_000
     north_m, east_m, up_m = (_metres(match[name], match["unit"], counts_per_unit) for name in ("n", "e", "z"))
+    has_distance = bool(north_m or east_m or up_m)  # nothing can be measured at the instrument's own centre
     return Fix(
         station=station,
         stamp=first_byte,
         last_byte=last_byte,
-        status=Status.OK,
+        status=Status.OK if has_distance else Status.NOT_AVAILABLE,
         lock=LockState.UNKNOWN,
         hz_angle_rad=signed_circle_angle_rad(match["h"], _angle_unit(match)),
-        north_m=north_m,
-        east_m=east_m,
-        up_m=up_m,
+        north_m=north_m if has_distance else None,
+        east_m=east_m if has_distance else None,
+        up_m=up_m if has_distance else None,
+        reason="" if has_distance else "no distance",
         raw=match[0].encode("latin-1"),
     )

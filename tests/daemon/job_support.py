@@ -15,7 +15,7 @@ from daemon.jobs import JobRunner
 from daemon.rigs import load_rig
 from daemon.scheduler import CHECK
 from daemon.store.store import Store
-from drivers.clock import NS_PER_S, ManualClock, Stamp
+from drivers.clock import NS_PER_S, ManualClock, Stamp, SystemClock
 from simulators.dataset import SimulatedObservations, simulate_observations
 from simulators.truth import RigTruth
 
@@ -39,7 +39,8 @@ result = {"model": str(directory / str(order["job_id"])), "sessions": sessions}
 what = json.loads((directory / "plan.json").read_text()).get(order["kind"], "done")
 if order["kind"] in ("report", "comparison"):
     result |= {"model": order["model"]}
-    result |= {"comparison": {"live": order["live_id"], "is_better": True}} if order["kind"] == "comparison" else {}
+    found = {"live": order["live_id"], "is_better": True, "sentence": "it errs by 1 mm"}
+    result |= {"comparison": found} if order["kind"] == "comparison" else {}
 if order["kind"] == "gap":
     result |= {"gap": {"verdict": "none", "effects": [], "experiments": []}, "sentence": "they agree", "report": "r"}
 if order["kind"] == "drift":
@@ -84,6 +85,14 @@ class CountingClock(ManualClock):
     def now(self) -> Stamp:
         self.asked += 1
         return super().now()
+
+
+class BootClock(SystemClock):
+    """The computer's clock in a boot of that name."""
+
+    def __init__(self, boot: str) -> None:
+        super().__init__()
+        self._boot_id = boot
 
 
 class JobRig:
@@ -163,12 +172,22 @@ class JobRig:
         """What processes of each kind of job do from now on; those not named get done."""
         (self.directory / "plan.json").write_text(json.dumps(kinds), encoding="utf-8")
 
-    def start(self, *, real: bool = False, command: Sequence[str] | None = None, rig: str = "swdt82") -> JobRunner:
-        """A new runner, as after a start of the daemon; all waits that are due have passed."""
+    def start(
+        self,
+        *,
+        real: bool = False,
+        command: Sequence[str] | None = None,
+        rig: str = "swdt82",
+        is_held: Callable[[], bool] = lambda: False,
+        boot: str = "boot-a",
+    ) -> JobRunner:
+        """A new runner, as after a start of the daemon in a boot of the computer; all waits have passed."""
         self.clock.advance(100.0)
         scripted = (sys.executable, "-I", "-S", "-c", SCRIPT, str(self.directory))
         command = JOB_COMMAND if real else command or scripted
-        self.runner = JobRunner(self.store, self.config, rig, self.clock, command=command)
+        self.runner = JobRunner(
+            self.store, self.config, rig, self.clock, command=command, is_held=is_held, work_clock=BootClock(boot)
+        )
         self.runner.start()
         return self.runner
 

@@ -313,6 +313,91 @@ def test_a_job_that_stops_interrupt_is_offered_again_however_often_that_was(tmp_
         rig.close()
 
 
+def cut_off(rig: JobRig) -> None:
+    """The job that runs is left running in the store, as a power cut or a kill leaves it."""
+    running = rig.running(1)
+    rig.stop()
+    left = {name: running[name] for name in ("state", "attempts", "host_boot", "interruptions", "pid")}
+    rig.store.update("jobs", {"id": 1}, left)
+
+
+def test_power_cuts_are_no_attempts_of_the_job_that_they_interrupt(tmp_path: Path) -> None:
+    rig = JobRig(tmp_path, max_attempts=2)
+    try:
+        rig.store.begin_run(rig.clock.now())
+        rig.session("a")
+        rig.plan(gap="hang")
+        for cuts in range(5):
+            rig.start(boot=f"boot-{cuts}")
+            rig.clock.advance(200.0)
+            assert rig.running(1)["attempts"] == 1
+            cut_off(rig)
+            rig.store.begin_run(rig.clock.now())  # the run before did not end in order
+        rig.plan()
+        rig.start(boot="the last one")
+        rig.clock.advance(200.0)
+        rig.wait_for("done", "done", "done", "done")
+        assert (rig.job(1)["attempts"], rig.job(1)["interruptions"]) == (1, 5)
+    finally:
+        rig.close()
+
+
+def test_a_job_in_which_the_daemon_was_killed_has_used_an_attempt(tmp_path: Path) -> None:
+    rig = JobRig(tmp_path, max_attempts=2)
+    try:
+        rig.store.begin_run(rig.clock.now())
+        rig.session("a")
+        rig.plan(gap="hang")
+        for attempt in (1, 2):
+            rig.start()
+            rig.clock.advance(200.0)
+            assert rig.running(1)["attempts"] == attempt
+            cut_off(rig)
+            rig.store.begin_run(rig.clock.now())
+        rig.start()
+        rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
+        assert rig.job(1)["error"].startswith("interrupted 2 times")
+    finally:
+        rig.close()
+
+
+def test_a_job_that_an_orderly_stop_had_no_time_to_write_down_has_used_no_attempt(rig: JobRig) -> None:
+    rig.store.begin_run(rig.clock.now())
+    rig.session("a")
+    rig.plan(gap="hang")
+    rig.start()
+    cut_off(rig)
+    rig.store.end_run(rig.clock.now())
+    rig.store.begin_run(rig.clock.now())
+    JobTable(rig.store, "swdt82", rig.clock).interrupt_left_over("boot-a")
+    assert (rig.states()[0], rig.job(1)["attempts"]) == ("interrupted", 0)
+
+
+def test_a_job_whose_restarts_never_end_is_given_up_and_can_be_retried(rig: JobRig) -> None:
+    jobs = table(rig)
+    rig.store.update("jobs", {"id": 1}, {"state": "interrupted", "interruptions": 20})
+    rig.start()
+    rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
+    assert rig.job(1)["error"].startswith("cut off 20 times by what is not its own fault")
+    rig.stop()
+    jobs.retry(1)
+    assert rig.job(1)["interruptions"] == 0
+
+
+def test_a_result_that_the_store_refuses_is_no_attempt(rig: JobRig) -> None:
+    rig.session("a")
+    with rig.store.transaction() as db:
+        refuse = "BEGIN SELECT RAISE(ABORT, 'database or disk is full'); END"
+        db.execute(f"CREATE TRIGGER full BEFORE UPDATE ON jobs WHEN NEW.state = 'done' {refuse}")
+    rig.start()
+    rig.wait_for("interrupted", "queued", "queued", "queued")
+    assert (rig.job(1)["attempts"], rig.job(1)["interruptions"]) == (0, 1)
+    with rig.store.transaction() as db:
+        db.execute("DROP TRIGGER full")
+    rig.clock.advance(6.0)
+    rig.wait_for("done", "done", "done", "done")
+
+
 def test_an_interrupted_job_waits_before_it_runs_again_and_can_be_cancelled_meanwhile(rig: JobRig) -> None:
     rig.session("a")
     rig.plan(gap="hang")

@@ -6,6 +6,7 @@ import math
 import random
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import pytest
 from hypothesis import given, settings
@@ -104,7 +105,7 @@ def test_a_length_does_not_wrap() -> None:
     assert joined.values["L2_mm"] == pytest.approx(750.0)
 
 
-@settings(max_examples=60)
+@settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32), st.integers(1, 400), st.floats(0.0, 0.3))
 def test_neither_order_nor_batches_of_records_change_what_is_joined(seed: int, batch: int, delay_s: float) -> None:
     fixes = [fix(t / 20) for t in range(5, 50)]
@@ -123,7 +124,7 @@ def test_neither_order_nor_batches_of_records_change_what_is_joined(seed: int, b
     assert joined == expected
 
 
-@settings(max_examples=60)
+@settings(max_examples=60, deadline=None)
 @given(st.integers(1, 400), st.floats(-20.0, 20.0))
 def test_one_link_may_be_read_long_after_another(batch: int, later_s: float) -> None:
     fixes = [fix(t / 4) for t in range(1, 40)]
@@ -379,3 +380,35 @@ def test_a_thousand_samples_a_second_are_no_burden() -> None:
         return worked
 
     assert worked_s(40.0) < 10 * worked_s(10.0), "four times the samples: four times the work, not sixteen"
+
+
+# ---- doubtful times --------------------------------------------------------------------------------------------------
+
+
+def late(seconds: float, channel: str = "theta1", unit: str = "deg") -> Reading:
+    return Reading(channel, at(seconds).doubted(), None, unit, Status.TIME_DOUBTFUL, 4711)
+
+
+def test_a_fix_of_doubtful_time_is_not_joined() -> None:
+    doubtful = replace(fix(1.0), stamp=at(1.0).doubted(), status=Status.TIME_DOUBTFUL)
+    assert join([*samples(2.0), doubtful]) == []
+
+
+def test_a_reading_of_doubtful_time_tells_nothing_of_any_instant() -> None:
+    records = [r for r in samples(3.0) if not 0.99 < r.stamp.since(at(0.0)) / 1e9 < 1.5]  # type: ignore[union-attr] # readings
+    (joined,) = join([*records, *(late(1.0 + n / 50) for n in range(25)), fix(1.2)])
+    assert "samples around the fix are more than 0.25 s apart" in joined.refused
+
+
+def test_readings_of_doubtful_time_do_not_keep_a_standing_joint_from_being_joined() -> None:
+    records = [r for r in samples(3.0, 5.0) if not 0.99 < r.stamp.since(at(0.0)) / 1e9 < 1.5]  # type: ignore[union-attr] # readings
+    (joined,) = join([*records, late(1.25), fix(1.2)])
+    assert joined.refused == ""
+    assert joined.values["theta1_deg"] == pytest.approx(5.0)
+
+
+def test_a_signal_of_doubtful_time_leaves_the_value_before_it() -> None:
+    joiner = ObservationJoiner((THETA,), (SignalInput("pump", "pump_bar"),))
+    records: list[Record] = [reading("pump", 0.5, 120.0, "bar"), late(0.9, "pump", "bar")]
+    (joined,) = joiner.feed([*samples(2.0), *records, fix(1.0)])
+    assert joined.values["pump_bar"] == 120.0

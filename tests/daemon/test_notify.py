@@ -2,6 +2,8 @@ import os
 import socket
 from pathlib import Path
 
+import pytest
+
 from daemon.notify import Notifier
 
 
@@ -29,3 +31,15 @@ def test_the_watchdog_interval_is_for_this_process_alone() -> None:
     mine = {"WATCHDOG_USEC": "30000000", "WATCHDOG_PID": str(os.getpid())}
     assert Notifier(mine).watchdog_s == 30.0
     assert Notifier(mine | {"WATCHDOG_PID": "1"}).watchdog_s is None
+
+
+def test_a_start_that_takes_its_time_asks_the_service_manager_for_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daemon.notify.EXTEND_EVERY_S", 0.01)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        notifier = Notifier({"NOTIFY_SOCKET": str(tmp_path / "notify")})
+        with notifier.extending("opening the store"):
+            for _ in range(2):
+                assert manager.recv(100) == b"EXTEND_TIMEOUT_USEC=60000000\nSTATUS=opening the store"

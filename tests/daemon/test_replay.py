@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -24,6 +25,7 @@ from daemon.sessions import SessionKeeper
 from daemon.setups import SetupBook
 from daemon.store.reader import Reader
 from daemon.store.store import Store
+from drivers.attendance import LATE_S
 from drivers.clock import NS_PER_S, ManualClock, Stamp
 from drivers.errors import DescriptionError
 from drivers.readings import CanCapture, Capture, Fix, SerialCapture
@@ -83,6 +85,20 @@ def nobody_read(captures: Sequence[Capture]) -> list[Capture]:
             late = captures[0].stamp.shifted(round(stop[1] * NS_PER_S))
             if sum(c.stamp == late for c in read) < QUEUE:
                 read.append(replace(capture, stamp=late))
+    return sorted(read, key=lambda capture: capture.stamp.monotonic_ns)
+
+
+def read_late_and_marked(captures: Sequence[Capture]) -> list[Capture]:
+    """The program was stopped: what came meanwhile is read at once, and is marked with what follows soon after."""
+    read: list[Capture] = []
+    for capture in captures:
+        at_s = seconds(capture, captures)
+        stop = next((s for s in STOPS_S if s[0] <= at_s < s[1] + LATE_S), None)
+        if stop is None or capture.is_transmitted:
+            read.append(capture)
+        else:
+            wait_ns = max(0, round((stop[1] - at_s) * NS_PER_S))
+            read.append(replace(capture, stamp=capture.stamp.shifted(wait_ns).doubted()))
     return sorted(read, key=lambda capture: capture.stamp.monotonic_ns)
 
 
@@ -174,6 +190,7 @@ def alike(live: dict[str, Any], again: dict[str, Any]) -> bool:
     [
         as_recorded,
         nobody_read,
+        read_late_and_marked,
         frames_were_lost,
         pytest.param(clock_was_set(HOUR_NS), id="clock_was_set_back"),
         pytest.param(clock_was_set(-HOUR_NS), id="clock_was_set_forward"),
@@ -194,12 +211,62 @@ def test_a_replay_gives_the_observations_that_were_made_live(
     assert len(kept) > 20
 
 
+@pytest.fixture(scope="module")
+def marked(recorded: Sequence[Capture], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where a session with captures of doubtful time was recorded, exported and replayed."""
+    directory = tmp_path_factory.mktemp("marked")
+    live(directory, read_late_and_marked(recorded), station_first=True)
+    replayed(directory)
+    return directory
+
+
+def test_captures_of_doubtful_time_are_stored_and_used_for_nothing(marked: Path, recorded: Sequence[Capture]) -> None:
+    with Reader(marked / "rigcal.sqlite") as reader:
+        expected = sum(capture.stamp.is_doubtful for capture in read_late_and_marked(recorded))
+        assert sum(capture.stamp.is_doubtful for capture in reader.captures()) == expected > 100
+        joined = "SELECT fixes.status FROM observations JOIN fixes ON fixes.id = fix_id WHERE fixes.status != 'ok'"
+        assert list(reader.rows(joined)) == []
+
+
+def test_captures_of_doubtful_time_are_doubtful_again_in_a_replay(marked: Path) -> None:
+    kept, again = (statuses(marked / name) for name in ("rigcal.sqlite", "again.sqlite"))
+    assert kept == again
+    assert kept["fixes", "time_doubtful"] > 10
+    assert kept["joint_samples", "time_doubtful"] > 100
+    told = read_session_file(marked / "out" / "s1.json")
+    assert set(told.doubtful) == {"boom", "station"}
+    assert len(told.doubtful["boom"].runs) == len(STOPS_S)
+
+
+def test_a_log_that_is_not_the_session_s_is_refused_as_its_marks_would_be_misplaced(
+    marked: Path, tmp_path: Path
+) -> None:
+    log, told, store = tmp_path / "s1-boom.log", marked / "out" / "s1.json", tmp_path / "again.sqlite"
+    log.write_text("".join((marked / "out" / log.name).read_text().splitlines(keepends=True)[1:]))
+    arguments = ["replay", log, "--session", told, "--config", marked / "rigcal.toml", "--store", store]
+    result = CliRunner().invoke(main, [*map(str, arguments)])
+    assert result.exit_code == 2
+    assert "give the log that was exported with it" in result.output.replace("\n", " ")
+    assert not store.exists()
+
+
+def statuses(store: Path) -> Counter[tuple[str, str]]:
+    """Table and status -> how many rows of the session."""
+    found: Counter[tuple[str, str]] = Counter()
+    with Reader(store) as reader:
+        for table in ("fixes", "joint_samples", "signals"):
+            for row in reader.rows(f"SELECT status, count(*) AS n FROM {table} GROUP BY status"):
+                found[table, row["status"]] = row["n"]
+    return found
+
+
 def test_a_replay_knows_the_control_points(tmp_path: Path, recorded: Sequence[Capture]) -> None:
     decoder = StationDecoder(StationConfig.model_validate({"profile": "passive", "serial": {"path": "/dev/station"}}))
     fixes = [record for capture in recorded for record in decoder.feed(capture) if isinstance(record, Fix)]
     place = next(place for fix in fixes if (place := position_mm(fix)) is not None)
     made = live(tmp_path, recorded, station_first=True, control_points={"cp1": list(place)})
     again = replayed(tmp_path)
+    assert "doubtful" not in json.loads((tmp_path / "out" / "s1.json").read_bytes())  # files are as ever without doubts
     assert [row["excluded"] for row in made] == [row["excluded"] for row in again]
     assert sum(row["excluded"] == "a control point, not the prism" for row in made) > 10
 

@@ -6,6 +6,7 @@ from daemon.scheduler import (
     CHECKS,
     DRIFT,
     DueChain,
+    DueComparison,
     DueRetry,
     JobFacts,
     JobKind,
@@ -139,6 +140,16 @@ def test_an_interrupted_job_is_offered_again_after_a_pause_until_its_attempts_ar
     assert [j.id for j in spent_jobs(after(3))] == [1]
 
 
+def test_a_job_that_the_computers_end_interrupted_waits_too_and_ends_after_twenty_times() -> None:
+    cut = replace(job(1, "interrupted", attempts=0), interruptions=3)
+    assert due_jobs(state(session(1), jobs=[cut], covered=BOTH), T0.shifted(14 * NS_PER_S)) == []
+    assert due_jobs(state(session(1), jobs=[cut], covered=BOTH), T0.shifted(15 * NS_PER_S)) == [DueRetry(1)]
+    assert spent_jobs(state(jobs=[replace(cut, interruptions=19)])) == []
+    spent = replace(cut, interruptions=20)
+    assert spent_jobs(state(jobs=[spent])) == [spent]
+    assert due_jobs(state(session(1), jobs=[spent], covered=BOTH), LATER) == []
+
+
 def test_queued_jobs_wait_while_a_session_is_open() -> None:
     assert next_job(state(session(2, state="open"), jobs=[job(1, "queued")])) is None
 
@@ -149,3 +160,16 @@ def test_jobs_run_one_at_a_time_in_the_order_of_their_dependence() -> None:
     assert next_job(state(jobs=[job(1, "running"), job(2, "queued")])) is None
     assert next_job(state(jobs=[job(1, "interrupted"), waiting, job(3, "queued")])) == job(3, "queued")
     assert next_job(state(jobs=[waiting])) is None
+
+
+def test_a_stale_comparison_is_made_again_once_nothing_else_will_make_it() -> None:
+    checked = state(session(1), session(2, "check"), covered={JobKind.GAP: 1, JobKind.REPORT: 2}, has_model=True)
+    stale = replace(checked, stale_candidate=7)
+    assert due_jobs(checked, LATER) == []
+    assert due_jobs(stale, LATER) == [DueComparison(7)]
+    compares = JobFacts(4, JobKind.COMPARISON, "s2", "running", 1, True, T0)
+    assert due_jobs(replace(stale, jobs=[compares]), LATER) == []
+    assert due_jobs(replace(stale, covered={JobKind.GAP: 1, JobKind.REPORT: 1}), LATER) == [
+        DueChain(CHECKS, "s2", "s2")
+    ]
+    assert due_jobs(replace(state(session(1), covered=BOTH), stale_candidate=7), LATER) == [], "nothing is held out"

@@ -36,7 +36,8 @@ def rigcal(*arguments: str) -> subprocess.CompletedProcess[str]:
 def record(daemon: DaemonProcess, prism: str, kind: str, poses: int) -> dict[str, Any]:
     name = daemon.say("session.start", prism=prism, kind=kind, operator="Ada")["id"]
     daemon.say("session.shoot", point="cp1")
-    daemon.wait(f"{poses} poses", lambda: daemon.say("session.show", id=name)["poses"] >= poses)
+    early = daemon.say("session.show", id=name)["poses"]  # before the shot; a busy computer was slow to say it
+    daemon.wait(f"{poses} poses", lambda: daemon.say("session.show", id=name)["poses"] >= early + poses)
     daemon.say("session.shoot", point="cp1")
     return dict(daemon.say("session.stop"))
 
@@ -154,6 +155,19 @@ def test_a_target_that_is_not_there_is_refused_at_once_and_the_rig_goes_on(finis
     assert refused.returncode == 2
     assert "no target 'nowhere'" in refused.stderr
     finished.wait("a pose", lambda: finished.say("session.show", id="lost")["poses"] >= 2)
+    finished.say("session.abort")
+
+
+def test_an_operator_confirms_the_prism_and_status_says_whether_it_is_suspected(finished: DaemonProcess) -> None:
+    socket = ("--socket", str(finished.socket))
+    refused = rigcal("session", "confirm-prism", *socket)
+    assert refused.returncode == 2
+    assert "no session is open" in refused.stderr
+    finished.say("session.start", prism="r", id="confirmed")
+    confirmed = rigcal("session", "confirm-prism", "--operator", "Ada", *socket)
+    assert confirmed.returncode == 0, confirmed.stderr
+    assert "Ada confirms that the station is on prism r" in confirmed.stdout
+    assert finished.say("status")["session"]["prism_suspicions"] == []
     finished.say("session.abort")
 
 

@@ -1,6 +1,5 @@
 import math
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,109 +9,11 @@ import pytest
 from calibration.observations import parse_observations
 from daemon.config import SessionsSection
 from daemon.control import CommandError
-from daemon.joiner import ObservationJoiner, joint_inputs, signal_inputs
-from daemon.rigs import load_rig
 from daemon.session_data import sessions_csv, setup_lines
-from daemon.sessions import SessionKeeper
-from daemon.setups import SetupBook
 from daemon.store.reader import Reader
-from daemon.store.store import Store
-from drivers.clock import NS_PER_S, ManualClock, Stamp
-from drivers.readings import DeviceEvent, EventKind, Fix, LockState, Reading, Record, Status
-
-SOURCE = load_rig("swdt82")
-STEP_S = 0.05
-
-
-class SharedClock(ManualClock):
-    """A manual clock that one thread moves while another waits on it."""
-
-    def wait(self, event: threading.Event, seconds: float) -> bool:
-        deadline_ns = self.monotonic_ns() + round(seconds * NS_PER_S)
-        while self.monotonic_ns() < deadline_ns and not event.wait(0.001):
-            pass
-        return event.is_set()
-
-
-class Rig:
-    """A machine and a station that can be stood still and moved, on a clock that only moves when told to."""
-
-    def __init__(self, path: Path) -> None:
-        self.clock = SharedClock()
-        self.store = Store(path)
-        self.store.begin_run(self.clock.now())
-        self.store.declare_channels({j.name: j.unit for j in SOURCE.rig.joints}, {})
-        self.values = {j.name: sum(j.limits) / 2 for j in SOURCE.rig.joints}
-        self.target_mm = (3000.0, 8000.0, 1000.0)
-        self.aimed: list[str] = []
-        self.setups = SetupBook(SOURCE.rig, self.store, self.clock, SessionsSection().control_tolerance_mm)
-        self.keeper = self.new_keeper()
-
-    def new_keeper(self, aim: Callable[[str], None] | None = None) -> SessionKeeper:
-        joiner = ObservationJoiner(joint_inputs(SOURCE.rig), signal_inputs(SOURCE.rig), settle_s=0.5)
-        return SessionKeeper(
-            SOURCE.rig,
-            SOURCE.text,
-            self.store,
-            self.setups,
-            joiner,
-            SessionsSection(fixes_per_shot=3),
-            self.clock,
-            run_id=1,
-            aim=aim,
-        )
-
-    def live(self, seconds: float, **rates: float) -> None:
-        """Let time pass: every joint sampled and the station shooting at each step, as acquisition would tell it."""
-        for _ in range(round(seconds / STEP_S)):
-            self.clock.advance(STEP_S)
-            for name, rate in rates.items():
-                self.values[name] += rate * STEP_S
-            records: list[Record] = [
-                Reading(j.name, self.clock.now(), self.values[j.name], j.unit) for j in SOURCE.rig.joints
-            ]
-            records.append(self.fix())
-            self.store.insert_records(records)
-            self.keeper.on_records(records)
-
-    def fix(self) -> Fix:
-        east, north, up = (v / 1000 for v in self.target_mm)
-        return Fix(
-            "station",
-            self.clock.now(),
-            self.clock.now(),
-            Status.OK,
-            LockState.LOCKED,
-            hz_angle_rad=math.atan2(east, north) % (2 * math.pi),
-            zenith_angle_rad=math.atan2(math.hypot(east, north), up),
-            slope_distance_m=math.sqrt(east**2 + north**2 + up**2),
-        )
-
-    def say(self, command: str, **arguments: Any) -> Any:
-        owner, name = (self.setups, command[6:]) if command.startswith("setup_") else (self.keeper, command)
-        return getattr(owner, f"{name}_command")(arguments)
-
-    def shoot(self, point: str, place_mm: tuple[float, float, float]) -> Any:
-        """Aim at a control point, shoot it, and aim back, with time passing meanwhile."""
-        before, self.target_mm = self.target_mm, place_mm
-        answer: list[Any] = []
-        failure: list[CommandError] = []
-
-        def ask() -> None:
-            try:
-                answer.append(self.say("shoot", point=point))
-            except CommandError as error:
-                failure.append(error)
-
-        asking = threading.Thread(target=ask)
-        asking.start()
-        while asking.is_alive():
-            self.live(STEP_S)
-        asking.join()
-        self.target_mm = before
-        if failure:
-            raise failure[0]
-        return answer[0]
+from drivers.clock import NS_PER_S, Stamp
+from drivers.readings import DeviceEvent, EventKind
+from tests.daemon.session_support import SOURCE, STEP_S, Rig
 
 
 @pytest.fixture
@@ -166,6 +67,44 @@ def test_a_clock_that_is_set_in_a_session_does_not_step_its_times(rig: Rig) -> N
         table = parse_observations(sessions_csv(reader, SOURCE.rig, ["s001-r"]), SOURCE.rig, "a session")
     assert np.diff(table.extra["time_s"]) == pytest.approx(STEP_S)
     assert table.extra["time_s"][-1] > 2.0
+
+
+@pytest.mark.parametrize(("step_s", "backwards"), [(-3600.0, True), (-0.2, True), (3600.0, False)])
+def test_a_session_whose_clock_was_set_is_flagged(rig: Rig, step_s: float, backwards: bool) -> None:
+    start(rig)
+    rig.live(2)
+    now = rig.clock.now()
+    rig.clock.set(Stamp(now.utc_ns + round(step_s * NS_PER_S), now.monotonic_ns, now.boot_id))
+    rig.live(2)
+    stopped = rig.say("stop")
+    for told in (stopped, rig.say("show", id="s001-r"), *rig.say("list")):
+        assert told["utc_ran_backwards"] is backwards
+        (step,) = told["clock_steps"]
+        assert step["step_s"] == pytest.approx(step_s)
+        assert step["at_utc_ns"] == now.utc_ns + round((step_s + STEP_S) * NS_PER_S)
+    advice = [sentence for sentence in stopped["advice"] if "clock was set back" in sentence]
+    assert len(advice) == backwards
+
+
+def test_a_session_that_goes_on_after_a_boot_with_an_earlier_clock_is_flagged(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    now = rig.clock.now()
+    rig.clock.set(Stamp(now.utc_ns - 86_400 * NS_PER_S, 5 * NS_PER_S, "next boot"))
+    rig.keeper = rig.new_keeper()
+    rig.live(2)
+    assert rig.say("stop")["utc_ran_backwards"]
+    rig.clock.set(Stamp(now.utc_ns + 86_400 * NS_PER_S, 5 * NS_PER_S, "a boot with a clock that is right"))
+    rig.say("start", prism="r")
+    rig.live(2)
+    assert rig.say("stop")["clock_steps"] == []
+
+
+def test_a_steady_clock_is_not_flagged(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    summary = rig.say("stop")
+    assert (summary["clock_steps"], summary["utc_ran_backwards"]) == ([], False)
 
 
 def test_a_later_session_by_itself_is_timed_on_the_clock_of_all(rig: Rig) -> None:
@@ -246,7 +185,7 @@ def test_a_session_that_cannot_be_is_refused_in_a_sentence(rig: Rig, arguments: 
 
 
 def test_a_session_needs_a_setup(rig: Rig) -> None:
-    with pytest.raises(CommandError, match="no usable station set-up; describe one with `rigcal setup new`"):
+    with pytest.raises(CommandError, match="there is no station set-up; describe one with `rigcal setup new`"):
         rig.say("start", prism="r")
 
 
@@ -294,7 +233,7 @@ def test_a_setup_that_moved_is_flagged_and_refused_from_then_on(rig: Rig) -> Non
     with pytest.raises(CommandError, match="set-up 'S1' has moved") as caught:
         rig.say("start", prism="r", setup="S1")
     assert caught.value.status == 3
-    with pytest.raises(CommandError, match="no usable station set-up"):
+    with pytest.raises(CommandError, match="set-up 'S1', the newest, has moved; describe a new one"):
         rig.say("start", prism="r")
 
 

@@ -60,7 +60,7 @@ def store(path: Path) -> Iterator[Store]:
 def test_every_table_is_strict_and_commits_survive_power_loss(store: Store) -> None:
     tables = store.rows("SELECT name, strict FROM pragma_table_list WHERE schema = 'main' AND type = 'table'")
     ours = [t for t in tables if not str(t["name"]).startswith(("sqlite_", "_sqlite"))]
-    assert len(ours) == 21
+    assert len(ours) == 24
     assert all(t["strict"] == 1 for t in ours)
     for pragma, value in (("journal_mode", "wal"), ("synchronous", 2), ("foreign_keys", 1)):
         assert [*store.rows(f"PRAGMA {pragma}")[0].values()] == [value]
@@ -112,7 +112,7 @@ def test_a_missing_directory_is_named(tmp_path: Path) -> None:
 def test_a_file_that_is_no_database_is_refused_and_let_go(path: Path) -> None:
     path.write_bytes(b"this is no database, however one looks at it" * 100)
     for _ in range(2):  # the second time shows that the lock was released
-        with pytest.raises(StoreError, match=r"rigcal\.sqlite: cannot be opened as a store"):
+        with pytest.raises(StoreError, match=r"rigcal\.sqlite: cannot be used as a store"):
             Store(path)
     with pytest.raises(StoreError, match="cannot be read as a store"):
         Reader(path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -16,7 +17,7 @@ from drivers.readings import CanCapture, Capture, SerialCapture
 from tests.daemon.store_support import at, frame, serial_bytes
 
 INT64 = st.integers(-(2**63), 2**63 - 1)
-STAMPS = st.builds(Stamp, INT64, INT64, st.sampled_from(["boot-a", "boot-b", "Anschluß"]))
+STAMPS = st.builds(Stamp, INT64, INT64, st.sampled_from(["boot-a", "boot-b", "Anschluß"]), st.booleans())
 CAN = st.builds(
     CanCapture,
     st.sampled_from(["boom", "feed"]),
@@ -80,9 +81,9 @@ def test_any_change_of_a_chunk_is_noticed(data: st.DataObject) -> None:
 def test_a_chunk_of_a_later_version_asks_for_a_newer_program() -> None:
     (chunk,) = encode_captures([frame(1)])
     later = bytearray(chunk.blob[:-4])
-    later[4] = 2
+    later[4] = 3
     later += zlib.crc32(later).to_bytes(4, "little")
-    with pytest.raises(StoreError, match="version 2"):
+    with pytest.raises(StoreError, match="version 3"):
         decode_captures(bytes(later))
 
 
@@ -100,3 +101,31 @@ def test_a_chunk_that_was_written_wrongly_is_refused_though_its_checksum_is_righ
     wrong += zlib.crc32(wrong).to_bytes(4, "little")
     with pytest.raises(StoreError, match="makes no sense"):
         decode_captures(bytes(wrong))
+
+
+START = Stamp(1_700_000_000_000_000_000, 1_000_000_000, "boot")
+WITHOUT_DOUBTS = {
+    # As programs wrote them that knew no doubts
+    "5243415001010100020000003400000004000400626f6f6d626f6f74780163603dc5308bc19a0101cc18fa197e31fc6598c3309d419c61c13f"
+    "4609b01c37135409231300e3b40772480383d8": (
+        CanCapture("boom", START, 0x1A0, b"\x01\x02"),
+        CanCapture("boom", START.shifted(5), 0x18FE, b"", is_extended=True, is_remote=True, is_transmitted=True),
+    ),
+    "524341500102000001000000170000000700040073746174696f6e626f6f7400ca9a3b0000000000368ffafd9c97170002000000512bc58b8c"
+    "dc": (SerialCapture("station", START, b"Q+"),),
+}
+
+
+@pytest.mark.parametrize("text", WITHOUT_DOUBTS)
+def test_chunks_of_earlier_programs_are_read_and_those_without_doubts_are_written_as_ever(text: str) -> None:
+    captures = list(WITHOUT_DOUBTS[text])
+    assert decode_captures(bytes.fromhex(text)) == captures
+    assert [chunk.blob.hex() for chunk in encode_captures(captures)] == [text]
+
+
+def test_a_doubtful_time_survives_and_earlier_programs_refuse_it() -> None:
+    captures: list[Capture] = [frame(1), replace(frame(2), stamp=frame(2).stamp.doubted()), frame(3)]
+    (chunk,) = encode_captures(captures)
+    assert decode_captures(chunk.blob) == captures
+    assert [capture.stamp.is_doubtful for capture in decode_captures(chunk.blob)] == [False, True, False]
+    assert chunk.blob[4] == 2

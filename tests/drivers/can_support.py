@@ -12,6 +12,7 @@ import time
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import can
@@ -45,6 +46,12 @@ def capture(text: str, seconds: float = 0.0, **flags: bool) -> CanCapture:
     return CanCapture(
         "boom", at(seconds), int(identifier, 16), bytes.fromhex("".join(data)), len(identifier) == 8, **flags
     )
+
+
+def late(text: str, seconds: float = 0.0, **flags: bool) -> CanCapture:
+    """The same, of doubtful time."""
+    captured = capture(text, seconds, **flags)
+    return replace(captured, stamp=captured.stamp.doubted())
 
 
 def the_reading(records: object) -> Reading:
@@ -126,10 +133,10 @@ def virtual_link(channel: str, clock: Clock | None = None, **settings: object) -
     return _link("virtual", channel, clock or SystemClock(), settings)
 
 
-def slcan_link(adapter: Adapter, **settings: object) -> CanLink:
+def slcan_link(adapter: Adapter, clock: Clock | None = None, **settings: object) -> CanLink:
     """A link behind an slcan adapter."""
     options = {"bitrate": 250_000, "options": {"sleep_after_open": 0.0}}
-    return _link("slcan", str(adapter.path), SystemClock(), options | settings)
+    return _link("slcan", str(adapter.path), clock or SystemClock(), options | settings)
 
 
 def _link(interface: str, channel: str, clock: Clock, settings: dict[str, object]) -> CanLink:

@@ -25,7 +25,7 @@ from drivers.readings import (
     SerialCapture,
     Status,
 )
-from tests.drivers.can_support import DBC, START, at, capture, events, the_reading
+from tests.drivers.can_support import DBC, START, at, capture, events, late, the_reading
 
 
 def encoder(name: str = "theta1", node: int = 32, **settings: object) -> EncoderDecoder:
@@ -319,3 +319,56 @@ def test_the_same_captures_give_the_same_records_whenever_time_is_told() -> None
         return records | set(boom.tick(at(9.5)))
 
     assert run([]) == run([0.5 * n for n in range(20)])
+
+
+# Frames of doubtful time
+
+
+def test_a_reading_of_a_late_frame_has_no_value_and_keeps_its_counts() -> None:
+    boom = decoder()
+    feed(boom, "1A0 00 40 00 00")
+    reading = the_reading(boom.feed(late("1A0 00 20 00 00", 0.1)))
+    assert (reading.value, reading.status, reading.raw_counts) == (None, Status.TIME_DOUBTFUL, 0x2000)
+    assert reading.stamp == at(0.1).doubted()
+    assert the_reading(feed(boom, "1A0 00 40 00 00", 0.2)).status is Status.OK
+
+
+def test_a_signal_of_a_late_frame_has_no_value_and_its_counter_still_counts() -> None:
+    field, counter = BitField(0, 16), BitField(16, 8)
+    channel = SignalChannel(name="pump", unit="bar", arbitration_id=0x201, field=field, counter=counter)
+    boom = CanDecoder("boom", [SignalDecoder(channel)])
+    feed(boom, "201 10 00 01")
+    reading = the_reading(boom.feed(late("201 20 00 02", 0.1)))
+    assert (reading.value, reading.status, reading.raw_counts) == (None, Status.TIME_DOUBTFUL, 0x20)
+    assert [type(record) for record in feed(boom, "201 10 00 03", 0.2)] == [Reading]
+
+
+def test_what_a_device_says_of_itself_stands_however_late_it_is_read() -> None:
+    pdo = TransmitPdo.usual(32, 1, (0x60040020, 0x65030010))
+    boom = CanDecoder("boom", [EncoderDecoder(EncoderChannel(name="theta1", node=32, pdo=pdo))])
+    records = boom.feed(late("1A0 00 40 00 00 01 00"))
+    assert kinds(records) == [EventKind.ALARM]
+    assert the_reading(records).status is Status.DEVICE_ALARM
+    assert kinds(boom.feed(late("720 05", 0.1))) == [EventKind.NMT_STATE]
+
+
+def test_a_late_frame_is_neither_taken_for_a_jump_nor_held_against_the_next() -> None:
+    boom = decoder(max_rate_per_s=20.0)
+    for number in range(5):
+        feed(boom, "1A0 00 40 00 00", number * 0.02)
+    assert kinds(boom.feed(late("1A0 00 10 00 00", 0.1))) == []
+    for number in range(5):
+        records = feed(boom, "1A0 00 40 00 00", 0.12 + number * 0.02)
+        assert kinds(records) == []
+        assert the_reading(records).status is Status.OK
+    assert kinds(feed(boom, "1A0 00 10 00 00", 0.24)) == [EventKind.PRESET_JUMP]
+
+
+def test_a_late_sync_says_nothing_of_when_a_node_was_sampled() -> None:
+    boom = decoder(is_synchronous=True)
+    boom.feed(late("080", 0.0))
+    assert the_reading(feed(boom, "1A0 00 40 00 00", 0.01)).stamp == at(0.01)
+    feed(boom, "080", 0.02)
+    assert the_reading(boom.feed(late("1A0 00 40 00 00", 0.03))).stamp == at(0.03).doubted()
+    feed(boom, "080", 0.04)
+    assert the_reading(feed(boom, "1A0 00 40 00 00", 0.05)).stamp == at(0.04)

@@ -89,6 +89,25 @@ def test_lines_of_an_adapter(line: str, frame: Frame) -> None:
     assert lines.malformed == 0
 
 
+@pytest.mark.parametrize(
+    ("line", "error_class", "data"),
+    [
+        ("sa057033", 0x004, "0040000000002139"),
+        ("sw000097", 0x004, "000c000000006100"),
+        ("sp128000", 0x004, "0030000000000080"),
+        ("sb256256", 0x040, "000000000000ffff"),
+        ("e1a", 0x020, "0000000000000000"),
+        ("e3bcO", 0x08C, "0002080800000000"),
+    ],
+)
+def test_lines_about_errors_are_the_error_frames_that_socketcan_would_give(
+    line: str, error_class: int, data: str
+) -> None:
+    lines = SlcanLines()
+    assert lines.feed(line.encode() + b"\r") == [Frame(error_class, bytes.fromhex(data), is_error=True)]
+    assert lines.malformed == 0
+
+
 def test_lines_may_arrive_in_any_pieces_and_between_answers() -> None:
     stream = b"\r\az\rV1013\rt1A02AABB\rZ\rt1A11CC\r"
     for size in range(1, len(stream)):
@@ -98,7 +117,9 @@ def test_lines_may_arrive_in_any_pieces_and_between_answers() -> None:
         assert lines.malformed == 0
 
 
-@pytest.mark.parametrize("line", [b"t1A0", b"t1A04AABB", b"t8001AA", b"T200000000", b"t1A09", b"x", b"t1A02AABB12"])
+@pytest.mark.parametrize(
+    "line", [b"t1A0", b"t1A04AABB", b"t8001AA", b"T200000000", b"t1A09", b"x", b"t1A02AABB12", b"e2a", b"sx000000"]
+)
 def test_a_line_that_is_no_frame_is_counted(line: bytes) -> None:
     lines = SlcanLines()
     assert lines.feed(line + b"\r") == []

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from drivers.cia404 import AnalogueChannel, AnalogueDecoder
 from drivers.errors import DescriptionError
 from drivers.pdo import TransmitPdo
-from drivers.readings import DecodeFailure, Reading, Status
-from tests.drivers.can_support import START, the_reading
+from drivers.readings import DecodeFailure, EventKind, Reading, Status
+from tests.drivers.can_support import START, at, events, the_reading
 
 REAL32, I16, I32 = 0x61300120, 0x71300110, 0x91300120
 STATUS = 0x61500108
@@ -96,3 +96,14 @@ def test_no_bytes_make_the_decoder_raise_or_give_a_number_that_is_none(data: byt
     reading = the_reading(analogue(word, STATUS).decode(START, data))
     assert (reading.status is Status.OK) == (reading.value is not None)
     assert reading.value is None or math.isfinite(reading.value)
+
+
+def test_a_length_that_jumps_behind_an_emergency_is_told() -> None:
+    decoder = analogue(I16, max_rate_per_s=500.0)
+    decoder.decode(START, struct.pack("<h", 1000))
+    decoder.is_void = True
+    decoder.decode(at(0.02), struct.pack("<h", 0))
+    decoder.is_void = False
+    records = decoder.decode(at(0.04), struct.pack("<h", 0))
+    assert [event.kind for event in events(records)] == [EventKind.PRESET_JUMP]
+    assert the_reading(records).value is None

@@ -227,11 +227,54 @@ def test_a_linear_transducer_jumps_too() -> None:
     assert the_reading(decoder.decode(at(0.04), u32(0))).value == 0.0
 
 
-def test_an_alarm_in_between_is_no_jump() -> None:
-    decoder = linear(0x60200120, ALARMS, max_rate_per_s=500.0)
+def test_a_place_lost_behind_an_alarm_is_told_when_good_samples_return() -> None:
+    decoder = encoder(POSITION, ALARMS, max_rate_per_s=20.0)
     decoder.decode(at(0), u32(10000) + bytes(2))
-    assert the_reading(decoder.decode(at(0.02), u32(0) + b"\x01\0")).status is Status.DEVICE_ALARM
-    assert not jumps(decoder.decode(at(0.04), u32(0) + bytes(2)))
+    for step in range(1, 10):
+        bad = decoder.decode(at(0.02 * step), u32(16000) + b"\x01\0")
+        assert the_reading(bad).status is Status.DEVICE_ALARM
+    records = decoder.decode(at(0.2), u32(16000) + bytes(2))  # 33 deg further, 200 ms later
+    assert "from 54.9316 to 87.8906 deg" in jumps(records)[0]
+    assert (the_reading(records).value, the_reading(records).status) == (None, Status.OUT_OF_RANGE)
+    assert not jumps(decoder.decode(at(0.22), u32(16000) + bytes(2)))
+
+
+def test_a_place_lost_behind_an_emergency_or_a_restart_is_told() -> None:
+    for restarts in (False, True):
+        decoder = linear(max_rate_per_s=500.0)
+        decoder.decode(at(0), u32(10000))
+        decoder.is_void = True
+        decoder.decode(at(0.02), u32(0))
+        decoder.is_void = False
+        if restarts:
+            decoder.node_restarted()
+        assert "from 1000.0000 to 0.0000 mm" in jumps(decoder.decode(at(0.04), u32(0)))[0]
+
+
+def test_a_place_lost_behind_samples_out_of_range_or_too_short_is_told() -> None:
+    for bad in (u32(30000), b"\0"):
+        decoder = linear(max_rate_per_s=500.0, range_mm=(0.0, 2000.0))
+        decoder.decode(at(0), u32(10000))
+        decoder.decode(at(0.02), bad)
+        assert jumps(decoder.decode(at(0.04), u32(0)))
+
+
+def test_what_a_joint_can_move_behind_an_alarm_is_no_jump() -> None:
+    decoder = encoder(POSITION, ALARMS, max_rate_per_s=20.0)
+    decoder.decode(at(0), u32(0) + bytes(2))
+    for step in range(1, 100):
+        decoder.decode(at(0.02 * step), bytes(4) + b"\x01\0")
+    assert not jumps(decoder.decode(at(2.0), u32(round(2.0 * FASTEST)) + bytes(2)))
+
+
+def test_a_time_with_bad_samples_alone_is_no_time_that_nobody_read() -> None:
+    decoder = encoder(POSITION, ALARMS, max_rate_per_s=20.0)
+    decoder.decode(at(0), u32(0) + bytes(2))
+    for step in range(1, 100):
+        decoder.decode(at(0.02 * step), bytes(4) + b"\x01\0")
+    decoder.decode(at(2.0), u32(0) + bytes(2))
+    # 2 s behind an alarm allow for 2 s of motion once, and not again between the samples that follow
+    assert jumps(decoder.decode(at(2.02), u32(2000) + bytes(2)))
 
 
 def test_linear_value_from_step_sign_and_zero() -> None:

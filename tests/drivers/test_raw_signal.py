@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from drivers.errors import DescriptionError
 from drivers.raw_signal import BitField, Multiplexing, SignalChannel, SignalDecoder
-from drivers.readings import DecodeFailure, Gap, GapReason, Reading, Status
-from tests.drivers.can_support import START, at, the_reading
+from drivers.readings import DecodeFailure, EventKind, Gap, GapReason, Reading, Status
+from tests.drivers.can_support import START, at, events, the_reading
 
 
 def signal(field: BitField, **settings: object) -> SignalDecoder:
@@ -159,3 +159,31 @@ def test_no_bytes_make_the_decoder_raise(data: bytes, start: int, length: int, o
     reading = the_reading(decoder.decode(START, data))
     assert (reading.status is Status.OK) == (reading.value is not None)
     assert reading.value is None or math.isfinite(reading.value)
+
+
+def test_a_joint_in_raw_frames_that_jumps_behind_missing_values_is_told() -> None:
+    decoder = SignalDecoder(
+        SignalChannel(
+            name="theta1",
+            unit="deg",
+            arbitration_id=0x201,
+            field=BitField(0, 16),
+            factor=0.01,
+            not_available=frozenset({0xFFFF}),
+            max_rate_per_s=20.0,
+        )
+    )
+    assert the_reading(decoder.decode(START, (1000).to_bytes(2, "little"))).value == 10.0
+    assert the_reading(decoder.decode(at(0.02), b"\xff\xff")).status is Status.NOT_AVAILABLE
+    records = decoder.decode(at(0.04), (4300).to_bytes(2, "little"))
+    assert [event.kind for event in events(records)] == [EventKind.PRESET_JUMP]
+    assert (the_reading(records).value, the_reading(records).status) == (None, Status.OUT_OF_RANGE)
+    assert the_reading(decoder.decode(at(0.06), (4300).to_bytes(2, "little"))).value == 43.0
+
+
+def test_a_joint_in_raw_frames_may_pass_the_full_turn() -> None:
+    decoder = SignalDecoder(
+        SignalChannel(name="theta1", unit="deg", arbitration_id=0x201, field=BitField(0, 16), max_rate_per_s=20.0)
+    )
+    decoder.decode(START, (359).to_bytes(2, "little"))
+    assert not events(decoder.decode(at(0.02), (1).to_bytes(2, "little")))

@@ -40,6 +40,7 @@ from tests.drivers.serial_support import (
 )
 
 BYTE_S = 10 / 9600
+NEAR_COORDINATES = framed(b"U+00006148-00023344-00029912m+2515656d")
 
 
 def config(**settings: object) -> StationConfig:
@@ -142,8 +143,8 @@ def test_all_records_of_a_classic_station_become_fixes() -> None:
 
 
 def test_a_passive_listener_understands_what_the_profiles_understand() -> None:
-    (fix,) = fixes(decode(decoder(profile="passive"), [(1, COORDINATES + b"\x03")]))
-    assert position_mm(fix) == pytest.approx((-23344, 1234566148, -29912))
+    (fix,) = fixes(decode(decoder(profile="passive"), [(1, NEAR_COORDINATES)]))
+    assert position_mm(fix) == pytest.approx((-23344, 6148, -29912))
     (fix,) = fixes(decode(decoder(profile="passive", listen_to="sokkia"), [(1, SET_REPLY + b"\r\n")]))
     assert fix.slope_distance_m == pytest.approx(6.662)
 
@@ -308,115 +309,85 @@ def test_silence_of_a_station_that_speaks_when_it_is_told_to_may_be_ignored() ->
     assert station.tick(at(10_000)) == []
 
 
-# --- jumps to another prism
+# --- what no instrument can measure
 
 
-def moving(
-    start_s: float, count: int, slope_mm: float, step_mm: float = 50, flag: int = 1
-) -> list[tuple[float, bytes]]:
-    """`count` records, 0.1 s apart, of a prism that moves `step_mm` between them."""
-    return [(start_s + 0.1 * k, tracking_record(slope_mm + step_mm * k, flag=flag)) for k in range(count)]
-
-
-def jump_events(records: Sequence[Record]) -> list[str]:
-    return [text for kind, text in events(records) if kind is EventKind.PRISM_JUMP]
-
-
-def usable(records: Sequence[Record]) -> list[bool]:
-    return [fix.status is Status.OK for fix in fixes(records)]
-
-
-def test_motion_is_no_jump() -> None:
-    records = decode(decoder(), moving(1, 30, 10_000, 100))  # 1 m/s
-    assert usable(records) == [True] * 30
-    assert jump_events(records) == []
-
-
-def test_a_jump_to_another_prism_is_named_and_its_fixes_are_refused() -> None:
-    records = decode(decoder(), moving(1, 5, 10_000) + moving(1.5, 20, 11_750))
-    assert usable(records) == [True] * 5 + [False] * 20
-    assert jump_events(records) == ["target moved 1.55 m in 0.10 s: another prism; its fixes are refused"]
-    refused = fixes(records)[5]
-    assert (refused.status, refused.reason) == (Status.OUT_OF_RANGE, "the station jumped to another prism")
-    assert refused.slope_distance_m == pytest.approx(11.75)  # what the station said is kept
-    assert position_mm(refused) is None
-
-
-def test_the_jump_stays_refused_however_far_motion_could_have_come_since() -> None:
-    # 5 m/s for 2 s reaches 10 m; still the target was followed without a break from where it jumped to.
-    records = decode(decoder(), moving(1, 2, 10_000, 0) + moving(1.2, 20, 11_500, 0))
-    assert not any(usable(records)[2:])
-
-
-def test_a_jump_back_counts_again() -> None:
-    records = decode(decoder(), moving(1, 5, 10_000) + moving(1.5, 5, 11_750) + moving(2.0, 5, 10_500))
-    assert usable(records) == [True] * 5 + [False] * 5 + [True] * 5
-    assert (EventKind.LOCK_ACQUIRED, "target is the earlier prism again; its fixes count") in events(records)
-
-
-def test_a_jump_on_to_a_third_prism_stays_refused() -> None:
-    records = decode(decoder(), moving(1, 5, 10_000, 0) + moving(1.5, 5, 11_500, 0) + moving(2.0, 5, 13_500, 0))
-    assert usable(records) == [True] * 5 + [False] * 10
-    assert jump_events(records)[1] == "target jumped again, 3.50 m from the earlier prism; its fixes are refused"
-
-
-def test_a_single_wrong_fix_costs_itself_alone() -> None:
-    records = decode(decoder(), moving(1, 3, 10_000, 0) + moving(1.3, 1, 14_000) + moving(1.4, 3, 10_000, 0))
-    assert usable(records) == [True] * 3 + [False] + [True] * 3
-
-
-def test_a_jump_across_a_lost_lock_is_seen_too() -> None:
-    records = decode(decoder(), moving(1, 3, 10_000, 0) + moving(1.3, 1, 10_000, flag=2) + moving(1.4, 3, 15_000, 0))
-    assert usable(records) == [True] * 3 + [False] * 4
-    assert len(jump_events(records)) == 1
-
-
-def test_after_a_new_lock_the_target_counts_and_the_operator_is_told() -> None:
-    records = decode(
-        decoder(),
-        moving(1, 3, 10_000, 0)
-        + moving(1.3, 3, 11_500, 0)
-        + moving(1.6, 2, 11_500, flag=2)
-        + moving(1.8, 3, 11_500, 0),
+def test_a_distance_beyond_what_the_instrument_can_measure_is_refused() -> None:
+    records = decode(decoder(), [(1.0, tracking_record(6_000_000)), (1.1, tracking_record(6_000_001))])
+    near, far = fixes(records)
+    assert near.status is Status.OK
+    assert (far.status, far.reason) == (
+        Status.OUT_OF_RANGE,
+        "slope distance 6000.001 m is beyond max_range_m = 6000",
     )
-    assert usable(records) == [True] * 3 + [False] * 5 + [True] * 3
-    assert any("1.50 m from the earlier one after a new lock" in text for _, text in events(records))
+    assert position_mm(far) is None
+    assert fixes(decode(decoder(max_range_m=9), [(1.0, tracking_record(10_000))]))[0].status is Status.OUT_OF_RANGE
 
 
-def test_after_a_new_lock_the_earlier_prism_is_known_again() -> None:
-    records = decode(
-        decoder(),
-        moving(1, 3, 10_000, 0)
-        + moving(1.3, 3, 11_500, 0)
-        + moving(1.6, 2, 11_500, flag=2)
-        + moving(1.8, 3, 10_000, 0),
-    )
-    assert usable(records)[-3:] == [True] * 3
-    assert any(text == "target is the earlier prism again; its fixes count" for _, text in events(records))
+def test_coordinates_beyond_what_the_instrument_can_measure_are_refused() -> None:
+    (fix,) = fixes(decode(decoder(profile="topcon_classic"), [(1, COORDINATES + b"\x03")]))
+    assert (fix.status, fix.north_m) == (Status.OUT_OF_RANGE, pytest.approx(1234566.148))
+    assert "coordinates 1234566.149 m from their origin are beyond max_range_m = 6000" in fix.reason
+    assert "set the station's own coordinates to 0" in fix.reason
 
 
-def test_a_target_followed_for_long_is_taken_for_the_one_that_is_meant() -> None:
-    records = decode(decoder(new_target_after_s=2), moving(1, 3, 10_000, 0) + moving(1.3, 30, 11_500, 0))
-    assert usable(records) == [True] * 3 + [False] * 20 + [True] * 10
-    assert any("was followed for 2 s; its fixes count from now on" in text for _, text in events(records))
+# --- a Sokkia station without check sums
 
 
-def test_shots_far_apart_in_time_are_not_judged() -> None:
-    shots = [
-        (10.0 * k, b"?+000%05dm0900000+0000000d+000%05dt60+00+00" % (d, d)) for k, d in enumerate((10000, 15000, 9000))
+def warnings(records: Sequence[Record]) -> list[str]:
+    return [text for kind, text in events(records) if kind is EventKind.WARNING]
+
+
+BARE_REPLY = SET_REPLY[:-3] + b"\r\n"
+FULL_REPLY = SET_REPLY + b"\r\n"
+
+
+def test_a_sokkia_station_without_check_sums_is_warned_about_once() -> None:
+    for profile in ({"profile": "sokkia_set"}, {"profile": "passive", "listen_to": "sokkia"}):
+        records = decode(decoder(**profile), [(k / 10, BARE_REPLY) for k in range(1, 30)])
+        (text,) = warnings(records)
+        assert "switch Checksum on" in text
+        assert [fix.status for fix in fixes(records)] == [Status.OK] * 29
+
+
+def test_the_identity_of_a_sokkia_station_tells_that_it_sends_no_check_sums() -> None:
+    assert warnings(decode(decoder(profile="sokkia_set"), [(1, b"A SET2C,123456,4100,2506\r\n")]))
+    assert not warnings(decode(decoder(profile="sokkia_set"), [(1, b"A SET2C,123456,4100,2506,39\r\n")]))
+
+
+def test_a_sokkia_station_with_check_sums_is_not_warned_about() -> None:
+    assert warnings(decode(decoder(profile="sokkia_set"), [(k / 10, FULL_REPLY) for k in range(1, 5)])) == []
+
+
+def test_a_reply_that_lost_its_check_sum_on_the_way_is_refused() -> None:
+    records = decode(decoder(profile="sokkia_set"), [(1, FULL_REPLY), (2, BARE_REPLY), (3, FULL_REPLY)])
+    assert len(fixes(records)) == 2
+    assert [reason for reason, _ in failures(records)] == [
+        "the line ends before its SUM, which the lines before it carry"
     ]
-    records = decode(decoder(profile="topcon_classic"), [(seconds, framed(data)) for seconds, data in shots])
-    assert usable(records) == [True] * 3
+    assert warnings(records) == []
 
 
-def test_coordinates_and_circles_are_never_compared() -> None:
-    records = decode(decoder(profile="topcon_classic"), [(1, SLOPE_MM + b"\x03"), (1.2, COORDINATES + b"\x03")])
-    assert usable(records) == [True, True]
+def test_check_sums_that_are_switched_off_are_warned_about() -> None:
+    records = decode(
+        decoder(profile="sokkia_set"), [(1, FULL_REPLY), (2, BARE_REPLY), (3, BARE_REPLY), (4, BARE_REPLY)]
+    )
+    assert len(fixes(records)) == 3
+    assert len(warnings(records)) == 1
 
 
-def test_the_limit_of_motion_can_be_set() -> None:
-    slow = decoder(max_speed_m_s=0.5, jump_slack_m=0.05)
-    assert usable(decode(slow, moving(1, 3, 10_000, 120))) == [True, False, False]
+# --- the target, which the decoder does not judge
+
+
+def test_which_prism_is_meant_is_not_the_decoder_s_to_know() -> None:
+    records = decode(decoder(), [(1.0, tracking_record(10_000)), (1.1, tracking_record(20_000))])
+    assert [fix.status for fix in fixes(records)] == [Status.OK, Status.OK]
+    assert [kind for kind, _ in events(records)] == [EventKind.LOCK_ACQUIRED]
+
+
+def test_coordinates_and_circles_are_both_usable() -> None:
+    records = decode(decoder(profile="topcon_classic"), [(1, SLOPE_MM + b"\x03"), (1.2, NEAR_COORDINATES)])
+    assert [fix.status for fix in fixes(records)] == [Status.OK, Status.OK]
 
 
 # --- whatever comes
@@ -482,6 +453,7 @@ def test_any_captures_yield_sound_records_and_the_same_ones_again(
         ({"profile": "leica"}, "topcon_gts8"),
         ({"poll": 1}, "Extra inputs"),
         ({"max_speed_m_s": 0}, "greater than 0"),
+        ({"new_target_after_s": 30.0}, "new_target_after_s is gone, remove it"),
     ],
 )
 def test_an_impossible_configuration_is_refused(settings: dict[str, object], reason: str) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import time
 from pathlib import Path
 
 import pytest
@@ -145,22 +147,48 @@ def test_a_clock_that_runs_fast_shortens_the_time_outs(tmp_path: Path) -> None:
         assert "did not answer T34 within 20 s" in error.text
 
 
-def test_a_port_that_had_worked_for_long_is_tried_again_soon(tmp_path: Path) -> None:
-    clock = ScaledClock(100.0, SystemClock().now())
+def test_a_port_that_is_unplugged_again_and_again_is_open_soon_each_time(tmp_path: Path) -> None:
+    clock = ScaledClock(10.0, SystemClock().now())
     with (
         plugged_in(tmp_path / "tty") as instrument,
         running(config(instrument.path), clock) as collected,
     ):
         for count in (1, 2, 3):
             collected.wait_for_event(EventKind.LINK_UP, count)
-            clock.sleep(11.0)
+            clock.sleep(3.0)
             instrument.unplug()
             collected.wait_for_event(EventKind.LINK_LOST, count)
             instrument.plug_in()
         collected.wait_for_event(EventKind.LINK_UP, 4)
         for opened, closed in zip(collected.gaps()[::2], collected.gaps()[1::2], strict=True):
             assert closed.end is not None
-            assert closed.end.monotonic_ns - opened.start.monotonic_ns < 10_000_000_000
+            assert closed.end.since(opened.start) < 10 * 2e9  # 2 real seconds
+
+
+def test_a_device_that_was_away_for_long_is_open_within_two_seconds_of_its_return(tmp_path: Path) -> None:
+    """On real time: what tells is the directory, and not the longest pause, which 8 s without it have reached."""
+    with plugged_in(tmp_path / "tty") as instrument, running(config(instrument.path)) as collected:
+        collected.wait_for_event(EventKind.LINK_UP)
+        instrument.unplug()
+        collected.wait_for_event(EventKind.LINK_LOST, 2)
+        time.sleep(4.0)  # attempts at 0.5, 1.5 and 3.5 s: the next would be at 5.5 s, and before at 7.5 s
+        instrument.plug_in()
+        back = time.monotonic_ns()
+        collected.wait_for_event(EventKind.LINK_UP, 2)
+        assert time.monotonic_ns() - back < 2e9
+
+
+def test_a_port_that_fails_as_soon_as_it_is_open_is_not_tried_without_a_pause(tmp_path: Path) -> None:
+    with plugged_in(tmp_path / "tty") as instrument:
+        # A hung-up pseudo-terminal can be opened by its path as long as somebody holds it, and every read fails.
+        with running(config(instrument.path)) as collected:
+            for count in range(1, 4):
+                collected.wait_for_event(EventKind.LINK_UP, count)
+                instrument.unplug()
+                instrument.plug_in()  # at once: a new entry in the directory each time
+            opened = [event.stamp.monotonic_ns for event in collected.events(EventKind.LINK_UP)]
+        pauses = [later - earlier for earlier, later in itertools.pairwise(opened)]
+        assert all(pause >= 0.5e9 * 2**k for k, pause in enumerate(pauses))
 
 
 def test_the_port_is_free_when_the_link_has_stopped(tmp_path: Path) -> None:

@@ -68,6 +68,23 @@ def test_a_coordinate_record_in_tenths_of_mm_has_ten_digits_each() -> None:
     assert (fix.north_m, fix.east_m, fix.up_m) == pytest.approx((12.3456, -23.4567, 0.0012), abs=1e-9)
 
 
+def test_a_coordinate_record_of_zeros_means_no_distance() -> None:
+    for data in (b"U+00000000-00000000+00000000m+2515656d", b"/+0000000000+0000000000+0000000000m+2515656d"):
+        fix = parsed(data)
+        assert (fix.status, fix.reason, fix.east_m) == (Status.NOT_AVAILABLE, "no distance", None)
+        assert position_mm(fix) is None
+    assert parsed(b"U+00000000-00000001+00000000m+2515656d").status is Status.OK
+
+
+@pytest.mark.parametrize(
+    "coordinates",
+    [b"+0000012345-00023344-00029912", b"+00012345-0000023344-00029912", b"+00012345-00023344-0000029912"],
+)
+def test_coordinates_of_one_record_have_one_width(coordinates: bytes) -> None:
+    with pytest.raises(RecordError, match="layout"):
+        parsed(b"U" + coordinates + b"m+2515656d")
+
+
 def test_a_tracking_record_keeps_everything_the_instrument_said() -> None:
     fix = parsed(TRACKING[:-3])
     assert fix.slope_distance_m == pytest.approx(1178.4812, abs=1e-9)

@@ -51,6 +51,7 @@ class Case:
         plan: what whoever drives the rig does.
         formats: of the CAN log.
         host: rigcal sets up the nodes, sends SYNC and polls; else it only listens.
+        prism: of the session that the replay takes the fixes for; "" for none.
     """
 
     duration_s: float
@@ -59,6 +60,7 @@ class Case:
     plan: Sequence[Step] = (Step(0.0, aim="r"),)
     formats: tuple[str, ...] = ("log",)
     host: bool = True
+    prism: str = ""
 
 
 CASES = {
@@ -68,7 +70,7 @@ CASES = {
         16.0,
         faults="bad_check@2,dropped_ack@3,joined_buffers@4,clutter@5,lock_loss@7:seconds=3",
     ),
-    "prism-jump": Case(8.0, faults="prism_jump@4:to=w"),
+    "prism-jump": Case(8.0, faults="prism_jump@4:to=w", prism="r"),
     "node-faults": Case(
         14.0,
         faults="node_silent@3:node=33:seconds=4,emergency@4:node=34,emergency_clear@6:node=34,"
@@ -115,6 +117,8 @@ def replay(folder: Path, suffix: str, readings: Path) -> None:
     store = readings.with_name(f"{readings.stem}-{suffix}.sqlite")
     files = [str(folder / f"boom.{suffix}"), str(folder / "station.serial")]
     options = ["--config", str(folder / "rigcal.toml"), "--store", str(store), "--readings", str(readings)]
+    prism = CASES[folder.name].prism
+    options += ["--prism", prism] if prism else []
     result = CliRunner().invoke(main, ["replay", *files, *options], catch_exceptions=False)
     for file in store.parent.glob(f"{store.name}*"):
         file.unlink()

@@ -97,6 +97,29 @@ def test_it_lives_from_ready_to_the_end_of_its_input(rig: Process) -> None:
     assert not rig.station.is_symlink()
 
 
+def test_what_is_put_on_the_links_is_logged(tmp_path: Path) -> None:
+    process = Process(tmp_path, "--push-s", "0.5", "--wire-log", str(tmp_path / "wire"))
+    process.next("ready")
+    process.do("aimed", do="aim", target="r")
+    with serial.Serial(str(process.station), 9600, timeout=0.1) as port:
+        for _ in range(10):  # the first ones come while it still turns
+            read_until(port, b"\n")
+    assert process.do("tracked", do="tracked")["target"] == "r"
+    process.do("accepted", do="fault", kind="bus_error", state="bus_off")
+    process.next("fault")
+    assert process.end() == (0, b"")
+    lines = [line.split(" ") for line in (tmp_path / "wire").read_text(encoding="ascii").splitlines()]
+    frames = [line for line in lines if line[0] == "C"]
+    assert ["40", "e", "0000000000000000"] in [line[2:] for line in frames]  # nobody listened on the bus: it is logged
+    assert {"80", "200", "201"} <= {line[2] for line in frames}
+    station = bytes.fromhex("".join(line[2] for line in lines if line[0] == "S"))
+    assert station.count(b"\r\n") >= 1
+    measured = [line for line in lines if line[0] == "M"]
+    assert {line[2] for line in measured} == {"r"}
+    assert set(json.loads(measured[0][6])) == set(shipped_rig("swdt82").joint_names)
+    assert [json.loads(" ".join(line[2:]))["kind"] for line in lines if line[0] == "E"] == ["bus_error"]
+
+
 def test_quit_and_sigterm_end_it_cleanly(tmp_path: Path) -> None:
     process = Process(tmp_path)
     process.next("ready")
@@ -202,6 +225,7 @@ def test_an_unplugged_port_comes_back(rig: Process) -> None:
         (["--latency-ms", "-1"], b"latency-ms must not be negative"),
         (["--random-faults", "-1"], b"random-faults must be positive"),
         (["--origin", "now"], b"is not UTC_NS,MONOTONIC_NS,BOOT_ID"),
+        (["--map", "38"], b"is not NODE:WORD+WORD"),
         (["--can-port", "/nowhere/can"], b"No such file"),
     ],
 )

@@ -66,6 +66,15 @@ def test_stamps_rise_and_no_two_frames_share_the_bus(quiet: Generated) -> None:
     assert min(np.diff(frames)) >= 47 / 500_000 * 1e9
 
 
+def test_a_node_may_be_commissioned_to_send_its_warnings_beside_the_position() -> None:
+    words = (0x60040020, 0x65030010, 0x65050010)
+    generated = record(shipped_rig("swdt82"), 4.0, faults="warning@2:node=38:bits=16", mappings={38: words})
+    sent = [capture.data for capture in can_of(generated, 0x180 + 38)]
+    assert {len(data) for data in sent} == {8}
+    assert [data[4:] for data in sent[:: len(sent) - 1]] == [bytes(4), b"\x00\x00\x10\x00"]
+    assert {len(capture.data) for capture in can_of(generated, 0x180 + 37)} == {4}
+
+
 def test_all_nodes_boot_are_started_and_answer_every_sync(quiet: Generated) -> None:
     syncs = len(can_of(quiet, 0x080))
     assert syncs == pytest.approx(200, abs=2)

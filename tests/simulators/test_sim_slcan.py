@@ -69,10 +69,15 @@ def test_the_wrong_bit_rate_hears_nothing_and_sends_nothing() -> None:
     assert adapter.encode(FRAME) != b""
 
 
-def test_error_frames_do_not_cross_this_protocol() -> None:
+def test_errors_on_the_bus_are_told_in_lines_of_their_own() -> None:
     adapter = SlcanAdapter()
+    bus_off = Frame(0x040, bytes(8), is_error=True)
+    assert adapter.encode(bus_off) == b""  # closed
     adapter.feed(b"O\r")
-    assert adapter.encode(Frame(4, bytes(8), is_error=True)) == b""
+    assert adapter.encode(bus_off) == b"sb000000\r"
+    assert adapter.encode(Frame(0x004, bytes([0, 0x10, 0, 0, 0, 0, 0, 0]), is_error=True)) == b"sp000000\r"
+    assert adapter.encode(Frame(0x020, bytes(8), is_error=True)) == b"e1a\r"
+    assert adapter.encode(Frame(0x200, bytes(8), is_error=True)) == b""  # none that adapters tell of
 
 
 @given(st.lists(st.binary(max_size=30), max_size=20))

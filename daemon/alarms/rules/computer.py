@@ -1,0 +1,54 @@
+"""The computer's clock, and the daemon's own parts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import UTC, datetime
+
+from daemon.alarms.alarm import Finding, rule
+from daemon.alarms.evidence import Evidence
+from drivers.clock import NS_PER_S
+from drivers.readings import EventKind
+
+STEPPED_S = 900.0
+EARLIEST_NS = round(datetime(2025, 1, 1, tzinfo=UTC).timestamp()) * NS_PER_S  # rigcal is not older
+BEHIND_NS = 60 * NS_PER_S
+
+
+@rule(
+    "warning", "See that the clock is right and stays so (NTP); records are ordered by another clock and are not lost."
+)
+def clock_stepped(evidence: Evidence) -> Iterator[Finding]:
+    """The computer's clock was set within the last 15 minutes."""
+    for event in evidence.lately(EventKind.CLOCK_STEP, STEPPED_S):
+        yield event.device, event.text
+
+
+@rule("critical", "Set the computer's clock; if it starts so each time, change the battery of its clock.")
+def clock_behind(evidence: Evidence) -> Iterator[Finding]:
+    """The computer's clock stands before the year 2025, or at an earlier time than when rigcal last ran. Cleared when
+    it is set."""
+    now_ns, before = evidence.now.utc_ns, evidence.previous_run
+    if now_ns < EARLIEST_NS:
+        yield "clock", f"the computer's clock stands at {_utc(now_ns):%Y-%m-%d}"
+    elif before is not None and now_ns < before.utc_ns - BEHIND_NS:
+        last = f"{_utc(before.utc_ns):%Y-%m-%d %H:%M} UTC"
+        yield "clock", f"the computer's clock stands at an earlier time than {last}, when rigcal last ran"
+
+
+@rule("critical", "Restart rigcal: `systemctl restart rigcal`.")
+def control_dead(evidence: Evidence) -> Iterator[Finding]:
+    """The daemon takes no commands on its control socket any more."""
+    if not evidence.is_control_served:
+        yield "control socket", "no commands are taken any more"
+
+
+@rule("warning", "Report the fault with rigcal's log; alarms of this sort stand as they were.", hold_s=5.0)
+def not_watched(evidence: Evidence) -> Iterator[Finding]:
+    """A rule of an alarm, or what it looks at, has failed itself. Cleared 5 s after it works again."""
+    for part, why in evidence.unwatched.items():
+        yield part, f"{part} cannot be watched: {why}"
+
+
+def _utc(utc_ns: int) -> datetime:
+    return datetime.fromtimestamp(utc_ns // NS_PER_S, UTC)

@@ -1,0 +1,64 @@
+"""Total stations: silent, not locked, tilted, in error, on another prism."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from daemon.alarms.alarm import Finding, rule
+from daemon.alarms.evidence import Evidence
+from daemon.present_state import SILENT, is_present
+from drivers.readings import EventKind, LockState
+
+_TURNED_AWAY = (LockState.STANDBY, LockState.SEARCHING, LockState.WAITING, LockState.ROTATING)
+
+
+@rule(
+    "critical", "Check that the station is on, its cable, and its settings (baud rate, parity, line end).", hold_s=3.0
+)
+def station_silent(evidence: Evidence) -> Iterator[Finding]:
+    """A station gives no records for longer than its time-out; a warning while no session is open. Cleared 3 s after
+    it is heard again. While its link is closed that alarm stands for this one."""
+    for station in evidence.acquisition.stations:
+        if station.status == SILENT:
+            yield station.name, "the station gives no records", "warning" if evidence.session is None else "critical"
+
+
+@rule("warning", "Aim the station at the session's prism; look what stands in the line of sight.", after_s=4, hold_s=3)
+def station_not_locked(evidence: Evidence) -> Iterator[Finding]:
+    """A station follows no prism for 4 s while a session is open. Searching and waiting are usual at other times, and
+    for some seconds when a boom passes the line of sight. Cleared when it has been locked for 3 s."""
+    for station in evidence.acquisition.stations:
+        if evidence.session is not None and is_present(station.status) and station.lock in _TURNED_AWAY:
+            yield station.name, f"the station is {station.lock} while session {evidence.session.id} is open"
+
+
+@rule(
+    "critical", "Level the instrument, or switch its compensator on; then describe a new set-up.", after_s=3, hold_s=3
+)
+def station_tilted(evidence: Evidence) -> Iterator[Finding]:
+    """A station says that its compensator is out of range or off, for 3 s; its fixes are not used."""
+    for station in evidence.acquisition.stations:
+        if is_present(station.status) and station.tilt_ok is False:
+            yield station.name, station.reason or "the compensator is out of range or off"
+
+
+@rule("warning", "Look at the instrument's display; the code is in its manual.")
+def instrument_error(evidence: Evidence) -> Iterator[Finding]:
+    """A station has reported an error, refused a command or not answered. Cleared when it has given a good fix since,
+    and half a minute after the last error at the earliest."""
+    good_s = {station.name: station.good_age_s for station in evidence.acquisition.stations}
+    for event in evidence.standing(EventKind.INSTRUMENT_ERROR):
+        since = good_s.get(event.device)
+        is_over = since is not None and since < event.age_s and event.age_s > 30.0
+        if not is_over and not evidence.is_cut_off(event.device):
+            yield event.device, event.text
+
+
+@rule("critical", "Aim the station at the session's prism; if it is on it, say `rigcal session confirm-prism`.")
+def prism_jump(evidence: Evidence) -> Iterator[Finding]:
+    """A station's target jumped further than a boom can move while a session is open: it may follow another prism, and
+    its fixes do not count. Cleared when the target is the earlier one again, when an operator confirms the prism, and
+    with the session; never by time."""
+    if evidence.session is not None:
+        for suspicion in evidence.session.suspicions:
+            yield suspicion.station, f"{suspicion.reason}; its fixes do not count"

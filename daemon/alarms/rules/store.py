@@ -1,0 +1,35 @@
+"""The store and its disk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from daemon.alarms.alarm import Finding, rule
+from daemon.alarms.evidence import Evidence
+
+CRITICAL_BYTES = 200 * 2**20
+
+
+@rule("critical", "Free space on the disk, or check it; captures wait in memory meanwhile.", hold_s=5.0)
+def not_storing(evidence: Evidence) -> Iterator[Finding]:
+    """Nothing can be written to the store. Cleared 5 s after it can again."""
+    if evidence.acquisition.error is not None:
+        yield "store", evidence.acquisition.error
+
+
+@rule("critical", "Do as the alarm says before rigcal is stopped: what lies in a file without a name goes with it.")
+def store_unsound(evidence: Evidence) -> Iterator[Finding]:
+    """The store is damaged, or a file of it was replaced or is gone."""
+    if evidence.store.fault:
+        yield "store", evidence.store.fault
+
+
+@rule("warning", "Free space on the disk of the store.", hold_s=60.0)
+def disk_nearly_full(evidence: Evidence) -> Iterator[Finding]:
+    """Little of the store's disk is free: less than 1 GiB, or less than 5 % and 10 GiB. Critical below 200 MiB. Cleared
+    after a minute with more."""
+    free = evidence.store.free_bytes
+    if free is not None and free < CRITICAL_BYTES:
+        yield "store", "less than 200 MiB are free on the disk", "critical"
+    elif evidence.store.is_low:
+        yield "store", "the disk is nearly full"

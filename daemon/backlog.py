@@ -1,0 +1,111 @@
+"""Captures that are stored and wait to be decoded.
+
+The store's `undecoded_chunks` is the whole of it, so a stop, a kill or a slow decoder loses nothing. What came last is
+kept in memory too, which spares reading it back; what a run before this one left, and what is more than memory should
+hold, is read from the store.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from daemon.store import Store, StoreError
+from drivers.clock import Clock
+from drivers.readings import Capture, DecodeFailure, Record
+
+BATCH_CAPTURES = 4096  # decoded and stored at once, so that a stop and the watchdog need not wait for more
+HELD_CAPTURES = 50_000
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Captures that are decoded together.
+
+    Attributes:
+        chunk_ids: the chunks that hold them.
+        captures: all of them, each link's in order.
+        reports: what the links told beside them, which is stored already.
+        failures: chunks among them that cannot be read.
+        is_left_over: a run before this one captured them.
+    """
+
+    chunk_ids: Sequence[int]
+    captures: Sequence[Capture]
+    reports: Sequence[Record] = ()
+    failures: Sequence[Record] = ()
+    is_left_over: bool = False
+
+
+class Backlog:
+    """What waits to be decoded, oldest first. Belongs to the writer's thread.
+
+    Args:
+        store: where the captures are.
+        clock: for when a chunk was found to be damaged.
+    """
+
+    def __init__(self, store: Store, clock: Clock) -> None:
+        self._store, self._clock = store, clock
+        self._batches: deque[Batch] = deque()
+        self._held = 0
+        self._reports: list[Record] = []  # of batches that memory does not hold
+        self._last_id = 0  # chunks up to this one have been given out
+        self._left_over_until = store.newest_undecoded()
+        self._is_in_store = self._left_over_until > 0
+
+    @property
+    def is_behind(self) -> bool:
+        """True while some of it is in the store alone."""
+        return self._is_in_store
+
+    @property
+    def is_empty(self) -> bool:
+        """True when all that was stored has been given out."""
+        return not self._batches and not self._is_in_store
+
+    def add(self, batch: Batch) -> None:
+        """A batch that has been stored waits behind all others."""
+        if self._is_in_store or self._held + len(batch.captures) > HELD_CAPTURES:
+            self._is_in_store = True
+            self._reports += batch.reports
+            return
+        self._batches.append(batch)
+        self._held += len(batch.captures)
+
+    def next(self) -> Batch | None:
+        """Take the oldest batch out; None when there is none.
+
+        Raises:
+            sqlite3.OperationalError: the disk does not give it at present.
+        """
+        if self._batches:
+            batch = self._batches.popleft()
+            self._held -= len(batch.captures)
+        elif self._is_in_store:
+            batch = self._read()
+            if not batch.chunk_ids:
+                self._is_in_store = False
+                if not batch.reports:
+                    return None
+                self._reports = []
+        else:
+            return None
+        self._last_id = max([self._last_id, *batch.chunk_ids])
+        return batch
+
+    def _read(self) -> Batch:
+        ids = self._store.undecoded_chunks(self._last_id, BATCH_CAPTURES)
+        is_left_over = bool(ids) and ids[0] <= self._left_over_until
+        if is_left_over:
+            ids = [chunk_id for chunk_id in ids if chunk_id <= self._left_over_until]
+        captures: list[Capture] = []
+        failures: list[Record] = []
+        for chunk_id in ids:
+            try:
+                captures += self._store.chunk_captures(chunk_id)
+            except StoreError as error:
+                failures.append(DecodeFailure("store", self._clock.now(), str(error), b""))
+        # What links told is news of now: it goes with what was captured now, after all that was left over.
+        return Batch(ids, captures, () if ids else tuple(self._reports), failures, is_left_over)

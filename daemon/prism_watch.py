@@ -1,0 +1,126 @@
+"""Watches in each session that its stations stay on its prism, and takes an operator's word that they are."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+from daemon.open_session import OpenSession
+from daemon.prism_guard import MotionLimit, PrismGuard, Suspicion, Word
+from daemon.store.reader import Reader
+from daemon.store.rows import stamp_of
+from daemon.store.store import Store
+from drivers.clock import Clock, Stamp
+from drivers.readings import DeviceEvent, EventKind, Fix, LockState, Status
+from drivers.station import position_mm
+
+log = logging.getLogger(__name__)
+
+_NUMBERS = ("hz_angle_rad", "zenith_angle_rad", "slope_distance_m", "north_m", "east_m", "up_m")
+# What a station gave in a session from the last fix that calibration may use, or from the session's start.
+_FIXES = f"""SELECT utc_ns, monotonic_ns, boot_id, status, lock, {", ".join(_NUMBERS)}
+    FROM fixes, (SELECT started_boot_id, started_monotonic_ns FROM calibration_sessions WHERE id = ?1)
+    WHERE station = ?2 AND (boot_id, monotonic_ns) >= (started_boot_id, started_monotonic_ns)
+        AND fixes.id >= coalesce((SELECT max(fix_id) FROM observations JOIN fixes AS used ON used.id = fix_id
+            WHERE session_id = ?1 AND excluded IS NULL AND used.station = ?2), 0)
+    ORDER BY fixes.id"""
+
+
+class PrismWatch:
+    """The guards of sessions' prisms.
+
+    Args:
+        store: where operators' words are kept; fixes and observations are there.
+        clock: for when they were given.
+        limits: station -> what motion can do to its prism.
+    """
+
+    def __init__(self, store: Store, clock: Clock, limits: Mapping[str, MotionLimit]) -> None:
+        self._store, self._clock, self._limits = store, clock, limits
+
+    def see(self, session: OpenSession, fix: Fix) -> DeviceEvent | None:
+        """Take a fix of the session, in order; what there is to tell an operator."""
+        event = self._take(session, fix)
+        if event is not None:
+            log.warning("station %s: %s", fix.station, event.text)
+        return event
+
+    def doubt(self, session: OpenSession, fix: Fix) -> str | None:
+        """Why a fix that was seen must not be used; None when it may."""
+        guard = session.guards.get(fix.station)
+        suspicion = guard.doubt(fix.stamp) if guard is not None else None
+        return suspicion.reason if suspicion is not None else None
+
+    def suspicions(self, session: OpenSession) -> list[Suspicion]:
+        """Those of the session that last."""
+        return [guard.suspicion for guard in list(session.guards.values()) if guard.suspicion is not None]
+
+    def confirm(self, session: OpenSession, operator: str) -> dict[str, Any]:
+        """Take the word that the session's stations are on its prism: their fixes count from now on."""
+        ended = self.suspicions(session)
+        at = self._clock.now()
+        row = {"session_id": session.id, **self._store.instant(at), "operator": operator, "turning": False}
+        who = operator or "an operator"
+        text = f"{who} confirms that the station is on prism {session.prism}; its fixes count from now on"
+        stations = [suspicion.station for suspicion in ended] or [*self._limits]
+        events = [DeviceEvent(station, at, EventKind.PRISM_CONFIRMED, text) for station in stations]
+        with self._store.transaction():
+            self._store.insert("prism_confirmations", row)
+            self._store.insert_records(events)
+        session.words.append(Word(at))
+        log.info("session %s: %s", session.id, text)
+        return {"session": session.id, "prism": session.prism, "text": text, "ended": [as_dict(s) for s in ended]}
+
+    def turned(self, session: OpenSession, at: Stamp) -> None:
+        """The station was turned to the session's prism by something that knows where that is."""
+        row = {"session_id": session.id, **self._store.instant(at), "turning": True}
+        self._store.insert("prism_confirmations", row)
+        session.words.append(Word(at, is_turning=True))
+
+    def restore(self, session: OpenSession) -> None:
+        """What an earlier run of the daemon knew, from what it stored; where it left off, the next fix is a new lock.
+
+        A restart ends no suspicion, and what happened while nobody listened may begin one.
+        """
+        with Reader(self._store.path) as reader:
+            boots = reader.boots()
+            words = reader.rows("SELECT * FROM prism_confirmations WHERE session_id = ? ORDER BY id", (session.id,))
+            session.words += [Word(stamp_of(row, boots), bool(row["turning"])) for row in words]
+            for station in self._limits:
+                for row in reader.rows(_FIXES, (session.id, station)):
+                    self._take(session, _fix(station, row, stamp_of(row, boots)))
+                self._guard(session, station).look_away()
+        for suspicion in self.suspicions(session):
+            log.warning("session %s: %s; %s", session.id, suspicion.reason, suspicion.remedy)
+
+    def _take(self, session: OpenSession, fix: Fix) -> DeviceEvent | None:
+        guard = self._guard(session, fix.station)
+        place_mm = position_mm(fix)
+        if not session.has(fix.stamp) or (place_mm is not None and session.is_control_point(place_mm)):
+            guard.look_away()
+            return None
+        return guard.see(fix)
+
+    def _guard(self, session: OpenSession, station: str) -> PrismGuard:
+        if station not in session.guards:
+            limit = self._limits.get(station, MotionLimit())
+            session.guards[station] = PrismGuard(station, limit, session.words)
+        return session.guards[station]
+
+
+def as_dict(suspicion: Suspicion) -> dict[str, Any]:
+    """A suspicion as `status` shows it."""
+    return {
+        "station": suspicion.station,
+        "since_utc_ns": suspicion.since.utc_ns,
+        "distance_m": suspicion.distance_m,
+        "text": suspicion.reason,
+        "remedy": suspicion.remedy,
+    }
+
+
+def _fix(station: str, row: Mapping[str, Any], stamp: Stamp) -> Fix:
+    """As much of a stored fix as a guard looks at."""
+    numbers = {name: row[name] for name in _NUMBERS}
+    return Fix(station, stamp, stamp, Status(row["status"]), LockState(row["lock"]), **numbers)

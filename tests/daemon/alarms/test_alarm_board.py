@@ -1,0 +1,192 @@
+"""Alarms are kept in memory, store, log and status alike, through faults of the store and restarts."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon.alarms.alarm import Finding, Rule, rule
+from daemon.alarms.board import GRACE_S, AlarmBoard
+from daemon.alarms.evidence import Evidence, FailedJob
+from daemon.alarms.library import library
+from daemon.store import Store
+from daemon.store.alarms import AlarmTable
+from drivers.clock import ManualClock
+from tests.daemon.store_support import at, table
+
+
+@rule("critical", "Plug it in.", after_s=2.0, hold_s=3.0)
+def unplugged(evidence: Evidence) -> Iterable[Finding]:
+    """It is unplugged."""
+    for job in evidence.failed_jobs:
+        yield job.kind, job.error
+
+
+class Rig:
+    """A board whose evidence tests say: names of what is wrong, each with its text."""
+
+    def __init__(self, path: Path, rules: list[Rule] | None = None, clock: ManualClock | None = None) -> None:
+        self.path, self.clock = path, clock or ManualClock(at(0))
+        self.store = Store(path)
+        self.wrong: dict[str, str] = {}
+        self.board = AlarmBoard(AlarmTable(self.store), self.gather, self.clock, rules or [unplugged])
+
+    def gather(self) -> Evidence:
+        return Evidence(self.clock.now(), failed_jobs=tuple(FailedJob(1, *item) for item in self.wrong.items()))
+
+    def pass_s(self, seconds: int, **wrong: str) -> None:
+        """Let seconds pass; the board looks at the end of each."""
+        self.wrong = wrong
+        for _ in range(seconds):
+            self.clock.advance(1.0)
+            self.board.evaluate()
+
+    def active(self) -> list[str]:
+        return [alarm["subject"] for alarm in self.board.status()["active"]]
+
+    def stored(self) -> list[tuple[str, bool]]:
+        return [(row["subject"], row["cleared_utc_ns"] is None) for row in table(self.path, "alarms")]
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    rig = Rig(tmp_path / "rigcal.sqlite")
+    yield rig
+    rig.store.close()
+
+
+def test_an_alarm_is_raised_once_and_cleared_once_in_store_log_and_status(
+    rig: Rig, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    rig.pass_s(10, boom="no such port")
+    (active,) = rig.board.status()["active"]
+    assert active["age_s"] == pytest.approx(7.0)  # it stood for 2 s before it was raised, at the third look
+    assert (active["kind"], active["severity"], active["text"]) == ("unplugged", "critical", "no such port")
+    assert active["remedy"] == "Plug it in."
+    assert rig.stored() == [("boom", True)]
+    rig.pass_s(10)
+    assert rig.active() == []
+    assert rig.stored() == [("boom", False)]
+    told = [(r.levelname, r.getMessage()) for r in caplog.records if r.name == "daemon.alarms.board"]
+    assert told == [
+        ("ERROR", "alarm unplugged, boom: no such port. Plug it in."),
+        ("INFO", "alarm unplugged, boom is over after 10 s"),
+    ]
+    (row,) = table(rig.path, "alarms")
+    assert row["cleared_monotonic_ns"] - row["raised_monotonic_ns"] == 10_000_000_000
+
+
+def test_what_comes_and_goes_is_one_alarm(rig: Rig) -> None:
+    for _ in range(5):
+        rig.pass_s(1, boom="gone")
+        rig.pass_s(1)
+    assert rig.stored() == [], "too short to be one"
+    for _ in range(5):
+        rig.pass_s(3, boom="gone")
+        rig.pass_s(2)
+    assert rig.stored() == [("boom", True)]
+
+
+def test_a_text_that_changes_is_the_same_alarm(rig: Rig) -> None:
+    rig.pass_s(4, boom="no such port")
+    rig.pass_s(1, boom="in use")
+    assert [row["text"] for row in table(rig.path, "alarms")] == ["in use"]
+
+
+def test_an_alarm_shows_although_the_store_cannot_be_written_and_is_written_later(rig: Rig) -> None:
+    rig.store.boot_row(rig.clock.now())
+    pages = rig.store.rows("PRAGMA page_count")[0]["page_count"]
+    long = "x" * 300
+    rig.store.rows(f"PRAGMA max_page_count = {pages}")
+    rig.pass_s(4, **{f"link{n}": long for n in range(200)})
+    assert len(rig.active()) == 200
+    assert len(rig.stored()) < 200
+    rig.pass_s(6, boom="still")
+    assert rig.active() == ["boom"]
+    rig.store.rows("PRAGMA max_page_count = 1000000")
+    rig.pass_s(1, boom="still")
+    stored = rig.stored()
+    assert len(stored) == 201
+    assert [subject for subject, is_active in stored if is_active] == ["boom"]
+
+
+def test_an_alarm_of_an_earlier_run_goes_on_with_its_old_time_or_ends_after_a_grace(tmp_path: Path) -> None:
+    path = tmp_path / "rigcal.sqlite"
+    before = Rig(path)
+    before.pass_s(5, boom="gone", station="gone")
+    since = {a["subject"]: a["since_utc_ns"] for a in before.board.status()["active"]}
+    before.store.close()
+    again = Rig(path, clock=ManualClock(at(3600, "another boot")))
+    assert sorted(again.active()) == ["boom", "station"], "before anything is known"
+    again.pass_s(round(GRACE_S) - 1, boom="gone")
+    assert sorted(again.active()) == ["boom", "station"]
+    again.pass_s(2, boom="gone")
+    (left,) = again.board.status()["active"]
+    assert (left["subject"], left["since_utc_ns"]) == ("boom", since["boom"])
+    assert again.stored() == [("boom", True), ("station", False)]
+    again.store.close()
+
+
+def test_a_rule_that_fails_is_an_alarm_and_its_alarms_stand_as_they_were(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    @rule("warning", "Look.")
+    def faulty(evidence: Evidence) -> Iterable[Finding]:
+        """It is faulty."""
+        for job in evidence.failed_jobs:
+            yield "first", "is there"
+            if job.error == "fail":
+                raise ZeroDivisionError("a defect")
+
+    (watched,) = (one for one in library() if one.kind == "not_watched")
+    rig = Rig(tmp_path / "rigcal.sqlite", [faulty, unplugged, watched])
+    rig.pass_s(4, boom="gone")
+    rig.wrong = {}
+    rig.pass_s(5, boom="fail")
+    active = {a["kind"]: a["subject"] for a in rig.board.status()["active"]}
+    assert active == {"unplugged": "boom", "faulty": "first", "not_watched": "faulty"}
+    assert caplog.text.count("Traceback") == 1
+    rig.pass_s(10)
+    assert rig.active() == []
+    rig.store.close()
+
+
+def test_a_board_that_cannot_look_says_how_old_its_alarms_are(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    rig.pass_s(4, boom="gone")
+
+    def fail() -> Evidence:
+        raise OSError("no evidence")
+
+    rig.board._gather = fail
+    rig.pass_s(30)
+    assert rig.active() == ["boom"]
+    assert rig.board.status()["looked_age_s"] == pytest.approx(30.0)
+    assert caplog.text.count("the alarms could not be looked at") == 1
+
+
+def test_alarms_that_are_over_are_listed_newest_first(rig: Rig) -> None:
+    rig.pass_s(4, one="a")
+    rig.pass_s(4, two="b")
+    rig.pass_s(8)
+    listed: dict[str, Any] = rig.board.list_command({"all": True})
+    assert listed["active"] == []
+    assert [alarm["subject"] for alarm in listed["cleared"]] == ["two", "one"]
+    assert rig.board.list_command({})["cleared"] == []
+
+
+def test_critical_alarms_come_first_and_older_ones_before_younger(tmp_path: Path) -> None:
+    @rule("warning", "Look.")
+    def minor(evidence: Evidence) -> Iterable[Finding]:
+        """It is minor."""
+        return [("minor", "is there")]
+
+    rig = Rig(tmp_path / "rigcal.sqlite", [minor, unplugged])
+    rig.pass_s(4, one="a")
+    rig.pass_s(4, one="a", two="b")
+    assert rig.active() == ["one", "two", "minor"]
+    rig.store.close()

@@ -1,0 +1,363 @@
+"""Every rule raises its alarm from evidence and clears it without; every kind is in docs/alarms.md."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon.acquisition_status import (
+    AcquisitionStatus,
+    ChannelStatus,
+    EventStatus,
+    FrameStatus,
+    LinkStatus,
+    StationStatus,
+)
+from daemon.alarms.alarm import Alarm
+from daemon.alarms.evidence import (
+    Evidence,
+    FailedJob,
+    ModelEvidence,
+    SessionEvidence,
+    SetupEvidence,
+    StoreEvidence,
+)
+from daemon.alarms.library import library
+from daemon.alarms.page import page
+from daemon.decode_failures import DecodeStatus
+from daemon.prism_guard import Suspicion
+from drivers.clock import NS_PER_S, Stamp
+from drivers.readings import EventKind
+
+NOW = Stamp(1_790_000_000 * NS_PER_S, 5000 * NS_PER_S, "boot")
+SESSION = SessionEvidence("s001-r", 100.0)
+DOCS = Path(__file__).parents[3] / "docs"
+
+
+def link(up: bool | None = True, name: str = "boom", **more: Any) -> LinkStatus:
+    return LinkStatus(name, up, **{"since_s": 1000.0, **more})
+
+
+def channel(
+    status: str = "ok", name: str = "theta1", kind: Any = "joint", last: str | None = "ok", age_s: float = 0.1
+) -> ChannelStatus:
+    value = 1.0 if status == "ok" else None
+    return ChannelStatus(name, "deg", value, status, None if last is None else age_s, last, "boom", kind)
+
+
+def station(status: str = "ok", lock: str = "locked", good_age_s: float | None = 0.1, **more: Any) -> StationStatus:
+    return StationStatus("station", status, lock, "", 0.1, 5, "ok", "locked", good_age_s, **more)
+
+
+def event(
+    kind: EventKind, device: str = "boom", number: int = 1, code: int | None = None, age_s: float = 5
+) -> EventStatus:
+    return EventStatus(device, kind.value, f"{device}: {kind.value}", code, NOW.utc_ns, age_s, number)
+
+
+def known(
+    *events: EventStatus,
+    links: Sequence[LinkStatus] = (link(),),
+    channels: Sequence[ChannelStatus] = (channel(),),
+    stations: Sequence[StationStatus] = (station(),),
+    decoding: Sequence[DecodeStatus] = (),
+    frames_s: Sequence[float] = (0.1,),
+    error: str | None = None,
+    **more: Any,
+) -> Evidence:
+    acquisition = AcquisitionStatus(
+        links=[*links, link(name="station")] if not any(one.name == "station" for one in links) else [*links],
+        channels=[*channels],
+        stations=[*stations],
+        last_events=[*events],
+        decoding=[*decoding],
+        frames=[FrameStatus("boom", f"{i:03X}", "", 5, None, age_s, None) for i, age_s in enumerate(frames_s)],
+        error=error,
+    )
+    return Evidence(NOW, **{"running_s": 1000.0, "acquisition": acquisition, **more})
+
+
+def failures(lately: int, share: float) -> DecodeStatus:
+    return DecodeStatus("theta1", 500, "the frame has 3 bytes, the value needs 4", 400, lately, share)
+
+
+SILENT = channel("silent", age_s=40)
+QUIET = channel("silent", "boom_valve", "signal", age_s=40)
+E = EventKind
+
+# kind -> evidence that raises it and the subjects it names; evidence in which it is over.
+CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
+    "link_down": [
+        (known(links=[link(False, reason="unplugged")]), ["boom"], known()),
+        (known(links=[link(None)]), ["boom"], known(links=[link(None)], running_s=2.0)),
+    ],
+    "link_restarted": [
+        (known(links=[link(restarted_age_s=5)]), ["boom"], known(links=[link(restarted_age_s=301)])),
+    ],
+    "queue_full": [(known(links=[link(dropped_age_s=1)]), ["boom"], known(links=[link(dropped_age_s=6)]))],
+    "time_doubtful": [(known(event(E.TIME_DOUBTFUL)), ["boom"], known(event(E.TIME_DOUBTFUL, age_s=301)))],
+    "frames_lost": [(known(event(E.FRAMES_DROPPED)), ["boom"], known(event(E.FRAMES_DROPPED, age_s=301)))],
+    "decode_failures": [
+        (known(decoding=[failures(10, 0.02)]), ["theta1"], known(decoding=[failures(10, 0.005)])),
+        (known(decoding=[failures(60, 1.0)]), ["theta1"], known(decoding=[failures(9, 1.0)])),
+    ],
+    "decoder_defective": [
+        (known(links=[link(decoder_failed_age_s=5)]), ["boom"], known(links=[link(decoder_failed_age_s=601)])),
+    ],
+    "bus_off": [
+        (
+            known(event(E.BUS_OFF, age_s=20), channels=[SILENT]),
+            ["boom"],
+            known(event(E.BUS_OFF, age_s=20), event(E.BUS_ERROR_ACTIVE, number=2), channels=[SILENT]),
+        ),
+        (
+            known(event(E.BUS_OFF, age_s=20), channels=[SILENT]),
+            ["boom"],
+            known(event(E.BUS_OFF, age_s=20), channels=[channel()]),
+        ),
+    ],
+    "bus_error_passive": [
+        (
+            known(event(E.BUS_ERROR_PASSIVE, number=3), event(E.BUS_ERROR_ACTIVE, number=2)),
+            ["boom"],
+            known(event(E.BUS_ERROR_PASSIVE), event(E.LINK_UP, number=2)),
+        )
+    ],
+    "heartbeat_lost": [
+        (
+            known(event(E.HEARTBEAT_LOST, "theta1")),
+            ["theta1"],
+            known(event(E.HEARTBEAT_LOST, "theta1"), event(E.HEARTBEAT_RESTORED, "theta1", 2)),
+        ),
+        (
+            known(event(E.HEARTBEAT_LOST, "theta1")),
+            ["theta1"],
+            known(event(E.HEARTBEAT_LOST, "theta1"), channels=[SILENT, channel(name="theta3")]),
+        ),
+    ],
+    "emergency": [
+        (
+            known(event(E.EMERGENCY, "theta1", code=0x5000)),
+            ["theta1"],
+            known(event(E.EMERGENCY, "theta1", code=0x5000), event(E.EMERGENCY_CLEARED, "theta1", 2)),
+        )
+    ],
+    "device_alarm": [
+        (known(event(E.ALARM, "theta1", code=1)), ["theta1"], known(event(E.ALARM, "theta1", code=0))),
+        (
+            known(event(E.ALARM, "theta1"), event(E.CONFIGURED, "theta1", 0)),
+            ["theta1"],
+            known(event(E.ALARM, "theta1"), event(E.CONFIGURED, "theta1", 2)),
+        ),
+        (
+            known(event(E.ALARM, "theta1", code=1), event(E.CONFIGURED, "theta1", 2)),
+            ["theta1"],
+            known(event(E.ALARM, "theta1", code=1), event(E.BOOT_UP, "theta1", 2)),
+        ),
+    ],
+    "device_warning": [
+        (known(event(E.WARNING, "theta1", code=16)), ["theta1"], known(event(E.WARNING, "theta1", code=0))),
+        (
+            known(event(E.WARNING, "station")),
+            ["station"],
+            known(event(E.WARNING, "station"), links=[link(), link(name="station", since_s=1.0)]),
+        ),
+    ],
+    "link_silent": [
+        (
+            known(channels=[SILENT, QUIET], frames_s=[40.0, 41.0]),
+            ["boom"],
+            known(channels=[SILENT, QUIET], frames_s=[40.0], links=[link(since_s=2.0)]),
+        ),
+        (
+            known(channels=[SILENT, channel(name="slow", age_s=40.0)], frames_s=[40.0]),
+            ["boom"],
+            known(channels=[SILENT, channel(name="theta3")]),
+        ),
+        (
+            known(channels=[channel("silent", n, last=None) for n in "ab"], frames_s=[]),
+            ["boom"],
+            known(channels=[channel("silent", n, last=None) for n in "ab"]),
+        ),
+    ],
+    "joint_silent": [
+        (
+            known(channels=[SILENT, QUIET, channel(name="theta3"), channel("silent", "theta4", last=None)]),
+            ["theta1", "theta4"],
+            known(),
+        ),
+        (
+            known(channels=[SILENT, channel(name="theta3")]),
+            ["theta1"],
+            known(channels=[channel("link_down"), channel("link_down", "theta3")], links=[link(False)]),
+        ),
+    ],
+    "signal_silent": [
+        (known(channels=[channel(), QUIET]), ["boom_valve"], known(channels=[SILENT, QUIET], frames_s=[40.0]))
+    ],
+    "joint_not_usable": [
+        (
+            known(channels=[channel(s, s) for s in ("not_available", "out_of_range", "device_alarm", "malformed")]),
+            ["not_available", "out_of_range", "device_alarm", "malformed"],
+            known(channels=[channel(s) for s in ("ok", "silent", "link_down", "starting")]),
+        ),
+        (
+            known(event(E.ALARM, "theta1", code=0), channels=[channel("device_alarm")]),
+            ["theta1"],
+            known(event(E.ALARM, "theta1", code=1), channels=[channel("device_alarm")]),
+        ),
+    ],
+    "signal_not_usable": [
+        (known(channels=[channel("not_available", "boom_valve", "signal")]), ["boom_valve"], known()),
+    ],
+    "station_silent": [(known(stations=[station("silent", "unknown")]), ["station"], known())],
+    "station_not_locked": [
+        (
+            known(stations=[station("not_available", "searching")], session=SESSION),
+            ["station"],
+            known(stations=[station("not_available", "searching")]),
+        ),
+        (
+            known(stations=[station("not_available", "waiting")], session=SESSION),
+            ["station"],
+            known(session=SESSION),
+        ),
+    ],
+    "station_tilted": [
+        (
+            known(stations=[station("out_of_range", tilt_ok=False)]),
+            ["station"],
+            known(stations=[station(tilt_ok=True)]),
+        ),
+    ],
+    "instrument_error": [
+        (
+            known(event(E.INSTRUMENT_ERROR, "station", age_s=60), stations=[station(good_age_s=70)]),
+            ["station"],
+            known(event(E.INSTRUMENT_ERROR, "station", age_s=60)),
+        ),
+        (
+            known(event(E.INSTRUMENT_ERROR, "station", age_s=20)),
+            ["station"],
+            known(
+                event(E.INSTRUMENT_ERROR, "station", age_s=20),
+                stations=[station(good_age_s=None)],
+                links=[link(), link(False, "station")],
+            ),
+        ),
+    ],
+    "prism_jump": [
+        (
+            known(session=replace(SESSION, suspicions=(Suspicion("station", NOW, 9.5),))),
+            ["station"],
+            known(event(E.PRISM_JUMP, "station"), session=SESSION),
+        )
+    ],
+    "not_storing": [(known(error="disk full"), ["store"], known())],
+    "store_unsound": [(known(store=StoreEvidence("the file is gone")), ["store"], known())],
+    "disk_nearly_full": [
+        (known(store=StoreEvidence(is_low=True)), ["store"], known(store=StoreEvidence(free_bytes=10**10))),
+        (known(store=StoreEvidence(free_bytes=10**8)), ["store"], known(store=StoreEvidence(free_bytes=10**9))),
+    ],
+    "setup_moved": [(known(setup=SetupEvidence("S2", True)), ["S2"], known(setup=SetupEvidence("S3", False)))],
+    "session_without_fixes": [
+        (
+            known(session=replace(SESSION, age_s=601), stations=[station(good_age_s=None)]),
+            ["s001-r"],
+            known(session=replace(SESSION, age_s=601)),
+        ),
+        (
+            known(session=replace(SESSION, age_s=9000), stations=[station(good_age_s=601)]),
+            ["s001-r"],
+            known(session=replace(SESSION, age_s=9000), stations=[station(good_age_s=None)], running_s=60.0),
+        ),
+    ],
+    "session_open_long": [
+        (known(session=replace(SESSION, age_s=86_401)), ["s001-r"], known(session=replace(SESSION, age_s=86_399))),
+    ],
+    "session_not_trained": [(known(untrained_sessions={"s001-r": "no control point was shot"}), ["s001-r"], known())],
+    "zero_lost": [
+        (
+            known(model=ModelEvidence(1, ("theta1",)), session=replace(SESSION, jumped=("theta1", "theta3"))),
+            ["theta1", "theta3"],
+            known(model=ModelEvidence(1), session=SESSION),
+        )
+    ],
+    "job_failed": [(known(failed_jobs=(FailedJob(7, "gap", "too poor"),)), ["job 7"], known())],
+    "model_drifted": [
+        (known(model=ModelEvidence(2, drifted_with="s009-r")), ["model 2"], known(model=ModelEvidence(3))),
+    ],
+    "model_unusable": [(known(model=ModelEvidence(2, defect="damaged")), ["model 2"], known(model=ModelEvidence(2)))],
+    "clock_stepped": [
+        (known(event(E.CLOCK_STEP, "clock")), ["clock"], known(event(E.CLOCK_STEP, "clock", age_s=901))),
+    ],
+    "clock_behind": [
+        (replace(known(), now=Stamp(0, 0, "boot")), ["clock"], known()),
+        (known(previous_run=NOW.shifted(3600 * NS_PER_S)), ["clock"], known(previous_run=NOW.shifted(-NS_PER_S))),
+    ],
+    "control_dead": [(known(is_control_served=False), ["control socket"], known())],
+    "not_watched": [(known(unwatched={"the jobs": "a fault"}), ["the jobs"], known())],
+}
+
+
+def raised(kind: str, evidence: Evidence) -> list[Alarm]:
+    (rule,) = (rule for rule in library() if rule.kind == kind)
+    return list(rule(evidence))
+
+
+@pytest.mark.parametrize("kind", CASES)
+def test_a_rule_raises_its_alarm_and_clears_it(kind: str) -> None:
+    for wrong, subjects, right in CASES[kind]:
+        alarms = raised(kind, wrong)
+        assert [alarm.subject for alarm in alarms] == subjects
+        assert all(alarm.text and alarm.remedy for alarm in alarms)
+        assert raised(kind, right) == []
+
+
+def test_every_rule_has_a_case_here() -> None:
+    assert set(CASES) == {rule.kind for rule in library()}
+
+
+def test_nothing_known_raises_nothing() -> None:
+    assert [alarm for rule in library() for alarm in rule(Evidence(NOW))] == []
+    assert [alarm for rule in library() for alarm in rule(known())] == []
+
+
+def test_an_unplugged_bus_is_one_alarm_and_so_is_a_bus_that_is_cut_beyond_the_adapter() -> None:
+    names = [f"theta{n}" for n in range(1, 9)]
+    events = [event(E.HEARTBEAT_LOST, name, n) for n, name in enumerate(names)]
+    unplugged = known(*events, links=[link(False)], channels=[channel("link_down", name) for name in names])
+    cut = known(*events, channels=[channel("silent", name, age_s=9) for name in names], frames_s=[9.0])
+    for evidence, kind in ((unplugged, "link_down"), (cut, "link_silent")):
+        assert [alarm.key for rule in library() for alarm in rule(evidence)] == [(kind, "boom")]
+
+
+def test_a_station_that_is_away_between_sessions_is_a_warning_and_in_one_critical() -> None:
+    for wrong in (
+        {"stations": [station("silent", "unknown")]},
+        {"links": [link(), link(False, "station")], "stations": [station("link_down", "unknown")]},
+    ):
+        idle, busy = known(**wrong), known(**wrong, session=SESSION)
+        assert [alarm.severity for rule in library() for alarm in rule(idle)] == ["warning"]
+        assert [alarm.severity for rule in library() for alarm in rule(busy)] == ["critical"]
+
+
+def test_what_an_instrument_says_comes_without_control_characters_and_bounded() -> None:
+    loud = replace(event(E.INSTRUMENT_ERROR, "station"), text="\x1b[2J\ud800" + "x" * 10_000)
+    (alarm,) = raised("instrument_error", known(loud))
+    assert alarm.text.startswith("?[2J?xxx")
+    assert len(alarm.text) == 300
+
+
+def test_every_kind_is_in_the_documentation_with_what_to_do() -> None:
+    written = (DOCS / "alarms.md").read_text(encoding="utf-8")
+    assert written == page(), "make it anew: python -m daemon.alarms.page > docs/alarms.md"
+    for rule in library():
+        assert f"## {rule.kind}\n" in written
+        assert rule.remedy in written
+        assert rule.meaning in written
+        assert len(rule.meaning) > 20

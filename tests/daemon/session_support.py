@@ -1,0 +1,136 @@
+"""A machine and a station for tests of sessions, which stand and move as they are told."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import resource
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from daemon.config import SessionsSection
+from daemon.control import CommandError
+from daemon.joiner import ObservationJoiner, joint_inputs, signal_inputs
+from daemon.rigs import load_rig
+from daemon.sessions import SessionKeeper
+from daemon.setups import SetupBook
+from daemon.store.store import Store
+from drivers.clock import NS_PER_S, ManualClock
+from drivers.readings import Fix, LockState, Reading, Record, Status
+
+SOURCE = load_rig("swdt82")
+STEP_S = 0.05
+
+
+class SharedClock(ManualClock):
+    """A manual clock that one thread moves while another waits on it."""
+
+    def wait(self, event: threading.Event, seconds: float) -> bool:
+        deadline_ns = self.monotonic_ns() + round(seconds * NS_PER_S)
+        while self.monotonic_ns() < deadline_ns and not event.wait(0.001):
+            pass
+        return event.is_set()
+
+
+class Rig:
+    """A machine and a station that can be stood still and moved, on a clock that only moves when told to."""
+
+    def __init__(self, path: Path) -> None:
+        self.clock = SharedClock()
+        self.store = Store(path)
+        self.store.begin_run(self.clock.now())
+        self.store.declare_channels({j.name: j.unit for j in SOURCE.rig.joints}, {})
+        self.values = {j.name: sum(j.limits) / 2 for j in SOURCE.rig.joints}
+        self.target_mm = (3000.0, 8000.0, 1000.0)
+        self.aimed: list[str] = []
+        self.setups = SetupBook(SOURCE.rig, self.store, self.clock, SessionsSection().control_tolerance_mm)
+        self.keeper = self.new_keeper()
+
+    def new_keeper(self, aim: Callable[[str], None] | None = None) -> SessionKeeper:
+        joiner = ObservationJoiner(joint_inputs(SOURCE.rig), signal_inputs(SOURCE.rig), settle_s=0.5)
+        return SessionKeeper(
+            SOURCE.rig,
+            SOURCE.text,
+            self.store,
+            self.setups,
+            joiner,
+            SessionsSection(fixes_per_shot=3),
+            self.clock,
+            run_id=1,
+            aim=aim,
+        )
+
+    def live(self, seconds: float, **rates: float) -> None:
+        """Let time pass: every joint sampled and the station shooting at each step, as acquisition would tell it."""
+        for _ in range(round(seconds / STEP_S)):
+            self.clock.advance(STEP_S)
+            for name, rate in rates.items():
+                self.values[name] += rate * STEP_S
+            records: list[Record] = [
+                Reading(j.name, self.clock.now(), self.values[j.name], j.unit) for j in SOURCE.rig.joints
+            ]
+            records.append(self.fix())
+            self.store.insert_records(records)
+            self.keeper.on_records(records)
+
+    def fix(self) -> Fix:
+        east, north, up = (v / 1000 for v in self.target_mm)
+        return Fix(
+            "station",
+            self.clock.now(),
+            self.clock.now(),
+            Status.OK,
+            LockState.LOCKED,
+            hz_angle_rad=math.atan2(east, north) % (2 * math.pi),
+            zenith_angle_rad=math.atan2(math.hypot(east, north), up),
+            slope_distance_m=math.sqrt(east**2 + north**2 + up**2),
+        )
+
+    def say(self, command: str, **arguments: Any) -> Any:
+        owner, name = (self.setups, command[6:]) if command.startswith("setup_") else (self.keeper, command)
+        return getattr(owner, f"{name}_command")(arguments)
+
+    def shoot(self, point: str, place_mm: tuple[float, float, float]) -> Any:
+        """Aim at a control point, shoot it, and aim back, with time passing meanwhile."""
+        before, self.target_mm = self.target_mm, place_mm
+        answer: list[Any] = []
+        failure: list[CommandError] = []
+
+        def ask() -> None:
+            try:
+                answer.append(self.say("shoot", point=point))
+            except CommandError as error:
+                failure.append(error)
+
+        asking = threading.Thread(target=ask)
+        asking.start()
+        while asking.is_alive():
+            self.live(STEP_S)
+        asking.join()
+        self.target_mm = before
+        if failure:
+            raise failure[0]
+        return answer[0]
+
+
+@contextlib.contextmanager
+def disk_fails() -> Iterator[None]:
+    """No byte that this process writes reaches a file: the kernel refuses it."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def controlled(rig: Rig, prism: str = "r", kind: str = "static_poses", seconds: float = 2.0) -> str:
+    """A closed session whose control point held from its start to its end."""
+    name = str(rig.say("start", prism=prism, kind=kind)["id"])
+    rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    rig.live(seconds)
+    rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    rig.say("stop")
+    return name

@@ -1,0 +1,268 @@
+"""A store that is damaged, replaced, unlinked or short of room is noticed, and people are told what to do."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import shutil
+import sqlite3
+import subprocess
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from daemon.composition import Parts, joiner
+from daemon.config import Config
+from daemon.control import request
+from daemon.notify import Notifier
+from daemon.service import Daemon
+from daemon.store import Reader, Store, StoreError
+from daemon.store.health import StoreWatch
+from daemon.store.identity import FileIdentity
+from drivers.clock import ManualClock, SystemClock
+from tests.daemon.acquisition_support import ListLink, wait_until
+from tests.daemon.damage import fill, small_disk, tear
+from tests.daemon.job_support import SOURCE, JobRig
+from tests.daemon.store_support import at, reading, table
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "rigcal.sqlite"
+
+
+@contextlib.contextmanager
+def watched(path: Path, *, ends_in_order: bool = True) -> Iterator[tuple[Store, StoreWatch]]:
+    """A run on a store; one that does not end in order is as if it had been killed."""
+    with contextlib.closing(Store(path)) as store:
+        store.begin_run(at(0))
+        watch = StoreWatch(store, ManualClock(at(0)))
+        watch.start()
+        yield store, watch
+        watch.stop()
+        if ends_in_order:
+            store.end_run(at(1))
+
+
+def settled(watch: StoreWatch) -> str:
+    """Its state once no check is under way."""
+
+    def is_settled() -> bool:
+        watch.look()
+        return watch.health.state != "checking"
+
+    wait_until(is_settled)
+    return watch.health.state
+
+
+def results(path: Path) -> list[str | None]:
+    return [row["result"] for row in table(path, "store_checks")]
+
+
+# ---- damage ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_store_is_checked_after_an_unclean_end_and_not_after_an_orderly_one(path: Path) -> None:
+    with watched(path):
+        pass
+    with watched(path, ends_in_order=False):
+        assert results(path) == []
+    with watched(path) as (_, watch):
+        assert settled(watch) == "ok"
+        assert results(path) == ["ok"]
+    with watched(path):
+        assert results(path) == ["ok"]
+
+
+def damaged(path: Path) -> None:
+    """A store whose run was killed, and one of whose indexes is torn."""
+    with watched(path, ends_in_order=False) as (store, _):
+        store.declare_channels({"theta1": "deg"}, {})
+        store.insert_records([reading("theta1", n / 10, float(n)) for n in range(100)])
+    shutil.copy(path, path.with_name("backup"))
+    tear(path, "joint_samples_by_time")
+
+
+def test_damage_after_an_unclean_end_is_told_and_not_forgotten_by_the_next_start(path: Path) -> None:
+    damaged(path)
+    for _ in range(2):  # the first of them ends in order
+        with watched(path) as (_, watch):
+            assert settled(watch) == "damaged"
+            text = watch.health.text
+            assert str(path) in text
+            assert "restore the store from a backup" in text
+            assert watch.health.since == at(0)
+    assert "ok" not in results(path)
+    path.with_name("backup").replace(path)
+    with watched(path) as (_, watch):
+        assert settled(watch) == "ok"
+
+
+def test_a_check_that_a_stop_ends_is_made_again(path: Path) -> None:
+    with watched(path, ends_in_order=False):
+        pass
+    with contextlib.closing(Store(path)) as store:
+        store.begin_run(at(0))
+        watch = StoreWatch(store, ManualClock(at(0)))
+        watch.stop()  # as when the stop comes while it runs
+        watch.start()
+        wait_until(lambda: results(path) == [None])
+        store.end_run(at(1))
+    with watched(path) as (_, watch):
+        assert settled(watch) == "ok"
+        assert results(path) == [None, "ok"]
+
+
+def test_a_long_check_ends_at_a_stop(path: Path) -> None:
+    with watched(path, ends_in_order=False) as (store, _), store.transaction() as db:
+        db.execute("CREATE TABLE long (n INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE) STRICT")
+        db.execute(
+            "WITH RECURSIVE c(n) AS (VALUES (1) UNION ALL SELECT n + 1 FROM c WHERE n < 200000) "
+            "INSERT INTO long SELECT n, printf('%032d', (n * 7919) % 200003) FROM c"
+        )
+    with contextlib.closing(Store(path)) as store:
+        store.begin_run(at(0))
+        watch = StoreWatch(store, ManualClock(at(0)))
+        starting = threading.Thread(target=watch.start)
+        starting.start()
+        wait_until(lambda: watch._connection is not None)
+        watch.stop()
+        starting.join()
+        assert watch._check is not None
+        assert not watch._check.is_alive()
+    assert results(path) == [None]
+
+
+def test_jobs_wait_while_the_store_cannot_be_trusted(tmp_path: Path) -> None:
+    rig = JobRig(tmp_path)
+    asked: list[bool] = []
+    released = threading.Event()
+
+    def is_held() -> bool:
+        asked.append(True)
+        return not released.is_set()
+
+    try:
+        rig.session("a")
+        rig.start(is_held=is_held)
+        rig.wait(lambda: len(asked) >= 2)
+        assert rig.jobs() == []
+        released.set()
+        rig.wait_for("done", "done", "done", "done")
+    finally:
+        rig.close()
+
+
+# ---- files -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_store_that_is_unlinked_is_noticed_and_can_be_saved_as_the_message_says(path: Path, tmp_path: Path) -> None:
+    with watched(path, ends_in_order=False) as (store, watch):
+        assert watch.health.state == "ok"
+        for suffix in ("", "-wal", "-shm"):
+            path.with_name(path.name + suffix).unlink()
+        store.insert("links", {"name": "boom", "kind": "can"})
+        watch.look()
+        assert watch.health.state == "missing"
+        commands = re.search(r"`(cp [^`]*)`", watch.health.text)
+        assert commands is not None
+        (tmp_path / "rescue").mkdir()
+        subprocess.run(commands[1], shell=True, check=True, cwd=tmp_path / "rescue")
+    with contextlib.closing(sqlite3.connect(tmp_path / "rescue" / "saved.sqlite")) as saved:
+        assert saved.execute("SELECT name FROM links").fetchall() == [("boom",)]
+        assert saved.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+
+
+@pytest.mark.parametrize("suffix", ["", "-wal", "-shm"])
+def test_a_file_of_the_store_that_another_takes_the_place_of_is_noticed_until_it_is_back(
+    path: Path, suffix: str
+) -> None:
+    with watched(path) as (_, watch):
+        file = path.with_name(path.name + suffix)
+        aside = file.with_name("aside")
+        file.rename(aside)
+        watch.look()
+        assert watch.health.state == "missing"
+        file.write_bytes(aside.read_bytes())
+        watch.look()
+        assert watch.health.state == "replaced"
+        assert str(file) in watch.health.text
+        assert "move the file back" in watch.health.text
+        aside.rename(file)
+        watch.look()
+        assert (watch.health.state, watch.health.text) == ("ok", "")
+
+
+def test_a_reader_that_wants_the_daemons_store_refuses_another_file_of_that_name(path: Path) -> None:
+    with watched(path) as (store, _):
+        ours = store.files.database
+        with Reader(path, ours) as reader:
+            assert reader.boots()
+    path.rename(path.with_name("aside"))
+    Store(path).close()
+    assert FileIdentity.of(path) != ours
+    with pytest.raises(StoreError, match="not the store that the daemon writes to"):
+        Reader(path, ours)
+
+
+def test_a_job_does_not_work_on_a_store_that_took_the_place_of_the_daemons(tmp_path: Path) -> None:
+    rig = JobRig(tmp_path)
+    (tmp_path / "other").mkdir()
+    other = JobRig(tmp_path / "other")
+    try:
+        rig.session("a")
+        other.session("a")
+        other.close()
+        path = rig.config.store_path
+        path.rename(tmp_path / "aside")
+        other.config.store_path.rename(path)
+        rig.start(real=True)
+        rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
+        assert "not the store that the daemon writes to" in rig.job(1)["error"]
+    finally:
+        rig.close()
+
+
+# ---- room ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_disk_that_fills_up_is_seen_before_it_is_full(tmp_path: Path) -> None:
+    with watched(tmp_path / "rigcal.sqlite") as (_, watch):
+        assert watch.health.free_bytes
+    with (
+        small_disk(tmp_path / "disk", 4096) as disk,
+        watched(disk / "rigcal.sqlite", ends_in_order=False) as (_, watch),
+    ):
+        before = watch.health.free_bytes
+        fill(disk)
+        watch.look()
+        assert watch.health.is_low
+        assert before
+        assert watch.health.free_bytes == 0
+
+
+# ---- the daemon ------------------------------------------------------------------------------------------------------
+
+
+def test_the_status_of_a_running_daemon_says_that_its_store_is_gone(tmp_path: Path) -> None:
+    config = Config(rig="swdt82", state_directory=tmp_path)
+    rig = SOURCE.rig
+    store = Store(config.store_path)
+    parts = Parts("live", rig, SOURCE.text, SystemClock(), [ListLink("boom", [])], {}, joiner(config, rig))
+    daemon = Daemon(config, store, parts)
+    stop = threading.Event()
+    running = threading.Thread(target=daemon.run, args=(stop, Notifier({})))
+    running.start()
+    try:
+        told = request(config.socket_path, "status")
+        assert told["store"] == str(config.store_path)
+        assert told["store_health"]["state"] == "ok"
+        config.store_path.rename(tmp_path / "aside")
+        wait_until(lambda: request(config.socket_path, "status")["store_health"]["state"] == "missing")
+        assert daemon.store_health.state == "missing"
+    finally:
+        stop.set()
+        running.join()
+        store.close()
