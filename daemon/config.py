@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import os
-import tomllib
+import reprlib
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from calibration.toml import LONGEST, parse_toml
 from daemon.control import reading_socket
 from drivers.can_transmit import is_free
+from drivers.files import read_text
 from drivers.station import StationConfig
 from drivers.tip_frames import FRAMES
 
+_QUOTED = 100  # characters of a key
 MAX_SOCKET_PATH_BYTES = 107  # unix(7): sun_path holds 108 bytes with the closing zero
 
 
@@ -209,8 +212,8 @@ def parse_config(text: str, source: Path) -> Config:
         ConfigError: every wrong key in one message, a line each.
     """
     try:
-        raw = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raw = parse_toml(text)
+    except ValueError as error:
         raise ConfigError(f"{source}: not valid TOML: {error}") from error
     try:
         config = Config.model_validate(raw)
@@ -240,7 +243,7 @@ def parse_config(text: str, source: Path) -> Config:
 def read_config(path: Path) -> Config:
     """Read and check a configuration file; ConfigError says what is wrong with it."""
     try:
-        return parse_config(path.read_text(encoding="utf-8"), path.resolve())
+        return parse_config(read_text(path, LONGEST), path.resolve())
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -249,8 +252,8 @@ def read_config(path: Path) -> Config:
 
 def _sentence(error: Any) -> str:
     """One pydantic error as `key: what is wrong (allowed: ...)`."""
-    key = ".".join(str(part + 1) if isinstance(part, int) else str(part) for part in error["loc"]) or "file"
-    message = error["msg"].removeprefix("Value error, ")
+    key = ".".join(str(part + 1) if isinstance(part, int) else str(part)[:_QUOTED] for part in error["loc"]) or "file"
+    message = error["msg"].removeprefix("Value error, ")[: 4 * _QUOTED]
     if error["type"] == "extra_forbidden":
         section: type[BaseModel] = Config
         for part in error["loc"][:-1]:
@@ -259,7 +262,7 @@ def _sentence(error: Any) -> str:
         return f"{key}: unknown key; allowed here: {allowed}"
     if error["type"] == "missing":
         return f"{key}: missing; it is required"
-    return f"{key}: {message}, found {error['input']!r}"
+    return f"{key}: {message}, found {reprlib.repr(error['input'])}"
 
 
 def _section_of(section: type[BaseModel], part: int | str) -> type[BaseModel]:

@@ -24,6 +24,7 @@ from daemon.cli.terminal import Terminal
 from daemon.numba_cache import prepare
 from daemon.rigs import load_rig
 from drivers.clock import NS_PER_S, SystemClock
+from drivers.files import read_whole
 
 if TYPE_CHECKING:
     from calibration.identification.refinement import Prior
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 METHODS = ("default", "pde-paper", "km", "skcm", "rbf-tcm")
 RESIDUALS = ("default", "none", "rbfn", "lightgbm", "chain", "gp")
 CONNECT_TIMEOUT_S = 5
+_DATA_MAX_BYTES = 128 << 20  # half a million fixes
 PREDICTED_COLUMNS = tuple(f"{name}_pred_mm" for name in ("x", "y", "z", "sigma_x", "sigma_y", "sigma_z"))
 INTERVAL_COLUMNS = tuple(f"{name}_pred_mm" for name in ("half90_x", "half90_y", "half90_z", "radius90"))
 
@@ -41,7 +43,7 @@ INTERVAL_COLUMNS = tuple(f"{name}_pred_mm" for name in ("half90_x", "half90_y", 
 def read_observations(path: Path, rig: Rig, *, positions_required: bool = True) -> tuple[Observations, bytes]:
     """An observations CSV and its bytes; DataError if it cannot be read or does not fit the rig."""
     try:
-        data = path.read_bytes()
+        data = read_whole(path, _DATA_MAX_BYTES)
     except OSError as error:
         raise DataError(str(path), f"cannot be read: {error.strerror}") from error
     return parse_observations(data, rig, path.name, positions_required=positions_required), data

@@ -82,6 +82,20 @@ def test_malformed_requests_are_refused_in_a_sentence(path: Path, line: bytes) -
     assert answer["status"] == 2
 
 
+@pytest.mark.parametrize(
+    "value", ["[" * 100_000, "NaN", "1e999, Infinity", '"\\ud800"', "9223372036854775808", "9" * 5000]
+)
+def test_arguments_that_nothing_can_store_or_show_are_refused_in_a_sentence(path: Path, value: str) -> None:
+    answer = talk(path, b'{"command": "echo", "arguments": {"a": [%b]}}\n' % value.encode())
+    assert (answer["ok"], answer["status"]) == (False, 2), answer
+    assert talk(path, b'{"command": "echo", "arguments": {"a": -9223372036854775808}}\n')["ok"]
+
+
+def test_a_refusal_does_not_repeat_all_that_was_asked(path: Path) -> None:
+    answer = talk(path, json.dumps({"command": "x" * 100_000}).encode() + b"\n")
+    assert len(answer["error"]) < 1100
+
+
 def test_an_endless_line_is_refused(path: Path) -> None:
     assert "longer than" in talk(path, b"x" * (1 << 20) + b"xx\n")["error"]
 
