@@ -14,7 +14,7 @@ export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 # The tests start a hundred processes: each would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help environment setup demo test lint blind bench soak lock clean
+.PHONY: help environment setup demo test lint blind bench soak fuzz lock clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -60,6 +60,10 @@ bench: setup ## speed and accuracy beside the peers', as ratios; an hour on two 
 soak: setup ## the daemon on a simulated rig at 4x with every fault at random; 30 minutes (SOAK="--seed 7 --minutes 5")
 	$(BIN)/python -m tests.soak $(SOAK)
 
+# One target after the other, each at most an hour; FUZZ="dbc eds --seconds 60" chooses. Inputs that find faults: fuzz-faults/
+fuzz: setup ## a million hostile inputs for every decoder, file reader and socket command; up to a day
+	nice $(BIN)/python -m tests.fuzz $(FUZZ)
+
 # The rig gets requirements.lock, with the build backend that installs the project itself; requirements-dev.lock holds
 # the same versions and the tools besides. Versions stay as they are unless pyproject.toml forces a change;
 # `make lock UPGRADE=--upgrade` takes the newest.
@@ -71,6 +75,6 @@ lock: environment ## write the lock files anew from pyproject.toml
 	$(COMPILE) pyproject.toml --extra dev --extra bench --constraints requirements.lock --output-file requirements-dev.lock
 
 clean: ## remove everything that make has made
-	rm -rf .venv .cache build rigcal-demo rigcal-sim htmlcov .coverage* *.egg-info
+	rm -rf .venv .cache build rigcal-demo rigcal-sim fuzz-faults htmlcov .coverage* *.egg-info
 	rm -rf .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+MESSAGE_MAX = 1000  # characters
+
 
 class CalibrationError(Exception):
     """Base of all errors of `calibration`; on its own: the computation failed."""
+
+    def __str__(self) -> str:
+        text = super().__str__()
+        # What was found is quoted, and may be anything
+        return text if len(text) <= MESSAGE_MAX else f"{text[:MESSAGE_MAX]}..."
 
 
 class RigError(CalibrationError):

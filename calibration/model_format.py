@@ -8,10 +8,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import struct
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Annotated, Any, Literal
@@ -28,6 +24,7 @@ from calibration.identification.refinement import Prior
 from calibration.kinematics import Chain, Placement
 from calibration.model import CalibratedModel, Coverage, LearnedResidual, Outlier
 from calibration.model_checks import LARGEST, check_covariance, check_names, check_placement, float_array
+from calibration.npz import read_npz
 from calibration.residual.conformal import Intervals
 from calibration.residual.features import no_features
 from calibration.residual.hybrid import LOADERS, Trial
@@ -48,11 +45,10 @@ Plausible = Annotated[float, Field(ge=1e-30, le=LARGEST, allow_inf_nan=False)]  
 Count = Annotated[int, Field(ge=0)]
 Triple = tuple[Bounded, Bounded, Bounded]
 
-# Beside KeyError: what the parsers of JSON, TOML, zip archives, npy headers and the learners end with on hostile bytes.
-_UNREADABLE = (
-    *(ArithmeticError, AttributeError, EOFError, IndexError, MemoryError, OSError, RuntimeError, TypeError, ValueError),
-    *(RigError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
-)
+_DOCUMENT_MAX_BYTES = 8 << 20  # 300 joints, prisms and set-ups take a tenth of it
+
+# Beside KeyError: what the parsers of JSON and TOML and the learners end with on hostile bytes.
+_UNREADABLE = (ArithmeticError, AttributeError, IndexError, MemoryError, RuntimeError, TypeError, ValueError, RigError)
 
 
 class _Part(BaseModel):
@@ -283,13 +279,15 @@ def check_manifest(files: Mapping[str, bytes]) -> dict[str, bytes]:
 def read_model(files: Mapping[str, bytes]) -> CalibratedModel:
     """Read a model; ModelError in one sentence for anything that is wrong with it."""
     checked = check_manifest(files)
+    if len(checked.get("model.json", b"")) > _DOCUMENT_MAX_BYTES:
+        raise ModelError(f"model.json is larger than {_DOCUMENT_MAX_BYTES:,} bytes; this is not a model")
     try:
         document = _Document.model_validate_json(checked["model.json"])
         rig_text = checked["rig.toml"].decode()
         rig = parse_rig(rig_text, "rig.toml of the model")
-        with np.load(io.BytesIO(checked["covariance.npz"]), allow_pickle=False) as arrays:
-            covariance = float_array(arrays, "covariance")
-            base_covariance = float_array(arrays, "base_covariance") if "base_covariance" in arrays else None
+        arrays = read_npz(checked["covariance.npz"])
+        covariance = float_array(arrays, "covariance")
+        base_covariance = float_array(arrays, "base_covariance") if "base_covariance" in arrays else None
         residual = None
         if document.residual is not None:
             part = document.residual

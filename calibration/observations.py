@@ -8,7 +8,8 @@ import io
 import math
 import re
 import unicodedata
-from collections.abc import Mapping
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NoReturn
 
@@ -31,7 +32,10 @@ _PART = 0.4  # of the spread of all places: no cell is larger
 _MOST_DEG = 36_000.0  # a hundred turns
 _MOST_TURNS_DEG = 720.0  # more than the limits have, within one file
 _MOST_MM = 1e7  # 10 km
-_LONGEST = 200  # characters of a label; every row takes as much memory as the longest
+_LONGEST = 200  # characters of a label or a number; every row's label takes as much memory as the longest
+_LONGEST_ROW = 1 << 20
+_MOST_COLUMNS = 1000
+_MOST_LABEL_BYTES = 64 << 20
 # What an optional column can be, by how its name ends (the first that fits); what is beyond is in another unit, or
 # noise that would drown every number it meets.
 _POSSIBLE = {
@@ -144,33 +148,62 @@ def parse_observations(data: bytes, rig: Rig, source: str, *, positions_required
     Raises:
         DataError: with file, line, column and reason.
     """
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise DataError(source, f"byte {error.start} is not UTF-8; save the file as UTF-8", line) from error
-    if "\0" in text:
-        line = text.count("\n", 0, text.index("\0")) + 1
+    if b"\0" in data:
+        line = data.count(b"\n", 0, data.index(b"\0")) + 1
         raise DataError(source, "a zero byte, as other encodings have; save the file as UTF-8", line)
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    lines: list[int] = []
-    rows: list[list[str]] = []
+    text = _Lines(data)
+    reader = csv.reader(text, strict=True)
     try:
         header = [name.strip() for name in next(reader, [])]
+        _check_header(header, rig, source, positions_required)
+        table = _Table(source, header, rig)
         for row in reader:
+            text.taken = 0
             if row:
-                lines.append(reader.line_num)
-                rows.append(row)
+                table.append(row, reader.line_num)
     except csv.Error as error:
-        raise DataError(source, f"not a CSV file: {error}", reader.line_num) from error
-    _check_header(header, rig, source, positions_required)
-    if not rows:
+        raise DataError(source, f"not a CSV file: {error}", text.line) from error
+    except UnicodeDecodeError:
+        raise _not_utf8(data, source) from None
+    if not len(table.lines):
         raise DataError(source, "no observations below the header")
-    for line, row in zip(lines, rows, strict=True):
-        if len(row) != len(header):
-            raise DataError(source, f"{len(row)} fields where the header has {len(header)}", line)
-    table = _Table(source, {name: [row[i].strip() for row in rows] for i, name in enumerate(header)}, lines)
     return _build(table, header, rig, positions_required)
+
+
+def _not_utf8(data: bytes, source: str) -> DataError:
+    try:
+        data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        return DataError(source, f"byte {error.start} is not UTF-8; save the file as UTF-8", line)
+    raise AssertionError("the text was not UTF-8")
+
+
+class _Lines:
+    """Lines for the CSV reader, which puts a row together from as many as its quotes ask for: not more than a few.
+
+    Attributes:
+        taken: characters since it was last set to 0.
+        line: number of the last line.
+    """
+
+    def __init__(self, data: bytes) -> None:
+        self._text = io.TextIOWrapper(io.BytesIO(data), "utf-8-sig", newline="")
+        self.taken = 0
+        self.line = 0
+
+    def __iter__(self) -> Iterator[str]:
+        return self
+
+    def __next__(self) -> str:
+        line = self._text.readline(_LONGEST_ROW + 1)
+        if not line:
+            raise StopIteration
+        self.line += 1
+        self.taken += len(line)
+        if self.taken > _LONGEST_ROW:
+            raise csv.Error(f"a row of more than {_LONGEST_ROW:,} characters")
+        return line
 
 
 def format_observations(observations: Observations, rig: Rig) -> str:
@@ -217,33 +250,75 @@ def _cells(values: Floats | Strings) -> list[str]:
     return [value if isinstance(value, str) else "" if math.isnan(value) else repr(value) for value in values.tolist()]
 
 
-@dataclass(frozen=True)
+class _Numbers:
+    """A column of numbers as it is read; what is wrong with it is told when the column is wanted."""
+
+    def __init__(self) -> None:
+        self.values = array("d")
+        self.empty_line: int | None = None
+        self.bad: tuple[int, str] | None = None  # line and cell
+
+    def append(self, cell: str, line: int) -> None:
+        if not cell:
+            self.values.append(math.nan)
+            if self.empty_line is None:
+                self.empty_line = line
+            return
+        value = float(cell) if len(cell) <= _LONGEST and _NUMBER.fullmatch(cell) else math.nan
+        self.values.append(value)
+        if self.bad is None and not math.isfinite(value):
+            self.bad = line, cell
+
+
 class _Table:
-    source: str
-    columns: Mapping[str, list[str]]
-    lines: list[int]
+    """The columns of a file that are wanted, row by row; numbers take eight bytes each, whatever was written.
+
+    Attributes:
+        source: file name for messages.
+        lines: of each row.
+    """
+
+    def __init__(self, source: str, header: Sequence[str], rig: Rig) -> None:
+        self.source = source
+        self.lines = array("q")
+        self._width = len(header)
+        self._numbers = {name: _Numbers() for name in header if name in _number_columns(header, rig)}
+        self._labels: dict[str, list[str]] = {name: [] for name in header if name in ("prism", *LABEL_COLUMNS)}
+        self._number_places = [(header.index(name), column) for name, column in self._numbers.items()]
+        self._label_places = [(header.index(name), cells) for name, cells in self._labels.items()]
+        self._alike: dict[str, str] = {}
+
+    def append(self, row: Sequence[str], line: int) -> None:
+        """Take a row; DataError if it has another number of fields than the header."""
+        if len(row) != self._width:
+            raise DataError(self.source, f"{len(row)} fields where the header has {self._width}", line)
+        self.lines.append(line)
+        for place, column in self._number_places:
+            column.append(row[place].strip(), line)
+        for place, cells in self._label_places:
+            cell = row[place].strip()
+            cells.append(self._alike.setdefault(cell, cell))
 
     def numbers(self, column: str, *, required: bool) -> Floats:
-        out = np.full(len(self.lines), np.nan)
-        for i, (line, cell) in enumerate(zip(self.lines, self.columns[column], strict=True)):
-            if not cell:
-                if required:
-                    raise DataError(self.source, "empty, but every observation needs it", line, column)
-                continue
-            if not _NUMBER.fullmatch(cell):
-                what = "not measured is an empty cell" if cell.lower() in _NO_NUMBERS else "write it as 1234.5 or 1e-3"
-                raise DataError(self.source, f"{cell!r} is not a finite number; {what}", line, column)
-            out[i] = float(cell)
-            if not math.isfinite(out[i]):
-                raise DataError(self.source, f"{cell!r} is beyond what a number can be", line, column)
-        return out
+        found = self._numbers[column]
+        first = found.empty_line if required else None
+        if found.bad is not None and (first is None or found.bad[0] < first):
+            line, cell = found.bad
+            raise DataError(self.source, _why_no_number(cell), line, column)
+        if first is not None:
+            raise DataError(self.source, "empty, but every observation needs it", first, column)
+        return np.frombuffer(found.values)
 
     def labels(self, column: str) -> Strings:
-        cells = self.columns.get(column, [""] * len(self.lines))
+        cells = self._labels.get(column, [""] * len(self.lines))
         alike: dict[str, str] = {}
+        longest = 1
         for cell in dict.fromkeys(cells):
+            longest = max(longest, len(cell))
             if len(cell) > _LONGEST:
                 self.refuse(column, cell, f"a label of {len(cell)} characters; at most {_LONGEST}")
+            if 4 * longest * len(cells) > _MOST_LABEL_BYTES:
+                self.refuse(column, cell, f"a label of {len(cell)} characters among {len(cells)} rows; shorten it")
             other = alike.setdefault(_plain(cell), cell)
             if other != cell:
                 self.refuse(column, cell, f"{cell!a} and {other!a} look the same; write them alike")
@@ -251,7 +326,7 @@ class _Table:
 
     def refuse(self, column: str, cell: str, reason: str) -> NoReturn:
         """DataError for the first row with this cell."""
-        raise DataError(self.source, reason, self.lines[self.columns[column].index(cell)], column)
+        raise DataError(self.source, reason, self.lines[self._labels[column].index(cell)], column)
 
     def check(self, column: str, values: Floats, bad: NDArray[np.bool_], reason: str) -> None:
         if bad.any():
@@ -259,9 +334,26 @@ class _Table:
             raise DataError(self.source, f"{values[i]:g} {reason}", self.lines[i], column)
 
 
+def _why_no_number(cell: str) -> str:
+    if len(cell) > _LONGEST:
+        return f"{cell[:20]!r}... of {len(cell)} characters is not a number"
+    if _NUMBER.fullmatch(cell):
+        return f"{cell!r} is beyond what a number can be"
+    what = "not measured is an empty cell" if cell.lower() in _NO_NUMBERS else "write it as 1234.5 or 1e-3"
+    return f"{cell!r} is not a finite number; {what}"
+
+
+def _number_columns(header: Sequence[str], rig: Rig) -> set[str]:
+    """Names of the columns of a file that are read as numbers."""
+    known = {*(j.column for j in rig.joints), *POSITION_COLUMNS, *SIGMA_COLUMNS, *optional_columns(rig)}
+    return {name for name in header if name in known or _SIGNAL.fullmatch(name)}
+
+
 def _check_header(header: list[str], rig: Rig, source: str, positions_required: bool) -> None:
     if not header or header == [""]:
         raise DataError(source, "the file is empty; a header is needed", 1)
+    if len(header) > _MOST_COLUMNS:
+        raise DataError(source, f"{len(header)} columns; at most {_MOST_COLUMNS}", 1)
     doubled = sorted({name for name in header if header.count(name) > 1})
     if doubled[:1] == [""]:
         raise DataError(source, f"{header.count('')} columns have no name; name them, or leave them out", 1)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import re
-import tomllib
 from collections.abc import Iterator, Sequence
 from importlib import resources
 from typing import Literal
@@ -18,6 +17,7 @@ from pydantic_core import ErrorDetails
 
 from calibration.channels import Channel
 from calibration.errors import RigError
+from calibration.toml import parse_toml
 
 Vector = tuple[float, float, float]
 RowParameter = Literal["alpha", "a", "d", "theta", "beta", "b"]
@@ -26,6 +26,7 @@ Convention = Literal["mdh_beta_after", "mdh_beta_before", "dh"]
 
 BEYOND_BUILDING = 4.0  # build tolerances: no correction by building alone is larger
 ANOTHER_VALUE = 10.0  # build tolerances: so far off, the file's value is another machine's and tells nothing
+_MOST = 300  # joints, rows, prisms, masses or channels
 _NEARLY_PARALLEL = math.cos(math.radians(15.0))  # beyond it the other constants turn an axis within their tolerances
 _COORDINATE = re.compile(r"(sigma_)?[xyz](_pred)?_mm")  # columns of a fix and of its prediction
 
@@ -196,11 +197,11 @@ class Rig(_Part):
     name: str
     convention: Convention
     gravity: Vector = (0.0, 0.0, -1.0)
-    joints: tuple[Joint, ...] = Field(alias="joint", min_length=1)
-    rows: tuple[Row, ...] = Field(alias="row", min_length=1)
-    prisms: tuple[Prism, ...] = Field(alias="prism", min_length=1)
-    masses: tuple[Mass, ...] = Field(alias="mass", default=())
-    channels: tuple[Channel, ...] = Field(alias="channel", default=())
+    joints: tuple[Joint, ...] = Field(alias="joint", min_length=1, max_length=_MOST)
+    rows: tuple[Row, ...] = Field(alias="row", min_length=1, max_length=_MOST)
+    prisms: tuple[Prism, ...] = Field(alias="prism", min_length=1, max_length=_MOST)
+    masses: tuple[Mass, ...] = Field(alias="mass", default=(), max_length=_MOST)
+    channels: tuple[Channel, ...] = Field(alias="channel", default=(), max_length=_MOST)
     tolerances: Tolerances
     station: Station = Station()
 
@@ -370,9 +371,11 @@ def parse_rig(text: str, source: str) -> Rig:
         RigError: malformed TOML, unknown keys, impossible values, parts that do not fit each other.
     """
     try:
-        return Rig.model_validate(tomllib.loads(text))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raw = parse_toml(text)
+    except ValueError as error:
         raise RigError(source, "", f"not valid TOML: {error}") from error
+    try:
+        return Rig.model_validate(raw)
     except ValidationError as error:
         # A misspelt key is unknown and missing; the spelling tells more.
         first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")

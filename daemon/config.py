@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import os
-import tomllib
+import reprlib
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from calibration.toml import LONGEST, parse_toml
+from daemon.control import reading_socket
 from drivers.can_transmit import is_free
+from drivers.files import read_text
 from drivers.station import StationConfig
 from drivers.tip_frames import FRAMES
 
+_QUOTED = 100  # characters of a key
 MAX_SOCKET_PATH_BYTES = 107  # unix(7): sun_path holds 108 bytes with the closing zero
 
 
@@ -140,11 +144,14 @@ class Config(_Section):
         rig: a shipped rig's name or a path to a rig file.
         state_directory: where store, models and reports live.
         socket: the control socket; `control.sock` in the runtime or state directory when absent.
+        read_group: whose members may look at the daemon's state and not change it, by a socket `status.sock` beside the
+            control socket; no one when absent.
     """
 
     rig: str
     state_directory: Path = Field(default_factory=lambda: Path(os.environ.get("STATE_DIRECTORY", "/var/lib/rigcal")))
     socket: Path | None = None
+    read_group: str | None = Field(default=None, min_length=1)
     can: tuple[CanSection, ...] = ()
     station: tuple[StationConfig, ...] = ()
     sessions: SessionsSection = SessionsSection()
@@ -205,8 +212,8 @@ def parse_config(text: str, source: Path) -> Config:
         ConfigError: every wrong key in one message, a line each.
     """
     try:
-        raw = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raw = parse_toml(text)
+    except ValueError as error:
         raise ConfigError(f"{source}: not valid TOML: {error}") from error
     try:
         config = Config.model_validate(raw)
@@ -221,9 +228,13 @@ def parse_config(text: str, source: Path) -> Config:
             "socket": base / config.socket if config.socket else None,
         }
     )
-    if len(os.fsencode(config.socket_path)) > MAX_SOCKET_PATH_BYTES:
+    if config.read_group is not None and config.socket_path == reading_socket(config.socket_path):
+        raise ConfigError(f"{source}: socket: {config.socket_path} is where `read_group` looks; give it another name")
+    sockets = [config.socket_path] + ([] if config.read_group is None else [reading_socket(config.socket_path)])
+    longest = max(sockets, key=lambda path: len(os.fsencode(path)))
+    if len(os.fsencode(longest)) > MAX_SOCKET_PATH_BYTES:
         raise ConfigError(
-            f"{source}: socket: {config.socket_path} is longer than the {MAX_SOCKET_PATH_BYTES} bytes a unix socket's "
+            f"{source}: socket: {longest} is longer than the {MAX_SOCKET_PATH_BYTES} bytes a unix socket's "
             "path may have; set `socket` to a shorter one"
         )
     return config
@@ -232,7 +243,7 @@ def parse_config(text: str, source: Path) -> Config:
 def read_config(path: Path) -> Config:
     """Read and check a configuration file; ConfigError says what is wrong with it."""
     try:
-        return parse_config(path.read_text(encoding="utf-8"), path.resolve())
+        return parse_config(read_text(path, LONGEST), path.resolve())
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -241,8 +252,8 @@ def read_config(path: Path) -> Config:
 
 def _sentence(error: Any) -> str:
     """One pydantic error as `key: what is wrong (allowed: ...)`."""
-    key = ".".join(str(part + 1) if isinstance(part, int) else str(part) for part in error["loc"]) or "file"
-    message = error["msg"].removeprefix("Value error, ")
+    key = ".".join(str(part + 1) if isinstance(part, int) else str(part)[:_QUOTED] for part in error["loc"]) or "file"
+    message = error["msg"].removeprefix("Value error, ")[: 4 * _QUOTED]
     if error["type"] == "extra_forbidden":
         section: type[BaseModel] = Config
         for part in error["loc"][:-1]:
@@ -251,7 +262,7 @@ def _sentence(error: Any) -> str:
         return f"{key}: unknown key; allowed here: {allowed}"
     if error["type"] == "missing":
         return f"{key}: missing; it is required"
-    return f"{key}: {message}, found {error['input']!r}"
+    return f"{key}: {message}, found {reprlib.repr(error['input'])}"
 
 
 def _section_of(section: type[BaseModel], part: int | str) -> type[BaseModel]:

@@ -27,11 +27,14 @@ from calibration.model_format import MANIFEST, check_manifest
 from calibration.rig import Rig
 from daemon.files import write_file
 from daemon.modelcheck import IS_NO_MODEL, encode
+from drivers.files import read_whole
 
 REPORT = "report.html"
 COMPANIONS = frozenset({REPORT})  # may lie beside the model's files, outside its manifest
 CHECK_TIMEOUT_S = 120.0
-_FILE_MAX_BYTES = 256 * 2**20
+_MODEL_MAX_BYTES = 64 << 20  # all files together; the most trees that are ever grown take 20 MB
+_MANIFEST_MAX_BYTES = 1 << 20
+_FILES_MAX = 32
 _FILE_NAME = re.compile(r"\w[\w.-]{0,99}", re.ASCII)
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
@@ -138,7 +141,11 @@ def read_model(directory: Path, manifest_sha256: str | None = None) -> Calibrate
         raise ModelError(f"{directory} is not a directory; name the one that calibrate wrote")
     if not (directory / MANIFEST).is_file():
         raise ModelError(f"{directory} is not a model directory: it has no {MANIFEST}")
-    files = {name: data for name in (MANIFEST, *_listed(directory)) if (data := _read(directory, name)) is not None}
+    files: dict[str, bytes] = {}
+    for name in (MANIFEST, *_listed(directory)):
+        data = _read(directory, name, _MODEL_MAX_BYTES - sum(map(len, files.values())))
+        if data is not None:
+            files[name] = data
     if manifest_sha256 is not None and _sha256(files[MANIFEST]) != manifest_sha256:
         raise ModelError(f"{directory} does not hold the model that was written there; restore it")
     try:
@@ -168,7 +175,7 @@ def read_model_of_rig(directory: Path, manifest_sha256: str, rig: Rig) -> Calibr
 
 def model_sha256(directory: Path) -> str:
     """SHA-256 of the manifest, which names the model; ModelError if there is none."""
-    data = _read(directory, MANIFEST)
+    data = _read(directory, MANIFEST, _MANIFEST_MAX_BYTES)
     if data is None:
         raise ModelError(f"{directory} is not a model directory: it has no {MANIFEST}")
     return _sha256(data)
@@ -177,29 +184,32 @@ def model_sha256(directory: Path) -> str:
 def _listed(directory: Path) -> list[str]:
     """Names of the files in the manifest, which need not be sound otherwise."""
     try:
-        names = list(json.loads(_read(directory, MANIFEST) or b"")["files"])
+        names = list(json.loads(_read(directory, MANIFEST, _MANIFEST_MAX_BYTES) or b"")["files"])
     except (ValueError, KeyError, TypeError, RecursionError, MemoryError) as error:
         raise ModelError(f"{directory}: {MANIFEST} is damaged; restore the model, or remove it") from error
+    if len(names) > _FILES_MAX:
+        raise ModelError(f"{directory}: {MANIFEST} lists {len(names)} files, a model has {_FILES_MAX} at most")
     for name in names:
         if not (isinstance(name, str) and _FILE_NAME.fullmatch(name)):
             raise ModelError(f"{directory}: {MANIFEST} lists {name!r}, which is no file name; this is not a model")
     return names
 
 
-def _read(directory: Path, name: str) -> bytes | None:
+def _read(directory: Path, name: str, most_bytes: int) -> bytes | None:
+    """The file's bytes; None if there is none; ModelError if it cannot be part of a model."""
     path = directory / name
     if path.exists() and not path.is_file():
         raise ModelError(f"{directory}: {name} is not a regular file; this is not a model")
     try:
-        with path.open("rb") as file:
-            data = file.read(_FILE_MAX_BYTES + 1)
+        return read_whole(path, most_bytes)
     except FileNotFoundError:
         return None
     except OSError as error:
+        if error.errno == errno.EFBIG:
+            raise ModelError(
+                f"{directory}: with {name} it is larger than a model can be ({_MODEL_MAX_BYTES:,} bytes)"
+            ) from error
         raise ModelError(f"{directory}: {name} cannot be read: {error.strerror}") from error
-    if len(data) > _FILE_MAX_BYTES:
-        raise ModelError(f"{directory}: {name} is larger than {_FILE_MAX_BYTES} bytes; this is not a model")
-    return data
 
 
 def _sha256(data: bytes) -> str:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from calibration.errors import RigError
 from calibration.rig import Rig, parse_rig, shipped_rigs
+from calibration.toml import LONGEST
+from drivers.files import read_text
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ def load_rig(name_or_path: str) -> RigSource:
             shipped = ", ".join(shipped_rigs())
             raise RigError(name_or_path, "", f"neither a shipped rig ({shipped}) nor a rig file")
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, LONGEST)
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise RigError(str(path), "", f"cannot be read: {reason}") from error

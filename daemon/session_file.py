@@ -8,6 +8,9 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from drivers.errors import DescriptionError
+from drivers.files import read_whole
+
+_FILE_MAX_BYTES = 8 << 20  # every run of doubtful captures takes some 20
 
 
 class DoubtfulCaptures(BaseModel):
@@ -60,7 +63,7 @@ def read_session_file(path: Path) -> SessionFile:
         DescriptionError: it cannot be read, or is no such file.
     """
     try:
-        return SessionFile.model_validate_json(path.read_bytes())
+        return SessionFile.model_validate_json(read_whole(path, _FILE_MAX_BYTES))
     except OSError as error:
         raise DescriptionError(str(path), f"cannot be read: {error.strerror}") from error
     except ValidationError as error:

@@ -12,8 +12,12 @@ from cantools.database.can import Database, Message, Signal
 from cantools.database.errors import Error as CantoolsError
 
 from drivers.canframe import DATA_MAX
+from drivers.dbc_sizes import check_sizes
 from drivers.errors import DescriptionError
+from drivers.files import read_whole
 from drivers.raw_signal import BitField, Multiplexing, SignalChannel
+
+_FILE_MAX_BYTES = 2 << 20  # cantools takes more than a second for a megabyte
 
 _COUNTER_NAME = re.compile(r"counter|alive", re.IGNORECASE)
 _NO_VALUE_TEXT = re.compile(r"^(sna|(signal )?not available|invalid)$", re.IGNORECASE)
@@ -32,10 +36,13 @@ class DbcFile:
     def __init__(self, path: Path) -> None:
         self._where = str(path)
         try:
-            database = cantools.database.load_file(str(path), database_format="dbc", encoding="cp1252")
+            text = read_whole(path, _FILE_MAX_BYTES).decode("cp1252", errors="replace")
+            check_sizes(text, self._where)
+            database = cantools.database.load_string(text, database_format="dbc")
         except OSError as error:
             raise DescriptionError(self._where, f"cannot be read: {error.strerror}") from error
-        except CantoolsError as error:
+        # Beside its own errors, what cantools lets through from parsing numbers and names
+        except (CantoolsError, ArithmeticError, LookupError, RecursionError, TypeError, ValueError) as error:
             raise DescriptionError(self._where, f"not a valid DBC file: {' '.join(str(error).split())}") from error
         assert isinstance(database, Database)  # database_format="dbc" gives no other
         self._database = database
@@ -67,6 +74,14 @@ class DbcFile:
         Raises:
             DescriptionError: no such message or signal, or one that no classic CAN frame can carry.
         """
+        try:
+            declared = self._declared(message, signal, counter)
+        except (ArithmeticError, LookupError, ValueError) as error:
+            raise DescriptionError(self._where, f"signal {signal!r} cannot be read: {error}") from error
+        return dataclasses.replace(declared, name=name, unit=unit, scale=scale, offset=offset, timeout_s=timeout_s)
+
+    def _declared(self, message: str, signal: str, counter: str | None) -> SignalChannel:
+        """The channel as far as the file tells; numbers may be beyond what can be computed with."""
         found = self._message(message)
         signals: dict[str, Signal] = {item.name: item for item in found.signals}
         wanted = self._signal(signals, message, signal)
@@ -75,17 +90,15 @@ class DbcFile:
             raise DescriptionError(
                 self._where, f"signal {signal!r}: factor {wanted.scale} and offset {wanted.offset} make no value"
             )
-        declared = SignalChannel(
-            name=name,
-            unit=unit,
+        return SignalChannel(
+            name=signal,
+            unit="",
             arbitration_id=found.frame_id,
             is_extended=is_extended,
             field=_field(wanted),
             is_float=wanted.is_float,
             factor=float(wanted.scale),
             summand=float(wanted.offset),
-            scale=scale,
-            offset=offset,
             minimum=None if wanted.minimum is None else float(wanted.minimum),
             maximum=None if wanted.maximum is None else float(wanted.maximum),
             not_available=frozenset(
@@ -93,10 +106,6 @@ class DbcFile:
             ),
             all_ones_is_not_available=not is_extended,
             is_j1939=is_extended,
-            timeout_s=timeout_s,
-        )
-        return dataclasses.replace(
-            declared,
             counter=self._counter(signals, message, signal, counter),
             multiplexing=self._multiplexing(signals, wanted),
         )

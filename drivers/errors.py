@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+MESSAGE_MAX = 1000  # characters
+
 
 class DriverError(Exception):
     """Base of all errors of `drivers`.
@@ -11,7 +13,9 @@ class DriverError(Exception):
     """
 
     def __init__(self, where: str, message: str) -> None:
-        super().__init__(f"{where}: {message}")
+        text = f"{where}: {message}"
+        # What was found is quoted, and may be anything
+        super().__init__(text if len(text) <= MESSAGE_MAX else f"{text[:MESSAGE_MAX]}...")
         self.where = where
 
 

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import configparser
+import io
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from canopen.objectdictionary import ObjectDictionary, ObjectDictionaryError, import_od
+from canopen.objectdictionary import ObjectDictionary, ObjectDictionaryError
+from canopen.objectdictionary.eds import import_eds
 
 from drivers.canframe import DATA_MAX, EXTENDED_ID_MAX
 from drivers.cia301 import tpdo_id
 from drivers.errors import DescriptionError
+from drivers.files import read_whole
+
+_FILE_MAX_BYTES = 2 << 20
 
 TPDO_COMMUNICATION = 0x1800
 TPDO_MAPPING = 0x1A00
@@ -138,8 +143,10 @@ class TransmitPdo:
 def _import(path: Path, node: int) -> ObjectDictionary:
     try:
         # EDS files are ASCII by CiA 306; makers write Latin-1 into names
-        with path.open(encoding="latin-1") as file:
-            return import_od(file, node)
+        # Whatever the file is called: canopen reads XML from one that is called .epf
+        file = io.StringIO(read_whole(path, _FILE_MAX_BYTES).decode("latin-1"), newline=None)
+        dictionary: ObjectDictionary = import_eds(file, node)  # type: ignore[no-untyped-call]
+        return dictionary
     except OSError as error:
         raise DescriptionError(str(path), f"cannot be read: {error.strerror}") from error
     except configparser.Error as error:

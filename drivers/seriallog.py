@@ -22,6 +22,7 @@ from typing import TextIO
 
 from drivers.clock import NS_PER_S, Stamp
 from drivers.errors import DescriptionError
+from drivers.files import bounded_lines
 from drivers.readings import SerialCapture
 
 _FIRST_LINE = "rigcal-serial-capture 1"
@@ -113,7 +114,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Numbered lines without comments and empty lines."""
     try:
         with path.open("rb") as stream:
-            for number, line in enumerate(stream, 1):
+            for number, line in enumerate(bounded_lines(stream), 1):
                 text = line.rstrip(b"\r\n")
                 if text and not text.startswith(b"#"):
                     yield number, _text(path, number, text)

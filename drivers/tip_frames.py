@@ -6,6 +6,7 @@ can pair them. Lengths are in 0.1 mm, little-endian, in the base frame.
 
 from __future__ import annotations
 
+import math
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
@@ -59,8 +60,8 @@ class TipMessage:
 def encode_tip(message: TipMessage, arbitration_id: int, counter: int) -> list[Frame]:
     """The frames of one tip.
 
-    A position that the frames cannot hold (838 m and more from the base) is sent as FAILED without one; a sigma or an
-    age beyond their ranges are sent as the greatest value.
+    A position that the frames cannot hold (838 m and more from the base, or no number) is sent as FAILED without one; a
+    sigma or an age that is not known, no number, or beyond its range is sent as the greatest value.
 
     Args:
         message: the tip.
@@ -70,16 +71,23 @@ def encode_tip(message: TipMessage, arbitration_id: int, counter: int) -> list[F
     status, coordinates = message.status, (NO_COORDINATE,) * 3
     sigma, age = NO_SIGMA, NO_AGE
     if message.position_mm is not None and status.has_position:
-        x, y, z = (round(value / UNIT_MM) for value in message.position_mm)
-        if max(abs(x), abs(y), abs(z)) > COORDINATE_MAX:
-            status = TipStatus.FAILED
+        x, y, z = (value / UNIT_MM for value in message.position_mm)
+        if all(abs(value) <= COORDINATE_MAX for value in (x, y, z)):  # False for NaN
+            coordinates = (round(x), round(y), round(z))
+            sigma = _counts(message.sigma_mm, UNIT_MM, SIGMA_MAX)
+            age = _counts(message.age_s, AGE_UNIT_S, AGE_MAX)
         else:
-            coordinates = (x, y, z)
-            sigma = SIGMA_MAX if message.sigma_mm is None else min(round(message.sigma_mm / UNIT_MM), SIGMA_MAX)
-            age = AGE_MAX if message.age_s is None else min(max(round(message.age_s / AGE_UNIT_S), 0), AGE_MAX)
+            status = TipStatus.FAILED
     x_bytes, y_bytes, z_bytes = (value.to_bytes(3, "little", signed=True) for value in coordinates)
     end = bytes([counter & 0xFF, status])
     return [
         Frame(arbitration_id, x_bytes + y_bytes + end),
         Frame(arbitration_id + 1, z_bytes + struct.pack("<HB", sigma, age) + end),
     ]
+
+
+def _counts(value: float | None, unit: float, most: int) -> int:
+    """Whole units in a value, 0 to `most`; `most` where it is not known or no number."""
+    if value is None or math.isnan(value):
+        return most
+    return round(min(max(value / unit, 0.0), most))

@@ -23,6 +23,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.npz import read_npz
 from calibration.observations import Floats
 from calibration.residual.curve_search import CurveSearch, Rows
 from calibration.residual.curves import Axis, Curve, CurveSum
@@ -89,8 +90,8 @@ class GaussianProcess:
     def from_files(cls, files: Mapping[str, bytes]) -> GaussianProcess:
         """Inverse of `to_files`; KeyError, TypeError or ValueError where parts are missing or do not fit."""
         document = json.loads(files[_META])
-        with np.load(io.BytesIO(files[_FILE]), allow_pickle=False) as stored:
-            weights, parameters = (np.asarray(stored[k], dtype=np.float64) for k in ("weights", "parameters"))
+        stored = read_npz(files[_FILE])
+        weights, parameters = (np.asarray(stored[k], dtype=np.float64) for k in ("weights", "parameters"))
         axes = tuple(Axis(float(a["low"]), float(a["high"]), bool(a["is_periodic"])) for a in document["axes"])
         curves = tuple(
             Curve(int(c["lever"]), tuple(map(int, c["axes"])), tuple(map(int, c["counts"]))) for c in document["curves"]

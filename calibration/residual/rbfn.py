@@ -14,6 +14,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.npz import read_npz
 from calibration.observations import Floats
 from calibration.residual.features import Features, is_frame_origin
 from calibration.residual.rbf_network import Hyperparameters, RbfNetwork, choose_hyperparameters
@@ -68,9 +69,10 @@ class Rbfn:
     @classmethod
     def from_files(cls, files: Mapping[str, bytes]) -> Rbfn:
         """Inverse of `to_files`; KeyError or ValueError where parts are missing or do not fit."""
-        with np.load(io.BytesIO(files[_FILE]), allow_pickle=False) as stored:
-            names = tuple(str(name) for name in stored["names"])
-            centre, scale, units, output = (stored[k] for k in ("centre", "scale", "units", "output"))
+        stored = read_npz(files[_FILE])
+        names = tuple(stored["names"].astype(str).tolist())
+        parts = ("centre", "scale", "units", "output")
+        centre, scale, units, output = (np.asarray(stored[k], dtype=np.float64) for k in parts)
         inputs = (len(names),)
         if centre.shape != inputs or scale.shape != inputs or (*units.shape, 3) != (len(output), *inputs, 3):
             raise ValueError("shapes of the network do not fit each other")

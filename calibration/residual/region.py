@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from calibration.kernels import region as kernel
 from calibration.model_checks import LARGEST, float_array
+from calibration.npz import read_npz
 from calibration.observations import Floats
 from calibration.residual.features import Features
 from calibration.rig import Joint
@@ -122,7 +123,7 @@ class Region:
         return (
             self.joints.shape == (5, joints)
             and self.poses.ndim == 2
-            and len(self.poses) > 0
+            and 0 < len(self.poses) <= _POSES
             and self.poses.shape[1] == joints
             and self.table.shape == (6, len(self.signals))
             and all(bool((np.abs(part) <= LARGEST).all()) for part in (self.joints, self.poses))
@@ -144,9 +145,9 @@ class Region:
     @classmethod
     def from_files(cls, files: Mapping[str, bytes]) -> Region:
         """Inverse of `to_files`; KeyError or ValueError where parts are missing. `fits` says whether they match."""
-        with np.load(io.BytesIO(files[FILE]), allow_pickle=False) as stored:
-            joints, poses, near, table = (float_array(stored, k) for k in ("joints", "poses", "near", "table"))
-            signals = np.asarray(stored["signals"])
+        stored = read_npz(files[FILE])
+        joints, poses, near, table = (float_array(stored, k) for k in ("joints", "poses", "near", "table"))
+        signals = np.asarray(stored["signals"])
         if near.shape != (1,) or signals.ndim != 1 or signals.dtype.kind != "U":
             raise ValueError(f"{FILE} holds no list of signals, or not one distance")
         return cls(joints, poses, float(near[0]), tuple(signals.tolist()), table)

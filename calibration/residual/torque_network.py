@@ -17,6 +17,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.npz import read_npz
 from calibration.observations import Floats
 from calibration.residual.features import Features
 from calibration.residual.folds import folds
@@ -72,9 +73,9 @@ class TorqueNetwork:
     @classmethod
     def from_files(cls, files: Mapping[str, bytes]) -> TorqueNetwork:
         """Inverse of `to_files`; KeyError or ValueError where parts are missing or do not fit."""
-        with np.load(io.BytesIO(files[_FILE]), allow_pickle=False) as stored:
-            names = tuple(str(name) for name in stored["names"])
-            units, width, output = (stored[k] for k in ("units", "inverse_width", "output"))
+        stored = read_npz(files[_FILE])
+        names = tuple(stored["names"].astype(str).tolist())
+        units, width, output = (np.asarray(stored[k], dtype=np.float64) for k in ("units", "inverse_width", "output"))
         if units.shape[1:] != (len(names),) or output.shape != (len(units) + 1, 3) or width.shape != (1,):
             raise ValueError("shapes of the network do not fit each other")
         return cls(names, units, float(width[0]), output)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from rich.console import Console
 
 from calibration.errors import DataError
 from calibration.observations import Floats, Observations, parse_observations
@@ -21,9 +20,11 @@ from daemon.cli.csv_output import check_out, deliver, with_columns
 from daemon.cli.options import DIRECTORY, data_option, model_option, prior_option, rig_option, seed_option
 from daemon.cli.output import Command, json_option, progress_display
 from daemon.cli.tables import say, show_evaluation
+from daemon.cli.terminal import Terminal
 from daemon.numba_cache import prepare
 from daemon.rigs import load_rig
 from drivers.clock import NS_PER_S, SystemClock
+from drivers.files import read_whole
 
 if TYPE_CHECKING:
     from calibration.identification.refinement import Prior
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 METHODS = ("default", "pde-paper", "km", "skcm", "rbf-tcm")
 RESIDUALS = ("default", "none", "rbfn", "lightgbm", "chain", "gp")
 CONNECT_TIMEOUT_S = 5
+_DATA_MAX_BYTES = 128 << 20  # half a million fixes
 PREDICTED_COLUMNS = tuple(f"{name}_pred_mm" for name in ("x", "y", "z", "sigma_x", "sigma_y", "sigma_z"))
 INTERVAL_COLUMNS = tuple(f"{name}_pred_mm" for name in ("half90_x", "half90_y", "half90_z", "radius90"))
 
@@ -41,7 +43,7 @@ INTERVAL_COLUMNS = tuple(f"{name}_pred_mm" for name in ("half90_x", "half90_y", 
 def read_observations(path: Path, rig: Rig, *, positions_required: bool = True) -> tuple[Observations, bytes]:
     """An observations CSV and its bytes; DataError if it cannot be read or does not fit the rig."""
     try:
-        data = path.read_bytes()
+        data = read_whole(path, _DATA_MAX_BYTES)
     except OSError as error:
         raise DataError(str(path), f"cannot be read: {error.strerror}") from error
     return parse_observations(data, rig, path.name, positions_required=positions_required), data
@@ -154,7 +156,7 @@ def calibrate(
         modelfiles.write_model(out, model, {modelfiles.REPORT: document.encode("utf-8")})
     result = training.as_dict(watch.seconds)
     if not as_json:
-        console = Console()
+        console = Terminal()
         show_evaluation(console, result, f"the {len(training)} fixes it was fitted to")
         say(console, f"Model: {out}   report: {out / modelfiles.REPORT}   {result['seconds']} s")
     return result
@@ -181,7 +183,7 @@ def evaluate(directory: Path, data: Path, *, refit_base: bool, as_json: bool) ->
     evaluation = pipeline.evaluate(model, observations, refit_base=refit_base)
     result = evaluation.as_dict(watch.seconds)
     if not as_json:
-        show_evaluation(Console(), result, f"the {len(evaluation)} fixes of {data.name}")
+        show_evaluation(Terminal(), result, f"the {len(evaluation)} fixes of {data.name}")
     return result
 
 

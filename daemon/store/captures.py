@@ -141,13 +141,24 @@ def decode_captures(blob: bytes) -> list[Capture]:
         raise StoreError(f"chunk of captures has version {blob[4]}, this program reads {known}; use a newer one")
     if _CRC.unpack_from(blob, len(blob) - _CRC.size)[0] != zlib.crc32(blob[: -_CRC.size]):
         raise StoreError("chunk of captures is damaged (its CRC-32 does not match); restore the store from a backup")
+    try:
+        return _decode(blob)
+    except (ArithmeticError, LookupError, TypeError, ValueError, zlib.error) as error:
+        # Its CRC-32 is right, so it was written so: not by this program, or on a broken computer.
+        raise StoreError(f"chunk of captures makes no sense ({error}); restore the store from a backup") from error
+
+
+def _decode(blob: bytes) -> list[Capture]:
     _, _, kind, packing, count, body_length, link_length, boot_length = _HEADER.unpack_from(blob)
     link_end = _HEADER.size + link_length
     boot_end = link_end + boot_length
     link = blob[_HEADER.size : link_end].decode()
     boot_id = blob[link_end:boot_end].decode()
-    packed = blob[boot_end : -_CRC.size]
-    body = zlib.decompress(packed, bufsize=body_length) if packing == _ZLIB else packed
+    body = blob[boot_end : -_CRC.size]
+    if packing == _ZLIB:
+        body = zlib.decompressobj().decompress(body, body_length + 1)
+    if len(body) != body_length:
+        raise ValueError(f"{len(body)} bytes or more where its header says {body_length}")
     columns = _Columns(body, count)
     monotonic = np.cumsum(columns.take("<i8"))
     utc = np.cumsum(columns.take("<i8")) + monotonic

@@ -1,10 +1,13 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +99,50 @@ def test_a_model_that_predicts_positions_off_the_earth_is_refused_by_the_child(m
     path.write_text(leaves.sub(lambda line: re.sub(r"\S+", "1e299", line.group()), path.read_text()))
     reseal(model_directory)
     with pytest.raises(ModelError, match=r"beyond 1e\+09 mm"):
+        read_model(model_directory)
+
+
+def test_a_model_of_compressed_zeros_is_refused_and_not_unpacked(model_directory: Path) -> None:
+    zeros = io.BytesIO()
+    np.savez_compressed(zeros, covariance=np.zeros((9000, 9000)))
+    (model_directory / "covariance.npz").write_bytes(zeros.getvalue())
+    reseal(model_directory)
+    with pytest.raises(ModelError, match="an archive of arrays is compressed"):
+        read_model(model_directory)
+
+
+def test_a_process_with_a_limit_of_memory_gets_no_more() -> None:
+    program = """
+from daemon.modelcheck import limit_memory
+limit_memory(100 << 20)
+kept = bytearray(50 << 20)
+try:
+    bytearray(100 << 20)
+except MemoryError:
+    print("no more")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "no more\n"
+
+
+def test_a_description_larger_than_that_of_any_model_is_not_parsed(model_directory: Path) -> None:
+    path = model_directory / "model.json"
+    document = json.loads(path.read_text())
+    document["ranges"] = {f"theta{n}": [0.0, 1.0] for n in range(400_000)}
+    path.write_text(json.dumps(document))
+    reseal(model_directory)
+    with pytest.raises(ModelError, match=r"model\.json is larger than 8,388,608 bytes"):
+        read_model(model_directory)
+
+
+def test_a_directory_with_more_than_a_model_is_not_read(model_directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(modelfiles, "_MODEL_MAX_BYTES", 100_000)
+    with pytest.raises(ModelError, match=r"is larger than a model can be \(100,000 bytes\)"):
+        read_model(model_directory)
+    manifest = json.loads((model_directory / "manifest.json").read_text())
+    manifest["files"] |= {f"file{n}": {"sha256": "", "bytes": 0} for n in range(40)}
+    (model_directory / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(ModelError, match="lists 48 files, a model has 32 at most"):
         read_model(model_directory)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import zlib
 from dataclasses import replace
 
@@ -84,6 +85,22 @@ def test_a_chunk_of_a_later_version_asks_for_a_newer_program() -> None:
     later += zlib.crc32(later).to_bytes(4, "little")
     with pytest.raises(StoreError, match="version 3"):
         decode_captures(bytes(later))
+
+
+@pytest.mark.parametrize(
+    ("place", "code", "value"), [(7 + 1, "<I", 2**31), (7 + 5, "<I", 7), (7 + 9, "<H", 60_000), (5, "B", 1)]
+)
+def test_a_chunk_that_was_written_wrongly_is_refused_though_its_checksum_is_right(
+    place: int, code: str, value: int
+) -> None:
+    (chunk,) = encode_captures([frame(n) for n in range(200)])
+    wrong = bytearray(chunk.blob[:-4])
+    struct.pack_into(code, wrong, place, value)
+    if code == "B":
+        wrong[-20:] = bytes(20)  # the packed columns themselves
+    wrong += zlib.crc32(wrong).to_bytes(4, "little")
+    with pytest.raises(StoreError, match="makes no sense"):
+        decode_captures(bytes(wrong))
 
 
 START = Stamp(1_700_000_000_000_000_000, 1_000_000_000, "boot")

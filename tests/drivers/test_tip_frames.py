@@ -1,5 +1,6 @@
 """The live tip as CAN frames: what is sent, what a receiver makes of it, and what may not be sent."""
 
+import math
 from pathlib import Path
 
 import can
@@ -67,6 +68,15 @@ def test_what_the_frames_cannot_hold_is_a_failure_and_no_wrong_number() -> None:
     assert far["tip_x"] == pytest.approx(-838_860.8)
     vague = decoded(encode_tip(TipMessage(TipStatus.OK, (0.0, 0.0, 0.0), 1e9, 1e9), IDENTIFIER, 0))
     assert (vague["tip_sigma"], vague["tip_age"]) == pytest.approx((6553.4, 2.54))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_what_is_no_number_is_sent_as_not_known(value: float) -> None:
+    lost = decoded(encode_tip(TipMessage(TipStatus.OK, (0.0, value, 0.0), 1.0, 0.1), IDENTIFIER, 0))
+    assert lost["tip_xy_status"] == TipStatus.FAILED
+    if value != -math.inf:
+        vague = decoded(encode_tip(TipMessage(TipStatus.OK, (0.0, 0.0, 0.0), value, value), IDENTIFIER, 0))
+        assert (vague["tip_sigma"], vague["tip_age"]) == pytest.approx((6553.4, 2.54))
 
 
 def test_every_status_has_a_name_in_the_dbc() -> None:

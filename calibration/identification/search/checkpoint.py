@@ -6,13 +6,13 @@ A state names the problem that it belongs to, so that a search of other data, bo
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.npz import read_npz
 from calibration.observations import Floats
 
 Arrays = dict[str, NDArray[Any]]
@@ -73,9 +73,8 @@ def unpack(state: bytes | None, identity: Mapping[str, NDArray[Any]]) -> tuple[A
     if state is None:
         return None, None
     try:
-        with np.load(io.BytesIO(state), allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile):
+        arrays = read_npz(state)
+    except ValueError:
         return None, "the checkpoint cannot be read, so the search began anew"
     found = {word: arrays.pop(_PREFIX + word, np.empty(0)) for word in identity}
     other = [word for word, value in identity.items() if not _same(found[word], value)]

@@ -1,0 +1,48 @@
+"""Files that others made, read with a bound on what they may take of memory."""
+
+from __future__ import annotations
+
+import errno
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, AnyStr
+
+LINE_MAX = 1 << 20  # a serial capture of half a megabyte, in hexadecimal
+
+
+def read_whole(path: Path, most_bytes: int) -> bytes:
+    """The bytes of a file.
+
+    Raises:
+        OSError: the file cannot be read, or (EFBIG) is larger than `most_bytes`; `strerror` says so.
+    """
+    with path.open("rb") as file:
+        data = file.read(most_bytes + 1)
+    if len(data) > most_bytes:
+        raise OSError(errno.EFBIG, f"it is larger than the {most_bytes:,} bytes that such a file may have", str(path))
+    return data
+
+
+def read_text(path: Path, most_bytes: int) -> str:
+    """The text of a UTF-8 file, with line ends as Python has them.
+
+    Raises:
+        OSError: see `read_whole`.
+        UnicodeDecodeError: not UTF-8.
+    """
+    return io.TextIOWrapper(io.BytesIO(read_whole(path, most_bytes)), encoding="utf-8").read()
+
+
+def bounded_lines(file: IO[AnyStr], most: int = LINE_MAX) -> Iterator[AnyStr]:
+    """Lines of an open file, as iterating over it gives them.
+
+    Raises:
+        OSError: the file cannot be read, or (EFBIG) has a longer line than `most`; `strerror` says so.
+    """
+    number = 0
+    while line := file.readline(most + 1):
+        number += 1
+        if len(line) > most:
+            raise OSError(errno.EFBIG, f"line {number} is longer than the {most:,} characters that one may have")
+        yield line
