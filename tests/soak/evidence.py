@@ -78,7 +78,6 @@ class Case:
         at_ns: when it began.
         expected: any of these will do.
         found: what has shown it.
-        is_bar: whether it counts; else it only tells how long something took.
     """
 
     name: str
@@ -87,7 +86,6 @@ class Case:
     at_ns: int
     expected: tuple[Expected, ...]
     found: Fact | None = None
-    is_bar: bool = True
 
     def shows(self, fact: Fact) -> bool:
         """Whether a fact is evidence of it."""

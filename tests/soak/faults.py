@@ -196,7 +196,7 @@ class Mischief:
             self._expect_alarm(kind, (STATION,), STATION, lasts_s)
         self._wait(lasts_s)
         if kind == "station_silent":
-            self._expect("station speaks again", (STATION,), STATION, is_bar=False)
+            self._expect("station speaks again", (STATION,), STATION)
         # The operator aims anew; after a loss of lock the station may as well have found something itself.
         if kind == "prism_jump" or (kind == "lock_loss" and self._rng.random() < 0.5):
             self._rig.aim(self._rig.aimed)
@@ -233,7 +233,7 @@ class Mischief:
             self._fault(kind, names, LINK, node=node, seconds=lasts_s)
             self._expect_alarm(kind, names, LINK, lasts_s)
             self._wait(lasts_s)
-            self._expect("node speaks again", names, LINK, is_bar=False)
+            self._expect("node speaks again", names, LINK)
         elif kind == "emergency":
             code = self._rng.choice((0x5000, 0x8130, 0x3100))
             self._fault(kind, names, LINK, node=node, code=code)
@@ -297,7 +297,7 @@ class Mischief:
                 self._expect_alarm("store not writable", ("store",), "", lasts_s)
                 self._wait(lasts_s)
                 self._daemon.allow_writing(allowed=True)
-                self._expect("store writable again", ("store",), "", is_bar=False)
+                self._expect("store writable again", ("store",), "")
                 self._wait(4.0)
             self._blackout("*", begin_ns)
 
@@ -322,7 +322,7 @@ class Mischief:
         self._expect(f"unplug {what}", (link,), "", at_ns=begin_ns)
         self._expect_alarm(f"unplug {what}", (link,), "", lasts_s)
         self._wait(lasts_s + 0.1)
-        self._expect(f"{what} back", (link,), "", is_bar=False)
+        self._expect(f"{what} back", (link,), "")
         self._wait(8.0)
         self._blackout(link, begin_ns)
 
@@ -337,11 +337,9 @@ class Mischief:
             expected = (Expected("alarm", ALARMS[fault]),)
             self._watch.expect(Case(f"{fault}: alarm", tuple(subjects), link, self._rig.now_ns(), expected))
 
-    def _expect(
-        self, name: str, subjects: Sequence[str], link: str, *, at_ns: int | None = None, is_bar: bool = True
-    ) -> None:
+    def _expect(self, name: str, subjects: Sequence[str], link: str, *, at_ns: int | None = None) -> None:
         at_ns = self._rig.now_ns() if at_ns is None else at_ns
-        self._watch.expect(Case(name, tuple(subjects), link, at_ns, EVIDENCE[name], is_bar=is_bar))
+        self._watch.expect(Case(name, tuple(subjects), link, at_ns, EVIDENCE[name]))
 
     def _blackout(self, link: str, begin_ns: int) -> None:
         end_ns = self._rig.now_ns() + round(AFTERWARDS_S * NS_PER_S)
