@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
+import sqlite3
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -315,7 +316,7 @@ class SessionKeeper:
                 if session is self._open:
                     self._aim(session.prism)
                     self._prisms.turned(session, self._clock.now())
-            except CommandError as error:
+            except (CommandError, sqlite3.Error) as error:  # another time: the station, or the disk, is not well
                 log.warning("station not aimed at prism %s again: %s", session.prism, error)
             finally:
                 self._commands.release()
