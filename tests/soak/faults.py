@@ -188,8 +188,8 @@ class Mischief:
             lasts_s = max(lasts_s, 2.0 if kind == "lock_loss" else 6.0)  # shorter ones leave no trace, and no harm
             given = {"seconds": lasts_s}
         elif kind == "prism_jump":
-            if not self._watch.has_session or self._rig.aimed not in self._prisms:
-                return  # only a session has a prism that the station could have left
+            if not self._watch.has_session or self._rig.aimed not in self._prisms or not self._rig.has_settled():
+                return  # only a session has a prism that the station can leave, once it has been seen on it
             given = {"to": self._rng.choice([p for p in self._prisms if p != self._rig.aimed])}
         self._fault(kind, (STATION,), STATION, **given)
         if kind in ALARMS and (kind != "lock_loss" or self._watch.has_session):

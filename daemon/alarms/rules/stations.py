@@ -23,10 +23,12 @@ def station_silent(evidence: Evidence) -> Iterator[Finding]:
             yield station.name, "the station gives no records", "warning" if evidence.session is None else "critical"
 
 
-@rule("warning", "Aim the station at the session's prism; look what stands in the line of sight.", after_s=4, hold_s=3)
+@rule(
+    "warning", "Aim the station at the session's prism; look what stands in the line of sight.", after_s=2.5, hold_s=3
+)
 def station_not_locked(evidence: Evidence) -> Iterator[Finding]:
-    """A station follows no prism for 4 s while a session is open. Searching and waiting are usual at other times, and
-    for some seconds when a boom passes the line of sight. Cleared when it has been locked for 3 s."""
+    """A station follows no prism for 2.5 s while a session is open; it has gone on as if it did for a second before.
+    Searching and waiting are usual at other times. Cleared when it has been locked for 3 s."""
     for station in evidence.acquisition.stations:
         if evidence.session is not None and is_present(station.status) and station.lock in _TURNED_AWAY:
             yield station.name, f"the station is {station.lock} while session {evidence.session.id} is open"
