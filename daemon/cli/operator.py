@@ -20,6 +20,7 @@ from daemon.cli.status_lines import alarm_line, cleared_line, decoding_lines, ga
 from daemon.cli.talk import ask, say, talks, utc, who
 from daemon.cli.terminal import coloured, echo
 from daemon.config import read_config
+from daemon.plain_text import shown
 from daemon.present_state import duration
 from daemon.scheduler import SESSION_KINDS
 
@@ -264,6 +265,8 @@ def session_shoot(point: str, **where: Any) -> Any:
         console.print(f"{result['point']}: misclosure {result['misclosure_mm']:.1f} mm, {verdict}", style=style)
         _advise(console, result["advice"])
 
+    if not where["as_json"]:
+        click.echo(f"measuring {shown(point)}: keep the station on it; Ctrl-C gives up", err=True)
     return ask(where, "session.shoot", show, timeout_s=SHOT_TIMEOUT_S, point=point)
 
 

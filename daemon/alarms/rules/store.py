@@ -18,7 +18,7 @@ def not_storing(evidence: Evidence) -> Iterator[Finding]:
         yield "store", evidence.acquisition.error
 
 
-@rule("critical", "Do what the alarm says before you stop rigcal: what only a deleted file holds is lost when rigcal stops.")
+@rule("critical", "Do what the alarm says before you stop rigcal: a deleted file is lost for good when rigcal stops.")
 def store_unsound(evidence: Evidence) -> Iterator[Finding]:
     """The store is damaged, or a file of it was replaced or is gone."""
     if evidence.store.fault:
