@@ -184,6 +184,9 @@ def setup_list(**where: Any) -> Any:
     """All set-ups with their control points."""
 
     def show(console: Console, setups: list[dict[str, Any]]) -> None:
+        if not setups:
+            say(console, "no set-ups yet; describe one with `rigcal setup new`")
+            return
         table = Table("set-up", "instrument", "state", "tilt arcsec", "ppm", "control points")
         for s in setups:
             points = ", ".join(p["name"] for p in s["control_points"])
@@ -287,6 +290,9 @@ def session_list(**where: Any) -> Any:
     """All sessions."""
 
     def show(console: Console, sessions: list[dict[str, Any]]) -> None:
+        if not sessions:
+            say(console, "no sessions yet; `rigcal session start` opens one")
+            return
         table = Table("session", "kind", "prism", "set-up", "state", "poses", "observations", "operator")
         for s in sessions:
             counts = (str(s["poses"]), str(s["observations"]))
@@ -337,19 +343,21 @@ def _show_session(console: Console, session: dict[str, Any]) -> None:
     for reason, n in session["excluded"].items():
         say(console, f"  {n} excluded: {reason}")
     for suspicion in session.get("prism_suspicions", ()):
-        console.print(f"  since {utc(suspicion['since_utc_ns'])}", end=" ", style="red")
-        say(console, f"{suspicion['text']}; its fixes do not count: {suspicion['remedy']}")
+        what = f"{suspicion['text']}; its fixes do not count: {suspicion['remedy']}"
+        console.print(Text.assemble((f"  since {utc(suspicion['since_utc_ns'])} ", "red"), shown(what)))
     for shot in session["control_shots"]:
         size = "defined" if shot["misclosure_mm"] is None else f"misclosure {shot['misclosure_mm']:.1f} mm"
         say(console, f"  control point {shot['point']} at the {shot['phase']}: {size}")
+    if session["state"] == "open" and not session["control_shots"]:
+        say(console, "  no control point has been shot yet: `rigcal session shoot NAME`, now and again before the end")
     for step in session["clock_steps"]:
         back = "back" if step["step_s"] < 0 else "forward"
         say(console, f"  {utc(step['at_utc_ns'])}: the computer's clock was set {back} by {abs(step['step_s']):.1f} s")
     if session["setup_moved"]:
         console.print("  the station has moved since this set-up was described", style="red")
     if session["not_used"] is not None:
-        console.print("  calibration does not use this session:", end=" ", style="red")
-        say(console, f"{session['not_used']}; to use it anyway: `rigcal session accept {session['id']}`")
+        why = f"{session['not_used']}; to use it anyway: `rigcal session accept {session['id']}`"
+        console.print(Text.assemble(("  calibration does not use this session: ", "red"), shown(why)))
     if session["accepted"] is not None:
         accepted = session["accepted"]
         by = who(accepted["by"], accepted["user"]) or "an operator"
