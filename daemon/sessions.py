@@ -356,10 +356,15 @@ class SessionKeeper:
         shot = self._table.shot(session.id, phase)
         advice = []
         missing = [name for name in points if name not in shot]
-        if missing or not points:
-            names = ", ".join(missing) if missing else "at least one"
-            how = " (`rigcal session shoot NAME`)" if phase == "start" else ""
-            advice.append(f"control points not shot at the session's {phase}: {names}{how}")
+        if phase == "start" and (missing or not points):
+            which = f"the control points {', '.join(missing)}" if missing else "a control point"
+            advice.append(
+                f"shoot {which} before the first pose (`rigcal session shoot NAME`), and again before the end"
+            )
+        elif missing or not points:
+            advice.append(
+                f"control points not shot at the session's end: {', '.join(missing) or 'none was shot at all'}"
+            )
         advice += [
             f"{joint} jumped during the session, and nothing after that is used: if its encoder was preset, start anew"
             for joint in self._rig.joint_names

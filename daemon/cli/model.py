@@ -37,7 +37,7 @@ def model_list(**where: Any) -> Any:
         if not models:
             say(console, "no models yet; the jobs of a closed session make them (`rigcal jobs list`)")
             return
-        table = Table("model", "state", "stage", "made (UTC)", "sessions", "comparison")
+        table = Table("model", "state", "stage", "made", "sessions", "comparison")
         for m in models:
             compared = m["comparison"]
             verdict = compared["sentence"] if compared else "not compared yet"

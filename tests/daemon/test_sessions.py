@@ -289,7 +289,10 @@ def test_where_something_can_aim_it_is_told_to(rig: Rig) -> None:
 
 def test_the_operator_is_told_what_is_still_to_be_done(rig: Rig) -> None:
     rig.say("setup_new", id="S1")
-    assert "control points not shot at the session's start" in rig.say("start", prism="r", kind="check")["advice"][0]
+    assert (
+        "shoot a control point before the first pose (`rigcal session shoot NAME`)"
+        in rig.say("start", prism="r", kind="check")["advice"][0]
+    )
     rig.live(2)
     advice = rig.say("stop")["advice"]
     assert "control points not shot at the session's end" in advice[0]

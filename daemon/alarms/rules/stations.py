@@ -26,7 +26,7 @@ def station_silent(evidence: Evidence) -> Iterator[Finding]:
             yield station.name, "the station gives no records", "warning" if evidence.session is None else "critical"
 
 
-@rule("warning", "Aim the station at the session's prism; look what stands in the line of sight.", after_s=4, hold_s=3)
+@rule("warning", "Aim the station at the session's prism; check what blocks the line of sight.", after_s=4, hold_s=3)
 def station_not_locked(evidence: Evidence) -> Iterator[Finding]:
     """A station follows no prism for 4 s while a session is open. Searching and waiting are usual at other times, and
     for some seconds when a boom passes the line of sight. Cleared when it has been locked for 3 s."""
