@@ -408,9 +408,11 @@ def jobs_retry(number: int, **where: Any) -> Any:
 
 
 def _job_line(job: dict[str, Any]) -> str:
+    name = f"job {job['id']} {job['kind']}" + (f" of {job['session_id']}" if job.get("session_id") else "")
     if job["state"] == "running":
-        return f"job {job['id']} {job['kind']}: running, {100 * job['progress']:.0f} %, {job['message'] or 'starting'}"
-    return f"job {job['id']} {job['kind']}: {job['state']}" + (f", {job['error']}" if job["error"] else "")
+        return f"{name}: running, {100 * job['progress']:.0f} %, {job['message'] or 'starting'}"
+    more = job["error"] or (job.get("result") or {}).get("report")
+    return f"{name}: {job['state']}" + (f", {more}" if more else "")
 
 
 @click.group()
