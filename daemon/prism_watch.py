@@ -85,7 +85,7 @@ class PrismWatch:
 
         A restart ends no suspicion, and what happened while nobody listened may begin one.
         """
-        with Reader(self._store.path) as reader:
+        with Reader(self._store.path, self._store.files.database) as reader:
             boots = reader.boots()
             words = reader.rows("SELECT * FROM prism_confirmations WHERE session_id = ? ORDER BY id", (session.id,))
             session.words += [Word(stamp_of(row, boots), bool(row["turning"])) for row in words]

@@ -29,6 +29,8 @@ class Reader:
 
     def __init__(self, path: Path, identity: FileIdentity | None = None) -> None:
         self.path = path
+        if not path.is_file() and identity is not None:
+            raise StoreError(f"{path}: the file is gone that the daemon writes to; `rigcal status` says what to do")
         if not path.is_file():
             raise StoreError(f"{path}: there is no store; start the daemon, or give the file with --store")
         if identity is not None and FileIdentity.of(path) != identity:

@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from daemon.cli.main import main
 from daemon.composition import Parts, joiner
 from daemon.config import Config
-from daemon.control import request
+from daemon.control import CommandError, request
 from daemon.notify import Notifier
 from daemon.service import Daemon
 from daemon.store import Reader, Store, StoreError
@@ -274,6 +274,18 @@ def test_the_status_of_a_running_daemon_says_that_its_store_is_gone(tmp_path: Pa
         config.store_path.rename(tmp_path / "aside")
         wait_until(lambda: request(config.socket_path, "status")["store_health"]["state"] == "missing")
         assert daemon.store_health.state == "missing"
+
+
+def test_lists_neither_fail_inside_the_daemon_nor_come_from_another_file_when_the_store_is_gone(tmp_path: Path) -> None:
+    with running(tmp_path) as (config, _):
+        assert request(config.socket_path, "session.list") == []
+        config.store_path.rename(tmp_path / "aside")
+        for command in ("session.list", "jobs.list"):
+            with pytest.raises(CommandError, match=r"^\S+: the file is gone .*; `rigcal status` says what to do$"):
+                request(config.socket_path, command)
+        shutil.copy(tmp_path / "aside", config.store_path)
+        with pytest.raises(CommandError, match="the file was replaced while it ran; `rigcal status` says what to do"):
+            request(config.socket_path, "session.list")
 
 
 def test_a_damaged_table_hides_nothing_else_from_status(tmp_path: Path) -> None:
