@@ -99,7 +99,7 @@ def parse_message(line: bytes) -> Progress | Outcome:
     except (ValueError, RecursionError):
         message = None
     match message:
-        case {"progress": float() | int() as share, "message": str() as text} if math.isfinite(share):
+        case {"progress": float() | int() as share, "message": str() as text} if -math.inf < share < math.inf:
             return Progress(min(max(float(share), 0.0), 1.0), text)
         case {"result": dict() as result}:
             return Outcome("done", result=result)

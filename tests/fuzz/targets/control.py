@@ -41,8 +41,7 @@ class _Rig:
 
     def __init__(self) -> None:
         logging.disable(logging.CRITICAL)
-        self.folder = scratch_directory()
-        config = parse_config(_CONFIG, Path(self.folder.name) / "rigcal.toml")
+        config = parse_config(_CONFIG, scratch_directory() / "rigcal.toml")
         parts = replayed(config, load_rig("swdt82"), [GOLDEN / "boom.log", GOLDEN / "station.serial"], _REPLAY_SPEED)
         self.store = Store(config.store_path)
         self.daemon = Daemon(config, self.store, replace(parts, is_over=lambda: False))
@@ -58,7 +57,6 @@ class _Rig:
         self.stop.set()
         self.thread.join(timeout=30)
         self.store.close()
-        self.folder.cleanup()
         logging.disable(logging.NOTSET)
 
     def _connect(self) -> None:
