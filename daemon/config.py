@@ -10,6 +10,7 @@ from typing import Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from calibration.toml import LONGEST, parse_toml
+from daemon.control import reading_socket
 from drivers.can_transmit import is_free
 from drivers.files import read_text
 from drivers.station import StationConfig
@@ -143,11 +144,14 @@ class Config(_Section):
         rig: a shipped rig's name or a path to a rig file.
         state_directory: where store, models and reports live.
         socket: the control socket; `control.sock` in the runtime or state directory when absent.
+        read_group: whose members may look at the daemon's state and not change it, by a socket `status.sock` beside the
+            control socket; no one when absent.
     """
 
     rig: str
     state_directory: Path = Field(default_factory=lambda: Path(os.environ.get("STATE_DIRECTORY", "/var/lib/rigcal")))
     socket: Path | None = None
+    read_group: str | None = Field(default=None, min_length=1)
     can: tuple[CanSection, ...] = ()
     station: tuple[StationConfig, ...] = ()
     sessions: SessionsSection = SessionsSection()
@@ -224,9 +228,13 @@ def parse_config(text: str, source: Path) -> Config:
             "socket": base / config.socket if config.socket else None,
         }
     )
-    if len(os.fsencode(config.socket_path)) > MAX_SOCKET_PATH_BYTES:
+    if config.read_group is not None and config.socket_path == reading_socket(config.socket_path):
+        raise ConfigError(f"{source}: socket: {config.socket_path} is where `read_group` looks; give it another name")
+    sockets = [config.socket_path] + ([] if config.read_group is None else [reading_socket(config.socket_path)])
+    longest = max(sockets, key=lambda path: len(os.fsencode(path)))
+    if len(os.fsencode(longest)) > MAX_SOCKET_PATH_BYTES:
         raise ConfigError(
-            f"{source}: socket: {config.socket_path} is longer than the {MAX_SOCKET_PATH_BYTES} bytes a unix socket's "
+            f"{source}: socket: {longest} is longer than the {MAX_SOCKET_PATH_BYTES} bytes a unix socket's "
             "path may have; set `socket` to a shorter one"
         )
     return config

@@ -1,4 +1,4 @@
-"""The control socket: one JSON object a line, each way, on a unix socket that only the rig's own users reach.
+"""The protocol of the control socket: one JSON object a line, each way; and the client's side of it.
 
 Request `{"command": "session.start", "arguments": {...}}`; answer `{"ok": true, "result": ...}` or
 `{"ok": false, "status": 2, "error": "one sentence"}`. `status` is the exit status a command line should end with.
@@ -7,21 +7,18 @@ Request `{"command": "session.start", "arguments": {...}}`; answer `{"ok": true,
 from __future__ import annotations
 
 import contextlib
+import grp
 import json
-import logging
-import os
+import math
 import socket
-import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
-from daemon.store.errors import is_unwritable
-
-log = logging.getLogger(__name__)
-
 MAX_LINE_BYTES = 1 << 20
-MESSAGE_MAX = 1000  # characters of an error
+MAX_ERROR_CHARACTERS = 2000
+MAX_DEPTH = 20  # of lists and objects in a request; those of our commands have four at most
+MAX_WHOLE = 2**63 - 1  # the store keeps whole numbers in 64 bits
 FAILED, WRONG_USE, REFUSED = 1, 2, 3
 
 
@@ -33,165 +30,167 @@ class CommandError(Exception):
     """
 
     def __init__(self, message: str, status: int = WRONG_USE) -> None:
-        # What was asked for is quoted, and may be anything
-        super().__init__(message if len(message) <= MESSAGE_MAX else f"{message[:MESSAGE_MAX]}...")
+        super().__init__(message)
         self.status = status
 
 
 Handler = Callable[[Mapping[str, Any]], Any]
 
 
-class ControlServer:
-    """Serves commands on a unix socket, one thread a connection, so that a slow command stops no other.
+# ---- requests and answers --------------------------------------------------------------------------------------------
 
-    Args:
-        path: the socket; a file left by a killed daemon is replaced (the store's lock says that it is dead).
-        handlers: command name -> function of the arguments, returning something JSON can hold.
+
+def parse_request(line: bytes) -> tuple[str, dict[str, Any]]:
+    """Return the command and the arguments of a request.
+
+    Raises:
+        CommandError: it is no request, or holds what no command can use: numbers that are not finite or need more than
+            64 bits, text that is no Unicode, deeper nesting than any command has.
     """
-
-    def __init__(self, path: Path, handlers: Mapping[str, Handler]) -> None:
-        self._path = path
-        self._handlers = handlers
-        self._stopping = threading.Event()
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._connections: set[socket.socket] = set()
-        self._threads: set[threading.Thread] = set()
-        self._lock = threading.Lock()
-        if path.is_socket():
-            path.unlink()
-        try:
-            self._socket.bind(str(path))
-        except OSError as error:
-            self._socket.close()
-            raise CommandError(f"the control socket {path} cannot be made: {error.strerror}", FAILED) from error
-        os.chmod(path, 0o660)
-        self._socket.listen(128)
-        self._acceptor = threading.Thread(target=self._accept, name="control", daemon=True)
-        self._acceptor.start()
-
-    def close(self) -> None:
-        """Stop serving; connections are closed and the socket file is removed."""
-        self._stopping.set()
-        with contextlib.suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)
-        self._socket.close()
-        with self._lock:
-            connections, threads = list(self._connections), list(self._threads)
-        for connection in connections:
-            with contextlib.suppress(OSError):
-                connection.shutdown(socket.SHUT_RDWR)
-        self._acceptor.join(timeout=5)
-        for thread in threads:
-            thread.join(timeout=5)
-        self._path.unlink(missing_ok=True)
-
-    def _accept(self) -> None:
-        while not self._stopping.is_set():
-            try:
-                connection, _ = self._socket.accept()
-            except OSError:
-                return
-            thread = threading.Thread(target=self._serve, args=(connection,), name="control-client", daemon=True)
-            with self._lock:
-                self._connections.add(connection)
-                self._threads.add(thread)
-            thread.start()
-
-    def _serve(self, connection: socket.socket) -> None:
-        try:
-            with connection, connection.makefile("rwb") as stream:
-                while line := stream.readline(MAX_LINE_BYTES + 1):
-                    stream.write(json.dumps(self._answer(line)).encode() + b"\n")
-                    stream.flush()
-                    if len(line) > MAX_LINE_BYTES:
-                        return
-        except (OSError, ValueError):
-            log.debug("a control connection ended early", exc_info=True)
-        finally:
-            with self._lock:
-                self._connections.discard(connection)
-                self._threads.discard(threading.current_thread())
-
-    def _answer(self, line: bytes) -> dict[str, Any]:
-        command: object = None
-        try:
-            command, arguments = self._parse(line)
-            return {"ok": True, "result": self._handlers[command](arguments)}
-        except CommandError as error:
-            return _refusal(str(error), error.status)
-        except Exception as error:  # a fault in one command must not end the daemon
-            if is_unwritable(error):
-                log.error("command %s: the store cannot be written (%s)", command, error)
-                return _refusal(
-                    f"the store cannot be written ({error}), so nothing was changed; free space on its disk, then say "
-                    "it again",
-                    FAILED,
-                )
-            log.exception("command %s failed", command)
-            return _refusal(f"{command} failed inside the daemon: {error}; see its log", FAILED)
-
-    def _parse(self, line: bytes) -> tuple[str, dict[str, Any]]:
-        if len(line) > MAX_LINE_BYTES:
-            raise CommandError(f"request longer than {MAX_LINE_BYTES} bytes")
-        try:
-            request = json.loads(line, parse_int=_int, parse_constant=_no_constant)
-            json.dumps(request, ensure_ascii=False).encode()  # half a surrogate pair can neither be stored nor shown
-        except (ValueError, RecursionError):
-            request = None
-        if not isinstance(request, dict) or not isinstance(request.get("command"), str):
-            raise CommandError('a request is one JSON object a line: {"command": NAME, "arguments": {...}}')
-        command, arguments = request["command"], request.get("arguments", {})
-        if command not in self._handlers:
-            raise CommandError(f"unknown command {command!r}; known: {', '.join(sorted(self._handlers))}")
-        if not isinstance(arguments, dict):
-            raise CommandError("arguments must be a JSON object")
-        return command, arguments
+    if len(line) > MAX_LINE_BYTES:
+        raise CommandError(f"request longer than {MAX_LINE_BYTES} bytes")
+    try:
+        request = json.loads(line, parse_constant=_no_number, parse_float=_finite, parse_int=_whole)
+    except ValueError:
+        request = None
+    except RecursionError:
+        raise _too_deep() from None
+    if not isinstance(request, dict) or not isinstance(request.get("command"), str):
+        raise CommandError('a request is one JSON object a line: {"command": NAME, "arguments": {...}}')
+    _check_values(request)
+    arguments = request.get("arguments", {})
+    if not isinstance(arguments, dict):
+        raise CommandError("arguments must be a JSON object")
+    return request["command"], arguments
 
 
-def _int(digits: str) -> int:
-    """A whole number that the store can hold; ValueError for one that it cannot."""
-    number = int(digits)
-    if not -(1 << 63) <= number < 1 << 63:
-        raise ValueError("a whole number beyond 64 bits")
-    return number
+def answer_line(result: object) -> bytes:
+    """Return the answer of a command that was carried out."""
+    return json.dumps({"ok": True, "result": result}).encode() + b"\n"
 
 
-def _no_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no JSON")
+def refusal_line(message: str, status: int) -> bytes:
+    """Return the answer of a command that was not carried out; a message without end is cut off."""
+    if len(message) > MAX_ERROR_CHARACTERS:
+        message = f"{message[:MAX_ERROR_CHARACTERS]}..."
+    return json.dumps({"ok": False, "status": status, "error": message}).encode() + b"\n"
 
 
-def _refusal(message: str, status: int) -> dict[str, Any]:
-    return {"ok": False, "status": status, "error": message}
+def _no_number(text: str) -> NoReturn:
+    raise CommandError(f"a request holds finite numbers only, not {text}")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    return value if math.isfinite(value) else _no_number(text[:20])
+
+
+def _whole(text: str) -> int:
+    if len(text) <= len(str(-MAX_WHOLE)) and -MAX_WHOLE - 1 <= (value := int(text)) <= MAX_WHOLE:
+        return value
+    raise CommandError(f"a request's whole numbers have 64 bits, which {text:.20} has not")
+
+
+def _check_values(request: object) -> None:
+    """Raise CommandError where JSON values are nested too deep, or a text cannot be encoded."""
+    level = [request]
+    for _ in range(MAX_DEPTH):
+        below: list[object] = []
+        for value in level:
+            if isinstance(value, str):
+                _check_text(value)
+            elif isinstance(value, dict):
+                below += (*value, *value.values())
+            elif isinstance(value, list):
+                below += value
+        if not below:
+            return
+        level = below
+    raise _too_deep()
+
+
+def _check_text(text: str) -> None:
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise CommandError(f"a request's texts are Unicode; {text[error.start]!a} is half a character") from None
+
+
+def _too_deep() -> CommandError:
+    return CommandError(f"a request nests at most {MAX_DEPTH} lists and objects")
+
+
+# ---- the client's side -----------------------------------------------------------------------------------------------
+
+
+def reading_socket(control_path: Path) -> Path:
+    """Return where the daemon serves those who may only look: beside its control socket."""
+    return control_path.with_name("status.sock")
+
+
+def how_to_be_let_in(control_path: Path) -> str:
+    """Return what a user does who may not use a daemon's control socket: a clause that names its group."""
+    try:
+        gid = control_path.stat().st_gid
+    except OSError:
+        return "join the group that owns its control socket, or use sudo"
+    try:
+        group = grp.getgrgid(gid).gr_name
+    except (KeyError, OSError):
+        group = str(gid)
+    return f"join the group {group} (`sudo adduser NAME {group}`, then log in anew), or use sudo"
 
 
 def request(path: Path, command: str, arguments: Mapping[str, Any] | None = None, *, timeout_s: float = 120.0) -> Any:
     """Send one command to the running daemon and return its result.
 
+    Who may not use the control socket is answered by the one for those who may only look, where there is one.
+
     Raises:
         CommandError: no daemon is listening, it refused, or it did not answer within `timeout_s`.
     """
+    message = json.dumps({"command": command, "arguments": dict(arguments or {})}).encode() + b"\n"
     try:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
-            connection.settimeout(timeout_s)
-            connection.connect(str(path))
-            with connection.makefile("rwb") as stream:
-                message = {"command": command, "arguments": dict(arguments or {})}
-                stream.write(json.dumps(message).encode() + b"\n")
-                stream.flush()
-                line = stream.readline()
+        try:
+            line = _exchange(path, message, timeout_s)
+        except PermissionError:
+            line = _exchange_reading(path, message, timeout_s)
     except TimeoutError:
-        raise CommandError(f"the daemon at {path} did not answer within {timeout_s:g} s", 1) from None
-    except PermissionError:
-        raise CommandError(f"{path}: permission denied; join the group that owns it or use sudo", 1) from None
+        raise CommandError(f"the daemon at {path} did not answer within {timeout_s:g} s", FAILED) from None
     except OSError as error:
         raise CommandError(
             f"no daemon is listening at {path} ({error.strerror or error}); start one with `rigcal run`, "
             "or name its socket with --socket",
-            1,
+            FAILED,
         ) from None
-    if not line:
-        raise CommandError(f"the daemon at {path} closed the connection without an answer; see its log", 1)
+    if not line.endswith(b"\n"):
+        raise CommandError(f"the daemon at {path} closed the connection without an answer; see its log", FAILED)
     answer = json.loads(line)
     if not answer["ok"]:
         raise CommandError(answer["error"], answer["status"])
     return answer["result"]
+
+
+def _exchange_reading(control_path: Path, message: bytes, timeout_s: float) -> bytes:
+    """Send a request to the socket for those who may only look."""
+    try:
+        return _exchange(reading_socket(control_path), message, timeout_s)
+    except TimeoutError:
+        raise
+    except OSError:
+        raise CommandError(f"{control_path}: permission denied; {how_to_be_let_in(control_path)}", REFUSED) from None
+
+
+def _exchange(path: Path, message: bytes, timeout_s: float) -> bytes:
+    """Send a line; return the one that comes back, b"" where none does."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        connection.settimeout(timeout_s)
+        connection.connect(str(path))
+        # A daemon that refuses a connection says why and closes it, perhaps before it was sent anything.
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            connection.sendall(message)
+        with connection.makefile("rb") as stream:
+            try:
+                return stream.readline()
+            except ConnectionResetError:
+                return b""

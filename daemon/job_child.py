@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import queue
 import signal
@@ -12,11 +13,15 @@ import threading
 from collections.abc import Sequence
 from types import TracebackType
 
+from daemon.journal import parse_line
 from daemon.order import Order, Outcome, Progress, parse_message
+
+log = logging.getLogger(__name__)
 
 # -P keeps the current directory off the process's path: what lies there is no code of ours.
 JOB_COMMAND = (sys.executable, "-P", "-m", "daemon.job_process")
 MAX_LINE_BYTES = 16 * 2**20
+MAX_LOGGED_BYTES = 4096
 END_TIMEOUT_S = 5.0  # from the end of a process's output to its own
 
 
@@ -35,13 +40,17 @@ class JobChild:
     """
 
     def __init__(self, order: Order, command: Sequence[str] = JOB_COMMAND) -> None:
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+        )
         self.pid = self._process.pid
         self._lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        # Both pipes have a thread of their own: one that the process does not empty must not hold up a cancellation.
+        self._job_id = order.job_id
+        # All pipes have a thread of their own: one that the process does not empty must not hold up a cancellation.
         self._threads = [
             threading.Thread(target=self._tell, args=(order.to_line(),), name=f"job-{order.job_id}-order", daemon=True),
             threading.Thread(target=self._read, name=f"job-{order.job_id}", daemon=True),
+            threading.Thread(target=self._log, name=f"job-{order.job_id}-log", daemon=True),
         ]
         for thread in self._threads:
             thread.start()
@@ -93,3 +102,11 @@ class JobChild:
             while line := output.readline(MAX_LINE_BYTES):
                 self._lines.put(line)
         self._lines.put(b"")
+
+    def _log(self) -> None:
+        """Log what the process says on standard error, each line as important as it says."""
+        assert self._process.stderr is not None
+        with self._process.stderr as errors:
+            while line := errors.readline(MAX_LOGGED_BYTES):
+                level, text = parse_line(line.rstrip().decode("utf-8", "replace"))
+                log.log(level, "job %d: %s", self._job_id, text)

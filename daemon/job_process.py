@@ -1,12 +1,14 @@
 """What a job does, in a process of its own: reads the store, computes, writes files, tells its parent.
 
 Standard input carries the order, one JSON object, and then stays open: when it closes, the daemon is gone and so goes
-the job. Standard output carries what `daemon.order` describes. Only the daemon writes to the store.
+the job. Standard output carries what `daemon.order` describes, and standard error log lines with their priorities.
+Only the daemon writes to the store.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 import os
 import sys
 import threading
@@ -22,6 +24,7 @@ from calibration.observations import Observations, parse_observations
 from calibration.rig import Rig
 from daemon.checkpoint import FileCheckpoint
 from daemon.files import write_file
+from daemon.journal import set_up_logging
 from daemon.modelfiles import REPORT, read_model, write_model
 from daemon.numba_cache import prepare
 from daemon.order import Order
@@ -30,6 +33,8 @@ from daemon.store.errors import StoreError
 from daemon.store.identity import FileIdentity
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S, SystemClock
+
+log = logging.getLogger(__name__)
 
 _LEAST_FIXES = 4  # three place a base and say nothing more
 
@@ -41,6 +46,7 @@ def main() -> int:
     line = sys.stdin.readline()
     if not line:
         return 2  # the daemon was gone before it could say what to do
+    set_up_logging(is_prefixed=True)  # the daemon reads standard error, and logs it
     order = Order.from_line(line)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     tell = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
@@ -52,11 +58,11 @@ def main() -> int:
 
     try:
         result = perform(order, lambda share, text: say({"progress": share, "message": text}))
-    except Exception as error:  # noqa: BLE001 - whatever goes wrong becomes the job's result
+    except Exception as error:
         if isinstance(error, CalibrationError | StoreError):
             say({"error": str(error)})
         else:
-            sys.excepthook(type(error), error, error.__traceback__)
+            log.error("%s failed", order.kind, exc_info=error)
             say({"error": f"{type(error).__name__}: {error}; the daemon's log has the whole story"})
         return 1
     say({"result": result})
@@ -144,7 +150,7 @@ def _held_out(order: Order, rig: Rig, training: Observations) -> Observations | 
     try:
         checks = _observations(order, rig, order.held_out_ids)
     except DataError as error:
-        print(f"the check sessions judge nothing: {error}", file=sys.stderr)  # the daemon's log
+        log.warning("the check sessions judge nothing: %s", error)
         return None
     return checks.select(np.isin(checks.setup, training.setup)) or None
 

@@ -454,11 +454,11 @@ class JobTable:
         return self._store.insert("jobs", row)
 
     def _job(self, job_id: object) -> dict[str, Any]:
-        found = isinstance(job_id, int) and self._store.rows(
+        found = type(job_id) is int and self._store.rows(
             "SELECT id, kind, state, attempts, interruptions, depends_on, error FROM jobs WHERE id = ?", (job_id,)
         )
         if not found:
-            raise CommandError(f"there is no job {job_id!r}; `rigcal jobs list` shows them")
+            raise CommandError(f"there is no job {job_id!r:.80}; `rigcal jobs list` shows them")
         return found[0]
 
     def _chain(self, job_id: int) -> list[dict[str, Any]]:

@@ -139,7 +139,7 @@ class LiveTip:
         if prism is None:
             raise CommandError(f"name a prism with --prism, or configure [tip] prism; the rig has {names}")
         if prism not in self._rig.prism_names:
-            raise CommandError(f"rig {self._rig.name!r} has no prism {prism!r}; it has {names}")
+            raise CommandError(f"rig {self._rig.name!r} has no prism {prism!r:.80}; it has {names}")
         return self.tip(str(prism), self._setup()).as_dict()
 
     def tip(self, prism: str, setup: str | None = None) -> Tip:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from daemon.caller import caller_columns
 from daemon.control import REFUSED, CommandError
 from daemon.session_data import time_zero_ns
 from daemon.store.store import Store
@@ -94,9 +95,9 @@ class ModelTable:
 
     def get(self, model_id: object) -> ModelRow:
         """The model of that number; CommandError if there is none."""
-        found = isinstance(model_id, int) and self._store.rows(f"{_MODELS} WHERE model.id = ?", (model_id,))
+        found = type(model_id) is int and self._store.rows(f"{_MODELS} WHERE model.id = ?", (model_id,))
         if not found:
-            raise CommandError(f"there is no model {model_id!r}; `rigcal model list` shows them")
+            raise CommandError(f"there is no model {model_id!r:.80}; `rigcal model list` shows them")
         return _row(found[0])
 
     def at(self, path: str) -> ModelRow:
@@ -127,7 +128,8 @@ class ModelTable:
     def history(self, model: ModelRow) -> list[dict[str, Any]]:
         """Every change of a model's state, oldest first."""
         return self._store.rows(
-            "SELECT state, utc_ns, operator, reason, replaced_id FROM model_states WHERE model_id = ? ORDER BY id",
+            "SELECT state, utc_ns, operator, caller_user AS user, reason, replaced_id FROM model_states "
+            "WHERE model_id = ? ORDER BY id",
             (model.id,),
         )
 
@@ -227,11 +229,11 @@ class ModelTable:
         """
         row = {"model_id": model.id, "state": "live", "operator": operator, "reason": "zeros checked"}
         checked = {"zeros_checked_through": through}
-        self._store.insert("model_states", row | checked | self._store.instant(self._clock.now()))
+        self._store.insert("model_states", row | checked | caller_columns() | self._store.instant(self._clock.now()))
 
     def _note(self, model_id: int, state: str, reason: str, operator: str = "", **more: int | None) -> None:
         row: dict[str, Any] = {"model_id": model_id, "state": state, "operator": operator, "reason": reason, **more}
-        self._store.insert("model_states", row | self._store.instant(self._clock.now()))
+        self._store.insert("model_states", row | caller_columns() | self._store.instant(self._clock.now()))
 
 
 def trained_on(models: Sequence[ModelRow | None]) -> frozenset[str]:

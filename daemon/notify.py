@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import socket
 import threading
+import weakref
 from collections.abc import Iterator
 
+from daemon.plain_text import shown
 from daemon.time_budget import TimeBudget
 
 EXTEND_EVERY_S = 20.0
 EXTEND_BY_S = 60
 EXTEND_LIMIT_S = 1800.0  # a start that takes longer hangs
+
+log = logging.getLogger(__name__)
 
 
 class Notifier:
@@ -23,19 +28,29 @@ class Notifier:
     """
 
     def __init__(self, environ: os._Environ[str] | dict[str, str] = os.environ) -> None:
-        self._address = environ.get("NOTIFY_SOCKET", "")
+        address = environ.get("NOTIFY_SOCKET", "")
+        self._address = "\0" + address[1:] if address.startswith("@") else address
+        self._is_heard = True
+        if self._address:
+            # Opened once: a beat must not need a descriptor when there are none left.
+            self._channel = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            weakref.finalize(self, self._channel.close)
         usec = environ.get("WATCHDOG_USEC", "")
         own = environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         self.watchdog_s = int(usec) / 1e6 if usec.isdigit() and own else None
 
     def send(self, *states: str) -> None:
-        """Send states such as `READY=1`, `STOPPING=1`, `WATCHDOG=1`, `STATUS=...`."""
+        """Send states such as `READY=1`, `STOPPING=1`, `WATCHDOG=1`, `STATUS=...`; one that is lost is logged."""
         if not self._address:
             return
-        address = "\0" + self._address[1:] if self._address.startswith("@") else self._address
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as channel:
-            channel.connect(address)
-            channel.sendall("\n".join(states).encode())
+        try:
+            self._channel.sendto("\n".join(map(shown, states)).encode(), self._address)
+        except OSError as error:
+            if self._is_heard:
+                log.warning("the service manager is not reached at %s: %s", self._address, error.strerror)
+            self._is_heard = False
+        else:
+            self._is_heard = True
 
     @contextlib.contextmanager
     def extending(self, status: str) -> Iterator[None]:

@@ -7,8 +7,11 @@ operator knows: who starts a session names it, and the station is believed to be
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from statistics import median_high
 
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import DeviceEvent, EventKind, Fix, LockState, Status
@@ -16,6 +19,8 @@ from drivers.station import StationConfig
 from drivers.survey import position_mm
 
 CONFIRM = "`rigcal session confirm-prism` says that it is the prism that is meant"
+USUAL_OF = 5  # intervals, whose median no single late fix and no pause changes
+USUAL_NS = NS_PER_S  # at most, and while fewer than three are known
 PAUSE_NS = 2 * NS_PER_S  # a station that is aimed by hand may have been aimed anew in so long a time without a fix
 
 _Point = tuple[float, float, float]
@@ -43,9 +48,9 @@ class MotionLimit:
         """The limit that a station's configuration gives."""
         return cls(config.max_speed_m_s, config.jump_slack_m, config.relock_within_m, config.tracks_silently)
 
-    def reach_m(self, earlier: Stamp, later: Stamp) -> float:
-        """How far apart two successive fixes of one prism may be."""
-        return self.slack_m + self.max_speed_m_s * max(0, later.since(earlier)) / NS_PER_S
+    def reach_m(self, within_ns: float) -> float:
+        """How far apart two fixes of one prism may be that were measured within so long a time."""
+        return self.slack_m + self.max_speed_m_s * max(0.0, within_ns) / NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +121,9 @@ class PrismGuard:
     shots motion can come far, and only what is faster is suspected. Positions by circles and by the instrument's own
     coordinates have different origins and are never compared. The first fix after a word is believed.
 
+    Stamps say when fixes were read: one that was read late seems to be followed too soon. So motion between two
+    successive fixes has no less time than fixes usually lie apart.
+
     Attributes:
         station: its name.
         limit: what motion can do.
@@ -131,6 +139,7 @@ class PrismGuard:
     _good: _Seen | None = None  # the last fix that was surely of the prism
     _near_m: float = 0.0  # so near to its place a target that has jumped again is the prism
     _last: _Seen | None = None
+    _intervals_ns: deque[int] = field(default_factory=partial(deque, maxlen=USUAL_OF))  # between fixes, lately
     _is_new_lock: bool = False
     _is_turning: bool = False
 
@@ -160,6 +169,8 @@ class PrismGuard:
         seen = _Seen(point, fix.stamp, fix.slope_distance_m is not None)
         is_new_lock, self._is_new_lock = self._is_new_lock, False
         last, self._last = self._last, seen
+        if last is not None and last.stamp.boot_id == seen.stamp.boot_id:
+            self._intervals_ns.append(seen.stamp.since(last.stamp))
         suspicion = self._lasting()
         if suspicion is not None:
             return self._judge_suspected(suspicion, seen, last, is_new_lock)
@@ -175,11 +186,12 @@ class PrismGuard:
         self._heeded += 1
         self._end_suspicion(word.at)
         self._good = self._last = None
+        self._intervals_ns.clear()
         self._is_new_lock, self._is_turning = False, word.is_turning
 
     def _judge(self, seen: _Seen, good: _Seen, is_new_lock: bool) -> DeviceEvent | None:
         moved_m = good.distance_m(seen)
-        explained_m = self.limit.reach_m(good.stamp, seen.stamp)
+        explained_m = self._reach_m(good, seen)
         if is_new_lock:
             is_one_boot = good.stamp.boot_id == seen.stamp.boot_id
             explained_m = min(explained_m, self.limit.relock_within_m) if is_one_boot else self.limit.relock_within_m
@@ -208,9 +220,7 @@ class PrismGuard:
         if good is None or last is None or good.has_circles != seen.has_circles:
             return None
         is_aimed_anew = is_new_lock or (seen.stamp.since(last.stamp) > PAUSE_NS)
-        has_jumped = last.has_circles == seen.has_circles and last.distance_m(seen) > self.limit.reach_m(
-            last.stamp, seen.stamp
-        )
+        has_jumped = last.has_circles == seen.has_circles and last.distance_m(seen) > self._reach_m(last, seen)
         if not (is_aimed_anew or has_jumped):
             return None
         back_m = good.distance_m(seen)
@@ -224,6 +234,10 @@ class PrismGuard:
         how = "locked again" if is_new_lock else "the target jumped again"
         text = f"{how} {back_m:.2f} m from the prism: perhaps another one; its fixes still do not count"
         return self._event(seen, EventKind.PRISM_JUMP, text)
+
+    def _reach_m(self, earlier: _Seen, later: _Seen) -> float:
+        usual_ns = min(USUAL_NS, median_high(self._intervals_ns)) if len(self._intervals_ns) > 2 else USUAL_NS
+        return self.limit.reach_m(max(usual_ns, later.stamp.since(earlier.stamp)))
 
     def _lasting(self) -> Suspicion | None:
         return self.suspicions[-1] if self.suspicions and self.suspicions[-1].until is None else None

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Mapping
 from typing import Any
 
+from daemon.caller import caller_columns
 from daemon.open_session import OpenSession
 from daemon.prism_guard import MotionLimit, PrismGuard, Suspicion, Word
 from daemon.store.reader import Reader
@@ -61,6 +62,7 @@ class PrismWatch:
         ended = self.suspicions(session)
         at = self._clock.now()
         row = {"session_id": session.id, **self._store.instant(at), "operator": operator, "turning": False}
+        row |= caller_columns()
         who = operator or "an operator"
         text = f"{who} confirms that the station is on prism {session.prism}; its fixes count from now on"
         stations = [suspicion.station for suspicion in ended] or [*self._limits]

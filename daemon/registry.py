@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from calibration.errors import CalibrationError
+from daemon.arguments import text_argument
 from daemon.control import REFUSED, CommandError
 from daemon.live_model import LiveModel
 from daemon.model_table import ModelRow, ModelTable
-from daemon.setups import text_argument
 
 log = logging.getLogger(__name__)
 

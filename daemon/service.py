@@ -8,7 +8,7 @@ import sqlite3
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import Any, TypeVar
 
 from calibration.rig import Rig
 from daemon.acquisition import Acquisition
@@ -17,7 +17,8 @@ from daemon.alarms.gather import Gatherer
 from daemon.clock_watch import ClockWatch
 from daemon.composition import Parts, motion_limits
 from daemon.config import Config
-from daemon.control import FAILED, REFUSED, CommandError, ControlServer, Handler
+from daemon.control import FAILED, REFUSED, CommandError, Handler, reading_socket
+from daemon.control_server import ControlServer
 from daemon.drift_table import DriftTable
 from daemon.gap_status import GapStatus
 from daemon.jobs import JobRunner
@@ -27,6 +28,7 @@ from daemon.model_table import ModelTable
 from daemon.notify import Notifier
 from daemon.present_state import expected_of
 from daemon.registry import ModelRegistry
+from daemon.rights import reading_only
 from daemon.sessions import SessionKeeper
 from daemon.setups import SetupBook
 from daemon.store.alarms import AlarmTable
@@ -41,9 +43,12 @@ from drivers.readings import Record
 
 log = logging.getLogger(__name__)
 
+T = TypeVar("T")
+
 BEAT_S = 1.0
 STOP_S = 20.0  # real seconds for all parts together, well within the unit's TimeoutStopSec
 STORE_END_S = 3.0  # of them for the store's last commits
+_EVENTS = "SELECT device, utc_ns, kind, text FROM device_events ORDER BY id DESC LIMIT 12"
 
 
 class Daemon:
@@ -111,6 +116,7 @@ class Daemon:
         self._jobs = JobRunner(store, config, parts.rig.name, parts.clock, is_held=self._are_jobs_held)
         drift = DriftTable(store, parts.rig.name, parts.clock)
         self._gap = GapStatus(store, parts.rig.name, drift)
+        self._servers: list[ControlServer] = []
         self._alarms = AlarmBoard(
             AlarmTable(store),
             Gatherer(
@@ -123,12 +129,17 @@ class Daemon:
                 acquisition=self._acquisition.status,
                 health=lambda: self._watch.health,
                 suspicions=self._sessions.prism_suspicions,
-                is_control_served=lambda: True,
+                control_faults=self._control_faults,
             ),
             parts.clock,
         )
         self._models = ModelRegistry(models, parts.rig.name, self._live_model, compare=self._jobs.compare)
-        self._control = ControlServer(config.socket_path, self._commands())
+        self._servers = control_servers(config, self._commands())
+
+    def _control_faults(self) -> dict[str, str]:
+        """Control sockets on which no one can connect, and why."""
+        found = {server.path.name: server.trouble() for server in self._servers}
+        return {name: trouble for name, trouble in found.items() if trouble is not None}
 
     @property
     def store_health(self) -> StoreHealth:
@@ -159,11 +170,13 @@ class Daemon:
             log.info("acquiring rig %s; control socket %s", self._parts.rig.name, self._config.socket_path)
             while not stop.wait(beat_s):
                 self._acquisition.check()
-                self._sessions.aim_again()
                 self._watch.look()
                 self._alarms.evaluate()
-                # The watchdog hears of the writer, not of this loop: a hung disk must restart the service.
-                if self._acquisition.alive(within_s=notifier.watchdog_s or 60.0):
+                self._sessions.aim_again()  # after the alarm that somebody should
+                # The watchdog hears of the writer and of the control sockets, not of this loop: a hung disk must
+                # restart the service, and so must a daemon that no one can reach.
+                within_s = notifier.watchdog_s or 60.0
+                if self._acquisition.alive(within_s) and all(server.alive(within_s) for server in self._servers):
                     notifier.send("WATCHDOG=1")
                 if self._parts.is_over():
                     log.info("the replay has ended")
@@ -176,7 +189,8 @@ class Daemon:
     def close(self) -> None:
         """Stop all parts within `STOP_S`, side by side, so that no one's stop delays what was captured."""
         budget = TimeBudget(STOP_S)
-        stops = [self._control.close, self._live_model.stop, self._jobs.stop, self._watch.stop]
+        stops = [server.close for server in self._servers]
+        stops += [self._live_model.stop, self._jobs.stop, self._watch.stop]
         if self._sender is not None:
             stops.append(self._sender.stop)
         others = [threading.Thread(target=_stop_part, args=(stop,), daemon=True) for stop in stops]
@@ -233,21 +247,28 @@ class Daemon:
         }
 
     def _status(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
-        acquisition = asdict(self._acquisition.status())
+        unreadable: dict[str, str] = {}  # a table that is damaged must not hide the rest
+
+        def stored(part: str, read: Callable[[], T]) -> T | None:
+            try:
+                return read()
+            except sqlite3.Error as error:
+                unreadable[part] = str(error)
+                return None
+
         return {
             "rig": self._parts.rig.name,
             "mode": self._parts.mode,
             "alarms": self._alarms.status(),
-            "acquisition": acquisition,
-            "session": self._sessions.open_session(),
-            "jobs": self._jobs.unfinished(),
-            "models": self._models.status(),
-            "gap": self._gap.now(),
-            "events": self._store.rows(
-                "SELECT device, utc_ns, kind, text FROM device_events ORDER BY id DESC LIMIT 12"
-            ),
+            "acquisition": asdict(self._acquisition.status()),
+            "session": stored("session", self._sessions.open_session),
+            "jobs": stored("jobs", self._jobs.unfinished) or [],
+            "models": stored("models", self._models.status),
+            "gap": stored("gap", self._gap.now),
+            "events": stored("events", lambda: self._store.rows(_EVENTS)) or [],
             "store": str(self._config.store_path),
             "store_health": self._watch.health.as_dict(),
+            "unreadable": unreadable,
         }
 
     def _visit(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -301,6 +322,22 @@ def tip_sender(config: Config, parts: Parts, tip: LiveTip) -> TipSender | None:
         return None
     link = next((link for link in parts.can_links if link.name == config.tip.can.link), None)
     return None if link is None else TipSender(tip, config.tip, config.tip.can, link)
+
+
+def control_servers(config: Config, commands: Mapping[str, Handler]) -> list[ControlServer]:
+    """Start the control socket, and the one for those who may only look where a group of them is configured.
+
+    Raises:
+        CommandError: the control socket cannot be made.
+    """
+    servers = [ControlServer(config.socket_path, commands)]
+    if config.read_group is not None:
+        path = reading_socket(config.socket_path)
+        try:
+            servers.append(ControlServer(path, reading_only(commands, config.socket_path), group=config.read_group))
+        except CommandError as error:
+            log.error("members of read_group %s cannot look: %s", config.read_group, error)
+    return servers
 
 
 def declare_channels(store: Store, rig: Rig) -> None:

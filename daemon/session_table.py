@@ -11,6 +11,7 @@ import itertools
 from collections.abc import Mapping
 from typing import Any
 
+from daemon.caller import caller_columns
 from daemon.control import CommandError
 from daemon.standstill_places import Exclusions
 from daemon.store.reader import Reader
@@ -23,8 +24,9 @@ NOT_ENCLOSED = "most of its poses do not lie between a control point's shots at 
 LEAST_ENCLOSED = 0.25  # of its poses; some come before the operator gets to the first shot, or after the last
 CLOCK_STEP_NS = NS_PER_S // 20  # less may be the time between reading the one clock and the other
 
-_SUMMARY = """SELECT id, rig, setup_id AS setup, prism, operator, kind, state, note, started_utc_ns, ended_utc_ns,
-        excluded AS not_used, accepted_despite, accepted_by, accepted_utc_ns,
+_SUMMARY = """SELECT id, rig, setup_id AS setup, prism, operator, caller_user AS user, kind, state, note,
+        started_utc_ns, ended_utc_ns, excluded AS not_used, accepted_despite, accepted_by, accepted_utc_ns,
+        accepted_caller_user AS accepted_user,
         (SELECT state = 'moved' FROM station_setups WHERE station_setups.id = setup_id) AS setup_moved
     FROM calibration_sessions WHERE id = ?"""
 _COUNTS = """SELECT count(*) FILTER (WHERE excluded IS NULL) AS observations,
@@ -176,6 +178,7 @@ class SessionTable:
                 "accepted_despite": despite,
                 "accepted_by": operator,
                 "accepted_after_job": newest["job"],
+                **caller_columns("accepted_"),
             }
             accepted = self._store.instant(self._clock.now(), "accepted_")
             self._store.update("calibration_sessions", {"id": session_id}, {**word, **accepted})
@@ -213,7 +216,7 @@ def _summary(reader: Reader, session_id: str) -> dict[str, Any]:
     if not found:
         raise _unknown(session_id)
     row = found[0]
-    accepted = {key: row.pop(f"accepted_{key}") for key in ("despite", "by", "utc_ns")}
+    accepted = {key: row.pop(f"accepted_{key}") for key in ("despite", "by", "user", "utc_ns")}
     (counts,) = reader.rows(_COUNTS, (session_id,))
     steps = _clock_steps(reader, session_id)
     return {
@@ -238,4 +241,4 @@ def _clock_steps(reader: Reader, session_id: str) -> list[dict[str, Any]]:
 
 
 def _unknown(session_id: str) -> CommandError:
-    return CommandError(f"there is no session {session_id!r}; `rigcal session list` shows them")
+    return CommandError(f"there is no session {session_id!r:.80}; `rigcal session list` shows them")

@@ -10,12 +10,15 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
+import sqlite3
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
 from calibration.rig import Rig
+from daemon.arguments import identifier, text_argument
+from daemon.caller import caller_columns
 from daemon.config import SessionsSection
 from daemon.control import FAILED, CommandError
 from daemon.joiner import JoinedFix, ObservationJoiner
@@ -24,11 +27,11 @@ from daemon.prism_guard import MotionLimit, Suspicion
 from daemon.prism_watch import PrismWatch, as_dict
 from daemon.scheduler import CHECK, SESSION_KINDS
 from daemon.session_table import SessionTable
-from daemon.setups import AXES, Place, SetupBook, identifier, text_argument
+from daemon.setups import AXES, Place, SetupBook
 from daemon.standstill_places import StandstillPlaces
 from daemon.store.errors import is_unwritable
 from daemon.store.store import Store
-from drivers.clock import NS_PER_S, Clock
+from drivers.clock import Clock
 from drivers.readings import DeviceEvent, EventKind, Fix, Record, Status
 from drivers.station import position_mm
 
@@ -36,7 +39,6 @@ log = logging.getLogger(__name__)
 
 STANDING_KINDS = ("static_poses", CHECK)
 CHECK_POSES = (3, 5)
-AIM_AGAIN_NS = 10 * NS_PER_S
 SHOT_SPREAD_MM = 20.0  # fixes of one shot that lie further apart are not of one standing target
 
 
@@ -192,10 +194,10 @@ class SessionKeeper:
             prism, kind = str(arguments.get("prism", "")), str(arguments.get("kind", "static_poses"))
             if prism not in self._rig.prism_names:
                 raise CommandError(
-                    f"rig {self._rig.name!r} has no prism {prism!r}; it has {', '.join(self._rig.prism_names)}"
+                    f"rig {self._rig.name!r} has no prism {prism!r:.80}; it has {', '.join(self._rig.prism_names)}"
                 )
             if kind not in SESSION_KINDS:
-                raise CommandError(f"there is no kind {kind!r}; kinds: {', '.join(SESSION_KINDS)}")
+                raise CommandError(f"there is no kind {kind!r:.80}; kinds: {', '.join(SESSION_KINDS)}")
             setup_id = self._setups.usable(arguments.get("setup"))
             free = self._table.free_id(prism)
             session_id = identifier(arguments, "id", "a session's id", default=free)
@@ -211,9 +213,10 @@ class SessionKeeper:
                 "rig_text": self._rig_text,
                 "setup_id": setup_id,
                 "prism": prism,
-                "operator": str(arguments.get("operator", "")),
+                "operator": text_argument(arguments, "operator"),
+                **caller_columns(),
                 "kind": kind,
-                "note": str(arguments.get("note", "")),
+                "note": text_argument(arguments, "note"),
             }
             self._table.start(row, now)
             self._open = session = OpenSession(session_id, setup_id, prism, kind, now, control_points=points)
@@ -304,18 +307,16 @@ class SessionKeeper:
         return self._table.summary(session.id) | {"prism_suspicions": suspicions}
 
     def aim_again(self) -> None:
-        """Where something can aim the station, do what an operator would when it has been suspected for a while."""
-        session, now = self._open, self._clock.now()
-        if self._aim is None or session is None:
-            return
-        if not any(now.since(s.since) > AIM_AGAIN_NS for s in self._prisms.suspicions(session)):
+        """Where something can aim the station, do what an operator would when it may be on another prism."""
+        session = self._open
+        if self._aim is None or session is None or not self._prisms.suspicions(session):
             return
         if self._commands.acquire(blocking=False):  # else a command is at work on the session: another time
             try:
                 if session is self._open:
                     self._aim(session.prism)
                     self._prisms.turned(session, self._clock.now())
-            except CommandError as error:
+            except (CommandError, sqlite3.Error) as error:  # another time: the station, or the disk, is not well
                 log.warning("station not aimed at prism %s again: %s", session.prism, error)
             finally:
                 self._commands.release()

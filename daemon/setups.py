@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 import math
-import re
 from collections.abc import Mapping, Sequence
 from statistics import fmean
 from typing import Any
 
 from calibration.rig import Rig
+from daemon.arguments import identifier, mapping_argument, number_argument, text_argument
 from daemon.control import REFUSED, CommandError
 from daemon.store.store import Store
 from drivers.clock import Clock
@@ -19,10 +19,7 @@ log = logging.getLogger(__name__)
 
 Place = tuple[float, float, float]
 MOST_CONSTANT_MM = 500.0
-MOST_TEXT = 500
 AXES = ("x_mm", "y_mm", "z_mm")
-
-_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 class SetupBook:
@@ -43,21 +40,21 @@ class SetupBook:
         setup_id = identifier(arguments, "id", "a set-up's id")
         if self._store.rows("SELECT id FROM station_setups WHERE id = ?", (setup_id,)):
             raise CommandError(f"set-up {setup_id!r} exists already; a station that was moved is a new set-up")
-        constants = _mapping(arguments, "prism_constants_mm")
+        constants = mapping_argument(arguments, "prism_constants_mm")
         for prism in constants:
-            _finite(constants, prism, limit=MOST_CONSTANT_MM)
+            number_argument(constants, prism, limit=MOST_CONSTANT_MM)
         unknown = sorted(set(constants) - set(self._rig.prism_names))
         if unknown:
             raise CommandError(
-                f"rig {self._rig.name!r} has no prism {unknown[0]!r}; it has {', '.join(self._rig.prism_names)}"
+                f"rig {self._rig.name!r} has no prism {unknown[0]!r:.80}; it has {', '.join(self._rig.prism_names)}"
             )
-        points = {str(n): _place(n, place) for n, place in _mapping(arguments, "control_points").items()}
+        points = {str(n): _place(n, place) for n, place in mapping_argument(arguments, "control_points").items()}
         row = {
             "id": setup_id,
             "instrument": text_argument(arguments, "instrument"),
             "serial": text_argument(arguments, "serial"),
-            "tilt_arcsec": _finite(arguments, "tilt_arcsec"),
-            "ppm": _finite(arguments, "ppm"),
+            "tilt_arcsec": number_argument(arguments, "tilt_arcsec"),
+            "ppm": number_argument(arguments, "ppm"),
             "prism_constants_json": constants,
             "note": text_argument(arguments, "note"),
             "state": "ok",
@@ -112,7 +109,7 @@ class SetupBook:
                         REFUSED,
                     )
                 return str(wanted)
-        raise CommandError(f"there is no set-up {wanted!r}; known: {', '.join(s['id'] for s in setups) or 'none'}")
+        raise CommandError(f"there is no set-up {wanted!r:.80}; known: {', '.join(s['id'] for s in setups) or 'none'}")
 
     def current(self) -> str | None:
         """The newest set-up; None where there is none, and where it has moved."""
@@ -192,43 +189,11 @@ class SetupBook:
         return [(r["x_mm"], r["y_mm"], r["z_mm"]) for r in rows]
 
 
-def identifier(arguments: Mapping[str, Any], key: str, what: str, default: str = "") -> str:
-    """The name that `arguments` gives under `key`; CommandError if it is none."""
-    name = arguments.get(key) or default
-    if not isinstance(name, str) or not _ID.fullmatch(name):
-        raise CommandError(f"{what} is 1 to 64 letters, digits, '.', '_' or '-', not {name!r:.80}")
-    return name
-
-
-def _mapping(arguments: Mapping[str, Any], key: str) -> dict[str, Any]:
-    value = arguments.get(key, {})
-    if not isinstance(value, dict):
-        raise CommandError(f"{key} must be an object, not {value!r:.80}")
-    return value
-
-
-def text_argument(arguments: Mapping[str, Any], key: str) -> str:
-    """The short text that `arguments` gives under `key`, "" by default; CommandError if it is none."""
-    value = arguments.get(key, "")
-    if not isinstance(value, str) or len(value) > MOST_TEXT or not value.isprintable():
-        raise CommandError(f"{key} must be a text of at most {MOST_TEXT} printable characters, not {value!r:.80}")
-    return value
-
-
-def _finite(arguments: Mapping[str, Any], key: str, limit: float = 1e6) -> float | None:
-    value = arguments.get(key)
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if value is not None and not (is_number and abs(value) <= limit):
-        raise CommandError(f"{key} must be a finite number of at most {limit:g}, not {value!r:.80}")
-    return value
-
-
 def _place(name: object, place: object) -> dict[str, float]:
-    if not _ID.fullmatch(str(name)):
-        raise CommandError(f"a control point's name is 1 to 64 letters, digits, '.', '_' or '-', not {name!r}")
+    identifier({"name": name}, "name", "a control point's name")
     if isinstance(place, list | tuple) and len(place) == len(AXES):
-        axes = {axis: _finite({axis: value}, axis, limit=1e7) for axis, value in zip(AXES, place, strict=True)}
+        axes = {axis: number_argument({axis: value}, axis, limit=1e7) for axis, value in zip(AXES, place, strict=True)}
         given = {axis: value for axis, value in axes.items() if value is not None}
         if len(given) == len(AXES):
             return given
-    raise CommandError(f"control point {name!r}: give three coordinates in mm, not {place!r}")
+    raise CommandError(f"control point {name!r}: give three coordinates in mm, not {place!r:.80}")

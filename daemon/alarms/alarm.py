@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from daemon.alarms.evidence import Evidence
+from daemon.plain_text import shown
 
 Severity = Literal["warning", "critical"]
 # Subject and text of what is wrong, and its severity where it is not the rule's usual one.
@@ -64,8 +65,8 @@ class Rule:
     def __call__(self, evidence: Evidence) -> Iterator[Alarm]:
         """What is wrong now."""
         for subject, text, *severity in self.find(evidence):
-            plain = "".join(c if c.isprintable() else "?" for c in text[:TEXT_MAX])
-            yield Alarm(self.kind, subject, severity[0] if severity else self.severity, plain, self.remedy)
+            how = severity[0] if severity else self.severity
+            yield Alarm(self.kind, subject, how, shown(text)[:TEXT_MAX], self.remedy)
 
 
 def rule(

@@ -101,7 +101,7 @@ class Evidence:
         model: the live one.
         store: its file and its disk.
         previous_run: when the daemon's run before this one was last alive, by a clock that can be compared.
-        is_control_served: commands are taken on the control socket.
+        control_faults: control socket on which no one can connect -> why.
         untrained_sessions: closed sessions that nothing trains on -> why; those that newer ones make up for are not
             there.
         unwatched: rule or part of the evidence that has failed itself -> why.
@@ -116,7 +116,7 @@ class Evidence:
     model: ModelEvidence | None = None
     store: StoreEvidence = StoreEvidence()
     previous_run: Stamp | None = None
-    is_control_served: bool = True
+    control_faults: Mapping[str, str] = field(default_factory=dict)
     untrained_sessions: Mapping[str, str] = field(default_factory=dict)
     unwatched: Mapping[str, str] = field(default_factory=dict)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
 from daemon.acquisition_status import AcquisitionStatus
@@ -31,7 +31,7 @@ class Gatherer:
         acquisition: its status.
         health: of the store.
         suspicions: stations that may be on another prism than the open session's.
-        is_control_served: whether commands are taken.
+        control_faults: of the control sockets, as of `Evidence`.
     """
 
     def __init__(
@@ -46,11 +46,12 @@ class Gatherer:
         acquisition: Callable[[], AcquisitionStatus],
         health: Callable[[], StoreHealth],
         suspicions: Callable[[], Sequence[Suspicion]],
-        is_control_served: Callable[[], bool],
+        control_faults: Callable[[], Mapping[str, str]],
     ) -> None:
         self._acquisition, self._health, self._suspicions = acquisition, health, suspicions
-        self._is_control_served, self._store, self._rig = is_control_served, store, rig_name
+        self._store, self._rig = store, rig_name
         self._live, self._drift, self._clock, self._previous_run = live, drift, clock, previous_run
+        self._control_faults = control_faults
         self._began = clock.now()
         self._known = Evidence(self._began)
         self._failed: dict[str, str] = {}
@@ -69,8 +70,8 @@ class Gatherer:
             model=self._part("the live model", self._model, known.model),
             store=self._part("the store's files", self._files, known.store),
             previous_run=self._previous_run,
-            is_control_served=self._part("the control socket", self._is_control_served, known.is_control_served),
             untrained_sessions=self._part("the sessions", self._untrained, known.untrained_sessions),
+            control_faults=self._part("the control sockets", self._control_faults, known.control_faults),
             unwatched=self._failed,
         )
         return self._known

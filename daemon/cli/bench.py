@@ -18,6 +18,7 @@ from rich.table import Table
 
 from daemon.cli.output import DONE, FAILED, Command, Delivered, json_option, progress_display
 from daemon.cli.tables import say
+from daemon.cli.terminal import Terminal
 
 if TYPE_CHECKING:
     from daemon.gap_bench.run import Run
@@ -95,7 +96,7 @@ def gap(
     chosen = {"cells": cells, "poses": poses, "noises": noises, "effects": effects, "sizes": sizes}
     for name, value in {**chosen, "repeats": repeats, "first": first}.items():
         options += [] if value is None else [f"--{name}", str(value)]
-    console = Console()
+    console = Terminal()
 
     def commit(sha256: str, cases: int) -> None:
         if not as_json:
@@ -168,7 +169,7 @@ def _show(console: Console, found: Run) -> None:
     for table in (_score_table(found.scores), *([_family_table(found.tallies)] if found.tallies else [])):
         # A number that is cut short is no number: on a narrow terminal the lines wrap.
         needed = Measurement.get(console, console.options.update(max_width=_WIDEST), table).maximum
-        Console(width=max(needed, console.width)).print(table)
+        Terminal(width=max(needed, console.width)).print(table)
     _list(console, "Cells that could not reach their size within the library's bounds", _counted(found.dropped))
     missed = [t for t in found.trials if t.is_wrong or t.verdict == "failed"]
     _list(

@@ -21,6 +21,7 @@ from daemon.cli.offline import read_observations
 from daemon.cli.options import FILE, prior_option, rig_option, seed_option
 from daemon.cli.output import Command, json_option, progress_display
 from daemon.cli.tables import say
+from daemon.cli.terminal import Terminal
 from daemon.files import write_file
 from daemon.numba_cache import prepare
 from daemon.rigs import load_rig
@@ -109,7 +110,7 @@ def compare(
         "prior and seed": f"{prior}, {seed}",
     }
     given = source.rig, source.text, training, held_out
-    console = Console()
+    console = Terminal()
     with progress_display(as_json=as_json) as progress:
         if protocol is None:
             comparison = compare_methods(
@@ -192,7 +193,7 @@ def _table(
         table.add_row(*row, style="bold" if bold and bold[number] else None)
     # A number that is cut short is no number: on a narrow terminal the lines wrap.
     needed = Measurement.get(console, console.options.update(max_width=_WIDEST), table).maximum
-    Console(width=max(needed, console.width)).print(table)
+    Terminal(width=max(needed, console.width)).print(table)
 
 
 def _sentences(console: Console, title: str, sentences: Sequence[str]) -> None:

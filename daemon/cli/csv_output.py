@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import csv
 import io
+import logging
+import sys
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import click
 
 from calibration.observations import Floats
+from daemon.cli.terminal import echo_error
 from daemon.files import write_file
+from daemon.plain_text import shown_lines
 
 
 def check_out(out: Path | None, data: Path) -> None:
@@ -58,6 +62,6 @@ def deliver(table: str, result: dict[str, object], warnings: Sequence[str], out:
     elif as_json:
         result["csv"] = table
     else:
-        click.echo(table, nl=False)
+        click.echo(shown_lines(table) if sys.stdout.isatty() else table, nl=False)
     for warning in () if as_json else warnings:
-        click.echo(f"Warning: {warning}", err=True)
+        echo_error(f"Warning: {warning}", logging.WARNING)

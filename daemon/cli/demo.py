@@ -17,6 +17,8 @@ from daemon.cli import hidden
 from daemon.cli.output import Command, json_option
 from daemon.cli.simulated_operator import PRISMS, Advance, DemoError, Operator
 from daemon.cli.tables import stage_table
+from daemon.cli.terminal import Terminal
+from daemon.plain_text import shown
 
 EFFECTS = (  # what the machine hides from its model, beside its build tolerances
     "boom_droop@boom",
@@ -53,7 +55,7 @@ def demo(out: Path, rate: float, seed: int | None, *, is_hidden: bool, as_json: 
     """
     started = time.monotonic()
     _make_room(out)
-    console = Console(stderr=True)
+    console = Terminal(stderr=True)
     columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, disable=as_json) as display:
         task = display.add_task(
@@ -61,7 +63,7 @@ def demo(out: Path, rate: float, seed: int | None, *, is_hidden: bool, as_json: 
         )
 
         def advance(text: str, n: int) -> None:
-            display.update(task, description=text, advance=n)
+            display.update(task, description=shown(text), advance=n)
 
         if is_hidden:
             seed = secrets.randbelow(_SECRETS) if seed is None else seed
@@ -70,7 +72,7 @@ def demo(out: Path, rate: float, seed: int | None, *, is_hidden: bool, as_json: 
             result = _calibrate(out.resolve(), rate, SEED if seed is None else seed, advance)
     result |= {"seconds": round(time.monotonic() - started, 1), "directory": str(out)}
     if not as_json:
-        (hidden.show if is_hidden else _show)(Console(), result)
+        (hidden.show if is_hidden else _show)(Terminal(), result)
     return result
 
 

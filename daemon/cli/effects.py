@@ -14,6 +14,7 @@ from rich.table import Table
 
 from daemon.cli.output import Command, json_option
 from daemon.cli.tables import say
+from daemon.cli.terminal import Terminal
 from daemon.rigs import load_rig
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ def effects(name: str | None, rig: str, *, as_json: bool) -> dict[str, object]:
     families = [described(library()[one], situation) for one in ([name] if name else library())]
     result: dict[str, object] = {"rig": found.name, "effects": families}
     if not as_json:
-        console = Console()
+        console = Terminal()
         if name is None:
             _show_all(console, found.name, families)
         else:
@@ -178,7 +179,7 @@ def _table(title: str, headings: Sequence[str]) -> Table:
 def _print_whole(console: Console, table: Table) -> None:
     # A number that is cut short is no number: on a narrow terminal the lines wrap.
     needed = Measurement.get(console, console.options.update(max_width=_WIDEST), table).maximum
-    Console(width=max(needed, console.width)).print(table)
+    Terminal(width=max(needed, console.width)).print(table)
 
 
 def _some(places: Sequence[str]) -> str:

@@ -18,6 +18,7 @@ from daemon.cli.offline import Stopwatch, read_observations
 from daemon.cli.options import DIRECTORY, FILE, data_option, prior_option, rig_option, seed_option
 from daemon.cli.output import Command, json_option, progress_display
 from daemon.cli.tables import say
+from daemon.cli.terminal import Terminal
 from daemon.numba_cache import prepare
 from daemon.report.markup import number
 from daemon.rigs import load_rig
@@ -89,7 +90,7 @@ def gap(
     result = gap_answer(found, watch.seconds)
     write_gap(out, found, result, document)
     if not as_json:
-        console = Console()
+        console = Terminal()
         show_gap(console, found)
         say(console, f"Model: {out / 'model'}   report: {out / REPORT}   {result['seconds']} s")
     return result

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +13,8 @@ from rich.console import Console
 from rich.table import Table
 
 from daemon.cli.output import Command
-from daemon.cli.talk import ask, say, socket_of, talks, utc
+from daemon.cli.talk import ask, say, socket_of, talks, utc, who
+from daemon.cli.terminal import echo, echo_error
 from daemon.control import request
 from daemon.files import write_file
 
@@ -144,14 +146,14 @@ def model_export(
     result = {"model": str(directory), "files": [str(out / name) for name in files], **summary}
     if not as_json:
         for file in result["files"]:
-            click.echo(file)
-        click.echo(
+            echo(file)
+        echo(
             f"{summary['rows']} rows; interpolated between them, corrections of {summary['correction_rms_mm']:.2g} mm "
             f"RMS are within {summary['p95_mm']:.2g} mm of the model's in 95 % of random poses "
             f"({summary['max_mm']:.2g} mm at most)"
         )
         for sentence in summary["warnings"]:
-            click.echo(f"Warning: {sentence}", err=True)
+            echo_error(f"Warning: {sentence}", logging.WARNING)
     return result
 
 
@@ -182,7 +184,7 @@ def _show(console: Console, shown: dict[str, Any]) -> None:
         for setup in compared.get("left_out", ()):
             say(console, f"  set-up {setup} is unknown and its fixes place no base: left out")
     for change in shown["history"]:
-        by = f" by {change['operator']}" if change["operator"] else ""
+        by = f" by {name}" if (name := who(change["operator"], change["user"])) else ""
         say(console, f"  {utc(change['utc_ns'])} {change['state']}{by}: {change['reason']}")
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from rich.console import Console
 
 from calibration.errors import DataError
 from calibration.observations import Floats, Observations, parse_observations
@@ -21,6 +20,7 @@ from daemon.cli.csv_output import check_out, deliver, with_columns
 from daemon.cli.options import DIRECTORY, data_option, model_option, prior_option, rig_option, seed_option
 from daemon.cli.output import Command, json_option, progress_display
 from daemon.cli.tables import say, show_evaluation
+from daemon.cli.terminal import Terminal
 from daemon.numba_cache import prepare
 from daemon.rigs import load_rig
 from drivers.clock import NS_PER_S, SystemClock
@@ -156,7 +156,7 @@ def calibrate(
         modelfiles.write_model(out, model, {modelfiles.REPORT: document.encode("utf-8")})
     result = training.as_dict(watch.seconds)
     if not as_json:
-        console = Console()
+        console = Terminal()
         show_evaluation(console, result, f"the {len(training)} fixes it was fitted to")
         say(console, f"Model: {out}   report: {out / modelfiles.REPORT}   {result['seconds']} s")
     return result
@@ -183,7 +183,7 @@ def evaluate(directory: Path, data: Path, *, refit_base: bool, as_json: bool) ->
     evaluation = pipeline.evaluate(model, observations, refit_base=refit_base)
     result = evaluation.as_dict(watch.seconds)
     if not as_json:
-        show_evaluation(Console(), result, f"the {len(evaluation)} fixes of {data.name}")
+        show_evaluation(Terminal(), result, f"the {len(evaluation)} fixes of {data.name}")
     return result
 
 

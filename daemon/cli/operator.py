@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,8 @@ from daemon.cli.gap_lines import gap_lines
 from daemon.cli.model import model_lines
 from daemon.cli.output import Command, json_option
 from daemon.cli.status_lines import alarm_line, cleared_line, decoding_lines, gap_state_lines, station_line
-from daemon.cli.talk import ask, say, talks, utc
+from daemon.cli.talk import ask, say, talks, utc, who
+from daemon.cli.terminal import coloured, echo
 from daemon.config import read_config
 from daemon.present_state import duration
 from daemon.scheduler import SESSION_KINDS
@@ -37,17 +39,19 @@ def status(frames: bool, **where: Any) -> Any:
 
 
 def _show_status(console: Console, status: dict[str, Any], *, frames: bool) -> None:
-    console.print(f"rig [bold]{status['rig']}[/] ({status['mode']}), store {status['store']}", highlight=False)
+    say(console, f"rig {status['rig']} ({status['mode']}), store {status['store']}")
     acquisition = status["acquisition"]
     _show_alarms(console, status["alarms"])
+    for sentence in _store_lines(status):
+        say(console, sentence)
     for line in gap_state_lines(acquisition):
         say(console, line)
     links = Table("link", "state", "captures", "per s", "queued", "dropped", title="links", title_justify="left")
     for link in acquisition["links"]:
-        state = {True: "[green]up[/]", False: "[red]down[/]", None: "starting"}[link["up"]]
+        state = coloured("up", "green") if link["up"] else coloured("down", "red")
         links.add_row(
             link["name"],
-            state,
+            "starting" if link["up"] is None else state,
             f"{link['captures']}",
             f"{link['captures_per_s']:.0f}",
             f"{link['queued']}",
@@ -59,7 +63,7 @@ def _show_status(console: Console, status: dict[str, Any], *, frames: bool) -> N
         value = "" if channel["value"] is None else f"{channel['value']:.3f} {channel['unit']}"
         mark = "green" if channel["status"] == "ok" else "red"
         age = "never" if channel["age_s"] is None else f"{channel['age_s']:.1f}"
-        channels.add_row(channel["name"], value, f"[{mark}]{channel['status'].replace('_', ' ')}[/]", age)
+        channels.add_row(channel["name"], value, coloured(channel["status"].replace("_", " "), mark), age)
     console.print(channels)
     if frames:
         console.print(_frame_table(acquisition["frames"]))
@@ -71,10 +75,21 @@ def _show_status(console: Console, status: dict[str, Any], *, frames: bool) -> N
         _show_session(console, status["session"])
     for job in status["jobs"]:
         say(console, _job_line(job))
-    for sentence in (*model_lines(status["models"]), *gap_lines(status["gap"])):
+    models, gap = status["models"], status["gap"]
+    for sentence in (*(model_lines(models) if models else ()), *(gap_lines(gap) if gap else ())):
         say(console, sentence)
     for event in reversed(status["events"]):
         say(console, f"{utc(event['utc_ns'])} {event['device']} {event['kind']}: {event['text']}")
+
+
+def _store_lines(status: dict[str, Any]) -> Iterator[str]:
+    """What the store is busy with, and what cannot be read from it; its faults are alarms."""
+    if status["store_health"]["state"] == "checking":
+        yield status["store_health"]["text"]
+    if status["acquisition"]["is_behind"]:
+        yield "captures of the last run are still being decoded: readings and fixes come late, and jobs wait"
+    for part, reason in status["unreadable"].items():
+        yield f"{part}: cannot be read from the store ({reason})"
 
 
 def _show_alarms(console: Console, alarms: dict[str, Any]) -> None:
@@ -245,8 +260,8 @@ def session_shoot(point: str, **where: Any) -> Any:
         if result["misclosure_mm"] is None:
             say(console, f"{result['point']} is known from now on; shoot it again before you stop the session")
             return
-        verdict = "[red]the set-up has moved[/]" if result["moved"] else "the set-up holds"
-        console.print(f"{result['point']}: misclosure {result['misclosure_mm']:.1f} mm, {verdict}", highlight=False)
+        verdict, style = ("the set-up has moved", "red") if result["moved"] else ("the set-up holds", None)
+        console.print(f"{result['point']}: misclosure {result['misclosure_mm']:.1f} mm, {verdict}", style=style)
         _advise(console, result["advice"])
 
     return ask(where, "session.shoot", show, timeout_s=SHOT_TIMEOUT_S, point=point)
@@ -273,7 +288,7 @@ def session_list(**where: Any) -> Any:
         for s in sessions:
             counts = (str(s["poses"]), str(s["observations"]))
             state = s["state"] if s["not_used"] is None else f"{s['state']}, not used"
-            table.add_row(s["id"], s["kind"], s["prism"], s["setup"], state, *counts, s["operator"])
+            table.add_row(s["id"], s["kind"], s["prism"], s["setup"], state, *counts, who(s["operator"], s["user"]))
         console.print(table)
 
     return ask(where, "session.list", show)
@@ -306,7 +321,7 @@ def session_export(name: str, config: Path, out: Path, can_format: Any, *, as_js
     files = export_session(read_config(config), name, out, can_format)
     if not as_json:
         for file in files:
-            click.echo(file)
+            echo(file)
     return {"files": [str(file) for file in files]}
 
 
@@ -319,7 +334,7 @@ def _show_session(console: Console, session: dict[str, Any]) -> None:
     for reason, n in session["excluded"].items():
         say(console, f"  {n} excluded: {reason}")
     for suspicion in session.get("prism_suspicions", ()):
-        console.print(f"  [red]since {utc(suspicion['since_utc_ns'])}[/]", end=" ", highlight=False)
+        console.print(f"  since {utc(suspicion['since_utc_ns'])}", end=" ", style="red")
         say(console, f"{suspicion['text']}; its fixes do not count: {suspicion['remedy']}")
     for shot in session["control_shots"]:
         size = "defined" if shot["misclosure_mm"] is None else f"misclosure {shot['misclosure_mm']:.1f} mm"
@@ -328,13 +343,14 @@ def _show_session(console: Console, session: dict[str, Any]) -> None:
         back = "back" if step["step_s"] < 0 else "forward"
         say(console, f"  {utc(step['at_utc_ns'])}: the computer's clock was set {back} by {abs(step['step_s']):.1f} s")
     if session["setup_moved"]:
-        console.print("  [red]the station has moved since this set-up was described[/]")
+        console.print("  the station has moved since this set-up was described", style="red")
     if session["not_used"] is not None:
-        console.print("  [red]calibration does not use this session:[/]", end=" ")
+        console.print("  calibration does not use this session:", end=" ", style="red")
         say(console, f"{session['not_used']}; to use it anyway: `rigcal session accept {session['id']}`")
     if session["accepted"] is not None:
         accepted = session["accepted"]
-        say(console, f"  accepted by {accepted['by'] or 'an operator'}, although {accepted['despite']}")
+        by = who(accepted["by"], accepted["user"]) or "an operator"
+        say(console, f"  accepted by {by}, although {accepted['despite']}")
 
 
 def _advise(console: Console, advice: list[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import sys
 import threading
@@ -12,13 +13,14 @@ from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import click
-from rich.console import Console
 
 from calibration.errors import DataError, ModelError, RigError, UnsafeError
+from daemon.cli.terminal import Terminal, echo_error
 from daemon.config import ConfigError
 from daemon.control import CommandError
 from daemon.numba_cache import is_compiled
 from daemon.plain_json import json_line
+from daemon.plain_text import shown, shown_lines
 from drivers.errors import DescriptionError
 
 DONE, FAILED, WRONG_INPUT, REFUSED = 0, 1, 2, 3
@@ -75,7 +77,10 @@ class Command(click.Command):
         except click.UsageError as error:
             if as_json:
                 print_json({"error": error_sentence(error), "kind": type(error).__name__})
-            raise
+            sentence = error.format_message()
+            if shown_lines(sentence) == sentence:
+                raise
+            raise click.UsageError(shown_lines(sentence), error.ctx) from None
 
     def invoke(self, ctx: click.Context) -> Any:
         as_json = bool(ctx.params.get("as_json"))
@@ -97,11 +102,11 @@ class Command(click.Command):
 
 def _end_badly(error: Exception, *, as_json: bool) -> NoReturn:
     if os.environ.get("RIGCAL_DEBUG") == "1":
-        traceback.print_exception(error, file=sys.stderr)
+        echo_error("".join(traceback.format_exception(error)), logging.DEBUG)
     sentence = error_sentence(error)
     if as_json:
         print_json({"error": sentence, "kind": type(error).__name__})
-    click.echo(f"Error: {sentence}", err=True)
+    echo_error(f"Error: {sentence}", logging.ERROR)
     raise click.exceptions.Exit(exit_status(error))
 
 
@@ -126,7 +131,7 @@ def progress_display(*, as_json: bool) -> Iterator[Progress]:
 
     if not is_compiled():
         click.echo("Compiling kernels first, once on this computer: half a minute or more", err=True)
-    console = Console(stderr=True)
+    console = Terminal(stderr=True)
     if as_json or not console.is_terminal:
         with _lines() as progress:
             yield progress
@@ -139,7 +144,7 @@ def progress_display(*, as_json: bool) -> Iterator[Progress]:
         transient=True,
     ) as bar:
         task = bar.add_task("starting", total=1.0)
-        yield lambda share, text: bar.update(task, completed=share, description=text)
+        yield lambda share, text: bar.update(task, completed=share, description=shown(text))
 
 
 @contextlib.contextmanager
@@ -157,7 +162,7 @@ def _lines() -> Iterator[Progress]:
         while not over.wait(LINE_S):
             seconds += LINE_S
             share, text = now
-            click.echo(f"{seconds:.0f} s: {text} ({share:.0%})", err=True)
+            echo_error(f"{seconds:.0f} s: {text} ({share:.0%})", logging.INFO)
 
     teller = threading.Thread(target=tell, name="progress", daemon=True)
     teller.start()

@@ -19,6 +19,7 @@ from calibration.rig import Rig
 from daemon.cli.options import rig_option, seed_option
 from daemon.cli.output import Command, json_option, progress_display
 from daemon.cli.tables import say
+from daemon.cli.terminal import Terminal
 from daemon.files import write_file
 from daemon.numba_cache import prepare
 from daemon.report.markup import number
@@ -118,7 +119,7 @@ def plan(
         write_file(out, as_csv(planned.rows).encode("utf-8"))
         result["out"] = str(out)
     if not as_json:
-        _show(Console(), planned, result)
+        _show(Terminal(), planned, result)
     return result
 
 
@@ -178,7 +179,7 @@ def _show(console: Console, planned: PosePlan, result: Mapping[str, Any]) -> Non
         table.add_row(str(row.pose), *values, *conditions, _LIST_SEPARATOR.join(row.prisms))
     # A number that is cut short is no number: on a narrow terminal the lines wrap.
     needed = Measurement.get(console, console.options.update(max_width=_WIDEST), table).maximum
-    Console(width=max(needed, console.width)).print(table)
+    Terminal(width=max(needed, console.width)).print(table)
     minutes, seconds = divmod(round(planned.plan.seconds_of_motion), 60)
     say(
         console,

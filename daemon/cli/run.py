@@ -16,9 +16,11 @@ import click
 
 from daemon.acquisition import Acquisition
 from daemon.cli.output import Command, json_option
+from daemon.cli.terminal import echo
 from daemon.composition import decoders, joiner, live, motion_limits, replayed, simulated
 from daemon.config import Config, parse_config, read_config
 from daemon.files import write_file
+from daemon.journal import set_up_logging
 from daemon.notify import Notifier
 from daemon.replay import BOOT_ID, LATEST_UTC_NS, first_captures, merged, stored_readings
 from daemon.rigs import load_rig
@@ -45,7 +47,6 @@ serial.path = "/dev/rigcal-station"
 """
 REPLAYED = "replayed"
 COUNTED = ("joint_samples", "signals", "fixes", "device_events", "decode_failures", "gaps", "observations")
-_LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
 _RATE = click.FloatRange(0.1, 100)
 _DWELL = click.FloatRange(1, 600)
@@ -93,7 +94,7 @@ def run(
 
     A replay keeps its store in a directory of its own, beside the configured one's.
     """
-    logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, format=_LOG_FORMAT)
+    set_up_logging(level=logging.DEBUG if verbose else logging.INFO)
     if not verbose:
         logging.getLogger("can").setLevel(logging.WARNING)  # python-can tells of every socket that it makes
     if bool(files) != is_replay or (sim and is_replay):
@@ -119,7 +120,7 @@ def run(
             daemon = Daemon(settings, store, parts)
         daemon.run(stop, notifier)
     if not as_json:
-        click.echo(f"the store is {settings.store_path}")
+        echo(f"the store is {settings.store_path}")
     return {"rig": source.rig.name, "mode": parts.mode, "store": str(settings.store_path)}
 
 
@@ -239,7 +240,7 @@ def replay(
         counts = {table: next(reader.rows(f"SELECT count(*) AS n FROM {table}"))["n"] for table in COUNTED}
     if not as_json:
         for table, n in counts.items():
-            click.echo(f"{n:9d} {table.replace('_', ' ')}")
+            echo(f"{n:9d} {table.replace('_', ' ')}")
     return counts | ({} if session is None else {"session": session})
 
 
@@ -270,7 +271,7 @@ def config_check(path: Path, *, as_json: bool) -> dict[str, Any]:
     source = load_rig(settings.rig)
     links = decoders(settings, source)
     if not as_json:
-        click.echo(f"{path}: good: rig {source.rig.name}, links {', '.join(links) or 'none'}")
+        echo(f"{path}: good: rig {source.rig.name}, links {', '.join(links) or 'none'}")
     return {"rig": source.rig.name, "links": list(links)}
 
 

@@ -12,6 +12,7 @@ import click
 from rich.console import Console
 
 from daemon.cli.output import json_option
+from daemon.cli.terminal import Terminal
 from daemon.config import read_config
 from daemon.control import request
 
@@ -35,7 +36,8 @@ def talks(command: Callable[..., Any]) -> Callable[..., Any]:
     command = click.option(
         "--config", type=click.Path(path_type=Path), help="Configuration of the daemon to talk to (gives its socket)."
     )(command)
-    return click.option("--socket", type=click.Path(path_type=Path), help="Control socket of the daemon.")(command)
+    at = click.Path(path_type=Path, readable=False)  # who may only look is told what to do, by `request`
+    return click.option("--socket", type=at, help="Control socket of the daemon.")(command)
 
 
 def ask(where: dict[str, Any], command: str, show: Show, timeout_s: float = 120.0, **arguments: Any) -> Any:
@@ -43,13 +45,20 @@ def ask(where: dict[str, Any], command: str, show: Show, timeout_s: float = 120.
     given = {key: value for key, value in arguments.items() if value is not None}
     result = request(socket_of(where["socket"], where["config"]), command, given, timeout_s=timeout_s)
     if not where["as_json"]:
-        show(Console(), result)
+        show(Terminal(), result)
     return result if isinstance(result, dict) else {"result": result}
 
 
 def say(console: Console, text: Any) -> None:
     """Print a line as it is."""
-    console.print(str(text), highlight=False, markup=False)
+    console.print(str(text))
+
+
+def who(operator: str, user: str | None) -> str:
+    """Return the operator that somebody named, and the user that the computer knew, where that is another name."""
+    if not user or user == operator:
+        return operator
+    return f"{operator} (user {user})" if operator else f"user {user}"
 
 
 def utc(utc_ns: int) -> str:

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from daemon.cli.output import Command
 from daemon.cli.talk import say, socket_of, talks
+from daemon.cli.terminal import Terminal
 from daemon.control import request
 
 FOLLOW_S = 0.2
@@ -33,7 +34,7 @@ def tip(prism: str | None, *, follow: bool, **where: Any) -> Any:
     if not follow:
         result = request(socket, "tip", arguments)
         if not where["as_json"]:
-            _show(Console(), result)
+            _show(Terminal(), result)
         return result
     try:
         while True:
@@ -42,7 +43,7 @@ def tip(prism: str | None, *, follow: bool, **where: Any) -> Any:
                 # A command's standard output is kept for its one result; here each line is one.
                 click.echo(json.dumps(result), file=sys.__stdout__)
             else:
-                _show(Console(), result)
+                _show(Terminal(), result)
             time.sleep(FOLLOW_S)
     except KeyboardInterrupt:
         raise click.exceptions.Exit(0) from None

@@ -37,6 +37,7 @@ _STYLE: Any = {
     "grid.color": GRID,
     "grid.linewidth": 0.8,
     "text.color": INK,
+    "text.parse_math": False,  # a dollar sign in a name is a dollar sign
     "xtick.color": SOFT,
     "ytick.color": SOFT,
     "xtick.major.size": 3,
@@ -49,6 +50,7 @@ _STYLE: Any = {
 }
 RASTER_DPI = 150
 WIDTH_IN = 9.6
+LABEL_CHARACTERS = 60  # of a name beside an axis
 MINUS = "\N{MINUS SIGN}"
 
 

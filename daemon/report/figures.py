@@ -8,7 +8,19 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from calibration.rig import Joint
-from daemon.report.drawing import AFTER, BEFORE, INK, MIDDLE, SOFT, WARN, WIDTH_IN, new_figure, plain_log_axis
+from daemon.plain_text import shown
+from daemon.report.drawing import (
+    AFTER,
+    BEFORE,
+    INK,
+    LABEL_CHARACTERS,
+    MIDDLE,
+    SOFT,
+    WARN,
+    WIDTH_IN,
+    new_figure,
+    plain_log_axis,
+)
 from daemon.report.inputs import USUAL, ErrorTable, Floats, ReportInput, Stage
 from daemon.report.markup import number
 
@@ -160,7 +172,7 @@ def importance(report: ReportInput, most: int = 10) -> Figure:
     axes.barh(range(len(lines)), shares, height=0.62, color=AFTER, linewidth=0)
     for place, share in enumerate(shares):
         axes.annotate(f"{number(share, 2)} %", (share, place), (4, 0), textcoords="offset points", va="center")
-    axes.set_yticks(range(len(lines)), [name for name, _ in lines])
+    axes.set_yticks(range(len(lines)), [shown(name, LABEL_CHARACTERS) for name, _ in lines])
     axes.tick_params(axis="y", length=0, labelcolor=INK)
     axes.set_ylim(len(lines) - 0.4, -0.6)
     axes.set_xlim(0.0, 1.12 * max(shares))
@@ -297,7 +309,7 @@ def corrections(report: ReportInput, most: int = 14) -> Figure:
         half = 2 * line.sigma / line.tolerance
         axes.plot([line.in_tolerances - half, line.in_tolerances + half], [place, place], color=colour, linewidth=2)
         axes.plot(line.in_tolerances, place, "o" if line.determined else "D", color=colour, markersize=5)
-    axes.set_yticks(range(len(lines)), [p.name for p in lines])
+    axes.set_yticks(range(len(lines)), [shown(p.name, LABEL_CHARACTERS) for p in lines])
     axes.tick_params(axis="y", length=0, labelcolor=INK)
     axes.set_ylim(len(lines) - 0.4, -0.6)
     axes.set_xlim(-reach, reach)

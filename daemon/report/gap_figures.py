@@ -13,7 +13,8 @@ from calibration.gap.result import Gap
 from calibration.gap.workflow import rms
 from calibration.observations import Floats
 from calibration.rig import Joint
-from daemon.report.drawing import AFTER, INK, MIDDLE, SOFT, WARN, new_figure
+from daemon.plain_text import shown
+from daemon.report.drawing import AFTER, INK, LABEL_CHARACTERS, MIDDLE, SOFT, WARN, new_figure
 from daemon.report.figures import forward_axis, key, robust_reach, running_median, scatter, sizes_mm, views
 from daemon.report.markup import number, signed
 
@@ -102,7 +103,7 @@ def steps(bars: Sequence[Bar], noise_mm: float) -> Figure:
         color=INK,
         fontsize=8.5,
     )
-    axes.set_yticks(range(len(bars)), [bar.label for bar in bars])
+    axes.set_yticks(range(len(bars)), [shown(bar.label, LABEL_CHARACTERS) for bar in bars])
     axes.tick_params(axis="y", length=0, labelcolor=INK, labelsize=10)
     axes.set_ylim(len(bars) - 0.05, -0.5)
     axes.set_xlim(0.0, reach)
@@ -138,7 +139,7 @@ def coefficients(intervals: Sequence[Interval]) -> Figure:
                 color=SOFT, ha="right" if side < 0 else "left", va="bottom",
             )  # fmt: skip
     axes.axvline(0.0, color=SOFT, linewidth=0.8)
-    axes.set_yticks(range(len(intervals)), [line.label for line in intervals])
+    axes.set_yticks(range(len(intervals)), [shown(line.label, LABEL_CHARACTERS) for line in intervals])
     axes.tick_params(axis="y", length=0, labelcolor=INK)
     axes.set_ylim(len(intervals) - 0.4, -0.65)
     axes.set_xlim(least - 0.14, 1.13 + _VALUES / (1.0 - _VALUES) * (1.27 - least))
@@ -214,23 +215,23 @@ def by_direction(gap: Gap) -> Figure | None:
     if not panels:
         return None
     figure = new_figure(2.9)
-    grid = figure.subplots(1, len(panels), width_ratios=[len(shown) for shown in panels.values()], squeeze=False)[0]
-    for axes, (unit, shown) in zip(grid, panels.items(), strict=True):
+    grid = figure.subplots(1, len(panels), width_ratios=[len(lines) for lines in panels.values()], squeeze=False)[0]
+    for axes, (unit, lines) in zip(grid, panels.items(), strict=True):
         reach = 0.0
-        for place, (_, own, sides) in enumerate(shown):
+        for place, (_, own, sides) in enumerate(lines):
             shifts = np.linspace(-0.06, 0.06, len(own.errors)) if len(own.errors) > 1 else [0.0]
             for errors, stage, shift in zip(own.errors, stages(gap), shifts, strict=True):
                 reach = max(reach, _pair(axes, place + float(shift), errors, sides, stage.colour))
-        ticks = {place + shift: arrow for place in range(len(shown)) for _, arrow, shift in _SIDES}
+        ticks = {place + shift: arrow for place in range(len(lines)) for _, arrow, shift in _SIDES}
         axes.set_xticks(list(ticks), list(ticks.values()))
-        for place, (joint, _, _) in enumerate(shown):
+        for place, (joint, _, _) in enumerate(lines):
             axes.annotate(
                 joint.name, (place, 0), (0, -19), xycoords=("data", "axes fraction"), textcoords="offset points",
                 ha="center", va="top", color=INK,
             )  # fmt: skip
         axes.axhline(0, color=SOFT, linewidth=0.7)
         axes.grid(False, axis="x")
-        axes.set_xlim(-0.5, len(shown) - 0.5)
+        axes.set_xlim(-0.5, len(lines) - 0.5)
         axes.set_ylim(-1.7 * reach, 1.7 * reach)  # the interval of a joint that moves the prism little may be cut
         axes.set_ylabel(f"mean error, {unit}")
     _legend(figure, gap)

@@ -6,6 +6,7 @@ import html
 import math
 from collections.abc import Iterable, Sequence
 
+from daemon.plain_text import shown
 from daemon.report.drawing import MINUS
 
 STYLE = """
@@ -57,7 +58,7 @@ code { font: .88em/1.4 ui-monospace, "DejaVu Sans Mono", monospace; }
 
 def escape(text: object) -> str:
     """Text made safe to stand in HTML."""
-    return html.escape(str(text), quote=True)
+    return html.escape(shown(text), quote=True)
 
 
 def number(value: float, digits: int = 3) -> str:

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import textwrap
+
+from daemon.plain_text import shown
 from daemon.report.build import headline
-from daemon.report.drawing import AFTER, BEFORE, SOFT, new_figure, png_bytes, styled
+from daemon.report.drawing import AFTER, BEFORE, LABEL_CHARACTERS, SOFT, new_figure, png_bytes, styled
 from daemon.report.figures import draw_error_map, draw_errors_by_prism
 from daemon.report.inputs import STAGES, ReportInput
 from daemon.report.markup import number
+
+_TITLE_CHARACTERS = 92
 
 
 def summary_png(report: ReportInput) -> bytes:
     """A PNG of about 1500 x 1000 pixels, for a README or a message."""
     with styled():
         figure = new_figure(7.0, 10.5)
-        figure.suptitle(
-            f"{report.rig}. {headline(report)}", x=0.012, ha="left", fontsize=13, fontweight="bold", wrap=True
-        )
+        # matplotlib's own wrapping takes what stands between dollar signs for a formula, whatever it was told.
+        title = textwrap.fill(f"{shown(report.rig, LABEL_CHARACTERS)}. {headline(report)}", _TITLE_CHARACTERS)
+        figure.suptitle(title, x=0.012, ha="left", fontsize=13, fontweight="bold")
         halves = figure.subfigures(2, 1, height_ratios=[1.0, 1.05], squeeze=False)
         top, bottom = halves[0, 0], halves[1, 0]
         stages, prisms = top.subplots(1, 2, width_ratios=[0.85, 1.4])

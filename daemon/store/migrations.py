@@ -253,7 +253,7 @@ def m009_uncontrolled_sessions(db: Database) -> None:
 
 
 @MIGRATIONS()
-def m014_prism_confirmations(db: Database) -> None:
+def m010_prism_confirmations(db: Database) -> None:
     """Words that a session's stations are on its prism: fixes that looked like another one's count from then on."""
     _create(
         db,
@@ -267,7 +267,7 @@ def m014_prism_confirmations(db: Database) -> None:
 
 
 @MIGRATIONS()
-def m012_store_health(db: Database) -> None:
+def m011_store_health(db: Database) -> None:
     """Checks of the store itself, and what the end of the computer did to jobs."""
     _create(
         db,
@@ -282,7 +282,7 @@ def m012_store_health(db: Database) -> None:
 
 
 @MIGRATIONS()
-def m013_comparisons_know_the_live_model(db: Database) -> None:
+def m012_comparisons_know_the_live_model(db: Database) -> None:
     """A comparison of a named model says with which change the model beside it had gone live."""
     _create(
         db,
@@ -301,6 +301,26 @@ def m013_alarms(db: Database) -> None:
             {_one_of("severity", "warning", "critical")}, text TEXT NOT NULL, remedy TEXT NOT NULL,
             {_instant("raised_")}, {_instant("cleared_", optional=True)}) STRICT""",
         "CREATE UNIQUE INDEX alarms_one_active ON alarms(kind, subject) WHERE cleared_utc_ns IS NULL",
+    )
+
+
+@MIGRATIONS()
+def m014_who_said_so(db: Database) -> None:
+    """Which user's process gave a command, as the kernel tells, beside the operator that it names."""
+    _create(
+        db,
+        # NULL where no command caused the row, and in rows from before this migration. caller_user: "" where the
+        # computer knew no name for caller_uid.
+        *(
+            f"ALTER TABLE {table} ADD COLUMN {prefix}{column}"
+            for table, prefix in (
+                ("calibration_sessions", ""),
+                ("calibration_sessions", "accepted_"),
+                ("prism_confirmations", ""),
+                ("model_states", ""),
+            )
+            for column in ("caller_user TEXT", "caller_uid INTEGER", "caller_pid INTEGER")
+        ),
     )
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from daemon.store.captures import decode_captures
 from daemon.store.errors import StoreError
 from daemon.store.identity import FileIdentity
-from daemon.store.rows import sql_value, stamp_of
+from daemon.store.rows import sql_value, stamp_of, stored_text
 from drivers.clock import Stamp
 from drivers.readings import Capture
 
@@ -39,6 +39,7 @@ class Reader:
         # Never immutable=1: the file changes under a live daemon.
         self._connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
         self._connection.row_factory = sqlite3.Row
+        self._connection.text_factory = stored_text
         try:
             self._connection.execute("PRAGMA query_only = ON")
             self._connection.execute("SELECT count(*) FROM boots")

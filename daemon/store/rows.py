@@ -35,6 +35,11 @@ FIX_COLUMNS = (
 )
 
 
+def stored_text(data: bytes) -> str:
+    """Return a text column's value; bytes of another program's that are no UTF-8 become replacement characters."""
+    return data.decode("utf-8", "replace")
+
+
 def sql_value(value: object) -> SqlValue:
     """`value` as SQLite stores it: numpy scalars become Python's, NaN and infinities None, mappings and lists JSON.
 

@@ -34,6 +34,7 @@ from daemon.store.rows import (
     sample_row,
     sql_value,
     stamp_of,
+    stored_text,
 )
 from drivers.clock import Stamp
 from drivers.readings import Capture, DecodeFailure, DeviceEvent, Fix, Gap, GapReason, Reading, Record
@@ -103,6 +104,7 @@ class Store:
         try:
             # Transactions take turns under `_turn`, so the connection need not belong to one thread.
             connection = sqlite3.connect(path, check_same_thread=False)
+            connection.text_factory = stored_text
             try:
                 self._db = Database(connection)
                 self._prepare(connection)

@@ -9,7 +9,8 @@ import pytest
 from click.testing import CliRunner
 
 from daemon.cli.main import main as rigcal
-from daemon.control import CommandError, ControlServer, request
+from daemon.control import CommandError, request
+from daemon.control_server import ControlServer
 from daemon.job_table import JobTable
 from daemon.store.store import Store
 from drivers.clock import ManualClock
@@ -148,3 +149,40 @@ def test_an_operator_who_asks_for_jobs_before_there_are_any_is_told_when_there_w
     store.close()
     assert done.exit_code == 0
     assert done.stdout == "no jobs yet; those of a session are queued some seconds after it was closed\n"
+
+
+HOSTILE_JSON = {
+    "deep": b"[" * 100_000 + b"\n",
+    "deep arguments": b'{"command": "echo", "arguments": {"a": ' + b"[" * 400 + b"]" * 400 + b"}}\n",
+    "NaN": b'{"command": "echo", "arguments": {"a": NaN}}\n',
+    "infinity": b'{"command": "echo", "arguments": {"a": -Infinity}}\n',
+    "a float beyond all": b'{"command": "echo", "arguments": {"a": 1e999}}\n',
+    "a whole number without end": b'{"command": "echo", "arguments": {"a": ' + b"9" * 10_000 + b"}}\n",
+    "a whole number of 65 bits": b'{"command": "echo", "arguments": {"a": 18446744073709551616}}\n',
+    "half a character": b'{"command": "echo", "arguments": {"a": "\\ud800"}}\n',
+    "half a character in a key": b'{"command": "echo", "arguments": {"\\udfff": 1}}\n',
+    "half a character as command": b'{"command": "\\ud800"}\n',
+}
+
+
+@pytest.mark.parametrize("line", HOSTILE_JSON.values(), ids=HOSTILE_JSON.keys())
+def test_json_that_no_command_can_use_is_one_refusal(path: Path, line: bytes) -> None:
+    answer = talk(path, line)
+    assert answer["ok"] is False
+    assert answer["status"] == 2
+    assert answer["error"].startswith("a request")
+    assert len(answer["error"]) < 200
+    assert request(path, "echo", {"still": "here"}) == {"still": "here"}
+
+
+def test_a_refusal_has_an_end_whatever_it_quotes(path: Path) -> None:
+    answer = talk(path, b'{"command": "' + b"x" * 500_000 + b'"}\n')
+    assert "unknown command" in answer["error"]
+    assert len(answer["error"]) < 4000
+
+
+def test_an_answer_that_is_no_json_is_a_refusal(tmp_path: Path) -> None:
+    server = ControlServer(tmp_path / "s", {"odd": lambda _: {1, 2}})
+    with pytest.raises(CommandError, match="odd failed inside the daemon"):
+        request(tmp_path / "s", "odd")
+    server.close()

@@ -19,7 +19,7 @@ from calibration.channels import RawSignal
 from daemon.cli.main import main
 from daemon.composition import decoders, live
 from daemon.config import Config, ConfigError, parse_config
-from daemon.control import ControlServer
+from daemon.control_server import ControlServer
 from daemon.modelfiles import read_model, write_model
 from daemon.rigs import load_rig
 from daemon.service import tip_sender

@@ -75,6 +75,12 @@ def test_motion_is_no_jump() -> None:
     assert watched.events == []
 
 
+def test_fast_motion_whose_fixes_were_read_late_is_no_jump() -> None:
+    watched = Watched()
+    for k in range(100):  # 4 m/s, measured every 0.5 s, every third read 0.3 s late
+        assert watched.fixes(0.5 * k + (0.3 if k % 3 == 0 else 0.0), 1, 10 + 2.0 * k) == [True]
+
+
 def test_the_fixes_after_a_jump_are_in_doubt_with_when_how_far_and_what_to_do() -> None:
     watched = Watched()
     assert watched.fixes(0, 5, 10, 0.05) == [True] * 5

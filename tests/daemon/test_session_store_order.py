@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 from sqlite_utils import Database
 
-from daemon.control import CommandError, ControlServer, request
+from daemon.control import CommandError, request
+from daemon.control_server import ControlServer
 from daemon.job_table import JobTable
 from daemon.order import Outcome
 from daemon.scheduler import CHAIN, DueChain, next_job

@@ -12,7 +12,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from daemon.cli.main import main
 from daemon.composition import Parts, joiner
 from daemon.config import Config
 from daemon.control import request
@@ -246,23 +248,41 @@ def test_a_disk_that_fills_up_is_seen_before_it_is_full(tmp_path: Path) -> None:
 # ---- the daemon ------------------------------------------------------------------------------------------------------
 
 
-def test_the_status_of_a_running_daemon_says_that_its_store_is_gone(tmp_path: Path) -> None:
+@contextlib.contextmanager
+def running(tmp_path: Path) -> Iterator[tuple[Config, Daemon]]:
     config = Config(rig="swdt82", state_directory=tmp_path)
     rig = SOURCE.rig
     store = Store(config.store_path)
     parts = Parts("live", rig, SOURCE.text, SystemClock(), [ListLink("boom", [])], {}, joiner(config, rig))
     daemon = Daemon(config, store, parts)
     stop = threading.Event()
-    running = threading.Thread(target=daemon.run, args=(stop, Notifier({})))
-    running.start()
+    thread = threading.Thread(target=daemon.run, args=(stop, Notifier({})))
+    thread.start()
     try:
+        yield config, daemon
+    finally:
+        stop.set()
+        thread.join()
+        store.close()
+
+
+def test_the_status_of_a_running_daemon_says_that_its_store_is_gone(tmp_path: Path) -> None:
+    with running(tmp_path) as (config, daemon):
         told = request(config.socket_path, "status")
         assert told["store"] == str(config.store_path)
         assert told["store_health"]["state"] == "ok"
         config.store_path.rename(tmp_path / "aside")
         wait_until(lambda: request(config.socket_path, "status")["store_health"]["state"] == "missing")
         assert daemon.store_health.state == "missing"
-    finally:
-        stop.set()
-        running.join()
-        store.close()
+
+
+def test_a_damaged_table_hides_nothing_else_from_status(tmp_path: Path) -> None:
+    with running(tmp_path) as (config, _):
+        pass
+    tear(config.store_path, "device_events")
+    with running(tmp_path) as (config, _):
+        status = request(config.socket_path, "status")
+        assert "malformed" in status["unreadable"]["events"]
+        assert status["acquisition"]["links"][0]["name"] == "boom"
+        shown = CliRunner().invoke(main, ["status", "--socket", str(config.socket_path)])
+        assert "events: cannot be read from the store" in shown.output

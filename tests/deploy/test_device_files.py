@@ -96,7 +96,10 @@ def test_the_service_gets_a_user_that_may_open_serial_ports(tmp_path: Path) -> N
     )
     assert user[5] == "/var/lib/rigcal"
     assert user[6].endswith("nologin")
-    assert re.search(r"(?m)^dialout:.*\brigcal\b", (tmp_path / "etc/group").read_text())
+    groups = (tmp_path / "etc/group").read_text()
+    assert re.search(r"(?m)^dialout:.*\brigcal\b", groups)
+    # A process may give a file to groups that it is a member of alone: the daemon gives those who look their socket.
+    assert re.search(rf"(?m)^{read_config(DEPLOY / 'rigcal.toml').read_group}:.*:rigcal$", groups)
 
 
 def test_the_example_configuration_is_accepted_and_sends_nothing() -> None:

@@ -82,6 +82,12 @@ def test_the_unit_reads_the_configuration_that_is_installed(installed: Path) -> 
     assert (installed / command[command.index("--config") + 1].lstrip("/")).is_file()
 
 
+def test_members_of_the_reading_group_reach_their_socket_and_no_one_lists_the_store() -> None:
+    unit = settings(DEPLOY / "rigcal.service")
+    assert unit["RuntimeDirectoryMode"] == ["0755"]  # the sockets in it have modes of their own
+    assert unit["StateDirectoryMode"] == ["0750"]
+
+
 def test_every_serial_driver_that_the_unit_allows_is_loaded_before_it(installed: Path) -> None:
     # ttyS is built into the kernel.
     driver_of = {"char-ttyS": None, "char-ttyUSB": "usbserial", "char-ttyACM": "cdc-acm"}

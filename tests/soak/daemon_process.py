@@ -42,6 +42,16 @@ STOP_S = 30.0  # of the service unit
 EVERYTHING = resource.RLIM_INFINITY
 
 
+UNIT = Path(__file__).parents[2] / "deploy" / "rigcal.service"
+
+
+def unit_environment() -> dict[str, str]:
+    """The environment that the service unit gives the daemon."""
+    lines = UNIT.read_text(encoding="utf-8").splitlines()
+    given = [line.removeprefix("Environment=").partition("=") for line in lines if line.startswith("Environment=")]
+    return {name: value for name, _, value in given}
+
+
 @dataclass(frozen=True)
 class Usage:
     """What the daemon's process uses at an instant.
@@ -92,7 +102,11 @@ class DaemonProcess:
         command += [str(self._config), rate, origin, str(self._operator)]
         # Through a pipe: a limit on the size of its files must not keep it from logging.
         self._process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, **unit_environment()},
+            start_new_session=True,
         )
         self.life += 1
         self._started_s = time.monotonic()

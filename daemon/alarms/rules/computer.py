@@ -36,11 +36,11 @@ def clock_behind(evidence: Evidence) -> Iterator[Finding]:
         yield "clock", f"the computer's clock stands at an earlier time than {last}, when rigcal last ran"
 
 
-@rule("critical", "Restart rigcal: `systemctl restart rigcal`.")
+@rule("critical", "Put right what the text says; if the alarm stays, restart rigcal: `systemctl restart rigcal`.")
 def control_dead(evidence: Evidence) -> Iterator[Finding]:
-    """The daemon takes no commands on its control socket any more."""
-    if not evidence.is_control_served:
-        yield "control socket", "no commands are taken any more"
+    """No one can connect to a control socket of the daemon's: its file was replaced, or the computer lacks descriptors.
+    Cleared when commands are taken again."""
+    yield from evidence.control_faults.items()
 
 
 @rule("warning", "Report the fault with rigcal's log; alarms of this sort stand as they were.", hold_s=5.0)

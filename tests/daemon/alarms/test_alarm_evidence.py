@@ -39,7 +39,7 @@ def gather(rig: ModelRig) -> Gatherer:
         acquisition=AcquisitionStatus,
         health=lambda: StoreHealth("replaced", "another file", rig.clock.now(), 5, is_low=True),
         suspicions=lambda: [Suspicion("station", rig.clock.now(), 9.5)],
-        is_control_served=lambda: False,
+        control_faults=lambda: {"control.sock": "the file is gone"},
     )
 
 
@@ -129,7 +129,7 @@ def test_a_session_that_is_not_used_is_told_until_a_newer_one_is(rig: ModelRig, 
 def test_the_store_and_the_control_socket_are_told_as_they_are(gather: Gatherer) -> None:
     evidence = gather()
     assert (evidence.store.fault, evidence.store.free_bytes, evidence.store.is_low) == ("another file", 5, True)
-    assert not evidence.is_control_served
+    assert evidence.control_faults == {"control.sock": "the file is gone"}
 
 
 def test_a_part_that_fails_keeps_what_it_was_last_known_to_be(rig: ModelRig, gather: Gatherer) -> None:

@@ -1,0 +1,35 @@
+"""A whole daemon, with its store and its sockets, on a rig without devices: for what does not depend on readings."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from daemon.composition import Parts, joiner
+from daemon.config import Config, JobsSection
+from daemon.notify import Notifier
+from daemon.service import Daemon
+from daemon.store.store import Store
+from drivers.clock import SystemClock
+from tests.daemon.job_support import SOURCE
+
+
+@contextlib.contextmanager
+def idle_daemon(directory: Path, notifier: Notifier | None = None, **settings: Any) -> Iterator[Config]:
+    """A daemon that runs while the block does; its store is in `directory`, and so is its control socket."""
+    config = Config(rig="swdt82", state_directory=directory, jobs=JobsSection(enabled=False), **settings)
+    store = Store(config.store_path)
+    parts = Parts("live", SOURCE.rig, SOURCE.text, SystemClock(), [], {}, joiner(config, SOURCE.rig))
+    daemon = Daemon(config, store, parts)
+    stop = threading.Event()
+    running = threading.Thread(target=daemon.run, args=(stop, notifier or Notifier({})))
+    running.start()
+    try:
+        yield config
+    finally:
+        stop.set()
+        running.join()
+        store.close()
