@@ -100,7 +100,7 @@ def parse_message(line: bytes) -> Progress | Outcome:
         message = None
     match message:
         case {"progress": float() | int() as share, "message": str() as text} if -math.inf < share < math.inf:
-            return Progress(min(max(float(share), 0.0), 1.0), text)
+            return Progress(float(min(max(share, 0), 1)), text)
         case {"result": dict() as result}:
             return Outcome("done", result=result)
         case {"error": str() as error}:

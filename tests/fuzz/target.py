@@ -17,7 +17,7 @@ from typing import Literal
 from tests.fuzz import targets as folder
 
 CORPUS = Path(__file__).parent / "corpus"
-MESSAGE_MAX = 2000  # characters of a refusal
+MESSAGE_MAX = 2100  # characters of a refusal, with what says where it comes from
 
 Run = Callable[[bytes], None]
 

@@ -83,7 +83,12 @@ class _Rig:
         for state in ("retired", "live", "candidate"):
             row = {"rig": "swdt82", "path": f"/nowhere/{state}", "manifest_sha256": "0" * 64, "stage": "geometric"}
             with self.store.transaction():
-                self.store.insert("models", row | {"state": state, **self.store.instant(now, "created_")})
+                instant = self.store.instant(now, "created_")
+                model = self.store.insert("models", row | {"state": state, **instant})
+                history = ["candidate", *["live"] * (state != "candidate"), *["retired"] * (state == "retired")]
+                for each in history:
+                    change = {"model_id": model, "state": each, "reason": "made", **self.store.instant(now)}
+                    self.store.insert("model_states", change)
 
 
 def _control() -> Run:
