@@ -593,6 +593,7 @@ def test_looking_for_work_stays_cheap_after_years(rig: JobRig) -> None:
     [
         (b'{"progress": 1, "message": "x"}\n', Progress(1.0, "x")),
         (b'{"progress": 1.0000001, "message": "x"}\n', Progress(1.0, "x")),
+        (b'{"progress": 1%b, "message": "x"}\n' % (b"0" * 400), Progress(1.0, "x")),
         (b'{"result": {"model": null}}\n', Outcome("done", result={"model": None})),
         (b'{"error": "too poor"}\n', Outcome("failed", "too poor")),
     ],
