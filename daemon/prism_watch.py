@@ -107,7 +107,7 @@ class PrismWatch:
     def _guard(self, session: OpenSession, station: str) -> PrismGuard:
         if station not in session.guards:
             limit = self._limits.get(station, MotionLimit())
-            session.guards[station] = PrismGuard(station, limit, session.words)
+            session.guards[station] = PrismGuard(station, limit, session.words, self._store.order)
         return session.guards[station]
 
 

@@ -242,6 +242,10 @@ class Store:
                 self._boots[stamp.boot_id] = row
         return row
 
+    def order(self, stamp: Stamp) -> tuple[int, int]:
+        """Where an instant lies among all that the store knows (`drivers.clock.Order`)."""
+        return self.boot_row(stamp), stamp.monotonic_ns
+
     # ---- runs of the daemon ----------------------------------------------------------------------------------------
 
     def begin_run(self, now: Stamp) -> None:
