@@ -28,7 +28,7 @@ from daemon.control import (
     refusal_line,
 )
 from daemon.rights import READING
-from daemon.store.errors import is_unwritable
+from daemon.store.errors import StoreError, is_unwritable
 from drivers.clock import NS_PER_S, SystemClock
 
 log = logging.getLogger(__name__)
@@ -310,6 +310,8 @@ class ControlServer:
                 return answer_line(handler(arguments))
         except CommandError as error:
             return refusal_line(str(error), error.status)
+        except StoreError as error:
+            return refusal_line(str(error), FAILED)
         except Exception as error:  # a fault in one command must not end the daemon
             if is_unwritable(error):
                 log.error("command %s: the store cannot be written (%s)", command, error)

@@ -133,12 +133,12 @@ class SessionTable:
         Raises:
             CommandError: there is none.
         """
-        with Reader(self._store.path) as reader:
+        with self._store.reader() as reader:
             return _summary(reader, session_id)
 
     def all(self) -> list[dict[str, Any]]:
         """All summaries, oldest first. Read beside the writing connection, which must not wait."""
-        with Reader(self._store.path) as reader:
+        with self._store.reader() as reader:
             ids = [row["id"] for row in reader.rows("SELECT id FROM calibration_sessions ORDER BY rowid")]
             return [_summary(reader, session_id) for session_id in ids]
 

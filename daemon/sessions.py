@@ -84,6 +84,7 @@ class SessionKeeper:
         self._prisms = PrismWatch(store, clock, limits or {})
         self._unstored: list[Callable[[], object]] = []  # observations that the store has yet to take, in their order
         self._is_waiting = False
+        self._late: set[str] = set()  # sessions that got fixes after their end, and must be judged again
         # Fixes measured in those that have ended may still come, or wait for their joints
         self._open, self._ended = self._table.unfinished()
         self._go_on()
@@ -100,12 +101,12 @@ class SessionKeeper:
                 for session in self._taking():
                     if session.lasted(record.stamp):
                         session.jumped.setdefault(record.device, record.stamp)
-        late: dict[str, None] = {}
-        for joined in self._joiner.feed(records):
-            observing = self._observe(joined)
-            if observing is not None and observing.until is not None:
-                late[observing.id] = None
-        self._unstored += [partial(self._table.judge_again, session_id) for session_id in late]
+        observing = [self._observe(joined) for joined in self._joiner.feed(records)]
+        late = [session.id for session in observing if session is not None and session.until is not None]
+        self._late.update(late)
+        if not late:  # no more of them at present
+            self._unstored += [partial(self._table.judge_again, session_id) for session_id in self._late]
+            self._late.clear()
         if self._unstored:
             self._store_observations()
 
