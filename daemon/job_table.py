@@ -16,7 +16,6 @@ from daemon.drift_table import DriftTable, LiveRun
 from daemon.model_table import ModelRow, ModelTable, trained_on
 from daemon.order import Order, Outcome, Progress
 from daemon.scheduler import CHECK, CHECKS, DueChain, JobFacts, JobKind, SessionFacts, State
-from daemon.store.reader import Reader
 from daemon.store.store import Store
 from drivers.clock import Clock
 
@@ -124,7 +123,7 @@ class JobTable:
 
     def all(self) -> list[dict[str, Any]]:
         """All jobs with their results, newest last. Read beside the writing connection, which must not wait."""
-        with Reader(self._store.path, self._store.files.database) as reader:
+        with self._store.reader() as reader:
             rows = list(reader.rows(f"SELECT {SHOWN}, result_json FROM jobs ORDER BY id"))
         return [row | {"result": json.loads(row.pop("result_json") or "null")} for row in rows]
 

@@ -6,6 +6,7 @@ result on its standard output; only the daemon writes.
 
 from __future__ import annotations
 
+import errno
 import logging
 import sqlite3
 import threading
@@ -25,6 +26,8 @@ from drivers.clock import NS_PER_S, Clock, SystemClock
 log = logging.getLogger(__name__)
 
 POLL_S = 0.5
+# What the computer may lack to start a process, for a while.
+_LACKS = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EAGAIN})
 LISTEN_S = 0.2  # a running job that is silent is looked after this often
 STOP_TIMEOUT_S = 30.0
 
@@ -63,7 +66,7 @@ class JobRunner:
         self._table = JobTable(store, rig_name, clock)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="jobs", daemon=True)
-        self._is_store_at_fault = False  # for a step that stumbled
+        self._is_computer_at_fault = False  # for a step that stumbled
         self._table.interrupt_left_over(self._host_boot)
 
     def start(self) -> None:
@@ -115,7 +118,9 @@ class JobRunner:
             try:
                 did_something = self._step()
             except Exception as error:
-                self._is_store_at_fault = isinstance(error, sqlite3.Error)
+                self._is_computer_at_fault = isinstance(error, sqlite3.Error) or (
+                    isinstance(error, OSError) and error.errno in _LACKS
+                )
                 log.exception("the scheduler stumbled; it goes on")
                 did_something = False
             if not did_something:
@@ -125,9 +130,10 @@ class JobRunner:
         """Queue what is due and run what is next; whether a job ran."""
         state = self._table.state()
         if any(job.state == "running" for job in state.jobs):
-            # None runs between two steps: the last step stumbled. A full disk is not the job's doing.
+            # None runs between two steps: the last step stumbled. A full disk is not the job's doing, nor is a lack of
+            # descriptors or memory that keeps its process from being started.
             self._table.interrupt_running(
-                "the daemon could not see it through; its log may tell why", is_innocent=self._is_store_at_fault
+                "the daemon could not see it through; its log may tell why", is_innocent=self._is_computer_at_fault
             )
             return False
         if self._is_held():

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from daemon.prism_guard import PrismGuard, Word
 from daemon.setups import Place
-from drivers.clock import Stamp
+from drivers.clock import Order, Stamp, lies_within
 from drivers.readings import Fix
 
 CONTROL_POINT_RADIUS_MM = 300.0  # a fix this close to a control point is of the control point, not of the boom
@@ -40,10 +40,11 @@ class OpenSession:
     """A session that takes fixes. Each fix's instant tells whose it is: it is joined, and comes, some time later.
 
     Attributes:
-        since, until: fixes measured in between are of its prism; None for one that began in an earlier run of the
-            daemon, and while it is open.
+        order: of instants.
+        since, until: fixes measured in between are of its prism, whichever run of the daemon decodes them; until is
+            None while it is open.
         shots: when the station was on control points instead.
-        jumped: joints whose encoder jumped in it, since when; None: in an earlier run.
+        jumped: joints whose encoder jumped in it, since when.
         control_points: where those of its set-up are, mm.
         words: who said when that its stations are on its prism.
         guards: station -> what watches that it stays there; for the writer's thread.
@@ -53,27 +54,25 @@ class OpenSession:
     setup_id: str
     prism: str
     kind: str
-    since: Stamp | None
+    order: Order
+    since: Stamp
     until: Stamp | None = None
     shots: list[Shot] = field(default_factory=list)
-    jumped: dict[str, Stamp | None] = field(default_factory=dict)
+    jumped: dict[str, Stamp] = field(default_factory=dict)
     control_points: list[Place] = field(default_factory=list)
     words: list[Word] = field(default_factory=list)
     guards: dict[str, PrismGuard] = field(default_factory=dict)
 
     def lasted(self, stamp: Stamp) -> bool:
         """Whether that instant lies in it."""
-        return within(stamp, self.since, self.until)
+        return lies_within(self.order, stamp, self.since, self.until)
 
     def has(self, stamp: Stamp) -> bool:
         """Whether what the station measured then is its prism."""
-        return self.lasted(stamp) and not any(within(stamp, shot.since, shot.until) for shot in self.shots)
+        return self.lasted(stamp) and not any(
+            lies_within(self.order, stamp, shot.since, shot.until) for shot in self.shots
+        )
 
     def is_control_point(self, place_mm: Place) -> bool:
         """Whether a control point of its set-up is there."""
         return any(math.dist(place_mm, point) < CONTROL_POINT_RADIUS_MM for point in self.control_points)
-
-
-def within(stamp: Stamp, since: Stamp | None, until: Stamp | None) -> bool:
-    """Whether `stamp` lies between two instants, the first included; None is without bound."""
-    return (since is None or stamp.since(since) >= 0) and (until is None or stamp.since(until) < 0)

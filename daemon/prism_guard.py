@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from statistics import median_high
 
-from drivers.clock import NS_PER_S, Stamp
+from drivers.clock import NS_PER_S, Order, Stamp, lies_within
 from drivers.readings import DeviceEvent, EventKind, Fix, LockState, Status
 from drivers.station import StationConfig
 from drivers.survey import position_mm
@@ -92,10 +92,6 @@ class Suspicion:
         """What to do about it."""
         return f"aim {self.station} at the prism again; where it is on it already, {CONFIRM}"
 
-    def covers(self, stamp: Stamp) -> bool:
-        """Whether a fix of that instant is in doubt."""
-        return stamp.since(self.since) >= 0 and (self.until is None or stamp.since(self.until) < 0)
-
 
 @dataclass(frozen=True, slots=True)
 class _Seen:
@@ -128,12 +124,14 @@ class PrismGuard:
         station: its name.
         limit: what motion can do.
         words: of the session, oldest first; grows meanwhile.
+        order: of instants.
         suspicions: all so far; only the last one can still last.
     """
 
     station: str
     limit: MotionLimit
     words: Sequence[Word]
+    order: Order
     suspicions: list[Suspicion] = field(default_factory=list)
     _heeded: int = 0  # words
     _good: _Seen | None = None  # the last fix that was surely of the prism
@@ -151,7 +149,7 @@ class PrismGuard:
 
     def doubt(self, stamp: Stamp) -> Suspicion | None:
         """The suspicion under which a fix of that instant falls."""
-        return next((suspicion for suspicion in self.suspicions if suspicion.covers(stamp)), None)
+        return next((s for s in self.suspicions if lies_within(self.order, stamp, s.since, s.until)), None)
 
     def look_away(self) -> None:
         """The station was on something else on purpose: its next fix is compared as after a new lock."""
@@ -159,7 +157,7 @@ class PrismGuard:
 
     def see(self, fix: Fix) -> DeviceEvent | None:
         """Take a fix, in order; what there is to tell an operator."""
-        while self._heeded < len(self.words) and fix.stamp.since(self.words[self._heeded].at) >= 0:
+        while self._heeded < len(self.words) and self.order(fix.stamp) >= self.order(self.words[self._heeded].at):
             self._heed(self.words[self._heeded])
         if fix.status is Status.NOT_AVAILABLE and (fix.lock is not LockState.UNKNOWN or self.limit.tracks):
             self._is_new_lock = True

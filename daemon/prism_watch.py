@@ -9,7 +9,6 @@ from typing import Any
 from daemon.caller import caller_columns
 from daemon.open_session import OpenSession
 from daemon.prism_guard import MotionLimit, PrismGuard, Suspicion, Word
-from daemon.store.reader import Reader
 from daemon.store.rows import stamp_of
 from daemon.store.store import Store
 from drivers.clock import Clock, Stamp
@@ -85,7 +84,7 @@ class PrismWatch:
 
         A restart ends no suspicion, and what happened while nobody listened may begin one.
         """
-        with Reader(self._store.path, self._store.files.database) as reader:
+        with self._store.reader() as reader:
             boots = reader.boots()
             words = reader.rows("SELECT * FROM prism_confirmations WHERE session_id = ? ORDER BY id", (session.id,))
             session.words += [Word(stamp_of(row, boots), bool(row["turning"])) for row in words]
@@ -107,7 +106,7 @@ class PrismWatch:
     def _guard(self, session: OpenSession, station: str) -> PrismGuard:
         if station not in session.guards:
             limit = self._limits.get(station, MotionLimit())
-            session.guards[station] = PrismGuard(station, limit, session.words)
+            session.guards[station] = PrismGuard(station, limit, session.words, self._store.order)
         return session.guards[station]
 
 

@@ -32,7 +32,7 @@ from daemon.rights import reading_only
 from daemon.sessions import SessionKeeper
 from daemon.setups import SetupBook
 from daemon.store.alarms import AlarmTable
-from daemon.store.errors import storage_errors, storage_sentence
+from daemon.store.errors import StoreError, storage_errors, storage_sentence
 from daemon.store.health import StoreHealth, StoreWatch
 from daemon.store.runs import previous_run
 from daemon.store.store import Store
@@ -71,7 +71,8 @@ class Daemon:
             try:
                 self._compose(config, store, parts)
             except BaseException:
-                self._end_run()  # in order: nothing was captured
+                if store.ended_in_order:  # else the check for damage, which the run before calls for, is still to come
+                    self._end_run()  # in order: nothing was captured
                 raise
 
     def _compose(self, config: Config, store: Store, parts: Parts) -> None:
@@ -252,7 +253,7 @@ class Daemon:
         def stored(part: str, read: Callable[[], T]) -> T | None:
             try:
                 return read()
-            except sqlite3.Error as error:
+            except (sqlite3.Error, StoreError) as error:
                 unreadable[part] = str(error)
                 return None
 

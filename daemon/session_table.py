@@ -8,22 +8,33 @@ Each change is one transaction.
 from __future__ import annotations
 
 import itertools
+import logging
 from collections.abc import Mapping
 from typing import Any
 
 from daemon.caller import caller_columns
 from daemon.control import CommandError
+from daemon.open_session import OpenSession
 from daemon.standstill_places import Exclusions
 from daemon.store.reader import Reader
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, Clock, Stamp
 from drivers.readings import Fix
 
+log = logging.getLogger(__name__)
+
 NOT_SHOT = "no control point was shot at its start and again at its end, so nothing shows that the station stood still"
 NOT_ENCLOSED = "most of its poses do not lie between a control point's shots at its start and at its end"
 LEAST_ENCLOSED = 0.25  # of its poses; some come before the operator gets to the first shot, or after the last
 CLOCK_STEP_NS = NS_PER_S // 20  # less may be the time between reading the one clock and the other
 
+# Fixes of these may still come: of the open ones, and of those that ended after the oldest capture that waits to be
+# decoded was made.
+_UNFINISHED = """SELECT * FROM calibration_sessions
+    WHERE state = 'open' OR (ended_boot_id, ended_monotonic_ns) >=
+        (SELECT first_boot_id, first_monotonic_ns FROM raw_chunks
+            WHERE id = (SELECT min(chunk_id) FROM undecoded_chunks))
+    ORDER BY rowid"""
 _SUMMARY = """SELECT id, rig, setup_id AS setup, prism, operator, caller_user AS user, kind, state, note,
         started_utc_ns, ended_utc_ns, excluded AS not_used, accepted_despite, accepted_by, accepted_utc_ns,
         accepted_caller_user AS accepted_user,
@@ -64,8 +75,10 @@ _ENCLOSED = """SELECT count(DISTINCT coalesce(o.pose, o.id)) AS poses,
 _BETWEEN = """SELECT 1 FROM observations AS o JOIN control_shots AS c ON c.session_id = o.session_id AND c.name = ?
     WHERE o.session_id = ? AND o.excluded IS NULL
         AND (o.boot_id, o.monotonic_ns) > (c.boot_id, c.monotonic_ns) LIMIT 1"""
-_JUMPED = """SELECT DISTINCT e.device FROM device_events AS e JOIN calibration_sessions AS s ON s.id = ?
-    WHERE e.kind = 'preset_jump' AND (e.boot_id, e.monotonic_ns) >= (s.started_boot_id, s.started_monotonic_ns)"""
+_JUMPED = """SELECT e.device, e.utc_ns, e.monotonic_ns, e.boot_id
+    FROM device_events AS e JOIN calibration_sessions AS s ON s.id = ?
+    WHERE e.kind = 'preset_jump' AND (e.boot_id, e.monotonic_ns) >= (s.started_boot_id, s.started_monotonic_ns)
+    ORDER BY e.boot_id, e.monotonic_ns"""
 _EXCLUDE = "UPDATE observations SET excluded = ? WHERE session_id = ? AND boot_id = ? AND monotonic_ns = ?"
 
 
@@ -84,9 +97,26 @@ class SessionTable:
 
     # ---- what is there -----------------------------------------------------------------------------------------------
 
-    def open(self) -> list[dict[str, Any]]:
-        """Id, rig, set-up, prism and kind of the open sessions, at most one a rig."""
-        return self._store.rows("SELECT id, rig, setup_id, prism, kind FROM calibration_sessions WHERE state = 'open'")
+    def unfinished(self) -> tuple[OpenSession | None, list[OpenSession]]:
+        """The rig's open session, and those that have ended and whose last captures were not decoded yet."""
+        opened: OpenSession | None = None
+        ended: list[OpenSession] = []
+        for row in self._store.rows(_UNFINISHED):
+            if row["rig"] != self._rig:
+                if row["state"] == "open":
+                    log.warning(
+                        "session %s of rig %s is open; it goes on when rigcal runs that rig", row["id"], row["rig"]
+                    )
+                continue
+            since, until = self._store.stamp(row, "started_"), self._store.stamp(row, "ended_")
+            assert since is not None  # the columns are NOT NULL
+            order = self._store.order
+            session = OpenSession(row["id"], row["setup_id"], row["prism"], row["kind"], order, since, until)
+            if until is None:
+                opened = session
+            else:
+                ended.append(session)
+        return opened, ended
 
     def ids(self) -> set[str]:
         """All sessions of the store."""
@@ -103,12 +133,12 @@ class SessionTable:
         Raises:
             CommandError: there is none.
         """
-        with Reader(self._store.path, self._store.files.database) as reader:
+        with self._store.reader() as reader:
             return _summary(reader, session_id)
 
     def all(self) -> list[dict[str, Any]]:
         """All summaries, oldest first. Read beside the writing connection, which must not wait."""
-        with Reader(self._store.path, self._store.files.database) as reader:
+        with self._store.reader() as reader:
             ids = [row["id"] for row in reader.rows("SELECT id FROM calibration_sessions ORDER BY rowid")]
             return [_summary(reader, session_id) for session_id in ids]
 
@@ -129,9 +159,14 @@ class SessionTable:
         )
         return {row["name"] for row in rows}
 
-    def jumped(self, session_id: str) -> list[str]:
-        """Devices whose encoders have jumped since the start of a session."""
-        return [row["device"] for row in self._store.rows(_JUMPED, (session_id,))]
+    def jumped(self, session: OpenSession) -> dict[str, Stamp]:
+        """Devices whose encoders have jumped in a session, since when."""
+        jumped: dict[str, Stamp] = {}
+        for row in self._store.rows(_JUMPED, (session.id,)):
+            stamp = self._store.stamp(row)
+            if stamp is not None and session.lasted(stamp):
+                jumped.setdefault(row["device"], stamp)
+        return jumped
 
     # ---- what changes ------------------------------------------------------------------------------------------------
 
@@ -152,6 +187,12 @@ class SessionTable:
             changes = {"state": state, "excluded": excluded, **self._store.instant(ended, "ended_")}
             self._store.update("calibration_sessions", {"id": session_id}, changes)
         return ended
+
+    def judge_again(self, session_id: str) -> None:
+        """Decide anew whether calibration may use a closed session, of which more was decoded after its end."""
+        with self._store.transaction():
+            closed = {"id": session_id, "state": "closed", "accepted_despite": None}
+            self._store.update("calibration_sessions", closed, {"excluded": self._why_not_used(session_id)})
 
     def accept(self, session_id: str, operator: str) -> str:
         """Calibration may use a closed session from now on, on an operator's word.

@@ -22,7 +22,7 @@ from daemon.caller import caller_columns, caller_has_left
 from daemon.config import SessionsSection
 from daemon.control import FAILED, CommandError
 from daemon.joiner import JoinedFix, ObservationJoiner
-from daemon.open_session import OpenSession, Shot, within
+from daemon.open_session import OpenSession, Shot
 from daemon.prism_guard import MotionLimit, Suspicion
 from daemon.prism_watch import PrismWatch, as_dict
 from daemon.scheduler import CHECK, SESSION_KINDS
@@ -31,7 +31,7 @@ from daemon.setups import AXES, Place, SetupBook
 from daemon.standstill_places import StandstillPlaces
 from daemon.store.errors import is_unwritable
 from daemon.store.store import Store
-from drivers.clock import Clock
+from drivers.clock import NS_PER_S, Clock, lies_within
 from drivers.readings import DeviceEvent, EventKind, Fix, Record, Status
 from drivers.station import position_mm
 
@@ -40,6 +40,7 @@ log = logging.getLogger(__name__)
 STANDING_KINDS = ("static_poses", CHECK)
 CHECK_POSES = (3, 5)
 _LOOK_S = 0.5  # how often a shot looks whether anyone still waits for it
+LATE_NS = 60 * NS_PER_S  # once a fix was joined that was measured so long after a session's end, it has all of its own
 SHOT_SPREAD_MM = 20.0  # fixes of one shot that lie further apart are not of one standing target
 
 
@@ -80,12 +81,14 @@ class SessionKeeper:
         self._aim = aim
         self._commands = threading.Lock()
         self._shot: Shot | None = None
-        self._ended: OpenSession | None = None  # the last one: fixes measured in it may still wait for their joints
         self._places = StandstillPlaces(rig)
         self._prisms = PrismWatch(store, clock, limits or {})
         self._unstored: list[Callable[[], object]] = []  # observations that the store has yet to take, in their order
         self._is_waiting = False
-        self._open = self._reopen()
+        self._late: set[str] = set()  # sessions that got fixes after their end, and must be judged again
+        # Fixes measured in those that have ended may still come, or wait for their joints
+        self._open, self._ended = self._table.unfinished()
+        self._go_on()
 
     # ---- the writer thread -------------------------------------------------------------------------------------------
 
@@ -96,11 +99,15 @@ class SessionKeeper:
                 self._feed_shot(record)
                 self._watch_prism(record)
             elif isinstance(record, DeviceEvent) and record.kind is EventKind.PRESET_JUMP:
-                for session in (self._ended, self._open):
-                    if session is not None and session.lasted(record.stamp):
+                for session in self._taking():
+                    if session.lasted(record.stamp):
                         session.jumped.setdefault(record.device, record.stamp)
-        for joined in self._joiner.feed(records):
-            self._observe(joined)
+        observing = [self._observe(joined) for joined in self._joiner.feed(records)]
+        late = [session.id for session in observing if session is not None and session.until is not None]
+        self._late.update(late)
+        if not late:  # no more of them at present
+            self._unstored += [partial(self._table.judge_again, session_id) for session_id in self._late]
+            self._late.clear()
         if self._unstored:
             self._store_observations()
 
@@ -109,7 +116,7 @@ class SessionKeeper:
         place_mm = position_mm(fix)
         if shot is None or shot.done.done() or place_mm is None or fix.status is not Status.OK:
             return
-        if not within(fix.stamp, shot.aimed, None):
+        if not lies_within(self._store.order, fix.stamp, shot.aimed, None):
             return
         if shot.places_mm and math.dist(place_mm, shot.places_mm[0]) > SHOT_SPREAD_MM:
             shot.fixes.clear()  # the station was still turning to it
@@ -120,17 +127,28 @@ class SessionKeeper:
             shot.done.set_result(None)
 
     def _watch_prism(self, fix: Fix) -> None:
-        for session in (self._ended, self._open):
-            if session is not None and session.lasted(fix.stamp):
+        for session in self._taking():
+            if session.lasted(fix.stamp):
                 event = self._prisms.see(session, fix)
                 if event is not None:
                     self._unstored.append(partial(self._store.insert_records, [event]))
 
-    def _observe(self, joined: JoinedFix) -> None:
-        session = next((s for s in (self._ended, self._open) if s is not None and s.has(joined.stamp)), None)
+    def _taking(self) -> list[OpenSession]:
+        """The sessions that may have measured what comes now, oldest first."""
+        opened = self._open
+        return [*self._ended, *([] if opened is None else [opened])]
+
+    def _observe(self, joined: JoinedFix) -> OpenSession | None:
+        """Make an observation of the session in which a fix was measured, if any; that session."""
+        for ended in list(self._ended):
+            if ended.until is not None and lies_within(
+                self._store.order, joined.stamp, ended.until.shifted(LATE_NS), None
+            ):
+                self._ended.remove(ended)
+        session = next((session for session in self._taking() if session.has(joined.stamp)), None)
         place_mm = position_mm(joined.fix)
         if session is None or place_mm is None:
-            return
+            return None
         standing = joined.standstill is not None
         excluded = self._exclusion(session, joined, place_mm)
         if standing and excluded is None:
@@ -152,6 +170,7 @@ class SessionKeeper:
             "excluded": excluded,
         }
         self._unstored.append(partial(self._table.add_observation, row, joined.fix, joined.stamp))
+        return session
 
     def _store_observations(self) -> None:
         """Store what was observed; while the disk is full it waits, with what comes after it."""
@@ -174,7 +193,7 @@ class SessionKeeper:
         if joined.refused:
             return joined.refused
         for joint in self._rig.joint_names:
-            if joint in session.jumped and within(joined.stamp, session.jumped[joint], None):
+            if joint in session.jumped and lies_within(session.order, joined.stamp, session.jumped[joint], None):
                 return f"{joint} jumped: its readings from then on do not fit those before"
         if session.is_control_point(place_mm):
             return "a control point, not the prism"
@@ -220,7 +239,8 @@ class SessionKeeper:
                 "note": text_argument(arguments, "note"),
             }
             self._table.start(row, now)
-            self._open = session = OpenSession(session_id, setup_id, prism, kind, now, control_points=points)
+            order = self._store.order
+            self._open = session = OpenSession(session_id, setup_id, prism, kind, order, now, control_points=points)
             if self._aim is not None:
                 self._prisms.turned(session, now)
             return {
@@ -392,7 +412,8 @@ class SessionKeeper:
         """End the open session, in the store and then here; what the store refuses leaves it open in both."""
         session = self._needs_open()
         session.until = self._table.end(session.id, state)
-        self._ended, self._open = session, None
+        self._ended.append(session)
+        self._open = None
         return session
 
     def _needs_open(self) -> OpenSession:
@@ -400,25 +421,19 @@ class SessionKeeper:
             raise CommandError("no session is open; start one with `rigcal session start`")
         return self._open
 
-    def _reopen(self) -> OpenSession | None:
-        """The session that was open when an earlier run ended goes on."""
-        open_ones = {row.pop("rig"): row for row in self._table.open()}
-        row = open_ones.pop(self._rig.name, None)
-        for rig, other in open_ones.items():
-            log.warning("session %s of rig %s is open too; it goes on when rigcal runs that rig", other["id"], rig)
-        if row is None:
-            return None
-        session = OpenSession(**row, since=None)
-        log.warning("session %s (prism %s) was open when rigcal last ended; it goes on", session.id, session.prism)
-        if self._aim is not None:
-            self._aim(session.prism)  # what aims may have forgotten; an operator's station has kept its lock
-        session.control_points = self._setups.control_points(session.setup_id)
-        session.jumped = dict.fromkeys(self._table.jumped(session.id))
-        if self._aim is None:
+    def _go_on(self) -> None:
+        """Ready the sessions that an earlier run left to take fixes: of those that ended, what it did not decode."""
+        for session in self._taking():
+            session.control_points = self._setups.control_points(session.setup_id)
+            session.jumped = self._table.jumped(session)
             self._prisms.restore(session)
-        else:
-            self._prisms.turned(session, self._clock.now())
-        return session
+        opened = self._open
+        if opened is None:
+            return
+        log.warning("session %s (prism %s) was open when rigcal last ended; it goes on", opened.id, opened.prism)
+        if self._aim is not None:  # what aims may have forgotten; an operator's station has kept its lock
+            self._aim(opened.prism)
+            self._prisms.turned(opened, self._clock.now())
 
 
 def _after_a_move(session: OpenSession) -> list[str]:

@@ -46,6 +46,17 @@ class Stamp:
         return self.utc_ns - earlier.utc_ns
 
 
+Order = Callable[[Stamp], tuple[int, int]]
+"""Where an instant lies among all others: which boot it belongs to, and its place therein. UTC cannot tell, for a boot
+may show an earlier time than the one before it."""
+
+
+def lies_within(order: Order, stamp: Stamp, since: Stamp | None, until: Stamp | None) -> bool:
+    """Whether `stamp` lies between two instants, the first included; None is without bound."""
+    at = order(stamp)
+    return (since is None or at >= order(since)) and (until is None or at < order(until))
+
+
 class Clock(Protocol):
     """What the program may ask of time."""
 

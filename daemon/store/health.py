@@ -33,6 +33,15 @@ LOW_SHARE = 0.05
 LOW_SHARE_MOST_BYTES = 10 * 2**30
 FINDINGS = 5
 NICE = 15
+RETRY_S = 5.0
+# What keeps a check from being made and says nothing of the store: no descriptors, no memory, a lock, a full disk.
+_HINDRANCES = {
+    sqlite3.SQLITE_CANTOPEN,
+    sqlite3.SQLITE_NOMEM,
+    sqlite3.SQLITE_BUSY,
+    sqlite3.SQLITE_LOCKED,
+    sqlite3.SQLITE_FULL,
+}
 SOUND = "ok"
 
 
@@ -169,20 +178,16 @@ class StoreWatch:
     def _search(self) -> None:
         with contextlib.suppress(OSError):  # this thread alone: acquisition comes first
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
-        try:
-            started = self._store.instant(self._clock.now(), "started_")
-            check_id = self._store.insert("store_checks", started)  # without a result, until there is one
-            findings = self._damage()
-            if findings is None:
+        check = _CheckRow(self._store)
+        check.note(self._clock.now(), "started_")  # without a result, until there is one
+        while (findings := self._damage()) is None:
+            if self._stopping.wait(RETRY_S):
                 return
-            self._findings = findings
-            ended = self._store.instant(self._clock.now(), "ended_")
-            self._store.update("store_checks", {"id": check_id}, {**ended, "result": findings or SOUND})
-        except sqlite3.Error as error:
-            log.error("the store's check is not written down: %s", storage_sentence(self._store.path, error))
+        self._findings = findings
+        check.note(self._clock.now(), "ended_", result=findings or SOUND)
 
     def _damage(self) -> str | None:
-        """What is damaged, "" if nothing is; None when the check was stopped."""
+        """What is damaged, "" if nothing is; None when the check was stopped, or cannot be made at present."""
         try:
             uri = f"{self._store.path.absolute().as_uri()}?mode=ro"
             connection = sqlite3.connect(uri, uri=True, check_same_thread=False)
@@ -191,11 +196,35 @@ class StoreWatch:
                 if self._stopping.is_set():
                     return None
                 found = [str(row[0]) for row in connection.execute(f"PRAGMA quick_check({FINDINGS})")]
+        except MemoryError:
+            return None
         except sqlite3.DatabaseError as error:
-            return None if self._stopping.is_set() else str(error)
+            if self._stopping.is_set() or (error.sqlite_errorcode & 0xFF) in _HINDRANCES:
+                return None
+            return str(error)
         finally:
             self._connection = None
         return "" if found == ["ok"] else "; ".join(" ".join(line.split()) for line in found)
+
+
+class _CheckRow:
+    """A check's row in the store, written as soon as the store takes it: a full disk keeps no check from being made."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._row: dict[str, object] = {}
+        self._id: int | None = None
+
+    def note(self, now: Stamp, prefix: str, **about: str) -> None:
+        """Write down that the check has begun or ended."""
+        try:
+            self._row |= {**self._store.instant(now, prefix), **about}
+            if self._id is None:
+                self._id = self._store.insert("store_checks", self._row)
+            else:
+                self._store.update("store_checks", {"id": self._id}, self._row)
+        except sqlite3.Error as error:
+            log.error("the store's check is not written down: %s", storage_sentence(self._store.path, error))
 
 
 def _space(directory: Path) -> tuple[int | None, bool]:

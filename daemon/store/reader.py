@@ -29,15 +29,13 @@ class Reader:
 
     def __init__(self, path: Path, identity: FileIdentity | None = None) -> None:
         self.path = path
-        if not path.is_file() and identity is not None:
-            raise StoreError(f"{path}: the file is gone that the daemon writes to; `rigcal status` says what to do")
-        if not path.is_file():
-            raise StoreError(f"{path}: there is no store; start the daemon, or give the file with --store")
         if identity is not None and FileIdentity.of(path) != identity:
             raise StoreError(
-                f"{path}: this is not the store that the daemon writes to: the file was replaced while it ran; "
-                "`rigcal status` says what to do"
+                f"{path}: this is not the store that the daemon writes to: the file was replaced or removed while it "
+                "ran; `rigcal status` says what to do"
             )
+        if not path.is_file():
+            raise StoreError(f"{path}: there is no store; start the daemon, or give the file with --store")
         # Never immutable=1: the file changes under a live daemon.
         self._connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
         self._connection.row_factory = sqlite3.Row

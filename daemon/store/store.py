@@ -24,6 +24,7 @@ from daemon.store.errors import StoreError, storage_sentence
 from daemon.store.identity import StoreFiles
 from daemon.store.lock import WriterLock
 from daemon.store.migrations import MIGRATIONS, unknown_migrations
+from daemon.store.reader import Reader
 from daemon.store.rows import (
     EXCERPT_BYTES,
     FIX_COLUMNS,
@@ -171,6 +172,14 @@ class Store:
                 self._channels.clear()
                 raise
 
+    def reader(self) -> Reader:
+        """A read-only view of this very store, for what the writing connection must not wait for.
+
+        Raises:
+            StoreError: its file was replaced, moved or removed.
+        """
+        return Reader(self.path, self.files.database)
+
     def write(self, work: Callable[[Database], T]) -> T:
         """What `work` returns, its changes committed in one transaction."""
         with self.transaction() as db:
@@ -241,6 +250,10 @@ class Store:
                     row = self.insert("boots", booted)
                 self._boots[stamp.boot_id] = row
         return row
+
+    def order(self, stamp: Stamp) -> tuple[int, int]:
+        """Where an instant lies among all that the store knows (`drivers.clock.Order`)."""
+        return self.boot_row(stamp), stamp.monotonic_ns
 
     # ---- runs of the daemon ----------------------------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import resource
 from pathlib import Path
 from typing import Any
 
@@ -615,3 +616,17 @@ def test_any_line_is_progress_or_an_end(line: bytes) -> None:
         assert 0.0 <= message.share <= 1.0
     else:
         assert message.state == ("done" if message.result is not None else "failed")
+
+
+def test_a_daemon_without_a_descriptor_left_uses_up_no_attempt(rig: JobRig) -> None:
+    rig.session("a")
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))
+    try:
+        rig.start()
+        rig.wait_for("interrupted", "queued", "queued", "queued")
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    assert (rig.job(1)["attempts"], rig.job(1)["interruptions"]) == (0, 1)
+    rig.clock.advance(6.0)
+    rig.wait_for("done", "done", "done", "done")

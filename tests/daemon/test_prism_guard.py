@@ -18,6 +18,10 @@ def at(seconds: float) -> Stamp:
     return START.shifted(round(seconds * 1e9))
 
 
+def order(stamp: Stamp) -> tuple[int, int]:
+    return int(stamp.boot_id != START.boot_id), stamp.monotonic_ns
+
+
 @dataclass
 class Watched:
     """A guard, and what it said of the fixes that it was given.
@@ -33,7 +37,7 @@ class Watched:
     events: list[DeviceEvent] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.guard = PrismGuard("station", self.limit, self.words)
+        self.guard = PrismGuard("station", self.limit, self.words, order)
 
     def fixes(
         self, start_s: float, count: int, slope_m: float, step_m: float = 0.0, every_s: float = 0.1
@@ -230,6 +234,20 @@ def test_a_reboot_ends_no_suspicion_and_hides_no_jump() -> None:
     later = Stamp(START.utc_ns + 10**12, 5, "next boot")
     watched.guard.see(Fix("station", later, later, Status.OK, LockState.LOCKED, 0.0, math.pi / 2, 20.0))
     assert watched.guard.doubt(later) is not None
+
+
+def test_a_boot_whose_clock_was_set_back_ends_no_suspicion_and_forgets_no_word() -> None:
+    watched = Watched()
+    watched.fixes(0, 5, 10)
+    assert not any(watched.fixes(0.5, 5, 20))
+    later = Stamp(START.utc_ns - 10**15, 5, "next boot")
+    again = Fix("station", later, later, Status.OK, LockState.LOCKED, 0.0, math.pi / 2, 20.0)
+    watched.guard.see(again)
+    assert watched.guard.doubt(later) is not None
+    assert watched.guard.suspicion is not None
+    watched.say(1)
+    watched.guard.see(again)
+    assert watched.guard.doubt(later) is None
 
 
 def test_shots_of_a_station_that_is_aimed_by_hand_are_judged_by_speed_alone() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+import resource
 import shutil
 import sqlite3
 import subprocess
@@ -20,13 +21,14 @@ from daemon.config import Config
 from daemon.control import CommandError, request
 from daemon.notify import Notifier
 from daemon.service import Daemon
-from daemon.store import Reader, Store, StoreError
+from daemon.store import Reader, Store, StoreError, health
 from daemon.store.health import StoreWatch
 from daemon.store.identity import FileIdentity
 from drivers.clock import ManualClock, SystemClock
 from tests.daemon.acquisition_support import ListLink, wait_until
 from tests.daemon.damage import fill, small_disk, tear
 from tests.daemon.job_support import SOURCE, JobRig
+from tests.daemon.session_support import disk_fails
 from tests.daemon.store_support import at, reading, table
 
 
@@ -135,6 +137,50 @@ def test_a_long_check_ends_at_a_stop(path: Path) -> None:
         assert watch._check is not None
         assert not watch._check.is_alive()
     assert results(path) == [None]
+
+
+def test_a_check_that_lacks_a_descriptor_finds_no_damage_and_is_made_once_there_is_one(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(health, "RETRY_S", 0.05)
+    monkeypatch.setattr(health, "AT_START_S", 0.2)
+    with watched(path, ends_in_order=False):
+        pass
+    with contextlib.closing(Store(path)) as store:
+        store.begin_run(at(0))
+        watch = StoreWatch(store, ManualClock(at(0)))
+        before = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))
+        try:
+            watch.start()
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, before)
+        assert watch.health.state == "checking"
+        assert settled(watch) == "ok"
+    assert results(path) == ["ok"]
+
+
+def test_damage_is_found_although_the_disk_takes_no_row_about_the_check(path: Path) -> None:
+    damaged(path)
+    with contextlib.closing(Store(path)) as store:
+        store.begin_run(at(0))
+        watch = StoreWatch(store, ManualClock(at(0)))
+        with disk_fails():
+            watch.start()
+            assert settled(watch) == "damaged"
+        watch.stop()
+
+
+def test_a_start_that_fails_leaves_the_check_to_the_next(tmp_path: Path) -> None:
+    config = Config(rig="swdt82", state_directory=tmp_path)
+    with watched(config.store_path, ends_in_order=False):
+        pass
+    config.socket_path.mkdir()
+    with pytest.raises(CommandError, match=re.escape(str(config.socket_path))), running(tmp_path):
+        pass
+    with watched(config.store_path) as (_, watch):
+        assert settled(watch) == "ok"
+    assert results(config.store_path) == ["ok"]
 
 
 def test_jobs_wait_while_the_store_cannot_be_trusted(tmp_path: Path) -> None:
@@ -254,7 +300,11 @@ def running(tmp_path: Path) -> Iterator[tuple[Config, Daemon]]:
     rig = SOURCE.rig
     store = Store(config.store_path)
     parts = Parts("live", rig, SOURCE.text, SystemClock(), [ListLink("boom", [])], {}, joiner(config, rig))
-    daemon = Daemon(config, store, parts)
+    try:
+        daemon = Daemon(config, store, parts)
+    except CommandError:
+        store.close()
+        raise
     stop = threading.Event()
     thread = threading.Thread(target=daemon.run, args=(stop, Notifier({})))
     thread.start()
@@ -281,11 +331,34 @@ def test_lists_neither_fail_inside_the_daemon_nor_come_from_another_file_when_th
         assert request(config.socket_path, "session.list") == []
         config.store_path.rename(tmp_path / "aside")
         for command in ("session.list", "jobs.list"):
-            with pytest.raises(CommandError, match=r"^\S+: the file is gone .*; `rigcal status` says what to do$"):
+            with pytest.raises(CommandError, match="replaced or removed while it ran; `rigcal status` says what to do"):
                 request(config.socket_path, command)
         shutil.copy(tmp_path / "aside", config.store_path)
-        with pytest.raises(CommandError, match="the file was replaced while it ran; `rigcal status` says what to do"):
+        with pytest.raises(CommandError, match="replaced or removed while it ran; `rigcal status` says what to do"):
             request(config.socket_path, "session.list")
+
+
+def test_a_store_that_is_gone_hides_neither_its_alarm_nor_anything_else_while_a_session_is_open(tmp_path: Path) -> None:
+    with running(tmp_path) as (config, _):
+        request(config.socket_path, "setup.new", {"id": "S1"})
+        request(config.socket_path, "session.start", {"prism": "r"})
+        config.store_path.rename(tmp_path / "aside")
+        wait_until(lambda: request(config.socket_path, "status")["alarms"]["active"])
+        status = request(config.socket_path, "status")
+        assert [alarm["kind"] for alarm in status["alarms"]["active"]] == ["store_unsound"]
+        assert "replaced or removed" in status["unreadable"]["session"]
+        assert status["acquisition"]["links"][0]["name"] == "boom"
+
+
+def test_sessions_of_a_file_that_took_the_store_s_place_are_not_shown(tmp_path: Path) -> None:
+    with running(tmp_path) as (config, _):
+        request(config.socket_path, "setup.new", {"id": "S1"})
+        request(config.socket_path, "session.start", {"prism": "r"})
+        Store(tmp_path / "another.sqlite").close()
+        (tmp_path / "another.sqlite").rename(config.store_path)
+        for command in ("session.list", "jobs.list"):
+            with pytest.raises(CommandError, match=r"not the store that the daemon writes to.*`rigcal status`"):
+                request(config.socket_path, command)
 
 
 def test_a_damaged_table_hides_nothing_else_from_status(tmp_path: Path) -> None:
