@@ -71,7 +71,18 @@ class PrismWatch:
             self._store.insert_records(events)
         session.words.append(Word(at))
         log.info("session %s: %s", session.id, text)
-        return {"session": session.id, "prism": session.prism, "text": text, "ended": [as_dict(s) for s in ended]}
+        advice = [
+            f"what {suspicion.station} measured before it jumped by {suspicion.distance_m:.2f} m counts too: if it was "
+            "on another prism then, abort the session and hold a new one"
+            for suspicion in ended
+        ]
+        return {
+            "session": session.id,
+            "prism": session.prism,
+            "text": text,
+            "ended": [as_dict(suspicion) for suspicion in ended],
+            "advice": advice,
+        }
 
     def turned(self, session: OpenSession, at: Stamp) -> None:
         """The station was turned to the session's prism by something that knows where that is."""

@@ -118,6 +118,7 @@ class Daemon:
         drift = DriftTable(store, parts.rig.name, parts.clock)
         self._gap = GapStatus(store, parts.rig.name, drift)
         self._servers: list[ControlServer] = []
+        self._unserved: dict[str, str] = {}  # sockets that could not be made, and why
         self._alarms = AlarmBoard(
             AlarmTable(store),
             Gatherer(
@@ -135,12 +136,12 @@ class Daemon:
             parts.clock,
         )
         self._models = ModelRegistry(models, parts.rig.name, self._live_model, compare=self._jobs.compare)
-        self._servers = control_servers(config, self._commands())
+        self._servers, self._unserved = control_servers(config, self._commands())
 
     def _control_faults(self) -> dict[str, str]:
         """Control sockets on which no one can connect, and why."""
         found = {server.path.name: server.trouble() for server in self._servers}
-        return {name: trouble for name, trouble in found.items() if trouble is not None}
+        return self._unserved | {name: trouble for name, trouble in found.items() if trouble is not None}
 
     @property
     def store_health(self) -> StoreHealth:
@@ -202,7 +203,7 @@ class Daemon:
             thread.join(budget.left_s)
             if thread.is_alive():
                 log.error("%s did not end within %g s; it is left behind", _name(stop), STOP_S)
-        if is_store_free and self._acquisition.has_stored_all:
+        if is_store_free and self._acquisition.has_stored_all and not self._store.damage:
             self._end_run()
         log.info("stopped")
 
@@ -254,6 +255,7 @@ class Daemon:
             try:
                 return read()
             except (sqlite3.Error, StoreError) as error:
+                self._store.note_damage(error)
                 unreadable[part] = str(error)
                 return None
 
@@ -325,20 +327,23 @@ def tip_sender(config: Config, parts: Parts, tip: LiveTip) -> TipSender | None:
     return None if link is None else TipSender(tip, config.tip, config.tip.can, link)
 
 
-def control_servers(config: Config, commands: Mapping[str, Handler]) -> list[ControlServer]:
+def control_servers(config: Config, commands: Mapping[str, Handler]) -> tuple[list[ControlServer], dict[str, str]]:
     """Start the control socket, and the one for those who may only look where a group of them is configured.
+
+    Returns:
+        The servers, and the name of a socket that could not be made -> why.
 
     Raises:
         CommandError: the control socket cannot be made.
     """
-    servers = [ControlServer(config.socket_path, commands)]
+    servers, unserved = [ControlServer(config.socket_path, commands)], {}
     if config.read_group is not None:
         path = reading_socket(config.socket_path)
         try:
             servers.append(ControlServer(path, reading_only(commands, config.socket_path), group=config.read_group))
         except CommandError as error:
-            log.error("members of read_group %s cannot look: %s", config.read_group, error)
-    return servers
+            unserved[path.name] = f"members of read_group {config.read_group} cannot look: {error}"
+    return servers, unserved
 
 
 def declare_channels(store: Store, rig: Rig) -> None:

@@ -281,7 +281,12 @@ def session_confirm_prism(operator: str, **where: Any) -> Any:
 
     Fixes count from now on; those that were in doubt before stay excluded.
     """
-    return ask(where, "session.confirm-prism", lambda c, r: say(c, r["text"]), operator=operator)
+
+    def show(console: Console, result: dict[str, Any]) -> None:
+        say(console, result["text"])
+        _advise(console, result["advice"])
+
+    return ask(where, "session.confirm-prism", show, operator=operator)
 
 
 @session.command(cls=Command, name="list")

@@ -44,6 +44,12 @@ def is_unwritable(error: BaseException) -> bool:
     return code is not None and code & 0xFF in _UNWRITABLE  # the low byte; the rest says which read or write it was
 
 
+def is_damage(error: BaseException) -> bool:
+    """True if the file makes no sense where it was read."""
+    code = getattr(error, "sqlite_errorcode", None) if isinstance(error, sqlite3.Error) else None
+    return code is not None and code & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+
+
 def storage_sentence(path: Path, error: sqlite3.Error | OSError) -> str:
     """What the disk or SQLite refused to do with a file, and what to do about it, in one sentence.
 

@@ -1,7 +1,7 @@
 """Whether the store can be trusted: its files are those that were opened, sound, and have room to grow.
 
-A run that ended without order (a power cut, a kill, a full disk) is followed by SQLite's `quick_check`, beside
-acquisition. Files are looked at with every beat of the daemon.
+A run that ended without order (a power cut, a kill, a full disk), or that met with damage, is followed by SQLite's
+`quick_check`, beside acquisition. Files are looked at with every beat of the daemon.
 """
 
 from __future__ import annotations
@@ -139,9 +139,9 @@ class StoreWatch:
                 f"{name}: {found} that rigcal writes to, and what it records now is lost when it stops: move the file "
                 f"back if it was moved; else save it first{self._copies()}, and then restart rigcal"
             )
-        if self._findings:
+        if damage := self._findings or self._store.damage:
             return "damaged", (
-                f"{path}: the store is damaged ({self._findings}); acquisition goes on, jobs do not run, and nothing "
+                f"{path}: the store is damaged ({damage}); acquisition goes on, jobs do not run, and nothing "
                 "that is read from it can be trusted: stop rigcal, keep the file, and restore the store from a backup"
             )
         if self._check is not None and self._check.is_alive():

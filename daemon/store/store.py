@@ -20,7 +20,7 @@ from typing import Any, Literal, TypeVar, cast
 from sqlite_utils import Database
 
 from daemon.store.captures import decode_captures, encode_captures
-from daemon.store.errors import StoreError, storage_sentence
+from daemon.store.errors import StoreError, is_damage, storage_sentence
 from daemon.store.identity import StoreFiles
 from daemon.store.lock import WriterLock
 from daemon.store.migrations import MIGRATIONS, unknown_migrations
@@ -88,6 +88,7 @@ class Store:
         begun: when the run began; None while none has.
         ended_in_order: whether the run before this one did; known once a run has begun, true before and without one.
         files: which files it is made of, as they were when it was opened.
+        damage: what was found damaged while it was used; "" as long as nothing was.
 
     Raises:
         StoreBusyError: another process writes to it.
@@ -127,12 +128,14 @@ class Store:
         self.begun: Stamp | None = None
         self.ended_in_order = True
         self.files = StoreFiles.of(path)
+        self.damage = ""
         log.info("store %s open, SQLite %s", path, sqlite3.sqlite_version)
 
     def _prepare(self, connection: sqlite3.Connection) -> None:
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = FULL")
         connection.execute("PRAGMA foreign_keys = ON")
+        connection.execute("PRAGMA temp_store = MEMORY")  # what a statement may undo needs no file, hence no descriptor
         connection.execute("PRAGMA journal_size_limit = 67108864")  # a WAL grown behind a slow reader shrinks again
         if later := unknown_migrations(self._db):
             raise StoreError(f"{self.path}: made by a newer rigcal (it has {later[0]}); install that version")
@@ -164,7 +167,8 @@ class Store:
             try:
                 with self._db.atomic() as db:
                     yield db
-            except BaseException:
+            except BaseException as error:
+                self.note_damage(error)
                 # Rows that the caches know may have been rolled back.
                 self._boots.clear()
                 self._boot_ids.clear()
@@ -212,9 +216,18 @@ class Store:
     def rows(self, sql: str, parameters: Sequence[object] = ()) -> list[dict[str, Any]]:
         """The rows of a query, on the writing connection: it sees the open transaction's own changes."""
         with self._turn:
-            cursor = self._db.execute(sql, [*map(sql_value, parameters)])
-            names = [column[0] for column in cursor.description]
-            return [dict(zip(names, row, strict=True)) for row in cursor]
+            try:
+                cursor = self._db.execute(sql, [*map(sql_value, parameters)])
+                names = [column[0] for column in cursor.description]
+                return [dict(zip(names, row, strict=True)) for row in cursor]
+            except sqlite3.Error as error:
+                self.note_damage(error)
+                raise
+
+    def note_damage(self, error: BaseException) -> None:
+        """Remember what was raised where the store was used, if it tells that the store is damaged."""
+        if is_damage(error):
+            self.damage = self.damage or str(error)
 
     def _number(self, sql: str, parameters: Sequence[object]) -> int | None:
         """The integer in the first column of a query's first row; None where there is no row."""

@@ -22,6 +22,7 @@ from daemon.config import Config, ConfigError, parse_config
 from daemon.control import CommandError, reading_socket, request
 from daemon.rights import READING
 from daemon.store.reader import Reader
+from tests.daemon.acquisition_support import wait_until
 from tests.daemon.idle_daemon import idle_daemon
 from tests.daemon.model_support import ModelRig
 
@@ -139,13 +140,14 @@ def test_the_reading_socket_is_its_groups_alone(tmp_path: Path) -> None:
         assert (found.st_mode & 0o777, found.st_gid) == (0o660, os.getegid())
 
 
-def test_without_the_group_the_daemon_runs_and_no_one_may_look(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_without_the_group_the_daemon_runs_and_an_alarm_says_that_no_one_may_look(tmp_path: Path) -> None:
     with idle_daemon(tmp_path, read_group="no-such-group") as config:
         assert request(config.socket_path, "setup.list") == []
         assert not reading_socket(config.socket_path).exists()
-    assert "there is no group 'no-such-group'" in caplog.text
+        wait_until(lambda: request(config.socket_path, "status")["alarms"]["active"])
+        (alarm,) = request(config.socket_path, "status")["alarms"]["active"]
+        assert (alarm["kind"], alarm["subject"]) == ("control_dead", "status.sock")
+        assert "there is no group 'no-such-group'" in alarm["text"]
 
 
 def test_a_reading_socket_in_the_control_sockets_place_is_refused(tmp_path: Path) -> None:

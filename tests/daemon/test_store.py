@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
+import resource
 import sqlite3
 import subprocess
 import sys
@@ -471,3 +473,19 @@ def test_a_reader_of_nothing_says_so(tmp_path: Path) -> None:
 def test_a_row_without_an_instant_is_not_taken_for_one() -> None:
     with pytest.raises(ValueError, match="end_utc_ns"):
         stamp_of({"end_utc_ns": None, "end_monotonic_ns": None, "end_boot_id": None}, {}, "end_")
+
+
+def test_records_are_stored_while_the_process_has_no_descriptor_left(path: Path) -> None:
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with contextlib.closing(Store(path)) as store:
+        store.begin_run(at(0))
+        store.declare_channels({"theta1": "deg"}, {})
+        store.insert_records([reading("theta1", n, 1.0) for n in range(20_000)])
+        resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))
+        try:
+            with store.transaction():  # what one step of it may undo is more than SQLite holds in memory by itself
+                store.insert_records([reading("theta1", n + 0.5, 2.0) for n in range(0, 20_000, 20)])
+            store.end_run(at(20_000))
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    assert sum(row["value"] == 2.0 for row in table(path, "joint_samples")) == 1000

@@ -371,3 +371,22 @@ def test_a_damaged_table_hides_nothing_else_from_status(tmp_path: Path) -> None:
         assert status["acquisition"]["links"][0]["name"] == "boom"
         shown = CliRunner().invoke(main, ["status", "--socket", str(config.socket_path)])
         assert "events: cannot be read from the store" in shown.output
+
+
+def test_damage_that_is_met_after_an_orderly_end_is_an_alarm_holds_jobs_and_is_searched_for_at_the_next_start(
+    tmp_path: Path,
+) -> None:
+    with running(tmp_path) as (config, _):
+        pass
+    tear(config.store_path, "device_events")
+    with running(tmp_path) as (config, daemon):
+        assert "malformed" in request(config.socket_path, "status")["unreadable"]["events"]
+        wait_until(lambda: request(config.socket_path, "status")["alarms"]["active"])
+        status = request(config.socket_path, "status")
+        assert status["store_health"]["state"] == "damaged"
+        assert "restore the store from a backup" in status["store_health"]["text"]
+        assert [alarm["kind"] for alarm in status["alarms"]["active"]] == ["store_unsound"]
+        assert daemon._are_jobs_held()
+    with running(tmp_path) as (config, _):
+        wait_until(lambda: request(config.socket_path, "status")["store_health"]["state"] == "damaged")
+    assert any(result not in (None, "ok") for result in results(config.store_path))

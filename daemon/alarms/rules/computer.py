@@ -36,10 +36,18 @@ def clock_behind(evidence: Evidence) -> Iterator[Finding]:
         yield "clock", f"the computer's clock stands at an earlier time than {last}, when rigcal last ran"
 
 
+@rule("warning", "Look what else the computer does; nothing is lost, and it stops by itself.", after_s=60.0, hold_s=5.0)
+def decoding_behind(evidence: Evidence) -> Iterator[Finding]:
+    """Captures have waited in the store to be decoded for a minute, as after a kill, or where the computer is too slow:
+    readings and fixes come late, and no job is started."""
+    if evidence.acquisition.is_behind:
+        yield "decoding", "captures wait to be decoded: readings and fixes come late, and jobs wait"
+
+
 @rule("critical", "Put right what the text says; if the alarm stays, restart rigcal: `systemctl restart rigcal`.")
 def control_dead(evidence: Evidence) -> Iterator[Finding]:
-    """No one can connect to a control socket of the daemon's: its file was replaced, or the computer lacks descriptors.
-    Cleared when commands are taken again."""
+    """No one can connect to a control socket of the daemon's: its file was replaced or cannot be made, or the computer
+    lacks descriptors. Cleared when commands are taken again."""
     yield from evidence.control_faults.items()
 
 

@@ -67,6 +67,7 @@ def known(
     decoding: Sequence[DecodeStatus] = (),
     frames_s: Sequence[float] = (0.1,),
     error: str | None = None,
+    is_behind: bool = False,
     **more: Any,
 ) -> Evidence:
     acquisition = AcquisitionStatus(
@@ -77,6 +78,7 @@ def known(
         decoding=[*decoding],
         frames=[FrameStatus("boom", f"{i:03X}", "", 5, None, age_s, None) for i, age_s in enumerate(frames_s)],
         error=error,
+        is_behind=is_behind,
     )
     return Evidence(NOW, **{"running_s": 1000.0, "acquisition": acquisition, **more})
 
@@ -257,6 +259,7 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
             known(event(E.PRISM_JUMP, "station"), session=SESSION),
         )
     ],
+    "decoding_behind": [(known(is_behind=True), ["decoding"], known())],
     "not_storing": [(known(error="disk full"), ["store"], known())],
     "store_unsound": [(known(store=StoreEvidence("the file is gone")), ["store"], known())],
     "disk_nearly_full": [
