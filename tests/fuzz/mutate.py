@@ -195,7 +195,7 @@ def _changed_json(rng: random.Random, data: bytes) -> bytes:
     if not holders or rng.random() < 0.03:
         document = value(rng)
     else:
-        _change_one(rng, rng.choice(holders))
+        _change_one(rng, rng.choice(holders), SIZE_MAX // (len(data) + 1) + 1)
     if rng.random() < 0.02:
         return b"[" * rng.choice((100, 5000, 100_000)) + data
     try:
@@ -204,7 +204,8 @@ def _changed_json(rng: random.Random, data: bytes) -> bytes:
         return data
 
 
-def _change_one(rng: random.Random, holder: Any) -> None:
+def _change_one(rng: random.Random, holder: Any, most: int) -> None:
+    """Change one value; none is there more than `most` times afterwards."""
     keys = list(holder) if isinstance(holder, dict) else list(range(len(holder)))
     key, other = rng.choice(keys), rng.choice(keys)
     match rng.randrange(7):
@@ -213,7 +214,7 @@ def _change_one(rng: random.Random, holder: Any) -> None:
         case 1:
             holder[key] = holder[other]
         case 2 if isinstance(holder, list):
-            holder += holder[: 10_000 // len(holder)] * rng.choice((1, 2, 5))
+            holder += holder[:1000] * min(most, rng.choice((1, 2, 50, 10_000)))
         case 3:
             for _ in range(rng.choice((1, 3, 900))):
                 holder[key] = [holder[key]]
