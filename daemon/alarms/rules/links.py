@@ -46,7 +46,11 @@ def queue_full(evidence: Evidence) -> Iterator[Finding]:
             yield link.name, "captures are being lost: the queue to the store is full"
 
 
-@rule("warning", "Look what else the computer does; the gaps in `rigcal status` tell what is missing.")
+@rule(
+    "warning",
+    "Look what else the computer does, or at the cable and bit rate of an adapter whose lines are no frames; the gaps "
+    "in `rigcal status` tell what is missing.",
+)
 def frames_lost(evidence: Evidence) -> Iterator[Finding]:
     """The kernel, an adapter or a full queue has lost frames of a link within the last 5 minutes."""
     for event in evidence.lately(EventKind.FRAMES_DROPPED, LATELY_S):
