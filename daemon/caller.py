@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import pwd
+import select
 import socket
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from dataclasses import dataclass
 
@@ -32,6 +33,7 @@ class Caller:
 
 
 _current: ContextVar[Caller | None] = ContextVar("caller", default=None)
+_has_left: ContextVar[Callable[[], bool]] = ContextVar("has_left", default=lambda: False)
 
 
 def current_caller() -> Caller | None:
@@ -46,14 +48,27 @@ def caller_columns(prefix: str = "") -> dict[str, str | int | None]:
     return {f"{prefix}caller_user": user, f"{prefix}caller_uid": uid, f"{prefix}caller_pid": pid}
 
 
+def caller_has_left() -> bool:
+    """Return whether nobody waits any more for the command that this thread carries out (Ctrl-C, a lost terminal)."""
+    return _has_left.get()()
+
+
 @contextlib.contextmanager
-def acting_for(caller: Caller) -> Iterator[None]:
-    """Make `caller` the current one of this thread."""
-    token = _current.set(caller)
+def acting_for(caller: Caller, has_left: Callable[[], bool] = lambda: False) -> Iterator[None]:
+    """Make `caller` the current one of this thread; `has_left` tells when it no longer waits for the answer."""
+    token, left_token = _current.set(caller), _has_left.set(has_left)
     try:
         yield
     finally:
         _current.reset(token)
+        _has_left.reset(left_token)
+
+
+def is_closed_by_peer(connection: socket.socket) -> bool:
+    """Return whether the other end of a unix socket is closed; one that has only ended its requests still listens."""
+    poll = select.poll()
+    poll.register(connection, 0)  # POLLHUP is always reported
+    return any(state & select.POLLHUP for _, state in poll.poll(0))
 
 
 def peer_of(connection: socket.socket) -> Caller:

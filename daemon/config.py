@@ -234,7 +234,7 @@ def parse_config(text: str, source: Path) -> Config:
     longest = max(sockets, key=lambda path: len(os.fsencode(path)))
     if len(os.fsencode(longest)) > MAX_SOCKET_PATH_BYTES:
         raise ConfigError(
-            f"{source}: socket: {longest} is longer than the {MAX_SOCKET_PATH_BYTES} bytes a unix socket's "
+            f"{source}: socket: {longest!s:.200} is longer than the {MAX_SOCKET_PATH_BYTES} bytes a unix socket's "
             "path may have; set `socket` to a shorter one"
         )
     return config

@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 MAX_LINE_BYTES = 1 << 20
 MAX_ERROR_CHARACTERS = 2000
 MAX_DEPTH = 20  # of lists and objects in a request; those of our commands have four at most
-MAX_DIGITS = 19  # of whole numbers, which the store keeps in 64 bits
+MAX_WHOLE = 2**63 - 1  # the store keeps whole numbers in 64 bits
 FAILED, WRONG_USE, REFUSED = 1, 2, 3
 
 
@@ -86,9 +86,9 @@ def _finite(text: str) -> float:
 
 
 def _whole(text: str) -> int:
-    if len(text.lstrip("-")) >= MAX_DIGITS:
-        raise CommandError(f"a request's whole numbers have less than {MAX_DIGITS} digits, not {len(text)}")
-    return int(text)
+    if len(text) <= len(str(-MAX_WHOLE)) and -MAX_WHOLE - 1 <= (value := int(text)) <= MAX_WHOLE:
+        return value
+    raise CommandError(f"a request's whole numbers have 64 bits, which {text:.20} has not")
 
 
 def _check_values(request: object) -> None:

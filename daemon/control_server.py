@@ -13,11 +13,11 @@ import logging
 import os
 import socket
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from daemon.caller import Caller, acting_for, peer_of
+from daemon.caller import Caller, acting_for, is_closed_by_peer, peer_of
 from daemon.control import (
     FAILED,
     MAX_LINE_BYTES,
@@ -253,7 +253,7 @@ class ControlServer:
             with client.connection:
                 caller = peer_of(client.connection)
                 while (line := self._next_line(client)) is not None:
-                    answer = self._answer(line, caller)
+                    answer = self._answer(line, caller, lambda: is_closed_by_peer(client.connection))
                     client.connection.settimeout(self._limits.send_s)
                     client.connection.sendall(answer)
                     if len(line) > MAX_LINE_BYTES:
@@ -297,7 +297,7 @@ class ControlServer:
         client.received = bytearray(rest)
         return line
 
-    def _answer(self, line: bytes, caller: Caller) -> bytes:
+    def _answer(self, line: bytes, caller: Caller, has_left: Callable[[], bool]) -> bytes:
         command: str | None = None
         try:
             command, arguments = parse_request(line)
@@ -306,11 +306,12 @@ class ControlServer:
                 raise CommandError(f"unknown command {command!r:.80}; known: {', '.join(sorted(self._handlers))}")
             if command not in READING:
                 log.info("%s, asked for by %s", command, caller)
-            with acting_for(caller):
+            with acting_for(caller, has_left):
                 return answer_line(handler(arguments))
         except CommandError as error:
             return refusal_line(str(error), error.status)
         except StoreError as error:
+            log.error("command %s: %s", command, error)
             return refusal_line(str(error), FAILED)
         except Exception as error:  # a fault in one command must not end the daemon
             if is_unwritable(error):

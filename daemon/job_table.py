@@ -317,7 +317,8 @@ class JobTable:
             if outcome.state in {"failed", "cancelled"}:
                 for waiting in self._chain(job_id)[1:]:
                     if waiting["state"] in {"queued", "interrupted"}:
-                        error = f"job {job_id} before it is {outcome.state}"
+                        why = "has failed" if outcome.state == "failed" else "was cancelled"
+                        error = f"it needs job {job_id}, which {why}"
                         self._set(waiting["id"], state="cancelled", error=error, **ended)
             return outcome
 

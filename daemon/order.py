@@ -99,8 +99,8 @@ def parse_message(line: bytes) -> Progress | Outcome:
     except (ValueError, RecursionError):
         message = None
     match message:
-        case {"progress": float() | int() as share, "message": str() as text} if math.isfinite(share):
-            return Progress(min(max(float(share), 0.0), 1.0), text)
+        case {"progress": float() | int() as share, "message": str() as text} if -math.inf < share < math.inf:
+            return Progress(float(min(max(share, 0), 1)), text)
         case {"result": dict() as result}:
             return Outcome("done", result=result)
         case {"error": str() as error}:

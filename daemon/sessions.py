@@ -18,7 +18,7 @@ from typing import Any
 
 from calibration.rig import Rig
 from daemon.arguments import identifier, text_argument
-from daemon.caller import caller_columns
+from daemon.caller import caller_columns, caller_has_left
 from daemon.config import SessionsSection
 from daemon.control import FAILED, CommandError
 from daemon.joiner import JoinedFix, ObservationJoiner
@@ -39,6 +39,7 @@ log = logging.getLogger(__name__)
 
 STANDING_KINDS = ("static_poses", CHECK)
 CHECK_POSES = (3, 5)
+_LOOK_S = 0.5  # how often a shot looks whether anyone still waits for it
 LATE_NS = 60 * NS_PER_S  # once a fix was joined that was measured so long after a session's end, it has all of its own
 SHOT_SPREAD_MM = 20.0  # fixes of one shot that lie further apart are not of one standing target
 
@@ -349,10 +350,20 @@ class SessionKeeper:
     # ---- parts -------------------------------------------------------------------------------------------------------
 
     def _await(self, shot: Shot) -> None:
-        """Wait until the shot is complete; the time-out runs on the clock of the rig."""
+        """Wait until the shot is complete; the time-out runs on the clock of the rig.
+
+        An operator who gives up turns the station back to the prism: a shot that nobody waits for ends at once.
+        """
         arrived = threading.Event()
         shot.done.add_done_callback(lambda _: arrived.set())
-        if not self._clock.wait(arrived, self._settings.shot_timeout_s):
+        left_s, is_complete = self._settings.shot_timeout_s, False
+        while left_s > 0 and not is_complete:
+            is_complete = self._clock.wait(arrived, min(left_s, _LOOK_S))
+            left_s -= _LOOK_S
+            if caller_has_left():
+                log.info("a shot of a control point was given up: nobody waits for it any more")
+                raise CommandError("the shot was given up, and nothing was stored", FAILED)
+        if not is_complete:
             raise CommandError(
                 f"{len(shot.fixes)} of {shot.wanted} good fixes within {self._settings.shot_timeout_s:g} s; is the "
                 "station aimed at the control point, and locked? `rigcal status` shows",
@@ -365,10 +376,15 @@ class SessionKeeper:
         shot = self._table.shot(session.id, phase)
         advice = []
         missing = [name for name in points if name not in shot]
-        if missing or not points:
-            names = ", ".join(missing) if missing else "at least one"
-            how = " (`rigcal session shoot NAME`)" if phase == "start" else ""
-            advice.append(f"control points not shot at the session's {phase}: {names}{how}")
+        if phase == "start" and (missing or not points):
+            which = f"the control points {', '.join(missing)}" if missing else "a control point"
+            advice.append(
+                f"shoot {which} before the first pose (`rigcal session shoot NAME`), and again before the end"
+            )
+        elif missing or not points:
+            advice.append(
+                f"control points not shot at the session's end: {', '.join(missing) or 'none was shot at all'}"
+            )
         advice += [
             f"{joint} jumped during the session, and nothing after that is used: if its encoder was preset, start anew"
             for joint in self._rig.joint_names

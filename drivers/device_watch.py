@@ -44,7 +44,7 @@ class DeviceWatch(ABC):
     """Waits for a device that may come back; see `watch_path` and `watch_interface`.
 
     It watches from the first `wait` until `close`, so that nothing is missed between two attempts to open the device.
-    What happens before the first wait is found by the attempt after it. One thread uses a watch.
+    What happens before the first wait is found by the attempt after it, so that one is short. One thread uses a watch.
     """
 
     def __init__(self) -> None:
@@ -63,6 +63,7 @@ class DeviceWatch(ABC):
         if self._descriptor is None:
             with contextlib.suppress(OSError):  # no descriptors left, or the kernel has no such thing: time must do
                 self._descriptor = self._open()
+                timeout_s = min(timeout_s, SETTLE_S)  # it may have come back before it was watched
         self._renew()
         deadline = time.monotonic() + timeout_s
         while not stop.is_set() and (left_s := deadline - time.monotonic()) > 0:

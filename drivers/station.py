@@ -174,6 +174,7 @@ class StationLink:
         self.name = config.name
         self._config = config
         self._clock = clock
+        self._attended = clock.now()  # the last time that the port was read
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Listen and talk until `stop` is set.
@@ -197,10 +198,12 @@ class StationLink:
                     if down_since is not None:
                         emit(Gap(self.name, GapReason.LINK_DOWN, down_since, self._clock.now()))
                     down_since, told, opened = None, "", self._clock.now()
+                    self._attended = opened
                     self._converse(port, emit, stop)
             except LinkError as error:
                 if down_since is None:
-                    down_since = self._clock.now()
+                    # What came since the last read is lost with the device, however long ago that was.
+                    down_since = self._clock.now() if opened is None else self._attended
                     emit(Gap(self.name, GapReason.LINK_DOWN, down_since))
                 if str(error) != told:  # once a cause, not once an attempt
                     told = str(error)
@@ -230,7 +233,7 @@ class StationLink:
             wait_s = _LONGEST_READ_S if conversation is None else self._speak(port, conversation, emit)
             patience_s = self._clock.real_seconds(wait_s)
             data = port.read(patience_s)
-            stamp = self._clock.now()
+            self._attended = stamp = self._clock.now()
             if attendance.is_late(stamp, patience_s):
                 stamp = stamp.doubted()
                 doubts.doubt(len(data), NOT_READ_IN_TIME)

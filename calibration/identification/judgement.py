@@ -77,8 +77,8 @@ def require_enough(rig: Rig, observations: Observations, different: int | None =
 def _how_many(parameters: int) -> str:
     """How many fixes to measure: a sentence's last clause, the same wherever there are too few."""
     return (
-        f"measure {_GOOD * parameters} or more in poses all over the work volume ({math.ceil(parameters / 3)} are the "
-        "least that are taken)"
+        f"measure {_GOOD * parameters} or more in different poses all over the work volume (fewer than "
+        f"{math.ceil(parameters / 3)} are refused)"
     )
 
 

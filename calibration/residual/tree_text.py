@@ -83,7 +83,7 @@ def read_trees(text: bytes, features: int) -> tuple[Tree, ...]:
     header = _settings(lines[1 : starts[0] if starts else end])
     for name, value in _HEADER.items():
         if header.get(name) != value:
-            raise ValueError(f"the trees have {name} {header.get(name)!r}, which is not read; only {value!r} is")
+            raise ValueError(f"the trees have {name} {header.get(name)!r:.60}, which is not read; only {value!r} is")
     if "average_output" in lines[1:end]:
         raise ValueError("the trees are a random forest, which is not read")
     if header.get("max_feature_idx") != str(features - 1):

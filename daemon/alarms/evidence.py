@@ -120,6 +120,11 @@ class Evidence:
     untrained_sessions: Mapping[str, str] = field(default_factory=dict)
     unwatched: Mapping[str, str] = field(default_factory=dict)
 
+    @property
+    def is_storing(self) -> bool:
+        """Whether captures are stored, and so decoded: until they are, every device looks silent and may not be."""
+        return self.acquisition.error is None
+
     def standing(self, kind: EventKind, *ended_by: EventKind) -> list[EventStatus]:
         """Events of a kind that their device has not taken back: by a later one of `ended_by`, or by code 0."""
         last = {(event.device, event.kind): event.number for event in self.acquisition.last_events}

@@ -14,7 +14,7 @@ def gap_lines(gap: Mapping[str, Any]) -> Iterator[str]:
     """The newest verdict with what to measure next, and how the live model holds against its checks."""
     found, failed, drift = gap["verdict"], gap["failed"], gap["drift"]
     if failed is not None:
-        yield f"gap: nothing came of session {failed['session']} (job {failed['job']}): {failed['error']}"
+        yield f"gap: the job of session {failed['session']} failed (job {failed['job']}): {failed['error']}"
     if found is not None:
         yield f"gap ({found['verdict']}, after session {found['session']}): {found['sentence']}"
         for text in found["experiments"][:_EXPERIMENTS_SHOWN]:

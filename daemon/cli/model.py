@@ -34,7 +34,10 @@ def model_list(**where: Any) -> Any:
     """All models, with how they compared with the live one on check sessions."""
 
     def show(console: Console, models: list[dict[str, Any]]) -> None:
-        table = Table("model", "state", "stage", "made (UTC)", "sessions", "comparison")
+        if not models:
+            say(console, "no models yet; the jobs of a closed session make them (`rigcal jobs list`)")
+            return
+        table = Table("model", "state", "stage", "made", "sessions", "comparison")
         for m in models:
             compared = m["comparison"]
             verdict = compared["sentence"] if compared else "not compared yet"

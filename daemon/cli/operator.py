@@ -20,6 +20,7 @@ from daemon.cli.status_lines import alarm_line, cleared_line, decoding_lines, ga
 from daemon.cli.talk import ask, say, talks, utc, who
 from daemon.cli.terminal import coloured, echo
 from daemon.config import read_config
+from daemon.plain_text import shown
 from daemon.present_state import duration
 from daemon.scheduler import SESSION_KINDS
 
@@ -183,6 +184,9 @@ def setup_list(**where: Any) -> Any:
     """All set-ups with their control points."""
 
     def show(console: Console, setups: list[dict[str, Any]]) -> None:
+        if not setups:
+            say(console, "no set-ups yet; describe one with `rigcal setup new`")
+            return
         table = Table("set-up", "instrument", "state", "tilt arcsec", "ppm", "control points")
         for s in setups:
             points = ", ".join(p["name"] for p in s["control_points"])
@@ -264,6 +268,8 @@ def session_shoot(point: str, **where: Any) -> Any:
         console.print(f"{result['point']}: misclosure {result['misclosure_mm']:.1f} mm, {verdict}", style=style)
         _advise(console, result["advice"])
 
+    if not where["as_json"]:
+        click.echo(f"measuring {shown(point)}: keep the station on it; Ctrl-C gives up", err=True)
     return ask(where, "session.shoot", show, timeout_s=SHOT_TIMEOUT_S, point=point)
 
 
@@ -289,6 +295,9 @@ def session_list(**where: Any) -> Any:
     """All sessions."""
 
     def show(console: Console, sessions: list[dict[str, Any]]) -> None:
+        if not sessions:
+            say(console, "no sessions yet; `rigcal session start` opens one")
+            return
         table = Table("session", "kind", "prism", "set-up", "state", "poses", "observations", "operator")
         for s in sessions:
             counts = (str(s["poses"]), str(s["observations"]))
@@ -339,19 +348,21 @@ def _show_session(console: Console, session: dict[str, Any]) -> None:
     for reason, n in session["excluded"].items():
         say(console, f"  {n} excluded: {reason}")
     for suspicion in session.get("prism_suspicions", ()):
-        console.print(f"  since {utc(suspicion['since_utc_ns'])}", end=" ", style="red")
-        say(console, f"{suspicion['text']}; its fixes do not count: {suspicion['remedy']}")
+        what = f"{suspicion['text']}; its fixes do not count: {suspicion['remedy']}"
+        console.print(Text.assemble((f"  since {utc(suspicion['since_utc_ns'])} ", "red"), shown(what)))
     for shot in session["control_shots"]:
         size = "defined" if shot["misclosure_mm"] is None else f"misclosure {shot['misclosure_mm']:.1f} mm"
         say(console, f"  control point {shot['point']} at the {shot['phase']}: {size}")
+    if session["state"] == "open" and not session["control_shots"]:
+        say(console, "  no control point has been shot yet: `rigcal session shoot NAME`, now and again before the end")
     for step in session["clock_steps"]:
         back = "back" if step["step_s"] < 0 else "forward"
         say(console, f"  {utc(step['at_utc_ns'])}: the computer's clock was set {back} by {abs(step['step_s']):.1f} s")
     if session["setup_moved"]:
         console.print("  the station has moved since this set-up was described", style="red")
     if session["not_used"] is not None:
-        console.print("  calibration does not use this session:", end=" ", style="red")
-        say(console, f"{session['not_used']}; to use it anyway: `rigcal session accept {session['id']}`")
+        why = f"{session['not_used']}; to use it anyway: `rigcal session accept {session['id']}`"
+        console.print(Text.assemble(("  calibration does not use this session: ", "red"), shown(why)))
     if session["accepted"] is not None:
         accepted = session["accepted"]
         by = who(accepted["by"], accepted["user"]) or "an operator"
@@ -402,9 +413,11 @@ def jobs_retry(number: int, **where: Any) -> Any:
 
 
 def _job_line(job: dict[str, Any]) -> str:
+    name = f"job {job['id']} {job['kind']}" + (f" of {job['session_id']}" if job.get("session_id") else "")
     if job["state"] == "running":
-        return f"job {job['id']} {job['kind']}: running, {100 * job['progress']:.0f} %, {job['message'] or 'starting'}"
-    return f"job {job['id']} {job['kind']}: {job['state']}" + (f", {job['error']}" if job["error"] else "")
+        return f"{name}: running, {100 * job['progress']:.0f} %, {job['message'] or 'starting'}"
+    more = job["error"] or (job.get("result") or {}).get("report")
+    return f"{name}: {job['state']}" + (f", {more}" if more else "")
 
 
 @click.group()

@@ -63,4 +63,4 @@ def who(operator: str, user: str | None) -> str:
 
 def utc(utc_ns: int) -> str:
     """An instant for people."""
-    return datetime.fromtimestamp(utc_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S")
+    return datetime.fromtimestamp(utc_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

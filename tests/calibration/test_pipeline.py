@@ -220,7 +220,7 @@ def test_data_that_would_give_a_wrong_model_are_refused(session: Session, change
 def test_repeats_do_not_count_as_poses(session: Session) -> None:
     repeated = joined(*[session.training.select(np.arange(10))] * 4)
     with pytest.raises(
-        UnsafeError, match=r"10 different fixes, repeats counted once of 40, .*\(19 are the least that are taken\)"
+        UnsafeError, match=r"10 different fixes, repeats counted once of 40, .*\(fewer than 19 are refused\)"
     ):
         identify(session.rig, TEXT, repeated)
 

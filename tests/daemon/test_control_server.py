@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from daemon.caller import caller_has_left
 from daemon.control import CommandError, reading_socket, request
 from daemon.control_server import ControlServer, Limits
 from daemon.notify import Notifier
@@ -181,6 +182,31 @@ def test_a_command_may_take_longer_than_a_client_may_wait(tmp_path: Path) -> Non
 
     with serving(tmp_path / "s", {"shoot": shoot}, idle_s=0.1, line_s=0.1, send_s=0.1):
         assert request(tmp_path / "s", "shoot") == "shot"
+
+
+def test_a_command_knows_when_nobody_waits_for_its_answer_any_more(tmp_path: Path) -> None:
+    began, ended = threading.Event(), threading.Event()
+
+    def shoot(_arguments: Mapping[str, Any]) -> str:
+        began.set()
+        wait("the client to leave", caller_has_left)
+        ended.set()
+        return "shot"
+
+    with serving(tmp_path / "s", {"shoot": shoot}):
+        with connected(tmp_path / "s", b'{"command": "shoot"}\n'):
+            assert began.wait(DEADLINE_S)
+        assert ended.wait(DEADLINE_S)
+
+
+def test_a_client_that_has_no_more_to_say_still_waits_for_its_answer(tmp_path: Path) -> None:
+    with (
+        serving(tmp_path / "s", {"shoot": lambda _: caller_has_left()}),
+        connected(tmp_path / "s", b'{"command": "shoot"}\n') as client,
+        client.makefile("rb") as stream,
+    ):
+        client.shutdown(socket.SHUT_WR)
+        assert json.loads(stream.readline())["result"] is False
 
 
 def test_requests_that_come_together_are_answered_in_order(tmp_path: Path) -> None:

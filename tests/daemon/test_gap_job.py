@@ -256,7 +256,7 @@ def test_status_says_why_nothing_came_of_the_newest_session_until_something_does
     rig.plan(gap="fail")
     rig.start()
     rig.wait(lambda: rig.states() == ["failed", *["cancelled"] * 3])
-    assert lines(rig) == ["gap: nothing came of session a (job 1): the data are too poor"]
+    assert lines(rig) == ["gap: the job of session a failed (job 1): the data are too poor"]
     rig.plan()
     rig.session("b")
     rig.clock.advance(3.0)

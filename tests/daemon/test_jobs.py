@@ -94,7 +94,7 @@ def test_data_that_determine_nothing_fail_in_a_sentence_whatever_lies_in_the_cur
     rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
     first, *waiting = rig.jobs()
     assert "sessions a" in first["error"]
-    assert [job["error"] for job in waiting] == ["job 1 before it is failed"] * 3
+    assert [job["error"] for job in waiting] == ["it needs job 1, which has failed"] * 3
     assert first["result_json"] is None
     assert rig.store.rows("SELECT * FROM models") == []
 
@@ -115,7 +115,11 @@ def test_a_failed_job_cancels_those_that_wait_for_it_and_says_why(rig: JobRig) -
     rig.plan(residual="fail")
     rig.start()
     rig.wait_for("done", "failed", "cancelled", "cancelled")
-    assert [job["error"] for job in rig.jobs()] == [None, "the data are too poor", *["job 2 before it is failed"] * 2]
+    assert [job["error"] for job in rig.jobs()] == [
+        None,
+        "the data are too poor",
+        *["it needs job 2, which has failed"] * 2,
+    ]
     assert {job["message"] for job in rig.jobs()} == {""}, "what an ended job was doing is no news"
 
 
@@ -207,7 +211,10 @@ def test_a_running_job_is_cancelled_with_its_process_and_those_that_wait(rig: Jo
     assert runner.cancel_command({"id": 1}) == "job 1 (gap) is being cancelled"
     rig.wait_for("cancelled", "cancelled", "cancelled", "cancelled")
     assert is_gone(job["pid"])
-    assert [j["error"] for j in rig.jobs()] == ["cancelled by the operator", *["job 1 before it is cancelled"] * 3]
+    assert [j["error"] for j in rig.jobs()] == [
+        "cancelled by the operator",
+        *["it needs job 1, which was cancelled"] * 3,
+    ]
 
 
 def test_a_queued_job_is_cancelled_and_the_one_before_it_runs_on(rig: JobRig) -> None:
@@ -217,7 +224,7 @@ def test_a_queued_job_is_cancelled_and_the_one_before_it_runs_on(rig: JobRig) ->
     rig.running(1)
     assert runner.cancel_command({"id": 2}) == "job 2 (residual) is cancelled"
     assert rig.states() == ["running", "cancelled", "cancelled", "cancelled"]
-    assert rig.job(3)["error"] == "job 2 before it is cancelled"
+    assert rig.job(3)["error"] == "it needs job 2, which was cancelled"
     runner.cancel_command({"id": 1})
     rig.wait_for("cancelled", "cancelled", "cancelled", "cancelled")
     assert rig.job(2)["error"] == "cancelled by the operator"
@@ -587,6 +594,7 @@ def test_looking_for_work_stays_cheap_after_years(rig: JobRig) -> None:
     [
         (b'{"progress": 1, "message": "x"}\n', Progress(1.0, "x")),
         (b'{"progress": 1.0000001, "message": "x"}\n', Progress(1.0, "x")),
+        (b'{"progress": 1%b, "message": "x"}\n' % (b"0" * 400), Progress(1.0, "x")),
         (b'{"result": {"model": null}}\n', Outcome("done", result={"model": None})),
         (b'{"error": "too poor"}\n', Outcome("failed", "too poor")),
     ],

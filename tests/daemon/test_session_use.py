@@ -264,8 +264,10 @@ def test_people_are_told_that_a_session_is_not_used_and_what_to_type(rig: Rig, t
         return " ".join(result.output.split())
 
     try:
+        assert "no sessions yet" in rigcal("session", "list")
         rig.say("start", prism="r")
         rig.live(2)
+        assert "no control point has been shot yet: `rigcal session shoot NAME`" in rigcal("session", "show", "s001-r")
         for text in (rigcal("session", "stop"), rigcal("session", "show", "s001-r")):
             assert "calibration does not use this session: no control point was shot" in text
             assert "`rigcal session accept s001-r`" in text

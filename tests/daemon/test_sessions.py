@@ -1,4 +1,5 @@
 import math
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import pytest
 from calibration.observations import parse_observations
 from daemon.config import SessionsSection
 from daemon.control import CommandError
+from daemon.control_server import ControlServer
 from daemon.session_data import sessions_csv, setup_lines
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S, Stamp
@@ -256,6 +258,26 @@ def test_a_control_point_that_is_not_there_is_told(rig: Rig) -> None:
         rig.say("shoot", point="r")
 
 
+def test_a_shot_that_the_operator_gave_up_measures_nothing(rig: Rig, tmp_path: Path) -> None:
+    """Who gives up turns the station back to the prism, whose fixes were then taken for the control point."""
+    start(rig)
+    rig.keeper._settings = SessionsSection(fixes_per_shot=40)
+    server = ControlServer(tmp_path / "socket", {"session.shoot": rig.keeper.shoot_command})
+    try:
+        with socket.socket(socket.AF_UNIX) as operator:
+            operator.connect(str(tmp_path / "socket"))
+            operator.sendall(b'{"command": "session.shoot", "arguments": {"point": "cp1"}}\n')
+            while rig.keeper._shot is None:
+                rig.live(STEP_S)
+        while rig.keeper._shot is not None:
+            rig.live(STEP_S)
+    finally:
+        server.close()
+    assert rig.say("setup_list")[0]["control_points"] == []
+    rig.live(2)
+    assert rig.say("stop")["control_shots"] == []
+
+
 def test_where_something_can_aim_it_is_told_to(rig: Rig) -> None:
     rig.keeper = rig.new_keeper(aim=rig.aimed.append)
     start(rig)
@@ -267,7 +289,10 @@ def test_where_something_can_aim_it_is_told_to(rig: Rig) -> None:
 
 def test_the_operator_is_told_what_is_still_to_be_done(rig: Rig) -> None:
     rig.say("setup_new", id="S1")
-    assert "control points not shot at the session's start" in rig.say("start", prism="r", kind="check")["advice"][0]
+    assert (
+        "shoot a control point before the first pose (`rigcal session shoot NAME`)"
+        in rig.say("start", prism="r", kind="check")["advice"][0]
+    )
     rig.live(2)
     advice = rig.say("stop")["advice"]
     assert "control points not shot at the session's end" in advice[0]

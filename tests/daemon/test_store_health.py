@@ -326,6 +326,18 @@ def test_the_status_of_a_running_daemon_says_that_its_store_is_gone(tmp_path: Pa
         assert daemon.store_health.state == "missing"
 
 
+def test_lists_neither_fail_inside_the_daemon_nor_come_from_another_file_when_the_store_is_gone(tmp_path: Path) -> None:
+    with running(tmp_path) as (config, _):
+        assert request(config.socket_path, "session.list") == []
+        config.store_path.rename(tmp_path / "aside")
+        for command in ("session.list", "jobs.list"):
+            with pytest.raises(CommandError, match="replaced or removed while it ran; `rigcal status` says what to do"):
+                request(config.socket_path, command)
+        shutil.copy(tmp_path / "aside", config.store_path)
+        with pytest.raises(CommandError, match="replaced or removed while it ran; `rigcal status` says what to do"):
+            request(config.socket_path, "session.list")
+
+
 def test_a_store_that_is_gone_hides_neither_its_alarm_nor_anything_else_while_a_session_is_open(tmp_path: Path) -> None:
     with running(tmp_path) as (config, _):
         request(config.socket_path, "setup.new", {"id": "S1"})

@@ -358,8 +358,12 @@ def test_a_link_sets_a_node_up_on_request() -> None:
         assert node.sdo[0x1017].raw == 1000
         heard.wait(lambda: node.nmt.state == "OPERATIONAL", "NMT start")
         assert not heard.events(EventKind.ALARM)
+        # What was sent is told in the order of its instants among what was received, so after the next read.
+        heard.wait(
+            lambda: [c.data for c in heard.sent if c.arbitration_id == 0] == [b"\x80\x20", b"\x01\x20"],
+            "the node's reset and its start",
+        )
         assert {capture.arbitration_id for capture in heard.sent} == {0x000, 0x620}
-        assert [c.data for c in heard.sent if c.arbitration_id == 0] == [b"\x80\x20", b"\x01\x20"]
 
 
 def test_a_link_goes_on_receiving_while_it_sets_up() -> None:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import itertools
+import threading
 import time
 from pathlib import Path
 
 import pytest
 
 from drivers.clock import ScaledClock, SystemClock
-from drivers.readings import EventKind, Fix, GapReason, Status
-from drivers.station import StationConfig, StationDecoder
+from drivers.readings import DeviceEvent, EventKind, Fix, Gap, GapReason, LinkItem, SerialCapture, Status
+from drivers.station import StationConfig, StationDecoder, StationLink
 from tests.drivers.serial_support import (
     ACK_FRAME,
     SET_REPLY,
@@ -20,6 +21,7 @@ from tests.drivers.serial_support import (
     running,
     tracking_record,
 )
+from tests.drivers.stopped_clock import StoppedClock
 
 T34 = b"T34083\x03\r\n"
 C11 = b"C11067\x03\r\n"
@@ -197,3 +199,29 @@ def test_the_port_is_free_when_the_link_has_stopped(tmp_path: Path) -> None:
             with running(config(instrument.path)) as collected:
                 collected.wait_for_event(EventKind.LINK_UP)
             assert not collected.events(EventKind.LINK_LOST)
+
+
+def test_what_came_while_the_program_was_stopped_and_the_adapter_pulled_lies_in_the_gap(tmp_path: Path) -> None:
+    clock, stop, lost = StoppedClock(), threading.Event(), threading.Event()
+    items: list[LinkItem] = []
+    with plugged_in(tmp_path / "tty") as instrument:
+
+        def emit(item: LinkItem) -> None:
+            items.append(item)
+            if isinstance(item, SerialCapture):
+                clock.stop()
+                instrument.unplug()
+            elif isinstance(item, DeviceEvent) and item.kind is EventKind.LINK_LOST:
+                lost.set()
+            elif isinstance(item, DeviceEvent) and item.kind is EventKind.LINK_UP:
+                instrument.send(tracking_record())
+
+        link = StationLink(config(instrument.path, profile="passive"), clock)
+        thread = threading.Thread(target=link.run, args=(emit, stop))
+        thread.start()
+        assert lost.wait(20.0)
+        stop.set()
+        thread.join()
+    (capture,) = [item for item in items if isinstance(item, SerialCapture)]
+    (gap,) = [item for item in items if isinstance(item, Gap)]
+    assert (gap.reason, gap.start, gap.end) == (GapReason.LINK_DOWN, capture.stamp, None)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from tests.fuzz.child import HEADER, SHARED_BYTES, save
-from tests.fuzz.target import Target
+from tests.fuzz.target import Target, memory_directory
 
 HANG_S = 5.0
 MEMORY_MB = 500
@@ -90,13 +90,21 @@ def run_target(
 
 def _run_process(target: Target, report: Report, faults: Path, numbers: list[int], module: str, hang_s: float) -> None:
     first = numbers[1]
-    with tempfile.NamedTemporaryFile(prefix="fuzz-") as shared, tempfile.TemporaryFile() as errors:
-        shared.truncate(SHARED_BYTES)
-        command = [sys.executable, "-m", "tests.fuzz.child", module, target.name, shared.name, str(faults)]
+    with (
+        tempfile.TemporaryDirectory(prefix="fuzz-", dir=memory_directory()) as scratch,
+        tempfile.TemporaryFile() as errors,
+    ):
+        shared = Path(scratch) / "shared"
+        shared.write_bytes(bytes(SHARED_BYTES))
+        command = [sys.executable, "-m", "tests.fuzz.child", module, target.name, str(shared), str(faults)]
         process = subprocess.Popen(
-            [*command, *map(str, numbers)], stdout=subprocess.PIPE, stderr=errors, start_new_session=True
+            [*command, *map(str, numbers)],
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            start_new_session=True,
+            env=os.environ | {"TMPDIR": scratch},
         )
-        number, data, is_hung = _watch(process, Path(shared.name), hang_s)
+        number, data, is_hung = _watch(process, shared, hang_s)
         assert process.stdout is not None
         told = process.stdout.read()
         process.stdout.close()

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
 import importlib
+import os
 import pkgutil
 import random
+import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +17,7 @@ from typing import Literal
 from tests.fuzz import targets as folder
 
 CORPUS = Path(__file__).parent / "corpus"
-MESSAGE_MAX = 2000  # characters of a refusal
+MESSAGE_MAX = 2100  # characters of a refusal, with what says where it comes from
 
 Run = Callable[[bytes], None]
 
@@ -62,7 +65,14 @@ def check_refusal(error: Exception, place: str = "") -> None:
     assert 0 < len(text) <= MESSAGE_MAX, f"a refusal of {len(text)} characters: {text[:200]}"
 
 
-def scratch_directory() -> tempfile.TemporaryDirectory[str]:
-    """A directory in memory where there is one: a disk would be what is tried."""
-    memory = Path("/dev/shm")
-    return tempfile.TemporaryDirectory(prefix="rigcal-fuzz-", dir=memory if memory.is_dir() else None)
+def memory_directory() -> str | None:
+    """Where files live in memory, None where nowhere: a disk would be what is tried."""
+    return "/dev/shm" if Path("/dev/shm").is_dir() else None
+
+
+def scratch_directory() -> Path:
+    """A directory of this process's own, until it ends; a process that is killed leaves it to the runner's TMPDIR."""
+    inside = None if "TMPDIR" in os.environ else memory_directory()
+    directory = Path(tempfile.mkdtemp(prefix="rigcal-fuzz-", dir=inside))
+    atexit.register(shutil.rmtree, directory, ignore_errors=True)
+    return directory

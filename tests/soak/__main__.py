@@ -13,7 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from calibration.rig import shipped_rig
-from daemon.control import ControlServer
+from daemon.control_server import ControlServer
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S
 from tests.soak.consistency import inconsistencies, untruths

@@ -2,8 +2,8 @@
 
 A fault's time to evidence is what it would be on a real rig: the time-outs of the program run on the rig's clock, which
 runs faster here, and what the computer itself takes runs in real time. So it is the rig's seconds from the fault to
-the stamp of what shows it, and the real seconds from that stamp until it could be read. Alarms are raised once a real
-second; what that is more than a second of the rig is taken off.
+the stamp of what shows it, and the real seconds from that stamp until it could be read. Alarms are raised, and
+`status` is asked for, once a real second each; what these are more than seconds of the rig is taken off.
 """
 
 from __future__ import annotations
@@ -78,7 +78,6 @@ class Case:
         at_ns: when it began.
         expected: any of these will do.
         found: what has shown it.
-        is_bar: whether it counts; else it only tells how long something took.
     """
 
     name: str
@@ -87,7 +86,6 @@ class Case:
     at_ns: int
     expected: tuple[Expected, ...]
     found: Fact | None = None
-    is_bar: bool = True
 
     def shows(self, fact: Fact) -> bool:
         """Whether a fact is evidence of it."""
@@ -108,10 +106,12 @@ class Case:
         if self.found is None:
             return None
         stamp_ns = self.found.stamp_ns
-        if self.found.kind == "alarm":
-            stamp_ns = self.found.seen_ns if stamp_ns is None else stamp_ns
-            stamp_ns = max(self.at_ns, stamp_ns - round((rate - 1) * ALARMS_REAL_S * NS_PER_S))
-            return (stamp_ns - self.at_ns) / NS_PER_S
+        if self.found.kind == "answer":  # nothing but the computer makes it wait
+            return (self.found.seen_ns - self.at_ns) / NS_PER_S / rate
+        if self.found.kind in ("alarm", "error", "well", "missed"):
+            beats_s = (ALARMS_REAL_S if self.found.kind == "alarm" else 0.0) + (ASK_REAL_S if stamp_ns is None else 0.0)
+            shown_ns = self.found.seen_ns if stamp_ns is None else stamp_ns
+            return max(0.0, (shown_ns - self.at_ns) / NS_PER_S - (rate - 1) * beats_s)
         if stamp_ns is None or stamp_ns < self.at_ns:
             return (self.found.seen_ns - self.at_ns) / NS_PER_S
         return (stamp_ns - self.at_ns) / NS_PER_S + (self.found.seen_ns - stamp_ns) / NS_PER_S / rate

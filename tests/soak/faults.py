@@ -134,16 +134,12 @@ class Mischief:
         self._stop = threading.Event()
         self._process = threading.Lock()  # what is done to the daemon's process comes one after the other
         self.blackouts: list[Blackout] = []
-        nodes: dict[int, list[str]] = {}
-        positions: dict[int, bool] = {}
-        for channel in machine.channels:
-            if isinstance(channel, Cia406Encoder | Cia406Linear | Cia404Analogue):
-                nodes.setdefault(channel.node, []).append(channel.name)
-                if not isinstance(channel, Cia404Analogue):
-                    positions[channel.node] = isinstance(channel, Cia406Encoder)
-        self._nodes = {node: tuple(names) for node, names in nodes.items()}
-        self._positions = positions
-        numbered = {name for names in nodes.values() for name in names}
+        on_bus = [c for c in machine.channels if isinstance(c, Cia406Encoder | Cia406Linear | Cia404Analogue)]
+        self._nodes = {channel.node: (channel.name,) for channel in on_bus}
+        self._positions = {c.node for c in on_bus if not isinstance(c, Cia404Analogue)}
+        self._joints = {c.node for c in on_bus if c.name in machine.joint_names}
+        self._encoders = {c.node for c in on_bus if isinstance(c, Cia406Encoder)}
+        numbered = {channel.name for channel in on_bus}
         self._signals = tuple(c.name for c in machine.channels if c.name not in numbered)
         self._prisms = machine.prism_names
         self._lanes = (
@@ -192,15 +188,15 @@ class Mischief:
             lasts_s = max(lasts_s, 2.0 if kind == "lock_loss" else 6.0)  # shorter ones leave no trace, and no harm
             given = {"seconds": lasts_s}
         elif kind == "prism_jump":
-            if not self._watch.has_session or self._rig.aimed not in self._prisms:
-                return  # only a session has a prism that the station could have left
+            if not self._watch.has_session or self._rig.aimed not in self._prisms or not self._rig.has_settled():
+                return  # only a session has a prism that the station can leave, once it has been seen on it
             given = {"to": self._rng.choice([p for p in self._prisms if p != self._rig.aimed])}
         self._fault(kind, (STATION,), STATION, **given)
         if kind in ALARMS and (kind != "lock_loss" or self._watch.has_session):
             self._expect_alarm(kind, (STATION,), STATION, lasts_s)
         self._wait(lasts_s)
         if kind == "station_silent":
-            self._expect("station speaks again", (STATION,), STATION, is_bar=False)
+            self._expect("station speaks again", (STATION,), STATION)
         # The operator aims anew; after a loss of lock the station may as well have found something itself.
         if kind == "prism_jump" or (kind == "lock_loss" and self._rng.random() < 0.5):
             self._rig.aim(self._rig.aimed)
@@ -218,10 +214,11 @@ class Mischief:
                 "preset_jump behind an alarm",
             )
         )
-        on = self._positions if kind == "alarm" or "jump" in kind else self._nodes
-        node = DIAGNOSED if kind == "warning" else self._rng.choice(sorted(on))
+        # What drives no joint may stand anywhere. Behind an alarm, a transducer may have come that far by itself.
+        on = {"alarm": self._positions, "preset_jump": self._joints, "preset_jump behind an alarm": self._encoders}
+        node = DIAGNOSED if kind == "warning" else self._rng.choice(sorted(on.get(kind, self._nodes)))
         names, lasts_s = self._nodes[node], self._rng.uniform(2.0, 14.0)
-        counts = self._rng.choice((-1, 1)) * (12_000 if self._positions.get(node) else 4_000)
+        counts = self._rng.choice((-1, 1)) * (12_000 if node in self._encoders else 4_000)
         if kind == "preset_jump behind an alarm":
             self._rig.do("fault", kind="alarm", node=node, seconds=1.0)
             self._rig.do("fault", kind="preset_jump", node=node, counts=counts, in_s=0.5)
@@ -236,7 +233,7 @@ class Mischief:
             self._fault(kind, names, LINK, node=node, seconds=lasts_s)
             self._expect_alarm(kind, names, LINK, lasts_s)
             self._wait(lasts_s)
-            self._expect("node speaks again", names, LINK, is_bar=False)
+            self._expect("node speaks again", names, LINK)
         elif kind == "emergency":
             code = self._rng.choice((0x5000, 0x8130, 0x3100))
             self._fault(kind, names, LINK, node=node, code=code)
@@ -300,7 +297,7 @@ class Mischief:
                 self._expect_alarm("store not writable", ("store",), "", lasts_s)
                 self._wait(lasts_s)
                 self._daemon.allow_writing(allowed=True)
-                self._expect("store writable again", ("store",), "", is_bar=False)
+                self._expect("store writable again", ("store",), "")
                 self._wait(4.0)
             self._blackout("*", begin_ns)
 
@@ -325,7 +322,7 @@ class Mischief:
         self._expect(f"unplug {what}", (link,), "", at_ns=begin_ns)
         self._expect_alarm(f"unplug {what}", (link,), "", lasts_s)
         self._wait(lasts_s + 0.1)
-        self._expect(f"{what} back", (link,), "", is_bar=False)
+        self._expect(f"{what} back", (link,), "")
         self._wait(8.0)
         self._blackout(link, begin_ns)
 
@@ -340,11 +337,9 @@ class Mischief:
             expected = (Expected("alarm", ALARMS[fault]),)
             self._watch.expect(Case(f"{fault}: alarm", tuple(subjects), link, self._rig.now_ns(), expected))
 
-    def _expect(
-        self, name: str, subjects: Sequence[str], link: str, *, at_ns: int | None = None, is_bar: bool = True
-    ) -> None:
+    def _expect(self, name: str, subjects: Sequence[str], link: str, *, at_ns: int | None = None) -> None:
         at_ns = self._rig.now_ns() if at_ns is None else at_ns
-        self._watch.expect(Case(name, tuple(subjects), link, at_ns, EVIDENCE[name], is_bar=is_bar))
+        self._watch.expect(Case(name, tuple(subjects), link, at_ns, EVIDENCE[name]))
 
     def _blackout(self, link: str, begin_ns: int) -> None:
         end_ns = self._rig.now_ns() + round(AFTERWARDS_S * NS_PER_S)

@@ -20,11 +20,12 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from drivers.clock import ScaledClock, Stamp, SystemClock
+from drivers.clock import NS_PER_S, ScaledClock, Stamp, SystemClock
 
 ANSWER_S = 60.0
 SPEED = 0.45  # of the joints' greatest rates
 STANDS_S = (2.0, 6.0)
+SETTLED_S = 5.0
 DIAGNOSED = 38  # the node whose TPDO carries these objects
 DIAGNOSED_WORDS = (0x60040020, 0x65030010, 0x65050010)
 UNASKED = ("fault", "arrived", "plugged", "ready")
@@ -52,7 +53,7 @@ class RigProcess:
         stamp = self.clock.origin
         self.origin = f"{stamp.utc_ns},{stamp.monotonic_ns},{stamp.boot_id}"
         self.can_port, self.station_port, self.wire_log = directory / "can", directory / "station", directory / "wire"
-        self.aimed = ""
+        self.aimed, self._aimed_ns = "", 0
         self.rig_file = _write_rig(directory)
         command = [sys.executable, "-m", "simulators", "--rig", str(self.rig_file), "--seed", str(seed)]
         command += ["--rate", str(rate), "--map", f"{DIAGNOSED}:{'+'.join(f'{word:X}' for word in DIAGNOSED_WORDS)}"]
@@ -87,7 +88,11 @@ class RigProcess:
     def aim(self, target: str) -> None:
         """Turn the station to a prism or control point."""
         self.do("aim", target=target)
-        self.aimed = target
+        self.aimed, self._aimed_ns = target, self.now_ns()
+
+    def has_settled(self) -> bool:
+        """Whether the station is where it was last told to turn to, and was told so some seconds ago."""
+        return self.tracked() == self.aimed and self.now_ns() - self._aimed_ns > SETTLED_S * NS_PER_S
 
     def tracked(self) -> str | None:
         """What the station is locked on, as whoever looks through the telescope sees."""

@@ -13,12 +13,14 @@ from daemon.store.reader import Reader
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import CanCapture
+from simulators.faults import KINDS
 from simulators.frame import Frame
 from simulators.wire_log import WireLog
+from tests.soak.__main__ import main
 from tests.soak.consistency import inconsistencies, untruths
 from tests.soak.daemon_process import Usage
 from tests.soak.evidence import Blackout, Case, Fact, judge
-from tests.soak.faults import EVIDENCE
+from tests.soak.faults import ALARMS, EVIDENCE
 from tests.soak.losses import Gap, Item, Wire, account, read_wire_log, stored_items
 from tests.soak.memory import growth
 
@@ -223,3 +225,16 @@ def test_a_rig_that_nobody_measured_has_no_observations(store: Store) -> None:
     store.close()
     with Reader(store.path) as reader:
         assert untruths(reader, shipped_rig("swdt82"), Wire(), RATE) == ({}, [])
+
+
+def test_every_fault_of_the_simulators_is_in_the_table() -> None:
+    tabled = {name.split(" ")[0] for name in EVIDENCE}
+    assert set(KINDS) <= tabled
+    assert set(ALARMS) <= set(EVIDENCE)
+
+
+def test_wrong_use_of_the_soak_is_told(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["soak", "--minutes", "long"])
+    with pytest.raises(SystemExit, match="2"):
+        main()
+    assert "invalid float value: 'long'" in capsys.readouterr().err

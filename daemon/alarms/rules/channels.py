@@ -26,7 +26,7 @@ def link_silent(evidence: Evidence) -> Iterator[Finding]:
     """A CAN link has been open for 5 s, channels of it are silent, and no other frame has come since they were heard.
     It explains that they are silent, and they raise no alarms of their own. Cleared 3 s after a frame has come."""
     for link, channels in _by_link(evidence).items():
-        if _is_quiet(evidence, link, channels) and _has_started(evidence, channels[0]):
+        if evidence.is_storing and _is_quiet(evidence, link, channels) and _has_started(evidence, channels[0]):
             yield link, "the link is open, and nothing is heard on it"
 
 
@@ -84,7 +84,7 @@ def _has_started(evidence: Evidence, channel: ChannelStatus) -> bool:
 
 def _silent(evidence: Evidence, kind: str) -> Iterator[Finding]:
     for link, channels in _by_link(evidence).items():
-        if _is_quiet(evidence, link, channels):
+        if not evidence.is_storing or _is_quiet(evidence, link, channels):
             continue
         for channel in channels:
             if channel.kind == kind and channel.status == SILENT and _has_started(evidence, channel):

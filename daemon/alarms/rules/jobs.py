@@ -8,7 +8,7 @@ from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
 
 
-@rule("warning", "Mend what the error says, then `rigcal jobs retry NUMBER`.")
+@rule("warning", "Do what the error says, then `rigcal jobs retry NUMBER`; too few data need another session instead.")
 def job_failed(evidence: Evidence) -> Iterator[Finding]:
     """A job has failed or was given up, and is the newest of its kind that has. Cleared when it is retried, or when a
     newer one of its kind is done."""

@@ -46,21 +46,17 @@ def queue_full(evidence: Evidence) -> Iterator[Finding]:
             yield link.name, "captures are being lost: the queue to the store is full"
 
 
-@rule(
-    "warning",
-    "Look what else the computer does, or at the cable and bit rate of an adapter whose lines are no frames; the gaps "
-    "in `rigcal status` tell what is missing.",
-)
+@rule("warning", "Check adapter and cable, and what else keeps the computer busy.")
 def frames_lost(evidence: Evidence) -> Iterator[Finding]:
     """The kernel, an adapter or a full queue has lost frames of a link within the last 5 minutes."""
     for event in evidence.lately(EventKind.FRAMES_DROPPED, LATELY_S):
         yield event.device, event.text
 
 
-@rule("warning", "Look what else the computer does, and whether its clock is set while rigcal runs.")
+@rule("warning", "See what else keeps the computer busy, and whether its clock is set while rigcal runs.")
 def time_doubtful(evidence: Evidence) -> Iterator[Finding]:
-    """When captures of a link were received is not known, as nobody read for a while or the clock was set, within the
-    last 5 minutes. They are stored and marked, and their readings are not used."""
+    """Within the last 5 minutes captures came of which it is not known when: the link was not read for a while, or the
+    clock was set. They are stored and marked, and their readings are not used."""
     for event in evidence.lately(EventKind.TIME_DOUBTFUL, LATELY_S):
         yield event.device, event.text
 

@@ -13,20 +13,23 @@ _TURNED_AWAY = (LockState.STANDBY, LockState.SEARCHING, LockState.WAITING, LockS
 
 
 @rule(
-    "critical", "Check that the station is on, its cable, and its settings (baud rate, parity, line end).", hold_s=3.0
+    "critical",
+    "Check that the station is on, its cable, and its settings (baud rate, parity, line end).",
+    after_s=1.0,
+    hold_s=3.0,
 )
 def station_silent(evidence: Evidence) -> Iterator[Finding]:
-    """A station gives no records for longer than its time-out; a warning while no session is open. Cleared 3 s after
-    it is heard again. While its link is closed that alarm stands for this one."""
+    """A station gives no records for 1 s longer than its time-out; a warning while no session is open. Cleared 3 s
+    after it is heard again. While its link is closed that alarm stands for this one."""
     for station in evidence.acquisition.stations:
-        if station.status == SILENT:
+        if evidence.is_storing and station.status == SILENT:
             yield station.name, "the station gives no records", "warning" if evidence.session is None else "critical"
 
 
-@rule("warning", "Aim the station at the session's prism; look what stands in the line of sight.", after_s=4, hold_s=3)
+@rule("warning", "Aim the station at the session's prism; check what blocks the line of sight.", after_s=2.5, hold_s=3)
 def station_not_locked(evidence: Evidence) -> Iterator[Finding]:
-    """A station follows no prism for 4 s while a session is open. Searching and waiting are usual at other times, and
-    for some seconds when a boom passes the line of sight. Cleared when it has been locked for 3 s."""
+    """A station follows no prism for 2.5 s while a session is open; it has gone on as if it did for a second before.
+    Searching and waiting are usual at other times. Cleared when it has been locked for 3 s."""
     for station in evidence.acquisition.stations:
         if evidence.session is not None and is_present(station.status) and station.lock in _TURNED_AWAY:
             yield station.name, f"the station is {station.lock} while session {evidence.session.id} is open"
@@ -42,15 +45,16 @@ def station_tilted(evidence: Evidence) -> Iterator[Finding]:
             yield station.name, station.reason or "the compensator is out of range or off"
 
 
-@rule("warning", "Look at the instrument's display; the code is in its manual.")
+@rule("warning", "Look at the instrument's display; its manual explains an error code.")
 def instrument_error(evidence: Evidence) -> Iterator[Finding]:
     """A station has reported an error, refused a command or not answered. Cleared when it has given a good fix since,
-    and half a minute after the last error at the earliest."""
+    and half a minute after the last error at the earliest. While it is silent that alarm stands for this one."""
     good_s = {station.name: station.good_age_s for station in evidence.acquisition.stations}
+    silent = {station.name for station in evidence.acquisition.stations if station.status == SILENT}
     for event in evidence.standing(EventKind.INSTRUMENT_ERROR):
         since = good_s.get(event.device)
         is_over = since is not None and since < event.age_s and event.age_s > 30.0
-        if not is_over and not evidence.is_cut_off(event.device):
+        if not is_over and event.device not in silent and not evidence.is_cut_off(event.device):
             yield event.device, event.text
 
 

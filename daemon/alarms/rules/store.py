@@ -12,12 +12,13 @@ CRITICAL_BYTES = 200 * 2**20
 
 @rule("critical", "Free space on the disk, or check it; captures wait in memory meanwhile.", hold_s=5.0)
 def not_storing(evidence: Evidence) -> Iterator[Finding]:
-    """Nothing can be written to the store. Cleared 5 s after it can again."""
+    """Nothing can be written to the store. What comes is decoded only when it is stored, so silence of links, channels
+    and stations raises no alarms meanwhile. Cleared 5 s after it can be written again."""
     if evidence.acquisition.error is not None:
         yield "store", evidence.acquisition.error
 
 
-@rule("critical", "Do as the alarm says before rigcal is stopped: what lies in a file without a name goes with it.")
+@rule("critical", "Do what the alarm says before you stop rigcal: a deleted file is lost for good when rigcal stops.")
 def store_unsound(evidence: Evidence) -> Iterator[Finding]:
     """The store is damaged, or a file of it was replaced or is gone."""
     if evidence.store.fault:

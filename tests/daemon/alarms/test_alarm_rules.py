@@ -330,6 +330,20 @@ def test_nothing_known_raises_nothing() -> None:
     assert [alarm for rule in library() for alarm in rule(known())] == []
 
 
+def test_a_full_disk_does_not_send_anyone_to_the_cables_of_devices_that_are_not_decoded_meanwhile() -> None:
+    quiet = {"channels": [SILENT, QUIET], "frames_s": [40.0], "stations": [station("silent", "unknown")]}
+    alone = known(channels=[SILENT, channel(name="theta3"), QUIET], error="disk full")
+    assert {a.kind for rule in library() for a in rule(known(**quiet))} == {"link_silent", "station_silent"}
+    assert [a.kind for rule in library() for a in rule(known(**quiet, error="disk full"))] == ["not_storing"]
+    assert [a.kind for rule in library() for a in rule(alone)] == ["not_storing"]
+
+
+def test_a_silent_station_is_one_alarm_although_it_did_not_answer_a_command() -> None:
+    unanswered = event(E.INSTRUMENT_ERROR, "station")
+    silent = known(unanswered, stations=[station("silent", "unknown", good_age_s=30)])
+    assert [a.kind for rule in library() for a in rule(silent)] == ["station_silent"]
+
+
 def test_an_unplugged_bus_is_one_alarm_and_so_is_a_bus_that_is_cut_beyond_the_adapter() -> None:
     names = [f"theta{n}" for n in range(1, 9)]
     events = [event(E.HEARTBEAT_LOST, name, n) for n, name in enumerate(names)]

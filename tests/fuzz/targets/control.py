@@ -41,8 +41,7 @@ class _Rig:
 
     def __init__(self) -> None:
         logging.disable(logging.CRITICAL)
-        self.folder = scratch_directory()
-        config = parse_config(_CONFIG, Path(self.folder.name) / "rigcal.toml")
+        config = parse_config(_CONFIG, scratch_directory() / "rigcal.toml")
         parts = replayed(config, load_rig("swdt82"), [GOLDEN / "boom.log", GOLDEN / "station.serial"], _REPLAY_SPEED)
         self.store = Store(config.store_path)
         self.daemon = Daemon(config, self.store, replace(parts, is_over=lambda: False))
@@ -58,7 +57,6 @@ class _Rig:
         self.stop.set()
         self.thread.join(timeout=30)
         self.store.close()
-        self.folder.cleanup()
         logging.disable(logging.NOTSET)
 
     def _connect(self) -> None:
@@ -85,7 +83,12 @@ class _Rig:
         for state in ("retired", "live", "candidate"):
             row = {"rig": "swdt82", "path": f"/nowhere/{state}", "manifest_sha256": "0" * 64, "stage": "geometric"}
             with self.store.transaction():
-                self.store.insert("models", row | {"state": state, **self.store.instant(now, "created_")})
+                instant = self.store.instant(now, "created_")
+                model = self.store.insert("models", row | {"state": state, **instant})
+                history = ["candidate", *["live"] * (state != "candidate"), *["retired"] * (state == "retired")]
+                for each in history:
+                    change = {"model_id": model, "state": each, "reason": "made", **self.store.instant(now)}
+                    self.store.insert("model_states", change)
 
 
 def _control() -> Run:

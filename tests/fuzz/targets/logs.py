@@ -29,11 +29,9 @@ _STAMP = Stamp(0, 0, "boot")
 
 def on_file(suffix: str, read: Callable[[Path], None]) -> Run:
     """A target that reads a file with this ending; it may refuse with DescriptionError."""
-    place = scratch_directory()
-    path = Path(place.name) / f"input{suffix}"
+    path = scratch_directory() / f"input{suffix}"
 
     def run(data: bytes) -> None:
-        assert place  # is kept while the target is
         path.write_bytes(data)
         try:
             read(path)
