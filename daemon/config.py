@@ -262,6 +262,8 @@ def _sentence(error: Any) -> str:
         return f"{key}: unknown key; allowed here: {allowed}"
     if error["type"] == "missing":
         return f"{key}: missing; it is required"
+    if isinstance(error["input"], dict):  # a whole table: the message names what is wrong in it
+        return f"{key}: {message}"
     return f"{key}: {message}, found {reprlib.repr(error['input'])}"
 
 

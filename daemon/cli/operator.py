@@ -88,7 +88,7 @@ def _store_lines(status: dict[str, Any]) -> Iterator[str]:
     if status["store_health"]["state"] == "checking":
         yield status["store_health"]["text"]
     if status["acquisition"]["is_behind"]:
-        yield "captures of the last run are still being decoded: readings and fixes come late, and jobs wait"
+        yield "captures wait to be decoded: readings and fixes come late, and jobs wait"
     for part, reason in status["unreadable"].items():
         yield f"{part}: cannot be read from the store ({reason})"
 

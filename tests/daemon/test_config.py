@@ -87,3 +87,11 @@ def test_a_missing_file_and_a_binary_file_are_sentences(tmp_path: Path) -> None:
     binary.write_bytes(b"rig = \xff")
     with pytest.raises(ConfigError, match="not UTF-8"):
         read_config(binary)
+
+
+def test_what_is_wrong_with_a_whole_table_is_told_without_the_table(tmp_path: Path) -> None:
+    text = 'rig = "swdt82"\n[[station]]\nnew_target_after_s = 20\nserial.path = "/dev/x"\n'
+    with pytest.raises(ConfigError) as raised:
+        parse_config(text, tmp_path / "rigcal.toml")
+    assert "station.1: new_target_after_s is gone, remove it" in str(raised.value)
+    assert "found" not in str(raised.value)
