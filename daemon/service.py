@@ -132,6 +132,7 @@ class Daemon:
                 health=lambda: self._watch.health,
                 suspicions=self._sessions.prism_suspicions,
                 control_faults=self._control_faults,
+                models_directory=config.models_directory,
             ),
             parts.clock,
         )
@@ -225,7 +226,7 @@ class Daemon:
             "status": self._status,
             "setup.new": self._setups.new_command,
             "setup.list": self._setups.list_command,
-            "session.start": sessions.start_command,
+            "session.start": self._start_session,
             "session.stop": sessions.stop_command,
             "session.abort": sessions.abort_command,
             "session.shoot": sessions.shoot_command,
@@ -273,6 +274,13 @@ class Daemon:
             "store_health": self._watch.health.as_dict(),
             "unreadable": unreadable,
         }
+
+    def _start_session(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Open a session, unless its store would be lost when the daemon stops."""
+        health = self._watch.health
+        if health.state in ("missing", "replaced"):
+            raise CommandError(f"no session is started: {health.text}", REFUSED)
+        return self._sessions.start_command(arguments)
 
     def _visit(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Where the simulated boom drives next: the rows of a pose plan; `left` tells how many stops are to come."""

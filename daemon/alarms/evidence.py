@@ -80,11 +80,13 @@ class StoreEvidence:
         fault: what is wrong with its files (damaged, replaced, missing), and what to do; "" if nothing is known to be.
         free_bytes: on its disk; None while not known.
         is_low: little of the disk is free, as `daemon.store.health` has it.
+        is_new_beside_models: it has never seen a job, and yet models lie beside it.
     """
 
     fault: str = ""
     free_bytes: int | None = None
     is_low: bool = False
+    is_new_beside_models: bool = False
 
 
 @dataclass(frozen=True)

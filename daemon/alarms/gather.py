@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TypeVar
 
 from daemon.acquisition_status import AcquisitionStatus
@@ -10,7 +11,7 @@ from daemon.alarms.evidence import Evidence, FailedJob, ModelEvidence, SessionEv
 from daemon.drift_table import DriftTable
 from daemon.live_model import LiveModel, Loaded
 from daemon.prism_guard import Suspicion
-from daemon.store.alarm_evidence import failed_jobs, newest_setup, open_session, untrained_sessions
+from daemon.store.alarm_evidence import failed_jobs, has_jobs, newest_setup, open_session, untrained_sessions
 from daemon.store.health import StoreHealth
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, Clock, Stamp
@@ -32,6 +33,7 @@ class Gatherer:
         health: of the store.
         suspicions: stations that may be on another prism than the open session's.
         control_faults: of the control sockets, as of `Evidence`.
+        models_directory: where jobs leave models.
     """
 
     def __init__(
@@ -47,11 +49,12 @@ class Gatherer:
         health: Callable[[], StoreHealth],
         suspicions: Callable[[], Sequence[Suspicion]],
         control_faults: Callable[[], Mapping[str, str]],
+        models_directory: Path,
     ) -> None:
         self._acquisition, self._health, self._suspicions = acquisition, health, suspicions
         self._store, self._rig = store, rig_name
         self._live, self._drift, self._clock, self._previous_run = live, drift, clock, previous_run
-        self._control_faults = control_faults
+        self._control_faults, self._models_directory = control_faults, models_directory
         self._began = clock.now()
         self._known = Evidence(self._began)
         self._failed: dict[str, str] = {}
@@ -110,7 +113,9 @@ class Gatherer:
     def _files(self) -> StoreEvidence:
         health = self._health()
         fault = health.text if health.state in ("damaged", "replaced", "missing") else ""
-        return StoreEvidence(fault, health.free_bytes, health.is_low)
+        are_models_there = self._models_directory.is_dir() and any(self._models_directory.iterdir())
+        is_new = are_models_there and not has_jobs(self._store)
+        return StoreEvidence(fault, health.free_bytes, health.is_low, is_new)
 
     def _untrained(self) -> dict[str, str]:
         return untrained_sessions(self._store, self._rig)

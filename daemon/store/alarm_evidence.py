@@ -61,6 +61,11 @@ def newest_setup(store: Store) -> tuple[str, str] | None:
     return (rows[0]["id"], rows[0]["state"]) if rows else None
 
 
+def has_jobs(store: Store) -> bool:
+    """Whether there ever was a job."""
+    return bool(store.rows("SELECT 1 FROM jobs LIMIT 1"))
+
+
 def failed_jobs(store: Store, rig_name: str) -> list[tuple[int, str, str]]:
     """Number, kind and error of the newest failed job of each kind, where no later one of the kind is done."""
     return [

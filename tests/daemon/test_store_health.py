@@ -361,6 +361,15 @@ def test_sessions_of_a_file_that_took_the_store_s_place_are_not_shown(tmp_path: 
                 request(config.socket_path, command)
 
 
+def test_no_session_is_started_in_a_store_whose_file_is_gone(tmp_path: Path) -> None:
+    with running(tmp_path) as (config, daemon):
+        request(config.socket_path, "setup.new", {"id": "S1"})
+        config.store_path.rename(tmp_path / "aside")
+        wait_until(lambda: daemon.store_health.state == "missing")
+        with pytest.raises(CommandError, match=r"no session is started.*the file is gone"):
+            request(config.socket_path, "session.start", {"prism": "r"})
+
+
 def test_a_damaged_table_hides_nothing_else_from_status(tmp_path: Path) -> None:
     with running(tmp_path) as (config, _):
         pass

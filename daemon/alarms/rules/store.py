@@ -25,6 +25,14 @@ def store_unsound(evidence: Evidence) -> Iterator[Finding]:
         yield "store", evidence.store.fault
 
 
+@rule("critical", "Stop rigcal and restore the store from a backup; if a new one is meant, move the old models away.")
+def store_new(evidence: Evidence) -> Iterator[Finding]:
+    """The store is new, but models lie beside it: the one that they came from was deleted or moved, and sessions, set-ups
+    and the live model with it. Cleared with the first job of the new store, and when the models are moved away."""
+    if evidence.store.is_new_beside_models:
+        yield "store", "the store is new and empty, but models of an earlier one lie beside it"
+
+
 @rule("warning", "Free space on the disk of the store.", hold_s=60.0)
 def disk_nearly_full(evidence: Evidence) -> Iterator[Finding]:
     """Little of the store's disk is free: less than 1 GiB, or less than 5 % and 10 GiB. Critical below 200 MiB. Cleared

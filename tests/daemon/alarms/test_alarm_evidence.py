@@ -40,6 +40,7 @@ def gather(rig: ModelRig) -> Gatherer:
         health=lambda: StoreHealth("replaced", "another file", rig.clock.now(), 5, is_low=True),
         suspicions=lambda: [Suspicion("station", rig.clock.now(), 9.5)],
         control_faults=lambda: {"control.sock": "the file is gone"},
+        models_directory=rig.store.path.with_name("models of an earlier store"),
     )
 
 
@@ -124,6 +125,18 @@ def test_a_session_that_is_not_used_is_told_until_a_newer_one_is(rig: ModelRig, 
     assert gather().untrained_sessions == {"c": "no control point was shot"}
     rig.jobs.session("d")
     assert gather().untrained_sessions == {}
+
+
+def test_a_new_store_beside_old_models_is_told_until_it_has_a_job(rig: ModelRig, gather: Gatherer) -> None:
+    models = rig.store.path.with_name("models of an earlier store")
+    assert not gather().store.is_new_beside_models
+    models.mkdir()
+    assert not gather().store.is_new_beside_models
+    (models / "7").mkdir()
+    assert gather().store.is_new_beside_models
+    rig.jobs.session("a")
+    job(rig, "gap", "a")
+    assert not gather().store.is_new_beside_models
 
 
 def test_the_store_and_the_control_socket_are_told_as_they_are(gather: Gatherer) -> None:

@@ -262,6 +262,7 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
     "decoding_behind": [(known(is_behind=True), ["decoding"], known())],
     "not_storing": [(known(error="disk full"), ["store"], known())],
     "store_unsound": [(known(store=StoreEvidence("the file is gone")), ["store"], known())],
+    "store_new": [(known(store=StoreEvidence(is_new_beside_models=True)), ["store"], known())],
     "disk_nearly_full": [
         (known(store=StoreEvidence(is_low=True)), ["store"], known(store=StoreEvidence(free_bytes=10**10))),
         (known(store=StoreEvidence(free_bytes=10**8)), ["store"], known(store=StoreEvidence(free_bytes=10**9))),
