@@ -27,8 +27,8 @@ def store_unsound(evidence: Evidence) -> Iterator[Finding]:
 
 @rule("critical", "Stop rigcal and restore the store from a backup; if a new one is meant, move the old models away.")
 def store_new(evidence: Evidence) -> Iterator[Finding]:
-    """The store is new, but models lie beside it: the one that they came from was deleted or moved, and with it the
-    sessions, set-ups and the live model. Cleared with the first job of the new store, and when the models are moved away."""
+    """The store is new, but models lie beside it: the one that they came from was deleted or moved, and with it its
+    sessions, set-ups and live model. Cleared with the first job of the new store, or when the models are moved away."""
     if evidence.store.is_new_beside_models:
         yield "store", "the store is new and empty, but models of an earlier one lie beside it"
 
