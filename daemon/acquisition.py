@@ -21,14 +21,13 @@ from typing import TypeVar
 from daemon.acquisition_status import AcquisitionStatus
 from daemon.backlog import BATCH_CAPTURES, Backlog, Batch
 from daemon.clock_watch import ClockWatch
+from daemon.link_decoders import TICK_NS, LinkDecoders
 from daemon.link_intake import LinkIntake
 from daemon.present_state import NOTHING_EXPECTED, Expected
 from daemon.status_board import StatusBoard
 from daemon.store import Store
 from daemon.store.errors import storage_sentence
 from daemon.time_budget import TimeBudget
-from drivers.can_decoder import CanDecoder
-from drivers.can_summary import CanSummary
 from drivers.clock import NS_PER_S, Clock, Stamp
 from drivers.readings import (
     CanCapture,
@@ -48,7 +47,6 @@ log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-TICK_NS = NS_PER_S // 10
 ALIVE_NS = 5 * NS_PER_S
 RETRY_S = 1.0
 STOP_S = 15.0  # real seconds
@@ -102,7 +100,7 @@ class Acquisition:
         self._batch_seconds = batch_seconds
         self._intakes = [LinkIntake(link, clock, queue_captures, store.begun or clock.now()) for link in links]
         self._factories = decoders
-        self._decoding = _Decoding(decoders)
+        self._decoding = LinkDecoders(decoders)
         self._backlog = Backlog(store, clock)
         self._is_left_over = False  # what is decoded now, a run before this one captured
         self._decoded: _Decoded | None = None
@@ -280,7 +278,7 @@ class Acquisition:
         if is_left_over:
             log.warning("captures that the last run left undecoded are being decoded")
         else:
-            self._decoding = _Decoding(self._factories)  # what was left over is decoded apart from what comes live
+            self._decoding = LinkDecoders(self._factories)  # what was left over is decoded apart from what comes live
             log.info("what the last run left is decoded")
 
     # ---- replay ----------------------------------------------------------------------------------------------------
@@ -426,80 +424,6 @@ def _tell_of_links(reports: Iterable[Record]) -> None:
     for report in reports:
         if isinstance(report, DeviceEvent) and report.kind in _LINK_LEVELS:
             log.log(_LINK_LEVELS[report.kind], "%s", report.text)
-
-
-class _Decoding:
-    """The decoders of all links, each within one boot."""
-
-    def __init__(self, factories: Mapping[str, Callable[[], Decoder]]) -> None:
-        self._factories = factories
-        self._decoders: dict[str, Decoder] = {}
-        self._boots: dict[str, str] = {}
-        self._defects: dict[str, Stamp] = {}
-        self._ticked_ns = -TICK_NS
-
-    def feed(self, captures: Sequence[Capture]) -> list[Record]:
-        """Records of captures, in their order."""
-        records: list[Record] = []
-        link = boot = None
-        decoder: Decoder | None = None
-        for capture in captures:
-            if capture.link != link or capture.stamp.boot_id != boot:
-                link, boot = capture.link, capture.stamp.boot_id
-                decoder = self._decoder(link, boot) if link in self._factories else None
-            if decoder is None:
-                continue
-            try:
-                produced = decoder.feed(capture)
-            except Exception as error:  # noqa: BLE001 - see _failure
-                produced = [self._failure(capture.link, capture.stamp, error, capture.data)]
-            if produced:
-                records.extend(produced)
-        return records
-
-    def feed_and_tick(self, captures: Sequence[Capture]) -> list[Record]:
-        """Records of captures and of the time that passes by their stamps."""
-        records: list[Record] = []
-        start = 0
-        for i, capture in enumerate(captures):
-            if not 0 <= capture.stamp.monotonic_ns - self._ticked_ns < TICK_NS:
-                records += self.feed(captures[start:i])
-                records += self.tick(capture.stamp)
-                start, self._ticked_ns = i, capture.stamp.monotonic_ns
-        return records + self.feed(captures[start:])
-
-    def tick(self, now: Stamp) -> list[Record]:
-        """Records that time causes, at decoders that live in the boot of `now`."""
-        records: list[Record] = []
-        for link in self._factories:
-            if self._boots.setdefault(link, now.boot_id) != now.boot_id:
-                continue
-            try:
-                records.extend(self._decoder(link, now.boot_id).tick(now))
-            except Exception as error:  # noqa: BLE001 - see _failure
-                records.append(self._failure(link, now, error, b""))
-        return records
-
-    def summaries(self, now: Stamp) -> list[CanSummary]:
-        """What the CAN links have heard until `now`; from any thread."""
-        decoders = [self._decoders.get(link) for link in self._factories]
-        return [decoder.summary(now) for decoder in decoders if isinstance(decoder, CanDecoder)]
-
-    def defects(self) -> dict[str, Stamp]:
-        """Link -> when its decoder last showed a defect of its own; from any thread."""
-        return dict(self._defects)
-
-    def _failure(self, link: str, stamp: Stamp, error: Exception, raw: bytes) -> DecodeFailure:
-        """A decoder never raises by contract; a defect in one must not end acquisition, nor flood the log."""
-        if link not in self._defects:
-            log.critical("link %s: its decoder is defective; captures are kept", link, exc_info=error)
-        self._defects[link] = stamp
-        return DecodeFailure(link, stamp, f"the decoder failed: {type(error).__name__}: {error}", raw)
-
-    def _decoder(self, link: str, boot: str) -> Decoder:
-        if link not in self._decoders or self._boots[link] != boot:
-            self._decoders[link], self._boots[link] = self._factories[link](), boot
-        return self._decoders[link]
 
 
 def _stamp(record: LinkItem | Record) -> Stamp:
