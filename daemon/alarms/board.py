@@ -71,7 +71,7 @@ class AlarmBoard:
         self._rules = library() if rules is None else rules
         self._turn = threading.Lock()
         self._looked = clock.now()
-        self._active = {(row.kind, row.subject): self._carried(row) for row in table.active()}
+        self._active = {(row.kind, row.subject): self._carried(row) for row in self._left_over()}
         self._sighted: dict[tuple[str, str], Stamp] = {}  # since when a fault has stood that is no alarm yet
         self._unwritten: deque[_Active] = deque(maxlen=UNWRITTEN_MAX)  # cleared ones
         self._failed_rules: dict[str, str] = {}
@@ -122,6 +122,14 @@ class AlarmBoard:
         return {**self.status(), "cleared": cleared}
 
     # ---- parts -------------------------------------------------------------------------------------------------------
+
+    def _left_over(self) -> list[AlarmRow]:
+        """Alarms of an earlier run; none where their table is damaged, which must not keep the daemon from starting."""
+        try:
+            return list(self._table.active())
+        except sqlite3.Error as error:
+            log.error("the alarms of earlier runs cannot be read: %s", error)
+            return []
 
     def _carried(self, row: AlarmRow) -> _Active:
         severity: Severity = "critical" if row.severity == "critical" else "warning"

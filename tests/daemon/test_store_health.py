@@ -361,6 +361,15 @@ def test_sessions_of_a_file_that_took_the_store_s_place_are_not_shown(tmp_path: 
                 request(config.socket_path, command)
 
 
+def test_a_damaged_table_of_alarms_keeps_no_daemon_from_starting(tmp_path: Path) -> None:
+    with running(tmp_path) as (config, _):
+        pass
+    tear(config.store_path, "alarms", "alarms_one_active")
+    with running(tmp_path) as (config, daemon):
+        assert request(config.socket_path, "status")["acquisition"]["links"][0]["name"] == "boom"
+        wait_until(lambda: daemon.store_health.state == "damaged")
+
+
 def test_no_session_is_started_in_a_store_whose_file_is_gone(tmp_path: Path) -> None:
     with running(tmp_path) as (config, daemon):
         request(config.socket_path, "setup.new", {"id": "S1"})
