@@ -47,7 +47,7 @@ class Rule:
     Attributes:
         kind: of its alarms.
         severity: the usual one.
-        remedy: what to do.
+        remedy: what to do; SUBJECT in it stands for the alarm's subject.
         after_s: how long a fault must stand before it is an alarm.
         hold_s: how long its evidence must be gone before the alarm is cleared.
         meaning: when it raises and clears, for docs/alarms.md.
@@ -66,7 +66,8 @@ class Rule:
         """What is wrong now."""
         for subject, text, *severity in self.find(evidence):
             how = severity[0] if severity else self.severity
-            yield Alarm(self.kind, subject, how, shown(text)[:TEXT_MAX], self.remedy)
+            plain = shown(text).removeprefix(f"{subject}: ")[:TEXT_MAX]  # the subject is shown before it
+            yield Alarm(self.kind, subject, how, plain, self.remedy.replace("SUBJECT", subject))
 
 
 def rule(

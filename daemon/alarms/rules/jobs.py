@@ -8,12 +8,12 @@ from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
 
 
-@rule("warning", "Do what the error says, then `rigcal jobs retry NUMBER`; too few data need another session instead.")
+@rule("warning", "Do what the error says, then `rigcal jobs retry SUBJECT`; too few data need another session instead.")
 def job_failed(evidence: Evidence) -> Iterator[Finding]:
     """A job has failed or was given up, and is the newest of its kind that has. Cleared when it is retried, or when a
     newer one of its kind is done."""
     for job in evidence.failed_jobs:
-        yield f"job {job.id}", f"job {job.id} ({job.kind}) has failed: {job.error}"
+        yield str(job.id), f"job {job.id} ({job.kind}) has failed: {job.error}"
 
 
 @rule("warning", "Calibrate again; `rigcal status` and the report of the gap workflow tell what has changed.")

@@ -38,7 +38,7 @@ def session_open_long(evidence: Evidence) -> Iterator[Finding]:
         yield evidence.session.id, "the session has been open for more than 24 hours, and jobs wait for its end"
 
 
-@rule("warning", "Hold a new session with control shots at both ends, or accept it: `rigcal session accept NAME`.")
+@rule("warning", "Hold a new session with control shots at both ends, or accept it: `rigcal session accept SUBJECT`.")
 def session_not_trained(evidence: Evidence) -> Iterator[Finding]:
     """Calibration does not use a closed session: control shots are missing at its start or end, or the station moved.
     Cleared when an operator accepts it, and by a newer session that is used."""

@@ -291,7 +291,7 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
             known(model=ModelEvidence(1), session=SESSION),
         )
     ],
-    "job_failed": [(known(failed_jobs=(FailedJob(7, "gap", "too poor"),)), ["job 7"], known())],
+    "job_failed": [(known(failed_jobs=(FailedJob(7, "gap", "too poor"),)), ["7"], known())],
     "model_drifted": [
         (known(model=ModelEvidence(2, drifted_with="s009-r")), ["model 2"], known(model=ModelEvidence(3))),
     ],
@@ -379,3 +379,11 @@ def test_every_kind_is_in_the_documentation_with_what_to_do() -> None:
         assert rule.remedy in written
         assert rule.meaning in written
         assert len(rule.meaning) > 20
+
+
+def test_an_alarm_says_its_subject_once_and_in_what_to_type() -> None:
+    rules = {rule.kind: rule for rule in library()}
+    (job,) = rules["job_failed"](known(failed_jobs=(FailedJob(7, "gap", "too poor"),)))
+    assert "`rigcal jobs retry 7`" in job.remedy
+    (lost,) = rules["frames_lost"](known(replace(event(E.FRAMES_DROPPED), text="boom: 3 frames lost")))
+    assert (lost.subject, lost.text) == ("boom", "3 frames lost")
