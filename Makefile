@@ -6,7 +6,7 @@ BOOTSTRAP := deploy/bootstrap.sh -e
 
 # Compiled kernels and font indexes stay in the tree, so that they are found again and no home directory is needed. Each
 # state of the sources has its own: numba does not see that a function which it compiled into another one has changed.
-COMPILED := $(sort $(shell grep -rl --include=*.py 'kernels.jit\|import numba' calibration))
+COMPILED := $(sort $(shell grep -rl --include=*.py 'numerics.jit\|numerics import jit\|import numba' calibration))
 KERNELS := .cache/numba/$(firstword $(shell cat $(COMPILED) | cksum))
 export NUMBA_CACHE_DIR := $(CURDIR)/$(KERNELS)
 export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
@@ -14,7 +14,7 @@ export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 # The tests start a hundred processes: each would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help environment setup demo test lint blind bench soak fuzz lock clean
+.PHONY: help environment setup demo check test lint blind bench soak fuzz lock clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -44,6 +44,12 @@ lint: environment ## style, types and import floors
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# Some of every room, and nothing that starts a daemon.
+QUICK := tests/drivers tests/daemon/store tests/daemon/report tests/calibration/numerics tests/calibration/rig tests/simulators/devices
+
+check: lint ## lint and a quick part of the tests, in a minute: before each commit
+	$(BIN)/python -m pytest -q -n auto --dist loadfile -m "not slow" $(QUICK)
 
 blind: setup ## a few blind cases of every kind for the gap workflow; two minutes on two cores
 	$(BIN)/rigcal bench gap --short

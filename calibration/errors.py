@@ -6,7 +6,7 @@ MESSAGE_MAX = 1000  # characters
 
 
 class CalibrationError(Exception):
-    """Base of all errors of `calibration`; on its own: the computation failed."""
+    """Base of all errors of `calibration`; on its own, it says that the computation failed."""
 
     def __str__(self) -> str:
         text = super().__str__()
@@ -15,7 +15,13 @@ class CalibrationError(Exception):
 
 
 class RigError(CalibrationError):
-    """A rig file is malformed or contradicts itself; the message names file, key and what is allowed."""
+    """A rig file is malformed or contradicts itself.
+
+    Args:
+        source: name of the file.
+        where: key in it; empty for the whole file.
+        reason: the fault, and what is allowed.
+    """
 
     def __init__(self, source: str, where: str, reason: str) -> None:
         super().__init__(f"{source}: {where}: {reason}" if where else f"{source}: {reason}")
@@ -23,7 +29,14 @@ class RigError(CalibrationError):
 
 
 class DataError(CalibrationError):
-    """Observations are malformed or do not fit the rig; the message names file, line, column and reason."""
+    """Observations are malformed or do not fit the rig.
+
+    Args:
+        source: name of the file or table.
+        reason: the fault, and how to mend it.
+        line: number of the line, from 1.
+        column: name of the column.
+    """
 
     def __init__(self, source: str, reason: str, line: int | None = None, column: str | None = None) -> None:
         place = source + (f", line {line}" if line is not None else "") + (f", column {column}" if column else "")

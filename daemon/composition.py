@@ -1,7 +1,6 @@
-"""The composition root: a configuration and a rig become links, decoders, clock and hands.
+"""The composition root: a configuration and a rig become links, decoders and clock.
 
-One function for each way to run; what they compose is the same, and everything above works with any of them. Nothing
-else in `daemon` knows whether a rig is real, simulated or replayed.
+One function for each way to run: live, simulated, replayed. Nothing else in `daemon` knows which it is.
 """
 
 from __future__ import annotations
@@ -14,24 +13,24 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from calibration.channels import Cia404Analogue, Cia406Encoder, Cia406Linear
-from calibration.rig import Rig
-from daemon.channels import decoder_factories, node_setups
-from daemon.config import CanSection, Config, ConfigError
-from daemon.control import CommandError
-from daemon.joiner import ObservationJoiner, joint_inputs, signal_inputs
-from daemon.prism_guard import MotionLimit
-from daemon.replay import captures_of, first_captures
-from daemon.rigs import RigSource
-from daemon.simulation import SimulatedRig, SimulationError, stops_of
-from drivers.can_channel import ChannelDecoder
+from calibration.rig.channels import Cia404Analogue, Cia406Encoder, Cia406Linear
+from calibration.rig.description import Rig
+from daemon.acquisition.channels import decoder_factories, node_setups
+from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_inputs
+from daemon.acquisition.simulated_rig import SimulatedRig, SimulationError, stops_of
+from daemon.commands import CommandError
+from daemon.config import CanSection, Config, ConfigError, RigSource
+from daemon.sessions.prism_guard import MotionLimit
+from daemon.sessions.replay import captures_of, first_captures
+from drivers.can.channel import ChannelDecoder
+from drivers.can.ports import CanLinkConfig, Interface
 from drivers.can_decoder import CanDecoder
-from drivers.can_ports import Interface
-from drivers.canbus import CanLink, CanLinkConfig
+from drivers.can_link import CanLink
 from drivers.clock import Clock, ScaledClock, Stamp, SystemClock
 from drivers.readings import Decoder, LinkLoop
-from drivers.serialport import SerialConfig
-from drivers.station import StationDecoder, StationLink
+from drivers.stations.decoder import StationDecoder
+from drivers.stations.link import StationLink
+from drivers.stations.serial_port import SerialConfig
 from simulators.replay import ReplayLink
 
 SIMULATED_SYNC_MS = 200
@@ -45,20 +44,20 @@ def _never() -> bool:
 
 @dataclass(frozen=True)
 class Parts:
-    """What the daemon runs.
+    """The parts that the daemon runs.
 
     Attributes:
         mode: for `status`.
         rig, rig_text: the machine, and the file that describes it.
         clock: of everything.
         links: loops that capture.
-        decoders: link name -> what makes a fresh decoder of its captures.
+        decoders: link name -> a factory of decoders for its captures.
         joiner: joins fixes with joints.
         aim: turns the station to a target, where something can.
         can_links: those that can be asked for active set-up.
         visit: drives the boom to the rows of a pose plan, and tells how many stops are to come; None where only an
             operator does.
-        is_over: whether there is nothing more to come (a replay has ended).
+        is_over: True when a replay has ended.
     """
 
     mode: Mode
@@ -77,10 +76,11 @@ class Parts:
 def live(
     config: Config, source: RigSource, clock: Clock | None = None, aim: Callable[[str], None] | None = None
 ) -> Parts:
-    """A real rig.
+    """Compose a real rig.
 
     Args:
-        config, source: links and rig.
+        config: names the links.
+        source: the rig.
         clock: the host's by default; another one for a rig that somebody simulates at the configured ports.
         aim: turns the station where something else than the operator can.
     """
@@ -98,13 +98,15 @@ def simulated(
     secret: Path | None = None,
     dwell_s: float,
 ) -> Iterator[Parts]:
-    """A simulated rig behind real protocols, in a process of its own, on the configured links' names.
+    """Compose a simulated rig behind real protocols, in a process of its own, on the configured links' names.
 
     Args:
+        config: names the links.
+        source: the rig.
         rate: simulated seconds per second.
         seed: which machine, which noise, which poses.
         effects: hidden effects, as the simulator spells them.
-        secret: where the simulator leaves the sealed envelope of one more, which it draws; none by default.
+        secret: directory in which the simulator names one more, which it draws; none by default.
         dwell_s: how long the boom stands at each pose, simulated seconds.
     """
     now = SystemClock().now()
@@ -162,7 +164,7 @@ def _visit(simulation: SimulatedRig, rig: Rig, dwell_s: float, rows: Sequence[Ma
 
 
 def replayed(config: Config, source: RigSource, files: Sequence[Path], speed: float) -> Parts:
-    """Captured logs in place of a rig, at `speed` times the recorded one.
+    """Compose captured logs in place of a rig, at `speed` times the recorded one.
 
     Raises:
         DescriptionError, ConfigError: a file is malformed, empty, or of a link that is not configured.
@@ -179,10 +181,11 @@ def replayed(config: Config, source: RigSource, files: Sequence[Path], speed: fl
 
 
 def decoders(config: Config, source: RigSource) -> dict[str, Callable[[], Decoder]]:
-    """Link name -> what makes a fresh decoder of its captures.
+    """Return link name -> a factory of decoders for its captures.
 
     Args:
-        config, source: links and rig.
+        config: names the links.
+        source: the rig.
 
     Raises:
         ConfigError: a channel's link is not configured.
@@ -208,7 +211,7 @@ def decoders(config: Config, source: RigSource) -> dict[str, Callable[[], Decode
 
 
 def joiner(config: Config, rig: Rig) -> ObservationJoiner:
-    """What joins the fixes of the configured stations with the rig's joints and signals."""
+    """Return the joiner of the configured stations' fixes with the rig's joints and signals."""
     return ObservationJoiner(
         joint_inputs(rig),
         signal_inputs(rig),
@@ -218,7 +221,7 @@ def joiner(config: Config, rig: Rig) -> ObservationJoiner:
 
 
 def motion_limits(config: Config) -> dict[str, MotionLimit]:
-    """For each configured station, what motion can do to its prism."""
+    """Return, for each configured station, the limit of its prism's motion."""
     return {station.name: MotionLimit.of_station(station) for station in config.station}
 
 

@@ -1,26 +1,30 @@
-"""The daemon's configuration: one TOML file, checked whole before anything is opened."""
+"""The daemon's configuration and the rig it names: TOML files, checked whole before anything is opened."""
 
 from __future__ import annotations
 
 import os
 import reprlib
+from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from calibration.toml import LONGEST, parse_toml
-from daemon.control import reading_socket
-from drivers.can_transmit import is_free
+from calibration.errors import RigError
+from calibration.rig.description import Rig, parse_rig, shipped_rigs
+from calibration.rig.toml import LONGEST, parse_toml
+from daemon.commands import CommandError, reading_socket
+from drivers.can.tip_frames import FRAMES
+from drivers.canopen.transmit import is_free
 from drivers.files import read_text
-from drivers.station import StationConfig
-from drivers.tip_frames import FRAMES
+from drivers.stations.config import StationConfig
 
 _QUOTED = 100  # characters of a key
 MAX_SOCKET_PATH_BYTES = 107  # unix(7): sun_path holds 108 bytes with the closing zero
 
 
-class ConfigError(Exception):
+class ConfigError(CommandError):
     """The configuration cannot be used; the message names file, key, what was found and what is allowed."""
 
 
@@ -179,23 +183,23 @@ class Config(_Section):
         return self
 
     def own_identifiers(self, link: str) -> tuple[int, ...]:
-        """Identifiers of rigcal's own messages on a CAN link."""
+        """Return the identifiers of rigcal's own messages on a CAN link."""
         can = self.tip.can if self.tip is not None else None
         return can.identifiers if can is not None and can.link == link else ()
 
     @property
     def store_path(self) -> Path:
-        """The store."""
+        """Path of the store."""
         return self.state_directory / "rigcal.sqlite"
 
     @property
     def models_directory(self) -> Path:
-        """One directory a model."""
+        """Directory that holds a directory for each model."""
         return self.state_directory / "models"
 
     @property
     def socket_path(self) -> Path:
-        """The control socket."""
+        """Path of the control socket."""
         if self.socket is not None:
             return self.socket
         return Path(os.environ.get("RUNTIME_DIRECTORY", self.state_directory)) / "control.sock"
@@ -251,7 +255,7 @@ def read_config(path: Path) -> Config:
 
 
 def _sentence(error: Any) -> str:
-    """One pydantic error as `key: what is wrong (allowed: ...)`."""
+    """Return one pydantic error as `key: fault (allowed: ...)`."""
     key = ".".join(str(part + 1) if isinstance(part, int) else str(part)[:_QUOTED] for part in error["loc"]) or "file"
     message = error["msg"].removeprefix("Value error, ")[: 4 * _QUOTED]
     if error["type"] == "extra_forbidden":
@@ -268,9 +272,50 @@ def _sentence(error: Any) -> str:
 
 
 def _section_of(section: type[BaseModel], part: int | str) -> type[BaseModel]:
-    """The section that `part` of an error's location leads to from `section`; an index stays in it."""
+    """Return the section that `part` of an error's location leads to; an index stays in `section`."""
     if isinstance(part, int) or part not in section.model_fields:
         return section
     annotation = section.model_fields[part].annotation
     candidates = (annotation, *get_args(annotation))
     return next((c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)), section)
+
+
+# ---- rigs ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RigSource:
+    """A rig and its origin.
+
+    Attributes:
+        rig: the description.
+        text: the TOML it was read from; travels with the model.
+        directory: where the DBC and EDS files that it names are.
+    """
+
+    rig: Rig
+    text: str
+    directory: Path
+
+
+def load_rig(name_or_path: str) -> RigSource:
+    """Load a shipped rig by its name, or any rig by the path of its file.
+
+    Raises:
+        RigError: no such rig or file, or the file is malformed.
+    """
+    if name_or_path in shipped_rigs():
+        directory = Path(str(resources.files("calibration").joinpath("rigs")))
+        path = directory / f"{name_or_path}.toml"
+    else:
+        path = Path(name_or_path)
+        directory = path.parent
+        if not path.is_file():
+            shipped = ", ".join(shipped_rigs())
+            raise RigError(name_or_path, "", f"neither a shipped rig ({shipped}) nor a rig file")
+    try:
+        text = read_text(path, LONGEST)
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise RigError(str(path), "", f"cannot be read: {reason}") from error
+    return RigSource(parse_rig(text, path.name), text, directory)

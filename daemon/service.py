@@ -8,36 +8,39 @@ import sqlite3
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
+from pathlib import Path
 from typing import Any, TypeVar
 
-from calibration.rig import Rig
-from daemon.acquisition import Acquisition
+from calibration.rig.description import Rig
+from daemon.acquisition.acquisition import Acquisition
+from daemon.acquisition.clock_watch import ClockWatch
+from daemon.acquisition.present_state import expected_of
 from daemon.alarms.board import AlarmBoard
-from daemon.alarms.gather import Gatherer
-from daemon.clock_watch import ClockWatch
+from daemon.alarms.evidence import Gatherer
+from daemon.commands import FAILED, REFUSED, CommandError, Handler, reading_socket
 from daemon.composition import Parts, motion_limits
 from daemon.config import Config
-from daemon.control import FAILED, REFUSED, CommandError, Handler, reading_socket
-from daemon.control_server import ControlServer
-from daemon.drift_table import DriftTable
-from daemon.gap_status import GapStatus
-from daemon.jobs import JobRunner
-from daemon.live_model import LiveModel
-from daemon.live_tip import FRESH_S, LiveTip
-from daemon.model_table import ModelTable
-from daemon.notify import Notifier
-from daemon.present_state import expected_of
-from daemon.registry import ModelRegistry
-from daemon.rights import reading_only
-from daemon.sessions import SessionKeeper
-from daemon.setups import SetupBook
+from daemon.control.protocol import reading_only
+from daemon.control.server import ControlServer
+from daemon.host.systemd import Notifier
+from daemon.jobs.runner import JobRunner
+from daemon.models.drift import gap_status
+from daemon.models.live_model import LiveModel
+from daemon.models.live_tip import FRESH_S, LiveTip
+from daemon.models.registry import ModelRegistry
+from daemon.models.tip_sender import TipSender
+from daemon.sessions.manager import SessionKeeper
+from daemon.sessions.station_setups import SetupBook
 from daemon.store.alarms import AlarmTable
-from daemon.store.errors import StoreError, storage_errors, storage_sentence
+from daemon.store.errors import StoreError, storage_errors, storage_sentence, unwritable_errors
 from daemon.store.health import StoreHealth, StoreWatch
-from daemon.store.runs import previous_run
+from daemon.store.jobs import JobTable
+from daemon.store.models import ModelTable
+from daemon.store.sessions import SessionTable
+from daemon.store.setups import SetupTable
 from daemon.store.store import Store
-from daemon.time_budget import TimeBudget
-from daemon.tip_sender import TipSender
+from drivers.clock import NS_PER_S, TimeBudget
 from drivers.errors import DeviceError, TransmitForbiddenError
 from drivers.readings import Record
 
@@ -48,7 +51,7 @@ T = TypeVar("T")
 BEAT_S = 1.0
 STOP_S = 20.0  # real seconds for all parts together, well within the unit's TimeoutStopSec
 STORE_END_S = 3.0  # of them for the store's last commits
-_EVENTS = "SELECT device, utc_ns, kind, text FROM device_events ORDER BY id DESC LIMIT 12"
+_EVENTS = 12  # the newest are shown in `status`
 
 
 class Daemon:
@@ -87,7 +90,7 @@ class Daemon:
             parts.joiner,
             config.sessions,
             parts.clock,
-            run_id=store.run_id,
+            run_id=store.run_id or parts.clock.now().utc_ns // NS_PER_S,  # unique also where the runs are damaged
             aim=parts.aim,
             limits=motion_limits(config),
         )
@@ -104,7 +107,7 @@ class Daemon:
             fresh_s=FRESH_S / parts.clock.real_seconds(1.0),  # what delays readings here are computers, in real time
         )
         self._sender = tip_sender(config, parts, self._tip)
-        before = previous_run(store) if parts.mode == "live" else None  # other clocks are none of the computer's
+        before = store.previous_end if parts.mode == "live" else None  # other clocks are none of the computer's
         self._acquisition = Acquisition(
             parts.links,
             parts.decoders,
@@ -115,42 +118,45 @@ class Daemon:
             clock_watch=ClockWatch(before) if parts.mode == "live" else None,
         )
         self._jobs = JobRunner(store, config, parts.rig.name, parts.clock, is_held=self._are_jobs_held)
-        drift = DriftTable(store, parts.rig.name, parts.clock)
-        self._gap = GapStatus(store, parts.rig.name, drift)
+        self._job_table, self._model_table = JobTable(store, parts.rig.name), models
         self._servers: list[ControlServer] = []
         self._unserved: dict[str, str] = {}  # sockets that could not be made, and why
         self._alarms = AlarmBoard(
             AlarmTable(store),
-            Gatherer(
-                store,
-                parts.rig.name,
-                self._live_model,
-                drift,
-                parts.clock,
-                before,
-                acquisition=self._acquisition.status,
-                health=lambda: self._watch.health,
-                suspicions=self._sessions.prism_suspicions,
-                control_faults=self._control_faults,
-                models_directory=config.models_directory,
-            ),
+            Gatherer(parts.clock, before, self._evidence()),
             parts.clock,
         )
         self._models = ModelRegistry(models, parts.rig.name, self._live_model, compare=self._jobs.compare)
         self._servers, self._unserved = control_servers(config, self._commands())
 
+    def _evidence(self) -> dict[str, Callable[[], object]]:
+        """Part of the alarms' evidence -> function that tells it."""
+        sessions = SessionTable(self._store, self._parts.rig.name)
+        return {
+            "acquisition": self._acquisition.status,
+            "session": sessions.open_session,
+            "suspicions": self._sessions.prism_suspicions,
+            "setup": SetupTable(self._store).newest,
+            "failed_jobs": self._job_table.failed,
+            "model": self._live_model.health,
+            "store": lambda: self._watch.health,
+            "is_store_new": lambda: is_store_new(self._job_table, self._config.models_directory),
+            "untrained_sessions": sessions.untrained,
+            "control_faults": self._control_faults,
+        }
+
     def _control_faults(self) -> dict[str, str]:
-        """Control sockets on which no one can connect, and why."""
+        """Return the control sockets that nobody can connect to -> why."""
         found = {server.path.name: server.trouble() for server in self._servers}
         return self._unserved | {name: trouble for name, trouble in found.items() if trouble is not None}
 
     @property
     def store_health(self) -> StoreHealth:
-        """How the store is; from any thread."""
+        """The store's health; from any thread."""
         return self._watch.health
 
     def _are_jobs_held(self) -> bool:
-        """Nothing is made of a store that cannot be trusted, or while what was measured is still being decoded."""
+        """Return True while the store cannot be trusted or captures wait to be decoded."""
         return self._watch.health.state != "ok" or self._acquisition.is_behind
 
     def run(self, stop: threading.Event, notifier: Notifier) -> None:
@@ -222,7 +228,7 @@ class Daemon:
 
     def _commands(self) -> Mapping[str, Handler]:
         sessions, jobs, models = self._sessions, self._jobs, self._models
-        return {
+        commands: dict[str, Handler] = {
             "status": self._status,
             "setup.new": self._setups.new_command,
             "setup.list": self._setups.list_command,
@@ -248,6 +254,11 @@ class Daemon:
             "devices.configure": self._configure_devices,
             **({} if self._parts.visit is None else {"simulation.visit": self._visit}),
         }
+        return {name: partial(self._carry_out, handler) for name, handler in commands.items()}
+
+    def _carry_out(self, handler: Handler, arguments: Mapping[str, Any]) -> Any:
+        with unwritable_errors(self._store.path):
+            return handler(arguments)
 
     def _status(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
         unreadable: dict[str, str] = {}  # a table that is damaged must not hide the rest
@@ -266,10 +277,10 @@ class Daemon:
             "alarms": self._alarms.status(),
             "acquisition": asdict(self._acquisition.status()),
             "session": stored("session", self._sessions.open_session),
-            "jobs": stored("jobs", self._jobs.unfinished) or [],
+            "jobs": stored("jobs", self._job_table.unfinished) or [],
             "models": stored("models", self._models.status),
-            "gap": stored("gap", self._gap.now),
-            "events": stored("events", lambda: self._store.rows(_EVENTS)) or [],
+            "gap": stored("gap", lambda: gap_status(self._job_table, self._model_table)),
+            "events": stored("events", lambda: self._store.newest_events(_EVENTS)) or [],
             "store": str(self._config.store_path),
             "store_health": self._watch.health.as_dict(),
             "unreadable": unreadable,
@@ -283,7 +294,7 @@ class Daemon:
         return self._sessions.start_command(arguments)
 
     def _visit(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Where the simulated boom drives next: the rows of a pose plan; `left` tells how many stops are to come."""
+        """Send the simulated boom to the rows of a pose plan; `left` tells how many stops are to come."""
         rows = arguments.get("poses", [])
         if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
             raise CommandError("poses: the rows of a plan, as `rigcal plan --json` prints them")
@@ -291,7 +302,7 @@ class Daemon:
         return {"left": self._parts.visit(rows)}
 
     def _configure_devices(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Active set-up of CANopen devices: only when the operator says that the machine is parked."""
+        """Set up CANopen devices, if the operator says that the machine is parked."""
         if arguments.get("machine_is_parked") is not True:
             raise CommandError(
                 "say that the machine is parked and locked out (--machine-is-parked): set-up writes to devices"
@@ -328,7 +339,7 @@ def _name(stop: Callable[[], None]) -> str:
 
 
 def tip_sender(config: Config, parts: Parts, tip: LiveTip) -> TipSender | None:
-    """What sends the tip; None where none is to be sent, and where there is no bus, as in a replay."""
+    """Return the sender of the tip; None if none is to be sent, or if there is no bus, as in a replay."""
     if config.tip is None or config.tip.can is None:
         return None
     link = next((link for link in parts.can_links if link.name == config.tip.can.link), None)
@@ -352,6 +363,11 @@ def control_servers(config: Config, commands: Mapping[str, Handler]) -> tuple[li
         except CommandError as error:
             unserved[path.name] = f"members of read_group {config.read_group} cannot look: {error}"
     return servers, unserved
+
+
+def is_store_new(jobs: JobTable, models: Path) -> bool:
+    """Return True if a store has never seen a job, and yet its models' directory holds some."""
+    return models.is_dir() and any(models.iterdir()) and jobs.newest_id() == 0
 
 
 def declare_channels(store: Store, rig: Rig) -> None:

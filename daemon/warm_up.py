@@ -1,26 +1,31 @@
-"""Compiles ahead what the first calibration on a computer would wait for: `python -m daemon.warm_up`.
+"""Compiled kernels: where they are kept, and how to compile them ahead (`python -m daemon.warm_up`).
 
-numba compiles a function when it is first called, and keeps the result in the directory that `daemon.numba_cache`
-chooses; all of rigcal's take some twenty seconds. So set-up and installation run a small calibration by each method
-that has loops of its own, cut short as soon as each loop was called. It fits invented fixes and writes nothing but the
-two caches. Whatever goes wrong is one sentence and no failure: the first calibration compiles what is missing.
+numba compiles a function when it is first called; all of rigcal's take some twenty seconds. numba and matplotlib keep
+files between runs, by default beside the installed program or in the home directory. A service can write to neither,
+and a laptop's may be read-only; then numba refuses to compile at all. So `prepare` chooses a writable directory before
+either is imported.
+
+Set-up and installation call `main`, which runs a small calibration by each method with loops of its own, cut short as
+soon as each loop was called. It fits invented fixes and writes nothing but the two caches. A failure is one sentence
+and exit status 0: the first calibration compiles what is missing.
 """
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
+import stat
 import sys
-from collections.abc import Callable, MutableMapping
+import tempfile
+from collections.abc import Iterator, MutableMapping
+from pathlib import Path
 from typing import TYPE_CHECKING
-
-import numpy as np
-
-from daemon.numba_cache import prepare
-from daemon.rigs import RigSource, load_rig
 
 if TYPE_CHECKING:
     from calibration.observations import Observations
+    from calibration.rig.description import Rig
+    from calibration.run import Run
 
 _RIG = "swdt82"  # with couplings, rows of beta, prismatic joints and several prisms: all that a rig may have
 _POSES = 30
@@ -28,11 +33,76 @@ _CURVES = 100  # columns that are nearly all zero, as splines are
 _JOINT_ERROR_DEG = 0.15  # far beyond noise: a global search is asked for, yet no search for encoders that are reversed
 
 
-def place_of_caches(environ: MutableMapping[str, str]) -> str | None:
-    """Choose where the caches are, as `numba_cache.prepare`; call before numba or matplotlib is imported.
+def prepare(environ: MutableMapping[str, str] = os.environ) -> Path:
+    """Point NUMBA_CACHE_DIR and MPLCONFIGDIR at writable directories; call before numba or matplotlib is imported.
+
+    A directory the user has set is kept where it can be written. Otherwise the service's CACHE_DIRECTORY (systemd),
+    the user's cache directory and a private temporary directory are tried in this order.
+
+    Args:
+        environ: the process's environment, which spawned children inherit.
 
     Returns:
-        A sentence where that is not where they were meant to be.
+        The directory of numba's cache.
+
+    Raises:
+        OSError: not even a temporary directory can be made.
+    """
+    root: Path | None = None
+    for variable, name in (("NUMBA_CACHE_DIR", "numba"), ("MPLCONFIGDIR", "matplotlib")):
+        if environ.get(variable) and _writable(Path(environ[variable])):
+            continue
+        if root is None:
+            root = next((path for path in _candidates(environ) if _writable(path)), None) or _private_temporary()
+        path = root / name
+        path.mkdir(exist_ok=True)
+        environ[variable] = str(path)
+    return Path(environ["NUMBA_CACHE_DIR"])
+
+
+def is_compiled(environ: MutableMapping[str, str] = os.environ) -> bool:
+    """Return True if anything was compiled before into the directory that `prepare` chooses."""
+    return any(prepare(environ).rglob("*.nbi"))
+
+
+def _candidates(environ: MutableMapping[str, str]) -> Iterator[Path]:
+    if service := environ.get("CACHE_DIRECTORY"):
+        yield Path(service.split(":")[0])
+    if cache := environ.get("XDG_CACHE_HOME"):
+        yield Path(cache) / "rigcal"
+    if home := environ.get("HOME"):
+        yield Path(home) / ".cache" / "rigcal"
+
+
+def _writable(path: Path) -> bool:
+    # Permission bits say nothing of read-only mounts, so a file is made.
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            return True
+    except OSError:
+        return False
+
+
+def _private_temporary() -> Path:
+    # The caches hold code that is run: a directory that another user could have prepared is not used.
+    path = Path(tempfile.gettempdir()) / f"rigcal-{os.getuid()}"
+    with contextlib.suppress(FileExistsError):
+        path.mkdir(mode=0o700)
+    found = path.lstat()
+    if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022:
+        return path
+    return Path(tempfile.mkdtemp(prefix="rigcal-"))
+
+
+# ---- compiling ahead -------------------------------------------------------------------------------------------------
+
+
+def place_of_caches(environ: MutableMapping[str, str]) -> str | None:
+    """Choose the directories of the caches, as `prepare`.
+
+    Returns:
+        A sentence where the caches are not where they were meant to be, else None.
 
     Raises:
         OSError: not even a temporary directory can be made.
@@ -49,30 +119,33 @@ def place_of_caches(environ: MutableMapping[str, str]) -> str | None:
 
 def compile_ahead() -> None:
     """Call everything that is compiled, and index the fonts that reports are drawn with."""
+    import numpy as np
     from matplotlib.font_manager import findfont
 
-    from calibration.kernels.gram import gram
-    from calibration.pipeline import calibrate
-    from calibration.residual.forest import Forest
+    from calibration.numerics.matrices import gram
+    from calibration.pipeline.calibrate import calibrate
+    from calibration.residual.trees.forest import Forest
+    from daemon.config import load_rig
 
     findfont("DejaVu Sans")
     source = load_rig(_RIG)
-    rig, text, observations = source.rig, source.text, _invented(source)
-    calibrate(rig, text, observations, residual="none", should_stop=_after_one_round())
+    given = source.rig, source.text, _invented(source.rig)
+    calibrate(*given, residual="none", run=_one_round())
     # Effects that explain all would leave nothing to learn.
-    calibrate(rig, text, observations, effects="none", should_stop=_after_one_round())
-    calibrate(rig, text, observations, method="pde-paper", residual="none", should_stop=_after_one_round())
+    calibrate(*given, effects="none", run=_one_round())
+    calibrate(*given, method="pde-paper", residual="none", run=_one_round())
     gram(np.eye(_CURVES))  # so few fixes ask for no curves of many splines
     Forest.build([()]).predict(np.zeros((1, 1)), np.zeros(1, dtype=np.int64))  # nor for trees
 
 
-def _invented(source: RigSource) -> Observations:
-    """Fixes of all prisms in random poses of the nominal machine, whose joints err by more than its model can say."""
-    from calibration.kinematics import Chain, ChainData, Placement
+def _invented(rig: Rig) -> Observations:
+    """Invent fixes of all prisms in random poses, with joint errors beyond what the model can say."""
+    import numpy as np
+
+    from calibration.kinematics.chain import Chain, ChainData, Placement
     from calibration.observations import Observations
 
     rng = np.random.default_rng(0)
-    rig = source.rig
     chain = Chain(rig, {"": Placement(np.eye(3), np.array([0.0, 8000.0, 0.0]))})
     prism = np.tile(np.arange(len(rig.prisms)), _POSES)
     n = len(prism)
@@ -91,13 +164,15 @@ def _invented(source: RigSource) -> Observations:
     )
 
 
-def _after_one_round() -> Callable[[], bool]:
-    """What a search asks before every round: one is enough to have called everything."""
-    return itertools.chain([False], itertools.repeat(True)).__next__
+def _one_round() -> Run:
+    """Return a run whose search stops after one round, which calls everything."""
+    from calibration.run import Run
+
+    return Run(should_stop=itertools.chain([False], itertools.repeat(True)).__next__)
 
 
 def main(environ: MutableMapping[str, str] = os.environ) -> int:
-    """Entry of the process; exit status 0 whatever comes of it."""
+    """Compile ahead; the exit status is 0 whatever comes of it."""
     try:
         displaced = place_of_caches(environ)
         if displaced is not None:

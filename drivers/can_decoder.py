@@ -1,22 +1,20 @@
-"""Captures of one CAN link -> readings, events, gaps. Pure: owns no port, no thread and no clock."""
+"""Decoder of a CAN link: captures to readings, events and gaps. Pure: owns no port, no thread and no clock."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Sequence
 
-from drivers.can_channel import ChannelDecoder, PdoChannelDecoder, without_time
-from drivers.can_errors import BusErrors
-from drivers.can_summary import CanSummary, IdSummary, RateWindow
-from drivers.canopen_supervision import NodeSupervision
-from drivers.cia301 import Service, classify
+from drivers.can.channel import ChannelDecoder, without_time
+from drivers.can.error_frames import BusErrors
+from drivers.can.j1939 import J1939Id
+from drivers.can.summary import CanSummary, IdSummary, RateWindow
+from drivers.canopen.cia301 import Service, classify
+from drivers.canopen.pdo import PdoChannelDecoder
+from drivers.canopen.supervision import NodeSupervision
+from drivers.canopen.sync import SYNC_ID, SyncSampling
 from drivers.clock import NS_PER_S, Stamp
-from drivers.j1939 import J1939Id
 from drivers.readings import CanCapture, Capture, Gap, GapReason, Record
-
-SYNC_ID = 0x080
-SYNC_WINDOW_NS = NS_PER_S // 10
-"""A PDO that follows a SYNC by more was not sampled by it: ten nodes at 20 kbit/s need 60 ms."""
 
 IDS_MAX = 512
 """Identifiers that are counted one by one; noise on a 29-bit bus must fill neither memory nor an operator's screen."""
@@ -106,7 +104,7 @@ class CanDecoder:
         return records
 
     def summary(self, now: Stamp) -> CanSummary:
-        """What was heard until `now`; channels that were never heard are there as well."""
+        """Return the counts until `now`, with channels that were never heard."""
         with self._lock:
             entries = sorted(self._entries.items())
             rates = self._rates.rates_per_s()
@@ -154,7 +152,7 @@ class _Entry:
     def summary(self, key: int, rate_per_s: float | None, now: Stamp) -> IdSummary:
         last_seen = self.last_seen
         # Channels of one message read the same counter; one that was silent for longer knows of fewer
-        missed = [channel.missed_frames for channel in self.channels if channel.missed_frames is not None]
+        missed = [count for channel in self.channels if (count := channel.missed_frames) is not None]
         return IdSummary(
             arbitration_id=key & ~_EXTENDED,
             is_extended=bool(key & _EXTENDED),
@@ -177,9 +175,9 @@ class _Entry:
 
 
 class _ChannelState:
-    """One channel: whether it is silent, and which SYNC its next frame belongs to."""
+    """One channel: its silence, and the SYNC that its next frame belongs to."""
 
-    __slots__ = ("_decoder", "_is_silent", "_is_synchronous", "_sync_used", "_timeout_ns", "last_seen", "name")
+    __slots__ = ("_decoder", "_is_silent", "_sampling", "_timeout_ns", "last_seen", "name")
 
     def __init__(self, decoder: ChannelDecoder) -> None:
         self.name = decoder.name
@@ -187,19 +185,15 @@ class _ChannelState:
         self._decoder = decoder
         self._timeout_ns = round(decoder.timeout_s * NS_PER_S)
         self._is_silent = False
-        self._is_synchronous = isinstance(decoder, PdoChannelDecoder) and decoder.is_synchronous
-        self._sync_used: Stamp | None = None
+        is_synchronous = isinstance(decoder, PdoChannelDecoder) and decoder.is_synchronous
+        self._sampling = SyncSampling() if is_synchronous else None
 
     @property
     def missed_frames(self) -> int | None:
         return self._decoder.missed_frames
 
     def decode(self, stamp: Stamp, sync: Stamp | None, data: bytes, records: list[Record]) -> None:
-        sampled = stamp
-        if self._is_synchronous and sync is not None and sync is not self._sync_used:
-            self._sync_used = sync
-            if 0 <= stamp.since(sync) <= SYNC_WINDOW_NS and not (stamp.is_doubtful or sync.is_doubtful):
-                sampled = sync
+        sampled = stamp if self._sampling is None else self._sampling.instant(stamp, sync)
         decoded = self._decoder.decode(sampled, data)
         if not decoded:
             return

@@ -1,4 +1,4 @@
-"""Time, passed in and never called: every record carries three clocks, liveness uses the monotonic one alone."""
+"""Clocks and stamps: every record carries three clocks, liveness uses the monotonic one alone."""
 
 from __future__ import annotations
 
@@ -32,39 +32,39 @@ class Stamp:
     is_doubtful: bool = False
 
     def shifted(self, nanoseconds: int) -> Stamp:
-        """The instant `nanoseconds` later (negative: earlier) on the same clocks."""
+        """Return the instant `nanoseconds` later (negative: earlier) on the same clocks."""
         return Stamp(self.utc_ns + nanoseconds, self.monotonic_ns + nanoseconds, self.boot_id, self.is_doubtful)
 
     def doubted(self) -> Stamp:
-        """The same instant, marked as doubtful."""
+        """Return the same instant, marked as doubtful."""
         return replace(self, is_doubtful=True)
 
     def since(self, earlier: Stamp) -> int:
-        """Nanoseconds from `earlier` to this instant: monotonic within one boot, UTC from one boot to another."""
+        """Return the nanoseconds since `earlier`: monotonic within one boot, UTC from one boot to another."""
         if self.boot_id == earlier.boot_id:
             return self.monotonic_ns - earlier.monotonic_ns
         return self.utc_ns - earlier.utc_ns
 
 
 Order = Callable[[Stamp], tuple[int, int]]
-"""Where an instant lies among all others: which boot it belongs to, and its place therein. UTC cannot tell, for a boot
+"""Order of instants: the boot that an instant belongs to, and its place in it. UTC cannot tell, for a boot
 may show an earlier time than the one before it."""
 
 
 def lies_within(order: Order, stamp: Stamp, since: Stamp | None, until: Stamp | None) -> bool:
-    """Whether `stamp` lies between two instants, the first included; None is without bound."""
+    """Return True if `stamp` lies between two instants, the first included; None is no bound."""
     at = order(stamp)
     return (since is None or at >= order(since)) and (until is None or at < order(until))
 
 
 class Clock(Protocol):
-    """What the program may ask of time."""
+    """A clock, passed to whatever needs time."""
 
     def now(self) -> Stamp:
-        """This instant on all three clocks."""
+        """Return this instant on all three clocks."""
 
     def monotonic_ns(self) -> int:
-        """The monotonic clock alone, for deadlines."""
+        """Return the monotonic clock alone, for deadlines."""
 
     def sleep(self, seconds: float) -> None:
         """Let `seconds` of this clock pass."""
@@ -73,18 +73,18 @@ class Clock(Protocol):
         """Wait for `event` for at most `seconds` of this clock; True when it is set."""
 
     def real_seconds(self, seconds: float) -> float:
-        """How long `seconds` of this clock last on the wall: the time-out to give to an operating-system call."""
+        """Convert seconds of this clock to real ones, as operating-system calls take them."""
 
     @property
     def host(self) -> Clock:
         """The host's own clocks, by which the kernel stamps what it receives."""
 
     def of_host(self, stamp: Stamp) -> Stamp:
-        """What this clock shows at an instant of the host's clocks."""
+        """Convert an instant of the host's clocks to this clock's."""
 
 
 def read_boot_id() -> str:
-    """The kernel's boot identifier (Linux, random(4)); "unknown" where there is none."""
+    """Return the kernel's boot identifier (Linux, random(4)); "unknown" where there is none."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except OSError:
@@ -106,7 +106,7 @@ class SystemClock:
         self._boot_id = read_boot_id()
 
     def now(self) -> Stamp:
-        """This instant on all three clocks.
+        """Return this instant on all three clocks.
 
         A thread can be interrupted between the readings of two clocks, for as long as the computer is busy. UTC is
         therefore read between two readings of the monotonic clock, and again if they lie apart; of several the tightest
@@ -233,3 +233,25 @@ class ManualClock:
 
     def of_host(self, stamp: Stamp) -> Stamp:
         return self._now.doubted() if stamp.is_doubtful else self._now
+
+
+class TimeBudget:
+    """A time-out in real time that several steps share, whatever the rig's clock does; it runs from now on.
+
+    Args:
+        seconds: how long it lasts.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self._clock = SystemClock()
+        self._ends_ns = self._clock.monotonic_ns() + round(seconds * NS_PER_S)
+
+    @property
+    def left_s(self) -> float:
+        """Seconds left, never negative: the time-out to give to a join or a wait."""
+        return max(self._ends_ns - self._clock.monotonic_ns(), 0) / NS_PER_S
+
+    @property
+    def is_over(self) -> bool:
+        """True when nothing is left."""
+        return self.left_s == 0.0

@@ -14,7 +14,6 @@ import socket
 import struct
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
 
 STOP_POLL_S = 0.05  # how long a stop may go unnoticed
@@ -40,7 +39,7 @@ _ATTRIBUTE = struct.Struct("@HH")  # length, type
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
-class DeviceWatch(ABC):
+class DeviceWatch:
     """Waits for a device that may come back; see `watch_path` and `watch_interface`.
 
     It watches from the first `wait` until `close`, so that nothing is missed between two attempts to open the device.
@@ -89,7 +88,7 @@ class DeviceWatch(ABC):
         return bool(poll.poll(timeout_s * 1000))
 
     def _has_news(self) -> bool:
-        """Read all that the kernel has to tell; whether any of it is about the device."""
+        """Read all messages of the kernel; return True if any is about the device."""
         assert self._descriptor is not None
         news = False
         while True:
@@ -101,16 +100,16 @@ class DeviceWatch(ABC):
                 return True
             news = self._is_news(message) or news
 
-    @abstractmethod
     def _open(self) -> int:
-        """A descriptor, not blocking, at which the kernel tells what happens."""
+        """Open a non-blocking descriptor on which the kernel sends its messages."""
+        raise OSError("nothing to watch")
 
-    def _renew(self) -> None:  # noqa: B027 - most have nothing to renew
-        """Look again at what must be watched."""
+    def _renew(self) -> None:
+        """Watch again those places that have changed."""
 
-    @abstractmethod
     def _is_news(self, message: bytes) -> bool:
-        """Whether what the kernel told is about the device."""
+        """Return True if a message of the kernel is about the device."""
+        raise NotImplementedError(message)
 
 
 def watch_path(path: str) -> DeviceWatch:
@@ -125,7 +124,7 @@ def watch_interface(name: str) -> DeviceWatch:
 
 def no_watch() -> DeviceWatch:
     """Watch nothing: for buses that are no devices, where only time can tell."""
-    return _NoWatch()
+    return DeviceWatch()
 
 
 class _PathWatch(DeviceWatch):
@@ -206,7 +205,7 @@ class _InterfaceWatch(DeviceWatch):
         return False
 
     def _is_up(self, link: bytes) -> bool:
-        """Whether a message says that the interface is up."""
+        """Return True if a message says that the interface is up."""
         if len(link) < _LINK_MESSAGE.size or not _LINK_MESSAGE.unpack_from(link)[3] & _IFF_UP:
             return False
         at = _LINK_MESSAGE.size
@@ -220,13 +219,3 @@ class _InterfaceWatch(DeviceWatch):
 
 def _aligned(length: int) -> int:
     return (length + 3) & ~3
-
-
-class _NoWatch(DeviceWatch):
-    """Knows of nothing."""
-
-    def _open(self) -> int:
-        raise OSError("nothing to watch")
-
-    def _is_news(self, message: bytes) -> bool:
-        raise NotImplementedError(message)

@@ -1,20 +1,24 @@
-"""The few errors that drivers raise. Each says which link or device, what was expected, and what to do."""
+"""Errors that drivers raise. Each names the link or device, the fault, and the remedy."""
 
 from __future__ import annotations
 
-MESSAGE_MAX = 1000  # characters
+MESSAGE_MAX = 1000
+"""Characters of a message, which may quote whatever was found."""
 
 
 class DriverError(Exception):
     """Base of all errors of `drivers`.
 
-    Attributes:
+    Args:
         where: link, device or file (with line) that the error is about.
+        message: the fault and the remedy; what is beyond MESSAGE_MAX is cut off.
+
+    Attributes:
+        where: as given.
     """
 
     def __init__(self, where: str, message: str) -> None:
         text = f"{where}: {message}"
-        # What was found is quoted, and may be anything
         super().__init__(text if len(text) <= MESSAGE_MAX else f"{text[:MESSAGE_MAX]}...")
         self.where = where
 

@@ -1,4 +1,4 @@
-"""Files that others made, read with a bound on what they may take of memory."""
+"""Reading of foreign files with a bound on memory."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LINE_MAX = 1 << 20  # a serial capture of half a megabyte, in hexadecimal
 
 
 def read_whole(path: Path, most_bytes: int) -> bytes:
-    """The bytes of a file.
+    """Read the bytes of a file.
 
     Raises:
         OSError: the file cannot be read, or (EFBIG) is larger than `most_bytes`; `strerror` says so.
@@ -25,7 +25,7 @@ def read_whole(path: Path, most_bytes: int) -> bytes:
 
 
 def read_text(path: Path, most_bytes: int) -> str:
-    """The text of a UTF-8 file, with line ends as Python has them.
+    """Read the text of a UTF-8 file, with line ends as Python has them.
 
     Raises:
         OSError: see `read_whole`.
@@ -35,7 +35,7 @@ def read_text(path: Path, most_bytes: int) -> str:
 
 
 def bounded_lines(file: IO[AnyStr], most: int = LINE_MAX) -> Iterator[AnyStr]:
-    """Lines of an open file, as iterating over it gives them.
+    """Yield the lines of an open file.
 
     Raises:
         OSError: the file cannot be read, or (EFBIG) has a longer line than `most`; `strerror` says so.

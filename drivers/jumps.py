@@ -1,12 +1,12 @@
-"""Jumps of a joint's position: a step that no motion explains, looked for between good samples alone."""
+"""Detection of jumps: steps of a joint's position, between good samples, that no motion explains."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from drivers.attendance import LATE_S
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import DeviceEvent, EventKind, Reading, Record, Status
+from drivers.stall_detector import LATE_S
 
 _MARGIN_NS = int(LATE_S * NS_PER_S)  # what samples may be read late by before they are marked
 _BACKLOG_NS = 5 * NS_PER_S  # what has queued is read within this time, however long nobody read
@@ -45,7 +45,7 @@ class JumpWatch:
             self._read(stamp.monotonic_ns)
 
     def jumped_from(self, stamp: Stamp, position: float) -> float | None:
-        """Take a good sample; the position before it if the joint cannot have moved so far since, else None."""
+        """Take a good sample; return the position before it if the joint cannot have moved so far since, else None."""
         if stamp.is_doubtful:
             return None
         now_ns = stamp.monotonic_ns
@@ -76,7 +76,7 @@ class JumpWatch:
 
 
 def joint_watch(max_rate_per_s: float | None, step: float, unit: str) -> JumpWatch | None:
-    """The watch of a joint whose values are compared as they are; None where no fastest motion is known.
+    """Make the watch of a joint whose values are compared as they are; None where no fastest motion is known.
 
     Args:
         max_rate_per_s: fastest motion, units per second.
@@ -89,7 +89,7 @@ def joint_watch(max_rate_per_s: float | None, step: float, unit: str) -> JumpWat
 
 
 def checked_reading(watch: JumpWatch, reading: Reading) -> list[Record]:
-    """The reading; one that no motion explains loses its value, and comes after the event that says so."""
+    """Return the reading; one that no motion explains loses its value and follows the event that says so."""
     if reading.value is None:
         watch.bad(reading.stamp)
         return [reading]
@@ -101,7 +101,7 @@ def checked_reading(watch: JumpWatch, reading: Reading) -> list[Record]:
 
 
 def jump_event(after: Reading, before: float) -> DeviceEvent:
-    """The event of a reading whose position jumped there from another value."""
+    """Return the event of a reading whose position jumped there from another value."""
     text = (
         f"position jumped from {before:.4f} to {after.value:.4f} {after.unit}, more than the joint can move: "
         "a preset was written, or the encoder lost its place; check the joint's zero"

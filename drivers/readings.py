@@ -1,4 +1,4 @@
-"""What flows out of drivers: captures (raw, as they crossed the wire) and the records decoded from them.
+"""Captures (raw, as they crossed the wire) and the records decoded from them: all that drivers give.
 
 A decoder is a pure state machine: it owns no port, no thread and no clock. It is fed captures in order and told the
 time, and returns records. Fed the same captures it returns the same records, so any reading can be made again.
@@ -92,7 +92,7 @@ class Reading:
 
 
 class LockState(StrEnum):
-    """What a robotic station is doing (protocols.md 1.6, tracking flag)."""
+    """Tracking state of a robotic station."""
 
     STANDBY = "standby"
     LOCKED = "locked"
@@ -147,7 +147,7 @@ class Fix:
 
 
 class EventKind(StrEnum):
-    """What happened to a device or a link."""
+    """Kinds of events of devices and links."""
 
     LINK_UP = "link_up"
     LINK_LOST = "link_lost"

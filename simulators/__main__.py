@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import os
-import secrets
 import signal
 import sys
 from collections.abc import Sequence
@@ -16,16 +16,16 @@ import numpy as np
 
 from calibration.errors import RigError
 from drivers.clock import ScaledClock, Stamp, SystemClock
-from simulators.effects import parse_effects
+from simulators.blind.hiding import HiddenEffect, draw_hidden_effect
+from simulators.devices.stations.total_station import StationSettings
+from simulators.effects.library import parse_effects
 from simulators.faults import parse_faults, random_faults
 from simulators.live import LiveRig, print_line
+from simulators.rig.truth import RigTruth, load_rig, replace_effects
 from simulators.rig_simulator import RigSimulator, SimulatorSettings
-from simulators.rigs import load_rig
-from simulators.secret import Envelope, draw_secret
-from simulators.total_station import StationSettings
-from simulators.truth import RigTruth, replace_effects
 from simulators.wire_log import WireLog
 
+HIDDEN = "hidden_effect.json"
 MAP_HELP = "what a commissioned node's TPDO carries, as hexadecimal words of object 1A00h: 38:60040020+65050010"
 
 
@@ -34,13 +34,13 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--rig", required=True, help="a shipped rig's name or a path to a TOML file")
     add("--seed", type=int, default=0, help="the machine and its noise")
-    add("--perturbation", type=float, default=1.0, help="how many build tolerances the machine deviates")
+    add("--perturbation", type=float, default=1.0, help="deviation of the machine in build tolerances")
     add("--rate", type=float, default=1.0, help="simulated seconds per real second")
     add("--origin", type=_origin, help="UTC_NS,MONOTONIC_NS,BOOT_ID at which simulated and real time agree")
     add("--can-port", type=Path, required=True, help="where the slcan port appears")
     add("--station-port", type=Path, required=True, help="where the station's port appears")
     add("--effects", default="", help="hidden effects: FAMILY@WHERE[:NAME=VALUE...],...")
-    add("--secret", type=Path, metavar="DIR", help="hide one more effect, drawn here, and seal it in an envelope there")
+    add("--secret", type=Path, metavar="DIR", help=f"hide one more effect, drawn here, and name it in {HIDDEN} there")
     add("--faults", default="", help="scripted faults: KIND@SECONDS[:NAME=VALUE...],...")
     add("--random-faults", type=float, metavar="SECONDS", help="further faults at this mean interval")
     add("--bus-master", choices=("machine", "host"), default="machine", help="who starts the nodes and sends SYNC")
@@ -52,7 +52,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--baud", type=int, default=9600, help="of the station's line")
     add("--latency-ms", type=float, default=20.0, help="how old a measurement is when its record starts")
     add("--push-s", type=float, help="the station sends records unasked at this interval")
-    add("--wire-log", type=Path, metavar="FILE", help="append what the rig puts on its links and measures to this file")
+    add("--wire-log", type=Path, metavar="FILE", help="append the rig's traffic and measurements to this file")
     return parser
 
 
@@ -72,7 +72,7 @@ def _origin(text: str) -> Stamp:
         raise argparse.ArgumentTypeError(f"{text!r} is not UTC_NS,MONOTONIC_NS,BOOT_ID") from None
 
 
-def _build(options: argparse.Namespace) -> tuple[RigSimulator, Envelope | None]:
+def _build(options: argparse.Namespace) -> tuple[RigSimulator, HiddenEffect | None]:
     if min(options.rate, options.sync_ms, options.signal_ms, options.baud) <= 0 or options.seed < 0:
         raise ValueError("rate, sync-ms, signal-ms and baud must be positive, seed not negative")
     if options.push_s is not None and options.push_s <= 0:
@@ -95,18 +95,17 @@ def _build(options: argparse.Namespace) -> tuple[RigSimulator, Envelope | None]:
     )
     effects = parse_effects(options.effects)
     truth = RigTruth(load_rig(options.rig), options.seed, perturbation=options.perturbation, effects=effects)
-    envelope = None
+    hidden = None
     if options.secret is not None:
-        secret = draw_secret(truth, np.random.default_rng([options.seed, 35]))
-        envelope = Envelope(options.secret, secret, secrets.token_bytes)
-        truth = replace_effects(truth, [*effects, secret.effect])
+        hidden = draw_hidden_effect(truth, np.random.default_rng([options.seed, 35]))
+        truth = replace_effects(truth, [*effects, hidden.effect])
     faults = list(parse_faults(options.faults))
     if options.random_faults is not None:
         if options.random_faults <= 0:
             raise ValueError("random-faults must be positive")
         kinds = ("lock_loss", "prism_jump", "bad_check", "dropped_ack", "clutter", "joined_buffers")
         faults += random_faults(options.seed, 86_400.0, options.random_faults, kinds)
-    return RigSimulator(truth, options.seed, settings, faults=faults), envelope
+    return RigSimulator(truth, options.seed, settings, faults=faults), hidden
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -125,22 +124,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with contextlib.ExitStack() as stack:
         try:
             log = None if options.wire_log is None else stack.enter_context(WireLog(options.wire_log))
-            simulator, envelope = _build(options)
+            simulator, hidden = _build(options)
             clock = ScaledClock(options.rate, origin)
             live = LiveRig(simulator, clock, options.can_port, options.station_port, print_line, log)
+            if hidden is not None:  # its instants count from simulated second 0
+                told = json.dumps(hidden.as_dict() | {"begin_utc_ns": live.begin.utc_ns})
+                (options.secret / HIDDEN).write_text(told, encoding="utf-8")
         except (RigError, ValueError, OSError) as error:
             sys.stderr.write(f"simulators: {error}\n")
             return 2
-        if envelope is not None:
-            envelope.begin(live.begin.utc_ns)
         try:
             live.run(sys.stdin.fileno(), wake_read)
-        except BrokenPipeError:  # nobody listens to the answers any more
+        except BrokenPipeError:  # the reader of the answers has ended
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         finally:
             live.close()
-            if envelope is not None:
-                envelope.open()
     return 0
 
 

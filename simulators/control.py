@@ -18,8 +18,8 @@ import json
 import math
 from collections.abc import Callable, Mapping
 
+from simulators.devices.machine import Floats
 from simulators.faults import make_fault
-from simulators.machine import Floats
 from simulators.rig_simulator import RigSimulator
 
 Message = Mapping[str, object]
@@ -52,7 +52,7 @@ class Control:
         }
 
     def obey(self, line: bytes, now_s: float) -> Message:
-        """The answer to one line."""
+        """Carry out the command of one line; returns the answer."""
         try:
             command = json.loads(line)
             if not isinstance(command, dict):

@@ -1,4 +1,4 @@
-"""What goes wrong, and when: a scripted or seeded schedule of faults.
+"""Faults of a simulated rig: a scripted or seeded schedule, and what each does to the devices.
 
 As text: `KIND@SECONDS[:NAME=VALUE...]`, separated by commas: `lock_loss@30:seconds=4,node_reboot@45:node=33`.
 """
@@ -9,15 +9,23 @@ import heapq
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
+from simulators.devices.can.bus import Frame
+from simulators.devices.can.machine_signals import MachineSignals
+from simulators.devices.can.node import CanopenNode
+from simulators.devices.can.profiles import PositionNode
+from simulators.devices.machine import Machine
+from simulators.devices.stations.total_station import TotalStation
+
 Parameter = str | float
 
-# kind -> its parameters with what they are if not given; numbers are counts, seconds, or codes
+# kind -> its parameters with their defaults; numbers are counts, seconds, or codes
 KINDS: Mapping[str, Mapping[str, Parameter]] = {
     "lock_loss": {"seconds": 3.0},  # something stands in the line of sight
-    "prism_jump": {"to": ""},  # the station follows another prism without a word; "": any other
+    "prism_jump": {"to": ""},  # the station follows another prism and does not report it; "": any other
     "bad_check": {"count": 1},  # records with a wrong block check
     "dropped_ack": {"count": 1},
     "joined_buffers": {"count": 1},  # acknowledgement and record in one buffer, its first byte lost
@@ -40,10 +48,19 @@ _CHOICES: Mapping[tuple[str, str], tuple[str, ...]] = {
     ("unplug", "link"): ("can", "station"),
 }
 
+# SocketCAN error frames (linux/can/error.h): class bits, and the eight data bytes
+_BUS_ERRORS = {
+    "warning": (0x004, bytes([0, 0x04, 0, 0, 0, 0, 0, 0])),
+    "passive": (0x004, bytes([0, 0x10, 0, 0, 0, 0, 0, 0])),
+    "active": (0x004, bytes([0, 0x40, 0, 0, 0, 0, 0, 0])),
+    "bus_off": (0x040, bytes(8)),
+    "acknowledge": (0x020, bytes(8)),
+}
+
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing that goes wrong.
+    """A fault at an instant.
 
     Attributes:
         at_s: when, simulated seconds.
@@ -56,23 +73,23 @@ class Fault:
     parameters: Mapping[str, Parameter]
 
     def number(self, name: str) -> float:
-        """A numeric parameter."""
+        """Value of a numeric parameter."""
         return float(self.parameters[name])
 
     def count(self, name: str) -> int:
-        """A whole-number parameter."""
+        """Value of a whole-number parameter."""
         return int(float(self.parameters[name]))
 
     def text(self, name: str) -> str:
-        """A textual parameter."""
+        """Value of a textual parameter."""
         return str(self.parameters[name])
 
 
 def make_fault(kind: str, at_s: float, given: Mapping[str, object]) -> Fault:
-    """A checked fault.
+    """Check a fault's parameters and complete them with the usual ones.
 
     Raises:
-        ValueError: unknown kind or parameter, or a value of the wrong sort; the message says what is known.
+        ValueError: unknown kind or parameter, or a value of the wrong sort; the message names the known ones.
     """
     if kind not in KINDS:
         raise ValueError(f"unknown fault {kind!r}; known: {', '.join(KINDS)}")
@@ -104,7 +121,7 @@ def _checked(kind: str, name: str, value: object, default: Parameter) -> Paramet
 
 
 def parse_faults(text: str) -> tuple[Fault, ...]:
-    """A schedule from text (see the module's head); ValueError says what is wrong."""
+    """Parse a schedule (see the module's head); ValueError says where it is wrong."""
     faults = []
     for part in (p.strip() for p in text.split(",")):
         if not part:
@@ -125,7 +142,7 @@ def parse_faults(text: str) -> tuple[Fault, ...]:
 def random_faults(
     seed: int, duration_s: float, mean_interval_s: float, kinds: Iterable[str] = tuple(KINDS)
 ) -> tuple[Fault, ...]:
-    """Faults at random instants (exponential intervals), of the given kinds with their usual parameters."""
+    """Draw faults at random instants (exponential intervals), of the given kinds with their usual parameters."""
     rng = np.random.default_rng([seed, 20])
     names = tuple(kinds)
     faults, at_s = [], float(rng.exponential(mean_interval_s))
@@ -145,17 +162,113 @@ class FaultSchedule:
             self.add(fault)
 
     def add(self, fault: Fault) -> None:
-        """One more."""
+        """Add a fault."""
         self._number += 1
         heapq.heappush(self._waiting, (fault.at_s, self._number, fault))
 
     def due(self, now_s: float) -> list[Fault]:
-        """Those whose time has come; each is returned once."""
+        """Return the faults that are due; each is returned once."""
         out = []
         while self._waiting and self._waiting[0][0] <= now_s:
             out.append(heapq.heappop(self._waiting)[2])
         return out
 
     def next_deadline(self) -> float:
-        """When the next one is due."""
+        """Instant at which the next fault is due."""
         return self._waiting[0][0] if self._waiting else math.inf
+
+
+class FaultyRig(Protocol):
+    """The parts of a rig that faults concern."""
+
+    machine: Machine
+    nodes: tuple[CanopenNode, ...]
+    signals: MachineSignals | None
+    station: TotalStation
+
+    def put(self, frame: Frame) -> None:
+        """Let a frame appear on the bus."""
+
+    def inject(self, fault: Fault) -> None:
+        """Add a fault to the schedule."""
+
+
+def check_fault(rig: FaultyRig, fault: Fault) -> None:
+    """Raise ValueError if the rig has no such node, prism or signals."""
+    prisms = rig.machine.truth.rig.prism_names
+    if fault.kind == "prism_jump" and fault.text("to") not in ("", *prisms, *rig.machine.control_points_mm):
+        raise ValueError(f"fault prism_jump: no prism {fault.text('to')!r}; this rig has {', '.join(prisms)}")
+    if fault.kind in ("counter_gap", "not_available") and rig.signals is None:
+        raise ValueError(f"fault {fault.kind}: this rig has no machine signals")
+    if "node" in fault.parameters:
+        node = _node(rig, fault)
+        if fault.kind in ("alarm", "warning", "preset_jump") and not isinstance(node, PositionNode):
+            raise ValueError(f"fault {fault.kind}: node {node.node} is no encoder or length transducer")
+
+
+def apply_fault(rig: FaultyRig, fault: Fault, now_s: float) -> None:
+    """Apply a fault that `check_fault` has passed."""
+    station, tracker = rig.station, rig.station.tracker
+    match fault.kind:
+        case "lock_loss":
+            tracker.block(now_s, now_s + fault.number("seconds"))
+        case "prism_jump":
+            tracker.jump(fault.text("to") or _another_prism(rig, now_s), now_s)
+        case "bad_check":
+            station.faults.bad_checks += fault.count("count")
+        case "dropped_ack":
+            station.faults.dropped_acks += fault.count("count")
+        case "joined_buffers":
+            station.faults.joined += fault.count("count")
+        case "clutter":
+            station.faults.clutter += fault.count("count")
+        case "station_silent":
+            station.faults.silent_until = now_s + fault.number("seconds")
+        case "counter_gap" if rig.signals is not None:
+            rig.signals.skip_frames(fault.count("count"))
+        case "not_available" if rig.signals is not None:
+            rig.signals.void(now_s + fault.number("seconds"))
+        case "bus_error":
+            identifier, data = _BUS_ERRORS[fault.text("state")]
+            rig.put(Frame(identifier, data, is_error=True))
+        case "unplug":
+            pass  # the port's owner does it when it is told of the fault
+        case _:
+            _node_fault(rig, fault, now_s)
+
+
+def _node_fault(rig: FaultyRig, fault: Fault, now_s: float) -> None:
+    node = _node(rig, fault)
+    match fault.kind:
+        case "node_silent":
+            node.mute(now_s + fault.number("seconds"))
+        case "node_reboot":
+            node.power_on(now_s)
+        case "emergency":
+            node.emergency(fault.count("code"), fault.count("register"))
+        case "emergency_clear":
+            node.emergency(0, 0)
+        case "alarm" if isinstance(node, PositionNode):
+            node.set_alarm(fault.count("bits"))
+            if fault.number("seconds"):
+                end_s = now_s + fault.number("seconds")
+                rig.inject(make_fault("alarm", end_s, {"node": node.node, "bits": 0, "seconds": 0}))
+        case "warning" if isinstance(node, PositionNode):
+            node.set_warning(fault.count("bits"))
+        case "preset_jump" if isinstance(node, PositionNode):
+            node.jump(fault.count("counts"))
+
+
+def _node(rig: FaultyRig, fault: Fault) -> CanopenNode:
+    number = fault.count("node")
+    for node in rig.nodes:
+        if number in (0, node.node):
+            return node
+    have = ", ".join(str(node.node) for node in rig.nodes) or "none"
+    raise ValueError(f"fault {fault.kind}: this rig has no node {number}; it has {have}")
+
+
+def _another_prism(rig: FaultyRig, now_s: float) -> str:
+    names = rig.machine.truth.rig.prism_names
+    now = rig.station.tracker.target(now_s)
+    return next((name for name in names if name != now), names[0])

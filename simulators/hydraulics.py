@@ -27,13 +27,14 @@ _RETURN_BAR = 12.0
 _UNLOADED_BAR = 20.0
 _BAR_PER_NM = 7e-4  # of the boom's lifting joint in its cylinder
 START_TEMPERATURE_DEGC = 38.0  # of the oil, when the simulation begins
+TEMPERATE_DEGC = 45.0  # of the oil, at which the machine has the lengths that were built
 
 _WARM_DEGC = 55.0
 _WARMING_S = 1500.0
 
 
 def valve_current_mA(speed: ArrayLike) -> Floats:  # noqa: N802 - the unit is mA
-    """Current of a proportional valve: none at rest, past the spool's overlap as soon as anything moves."""
+    """Current of a proportional valve: none at rest, past the spool's overlap in any motion."""
     speed = np.asarray(speed, dtype=float)
     return np.where(speed == 0.0, 0.0, np.copysign(DEAD_BAND_MA + (_FULL_MA - DEAD_BAND_MA) * np.abs(speed), speed))
 
@@ -62,7 +63,7 @@ def oil_temperature_degC(running_s: ArrayLike, start_degC: float) -> Floats:  # 
 
 
 def motion_columns(speeds: Mapping[str, ArrayLike]) -> dict[str, Floats]:
-    """What the machine's motion alone puts into its signals, before any sensor's noise.
+    """Signals that follow from the machine's motion alone, before any sensor's noise.
 
     Args:
         speeds: joint -> speed, of all joints of a machine.

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from drivers.clock import NS_PER_S, Clock
 from simulators.control import Control
+from simulators.devices.can.slcan_adapter import Channel, SlcanAdapter
 from simulators.pty_port import PtyPort
 from simulators.rig_simulator import Output, RigSimulator
-from simulators.slcan_adapter import Channel, SlcanAdapter
 from simulators.wire_log import WireLog
 
 _SHORTEST_SLEEP_S = 0.001  # real: finer would only cost
@@ -22,17 +22,17 @@ _LONGEST_LINE = 65536
 
 
 class LiveRig:
-    """The rig's two links, and its commands as JSON lines.
+    """A simulated rig's two links, and its commands as JSON lines.
 
     Attributes:
         begin: the clock at simulated second 0.
 
     Args:
         simulator: the rig.
-        clock: the time that it shares with whoever listens.
+        clock: shared with the host.
         can_port, station_port: where the ports appear.
         send: takes each answer and event.
-        log: takes what the rig puts on its links; None: nobody asks.
+        log: takes the traffic on the links; None: no log.
 
     Raises:
         OSError: a port cannot be made.
@@ -155,6 +155,6 @@ class LiveRig:
 
 
 def print_line(message: Mapping[str, object]) -> None:
-    """One JSON line on standard output."""
+    """Write a JSON line to standard output."""
     sys.stdout.write(json.dumps(message) + "\n")
     sys.stdout.flush()

@@ -8,7 +8,7 @@ import termios
 import tty
 from pathlib import Path
 
-_BACKLOG = 65536  # bytes kept for a host that does not read; what is more is lost, as on a real line
+_BACKLOG = 65536  # bytes kept for a host that does not read; further ones are lost, as on a real line
 
 
 class PtyPort:
@@ -16,7 +16,7 @@ class PtyPort:
 
     Attributes:
         path: the symbolic link.
-        lost: bytes that nobody read.
+        lost: number of bytes that no host read.
 
     Args:
         path: where the link appears; its directory must exist. A link that is there already is replaced.
@@ -35,7 +35,7 @@ class PtyPort:
 
     @property
     def plugged(self) -> bool:
-        """Whether the port is there."""
+        """True if the port exists."""
         return self._master >= 0
 
     def fileno(self) -> int:
@@ -74,7 +74,7 @@ class PtyPort:
         self._waiting.clear()
 
     def read(self) -> bytes:
-        """What the host wrote since the last call."""
+        """Return the bytes that the host wrote since the last call."""
         if not self.plugged:
             return b""
         try:
@@ -96,7 +96,7 @@ class PtyPort:
         del self._waiting[:sent]
 
     def discard(self) -> None:
-        """Forget what the host has not read yet."""
+        """Discard the bytes that the host has not read yet."""
         if self.plugged:
             self._waiting.clear()
             termios.tcflush(self._slave, termios.TCIFLUSH)

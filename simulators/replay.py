@@ -1,4 +1,4 @@
-"""Captured links in place of real ones: what was recorded comes again, at its recorded times."""
+"""Captured links in place of real ones: captures come again at their recorded times."""
 
 from __future__ import annotations
 

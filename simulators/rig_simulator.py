@@ -1,7 +1,7 @@
 """A whole rig: machine, encoder nodes, machine controller, bus master and total station on one time line.
 
 Sans-IO: frames, bytes and the time go in, frames, bytes and events come out. `live.py` puts it on ptys in real or
-scaled time, `generate.py` runs it against a scripted host as fast as it goes. Times are simulated seconds.
+scaled time. Times are simulated seconds.
 """
 
 from __future__ import annotations
@@ -10,44 +10,32 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
-from calibration.channels import Cia404Analogue, Cia406Encoder, Cia406Linear, DbcSignal, RawSignal
-from calibration.rig import Rig
-from simulators.bus_controller import BusController
-from simulators.canopen_node import CanopenNode
-from simulators.canopen_nodes import Source, encoder_of, linear_of, pressure_of
-from simulators.fault_effects import apply_fault, check_fault
-from simulators.faults import Fault, FaultSchedule
-from simulators.frame import Frame
-from simulators.machine import Floats, Machine
-from simulators.machine_signals import MachineSignals
-from simulators.motion import BoomMotion
-from simulators.raw_signals import RawSignals
-from simulators.sokkia_station import SokkiaStation
-from simulators.station_tracker import Tracker
-from simulators.topcon_station import TopconStation
-from simulators.total_station import StationSettings, TotalStation
-from simulators.truth import RigTruth
+from calibration.rig.channels import Cia404Analogue, Cia406Encoder, Cia406Linear, DbcSignal, RawSignal
+from calibration.rig.description import Rig
+from simulators.devices.can.bus import BusController, BusDevice, Frame
+from simulators.devices.can.machine_signals import MachineSignals
+from simulators.devices.can.node import CanopenNode
+from simulators.devices.can.profiles import Source, encoder_of, linear_of, pressure_of
+from simulators.devices.can.raw_signals import RawSignals
+from simulators.devices.machine import Floats, Machine
+from simulators.devices.stations.sokkia import SokkiaStation
+from simulators.devices.stations.topcon import TopconStation
+from simulators.devices.stations.total_station import StationSettings, TotalStation
+from simulators.devices.stations.tracker import Tracker
+from simulators.faults import Fault, FaultSchedule, apply_fault, check_fault
+from simulators.rig.motion import BoomMotion
+from simulators.rig.truth import RigTruth
 
 Event = Mapping[str, object]
 
 
-class BusDevice(Protocol):
-    """Something that sends frames of itself."""
-
-    def poll(self, now_s: float) -> list[Frame]:
-        """The frames that are due."""
-
-    def next_deadline(self) -> float:
-        """When `poll` will have something to do."""
-
-
 @dataclass(frozen=True)
 class SimulatorSettings:
-    """How the rig is set up.
+    """Settings of a simulated rig.
 
     Attributes:
         bus_master: `machine`: the machine's controller has commissioned the nodes, starts them and sends SYNC; a host
@@ -56,7 +44,7 @@ class SimulatorSettings:
         signal_period_s: cycle of the machine controller's signals; machine.dbc says 10 ms.
         station: the instrument.
         setup: station set-up, decides where the machine stands.
-        mappings: node -> what its TPDO carries where the machine has commissioned it otherwise than the factory, as
+        mappings: node -> content of its TPDO if the machine has commissioned it otherwise than the factory, as
             words of object 1A00h.
     """
 
@@ -70,12 +58,12 @@ class SimulatorSettings:
 
 @dataclass
 class Output:
-    """What came out of the rig, in order.
+    """Output of the rig, in order.
 
     Attributes:
         frames: on the bus, but for the host's own.
         station: bytes from the total station.
-        events: `arrived`, `fault`: for whoever drives the rig.
+        events: `arrived`, `fault`: for the process that drives the rig.
     """
 
     frames: list[Frame] = field(default_factory=list)
@@ -148,7 +136,7 @@ class RigSimulator:
         return arrival_s
 
     def inject(self, fault: Fault) -> None:
-        """Let something go wrong at its time; ValueError when this rig has no such part."""
+        """Add a fault to the schedule; ValueError if this rig has no such part."""
         check_fault(self, fault)
         self.faults.add(fault)
 
@@ -162,19 +150,19 @@ class RigSimulator:
     # The links
 
     def receive_can(self, frame: Frame, now_s: float) -> None:
-        """A frame that the host sent."""
+        """Take a frame that the host sent."""
         self._spread(frame, now_s)
 
     def receive_station(self, data: bytes, now_s: float) -> None:
-        """Bytes that the host wrote to the station."""
+        """Take bytes that the host wrote to the station."""
         self.station.receive(data, now_s)
 
     def put(self, frame: Frame) -> None:
-        """A frame that appears on the bus and that no node answers (an error frame)."""
+        """Put a frame on the bus that no node answers (an error frame)."""
         self._output.frames.append(frame)
 
     def tell(self, event: Event) -> None:
-        """An event for whoever drives the rig."""
+        """Report an event to the process that drives the rig."""
         self._output.events.append(event)
 
     def _spread(self, frame: Frame, now_s: float) -> None:
@@ -199,6 +187,7 @@ class RigSimulator:
         """Live up to now; returns what came out since the last call."""
         for fault in self.faults.due(now_s):
             apply_fault(self, fault, now_s)
+            self._due = [device.next_deadline() for device in self._devices]
             self.tell({"event": "fault", "kind": fault.kind, **fault.parameters})
         while self._devices:
             index = min(range(len(self._due)), key=self._due.__getitem__)
@@ -224,12 +213,8 @@ class RigSimulator:
             self._emit(frames, now_s)
         self._due[index] = device.next_deadline()
 
-    def refresh(self) -> None:
-        """A device was changed from outside (a fault): ask all of them again what they are waiting for."""
-        self._due = [device.next_deadline() for device in self._devices]
-
     def next_deadline(self) -> float:
-        """When `poll` will have something to do."""
+        """Instant at which `poll` is due."""
         arrival = self._arrivals[0][0] if self._arrivals else math.inf
         return min([*self._due, arrival, self.station.next_deadline(), self.faults.next_deadline()])
 
@@ -237,7 +222,7 @@ class RigSimulator:
 def _nodes(
     rig: Rig, machine: Machine, seed: int, mappings: Mapping[int, Sequence[int]] | None
 ) -> tuple[CanopenNode, ...]:
-    """The nodes, fresh from the factory if there are no mappings, else commissioned with them."""
+    """Build the nodes, fresh from the factory if there are no mappings, else commissioned with them."""
     nodes: list[CanopenNode] = []
     for number, channel in enumerate(rig.channels):
         serial = 100_000 + 1000 * (seed % 1000) + number
@@ -264,7 +249,7 @@ def _nodes(
 
 
 def _source(rig: Rig, machine: Machine, name: str) -> Source:
-    """What a channel senses: its joint, or something believable that no joint follows."""
+    """Source of a channel: its joint, or a plausible signal that no joint follows."""
     if name in rig.joint_names:
         return partial(machine.joint, name)
     channel = next(c for c in rig.channels if c.name == name)

@@ -18,15 +18,15 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
 
-from simulators.frame import Frame
-from simulators.machine import Floats
+from simulators.devices.can.bus import Frame
+from simulators.devices.machine import Floats
 
 
 class WireLog:
     """Writes the log; a context manager.
 
     Args:
-        path: the file; what it holds already is kept.
+        path: the file; lines are appended.
     """
 
     def __init__(self, path: Path) -> None:
@@ -41,23 +41,23 @@ class WireLog:
         self._file.close()
 
     def frames(self, at_ns: int, frames: Iterable[Frame]) -> None:
-        """Frames that appeared on the bus."""
+        """Log frames that appeared on the bus."""
         for frame in frames:
             flags = "x" * frame.is_extended + "r" * frame.is_remote + "e" * frame.is_error or "-"
             self._file.write(f"C {at_ns} {frame.arbitration_id:X} {flags} {frame.data.hex()}\n")
 
     def station(self, at_ns: int, data: bytes) -> None:
-        """Bytes that left the station."""
+        """Log bytes that left the station."""
         if data:
             self._file.write(f"S {at_ns} {data.hex()}\n")
 
     def measured(self, at_ns: int, target: str, place_mm: Floats, pose: Mapping[str, float]) -> None:
-        """A distance that the station measured."""
+        """Log a distance that the station measured."""
         x, y, z = place_mm
         rounded = json.dumps({name: round(value, 5) for name, value in pose.items()}, separators=(",", ":"))
         self._file.write(f"M {at_ns} {target} {x:.3f} {y:.3f} {z:.3f} {rounded}\n")
 
     def event(self, at_ns: int, event: Mapping[str, object]) -> None:
-        """Something that happened to the rig; written to the disk with all before it."""
+        """Log an event of the rig; it is written to the disk with all before it."""
         self._file.write(f"E {at_ns} {json.dumps(event)}\n")
         self._file.flush()

@@ -1,4 +1,4 @@
-"""Under which conditions a pose can be measured: approached from which side, on the move, after which stand ...
+"""Conditions of a pose: the side it is approached from, motion, dwell, time, temperature, payload, pressures.
 
 Some effects show only where these differ. A plan varies the ones that the effects in question need, between levels
 that an operator can bring about.
@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 import numpy as np
 
 from calibration.observations import Floats
-from calibration.rig import Rig
+from calibration.rig.description import Rig
 
 Conditions = Mapping[str, Floats]
 """Columns of observations beside the joints' readings -> (n,) of each pose; `fixes`, how many of each prism."""
@@ -32,7 +32,7 @@ _SLOW = ("time_s", "temperature_degC", "payload_kg")  # nobody changes these fro
 def drawn(
     rig: Rig, count: int, rng: np.random.Generator, *, begin_s: float = 0.0, payload_kg: float = 0.0
 ) -> Conditions:
-    """All conditions of `count` poses, each between its levels.
+    """Draw all conditions of `count` poses, each among its levels.
 
     Args:
         rig: the rig description.
@@ -58,7 +58,7 @@ def drawn(
 
 
 def under(conditions: Conditions, names: Collection[str]) -> Conditions:
-    """Those of some names; what moves has not stood, and passes a pose once."""
+    """Keep the conditions of some names; a pose passed on the move has no dwell and one fix."""
     out = {name: values for name, values in conditions.items() if name in names}
     rates = [values for name, values in out.items() if name.endswith("_rate")]
     if rates:
@@ -68,7 +68,7 @@ def under(conditions: Conditions, names: Collection[str]) -> Conditions:
 
 
 def kinds_of(rig: Rig) -> tuple[tuple[str, ...], ...]:
-    """The conditions of a rig, those together that change together."""
+    """Conditions of a rig, grouped by what changes together."""
     joints = rig.joint_names
     payload = [("payload_kg",)] if any(mass.payload for mass in rig.masses) else []
     return (
@@ -83,11 +83,11 @@ def kinds_of(rig: Rig) -> tuple[tuple[str, ...], ...]:
 
 
 def needed(rig: Rig, is_known: Callable[[Collection[str]], bool]) -> tuple[str, ...] | None:
-    """The fewest conditions with which an effect knows what it needs; None if no condition gives it that.
+    """Find the fewest conditions with which an effect knows what it needs; None if none do.
 
     Args:
         rig: the rig description.
-        is_known: whether the effect knows what it needs under conditions of these names.
+        is_known: True if the effect knows what it needs under conditions of these names.
     """
     kinds = kinds_of(rig)
     kept = [name for kind in kinds for name in kind]
@@ -101,7 +101,7 @@ def needed(rig: Rig, is_known: Callable[[Collection[str]], bool]) -> tuple[str, 
 
 
 def changed(conditions: Conditions, kind: Collection[str]) -> Conditions:
-    """The same with those of one kind as different as a plan can have them."""
+    """Change the conditions of one kind as much as a plan can."""
     out = dict(conditions)
     for name in kind:
         values = conditions[name]
@@ -115,12 +115,12 @@ def changed(conditions: Conditions, kind: Collection[str]) -> Conditions:
 
 
 def slow(names: Collection[str]) -> tuple[str, ...]:
-    """Those conditions by which a plan is divided into blocks, the slowest to change first."""
+    """Conditions by which a plan is divided into blocks, the slowest to change first."""
     return (*(name for name in _SLOW if name in names), *sorted(name for name in names if name.endswith("_bar")))
 
 
 def one_after_another(conditions: Conditions) -> Conditions:
-    """The same for poses that are measured in this order: those of a round at instants of their own."""
+    """Give poses measured in this order instants of their own within a round."""
     if "time_s" not in conditions:
         return conditions
     times: list[float] = []
@@ -130,7 +130,7 @@ def one_after_another(conditions: Conditions) -> Conditions:
 
 
 def instructions(rig: Rig, conditions: Conditions) -> tuple[str, ...]:
-    """What an operator has to do for each condition of a plan, in sentences."""
+    """Instructions for the operator, a sentence for each condition of a plan."""
     out = []
     sides = [joint.name for joint in rig.joints if f"{joint.name}_dir" in conditions]
     if sides:

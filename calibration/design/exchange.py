@@ -30,13 +30,13 @@ _TOGETHER = 1000  # candidates, so that the work arrays stay small
 
 
 class Criterion(Protocol):
-    """What a design is chosen for."""
+    """Criterion that a design maximises."""
 
     def value(self, information: Floats) -> float:
-        """How good an information (q, q), the prior's included, is; larger is better."""
+        """Value of an information (q, q), the prior's included; larger is better."""
 
     def gain(self, information: Floats, blocks: Floats) -> Floats:
-        """(m,) how much `value` grows by each of m blocks (m, r, q)."""
+        """(m,) gains in `value` by each of m blocks (m, r, q)."""
 
 
 class Determinant:
@@ -173,12 +173,19 @@ class Discrimination:
 
 
 def choose(blocks: Floats, count: int, criterion: Criterion, before: Floats | None = None) -> Integers:
-    """Indices of `count` different blocks of (n, r, q), in the order in which they were added or exchanged.
+    """Choose different blocks, greedily and then by exchanges.
 
-    `before` (q, q) is the information of what has been measured already, W'W in prior units; nothing by default.
+    Gains are looked at anew only where an old one is still among the largest. For the determinant they never grow as
+    the set does, so this finds exactly the best candidate each time (Minoux 1978).
 
-    Greedy: gains are looked at anew only where an old one is still among the largest. For the determinant they never
-    grow as the set does, so this finds exactly the best candidate each time (Minoux 1978).
+    Args:
+        blocks: (n, r, q) candidates.
+        count: number to choose.
+        criterion: value to maximise.
+        before: (q, q) information of earlier measurements, W'W in prior units; nothing by default.
+
+    Returns:
+        (count,) indices in the order in which they were added or exchanged.
     """
     known = _known(blocks, before)
     chosen = _greedy(blocks, count, criterion, known)
@@ -189,7 +196,7 @@ def choose(blocks: Floats, count: int, criterion: Criterion, before: Floats | No
 
 
 def improve(blocks: Floats, near: Integers, criterion: Criterion, before: Floats | None = None) -> Integers:
-    """Indices of one block for each of several poses, the best of those near it while the others are as they are.
+    """Choose one block for each of several poses, the best of those near it while the others stay.
 
     Coordinate exchange (Meyer and Nachtsheim, Technometrics 37, 1995), whole poses being the coordinates.
 
@@ -197,16 +204,20 @@ def improve(blocks: Floats, near: Integers, criterion: Criterion, before: Floats
         blocks: (n, r, q).
         near: (n,) number of the pose, from 0, that each is near; the first of each is the pose's own, and stays where
             no other is better.
-        criterion, before: as for `choose`.
+        criterion: as for `choose`.
+        before: as for `choose`.
+
+    Returns:
+        Indices, one for each pose.
     """
     chosen = np.unique(near, return_index=True)[1]
     information = information_of(blocks[chosen], before)
     for place, old in enumerate(chosen.tolist()):
         information -= blocks[old].T @ blocks[old]
-        rivals = np.flatnonzero(near == place)
-        gained = criterion.gain(information, blocks[rivals])
+        others = np.flatnonzero(near == place)
+        gained = criterion.gain(information, blocks[others])
         if gained.max() > gained[0]:
-            chosen[place] = rivals[int(np.argmax(gained))]
+            chosen[place] = others[int(np.argmax(gained))]
         information += blocks[chosen[place]].T @ blocks[chosen[place]]
     return chosen
 
@@ -252,7 +263,7 @@ def _greedy(blocks: Floats, count: int, criterion: Criterion, known: Floats) -> 
 
 
 def _sweep(blocks: Floats, chosen: list[int], criterion: Criterion, known: Floats) -> bool:
-    """Try to exchange every chosen block for a better one, in place; whether that was worthwhile."""
+    """Try to exchange every chosen block for a better one, in place; return True if that was worthwhile."""
     rows = blocks[chosen].reshape(-1, blocks.shape[2])
     information = known + rows.T @ rows
     before = criterion.value(information)
@@ -261,9 +272,9 @@ def _sweep(blocks: Floats, chosen: list[int], criterion: Criterion, known: Float
     shortlist = np.argsort(-gains, kind="stable")[: min(_SHORTLIST, len(blocks) - len(chosen))]
     for place, old in enumerate(chosen):
         without = information - blocks[old].T @ blocks[old]
-        rivals = np.append(shortlist[~np.isin(shortlist, chosen)], old)
-        gained = _gains(blocks, rivals, without, criterion)
-        best = int(rivals[int(np.argmax(gained))])
+        others = np.append(shortlist[~np.isin(shortlist, chosen)], old)
+        gained = _gains(blocks, others, without, criterion)
+        best = int(others[int(np.argmax(gained))])
         if best != old and gained.max() > gained[-1] + _WORTHWHILE:
             chosen[place] = best
             information = without + blocks[best].T @ blocks[best]

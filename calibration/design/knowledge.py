@@ -1,4 +1,4 @@
-"""What is known of a rig before poses are measured: from its build tolerances, or from a calibrated model."""
+"""Prior knowledge of a rig before poses are measured: from its build tolerances, or from a calibrated model."""
 
 from __future__ import annotations
 
@@ -9,24 +9,23 @@ from functools import cached_property
 import numpy as np
 
 from calibration.design.conditions import Conditions
-from calibration.effects.base import Situation
+from calibration.effects.context import EffectContext
 from calibration.effects.fitted import AppliedEffects, FittedEffect
 from calibration.errors import UnsafeError
-from calibration.identification.additions import Additions
-from calibration.identification.refinement import prior_precision
-from calibration.kernels.lineariser import Lineariser
-from calibration.kernels.machine import Machine, root_of
-from calibration.kinematics import Chain, ChainData, Linearisation
-from calibration.model import CalibratedModel
+from calibration.identification.linear_model import prior_precision
+from calibration.kinematics.chain import Chain, Linearisation
+from calibration.kinematics.compiled_chain import CompiledChain
+from calibration.kinematics.torques import GravityModel
+from calibration.model.model import CalibratedModel
+from calibration.numerics.matrices import root_of
 from calibration.observations import Floats, Observations
-from calibration.torques import GravityLoads
 
 _BASE = 6  # parameters of a set-up's base
 
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What is known of a rig before the poses are measured.
+    """Prior knowledge of a rig: parameters and coefficients with their covariance.
 
     Attributes:
         chain, x: kinematics and its parameters (p,).
@@ -45,19 +44,19 @@ class Knowledge:
 
     @classmethod
     def of_rig(cls, chain: Chain) -> Knowledge:
-        """Build tolerances alone, at the first set-up of the chain."""
+        """Knowledge by build tolerances alone, at the first set-up of the chain."""
         return cls(chain, np.zeros(len(chain)), 0, np.diag(prior_precision(chain, 1.0) ** -0.5))
 
     @classmethod
     def before(cls, model: CalibratedModel, setup: int) -> Knowledge:
-        """What was known before the data of a calibration, with its noise; the model is where to linearise."""
+        """Knowledge before the data of a calibration, with its noise; linearised at the calibrated model."""
         effects = [c.prior_sigma for effect in model.effects for c in effect.coefficients]
         sigma = np.append(prior_precision(model.chain, model.prior_scale) ** -0.5, effects)
         return replace(cls.of_model(model, setup), root=np.diag(sigma))
 
     @classmethod
     def of_model(cls, model: CalibratedModel, setup: int) -> Knowledge:
-        """What a calibration left, at one of its set-ups."""
+        """Knowledge after a calibration, at one of its set-ups."""
         excess = model.excess_sigma_mm**2 + model.repeat_sigma_mm**2
         return cls(model.chain, model.values, setup, root_of(model.covariance), excess, model.effects)
 
@@ -73,7 +72,7 @@ class Knowledge:
 
     @property
     def parameters(self) -> int:
-        """How many parameters of the chain the set-up's fixes can show: the machine's, and those of its own base."""
+        """Number of parameters that the set-up's fixes can show: the machine's, and those of its own base."""
         return len(self.chain) - _BASE * (len(self.chain.setups) - 1)
 
     def without(self, names: Collection[str]) -> Knowledge:
@@ -90,47 +89,36 @@ class Knowledge:
         rows = self.root[kept]
         return replace(self, root=root_of(rows @ rows.T), effects=kept_effects)
 
-    def linearise(self, readings: Floats, conditions: Conditions | None = None) -> tuple[Linearisation, Floats]:
-        """All prisms in every pose: the linearisation of the n * prisms fixes, prism by prism in each pose, and
-        (n * prisms, 3, p + k) the derivatives by parameters and coefficients.
+    def linearise(self, readings: Floats, conditions: Conditions | None = None) -> Linearisation:
+        """Linearise the fixes of all prisms in every pose.
 
         Args:
             readings: (n, joints) deg or mm.
             conditions: under which the poses are taken, (n,) each; nothing is known of them by default.
+
+        Returns:
+            Of n * prisms fixes, prism by prism in each pose; its Jacobian is by parameters and coefficients, p + k.
         """
-        prisms = len(self.chain.rig.prisms)
-        true = np.repeat(readings, prisms, axis=0)
-        if not self.effects:
-            lin = self._lineariser(self.x, self._bound(true))
-            return lin, lin.jacobian
-        columns = self._applied.columns(self.situation(readings, conditions))
-        lin = self._lineariser(self.x, self._bound(true + self._applied.change(columns)))
-        shift = self._applied.shifted_mm(columns)
-        if shift is not None:
-            lin = lin._replace(position_mm=lin.position_mm + shift)
-        moves = Additions((), self._applied.joint, columns.column, np.empty(0), columns.shift_mm)
-        return lin, np.concatenate([lin.jacobian, moves.moved_mm(lin.joint_jacobian)], axis=2)
+        context = self.context(readings, conditions)
+        columns = self._applied.columns(context)
+        return columns.linearise(lambda data: self.chain.linearise(self.x, data), context.data, self._applied.values)
 
     def unknown_variance(self, readings: Floats, conditions: Conditions | None = None) -> Floats:
         """(n * prisms, joints) variance of the joints' values by effects that lack what they need, deg^2 or mm^2.
 
         Arguments as for `linearise`.
         """
-        if not self.effects:
-            return np.zeros((len(readings) * len(self.chain.rig.prisms), readings.shape[1]))
-        return self._applied.unknown_variance(self.situation(readings, conditions))
+        return self._applied.unknown_variance(self.context(readings, conditions))
 
     def unknown_mm2(self, readings: Floats, conditions: Conditions | None = None) -> Floats:
         """(n * prisms,) variance of each coordinate by effects that move the prism and lack what they need, mm^2.
 
         Arguments as for `linearise`.
         """
-        if not self.effects:
-            return np.zeros(len(readings) * len(self.chain.rig.prisms))
-        return self._applied.unknown_mm2(self.situation(readings, conditions))
+        return self._applied.unknown_mm2(self.context(readings, conditions))
 
-    def situation(self, readings: Floats, conditions: Conditions | None = None) -> Situation:
-        """What effects may see of the poses (n, joints): a row for every prism in each, not measured yet."""
+    def context(self, readings: Floats, conditions: Conditions | None = None) -> EffectContext:
+        """Poses (n, joints) as effects see them: a row for every prism in each, not measured yet."""
         rig = self.chain.rig
         n, prisms = len(readings), len(rig.prisms)
         rows = n * prisms
@@ -139,31 +127,19 @@ class Knowledge:
         extra = {name: np.repeat(values, prisms) for name, values in (conditions or {}).items()}
         setup = np.full(rows, self.chain.setups[self.setup])
         fixes = Observations(np.tile(rig.prism_names, n), joints, nothing, nothing, setup, empty, empty, extra)
-        return Situation(self.chain, self.x, fixes, self._loads, self._machine)
-
-    def _bound(self, readings: Floats) -> ChainData:
-        prisms = len(self.chain.rig.prisms)
-        return ChainData(
-            readings,
-            np.tile(np.arange(prisms), len(readings) // prisms),
-            np.full(len(readings), self.setup, dtype=np.intp),
-        )
+        return EffectContext(self.chain, self.x, fixes, self._loads, self._machine)
 
     @cached_property
     def _applied(self) -> AppliedEffects:
         return AppliedEffects(self.effects, self.chain)
 
     @cached_property
-    def _lineariser(self) -> Lineariser:
-        return Lineariser(self.chain)
+    def _loads(self) -> GravityModel:
+        return GravityModel(self.chain, self.x)
 
     @cached_property
-    def _loads(self) -> GravityLoads:
-        return GravityLoads(self.chain, self.x)
-
-    @cached_property
-    def _machine(self) -> Machine:
-        return Machine(self.chain, self.x)
+    def _machine(self) -> CompiledChain:
+        return CompiledChain(self.chain, self.x)
 
 
 def setup_of(model: CalibratedModel, name: str | None = None) -> int:

@@ -1,26 +1,26 @@
-"""The pose plan that the command line prints: what is known, poses that add most to it, what they will bring."""
+"""Pose plan of the command line: the poses that add most to what is known, and the accuracy they will bring."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
 
-from calibration.accuracy import VOLUME_POSES, ExpectedAccuracy, predicted_accuracy, shares_left
+from calibration.design.accuracy import VOLUME_POSES, ExpectedAccuracy, accuracy_of_model, predicted_accuracy
+from calibration.design.candidates import CANDIDATES, Candidates, draw, near, work_volume
 from calibration.design.conditions import instructions
 from calibration.design.knowledge import Knowledge, setup_of
-from calibration.design.poses import CANDIDATES, Candidates, Plan, draw, near, plan, volume_root, work_volume
+from calibration.design.poses import Plan, plan, volume_root
 from calibration.design.visibility import Site, placement, site
 from calibration.errors import UnsafeError
-from calibration.kinematics import Chain, Placement
-from calibration.model import CalibratedModel
+from calibration.kinematics.chain import Chain, Placement
+from calibration.model.model import CalibratedModel
 from calibration.observations import Floats
-from calibration.rig import Rig
-
-Progress = Callable[[float, str], None]
+from calibration.rig.description import Rig
+from calibration.run import DEFAULT_RUN, Run
 
 _COVERED = 0.8  # of a joint's range
 _SHARE = 0.03  # of the expected variance
@@ -53,7 +53,7 @@ class PoseRow:
 
 @dataclass(frozen=True)
 class PosePlan:
-    """Poses to measure and what they bring.
+    """Poses to measure and the accuracy they bring.
 
     Attributes:
         rig: the rig description.
@@ -77,7 +77,7 @@ class PosePlan:
 
     @property
     def assumptions(self) -> tuple[str, ...]:
-        """What the plan takes for granted, in sentences."""
+        """Assumptions of the plan, in sentences."""
         if self.before is not None:
             return (self.station, *self.at.rules)
         lacks = "expected error: of a model that lacks nothing, with the noise that the rig file gives"
@@ -128,16 +128,15 @@ def pose_rows(rig: Rig, poses: Candidates) -> tuple[PoseRow, ...]:
 def plan_poses(
     rig: Rig,
     poses: int,
-    rng: np.random.Generator,
     *,
     model: CalibratedModel | None = None,
     station_mm: Floats | None = None,
     setup: str | None = None,
     floor_mm: float | None = None,
     separate: Sequence[str] = (),
-    progress: Progress | None = None,
+    run: Run = DEFAULT_RUN,
 ) -> PosePlan:
-    """Plan a session, or what to measure after one.
+    """Plan the poses of a first session, or of one after a calibration.
 
     Without a model the poses make the parameters best determined; with one they lower most what it is expected to err
     over the work volume; with `separate` they tell effects apart.
@@ -145,24 +144,26 @@ def plan_poses(
     Args:
         rig: the rig description.
         poses: how many.
-        rng: draws candidates and work volume.
         model: what is known already. At one of its set-ups the poses will be measured, unless `station_mm` is given.
         station_mm: (3,) place of a new station set-up in the base frame.
         setup: which of the model's set-ups; by default the one whose base is known best.
         floor_mm: height of the floor over the base's origin.
         separate: two effects or more, each the `family@where` of one in the library.
-        progress: told (share done, what is going on).
+        run: seed of candidates and work volume, and progress.
+
+    Returns:
+        The poses in the order to measure them, with the accuracy before and after.
 
     Raises:
         DataError: fewer reachable poses than asked for; an effect that poses do not show.
         UnsafeError: a model of another rig, or without that set-up; no reachable pose in view.
     """
-    report = progress or _silent
+    rng, report = np.random.default_rng(run.seed), run.progress
     if model is not None:
         _require_same(rig, model.rig)
     report(0.0, "placing the station")
     present = None if model is None else Knowledge.of_model(model, setup_of(model, setup))
-    knowledge, at, station = _situation(rig, present, station_mm, floor_mm)
+    knowledge, at, station = _surroundings(rig, present, station_mm, floor_mm)
     report(0.1, "drawing poses")
     candidates = draw(knowledge, at, rng, max(CANDIDATES, poses))
     volume = work_volume(knowledge, at, rng, VOLUME_POSES)
@@ -176,8 +177,8 @@ def plan_poses(
     if model is None or present is None:
         after = predicted_accuracy(knowledge, chosen.root, volume)
     else:
-        before = _of_model(model, present, present.root, volume)
-        after = _of_model(model, knowledge, chosen.root, volume)
+        before = accuracy_of_model(model, present, present.root, volume)
+        after = accuracy_of_model(model, knowledge, chosen.root, volume)
         advice += tuple(_advice(model, present, chosen, before, after, moved=station_mm is not None))
     return PosePlan(rig, chosen, at, station, before, after, advice, tuple(_warnings(rig, chosen, model)))
 
@@ -196,10 +197,10 @@ def _require_same(rig: Rig, of_model: Rig) -> None:
         )
 
 
-def _situation(
+def _surroundings(
     rig: Rig, present: Knowledge | None, station_mm: Floats | None, floor_mm: float | None
 ) -> tuple[Knowledge, Site, str]:
-    """What is known where the poses will be measured, what stands around, and where the station's place is from."""
+    """Knowledge and surroundings at the poses to be measured, and a sentence about the station's place."""
     if present is not None and station_mm is None:
         at = site(present.chain, present.x, setup=present.setup, floor_mm=floor_mm)
         label = f"set-up {name!r}" if (name := present.chain.setups[present.setup]) else "the set-up"
@@ -219,18 +220,6 @@ def _situation(
 
 def _place(at: Site) -> str:
     return f"at {', '.join(f'{round(float(c))}' for c in at.station_mm)} mm in the base frame"
-
-
-def _of_model(model: CalibratedModel, knowledge: Knowledge, root: Floats, volume: Floats) -> ExpectedAccuracy:
-    parameters, lacking = shares_left(model)
-    return predicted_accuracy(
-        knowledge,
-        root,
-        volume,
-        joint_error_scale=model.joint_error_scale,
-        parameters_share=parameters,
-        lacking_share=lacking,
-    )
 
 
 def _advice(
@@ -306,7 +295,3 @@ def _warnings(rig: Rig, chosen: Plan, model: CalibratedModel | None) -> Iterator
                 f"{effect} of plausible size would stand out from the others by {sigma:.1f} sigma only: plan more "
                 f"poses, or look for another experiment"
             )
-
-
-def _silent(share: float, what: str) -> None:
-    """Progress that nobody watches."""

@@ -1,4 +1,4 @@
-"""Poses that determine a model best: drawn inside the joint limits, in view of the station, chosen by exchange.
+"""Choice of the poses that determine a model best, or tell effects apart, among candidates.
 
 A pose brings the fixes of all prisms in view. They share the errors of the joints' readings, so their covariance is
 Sigma_station + J_q Sigma_q J_q' with the second part common to them; what is known beforehand are the build tolerances,
@@ -8,13 +8,22 @@ or a model's covariance. With such a prior a redundant parameter is no obstacle:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from calibration.design.conditions import Conditions, drawn, one_after_another, slow, under
+from calibration.design.alternatives import (
+    Alternative,
+    alternative_of,
+    changing,
+    conditions_of,
+    joined_columns,
+    name_of,
+)
+from calibration.design.candidates import Candidates
+from calibration.design.conditions import one_after_another
 from calibration.design.exchange import (
     Accuracy,
     Criterion,
@@ -28,72 +37,22 @@ from calibration.design.exchange import (
     information_of,
 )
 from calibration.design.knowledge import Knowledge
-from calibration.design.rivals import Rival, changing, conditions_of, name_of, rival_of, together
-from calibration.design.tour import length_s, short_tour, travel_s
-from calibration.design.visibility import Bodies, Flags, Site, in_view, is_reachable, limits
-from calibration.effects.base import Situation
-from calibration.effects.fitted import FittedEffect, coefficient_values, fitted_additions
-from calibration.effects.library import library
-from calibration.errors import DataError, UnsafeError
-from calibration.identification.additions import Additions, joined
+from calibration.design.tour import length_s, ordered, travel_s
+from calibration.effects.columns import joined
+from calibration.effects.context import EffectContext
+from calibration.effects.fitted import FittedEffect, coefficient_values, fitted_columns
+from calibration.errors import DataError
 from calibration.identification.identifiability import observability_indices
-from calibration.identification.refinement import information, prior_precision
-from calibration.identification.samples import averaged, reading_variance, station_covariance
-from calibration.kernels.machine import root_of
-from calibration.kinematics import Linearisation
+from calibration.identification.linear_model import information, prior_precision
+from calibration.identification.noise import reading_variance, station_covariance
+from calibration.identification.samples import averaged
+from calibration.kinematics.chain import Linearisation
+from calibration.numerics.matrices import root_of
 from calibration.observations import Floats, Observations
-from calibration.rig import Rig
 
-CANDIDATES = 10_000
-_BATCHES = 10
-_MARGIN = 0.01  # of a joint's range, kept from its limits
-_NEAR = 100  # to each pose
 _MOVES = 20  # of each pose; as many again would bring a hundredth more of the log odds
-_WIDTHS = 0.02, 0.2  # of a joint's range, 1 sigma
 _SEEN = 0.1  # as in identifiability: the data alone determine a direction within ten prior sigmas
-_TRIED = 64  # poses in which conditions are tried
 _LINEARISED_AT_ONCE = 2000
-
-
-@dataclass(frozen=True)
-class Candidates:
-    """Poses that the rig can take.
-
-    Attributes:
-        readings: (n, joints) deg or mm.
-        conditions: under which each is to be measured.
-        seen: (n, prisms) prisms in view.
-    """
-
-    readings: Floats
-    conditions: Conditions
-    seen: Flags
-
-    def __len__(self) -> int:
-        return len(self.readings)
-
-    @property
-    def fixes(self) -> Floats:
-        """(n,) how many are taken of each prism in view."""
-        return self.conditions.get("fixes", np.ones(len(self)))
-
-    @property
-    def fixes_in_all(self) -> int:
-        """Of all prisms in all poses."""
-        return int(self.fixes @ self.seen.sum(axis=1))
-
-    def few(self) -> Candidates:
-        """Enough of them to try in which conditions what shows."""
-        return self.select(np.arange(min(_TRIED, len(self))))
-
-    def select(self, which: Integers) -> Candidates:
-        """The given poses."""
-        conditions = {name: values[which] for name, values in self.conditions.items()}
-        return Candidates(self.readings[which], conditions, self.seen[which])
-
-    def under(self, names: Collection[str]) -> Candidates:
-        """The same poses, with nothing said of other conditions."""
-        return replace(self, conditions=under(self.conditions, names))
 
 
 @dataclass(frozen=True)
@@ -103,7 +62,8 @@ class Plan:
     Attributes:
         poses: what to drive to, under which conditions where these matter, and what is in view there.
         seconds_of_motion: from the first to the last, every joint at its full rate.
-        parameters, determined: how many the set-up can show, and how many directions of them the poses alone determine.
+        parameters: number that the set-up can show.
+        determined: number of directions of them that the poses alone determine.
         observability: `O1` .. `O5` of the poses alone.
         root: (p + k, p + k) covariance of parameters and coefficients after the poses = root @ root'.
         stands_out: `family@where` of the effects to be told apart -> by how many sigma one of plausible size, or of the
@@ -120,96 +80,6 @@ class Plan:
     stands_out: dict[str, float]
 
 
-def draw(
-    knowledge: Knowledge,
-    at: Site,
-    rng: np.random.Generator,
-    count: int = CANDIDATES,
-    *,
-    begin_s: float = 0.0,
-    payload_kg: float = 0.0,
-) -> Candidates:
-    """Random poses that the rig can take and in which the station sees a prism.
-
-    Half of them are drawn evenly between the joint limits, half lean to the limits (arcsine law), where errors show
-    most.
-
-    Args:
-        knowledge: of the rig.
-        at: what stands around it.
-        rng: draws.
-        count: how many poses.
-        begin_s: `time_s` at which they can be measured, at the earliest.
-        payload_kg: as for `conditions.drawn`.
-
-    Raises:
-        UnsafeError: there is none.
-    """
-    chain = knowledge.chain
-    low, high = limits(chain.rig)
-    margin = _MARGIN * (high - low)
-    readings, seen = np.empty((0, len(low))), np.empty((0, len(chain.rig.prisms)), dtype=bool)
-    for _ in range(_BATCHES):
-        share = rng.random((count, len(low)))
-        share[::2] = np.sin(0.5 * np.pi * share[::2]) ** 2
-        tried = low + margin + (high - low - 2.0 * margin) * share
-        bodies = Bodies.of(chain, knowledge.x, tried)
-        view = in_view(bodies, at)
-        good = is_reachable(bodies, at) & view.any(axis=1)
-        readings, seen = np.concatenate([readings, tried[good]]), np.concatenate([seen, view[good]])
-        if len(readings) >= count:
-            break
-    if len(readings) == 0:
-        raise UnsafeError(
-            f"of {_BATCHES * count} poses inside the joint limits of rig {chain.rig.name!r} none is reachable with a "
-            f"prism in view of the station at {', '.join(f'{c:.0f}' for c in at.station_mm)} mm in the base frame; "
-            f"check the station's place and the floor"
-        )
-    readings, seen = readings[:count], seen[:count]
-    conditions = drawn(chain.rig, len(readings), rng, begin_s=begin_s, payload_kg=payload_kg)
-    return Candidates(readings, conditions, seen)
-
-
-def near(knowledge: Knowledge, at: Site, rng: np.random.Generator, poses: Candidates) -> tuple[Candidates, Integers]:
-    """These poses, and random ones that differ little from each in some of the joints, under the same conditions.
-
-    Only such as the rig can take and in which the station sees all that it sees in the one they are near, whose number
-    comes with each; the pose itself is the first of them.
-    """
-    low, high = limits(knowledge.chain.rig)
-    margin = _MARGIN * (high - low)
-    number = np.repeat(np.arange(len(poses)), _NEAR)
-    about = poses.select(number)
-    width = np.tile(np.geomspace(*_WIDTHS, _NEAR), len(poses))[:, None]
-    moved = width * rng.standard_normal(about.readings.shape) * (rng.random(about.readings.shape) < 0.5)
-    moved[::_NEAR] = 0.0
-    tried = np.clip(about.readings + (high - low) * moved, low + margin, high - margin)
-    bodies = Bodies.of(knowledge.chain, knowledge.x, tried)
-    good = np.flatnonzero(is_reachable(bodies, at) & (in_view(bodies, at) >= about.seen).all(axis=1))
-    return replace(about, readings=tried).select(good), number[good]
-
-
-def work_volume(knowledge: Knowledge, at: Site, rng: np.random.Generator, count: int) -> Floats:
-    """(count, joints) poses drawn evenly among those that the rig can take, in view or not.
-
-    Raises:
-        UnsafeError: there is none.
-    """
-    low, high = limits(knowledge.chain.rig)
-    found = np.empty((0, len(low)))
-    for _ in range(_BATCHES):
-        drawn = rng.uniform(low, high, (count, len(low)))
-        found = np.concatenate([found, drawn[is_reachable(Bodies.of(knowledge.chain, knowledge.x, drawn), at)]])
-        if len(found) >= count:
-            return found[:count]
-    if len(found) == 0:
-        raise UnsafeError(
-            f"rig {knowledge.chain.rig.name!r} can take none of {_BATCHES * count} poses inside its joint limits "
-            f"without touching itself or the floor at {at.floor_mm:.0f} mm; check the floor"
-        )
-    return found
-
-
 def plan(
     knowledge: Knowledge,
     candidates: Candidates,
@@ -220,7 +90,7 @@ def plan(
     measured: Observations | None = None,
     nearby: Callable[[Candidates], tuple[Candidates, Integers]] | None = None,
 ) -> Plan:
-    """Choose poses.
+    """Choose poses among candidates.
 
     Args:
         knowledge: of the rig.
@@ -244,16 +114,16 @@ def plan(
     effects = [effect for answer in answers for effect in answer]
     before = knowledge.without([name_of(effect) for effect in effects])
     known = len(before.root)
-    candidates = _as_they_matter(knowledge, before, candidates, effects)
+    candidates = _under_conditions_that_matter(knowledge, before, candidates, effects)
     with threadpool_limits(1, user_api="blas"):  # the blocks are small: threads would wait for each other
-        rivals = tuple(rival_of(before, e, candidates.readings, candidates.conditions) for e in effects)
-        told = None if measured is None else _told(before, measured, rivals)
-        blocks = whitened(before, candidates, rivals)
+        alternatives = tuple(alternative_of(before, e, candidates.readings, candidates.conditions) for e in effects)
+        told = None if measured is None else _told(before, measured, alternatives)
+        blocks = whitened(before, candidates, alternatives)
         criterion: Criterion = Determinant()
-        if rivals:
+        if alternatives:
             nothing = information_of(blocks[:0], told)
             pairs = _pairs([len(answer) for answer in answers])
-            hypotheses = _hypotheses(known, rivals, nothing)
+            hypotheses = _hypotheses(known, alternatives, nothing)
             criterion = Discrimination(hypotheses if len(answers) == 1 else hypotheses[:-1], nothing, pairs)
         elif volume is not None:
             criterion = Accuracy(volume_root(knowledge, volume))
@@ -262,21 +132,18 @@ def plan(
         if nearby is not None:
             for _ in range(_MOVES):
                 closer, number = nearby(chosen)
-                chosen = closer.select(improve(whitened(before, closer, rivals)[:, in_view], number, criterion, told))
+                chosen = closer.select(
+                    improve(whitened(before, closer, alternatives)[:, in_view], number, criterion, told)
+                )
         seconds = travel_s(rig, chosen.readings)
-        order = _order(rig, seconds, chosen, [name_of(effect) for effect in effects])
+        order = ordered(rig, seconds, chosen, [name_of(effect) for effect in effects])
         poses = chosen.select(order)
         poses = replace(poses, conditions=one_after_another(poses.conditions))
         stands_out: dict[str, float] = {}
         if isinstance(criterion, Discrimination):
             # Once more in their order: some effects depend on what was before.
-            log_odds = criterion.log_odds(information_of(whitened(before, poses, rivals), told))
-            least: dict[int, float] = {}
-            for odds, (true, _) in zip(log_odds.tolist(), pairs, strict=True):
-                least[true] = min(odds, least.get(true, math.inf))
-            for true, odds in least.items():
-                if true < len(rivals):  # nothing at all is told apart, too, and has no name
-                    stands_out[rivals[true].name] = math.sqrt(2.0 * max(0.0, odds))
+            log_odds = criterion.log_odds(information_of(whitened(before, poses, alternatives), told))
+            stands_out = _stands_out(alternatives, criterion.pairs, log_odds)
         after = covariance_of(whitened(knowledge, poses))
         alone = _alone(knowledge, poses)
     seen = alone[alone > _SEEN]
@@ -291,13 +158,13 @@ def plan(
     )
 
 
-def _as_they_matter(
+def _under_conditions_that_matter(
     knowledge: Knowledge, before: Knowledge, candidates: Candidates, separate: Sequence[str | FittedEffect]
 ) -> Candidates:
-    """The same poses under the conditions that matter.
+    """Keep the conditions that matter.
 
-    Those that effects to be told apart need, varied only where that changes any of them, and those that change some of
-    them and leave others.
+    They are those that effects to be told apart need, varied only where that changes any of them, and those that change
+    some of the effects and leave others.
     """
     matters = _sides(knowledge, candidates)
     if not separate:
@@ -315,9 +182,9 @@ def _as_they_matter(
 
 
 def _pairs(members: Sequence[int]) -> tuple[tuple[int, int], ...]:
-    """Of answers with so many members each, the first of every one, and all of the others that it is to be told from.
+    """Pair the first member of every answer with all members of the other answers.
 
-    One answer is to be told from none at all, which comes last.
+    One answer alone is paired with no effect at all, which comes last.
     """
     first = [sum(members[:number]) for number in range(len(members))]
     if len(members) == 1:
@@ -331,51 +198,61 @@ def _pairs(members: Sequence[int]) -> tuple[tuple[int, int], ...]:
     )
 
 
-def _hypotheses(known: int, rivals: Sequence[Rival], before: Floats) -> tuple[Hypothesis, ...]:
+def _stands_out(
+    alternatives: Sequence[Alternative], pairs: Sequence[tuple[int, int]], log_odds: Floats
+) -> dict[str, float]:
+    """Return the sigma by which each effect stands out from the most alike of the others, by its name."""
+    least: dict[int, float] = {}
+    for odds, (true, _) in zip(log_odds.tolist(), pairs, strict=True):
+        least[true] = min(odds, least.get(true, math.inf))
+    # The hypothesis of no effect at all comes last and has no name.
+    named = {alternatives[true].name: odds for true, odds in least.items() if true < len(alternatives)}
+    return {name: math.sqrt(2.0 * max(0.0, odds)) for name, odds in named.items()}
+
+
+def _hypotheses(known: int, alternatives: Sequence[Alternative], before: Floats) -> tuple[Hypothesis, ...]:
     """Each effect by itself beside the kinematics, and last the kinematics alone.
 
     Args:
-        known: how many parameters and coefficients there are beside those of the rivals.
-        rivals: the effects.
+        known: how many parameters and coefficients there are beside those of the alternatives.
+        alternatives: the effects.
         before: (q, q) information of the prior and of what was measured already.
     """
     kinematics, found = np.arange(known), list[Hypothesis]()
     first = known
-    for rival in rivals:
-        own = first + np.arange(rival.size)
-        first += rival.size
+    for alternative in alternatives:
+        own = first + np.arange(alternative.size)
+        first += alternative.size
         mean = np.zeros(len(before))
-        mean[own] = rival.found
+        mean[own] = alternative.found
         # Beside it, the kinematics explain the rest of what was measured.
-        mean[:known] = -np.linalg.solve(before[:known, :known], before[:known, own] @ rival.found)
+        mean[:known] = -np.linalg.solve(before[:known, :known], before[:known, own] @ alternative.found)
         found.append(Hypothesis(mean, np.concatenate([kinematics, own])))
     return (*found, Hypothesis(np.zeros(len(before)), kinematics))
 
 
-def whitened(knowledge: Knowledge, candidates: Candidates, rivals: tuple[Rival, ...] = ()) -> Floats:
+def whitened(knowledge: Knowledge, candidates: Candidates, alternatives: tuple[Alternative, ...] = ()) -> Floats:
     """(n, 3 prisms, p + k) Jacobian of each pose's fixes in their sigmas, the parameters in prior units.
 
-    Rows of prisms out of view are zero. The coefficients of `rivals` come last.
+    Rows of prisms out of view are zero. The coefficients of `alternatives` come last.
     """
     prisms, known = len(knowledge.chain.rig.prisms), len(knowledge.root)
-    columns: Additions | None = None
-    if rivals:  # of all poses at once: what an effect does may depend on those before
-        columns = together(rivals, knowledge.situation(candidates.readings, candidates.conditions))
-    total = known + (0 if columns is None else len(columns))
+    # Of all poses at once: an effect in one may depend on those before.
+    columns = joined_columns(alternatives, knowledge.context(candidates.readings, candidates.conditions))
+    total = known + len(columns)
     out = np.empty((len(candidates), 3 * prisms, total))
     for first in range(0, len(candidates), _LINEARISED_AT_ONCE):
         rows = np.arange(first, min(first + _LINEARISED_AT_ONCE, len(candidates)))
         some, n = candidates.select(rows), len(rows)
-        lin, by_known = knowledge.linearise(some.readings, some.conditions)
+        lin = knowledge.linearise(some.readings, some.conditions)
         covariance = _noise(knowledge, lin, some)
         hidden = np.repeat(~some.seen, 3, axis=1)
         covariance[hidden[:, :, None] | hidden[:, None, :]] = 0.0
         covariance[hidden[:, :, None] & np.eye(3 * prisms, dtype=bool)] = 1.0
         jacobian = np.empty((n * prisms, 3, total))
-        jacobian[:, :, :known] = by_known @ knowledge.root
-        if columns is not None:
-            fixes = np.arange(prisms * rows[0], prisms * (rows[-1] + 1))
-            jacobian[:, :, known:] = columns.select(fixes).moved_mm(lin.joint_jacobian)
+        jacobian[:, :, :known] = lin.jacobian @ knowledge.root
+        fixes = np.arange(prisms * rows[0], prisms * (rows[-1] + 1))
+        jacobian[:, :, known:] = columns.select(fixes).moved_mm(lin.joint_jacobian)
         stacked = jacobian.reshape(n, 3 * prisms, total)
         stacked[hidden] = 0.0
         out[rows] = np.linalg.solve(np.linalg.cholesky(covariance), stacked)
@@ -384,7 +261,7 @@ def whitened(knowledge: Knowledge, candidates: Candidates, rivals: tuple[Rival, 
 
 def volume_root(knowledge: Knowledge, volume: Floats) -> Floats:
     """(p + k, r) root of the mean of J'J over poses (v, joints) and all prisms, the parameters in prior units."""
-    _, jacobian = knowledge.linearise(volume)
+    jacobian = knowledge.linearise(volume).jacobian
     rows = (jacobian @ knowledge.root).reshape(-1, len(knowledge.root)) / np.sqrt(len(jacobian))
     return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64).T
 
@@ -416,18 +293,18 @@ def _noise(knowledge: Knowledge, lin: Linearisation, poses: Candidates) -> Float
 
 
 def _alone(knowledge: Knowledge, poses: Candidates) -> Floats:
-    """Singular values of what the poses alone say, each parameter in units of its build tolerance."""
+    """Singular values of the Jacobian of the poses alone, each parameter in units of its build tolerance."""
     sigma = np.diag(prior_precision(knowledge.chain, 1.0) ** -0.5)
     rows = whitened(replace(knowledge, root=sigma, effects=()), poses)
     return np.asarray(np.linalg.svd(rows.reshape(-1, rows.shape[2]), compute_uv=False), dtype=np.float64)
 
 
-def _told(knowledge: Knowledge, measured: Observations, rivals: tuple[Rival, ...]) -> Floats:
-    """(q, q) what rows that were measured say of parameters and coefficients, in prior units."""
+def _told(knowledge: Knowledge, measured: Observations, alternatives: tuple[Alternative, ...]) -> Floats:
+    """(q, q) information of measured rows about parameters and coefficients, in prior units."""
     chain = knowledge.chain
     samples = averaged(chain, measured)
-    situation = Situation(chain, knowledge.x, measured)
-    parts = [fitted_additions(knowledge.effects, situation), together(rivals, situation)]
+    context = EffectContext(chain, knowledge.x, measured)
+    parts = [fitted_columns(knowledge.effects, context), joined_columns(alternatives, context)]
     additions = joined(parts, len(measured)).over(samples.average)
     known, total = len(knowledge.root), len(chain) + len(additions)
     x = np.zeros(total)
@@ -439,34 +316,8 @@ def _told(knowledge: Knowledge, measured: Observations, rivals: tuple[Rival, ...
     return in_units
 
 
-def _order(rig: Rig, seconds: Floats, poses: Candidates, separate: Sequence[str]) -> Integers:
-    """(n,) a short way through the poses, those under the same slow conditions together.
-
-    To and fro where one of the effects to be told apart grows with the path of its joint.
-    """
-    names = slow(poses.conditions)
-    levels = np.column_stack([np.zeros(len(poses)), *(poses.conditions[name] for name in names)])
-    _, block = np.unique(levels, axis=0, return_inverse=True)
-    parts = [np.flatnonzero(block == number) for number in range(block.max() + 1)]
-    places = [effect.partition("@") for effect in separate]
-    travelling = [rig.joint_names.index(where) for name, _, where in places if library()[name].goes_by_travel]
-    if travelling:
-        low, high = limits(rig)
-        share = ((poses.readings - low) / (high - low))[:, travelling].sum(axis=1)
-        return np.concatenate([own[_to_and_fro(share[own])] for own in parts])
-    return np.concatenate([own[short_tour(seconds[np.ix_(own, own)])] for own in parts])
-
-
-def _to_and_fro(values: Floats) -> Integers:
-    """(n,) the lower and the upper half of some values in turn."""
-    rising = np.argsort(values, kind="stable")
-    order = np.empty(len(values), dtype=np.intp)
-    order[0::2], order[1::2] = np.split(rising, [(len(values) + 1) // 2])
-    return order
-
-
 def _sides(knowledge: Knowledge, candidates: Candidates) -> set[str]:
-    """The directions of approach that effects of the model ask for."""
+    """Directions of approach that effects of the model need."""
     joints = knowledge.chain.rig.joint_names
     poses = candidates.select(np.arange(1)).under([f"{name}_dir" for name in joints])
     blank = knowledge.unknown_variance(poses.readings)[0]

@@ -1,14 +1,18 @@
-"""The order of poses that moves the machine least: an open travelling-salesman path, nearest neighbour and 2-opt."""
+"""Order of the poses of a plan: an open travelling-salesman path, by nearest neighbour and 2-opt."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.design.candidates import Candidates
+from calibration.design.conditions import slow
+from calibration.design.exchange import Integers
+from calibration.design.visibility import limits
+from calibration.effects.library import library
 from calibration.observations import Floats
-from calibration.rig import Rig
-
-Integers = NDArray[np.intp]
+from calibration.rig.description import Rig
 
 _ROUNDS = 20
 _WORK = 500  # poses times starts
@@ -16,7 +20,7 @@ _LESS = 1e-9  # s; less is rounding
 
 
 def travel_s(rig: Rig, readings: Floats) -> Floats:
-    """(n, n) seconds from pose to pose (n, joints): all joints move at once, each at its `max_rate`."""
+    """(n, n) seconds between poses (n, joints): all joints move at once, each at its `max_rate`."""
     rate = np.array([joint.max_rate for joint in rig.joints])
     scaled = readings / rate
     seconds: Floats = np.abs(scaled[:, None, :] - scaled[None, :, :]).max(axis=2)
@@ -24,12 +28,38 @@ def travel_s(rig: Rig, readings: Floats) -> Floats:
 
 
 def length_s(seconds: Floats, order: Integers) -> float:
-    """How long the way through (n, n) travel times takes in an order."""
+    """Sum the travel times (n, n) from pose to pose in an order, s."""
     return float(seconds[order[:-1], order[1:]].sum())
 
 
+def ordered(rig: Rig, seconds: Floats, poses: Candidates, separate: Sequence[str]) -> Integers:
+    """Order the poses (n,) for a short way, those under the same slow conditions together.
+
+    The way goes to and fro where one of the effects to be told apart grows with the path of its joint.
+    """
+    names = slow(poses.conditions)
+    levels = np.column_stack([np.zeros(len(poses)), *(poses.conditions[name] for name in names)])
+    _, block = np.unique(levels, axis=0, return_inverse=True)
+    parts = [np.flatnonzero(block == number) for number in range(block.max() + 1)]
+    places = [effect.partition("@") for effect in separate]
+    travelling = [rig.joint_names.index(where) for name, _, where in places if library()[name].goes_by_travel]
+    if travelling:
+        low, high = limits(rig)
+        share = ((poses.readings - low) / (high - low))[:, travelling].sum(axis=1)
+        return np.concatenate([own[_to_and_fro(share[own])] for own in parts])
+    return np.concatenate([own[short_tour(seconds[np.ix_(own, own)])] for own in parts])
+
+
+def _to_and_fro(values: Floats) -> Integers:
+    """(n,) the lower and the upper half of some values in turn."""
+    rising = np.argsort(values, kind="stable")
+    order = np.empty(len(values), dtype=np.intp)
+    order[0::2], order[1::2] = np.split(rising, [(len(values) + 1) // 2])
+    return order
+
+
 def short_tour(seconds: Floats) -> Integers:
-    """(n,) an order with a short way through (n, n) travel times; where it begins and ends is free."""
+    """Find an order (n,) with a short way through (n, n) travel times; both ends are free."""
     n = len(seconds)
     starts = np.unique(np.linspace(0, n - 1, max(1, min(n, _WORK // n))).astype(int))
     tours = [_two_opt(seconds, _nearest_neighbour(seconds, int(start))) for start in starts]
@@ -47,7 +77,7 @@ def _nearest_neighbour(seconds: Floats, start: int) -> Integers:
 
 
 def _two_opt(seconds: Floats, order: Integers) -> Integers:
-    """Turn parts of the way round while that shortens it; a step to or from nowhere takes no time."""
+    """Reverse parts of the way while that shortens it; a step to or from nowhere takes no time."""
     n = len(order)
     if n < 2:
         return order

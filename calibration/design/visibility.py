@@ -1,4 +1,4 @@
-"""Which poses a rig can take, and which prisms a station sees in them: its links as capsules, some plain rules.
+"""Reachable poses and prisms in view of the station, by plain rules: links are capsules.
 
 A rig file knows frames and no shapes. So every link is the straight line between the origins of two frames that follow
 each other, with a radius of 1.2 % of the reach, and a pedestal stands between the base and the floor. Everything here
@@ -14,9 +14,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.kinematics import Chain, ChainData, Placement
+from calibration.kinematics.chain import Chain, ChainData, Placement
+from calibration.kinematics.compiled_chain import CompiledChain
 from calibration.observations import Floats
-from calibration.rig import Rig
+from calibration.rig.description import Rig
 
 Flags = NDArray[np.bool_]
 
@@ -37,7 +38,7 @@ _EYE_MM = 1600.0  # the instrument above the floor
 
 @dataclass(frozen=True)
 class Site:
-    """What stands around a rig.
+    """The surroundings of a rig: station and floor.
 
     Attributes:
         station_mm: (3,) the instrument's centre.
@@ -60,7 +61,7 @@ class Site:
 
     @property
     def rules(self) -> tuple[str, ...]:
-        """What counts as reachable and as in view, in sentences."""
+        """The rules for reachable and in view, in sentences."""
         return (
             f"reachable: inside the joint limits, nothing lower than the floor at {self.floor_mm:.0f} mm over the "
             f"base's origin, links (straight between their frames, {self.radius_mm:.0f} mm in radius) clear of each "
@@ -91,13 +92,9 @@ class Bodies:
         here = Chain(chain.rig, {"": Placement.identity()})
         own = np.concatenate([x[: chain.base_start], np.zeros(6)])
         zero = np.zeros(n * prisms, dtype=np.intp)
-        frames = here.frames_mm(own, ChainData(readings, zero[:n], zero[:n]))
         every = ChainData(np.repeat(readings, prisms, axis=0), np.tile(np.arange(prisms), n), zero)
-        return cls(
-            chain.rig,
-            np.concatenate([np.zeros((n, 1, 3)), frames], axis=1),
-            here.positions_mm(own, every).reshape(n, prisms, 3),
-        )
+        located = CompiledChain(here, own).locate(every)
+        return cls(chain.rig, located.frames_mm[::prisms], located.position_mm.reshape(n, prisms, 3))
 
     def __len__(self) -> int:
         return len(self.frames_mm)
@@ -134,11 +131,8 @@ class Bodies:
         Links go by the number of their row; the pedestal is 0 and ends at the base.
         """
         ends = [(self._parents[number - 1], number) if number else (0, 0) for number in (one, other)]
-        return min(self._apart_mm(a, b) for a in ends[0] for b in ends[1])
-
-    def _apart_mm(self, one: int, other: int) -> float:
-        rows = set(self.rig.path(one)) ^ set(self.rig.path(other))
-        return float(sum(self._lengths_mm[number - 1] for number in rows))
+        paths = [set(self.rig.path(a)) ^ set(self.rig.path(b)) for a in ends[0] for b in ends[1]]
+        return min(float(sum(self._lengths_mm[number - 1] for number in path)) for path in paths)
 
 
 def limits(rig: Rig) -> tuple[Floats, Floats]:
@@ -166,10 +160,11 @@ def site(
     station_mm: Floats | None = None,
     floor_mm: float | None = None,
 ) -> Site:
-    """What stands around a rig.
+    """Place the station and the floor about a rig.
 
     Args:
-        chain, x: kinematics and its parameters (p,).
+        chain: kinematics.
+        x: (p,) its parameters.
         setup: the set-up of the chain whose station it is.
         station_mm: (3,) the station in the base frame. Without it and without a set-up: on its tripod on the floor
             about the base, never within reach of the machine, where it sees most.
@@ -192,7 +187,7 @@ def site(
 
 
 def placement(at: Site) -> Placement:
-    """Where the base stands in the frame of a levelled station there."""
+    """Placement of the base in the frame of a levelled station there."""
     up = at.up
     across = np.cross(np.eye(3)[int(np.argmin(np.abs(up)))], up)
     east = across / np.linalg.norm(across)
@@ -262,8 +257,10 @@ def in_view(bodies: Bodies, at: Site) -> Flags:
 
 
 def segment_distance(p0: Floats, p1: Floats, q0: Floats, q1: Floats) -> Floats:
-    """(n,) shortest distances between line segments p0 p1 and q0 q1, all (n, 3); Ericson, Real-Time Collision
-    Detection (2005), section 5.1.9."""
+    """(n,) shortest distances between line segments p0 p1 and q0 q1, all (n, 3).
+
+    Source: Ericson, Real-Time Collision Detection (2005), section 5.1.9.
+    """
     u, v, w = p1 - p0, q1 - q0, p0 - q0
     a, e, b = _dot(u, u), _dot(v, v), _dot(u, v)
     c, f = _dot(u, w), _dot(v, w)

@@ -5,22 +5,22 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.effects.base import PrismFamily, Situation
-from calibration.kinematics import Chain, rotation_about
+from calibration.effects.base import PrismFamily
+from calibration.effects.context import EffectContext
+from calibration.kinematics.chain import Chain, rotation_about
 from calibration.observations import Floats
-from calibration.rig import Rig
+from calibration.rig.description import Rig
 
 _LEAST_MM = 1e-6
 _PARALLEL = math.cos(math.radians(1.0))  # an axis so near to a slide's direction does not swing it
 
 
 def boom_of(rig: Rig) -> tuple[int, str] | None:
-    """Number of the row that is the boom and the joint that extends it; None where a rig has no such row.
+    """Return the number of the boom's row and the joint that extends it; None where a rig has no boom.
 
     A boom slides, along `a` or `d`, and a joint before it swings it, about an axis that is not parallel to it. Of
     several the first: it carries the others.
@@ -30,7 +30,7 @@ def boom_of(rig: Rig) -> tuple[int, str] | None:
 
 
 def _swung(chain: Chain, number: int) -> tuple[int, str] | None:
-    """A row and the joint that slides it, where another swings it.
+    """Return a row and the joint that slides it, where another swings it.
 
     Asked with all readings at zero: where all axes are parallel to the slide there, turning about them leaves them so.
     """
@@ -47,9 +47,9 @@ def _swung(chain: Chain, number: int) -> tuple[int, str] | None:
 
 
 class BoomFamily(PrismFamily):
-    """An effect of what a telescoping boom carries; only rigs that have one have a place for it."""
+    """An effect of the load of a telescoping boom; rigs without a boom have no place for it."""
 
-    goes_with: ClassVar[Literal["", "torque", "weights"]] = "weights"
+    goes_with = "weights"
 
     def places(self, rig: Rig) -> tuple[str, ...]:
         return ("boom",) if boom_of(rig) is not None else ()
@@ -58,9 +58,9 @@ class BoomFamily(PrismFamily):
         del where
         return "masses in the rig file"
 
-    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
+    def known(self, context: EffectContext, where: str) -> NDArray[np.bool_]:
         del where
-        return np.full(len(situation), bool(situation.rig.masses))
+        return np.full(len(context), bool(context.rig.masses))
 
 
 @dataclass(frozen=True)
@@ -68,39 +68,39 @@ class Boom:
     """The boom in n rows; vectors are of the base frame.
 
     Attributes:
-        situation: the rows.
+        context: the rows.
         row: number of the boom's row. Its root is the origin of the frame before, its tip that of its own.
         joint: name of what extends it.
     """
 
-    situation: Situation
+    context: EffectContext
     row: int
     joint: str
 
     @cached_property
     def _root(self) -> int:
-        path = self.situation.rig.path(self.row)
+        path = self.context.rig.path(self.row)
         return path[-2] if len(path) > 1 else 0
 
     @cached_property
     def outer_mm(self) -> float:
         """Length of the outer section: the boom's at a reading of zero."""
-        row = self.situation.rig.rows[self.row - 1]
+        row = self.context.rig.rows[self.row - 1]
         return abs(row.a_mm if self.joint in row.drive.get("a", {}) else row.d_mm)
 
     @cached_property
     def root_mm(self) -> Floats:
-        """(n, 3)."""
-        return self.situation.located.frames_mm[:, self._root]
+        """(n, 3) place of its root."""
+        return self.context.located.frames_mm[:, self._root]
 
     @cached_property
     def tip_mm(self) -> Floats:
-        """(n, 3)."""
-        return self.situation.located.frames_mm[:, self.row]
+        """(n, 3) place of its tip."""
+        return self.context.located.frames_mm[:, self.row]
 
     @cached_property
     def length_mm(self) -> Floats:
-        """(n,) from root to tip."""
+        """(n,) distance from root to tip."""
         length: Floats = np.sqrt(((self.tip_mm - self.root_mm) ** 2).sum(axis=1))
         return length
 
@@ -112,12 +112,12 @@ class Boom:
     @property
     def down(self) -> Floats:
         """(n, 3) unit vectors of gravity."""
-        return self.situation.down
+        return self.context.down
 
     def lowered(self, arm: Floats) -> Floats:
-        """(n, 3) what a point at `arm` (n, 3) does as the boom turns down about the level axis across it.
+        """Return the displacement (n, 3) of a point at `arm` (n, 3) as the boom turns down about its level axis.
 
-        Per rad, less by the cosine of the boom's elevation: (axis x down) x arm.
+        Per rad, times the cosine of the boom's elevation: (axis x down) x arm.
         """
         along, below = (self.axis * arm).sum(axis=1), (self.down * arm).sum(axis=1)
         moved: Floats = along[:, None] * self.down - below[:, None] * self.axis
@@ -125,34 +125,34 @@ class Boom:
 
     @cached_property
     def _beyond(self) -> NDArray[np.bool_]:
-        """(rows + 1,) which frames move with the tip."""
-        rig = self.situation.rig
+        """(rows + 1,) mask of the frames that move with the tip."""
+        rig = self.context.rig
         return np.array([self.row in rig.path(frame) for frame in range(len(rig.rows) + 1)])
 
     @cached_property
     def carries_prism(self) -> NDArray[np.bool_]:
-        """(n,) whether the prism moves with the tip."""
-        carried: NDArray[np.bool_] = self._beyond[self.situation.prism_frame]
+        """(n,) mask of the rows whose prism moves with the tip."""
+        carried: NDArray[np.bool_] = self._beyond[self.context.prism_frame]
         return carried
 
     @cached_property
     def hanging(self) -> NDArray[np.bool_]:
-        """(points,) which of the machine's weights the tip carries."""
-        return self._beyond[self.situation.loads.point_frame]
+        """(points,) mask of the machine's weights that the tip carries."""
+        return self._beyond[self.context.loads.point_frame]
 
     @cached_property
     def own(self) -> NDArray[np.bool_]:
-        """(points,) which of the weights are fixed to the boom's root section."""
-        own: NDArray[np.bool_] = self.situation.loads.point_frame == self._root
+        """(points,) mask of the weights that are fixed to the boom's root section."""
+        own: NDArray[np.bool_] = self.context.loads.point_frame == self._root
         return own
 
     @cached_property
     def weights(self) -> tuple[Floats, Floats]:
-        """(n, points, 3) mm where the machine's weights are, and (n, points) N how heavy."""
-        return self.situation.loads.places(self.situation.data.readings, self.situation.observations.extra)
+        """(n, points, 3) places of the machine's weights, mm, and (n, points) their sizes, N."""
+        return self.context.loads.places(self.context.data.readings, self.context.observations.extra)
 
 
-def boom_in(situation: Situation) -> Boom | None:
-    """The boom of a situation's machine; None where it has none."""
-    found = boom_of(situation.rig)
-    return None if found is None else Boom(situation, *found)
+def boom_in(context: EffectContext) -> Boom | None:
+    """Return the boom of a context's machine; None where it has none."""
+    found = boom_of(context.rig)
+    return None if found is None else Boom(context, *found)

@@ -1,4 +1,4 @@
-"""Effects as a fit found them, and what they do to the readings of observations."""
+"""Effects as they are chosen, fitted, and applied to observations."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
-from typing import NamedTuple
 
 import numpy as np
 
-from calibration.effects.base import Family, FittedCoefficient, JointFamily, PrismFamily, Settings, Situation
+from calibration.effects.base import Family, FittedCoefficient, JointFamily, PrismFamily, Settings
+from calibration.effects.columns import NO_JOINT, EffectColumns
+from calibration.effects.context import EffectContext
 from calibration.effects.library import library
-from calibration.identification.additions import NO_JOINT, Additions
-from calibration.kinematics import Chain
+from calibration.kinematics.chain import Chain
 from calibration.observations import Floats, Observations
 
 _CHANCE = 2.0  # standard errors
@@ -35,7 +35,7 @@ class FittedEffect:
     settings: Settings = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, object]:
-        """The contract's JSON object, with the form and the numbers of the variant added."""
+        """Return the JSON object (docs/formats.md, gap), with the form and the numbers of the variant."""
         return {
             "family": self.family,
             "where": self.where,
@@ -48,12 +48,12 @@ class FittedEffect:
 
     @property
     def form(self) -> str:
-        """Which of several forms it has, a phrase; empty where that is no news."""
+        """A phrase that names its form; empty where there is nothing to tell."""
         return library()[self.family].form(self.settings)
 
     @property
     def reported(self) -> tuple[FittedCoefficient, ...]:
-        """What outputs list of the coefficients."""
+        """The numbers that outputs list."""
         return library()[self.family].reported(self.settings, self.coefficients)
 
 
@@ -64,7 +64,7 @@ class Choice:
     Attributes:
         family, where: which effect, and the place it is at.
         settings: the numbers of its variant.
-        scale: of the plausible sizes of its coefficients, where the data say that they are larger or smaller.
+        scale: factor on the plausible sizes of its coefficients, where the data say that they are larger or smaller.
     """
 
     family: str
@@ -75,37 +75,37 @@ class Choice:
     def __str__(self) -> str:
         return f"{self.family}@{self.where}"
 
-    def additions(self, situation: Situation) -> Additions:
-        """Its coefficients, for the observations of a situation."""
+    def columns(self, context: EffectContext) -> EffectColumns:
+        """Return its coefficients for the observations of a context."""
         family = library()[self.family]
-        found = family.coefficients(situation, self.where, self.settings)
-        column, shift = _moves(family, situation, self.where, self.settings)
-        return Additions(
+        found = family.coefficients(context, self.where, self.settings)
+        column, shift = _moves(family, context, self.where, self.settings)
+        return EffectColumns(
             tuple(f"{self}:{c.name}" for c in found),
-            np.full(len(found), _joint(family, situation.chain, self.where)),
+            np.full(len(found), _joint(family, context.chain, self.where)),
             column,
             np.array([c.sigma * self.scale for c in found]),
             shift,
         )
 
-    def fitted(self, situation: Situation, values: Floats, standard_errors: Floats) -> FittedEffect:
-        """As a fit found it; arrays (k,)."""
-        found = library()[self.family].coefficients(situation, self.where, self.settings)
+    def fitted(self, context: EffectContext, values: Floats, standard_errors: Floats) -> FittedEffect:
+        """Return the effect as a fit found it, values and standard errors (k,)."""
+        found = library()[self.family].coefficients(context, self.where, self.settings)
         coefficients = tuple(
             FittedCoefficient(c.name, c.unit, float(value), float(error), c.sigma)
             for c, value, error in zip(found, values, standard_errors, strict=True)
         )
         return FittedEffect(self.family, self.where, coefficients, dict(self.settings))
 
-    def beyond(self, situation: Situation, values: Floats, standard_errors: Floats) -> tuple[str, ...]:
-        """Names of the coefficients (k,) that are beyond their hard limits by more than chance.
+    def beyond(self, context: EffectContext, values: Floats, standard_errors: Floats) -> tuple[str, ...]:
+        """Return the names of the coefficients (k,) that are beyond their hard limits by more than chance.
 
         Those that only shape an effect, and are not reported, have none; see `strained`.
         """
         family = library()[self.family]
-        limits = {c.name: c for c in family.coefficients(situation, self.where, self.settings)}
+        limits = {c.name: c for c in family.coefficients(context, self.where, self.settings)}
         out = []
-        for c in self.fitted(situation, values, standard_errors).reported:
+        for c in self.fitted(context, values, standard_errors).reported:
             limit = limits.get(c.name)
             if limit is None:
                 continue
@@ -115,24 +115,12 @@ class Choice:
         return tuple(out)
 
     def strained(self, values: Floats, standard_errors: Floats) -> bool:
-        """Whether coefficients (k,) have what only shapes the effect beyond its limits by more than chance."""
+        """Return True if coefficients that only shape the effect are implausibly large; see `Family.strained`."""
         return library()[self.family].strained(self.settings, values, standard_errors)
 
 
-class Columns(NamedTuple):
-    """What the k coefficients of a model's effects do in n rows.
-
-    Attributes:
-        column: (n, k) deg or mm of its joint per unit of each; zero for those that change none.
-        shift_mm: (n, 3, k) displacement of the prism in the station's frame beside that; None where none does.
-    """
-
-    column: Floats
-    shift_mm: Floats | None
-
-
 class AppliedEffects:
-    """A model's effects, prepared for any observations of its rig.
+    """The effects of a model, prepared for any observations of its rig.
 
     An effect does nothing in rows that lack what it needs.
 
@@ -141,112 +129,94 @@ class AppliedEffects:
         chain: whose joints they are at.
 
     Attributes:
-        joint: (k,) index of the joint that each coefficient changes, -1 for none.
-        goes_by_order: whether what they do in a row depends on the rows before it.
+        names: (k,) `family@where:name` of each coefficient.
+        joint: (k,) index of the joint that each changes, `NO_JOINT` for none.
+        values: (k,) of the coefficients.
+        machine_values: (k,) the same; 0 for those that do not move prisms in the base frame.
+        goes_by_order: True if the change in a row depends on the rows before it.
     """
 
     def __init__(self, effects: Sequence[FittedEffect], chain: Chain) -> None:
         ends = list(accumulate((len(effect.coefficients) for effect in effects), initial=0))
         self._parts = [(library()[effect.family], effect, slice(*ends[i : i + 2])) for i, effect in enumerate(effects)]
         at = [_joint(family, chain, effect.where) for family, effect, _ in self._parts]
-        self.joint = np.repeat(np.array(at, dtype=np.intp), np.diff(ends))
-        self.goes_by_order = any(family.goes_by_order(effect.settings) for family, effect, _ in self._parts)
-        self._value = coefficient_values(effects)
         of_machine = [family.moves_machine for family, _, _ in self._parts]
-        self._of_machine = self._value * np.repeat(np.array(of_machine, dtype=bool), np.diff(ends))
-        self._by_joint = np.zeros((ends[-1], len(chain.joint_index)))
-        moving = np.flatnonzero(self.joint != NO_JOINT)
-        self._by_joint[moving, self.joint[moving]] = self._value[moving]
+        self.names = tuple(f"{e.family}@{e.where}:{c.name}" for e in effects for c in e.coefficients)
+        self.joint = np.repeat(np.array(at, dtype=np.intp), np.diff(ends))
+        self.values = coefficient_values(effects)
+        self.machine_values = self.values * np.repeat(np.array(of_machine, dtype=bool), np.diff(ends))
+        self.goes_by_order = any(family.goes_by_order(effect.settings) for family, effect, _ in self._parts)
+        self._joints = len(chain.joint_index)
+        self._prior_sigma = np.array([c.prior_sigma for effect in effects for c in effect.coefficients])
         self._shifts = bool((self.joint == NO_JOINT).any())
-        # Most effects lack nothing ever; what the others leave open does not depend on the rows.
+        # Most effects lack nothing ever; the variance that the others leave does not depend on the rows.
         self._unknown = [
-            (family, effect.where, joint, _left_open(effect))
+            (family, effect.where, joint, _unknown_variance(effect))
             for (family, effect, _), joint in zip(self._parts, at, strict=True)
             if family.needs(effect.where)
         ]
 
-    def columns(self, situation: Situation) -> Columns:
-        """What unit coefficients do."""
-        column = np.zeros((len(situation), len(self.joint)))
-        shift_mm = np.zeros((len(situation), 3, len(self.joint))) if self._shifts else None
+    def columns(self, context: EffectContext) -> EffectColumns:
+        """Return the coefficients for the observations of a context, n rows."""
+        column = np.zeros((len(context), len(self.joint)))
+        shift_mm = np.zeros((len(context), 3, len(self.joint))) if self._shifts else None
         for family, effect, own in self._parts:
-            moved, shifted = _moves(family, situation, effect.where, effect.settings)
+            moved, shifted = _moves(family, context, effect.where, effect.settings)
             column[:, own] = moved
             if shift_mm is not None and shifted is not None:
                 shift_mm[:, :, own] = shifted
-        return Columns(column, shift_mm)
+        return EffectColumns(self.names, self.joint, column, self._prior_sigma, shift_mm)
 
-    def change(self, columns: Columns) -> Floats:
-        """(n, joints) by what the coefficients with these columns change the joints, deg or mm."""
-        change: Floats = columns.column @ self._by_joint
-        return change
-
-    def shifted_mm(self, columns: Columns) -> Floats | None:
-        """(n, 3) by what they move the prism beside that, in the station's frame; None where none does."""
-        return None if columns.shift_mm is None else columns.shift_mm @ self._value
-
-    def machine_shifted_mm(self, columns: Columns) -> Floats | None:
-        """(n, 3) that part of it by which prisms move in the base frame; still along the station's axes."""
-        return None if columns.shift_mm is None else columns.shift_mm @ self._of_machine
-
-    def unknown_variance(self, situation: Situation) -> Floats:
-        """(n, joints) variance of the joints' values in rows that lack what an effect needs, deg^2 or mm^2."""
-        out = np.zeros((len(situation), self._by_joint.shape[1]))
+    def unknown_variance(self, context: EffectContext) -> Floats:
+        """Return the variance (n, joints) of joint values in rows that lack what an effect needs, deg^2 or mm^2."""
+        out = np.zeros((len(context), self._joints))
         for family, where, joint, variance in self._unknown:
-            known = family.known(situation, where)
+            known = family.known(context, where)
             if joint != NO_JOINT and not known.all():
                 out[~known, joint] += variance
         return out
 
-    def unknown_mm2(self, situation: Situation) -> Floats:
-        """(n,) variance of each coordinate in rows that lack what an effect that moves the prism needs, mm^2."""
-        out = np.zeros(len(situation))
+    def unknown_mm2(self, context: EffectContext) -> Floats:
+        """Return the variance (n,) of each coordinate in rows that lack what an effect on the prism needs, mm^2."""
+        out = np.zeros(len(context))
         for family, where, joint, variance in self._unknown:
             if joint == NO_JOINT:
-                out[~family.known(situation, where)] += variance
+                out[~family.known(context, where)] += variance
         return out
 
 
-def fitted_additions(effects: Sequence[FittedEffect], situation: Situation) -> Additions:
-    """The coefficients of a model's effects, for other observations."""
-    applied = AppliedEffects(effects, situation.chain)
-    columns = applied.columns(situation)
-    return Additions(
-        tuple(f"{effect.family}@{effect.where}:{c.name}" for effect in effects for c in effect.coefficients),
-        applied.joint,
-        columns.column,
-        np.array([c.prior_sigma for effect in effects for c in effect.coefficients]),
-        columns.shift_mm,
-    )
+def fitted_columns(effects: Sequence[FittedEffect], context: EffectContext) -> EffectColumns:
+    """Return the coefficients of a model's effects for other observations."""
+    return AppliedEffects(effects, context.chain).columns(context)
 
 
 def coefficient_values(effects: Sequence[FittedEffect]) -> Floats:
-    """(k,) values of all coefficients, in the order of `fitted_additions`."""
+    """Return the values (k,) of all coefficients, in the order of `fitted_columns`."""
     return np.array([c.value for effect in effects for c in effect.coefficients])
 
 
 def corrected(observations: Observations, change: Floats, names: Sequence[str]) -> Observations:
-    """Observations with a change (n, joints) added to the readings of the joints called `names`."""
+    """Return observations with a change (n, joints) added to the readings of the joints called `names`."""
     joints: Mapping[str, Floats] = {name: observations.joints[name] + change[:, i] for i, name in enumerate(names)}
     return replace(observations, joints=joints)
 
 
-def left_out(effects: Sequence[FittedEffect], situation: Situation) -> tuple[str, ...]:
-    """A sentence for every effect that some of these observations lack something for."""
+def left_out(effects: Sequence[FittedEffect], context: EffectContext) -> tuple[str, ...]:
+    """Return a sentence for every effect that lacks an input in some of these observations."""
     sentences = []
     for effect in effects:
         family = library()[effect.family]
-        lacking = int((~family.known(situation, effect.where)).sum())
+        lacking = int((~family.known(context, effect.where)).sum())
         if lacking:
-            rows = "" if lacking == len(situation) else f" in {lacking} of {len(situation)} rows"
+            rows = "" if lacking == len(context) else f" in {lacking} of {len(context)} rows"
             sentences.append(
                 f"{effect.family}@{effect.where} is left out{rows}: this data lacks {family.needs(effect.where)}"
             )
     return tuple(sentences)
 
 
-def _left_open(effect: FittedEffect) -> float:
-    """Mean square of what an effect does to its joint where what it needs is not known, deg^2 or mm^2."""
+def _unknown_variance(effect: FittedEffect) -> float:
+    """Return the mean squared effect in rows that lack its inputs, deg^2 or mm^2."""
     values = np.array([c.value for c in effect.coefficients])
     plausible = np.array([c.prior_sigma for c in effect.coefficients])
     return library()[effect.family].unknown_variance(values, plausible, effect.settings)
@@ -256,10 +226,10 @@ def _joint(family: Family, chain: Chain, where: str) -> int:
     return chain.joint_index[where] if isinstance(family, JointFamily) else NO_JOINT
 
 
-def _moves(family: Family, situation: Situation, where: str, settings: Settings) -> tuple[Floats, Floats | None]:
-    """(n, k) columns at the joint; (n, 3, k) displacements beside that, None for effects at a joint."""
+def _moves(family: Family, context: EffectContext, where: str, settings: Settings) -> tuple[Floats, Floats | None]:
+    """Return (n, k) columns at the joint; (n, 3, k) displacements of the prism, None for effects at a joint."""
     if isinstance(family, JointFamily):
-        return family.columns(situation, where, settings), None
+        return family.columns(context, where, settings), None
     assert isinstance(family, PrismFamily)  # there are these two
-    shift = family.shift_mm(situation, where, settings)
-    return np.zeros((len(situation), shift.shape[2])), shift
+    shift = family.shift_mm(context, where, settings)
+    return np.zeros((len(context), shift.shape[2])), shift

@@ -1,4 +1,4 @@
-"""The effect families there are: every file of `calibration/effects/families`."""
+"""All effect families: every file of `calibration/effects/families`."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from types import MappingProxyType
 
 from calibration.effects import families
 from calibration.effects.base import Family
-from calibration.rig import Rig
+from calibration.rig.description import Rig
 
 
 @cache
 def library() -> Mapping[str, Family]:
-    """Name -> family, in alphabetical order."""
+    """Return name -> family, in alphabetical order."""
     names = sorted(module.name for module in pkgutil.iter_modules(families.__path__))
     found: dict[str, Family] = {}
     for name in names:
@@ -25,7 +25,7 @@ def library() -> Mapping[str, Family]:
 
 
 def parse_effects(text: str, rig: Rig) -> tuple[tuple[str, str], ...]:
-    """Read `FAMILY@WHERE,...`.
+    """Parse `FAMILY@WHERE,...`.
 
     Returns:
         (family, where) of each, in the order of the text.

@@ -1,4 +1,4 @@
-"""What the load on a joint may be beside what a rig file's masses make it: nobody has weighed a boom part by part.
+"""Uncertainty of the load on a joint by that of a rig file's masses: nobody has weighed a boom part by part.
 
 An effect c * load becomes c * (load + parts @ p), p standard normal numbers, one for each weight and for each distance
 of a centre of gravity that is uncertain. Much of that only makes the whole load larger or smaller, which no pose tells
@@ -12,17 +12,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.effects.base import Coefficient, Family, FittedCoefficient, JointFamily, Settings, Situation
+from calibration.effects.base import Coefficient, Family, FittedCoefficient, JointFamily, Settings
+from calibration.effects.context import EffectContext
 from calibration.errors import ModelError
-from calibration.kinematics import Chain
+from calibration.kinematics.chain import Chain
+from calibration.kinematics.torques import MASS_SIGMA
 from calibration.observations import Floats
-from calibration.torques import MASS_SIGMA
 
 UNIT = "rad/(N m)"
 _LOAD_SIGMA, _ABOUT, _PARTS = "load_sigma", "about_rad_per_Nm", "parts"
@@ -34,7 +34,7 @@ _CHANCE = 2.0  # standard errors
 
 @dataclass(frozen=True)
 class LoadShapes:
-    """What uncertain weights do to a load.
+    """Shapes by which uncertain weights change a load over the poses.
 
     Attributes:
         share: (parts,) by how much of itself the load is larger when a part is 1 sigma larger.
@@ -53,7 +53,7 @@ class LoadShapes:
         return float(np.linalg.norm(self.share))
 
     def __call__(self, load: Floats, parts: Floats) -> Floats:
-        """(n, r) change of the load, N m per sigma of each shape; none where there are no parts, as of a measured load.
+        """Return the change of a load (n, r), N m per sigma of each shape; 0 where no part is known.
 
         Args:
             load: (n,) N m.
@@ -66,12 +66,13 @@ class LoadShapes:
 
 
 def load_shapes(load: Floats, parts: Floats, *, constant: bool = False) -> LoadShapes:
-    """The shapes of a load (n,) with parts (n, k) over a work volume of n poses, the largest first.
+    """Find the shapes of a load over a work volume of n poses, the largest first.
 
     Args:
-        load, parts: N m, and its change per sigma of each part.
-        constant: whether what is constant over the poses counts as well, as it does where a load changes its sign. It
-            goes with the load itself otherwise: an encoder's zero takes it up.
+        load: (n,) N m.
+        parts: (n, k) its change per sigma of each part.
+        constant: True if a change that is constant over the poses counts as well, as it does where a load changes its
+            sign. An encoder's zero takes it up otherwise.
     """
     level = np.column_stack([np.zeros(len(load)) if constant else np.ones(len(load)), load])
     share = np.linalg.lstsq(level, parts)[0][1]
@@ -85,54 +86,66 @@ _shapes: WeakKeyDictionary[Chain, dict[str, LoadShapes]] = WeakKeyDictionary()
 
 
 def shapes_by_design(
-    situation: Situation,
+    context: EffectContext,
     load: str,
-    volume: Callable[[Situation], tuple[Floats, Floats]],
+    volume: Callable[[EffectContext], tuple[Floats, Floats]],
     *,
     constant: bool = False,
 ) -> LoadShapes:
-    """The shapes of a load on the machine as designed, from its work volume; worked out once a chain.
+    """Return the shapes of a load on the machine as designed, from its work volume; found once for each chain.
 
     Args:
-        situation: whose chain it is.
-        load: which, a name to remember it by.
+        context: whose chain it is.
+        load: a name to remember it by.
         volume: the load (n,) and its parts (n, k) in a work volume.
         constant: as for `load_shapes`.
     """
-    if not situation.rig.masses:
+    if not context.rig.masses:
         return LoadShapes(np.zeros(0), np.zeros((0, 0)))
-    known = _shapes.setdefault(situation.chain, {})
+    known = _shapes.setdefault(context.chain, {})
     if load not in known:
-        known[load] = load_shapes(*volume(situation.as_designed.work_volume), constant=constant)
+        known[load] = load_shapes(*volume(context.as_designed.work_volume), constant=constant)
     return known[load]
 
 
-def gravity_shapes(situation: Situation, where: str, *, constant: bool = False) -> LoadShapes:
-    """The shapes of what gravity makes a joint carry; `constant` as for `load_shapes`."""
+def gravity_shapes(context: EffectContext, where: str, *, constant: bool = False) -> LoadShapes:
+    """Return the shapes of gravity's load on a joint; `constant` as for `load_shapes`."""
     return shapes_by_design(
-        situation,
+        context,
         f"{where} with its constant part" if constant else where,
         lambda volume: (volume.torque(where), volume.torque_parts(where)),
         constant=constant,
     )
 
 
-def shape_columns(shapes: LoadShapes, load: Floats, parts: Floats, settings: Settings) -> Floats:
-    """(n, r) change of a load for the variant's coefficients that shape it, N m; `load` and `parts` as for the shapes.
+def load_columns(
+    load: Floats, settings: Settings, shapes: Callable[[], LoadShapes], parts: Callable[[], Floats]
+) -> Floats:
+    """Return a load, and its change for each coefficient of a variant that shapes it.
+
+    Args:
+        load: (n,) N m, 0 where not known.
+        settings: the variant, as `load_variants` makes them.
+        shapes: returns the shapes of the load; asked only if the variant has some.
+        parts: returns its change (n, parts) per sigma of each part; likewise.
+
+    Returns:
+        (n, 1 + r) N m.
 
     Raises:
         ModelError: the variant is of other shapes, made by another version of this program.
     """
     names = part_names(settings)
     if not names:
-        return np.empty((len(load), 0))
-    if len(names) != len(shapes):
-        raise ModelError(f"the model has {len(names)} shapes of a load that has {len(shapes)}; calibrate again")
-    return shapes(np.nan_to_num(load), parts)
+        return load[:, None]
+    found = shapes()
+    if len(names) != len(found):
+        raise ModelError(f"the model has {len(names)} shapes of a load that has {len(found)}; calibrate again")
+    return np.column_stack([load, found(load, parts())])
 
 
 def load_variants(shapes: LoadShapes, plausible: float) -> tuple[Settings, ...]:
-    """The variants of an effect in proportion to a load: with the nominal shape, and with what may be beside it.
+    """Return the variants of an effect in proportion to a load: without its shapes and with them.
 
     Args:
         shapes: of its load; none where the load is measured.
@@ -145,7 +158,11 @@ def load_variants(shapes: LoadShapes, plausible: float) -> tuple[Settings, ...]:
 
 
 def part_names(settings: Settings) -> tuple[str, ...]:
-    """Names of the coefficients that shape the load; ValueError for settings that `load_variants` does not make."""
+    """Return the names of the coefficients that shape the load.
+
+    Raises:
+        ValueError: settings that `load_variants` does not make.
+    """
     if set(settings) <= {_LOAD_SIGMA} and settings.get(_LOAD_SIGMA, 0.0) >= 0.0:
         return ()
     if (
@@ -161,25 +178,25 @@ def part_names(settings: Settings) -> tuple[str, ...]:
 
 
 def part_coefficients(settings: Settings, bound: float) -> tuple[Coefficient, ...]:
-    """The coefficients that shape the load, within +-`bound`, rad per N m."""
+    """Return the coefficients that shape the load, within +-`bound`, rad per N m."""
     return tuple(Coefficient(name, UNIT, settings[_ABOUT], -bound, bound) for name in part_names(settings))
 
 
 class OfUncertainLoad(Family):
     """An effect in proportion to a load: its own coefficient, and after it those of what is uncertain of the load."""
 
-    limit_sigma: ClassVar[float] = MASS_SIGMA  # limits are what it may do at the largest load
+    limit_sigma = MASS_SIGMA  # limits are what it may do at the largest load
 
     def reported(
         self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
     ) -> tuple[FittedCoefficient, ...]:
-        """The effect's own coefficient alone, the uncertainty of the whole load in its standard error."""
+        """Return the effect's own coefficient alone, with the uncertainty of the whole load in its standard error."""
         own = coefficients[0]
         error = math.hypot(own.standard_error, settings.get(_LOAD_SIGMA, 0.0) * own.value)
         return (replace(own, standard_error=error),)
 
     def strained(self, settings: Settings, values: Floats, standard_errors: Floats) -> bool:
-        """Whether the shapes ask for weights that no machine has; a fit that needs them follows another effect."""
+        """Return True if the shapes ask for weights that no machine has: the fit follows another effect."""
         del settings
         most = _MOST_SIGMAS * (abs(values[0]) + _CHANCE * standard_errors[0])
         return bool((np.abs(values[1:]) > most + _CHANCE * standard_errors[1:]).any())
@@ -188,11 +205,11 @@ class OfUncertainLoad(Family):
 class TorqueFamily(JointFamily):
     """An effect at a revolute joint in whose load it lies alone."""
 
-    goes_with: ClassVar[Literal["", "torque", "weights"]] = "torque"
-    kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
+    goes_with = "torque"
+    kind = "revolute"
 
     def needs(self, where: str) -> str:
         return f"masses in the rig file or the column {where}_Nm"
 
-    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
-        return np.isfinite(situation.torque(where))
+    def known(self, context: EffectContext, where: str) -> NDArray[np.bool_]:
+        return np.isfinite(context.torque(where))

@@ -1,4 +1,4 @@
-"""What these data could show of every effect, whether it is there or not.
+"""Forecasts: how visible every effect would be in these data, whether it is there or not.
 
 Calibration hides physics: of what an effect moves, a refit absorbs most, and another effect may imitate the rest. Both
 follow from the poses alone. With G (r, k) what one prior sigma of each coefficient moves in the projected space and
@@ -6,8 +6,8 @@ G'G = V diag(l) V', an effect c makes the expected log Bayes factor of a candida
 
     1/2 sum_i (|U_i' G c|^2 + 1) l_i / (1 + l_i) - 1/2 sum_i ln(1 + l_i),
 
-so how large c must be for the effect to stand out, from nothing and from every rival, is a closed form. A curve that is
-free enough to imitate anything is no rival: its evidence pays for the freedom.
+so how large c must be for the effect to stand out from nothing and from every alternative is a closed form. A curve
+that is free enough to imitate anything is no alternative: its evidence pays for the freedom.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from calibration.effects.fitted import Choice
 from calibration.effects.library import library
 from calibration.gap.projection import Integers
 from calibration.gap.result import Forecast
-from calibration.gap.screen import Screen
+from calibration.gap.screening import Screen
 from calibration.observations import Floats
 
-_NAMED = 5.0  # log Bayes factor over nothing, and over any rival
+_NAMED = 5.0  # log Bayes factor over nothing, and over any alternative
 _SURE = math.log(0.95 / 0.05)  # log odds, its share of the prior taken into account
-_FREE = 4  # coefficients; variants of another effect with more are no rivals
+_FREE = 4  # coefficients; variants of another effect with more are no alternatives
 _SEEN = 1e-9  # eigenvalue of what is visible, of the largest
 
 
 @dataclass(frozen=True)
 class _Variant:
-    """One variant of a place as a candidate.
+    """One variant of a candidate, as a model to fit.
 
     Attributes:
-        place: index of its place.
+        candidate: index of its candidate.
         basis: (r, k) orthonormal, of what it can move.
         kept: (k,) l / (1 + l): share of a residual along the basis that the prior lets it take.
         chance: expected log Bayes factor of it where there is noise alone.
     """
 
-    place: int
+    candidate: int
     basis: Floats
     kept: Floats
     chance: float
@@ -50,10 +50,10 @@ class _Variant:
 
 @dataclass(frozen=True)
 class _Shown:
-    """A place as the truth, in the variant that shows most.
+    """A candidate as the truth, in the variant that shows most.
 
     Attributes:
-        option: index of that among the place's.
+        option: index of that among the candidate's.
         leading: its first coefficient.
         main: (r, k) what one prior sigma of each coefficient moves, without those that only shape it.
         visible: share of it, RMS, that the kinematics cannot absorb.
@@ -68,32 +68,33 @@ class _Shown:
 
 
 def forecasts(screen: Screen) -> tuple[Forecast, ...]:
-    """One for each place, in the order of the screen's."""
+    """Return one forecast for each candidate, in the order of the screen's."""
     variants: list[_Variant] = []
     shown: list[_Shown] = []
     own: list[int] = []
-    for number, place in enumerate(screen.places):
+    for number, candidate in enumerate(screen.candidates):
         first = len(variants)
         options = _distinct(screen, number)
         truth = _truth(screen, number, options)
-        options = [o for o in options if o == truth.option or len(place.additions[o]) <= _FREE]
+        options = [o for o in options if o == truth.option or len(candidate.additions[o]) <= _FREE]
         variants += [
-            _variant(number, screen.columns(number, option) * place.additions[option].prior_sigma) for option in options
+            _variant(number, screen.columns(number, option) * candidate.additions[option].prior_sigma)
+            for option in options
         ]
         shown.append(truth)
         own.append(first + options.index(truth.option))
     if not variants:
         return ()
-    rivals = _Rivals(variants, [screen.places[v.place].family for v in variants])
-    explained, evidence = rivals.of([truth.main for truth in shown])
+    alternatives = _Alternatives(variants, [screen.candidates[v.candidate].family for v in variants])
+    explained, evidence = alternatives.of([truth.main for truth in shown])
     return tuple(
-        _forecast(screen, number, truth, rivals, own[number], explained[number], evidence[number])
+        _forecast(screen, number, truth, alternatives, own[number], explained[number], evidence[number])
         for number, truth in enumerate(shown)
     )
 
 
-class _Rivals:
-    """All variants as candidates, for many truths at once.
+class _Alternatives:
+    """All variants as models to fit, for many truths at once.
 
     Args:
         variants: v of them.
@@ -108,15 +109,18 @@ class _Rivals:
         self.variants = variants
         self.chance = np.array([v.chance for v in variants])
         self._family = np.array(families)
-        self._is_rival = np.array([v.basis.shape[1] <= _FREE for v in variants])
+        self._is_alternative = np.array([v.basis.shape[1] <= _FREE for v in variants])
 
     def against(self, family: str) -> Integers:
-        """Indices of those of other families that are not free to imitate anything."""
-        return np.flatnonzero(self._is_rival & (self._family != family))
+        """Return indices of the variants of other families that are not free to imitate anything."""
+        return np.flatnonzero(self._is_alternative & (self._family != family))
 
     def of(self, truths: list[Floats]) -> tuple[Floats, Floats]:
-        """For truths (r, k), each coefficient its share: what of their squares every variant can take, (t, v), and by
-        what a square of their size raises its expected log Bayes factor, (t, v).
+        """Return how well every variant imitates each of t truths (r, k), whose coefficients share equally.
+
+        Returns:
+            (t, v) the part of a truth's squares that each variant can take, and (t, v) by how much a square of its size
+            raises the variant's expected log Bayes factor.
         """
         basis, kept = np.hstack([v.basis for v in self.variants]), np.concatenate([v.kept for v in self.variants])
         begin = np.cumsum([0, *(v.basis.shape[1] for v in self.variants)])[:-1]
@@ -127,35 +131,41 @@ class _Rivals:
 
 
 def _forecast(
-    screen: Screen, number: int, truth: _Shown, rivals: _Rivals, own: int, explained: Floats, evidence: Floats
+    screen: Screen,
+    number: int,
+    truth: _Shown,
+    alternatives: _Alternatives,
+    own: int,
+    explained: Floats,
+    evidence: Floats,
 ) -> Forecast:
-    place = screen.places[number]
-    others = rivals.against(place.family)
-    value = truth.leading.sigma * _least_size(own, others, evidence, rivals.chance, place.log_prior)
-    rival, separation = "", 1.0
+    candidate = screen.candidates[number]
+    others = alternatives.against(candidate.family)
+    value = truth.leading.sigma * _least_size(own, others, evidence, alternatives.chance, candidate.log_prior)
+    alternative, separation = "", 1.0
     if len(others) > 0:
         total = float((truth.main**2).sum()) / truth.main.shape[1]
         closest = int(others[np.argmax(explained[others])])
-        rival = str(screen.places[rivals.variants[closest].place])
+        alternative = str(screen.candidates[alternatives.variants[closest].candidate])
         separation = math.sqrt(max(0.0, 1.0 - float(explained[closest]) / total)) if total > 0.0 else 0.0
     return Forecast(
-        place.family,
-        place.where,
+        candidate.family,
+        candidate.where,
         truth.leading.unit,
         truth.visible,
         truth.visible_mm,
         value if value <= max(-truth.leading.lower, truth.leading.upper) else math.inf,
-        rival,
+        alternative,
         separation,
     )
 
 
 def _least_size(own: int, others: Integers, evidence: Floats, chance: Floats, log_prior: float) -> float:
-    """How many prior sigmas an effect must have, each coefficient its share, to be named.
+    """Return the least size of an effect, in prior sigmas, each coefficient its share, at which it is named.
 
     Args:
         own: index of its variant.
-        others: indices of its rivals' variants.
+        others: indices of its alternatives' variants.
         evidence: (v,) by what its square raises the expected log Bayes factor of each variant.
         chance: (v,) that of noise alone.
         log_prior: of the effect.
@@ -168,40 +178,40 @@ def _least_size(own: int, others: Integers, evidence: Floats, chance: Floats, lo
     return math.sqrt(max(squares))
 
 
-def _distinct(screen: Screen, place: int) -> list[int]:
-    """Variants that move differently; of those that differ in their prior alone the one with the widest."""
-    sigma = [additions.prior_sigma.sum() for additions in screen.places[place].additions]
-    return [max(same, key=sigma.__getitem__) for same in screen.distinct(place)]
+def _distinct(screen: Screen, candidate: int) -> list[int]:
+    """Return the variants of different columns; of those that differ in their prior alone the one with the widest."""
+    sigma = [additions.prior_sigma.sum() for additions in screen.candidates[candidate].additions]
+    return [max(same, key=sigma.__getitem__) for same in screen.distinct(candidate)]
 
 
-def _variant(place: int, columns: Floats) -> _Variant:
+def _variant(candidate: int, columns: Floats) -> _Variant:
     value, vector = np.linalg.eigh(columns.T @ columns)
     if not value[-1] > 0.0:  # nothing of it is left: it can take nothing
-        return _Variant(place, np.zeros((len(columns), 1)), np.zeros(1), 0.0)
+        return _Variant(candidate, np.zeros((len(columns), 1)), np.zeros(1), 0.0)
     seen = value > _SEEN * value[-1]
     value, vector = value[seen], vector[:, seen]
     kept = value / (1.0 + value)
-    return _Variant(place, columns @ (vector / np.sqrt(value)), kept, 0.5 * float((kept - np.log1p(value)).sum()))
+    return _Variant(candidate, columns @ (vector / np.sqrt(value)), kept, 0.5 * float((kept - np.log1p(value)).sum()))
 
 
 def _truth(screen: Screen, number: int, options: list[int]) -> _Shown:
-    """The variant that shows most, of those with the coefficients of the first."""
-    place, projection = screen.places[number], screen.projection
-    names = place.additions[options[0]].names
+    """Return the variant that shows most, of those with the coefficients of the first."""
+    candidate, projection = screen.candidates[number], screen.projection
+    names = candidate.additions[options[0]].names
     best: tuple[float, int, Floats, list[int], tuple[Coefficient, ...]] | None = None
     for option in options:
-        if place.additions[option].names != names:
+        if candidate.additions[option].names != names:
             continue
-        coefficients = _coefficients(screen, place.options[option])
-        main = _leading(place.options[option], coefficients)
-        sigma = place.additions[option].prior_sigma[main]
+        coefficients = _coefficients(screen, candidate.options[option])
+        main = _leading(candidate.options[option], coefficients)
+        sigma = candidate.additions[option].prior_sigma[main]
         moved = screen.columns(number, option)[:, main] * sigma
         power = float((moved**2).sum())
         if best is None or power > best[0]:
             best = power, option, moved, main, coefficients
     assert best is not None  # the first has its own names
     power, option, moved, main, coefficients = best
-    additions = place.additions[option]
+    additions = candidate.additions[option]
     raw_mm = projection.moved_mm(additions)[:, :, main] * additions.prior_sigma[main]
     whole = float((projection.whitened(raw_mm) ** 2).sum())
     visible = math.sqrt(power / whole) if whole > 0.0 else 0.0
@@ -214,7 +224,7 @@ def _coefficients(screen: Screen, choice: Choice) -> tuple[Coefficient, ...]:
 
 
 def _leading(choice: Choice, coefficients: tuple[Coefficient, ...]) -> list[int]:
-    """Indices of the coefficients that outputs list; all where these list something else."""
+    """Return indices of the coefficients that outputs list; all where these list something else."""
     fitted = tuple(FittedCoefficient(c.name, c.unit, 0.0, 0.0, c.sigma) for c in coefficients)
     listed = {c.name for c in library()[choice.family].reported(choice.settings, fitted)}
     found = [i for i, c in enumerate(coefficients) if c.name in listed]

@@ -1,4 +1,4 @@
-"""What the gap workflow found, as its report, the command line and the daemon take it."""
+"""The answer of `find_gap`, as reports, the command line and the daemon take it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal
 
 from calibration.effects.base import FittedCoefficient
 from calibration.effects.fitted import FittedEffect
-from calibration.model import CalibratedModel
+from calibration.model.model import CalibratedModel
 from calibration.observations import Floats, Observations
 
 Verdict = Literal["named", "none", "indistinguishable", "unidentified"]
@@ -16,7 +16,7 @@ Verdict = Literal["named", "none", "indistinguishable", "unidentified"]
 
 @dataclass(frozen=True)
 class Candidate:
-    """One effect at one place, weighed against the others of its round.
+    """One effect at one place, scored against the others of its round.
 
     Attributes:
         family, where: which.
@@ -36,18 +36,18 @@ class Candidate:
     reason: str = ""
 
     def as_dict(self) -> dict[str, object]:
-        """The contract's object of a set."""
+        """Return the JSON object of a candidate in a set (docs/formats.md, gap)."""
         return {"family": self.family, "where": self.where, "posterior": self.posterior}
 
 
 @dataclass(frozen=True)
 class Disagreement:
-    """Where simulation and measurement disagree beyond chance.
+    """A place and a variable in which simulation and measurement disagree beyond chance.
 
     Attributes:
         where: joint, prism, `boom`, `base`, `station`, `clock`.
         variable: on what the disagreement depends there: `direction`, `torque`, `sin 2 theta4`, `time` ...
-        p: corrected for all that was looked at.
+        p: p-value, corrected for all tests.
     """
 
     where: str
@@ -55,13 +55,13 @@ class Disagreement:
     p: float
 
     def as_dict(self) -> dict[str, object]:
-        """The contract's object."""
+        """Return the JSON object (docs/formats.md, gap)."""
         return {"where": self.where, "variable": self.variable, "p": self.p}
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """What would tell more.
+    """A proposal for what to measure next.
 
     Attributes:
         kind: `poses`, `approach`, `dwell`, `payload`, `prism`, `control_points`, `motion` ...
@@ -77,7 +77,7 @@ class Experiment:
     stands_out_sigma: Mapping[str, float] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, object]:
-        """The contract's object, with the poses and what they promise where there are any."""
+        """Return the JSON object (docs/formats.md, gap), with poses and their promise, if any."""
         told: dict[str, object] = {"kind": self.kind, "text": self.text}
         if self.poses:
             told |= {"poses": list(self.poses), "stands_out_sigma": dict(self.stands_out_sigma)}
@@ -86,7 +86,7 @@ class Experiment:
 
 @dataclass(frozen=True)
 class Forecast:
-    """What this data could show of one effect.
+    """The visibility of one effect in these data.
 
     Attributes:
         family, where: which.
@@ -94,8 +94,8 @@ class Forecast:
         visible: share of what it moves, RMS, that refitted kinematics cannot absorb.
         visible_mm: RMS of that at the plausible size.
         nameable: smallest value of the first coefficient that this data could name; infinity for none within bounds.
-        rival: `family@where` of the effect most like it; empty for none.
-        separation: share of what is visible that the rival cannot imitate either.
+        alternative: `family@where` of the effect most like it; empty for none.
+        separation: share of what is visible that the alternative cannot imitate either.
     """
 
     family: str
@@ -104,18 +104,18 @@ class Forecast:
     visible: float
     visible_mm: float
     nameable: float
-    rival: str
+    alternative: str
     separation: float
 
 
 @dataclass(frozen=True)
 class Round:
-    """One turn of the workflow.
+    """One step of the search.
 
     Attributes:
         held_out_mm: RMS of held-out groups before anything of this round was adopted.
-        adopted: `family@where` of what this round took in; none in the last.
-        candidates: weighed in this round, the most probable first.
+        adopted: `family@where` of the effects that this round adopted; none in the last.
+        candidates: scored in this round, the most probable first.
     """
 
     held_out_mm: float
@@ -124,7 +124,7 @@ class Round:
 
 
 @dataclass(frozen=True)
-class Gap:
+class GapResult:
     """The answer of the workflow.
 
     Attributes:
@@ -171,7 +171,7 @@ class Gap:
     warnings: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, object]:
-        """The contract's JSON object, without `seconds`."""
+        """Return the JSON object of `gap` (docs/formats.md), without `seconds`."""
         return {
             "verdict": self.verdict,
             "effects": [{**e.as_dict(), "posterior": self.posterior[f"{e.family}@{e.where}"]} for e in self.effects],

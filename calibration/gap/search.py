@@ -1,213 +1,36 @@
-"""The search for what the model lacks: screen, decide, adopt by joint refit, and again while anything can be named."""
+"""The search for missing effects: screen, select, adopt by joint refit, and again while anything can be named."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from calibration.effects.columns import joined
 from calibration.effects.fitted import Choice
-from calibration.gap.adopt import Adopted, JointFit, adopted, joint_fit
-from calibration.gap.found import Found, Turn, concluded
-from calibration.gap.grammar import Found as Formula
-from calibration.gap.grammar import Grammar
-from calibration.gap.problem import OUTLIER, Problem
+from calibration.gap.adoption import Adopted, adopted
+from calibration.gap.candidates import CandidateEffect, candidate_at, candidate_effects, variants_at
+from calibration.gap.criteria import best_of_each_family, beyond_doubt, explains, joint_log_bayes_factor
+from calibration.gap.formulas.grammar import Formula, Grammar
+from calibration.gap.joint_fit import OUTLIER, JointFit, Problem, joint_fit
 from calibration.gap.projection import Projection
-from calibration.gap.reading_steps import in_true_steps
-from calibration.gap.rivals import best_of_each_family, beyond_doubt, explains
-from calibration.gap.screen import Place, Screen, Weighed, possible
-from calibration.gap.settle import explaining_outliers, settled
-from calibration.gap.turn import decide
+from calibration.gap.screening import ScoredEffect, Screen
+from calibration.gap.search_result import SearchResult, SelectionStep, conclude
+from calibration.gap.selection import Selection, select_effect
+from calibration.identification.reading_steps import in_true_steps
 from calibration.identification.refinement import Prior
 from calibration.identification.solve import Solution
 from calibration.observations import Observations
 
-MOST_FAMILIES = 4
-
+_MOST_FAMILIES = 4
 _STEPS = 30  # of the loop; every place of every adopted family
-_PENDING = 3  # sets that are looked behind
+_PENDING = 3  # sets that are adopted for the time being
 _FORMULAS = 3  # that are fitted along
 _MANY = 0.02  # share of gross outliers that is more than accidents
-
-
-class _Search:
-    def __init__(self, problem: Problem, families: Collection[str]) -> None:
-        self.problem, self.families = problem, tuple(families)
-
-    def run(self, before: Found | None = None) -> Found:
-        """The search without the fixes that are far off, and with all where there are many such.
-
-        It goes on after what was found `before`, if anything was.
-
-        To kinematics alone a fix that shows an effect may look like an outlier, as such fixes are often the rare ones:
-        those after a step, or where a load has changed its side. Of both searches the one counts whose effects leave
-        fewer outliers over.
-        """
-        counted = self.problem.counted(self.problem.alone())
-        weight = counted.fit.weight
-        found = self._run(counted, before)
-        if (weight < OUTLIER).mean() < _MANY:
-            return found
-        with_all = self._run(replace(counted, fit=replace(counted.fit, weight=np.ones_like(weight))), before)
-        return with_all if with_all.joint.choices and self._outliers(with_all) < self._outliers(found) else found
-
-    def _outliers(self, found: Found) -> int:
-        """How many samples the kinematics with what was found weigh out."""
-        fit = found.joint.fit if found.joint.choices else self.problem.solution.fit
-        return int((fit.weight < OUTLIER).sum())
-
-    def _run(self, joint: JointFit, before: Found | None) -> Found:
-        """The search from a fit of the kinematics alone, whose weights are those of the first turn."""
-        projection = self.problem.project(joint)
-        alone = Turn(joint, projection, (), {}, ())
-        first = possible(joint.situation, projection, self.families)
-        turns: list[Turn] = []
-        certain: dict[str, float] = {}
-        pending: list[str] = []
-        there, steps = first.places, 0
-        if before is not None and before.joint.choices:
-            turns, certain = list(before.turns[:-1]), dict(before.certain)
-            joint = self.problem.fit(before.joint.choices, joint.fit.x)
-            projection = self.problem.open(joint)
-            there = self._possible(joint.choices, projection)
-        while True:
-            decision = decide(self.problem, joint, projection, there)
-            steps += 1
-            is_set = decision.kind == "set" and len(pending) < _PENDING
-            taken = () if decision.joint is None else decision.joint.choices[len(joint.choices) :]
-            rested = self._rested(joint, taken) if steps < _STEPS else joint
-            if rested is not joint:
-                joint, projection = rested, self.problem.open(rested)
-                there = self._possible(joint.choices, projection)
-                continue
-            if not is_set:
-                own = taken if decision.kind == "take" else ()
-                turns.append(Turn(joint, projection, decision.weighed, decision.posterior, own, decision.reasons))
-            if decision.joint is None or steps > _STEPS or not (is_set or decision.kind == "take"):
-                break
-            # What cannot be told apart yet is there for the time being: others may stand out beside it.
-            if is_set:
-                pending += [str(c) for c in taken]
-            certain |= {str(c): decision.posterior[c.family] for c in taken}
-            joint = decision.joint
-            projection = self.problem.open(joint)
-            there = self._possible(joint.choices, projection)
-        rivals = decision.rivals
-        for name in pending:
-            joint, turn, left = self._judged_again(joint, name)
-            if turn is not None and turn.taken:
-                turns.insert(-1, turn)
-                certain |= {str(c): turn.posterior[c.family] for c in turn.taken}
-            elif turn is not None and left and not rivals:
-                turns[-1], rivals = turn, left
-        joint, renamed = self._renamed(joint, [str(c) for c in joint.choices if str(c) not in pending])
-        for turn in renamed:
-            turns.insert(-1, turn)
-            certain |= {str(c): turn.posterior[c.family] for c in turn.taken}
-        joint = explaining_outliers(self.problem, joint)
-        return concluded(self.problem, joint, alone, turns, rivals, decision.formulas, certain, first)
-
-    def _rested(self, joint: JointFit, taken: Sequence[Choice]) -> JointFit:
-        """The fit with its effects at rest, before what is to be `taken` beside them comes in.
-
-        What is there may have a better form by now, all the more at the same place; and where nothing more is taken,
-        one that explains outliers as well.
-        """
-        places = {c.where for c in taken}
-        rested = settled(self.problem, joint, [c for c in joint.choices if not taken or c.where in places])
-        return rested if taken or rested is not joint else explaining_outliers(self.problem, joint)
-
-    def _renamed(self, joint: JointFit, names: Sequence[str]) -> tuple[JointFit, list[Turn]]:
-        """The fit with what took one of the names when others were not known yet and has another one beside them."""
-        turns: list[Turn] = []
-        for name in names:
-            if len({c.family for c in joint.choices}) == 1:
-                break
-            if name not in map(str, joint.choices) or self._is_plain(joint, name):
-                continue
-            other, turn, _ = self._judged_again(joint, name)
-            if turn is not None and turn.taken and name not in map(str, turn.taken):
-                joint = settled(self.problem, other, other.choices)
-                turns.append(turn)
-        return joint, turns
-
-    def _is_plain(self, joint: JointFit, name: str) -> bool:
-        """Whether nothing comes near what took a name, beside all else that is there: it would take it again."""
-        joint = joint.with_last([str(c) for c in joint.choices].index(name))
-        projection = self.problem.project(joint, without_last=True)
-        weighed = Screen(projection, self._possible(joint.choices[:-1], projection)).weigh()
-        return str(weighed[0].place) == name and beyond_doubt(best_of_each_family(weighed))
-
-    def _judged_again(self, joint: JointFit, name: str) -> tuple[JointFit, Turn | None, tuple[Weighed, ...]]:
-        """What could not be told from others, now that all else is known: the fit with it, or without and the set."""
-        if name not in map(str, joint.choices):
-            return joint, None, ()
-        others = [c for c in joint.choices if str(c) != name]
-        without = self.problem.fit(others, joint.start(others))
-        # What all together explain is no outlier to a part of it.
-        projection = self.problem.open(replace(without, fit=replace(without.fit, weight=joint.fit.weight)))
-        decision = decide(self.problem, without, projection, self._possible(others, projection))
-        if decision.kind != "take" or decision.joint is None:
-            turn = Turn(without, projection, decision.weighed, decision.posterior, (), decision.reasons)
-            return without, turn, decision.rivals
-        taken = decision.joint.choices[len(others) :]
-        turn = Turn(without, projection, decision.weighed, decision.posterior, taken, decision.reasons)
-        return decision.joint, turn, ()
-
-    def _possible(self, there: Sequence[Choice], projection: Projection) -> tuple[Place, ...]:
-        """All places for what may still be missing: of no other families once there are as many as a model takes."""
-        taken = {c.family for c in there}
-        allowed = [f for f in self.families if f in taken] if len(taken) >= MOST_FAMILIES else self.families
-        return possible(projection.situation, projection, allowed, [str(c) for c in there]).places
-
-
-def _beside_formulas(problem: Problem, families: Collection[str], found: Found) -> Found:
-    """What was found, and what is beyond doubt beside the formulas of what no library has.
-
-    On a machine there is always something that no library has, and clear effects beside it. The search goes on with a
-    formula fitted along, one more each time: of several that are found together others may be an effect in words. The
-    model that comes of it has the effects alone; what they leave is told as ever.
-
-    Args:
-        problem: the data.
-        families: that may be named.
-        found: without formulas fitted along. It stays as it is where nothing more is named, or a set is not settled.
-    """
-    further, formulas = found, list[Formula]()
-    for _ in range(_FORMULAS):
-        new = next((f for f in further.strange if not _has_name(f, further)), None)
-        if new is None:
-            break
-        formulas.append(new)
-        further = _Search(problem.beside(formulas), families).run(further)
-    named, pending = {str(c) for c in further.joint.choices}, {str(w.place) for w in found.rivals}
-    if not {str(c) for c in found.joint.choices} < named or (pending and not pending & named):
-        return found
-    fits = [problem.fit(turn.fit.choices, problem.solution.fit.x) for turn in further.turns]
-    turns = [replace(t, fit=fit, projection=problem.project(fit)) for t, fit in zip(further.turns, fits, strict=True)]
-    joint, left = fits[-1], Grammar(turns[-1].projection)
-    return replace(
-        found,
-        adopted=adopted(problem.solution, joint, further.adopted.reason),
-        joint=joint,
-        turns=tuple(turns),
-        rivals=(),
-        formulas=left.found() or tuple(formulas),
-        certain=further.certain,
-        left=left,
-    )
-
-
-def _has_name(formula: Formula, found: Found) -> bool:
-    """Whether an effect that was weighed in the last turn explains what a formula does.
-
-    What does not show by itself, for all that hides it, is no more than a formula.
-    """
-    over = found.left.projection
-    shows = formula.shows_beside(np.empty((len(over.residual), 0)), over.residual)
-    weighed = found.turns[-1].weighed if shows else ()
-    return any(w.log_bayes_factor > 0.0 and explains(w, formula, over) for w in weighed)
+_BETTER = 1.0  # log Bayes factor, to change the form of an adopted effect
+_FORMS = 5  # times that the forms of adopted effects are changed, before all candidates are scored again
 
 
 def search(
@@ -217,19 +40,19 @@ def search(
     *,
     prior: Prior = "recalibration",
     seed: int = 0,
-) -> Found:
+) -> SearchResult:
     """Find the effects that the data ask for.
 
     Args:
         solution: the kinematics alone, fitted to `observations`.
         observations: the rows.
-        families: that may be named.
-        prior: as the solution was found with.
+        families: of effects that may be named.
+        prior: of the solution.
         seed: of half-samples and folds.
     """
     seen = in_true_steps(solution, observations, prior)
     problem = Problem(seen, observations, prior, seed)
-    found = _beside_formulas(problem, families, _Search(problem, families).run())
+    found = _search_with_formulas(problem, families, _Search(problem, families).run())
     if seen is solution:
         return found
     # A model counts the noise of readings as its rig file has it, and what is beyond that as scatter.
@@ -237,3 +60,275 @@ def search(
         return replace(found, adopted=Adopted(solution, solution.fit, reason=found.adopted.reason))
     joint = joint_fit(solution, observations, found.joint.choices, prior, found.joint.fit.x)
     return replace(found, adopted=adopted(solution, joint, found.adopted.reason))
+
+
+class _Search:
+    """A search over the given families."""
+
+    def __init__(self, problem: Problem, families: Collection[str]) -> None:
+        self.problem, self.families = problem, tuple(families)
+
+    def run(self, before: SearchResult | None = None) -> SearchResult:
+        """Search without gross outliers, and with all samples where there are many such.
+
+        To kinematics alone a fix that shows an effect may look like an outlier, as such fixes are often the rare ones:
+        those after a step, or where a load has changed its side. The search whose effects leave fewer outliers counts.
+
+        Args:
+            before: a result from which to go on.
+        """
+        counted = self.problem.with_mild_outliers(self.problem.kinematics_only())
+        weight = counted.fit.weight
+        found = self._run(counted, before)
+        if (weight < OUTLIER).mean() < _MANY:
+            return found
+        with_all = self._run(replace(counted, fit=replace(counted.fit, weight=np.ones_like(weight))), before)
+        return with_all if with_all.joint.choices and self._outliers(with_all) < self._outliers(found) else found
+
+    def _outliers(self, found: SearchResult) -> int:
+        """Return the number of outliers to a result."""
+        fit = found.joint.fit if found.joint.choices else self.problem.solution.fit
+        return int((fit.weight < OUTLIER).sum())
+
+    def _run(self, joint: JointFit, before: SearchResult | None) -> SearchResult:
+        """Search from a fit of the kinematics alone, whose weights are those of the first step."""
+        projection = self.problem.project(joint)
+        alone = SelectionStep(joint, projection, (), {}, ())
+        initial = candidate_effects(joint.situation, projection, self.families)
+        steps: list[SelectionStep] = []
+        posterior: dict[str, float] = {}
+        pending: list[str] = []
+        candidates, count = initial.candidates, 0
+        if before is not None and before.joint.choices:
+            steps, posterior = list(before.steps[:-1]), dict(before.posterior)
+            joint = self.problem.fit(before.joint.choices, joint.fit.x)
+            projection, candidates = self._candidates(joint)
+        while True:
+            selection = select_effect(self.problem, joint, projection, candidates)
+            count += 1
+            is_set = selection.kind == "set" and len(pending) < _PENDING
+            taken = () if selection.joint is None else selection.joint.choices[len(joint.choices) :]
+            reselected = self._reselected(joint, taken) if count < _STEPS else joint
+            if reselected is not joint:
+                joint = reselected
+                projection, candidates = self._candidates(joint)
+                continue
+            if not is_set:
+                steps.append(_step(joint, projection, selection, taken if selection.kind == "adopt" else ()))
+            if selection.joint is None or count > _STEPS or not (is_set or selection.kind == "adopt"):
+                break
+            # The first of a set is adopted for the time being: others may stand out in addition to it.
+            if is_set:
+                pending += [str(c) for c in taken]
+            posterior |= {str(c): selection.posterior[c.family] for c in taken}
+            joint = selection.joint
+            projection, candidates = self._candidates(joint)
+        alternatives = selection.alternatives
+        for name in pending:
+            joint, step, members = self._judged_again(joint, name)
+            if step is not None and step.adopted:
+                steps.insert(-1, step)
+                posterior |= {str(c): step.posterior[c.family] for c in step.adopted}
+            elif step is not None and members and not alternatives:
+                steps[-1], alternatives = step, members
+        joint, renamed = self._renamed(joint, [str(c) for c in joint.choices if str(c) not in pending])
+        for step in renamed:
+            steps.insert(-1, step)
+            posterior |= {str(c): step.posterior[c.family] for c in step.adopted}
+        joint = explain_outliers(self.problem, joint)
+        return conclude(self.problem, joint, alone, steps, alternatives, selection.formulas, posterior, initial)
+
+    def _candidates(self, joint: JointFit) -> tuple[Projection, tuple[CandidateEffect, ...]]:
+        """Return the projection about a fit, and the candidates that may be missing in it."""
+        projection = self.problem.project_with_mild_outliers(joint)
+        return projection, self._still_possible(joint.choices, projection)
+
+    def _still_possible(self, there: Sequence[Choice], projection: Projection) -> tuple[CandidateEffect, ...]:
+        """Return the candidates that may be added: of no other families once a model has its most."""
+        taken = {c.family for c in there}
+        allowed = [f for f in self.families if f in taken] if len(taken) >= _MOST_FAMILIES else self.families
+        return candidate_effects(projection.situation, projection, allowed, [str(c) for c in there]).candidates
+
+    def _reselected(self, joint: JointFit, taken: Sequence[Choice]) -> JointFit:
+        """Return the fit with its effects in their best forms, before those `taken` are added.
+
+        An effect may have a better form by now, all the more at the same place; and where nothing more is taken, one
+        that explains outliers as well.
+        """
+        places = {c.where for c in taken}
+        reselected = reselect(self.problem, joint, [c for c in joint.choices if not taken or c.where in places])
+        return reselected if taken or reselected is not joint else explain_outliers(self.problem, joint)
+
+    def _renamed(self, joint: JointFit, names: Sequence[str]) -> tuple[JointFit, list[SelectionStep]]:
+        """Return the fit with other effects in place of those that were only the best before the others were known.
+
+        Args:
+            joint: kinematics and effects.
+            names: `family@where` of the effects to judge again.
+        """
+        steps: list[SelectionStep] = []
+        for name in names:
+            if len({c.family for c in joint.choices}) == 1:
+                break
+            if name not in map(str, joint.choices) or self._is_plain(joint, name):
+                continue
+            other, step, _ = self._judged_again(joint, name)
+            if step is not None and step.adopted and name not in map(str, step.adopted):
+                joint = reselect(self.problem, other, other.choices)
+                steps.append(step)
+        return joint, steps
+
+    def _is_plain(self, joint: JointFit, name: str) -> bool:
+        """True if an effect would be named again, given all others, with no alternative near."""
+        joint = joint.with_last([str(c) for c in joint.choices].index(name))
+        projection = self.problem.project(joint, without_last=True)
+        scored = Screen(projection, self._still_possible(joint.choices[:-1], projection)).score()
+        return str(scored[0].candidate) == name and beyond_doubt(best_of_each_family(scored))
+
+    def _judged_again(
+        self, joint: JointFit, name: str
+    ) -> tuple[JointFit, SelectionStep | None, tuple[ScoredEffect, ...]]:
+        """Judge an effect again, now that all others are known.
+
+        Returns:
+            The fit with it or without, the step (None if the effect is not there), and the set that is not told apart.
+        """
+        if name not in map(str, joint.choices):
+            return joint, None, ()
+        others = [c for c in joint.choices if str(c) != name]
+        without = self.problem.fit(others, joint.start(others))
+        # What all together explain is no outlier to a part of it.
+        counted = replace(without, fit=replace(without.fit, weight=joint.fit.weight))
+        projection = self.problem.project_with_mild_outliers(counted)
+        selection = select_effect(self.problem, without, projection, self._still_possible(others, projection))
+        if selection.kind != "adopt" or selection.joint is None:
+            return without, _step(without, projection, selection, ()), selection.alternatives
+        taken = selection.joint.choices[len(others) :]
+        return selection.joint, _step(without, projection, selection, taken), ()
+
+
+def _step(joint: JointFit, projection: Projection, selection: Selection, taken: tuple[Choice, ...]) -> SelectionStep:
+    return SelectionStep(joint, projection, selection.scored, selection.posterior, taken, selection.reasons)
+
+
+def _search_with_formulas(problem: Problem, families: Collection[str], found: SearchResult) -> SearchResult:
+    """Return a result with the effects that are beyond doubt in addition to formulas of effects outside the library.
+
+    On a machine there is always something that no library has, and clear effects besides. The search goes on with a
+    formula fitted along, one more each time: of several that are found together others may be an effect in words. The
+    model that comes of it has the effects alone; what they leave is told as ever.
+
+    Args:
+        problem: the data.
+        families: of effects that may be named.
+        found: without formulas fitted along. It stays as it is where nothing more is named, or a set stays open.
+    """
+    further, formulas = found, list[Formula]()
+    for _ in range(_FORMULAS):
+        new = next((f for f in further.outside_library if not _has_name(f, further)), None)
+        if new is None:
+            break
+        formulas.append(new)
+        further = _Search(problem.with_formulas(formulas), families).run(further)
+    named, pending = {str(c) for c in further.joint.choices}, {str(w.candidate) for w in found.alternatives}
+    if not {str(c) for c in found.joint.choices} < named or (pending and not pending & named):
+        return found
+    fits = [problem.fit(step.fit.choices, problem.solution.fit.x) for step in further.steps]
+    steps = [replace(s, fit=fit, projection=problem.project(fit)) for s, fit in zip(further.steps, fits, strict=True)]
+    joint, final = fits[-1], Grammar(steps[-1].projection)
+    return replace(
+        found,
+        adopted=adopted(problem.solution, joint, further.adopted.reason),
+        joint=joint,
+        steps=tuple(steps),
+        alternatives=(),
+        formulas=final.find() or tuple(formulas),
+        posterior=further.posterior,
+        final=final,
+    )
+
+
+def _has_name(formula: Formula, found: SearchResult) -> bool:
+    """True if an effect that was scored in the last step explains what a formula does.
+
+    A formula that does not show by itself, for all that hides it, has no name.
+    """
+    over = found.final.projection
+    shows = formula.adds_to(np.empty((len(over.residual), 0)), over.residual)
+    scored = found.steps[-1].scored if shows else ()
+    return any(w.log_bayes_factor > 0.0 and explains(w, formula, over) for w in scored)
+
+
+def reselect(problem: Problem, joint: JointFit, again: Sequence[Choice]) -> JointFit:
+    """Return the fit without effects that others make superfluous, and with the best forms of the rest.
+
+    Args:
+        problem: the data.
+        joint: kinematics and effects; returned itself where nothing changes.
+        again: those of its effects to look at.
+    """
+    names = {str(c) for c in again}
+    for _ in range(_FORMS):
+        before = joint
+        joint = _reselect_once(problem, before, [c for c in before.choices if str(c) in names])
+        if joint is before:
+            break
+    return joint
+
+
+def explain_outliers(problem: Problem, joint: JointFit) -> JointFit:
+    """Return the fit with its effects in forms that explain its outliers too, or itself where these are less likely.
+
+    The few fixes beyond the loads of all others are outliers to a straight line, and the only ones that show a curve.
+
+    Args:
+        problem: the data.
+        joint: kinematics and effects.
+    """
+    if (joint.fit.weight >= OUTLIER).all():
+        return joint
+    every = replace(joint, fit=replace(joint.fit, weight=np.ones_like(joint.fit.weight)))
+    tried = reselect(problem, every, joint.choices)
+    return tried if tried is not every and tried.fit.cost < joint.fit.cost else joint
+
+
+def _reselect_once(problem: Problem, joint: JointFit, again: Sequence[Choice]) -> JointFit:
+    """Reselect each effect once, by the linear model about the fit."""
+    if len(joint.choices) < 2 or not again:
+        return joint
+    over = Projection(problem.solution, joint.situation, joint.fit, joint.additions)
+    candidates = [_with_variants(joint, over, choice, is_open=choice in again) for choice in joint.choices]
+    screen = Screen(over, candidates)
+    chosen = {number: (0, choice.scale) for number, choice in enumerate(joint.choices)}
+    for number, choice in enumerate(joint.choices):
+        if choice not in again:
+            continue
+        others = {k: v for k, v in chosen.items() if k != number}
+        without = joint_log_bayes_factor(screen, others)
+        values = {
+            one: joint_log_bayes_factor(screen, {**others, number: one}) + float(candidates[number].log_odds[one[0]])
+            for one in itertools.product(range(len(candidates[number].options)), {1.0, choice.scale})
+        }
+        best = max(values, key=values.__getitem__)
+        if values[best] < without:
+            chosen = others
+        elif values[best] > values[chosen[number]] + _BETTER:
+            chosen[number] = best
+    kept = [replace(candidates[n].options[option], scale=scale) for n, (option, scale) in chosen.items()]
+    if kept == list(joint.choices):
+        return joint
+    parts = [
+        replace(part, prior_sigma=part.prior_sigma * scale)
+        for n, (option, scale) in chosen.items()
+        for part in [candidates[n].additions[option]]
+    ]
+    return problem.fit(kept, over.solved(joined(parts, len(over.samples))))
+
+
+def _with_variants(joint: JointFit, over: Projection, choice: Choice, *, is_open: bool) -> CandidateEffect:
+    """Return the candidate of an effect in its present form, and in its other variants where that is open."""
+    options = [replace(choice, scale=1.0)]
+    if is_open:
+        variants = variants_at(joint.situation, choice.family, choice.where)
+        options += [v for v in variants if v.settings != choice.settings]
+    return candidate_at(joint.situation, over, choice.family, choice.where, options)

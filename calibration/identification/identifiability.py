@@ -1,4 +1,4 @@
-"""What the data cannot see: singular values of the whitened Jacobian, each parameter measured in prior sigmas.
+"""Identifiability by the singular values of the whitened Jacobian, each parameter measured in prior sigmas.
 
 The prior itself takes no part: a direction counts as seen where the data alone would determine it within ten prior
 sigmas. Everything else stays at its prior and is named in words: parameters that no fix depends on with the reason
@@ -9,16 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.halton import halton
-from calibration.identification.additions import Additions
-from calibration.identification.samples import Samples
-from calibration.identification.standing import standing_spread
-from calibration.kinematics import Chain, Linearisation
+from calibration.effects.columns import EffectColumns
+from calibration.identification.samples import Samples, standing_spread
+from calibration.kinematics.chain import Chain, Linearisation
+from calibration.numerics.statistics import halton
 from calibration.observations import Floats
 
 _SEEN = 0.1
@@ -31,7 +30,7 @@ _NAMED = 4
 
 @dataclass(frozen=True)
 class Identifiability:
-    """How much of the parameters the data determine.
+    """Number and names of the parameters that the data determine or do not.
 
     Attributes:
         parameters: how many were asked for: of the kinematics, and the coefficients of effects fitted along.
@@ -48,25 +47,18 @@ class Identifiability:
     observability: Mapping[str, float] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, object]:
-        """The contract's JSON object."""
-        return {
-            "parameters": self.parameters,
-            "rank": self.rank,
-            "unidentifiable": list(self.unidentifiable),
-            "marked": list(self.marked),
-            "observability": dict(self.observability),
-        }
+        """Return the JSON object (docs/formats.md, calibrate)."""
+        return asdict(self)
 
 
 @dataclass(frozen=True)
 class _Asked:
-    """The parameters under analysis: their names, what the words call them, and one prior sigma of each."""
+    """The parameters under analysis."""
 
     names: tuple[str, ...]
-    words: tuple[str, ...]
-    groups: tuple[str, ...]
-    sigma: Floats
-    columns: NDArray[np.intp]  # which columns of parameters and coefficients
+    words: tuple[tuple[str, str], ...]  # each as the one meant, and as one of several that are named together
+    sigma: Floats  # of the prior
+    columns: NDArray[np.intp]  # among parameters and coefficients
 
 
 def identifiability(
@@ -76,10 +68,10 @@ def identifiability(
     excess_variance: float,
     *,
     free: NDArray[np.bool_] | None = None,
-    additions: Additions | None = None,
+    additions: EffectColumns | None = None,
     listed: NDArray[np.bool_] | None = None,
 ) -> Identifiability:
-    """Rank and null space.
+    """Find rank and null space of the parameters, and name them.
 
     Args:
         chain: kinematics.
@@ -94,7 +86,7 @@ def identifiability(
     at = np.concatenate([x, np.zeros(len(chain) + coefficients - len(x))])
     asked = _asked(chain, free, additions, np.ones(coefficients, dtype=bool) if listed is None else listed)
     whitened = _whitened(chain, samples, at, excess_variance, additions, asked)
-    count = len(asked.names)
+    count, effect = len(asked.names), np.linalg.norm(whitened, axis=0)
     # The triangle has the singular values of the whole, at a fraction of the cost.
     _, singular, vt = np.linalg.svd(np.linalg.qr(whitened, mode="r"), full_matrices=True)
     rank = int((singular > _SEEN).sum())
@@ -105,11 +97,10 @@ def identifiability(
             joint: _whitened(chain, shown, at, excess_variance, additions, asked)
             for joint, shown in _with_still_joints_moved(chain, samples).items()
         }
-        blind, combinations = _echelon(null, np.linalg.norm(whitened, axis=0))
+        blind, combinations = _echelon(null, effect)
         for i in blind:
             reason = _why_blind(chain, samples, asked.names[i]) or _why(chain, moved, np.eye(count)[i])
-            sentences.append(f"{asked.names[i]}: the data say nothing of {asked.words[i]}{reason}")
-        effect = np.linalg.norm(whitened, axis=0)
+            sentences.append(f"{asked.names[i]}: the data say nothing of {asked.words[i][0]}{reason}")
         for pivot, direction in combinations:
             sentences.append(_repeats(asked, pivot, direction * effect) + _why(chain, moved, direction))
     left = (null**2).sum(axis=0)
@@ -157,7 +148,7 @@ def observability_indices(singular: Floats, measurements: int) -> dict[str, floa
 
 
 def _asked(
-    chain: Chain, free: NDArray[np.bool_] | None, additions: Additions | None, listed: NDArray[np.bool_]
+    chain: Chain, free: NDArray[np.bool_] | None, additions: EffectColumns | None, listed: NDArray[np.bool_]
 ) -> _Asked:
     asked = np.ones(len(chain), dtype=bool) if free is None else free
     names = [p.name for p in chain.parameters]
@@ -165,47 +156,40 @@ def _asked(
     words = [_words(chain, name) for name in names]
     if additions is not None:
         names += additions.names
-        words += [(text := _words_of_coefficient(name), text) for name in additions.names]
+        words += [_words_of_coefficient(name) for name in additions.names]
         sigma = np.concatenate([sigma, additions.prior_sigma])
     columns = np.concatenate([np.flatnonzero(asked), len(chain) + np.flatnonzero(listed)])
     return _Asked(
         tuple(names[i] for i in columns),
-        tuple(words[i][0] for i in columns),
-        tuple(words[i][1] for i in columns),
+        tuple(words[i] for i in columns),
         sigma[columns],
         columns,
     )
 
 
 def _whitened(
-    chain: Chain, samples: Samples, at: Floats, excess_variance: float, additions: Additions | None, asked: _Asked
+    chain: Chain, samples: Samples, at: Floats, excess_variance: float, additions: EffectColumns | None, asked: _Asked
 ) -> Floats:
     """(3 m, q) change of the fixes in their sigmas by one prior sigma of each parameter asked for."""
-    lin, jacobian = _linearised(chain, samples, at, additions)
+    lin = _linearised(chain, samples, at, additions)
     covariance = samples.covariance(chain.rig, lin.joint_jacobian) + excess_variance * np.eye(3)
-    whitened = np.linalg.solve(np.linalg.cholesky(covariance), jacobian[:, :, asked.columns] * asked.sigma)
+    whitened = np.linalg.solve(np.linalg.cholesky(covariance), lin.jacobian[:, :, asked.columns] * asked.sigma)
     return np.asarray(whitened.reshape(-1, len(asked.columns)), dtype=np.float64)
 
 
-def _linearised(
-    chain: Chain, samples: Samples, at: Floats, additions: Additions | None
-) -> tuple[Linearisation, Floats]:
-    """The linearisation and (m, 3, p + k) the Jacobian by parameters and coefficients."""
+def _linearised(chain: Chain, samples: Samples, at: Floats, additions: EffectColumns | None) -> Linearisation:
+    """Linearise the m samples by p parameters and k coefficients, values `at` (p + k,)."""
     if additions is None:
-        lin = chain.linearise(at, samples.data)
-        return lin, lin.jacobian
-    readings = samples.data.readings
-    corrected = readings + additions.change(at[len(chain) :], readings.shape[1])
-    lin = chain.linearise(at[: len(chain)], replace(samples.data, readings=corrected))
-    by_coefficient = additions.moved_mm(lin.joint_jacobian)
-    return lin, np.concatenate([lin.jacobian, by_coefficient], axis=2)
+        return chain.linearise(at, samples.data)
+    p = len(chain)
+    return additions.linearise(lambda data: chain.linearise(at[:p], data), samples.data, at[p:])
 
 
 # -- the null space --------------------------------------------------------------------------------------------------
 
 
 def _echelon(null: Floats, effect: Floats) -> tuple[list[int], list[tuple[int, Floats]]]:
-    """Bring the null space (k, q), in prior sigmas, to reduced echelon form: each row one parameter and its repeats.
+    """Bring the null space (k, q), in prior sigmas, to reduced echelon form: a row is one parameter and its repeats.
 
     The pivots are the parameters that stay at their prior most; of equal ones the last, as earlier rows are what people
     look for.
@@ -216,7 +200,8 @@ def _echelon(null: Floats, effect: Floats) -> tuple[list[int], list[tuple[int, F
     # So small that all of them together are still not seen: each takes one direction of the null space by itself.
     blind = effect <= _SEEN / math.sqrt(len(effect))
     others = np.flatnonzero(~blind)
-    rows = _row_space(null[:, others], len(null) - int(blind.sum()))
+    # An orthonormal basis of the strongest directions.
+    rows = np.linalg.svd(null[:, others], full_matrices=False)[2][: len(null) - int(blind.sum())]
     pivots: list[int] = []
     left = rows.copy()
     for _ in range(len(rows)):
@@ -235,11 +220,6 @@ def _echelon(null: Floats, effect: Floats) -> tuple[list[int], list[tuple[int, F
     return np.flatnonzero(blind).tolist(), found
 
 
-def _row_space(rows: Floats, rank: int) -> Floats:
-    """(rank, q) orthonormal basis of the strongest directions of (k, q) rows."""
-    return np.linalg.svd(rows, full_matrices=False)[2][:rank]
-
-
 # -- words -----------------------------------------------------------------------------------------------------------
 
 
@@ -250,10 +230,10 @@ def _repeats(asked: _Asked, pivot: int, part: Floats) -> str:
     """
     order = np.argsort(-np.abs(part), kind="stable").tolist()
     others = [i for i in order if i != pivot and abs(part[i]) > _PART * abs(part[pivot])]
-    groups = list(dict.fromkeys(asked.groups[i] for i in others))
+    groups = list(dict.fromkeys(asked.words[i][1] for i in others))
     names = _listed([asked.names[i] for i in others[:_NAMED]], len(others) - _NAMED)
     words = _listed(groups[:_NAMED], len(groups) - _NAMED)
-    return f"{asked.names[pivot]} repeats {names}: {asked.words[pivot]} repeats {words}"
+    return f"{asked.names[pivot]} repeats {names}: {asked.words[pivot][0]} repeats {words}"
 
 
 def _listed(items: Iterable[str], more: int) -> str:
@@ -262,7 +242,7 @@ def _listed(items: Iterable[str], more: int) -> str:
 
 
 def _words(chain: Chain, name: str) -> tuple[str, str]:
-    """A parameter as the one meant, and as one of several that are named together."""
+    """Words for a parameter: as the one meant, and as one of several that are named together."""
     where, _, constant = name.rpartition(".")
     if where.startswith("base"):
         setup = where.removeprefix("base")[1:-1]
@@ -282,14 +262,16 @@ def _words(chain: Chain, name: str) -> tuple[str, str]:
     return (text := f"{constant} at row {number}"), text
 
 
-def _words_of_coefficient(name: str) -> str:
+def _words_of_coefficient(name: str) -> tuple[str, str]:
+    """Words for a coefficient, as `_words`."""
     family, _, place = name.partition("@")
     where, _, coefficient = place.partition(":")
-    return f"{coefficient} of {family} at {where}" if coefficient else f"{family} at {where}"
+    text = f"{coefficient} of {family} at {where}" if coefficient else f"{family} at {where}"
+    return text, text
 
 
 def _why_blind(chain: Chain, samples: Samples, name: str) -> str:
-    """Why no fix depends on a parameter, where it is that no prism beyond it was measured."""
+    """Reason why no fix depends on a parameter: no prism beyond it, or no fix at its set-up, was measured."""
     where, _, _ = name.rpartition(".")
     measured = [chain.rig.prisms[i] for i in np.unique(samples.data.prism)]
     if where.startswith("prism.") and where.removeprefix("prism.") not in {p.name for p in measured}:
@@ -302,7 +284,7 @@ def _why_blind(chain: Chain, samples: Samples, name: str) -> str:
 
 
 def _with_still_joints_moved(chain: Chain, samples: Samples) -> dict[tuple[int, ...], Samples]:
-    """The same rows as they would be had joints that never moved been moved through their limits: each, and all."""
+    """Rows as they would be had joints that never moved been moved through their limits: each, and all."""
     readings = samples.data.readings
     still = np.flatnonzero(np.ptp(readings, axis=0) <= standing_spread(chain.rig)).tolist()
     if not still:
@@ -321,13 +303,9 @@ def _with_still_joints_moved(chain: Chain, samples: Samples) -> dict[tuple[int, 
 
 
 def _why(chain: Chain, moved: Mapping[tuple[int, ...], Floats], direction: Floats) -> str:
-    """The joints that never moved and would show a direction (q,) if they did."""
+    """Reason why a direction (q,) is not seen: joints that never moved and would show it if they did."""
     for joints, whitened in moved.items():
         if float(np.linalg.norm(whitened @ direction)) > _SEEN:
-            names = [chain.rig.joint_names[j] for j in joints]
-            return (
-                f", as {_listed(names, 0)} never moved"
-                if len(names) == 1
-                else f", as none of {_listed(names, 0)} moved"
-            )
+            names = _listed([chain.rig.joint_names[j] for j in joints], 0)
+            return f", as {names} never moved" if len(joints) == 1 else f", as none of {names} moved"
     return ""

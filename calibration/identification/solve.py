@@ -2,43 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
 
+from calibration.effects.columns import EffectColumns
 from calibration.errors import UnsafeError
-from calibration.identification.additions import Additions
-from calibration.identification.approach import PRIOR_SCALE, approach
-from calibration.identification.held_fixed import held_fixed
-from calibration.identification.identifiability import Identifiability, identifiability
-from calibration.identification.judgement import (
+from calibration.identification.checks import (
     at_the_noise,
     beyond_assembly,
+    data_warnings,
     different_fixes,
-    doubts,
+    fixed_constant_warnings,
     mean_error_mm,
     refuse_discarded,
     refuse_foreign,
     refuse_turning,
     require_enough,
     rms_tolerated_mm,
-    tilts,
+    tilt_warnings,
 )
-from calibration.identification.misread import Quality, explain
-from calibration.identification.refinement import Fit, Prior, prior_precision, refine
+from calibration.identification.diagnosis import Quality, diagnose
+from calibration.identification.identifiability import Identifiability, identifiability
+from calibration.identification.linear_model import prior_precision
+from calibration.identification.refinement import Fit, Prior, refine
 from calibration.identification.samples import Samples, averaged
-from calibration.identification.search.checkpoint import Checkpoint
 from calibration.identification.search.global_search import search_globally
-from calibration.identification.start import Start, rough_start
+from calibration.identification.start import PRIOR_SCALE, Start, approach, rough_start
 from calibration.identification.sweeps.axis_start import start_from_axes
 from calibration.identification.sweeps.circles import find_axes
-from calibration.kinematics import Chain, Placement
+from calibration.kinematics.chain import Chain, Placement
 from calibration.observations import Floats, Observations
-from calibration.rig import ANOTHER_VALUE, Rig
-
-Progress = Callable[[float, str], None]
+from calibration.rig.description import ANOTHER_VALUE, Rig
+from calibration.run import Run
 
 _BETTER = 1.0  # in log evidence; less is rounding
 _MISTAKES = 3  # supposed together where nothing else explains the data
@@ -70,12 +66,12 @@ class Solution:
     search: str
     tolerated_mm: float
     warnings: tuple[str, ...] = ()
-    additions: Additions | None = None
+    additions: EffectColumns | None = None
     has_priors: bool = True
 
 
 def place(rig: Rig, observations: Observations) -> tuple[Chain, Samples, Start]:
-    """The chain with every set-up's base placed, the rows to fit and the rough start.
+    """Place the base of every set-up; return the chain, the rows to fit and the rough start.
 
     Raises:
         DataError, UnsafeError: as `averaged` and `rough_start`, which lets mirrored coordinates pass here.
@@ -87,56 +83,40 @@ def place(rig: Rig, observations: Observations) -> tuple[Chain, Samples, Start]:
     return Chain(rig, start.placements), samples, start
 
 
-def solve(
-    rig: Rig,
-    observations: Observations,
-    *,
-    prior: Prior,
-    seed: int,
-    executor: Executor,
-    progress: Progress,
-    should_stop: Callable[[], bool] | None = None,
-    checkpoint: Checkpoint | None = None,
-) -> Solution:
+def solve(rig: Rig, observations: Observations, *, prior: Prior, run: Run) -> Solution:
     """Identify all parameters of a rig: place the base, fit from the nominal model, search, judge.
 
     Args:
         rig: the rig description.
         observations: rows with positions.
         prior: trust the build tolerances, or estimate their scale.
-        seed: of the global search.
-        executor: runs what is independent; the result does not depend on it.
-        progress: told (share done, what is going on).
-        should_stop: asked during the global search; once it says so, the best so far is refined.
-        checkpoint: where the global search keeps its state, and goes on from.
+        run: of the global search, whose best candidate so far is refined where it is stopped.
 
     Raises:
         DataError: a prism that the rig lacks.
         UnsafeError: too few fixes, a set-up whose base cannot be placed, mirrored coordinates, another rig's data, a
             joint's sign or unit that the rig file has otherwise, exchanged columns.
     """
-    progress(0.0, "placing the base")
+    run.progress(0.0, "placing the base")
     require_enough(rig, observations)
     chain, samples, start = place(rig, observations)
     different = different_fixes(chain, samples)
     require_enough(rig, observations, different)
-    warnings = list(doubts(observations, chain, different))
+    warnings = list(data_warnings(observations, chain, different))
     nominal = refine(chain, samples, start.x, free=np.isinf(chain.prior_sigma))
-    progress(0.1, "refining")
+    run.progress(0.1, "refining")
     fit = _descend(chain, samples, nominal.x, prior)
-    progress(0.3, "searching globally")
+    run.progress(0.3, "searching globally")
     if at_the_noise(chain, samples, fit):
         search = "no global search: what is left from the nominal model on is what instruments and repeats explain"
     else:
-        fit, search, trouble = _searched(
-            chain, samples, nominal, fit, start.scale_mm, prior, seed, executor, progress, should_stop, checkpoint
-        )
+        fit, search, trouble = _searched(chain, samples, nominal, fit, start.scale_mm, prior, run)
         warnings += trouble
     tolerated_mm = rms_tolerated_mm(chain, samples, nominal)
     misfits = mean_error_mm(chain, samples, fit) > _SUSPICIOUS * tolerated_mm
     if misfits or beyond_assembly(chain, fit):
-        progress(0.8, "looking for signs, units and zeros that are otherwise")
-        found = explain(
+        run.progress(0.8, "looking for signs, units and zeros that are otherwise")
+        found = diagnose(
             chain,
             samples,
             precision=prior_precision(chain, PRIOR_SCALE[prior]),
@@ -154,18 +134,18 @@ def solve(
                 flat = np.isinf(chain.prior_sigma)
                 nominal = refine(chain, samples, np.where(flat, found.x, 0.0), free=flat)
     chain, fit = _without_wrong_tolerances(chain, samples, fit, prior)
-    warnings += tilts(chain, fit)
+    warnings += tilt_warnings(chain, fit)
     refuse_foreign(chain, samples, fit, tolerated_mm, prior)
     refuse_discarded(chain, samples, fit, prior)
     refuse_turning(chain, samples, fit.x)
-    warnings += held_fixed(chain, samples, fit, prior)
-    progress(0.9, "checking what the data determine")
+    warnings += fixed_constant_warnings(chain, samples, fit, prior)
+    run.progress(0.9, "checking what the data determine")
     seen = identifiability(chain, samples, fit.x, fit.excess_variance)
     return Solution(chain, samples, nominal, fit, seen, search, tolerated_mm, tuple(warnings))
 
 
 def _without_wrong_tolerances(chain: Chain, samples: Samples, fit: Fit, prior: Prior) -> tuple[Chain, Fit]:
-    """The optimum where values that the rig file has wrong, such as zeros set anew, are held to it no more.
+    """Refit without holding to the rig file the values that it has wrong, such as zeros set anew.
 
     A tolerance that pulls by so much bends all the others, and what it is off would pass for an effect. The new one is
     the distance itself, which makes the fit most probable.
@@ -181,7 +161,7 @@ def _without_wrong_tolerances(chain: Chain, samples: Samples, fit: Fit, prior: P
 
 
 def _descend(chain: Chain, samples: Samples, start: Floats, prior: Prior) -> Fit:
-    """The optimum that a start leads to: roughly with no row left out, then exactly."""
+    """Descend to the optimum that a start leads to: roughly with no row left out, then exactly."""
     near = approach(chain, samples, start, precision=prior_precision(chain, PRIOR_SCALE[prior]))
     return refine(chain, samples, near, prior=prior)
 
@@ -193,16 +173,12 @@ def _searched(
     local: Fit,
     scale_mm: float,
     prior: Prior,
-    seed: int,
-    executor: Executor,
-    progress: Progress,
-    should_stop: Callable[[], bool] | None,
-    checkpoint: Checkpoint | None,
+    run: Run,
 ) -> tuple[Fit, str, tuple[str, ...]]:
-    """The best of the local fit, the one that single-joint sweeps lead to, and the one that the global search finds.
+    """Take the best of the local fit and those that single-joint sweeps and the global search lead to.
 
     Returns:
-        the fit, in words which it is, and what went wrong with the checkpoint.
+        The fit; words for which it is; warnings of the checkpoint.
     """
     origin = "the nominal model leads"
     # Their start takes seconds; where the local fit explains the data, it would only lead there again.
@@ -212,13 +188,11 @@ def _searched(
         swept = _descend(chain, samples, start_from_axes(chain, samples, axes), prior)
         if swept.cost < local.cost - _BETTER:
             local, origin = swept, "the axes of single-joint sweeps lead"
-    found = search_globally(
-        chain, samples, nominal, local, scale_mm, prior, seed, executor, progress, should_stop, checkpoint
-    )
-    ended = "" if found.complete else ", which was stopped before its end,"
-    if found.x is not None:
-        progress(0.75, "refining")
-        distant = _descend(chain, samples, found.x, prior)
+    x, search = search_globally(chain, samples, nominal.x, local.x, scale_mm, prior, run.part(0.3, 0.75))
+    ended = "" if search.complete else ", which was stopped before its end,"
+    if x is not None:
+        run.progress(0.75, "refining")
+        distant = _descend(chain, samples, x, prior)
         if distant.cost < local.cost - _BETTER:
-            return distant, f"the global search{ended} found a better optimum than where {origin}", found.warnings
-    return local, f"the global search{ended} found nothing better than where {origin}", found.warnings
+            return distant, f"the global search{ended} found a better optimum than where {origin}", search.warnings
+    return local, f"the global search{ended} found nothing better than where {origin}", search.warnings

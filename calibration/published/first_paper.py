@@ -7,34 +7,26 @@ and the prior decides how far. Its end result is taken as it is: no local refine
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from concurrent.futures import Executor
+from collections.abc import Mapping
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import UnsafeError
+from calibration.identification.checks import different_fixes, refuse_turning, rms_left_mm, rms_tolerated_mm
 from calibration.identification.identifiability import identifiability
-from calibration.identification.judgement import (
-    different_fixes,
-    refuse_mirrored,
-    refuse_turning,
-    rms_left_mm,
-    rms_tolerated_mm,
-)
 from calibration.identification.refinement import Prior, posterior, refine
 from calibration.identification.samples import Samples
-from calibration.identification.search.checkpoint import Checkpoint
 from calibration.identification.search.islands import Evolved
 from calibration.identification.solve import Solution, place
-from calibration.kinematics import Chain
+from calibration.identification.start import refuse_mirrored
+from calibration.kinematics.chain import Chain
 from calibration.observations import Observations
 from calibration.published.paper_evolution import PaperSettings, evolve_paper
 from calibration.published.paper_objective import PaperObjective
-from calibration.rig import Rig
-
-Progress = Callable[[float, str], None]
+from calibration.rig.description import Rig
+from calibration.run import Run
 
 _WIDTH: Mapping[Prior, Mapping[str, float]] = {  # half-width of the bounds in build tolerances
     "recalibration": {"mm": 4.0, "rad": 4.0},
@@ -44,34 +36,20 @@ _REPEATS = 2
 _SHARE = 0.8  # of the poses that each repeat sees
 
 
-def pde_paper(
-    rig: Rig,
-    observations: Observations,
-    *,
-    prior: Prior,
-    seed: int,
-    executor: Executor,
-    progress: Progress,
-    should_stop: Callable[[], bool] | None = None,
-    checkpoint: Checkpoint | None = None,
-) -> Solution:
+def pde_paper(rig: Rig, observations: Observations, *, prior: Prior, run: Run) -> Solution:
     """Identify the rows' constants by the paper's search; every prism has the same weight in Eq. 19.
 
     Args:
         rig: the rig description.
         observations: rows with positions.
         prior: how wide the bounds are: four build tolerances, or what an uncalibrated machine needs.
-        seed: of the search.
-        executor: evaluates the sub-populations; the result does not depend on it.
-        progress: told (share done, what is going on).
-        should_stop: asked after every generation; the best so far is taken once it says so.
-        checkpoint: where the search keeps its state, and goes on from.
+        run: of the search, as `evolve_paper`.
 
     Raises:
         DataError: a prism that the rig lacks.
         UnsafeError: a base that cannot be placed, mirrored coordinates, fewer fixes than the unknowns need.
     """
-    progress(0.0, "placing the base")
+    run.progress(0.0, "placing the base")
     chain, samples, start = place(rig, observations)
     refuse_mirrored(chain, samples)
     nominal = refine(chain, samples, start.x, free=np.isinf(chain.prior_sigma))
@@ -81,15 +59,7 @@ def pde_paper(
     if 3 * different < rows.sum():
         raise UnsafeError(f"{different} different fixes cannot determine {rows.sum()} constants of the rows")
     objective = _objective(chain, samples, rows, nominal.x)
-    evolved = search(
-        objective,
-        bounds(chain, prior)[rows],
-        seed=seed,
-        executor=executor,
-        progress=lambda share: progress(0.05 + 0.85 * share, "the paper's differential evolution"),
-        should_stop=should_stop,
-        checkpoint=checkpoint,
-    )
+    evolved = search(objective, bounds(chain, prior)[rows], run=run.part(0.05, 0.9))
     x = nominal.x.copy()
     x[rows] = evolved.x
     fit = posterior(chain, samples, x, prior=prior)
@@ -126,11 +96,7 @@ def search(
     objective: PaperObjective,
     width: NDArray[np.float64],
     *,
-    seed: int,
-    executor: Executor,
-    progress: Callable[[float], None] | None = None,
-    should_stop: Callable[[], bool] | None = None,
-    checkpoint: Checkpoint | None = None,
+    run: Run,
     settings: PaperSettings | None = None,
 ) -> Evolved:
     """The paper's search of an objective's free parameters within +-`width`: shuffled data, repeated.
@@ -138,16 +104,12 @@ def search(
     Arguments and errors as `pde_paper`; `settings` are the paper's by default.
     """
     return evolve_paper(
-        [objective.fitness(part) for part in objective.shuffled(_REPEATS, _SHARE, seed)],
+        [objective.fitness(part) for part in objective.shuffled(_REPEATS, _SHARE, run.seed)],
         objective.fitness(),
         -width,
         width,
-        seed=seed,
-        executor=executor,
+        run=run,
         settings=settings or PaperSettings(),
-        progress=progress,
-        should_stop=should_stop,
-        checkpoint=checkpoint,
     )
 
 
@@ -155,7 +117,7 @@ def _objective(chain: Chain, samples: Samples, rows: NDArray[np.bool_], at: NDAr
     """Eq. 19 with equal weights, and the attitude where two prisms of one frame were measured in the same poses."""
     names = chain.rig.prism_names
     present = [names[i] for i in np.unique(samples.data.prism)]
-    pose = np.array([""] * len(samples) if samples.standstill is None else samples.standstill.astype(str))
+    pose = samples.standstill.astype(str)
     weight = dict.fromkeys(present, 1.0)
     attitude = next(
         (

@@ -9,16 +9,17 @@ number of sub-populations, nor on an interruption.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.identification.search.checkpoint import Arrays, Checkpoint, keep, pack, problem, unpack
+from calibration.identification.search.checkpoint import Arrays, SavedSearch, problem
 from calibration.identification.search.islands import Evolved
 from calibration.identification.search.streams import below, scatter, stream, uniform, word
-from calibration.kernels.jit import compiled
+from calibration.numerics.jit import compiled
 from calibration.observations import Floats
+from calibration.run import Run
 
 _SAVED_EVERY = 20  # generations; a state of the paper's population is nine megabytes
 _LEAST = 4  # a candidate and three others
@@ -69,12 +70,8 @@ def evolve_paper(
     lower: Floats,
     upper: Floats,
     *,
-    seed: int,
-    executor: Executor,
+    run: Run,
     settings: PaperSettings,
-    progress: Callable[[float], None] | None = None,
-    should_stop: Callable[[], bool] | None = None,
-    checkpoint: Checkpoint | None = None,
 ) -> Evolved:
     """Search once for every fitness and take the winner that `judge` finds best.
 
@@ -84,13 +81,11 @@ def evolve_paper(
     Args:
         fitnesses: one search each; (candidates, p) -> (candidates,), picklable where the executor is a process pool.
         judge: likewise.
-        lower, upper: (p,) bounds.
-        seed: of all random streams.
-        executor: evaluates the sub-populations.
-        settings: the paper's by default.
-        progress: told the share that is done, after every generation.
-        should_stop: asked after every generation; the best so far is returned once it says so.
-        checkpoint: continued if it holds a state of this very search, and saved every 20 generations.
+        lower: (p,) bounds.
+        upper: (p,) bounds.
+        run: seed of all random streams, workers for the sub-populations; it is reported to and asked to stop after
+            every generation, saved every 20 generations, and goes on from a checkpoint of this very search.
+        settings: of the search.
 
     Raises:
         ValueError: no search, or a population of fewer than four.
@@ -100,46 +95,38 @@ def evolve_paper(
     lower, upper = np.array(lower, dtype=np.float64), np.array(upper, dtype=np.float64)
     cuts = np.linspace(0, settings.population, settings.subpopulations + 1).astype(int)
     parts = [slice(*ends) for ends in zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True)]
-    identity: Arrays = {}
-    population, winners, set_aside, unsaved = None, [], None, None
-    if checkpoint is not None:
-        identity = _identity(fitnesses, judge, lower, upper, seed, settings)
-        arrays, set_aside = unpack(checkpoint.load(), identity)
-        if arrays is not None:
-            winners = list(arrays["winners"])
-            population = _Population(int(arrays["generation"]), arrays["candidates"], arrays["cost"])
+    population, winners = None, []
+    saved = SavedSearch(run.checkpoint, lambda: _identity(fitnesses, judge, lower, upper, run.seed, settings))
+    if saved.arrays is not None:
+        winners = list(saved.arrays["winners"])
+        population = _Population(int(saved.arrays["generation"]), saved.arrays["candidates"], saved.arrays["cost"])
     complete, evaluations = True, 0
-    for search in range(len(winners), len(fitnesses)):
-        fitness, first_stream = fitnesses[search], search * (settings.generations + 1)
-        if population is None:
-            candidates = np.empty((settings.population, len(lower)))
-            scatter(word(seed), first_stream, 0, lower, upper, candidates)
-            with _Pending() as pending:
-                for part in parts:
-                    pending.add(executor.submit(fitness, candidates[part]))
-                cost = np.concatenate(pending.results())
-            population = _Population(0, candidates, np.where(np.isnan(cost), np.inf, cost))
-        trial = np.empty_like(population.candidates)
-        while population.generation < settings.generations:
-            if should_stop is not None and should_stop():
-                complete = False
-                break
-            _advance(population, fitness, lower, upper, seed, first_stream, executor, settings, parts, trial)
-            if checkpoint is not None and (
-                population.generation % _SAVED_EVERY == 0 or population.generation == settings.generations
-            ):
-                unsaved = keep(checkpoint, pack(identity, _arrays(population, winners))) or unsaved
-            if progress is not None:
+    with run.workers() as executor:
+        for search in range(len(winners), len(fitnesses)):
+            fitness, first_stream = fitnesses[search], search * (settings.generations + 1)
+            if population is None:
+                candidates = np.empty((settings.population, len(lower)))
+                scatter(word(run.seed), first_stream, 0, lower, upper, candidates)
+                cost = np.concatenate(list(executor.map(fitness, (candidates[part] for part in parts))))
+                population = _Population(0, candidates, np.where(np.isnan(cost), np.inf, cost))
+            trial = np.empty_like(population.candidates)
+            while population.generation < settings.generations:
+                if run.should_stop():
+                    complete = False
+                    break
+                _advance(population, fitness, lower, upper, run.seed, first_stream, executor, settings, parts, trial)
+                if population.generation % _SAVED_EVERY == 0 or population.generation == settings.generations:
+                    saved.save(_arrays(population, winners))
                 share = (search * settings.generations + population.generation) / settings.generations
-                progress(share / len(fitnesses))
-        winners.append(population.best())
-        evaluations = settings.population * (search * (settings.generations + 1) + 1 + population.generation)
-        population = None
-        if not complete:
-            break
+                run.progress(share / len(fitnesses), "the paper's differential evolution")
+            winners.append(population.best())
+            evaluations = settings.population * (search * (settings.generations + 1) + 1 + population.generation)
+            population = None
+            if not complete:
+                break
     cost = judge(np.array(winners))
     best = int(np.where(np.isnan(cost), np.inf, cost).argmin())
-    return Evolved(winners[best], float(cost[best]), evaluations, complete, set_aside, unsaved)
+    return Evolved(winners[best], float(cost[best]), evaluations, complete, saved.set_aside, saved.unsaved)
 
 
 def _advance(
@@ -154,46 +141,28 @@ def _advance(
     parts: Sequence[slice],
     trial: Floats,
 ) -> None:
-    """One generation. Parents are replaced only once every part has been mutated."""
+    """Advance by one generation. Parents are replaced only once every part has been mutated."""
     generation = population.generation + 1
-    with _Pending() as pending:
-        for part in parts:
-            _mutate(
-                population.candidates,
-                lower,
-                upper,
-                settings.scale_factor,
-                settings.crossover,
-                word(seed),
-                first_stream + generation,
-                part.start,
-                trial[part],
-            )
-            pending.add(executor.submit(fitness, trial[part]))
-        for part, trial_cost in zip(parts, pending.results(), strict=True):
-            _select(population.candidates[part], population.cost[part], trial[part], np.array(trial_cost))
+
+    def mutated(part: slice) -> Floats:
+        _mutate(
+            population.candidates,
+            lower,
+            upper,
+            settings.scale_factor,
+            settings.crossover,
+            word(seed),
+            first_stream + generation,
+            part.start,
+            trial[part],
+        )
+        return trial[part]
+
+    # A part is handed to the executor as soon as it is mutated.
+    costs = executor.map(fitness, (mutated(part) for part in parts))
+    for part, trial_cost in zip(parts, costs, strict=True):
+        _select(population.candidates[part], population.cost[part], trial[part], np.array(trial_cost))
     population.generation = generation
-
-
-class _Pending:
-    """Evaluations under way; what has not begun is called off where one of them, or the caller, fails."""
-
-    def __init__(self) -> None:
-        self._futures: list[Future[Floats]] = []
-
-    def __enter__(self) -> _Pending:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for future in self._futures:
-            future.cancel()
-
-    def add(self, future: Future[Floats]) -> None:
-        self._futures.append(future)
-
-    def results(self) -> list[Floats]:
-        """Costs, in the order of `add`."""
-        return [future.result() for future in self._futures]
 
 
 def _identity(

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import DataError
-from calibration.kernels import Fitness
-from calibration.kinematics import Chain, ChainData
+from calibration.kinematics.chain import Chain, ChainData
+from calibration.kinematics.fitness import Fitness
 from calibration.observations import Floats
 
 Integers = NDArray[np.intp]

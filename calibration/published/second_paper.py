@@ -6,40 +6,33 @@ KM iterates d_phi = (J'J)^-1 J' dP over the kinematic parameters (Eqs. 5-8). SKC
 joint with a torque, d_theta = tau C and so dP = J_e tau C (Eqs. 16, 17), and solves for both together. Where J'J is
 singular the paper strikes redundant parameters by hand; here the directions that the data cannot see are found once, on
 the nominal model, and held: every step is the shortest of all equally good ones. RBF-TCM is KM with the network of
-`calibration.residual.torque_network` on top.
+`calibration.residual.rbf.torque_network` on top.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.effects.base import Situation
+from calibration.effects.columns import EffectColumns, joined
+from calibration.effects.context import EffectContext
 from calibration.effects.fitted import Choice
 from calibration.errors import CalibrationError, DataError, UnsafeError
-from calibration.gap.adopt import Adopted
-from calibration.identification.additions import Additions, joined
+from calibration.gap.adoption import Adopted
+from calibration.identification.checks import different_fixes, refuse_turning, rms_left_mm, rms_tolerated_mm
 from calibration.identification.identifiability import identifiability
-from calibration.identification.judgement import (
-    different_fixes,
-    refuse_mirrored,
-    refuse_turning,
-    rms_left_mm,
-    rms_tolerated_mm,
-)
-from calibration.identification.refinement import Fit, prior_precision, refine
+from calibration.identification.linear_model import prior_precision
+from calibration.identification.refinement import Fit, refine
 from calibration.identification.samples import Samples
 from calibration.identification.solve import Solution, place
-from calibration.kernels.lineariser import Lineariser
-from calibration.kinematics import Chain, Linearisation
+from calibration.identification.start import refuse_mirrored
+from calibration.kinematics.chain import Chain, Linearisation
+from calibration.kinematics.torques import gravity_torques, loaded_joints
 from calibration.observations import Floats, Observations
-from calibration.rig import Rig
-from calibration.torques import gravity_torques, loaded_joints
-
-Progress = Callable[[float, str], None]
+from calibration.rig.description import Rig
+from calibration.run import Run
 
 _SEEN = 1e-6  # singular value over the largest, columns scaled to one length; what repeats another is at 1e-16
 _ROUNDS = 100
@@ -52,7 +45,7 @@ class _State:
     """Parameters and coefficients `z` (p + k,), and what they make of the samples."""
 
     z: Floats
-    additions: Additions
+    additions: EffectColumns
     lin: Linearisation
     error: Floats  # (m, 3) measured minus modelled
 
@@ -67,7 +60,7 @@ class _State:
         return both
 
 
-def km(rig: Rig, observations: Observations, *, progress: Progress) -> Solution:
+def km(rig: Rig, observations: Observations, run: Run) -> Solution:
     """Kinematic parameters by iterated least squares (Eqs. 5-8).
 
     Raises:
@@ -75,13 +68,15 @@ def km(rig: Rig, observations: Observations, *, progress: Progress) -> Solution:
         UnsafeError: too few fixes, a base that cannot be placed, mirrored coordinates, another rig's data.
         CalibrationError: the iteration left the range of numbers.
     """
-    progress(0.0, "placing the base")
+    run.progress(0.0, "placing the base")
     chain, samples, start = place(rig, observations)
     refuse_mirrored(chain, samples)
     nominal = refine(chain, samples, start.x, free=np.isinf(chain.prior_sigma))
     refuse_turning(chain, samples, nominal.x)
-    progress(0.2, "iterating least squares")
-    fit, rounds = _iterated(chain, samples, nominal.x, _Compliances(samples, Situation(chain, nominal.x, observations)))
+    run.progress(0.2, "iterating least squares")
+    fit, rounds = _iterated(
+        chain, samples, nominal.x, _Compliances(samples, EffectContext(chain, nominal.x, observations))
+    )
     tolerated_mm = rms_tolerated_mm(chain, samples, nominal)
     left_mm = rms_left_mm(chain, samples, fit.x)
     if left_mm > tolerated_mm:
@@ -90,13 +85,13 @@ def km(rig: Rig, observations: Observations, *, progress: Progress) -> Solution:
             f"tolerances explain {tolerated_mm:.0f} mm even before it: the method cannot cope with these data; "
             f"--method default can, or says what is wrong with them"
         )
-    progress(0.9, "checking what the data determine")
+    run.progress(0.9, "checking what the data determine")
     seen = identifiability(chain, samples, fit.x, fit.excess_variance)
     words = f"plain least squares from the nominal model, {rounds} rounds"
     return Solution(chain, samples, nominal, fit, seen, words, tolerated_mm, has_priors=False)
 
 
-def skcm(rig: Rig, observations: Observations, *, progress: Progress) -> Adopted:
+def skcm(rig: Rig, observations: Observations, run: Run) -> Adopted:
     """Kinematic parameters and one compliance for each joint with a torque, together (Eqs. 16, 17).
 
     Returns:
@@ -107,10 +102,10 @@ def skcm(rig: Rig, observations: Observations, *, progress: Progress) -> Adopted
         UnsafeError, CalibrationError: as `km`.
     """
     require_torques(rig, observations, "skcm")
-    solution = km(rig, observations, progress=lambda share, what: progress(0.7 * share, what))
+    solution = km(rig, observations, run.part(0.0, 0.7))
     chain, samples, nominal = solution.chain, solution.samples, solution.nominal
-    progress(0.7, "iterating least squares with compliances")
-    situation = Situation(chain, nominal.x, observations)
+    run.progress(0.7, "iterating least squares with compliances")
+    situation = EffectContext(chain, nominal.x, observations)
     joints = loaded_joints(rig, gravity_torques(chain, nominal.x, observations))
     choices = tuple(Choice("joint_compliance", rig.joint_names[joint], {}) for joint in joints)
     compliances = _Compliances(samples, situation, choices)
@@ -152,21 +147,21 @@ class _Compliances:
     """The compliances to find, none for kinematics alone; their torques follow the kinematics."""
 
     samples: Samples
-    situation: Situation
+    situation: EffectContext
     choices: tuple[Choice, ...] = ()
 
-    def at(self, x: Floats) -> Additions:
+    def at(self, x: Floats) -> EffectColumns:
         """Columns of the samples at kinematic parameters x (p,)."""
         situation = replace(self.situation, x=x)
-        found = joined([choice.additions(situation) for choice in self.choices], len(situation))
+        found = joined([choice.columns(situation) for choice in self.choices], len(situation))
         return found.over(self.samples.average)
 
 
 def _iterated(chain: Chain, samples: Samples, start: Floats, compliances: _Compliances) -> tuple[Fit, int]:
     """Least squares from kinematic parameters `start` (p,) and no compliance, and how many rounds it took."""
     p = len(chain)
-    linearise, additions = Lineariser(chain), compliances.at(start)
-    state = _state(linearise, samples, np.concatenate([start, np.zeros(len(additions))]), additions)
+    additions = compliances.at(start)
+    state = _state(chain, samples, np.concatenate([start, np.zeros(len(additions))]), additions)
     seen, unseen = _directions(state)
     different = different_fixes(chain, samples)
     if 3 * different <= seen.shape[1]:
@@ -178,16 +173,16 @@ def _iterated(chain: Chain, samples: Samples, start: Floats, compliances: _Compl
     while not settled and rounds < _ROUNDS:
         rounds += 1
         if len(additions):
-            state = _state(linearise, samples, state.z, compliances.at(state.z[:p]))
-        state, change = _step(linearise, samples, state, seen)
+            state = _state(chain, samples, state.z, compliances.at(state.z[:p]))
+        state, change = _step(chain, samples, state, seen)
         settled = change <= _SETTLED
     return _fit(chain, samples, state, seen, unseen, settled), rounds
 
 
-def _state(linearise: Lineariser, samples: Samples, z: Floats, additions: Additions) -> _State:
+def _state(chain: Chain, samples: Samples, z: Floats, additions: EffectColumns) -> _State:
     p = len(z) - len(additions)
-    readings = samples.data.readings + additions.change(z[p:], samples.data.readings.shape[1])
-    lin = linearise(z[:p], replace(samples.data, readings=readings))
+    data, _ = additions.apply(samples.data, z[p:])
+    lin = chain.linearise(z[:p], data)
     return _State(z, additions, lin, samples.position_mm - lin.position_mm)
 
 
@@ -202,13 +197,13 @@ def _directions(state: _State) -> tuple[Floats, Floats]:
     return axes[:, :rank], axes[:, rank:]
 
 
-def _step(linearise: Lineariser, samples: Samples, state: _State, seen: Floats) -> tuple[_State, float]:
+def _step(chain: Chain, samples: Samples, state: _State, seen: Floats) -> tuple[_State, float]:
     """One step of least squares, halved while it raises the squares; the new state, and the step over the error."""
     columns = state.columns() @ seen
     step = np.linalg.lstsq(columns, state.error.ravel(), rcond=None)[0]
     change = float(np.linalg.norm(columns @ step)) / max(math.sqrt(state.squares), 1e-9)
     for halving in range(_HALVINGS):
-        moved = _state(linearise, samples, state.z + seen @ step * 0.5**halving, state.additions)
+        moved = _state(chain, samples, state.z + seen @ step * 0.5**halving, state.additions)
         if moved.squares <= state.squares * (1.0 + 1e-12):
             return moved, change
     return state, change

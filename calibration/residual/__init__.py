@@ -1,1 +1,1 @@
-"""What kinematics leave over, learned from the data and kept only where it helps on held-out groups."""
+"""Learners of the error that kinematics leave over, kept only where they help on held-out groups."""

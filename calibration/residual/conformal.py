@@ -30,13 +30,13 @@ class Coverage:
     radius: float
 
     def as_dict(self) -> dict[str, object]:
-        """As in the JSON of `calibrate` and `evaluate`."""
+        """Object in the JSON of `calibrate` and `evaluate`."""
         return {"level": LEVEL, "axis_coverage": list(self.axes), "radius_coverage": self.radius}
 
 
 @dataclass(frozen=True)
 class Intervals:
-    """How many predicted standard deviations hold an error with probability `LEVEL`.
+    """Number of predicted standard deviations that hold an error with probability `LEVEL`.
 
     Attributes:
         axes: of the error along x, y, z of the station's frame.
@@ -47,7 +47,7 @@ class Intervals:
     radius: float = float(np.sqrt(chdtri(3, 1.0 - LEVEL) / 3.0))
 
     def at_other_setups(self) -> Intervals:
-        """The same where nobody knows which way x and y point, seen from the machine; z is up at all set-ups."""
+        """Intervals where nobody knows which way x and y point, seen from the machine; z is up at all set-ups."""
         level = float(np.sqrt((self.axes[0] ** 2 + self.axes[1] ** 2) / 2.0))
         return Intervals((level, level, self.axes[2]), self.radius)
 
@@ -61,14 +61,14 @@ class Intervals:
         return np.asarray(self.radius * np.linalg.norm(sigma_mm, axis=1), dtype=np.float64)
 
     def coverage(self, error_mm: Floats, sigma_mm: Floats) -> Coverage:
-        """How many of the errors (n, 3) are inside, for standard deviations (n, 3)."""
+        """Share of the errors (n, 3) that are inside, for standard deviations (n, 3)."""
         axes = (np.abs(error_mm) <= self.half_mm(sigma_mm)).mean(axis=0)
         radius = (np.linalg.norm(error_mm, axis=1) <= self.radius_mm(sigma_mm)).mean()
         return Coverage(tuple(axes.tolist()), float(radius))
 
 
 def conformal_intervals(error_mm: Floats, sigma_mm: Floats, independent: int) -> Intervals:
-    """Count how many standard deviations held-out errors are.
+    """Count the standard deviations that hold held-out errors.
 
     Args:
         error_mm: (n, 3) errors of rows that the model was fitted without, in the station's frame.

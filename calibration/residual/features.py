@@ -1,4 +1,4 @@
-"""What a residual learner sees of an observation, computed in one place for training and prediction alike."""
+"""Features of an observation for residual learners, computed in one place for training and prediction alike."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.kernels import features as kernel
-from calibration.kernels.machine import Located
-from calibration.kinematics import Chain
+from calibration.kinematics.chain import Chain
+from calibration.kinematics.compiled_chain import Located
+from calibration.kinematics.torques import GravityModel, gravity_torques, torque_columns
+from calibration.numerics.jit import compiled, part
 from calibration.observations import Floats, Observations
-from calibration.rig import Rig
-from calibration.torques import GravityLoads, gravity_torques, torque_columns
+from calibration.rig.description import Rig
 
 _NOT_FEATURES = frozenset({"time_s"})  # a tree that splits on time knows the past alone
 _LEAST_MEASURED = 0.5
 _VARYING = 1e-6  # of the largest load
 DEFLECTION = ("deflection_x_mm", "deflection_y_mm", "deflection_z_mm")
 _COMPLIANCE_RAD_PER_NM = 1e-7  # of every joint: what counts of a deflection is its shape
+_RIGID = 6  # ways in which a base can be off
 _FRAME_ORIGIN = re.compile(r"frame\d+_[xyz]_mm")
 _PLACE = re.compile(r"(frame\d+|prism)_[xyz]_mm")
 
@@ -51,15 +52,15 @@ class Features:
         return len(self.geometry)
 
     def table(self) -> Floats:
-        """(n, g + s) all columns."""
+        """(n, g + s) columns."""
         return np.concatenate([self.geometry, self.signals], axis=1)
 
     def columns(self, names: Sequence[str]) -> Floats:
-        """(n, k) the columns of these names; ValueError for one that is not there."""
+        """(n, k) columns of these names; ValueError for one that is not there."""
         return self.table()[:, column_places(self.names, tuple(names))]
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Features:
-        """The given rows, by mask or by index."""
+        """Rows by mask or by index."""
         return replace(
             self,
             geometry=self.geometry[rows],
@@ -69,13 +70,13 @@ class Features:
         )
 
     def with_signals(self, names: Sequence[str], columns: Floats) -> Features:
-        """With further signal columns (n, k)."""
+        """Append signal columns (n, k)."""
         return replace(self, names=(*self.names, *names), signals=np.hstack([self.signals, columns]))
 
 
 @lru_cache(maxsize=64)
 def column_places(names: tuple[str, ...], wanted: tuple[str, ...]) -> NDArray[np.intp]:
-    """Where the wanted names are among all; ValueError for one that is not there.
+    """Find the wanted names among all; ValueError for one that is not there.
 
     A learner asks for the same ones with each prediction.
     """
@@ -83,22 +84,18 @@ def column_places(names: tuple[str, ...], wanted: tuple[str, ...]) -> NDArray[np
 
 
 def usable_signals(observations: Observations) -> tuple[str, ...]:
-    """Optional columns that vary and are measured in at least half of the rows."""
-    names: list[str] = []
-    for name, values in observations.extra.items():
+    """Names of optional columns that vary and are measured in at least half of the rows."""
+
+    def is_usable(values: Floats) -> bool:
         measured = values[np.isfinite(values)]
-        if (
-            name not in _NOT_FEATURES
-            and len(measured) >= _LEAST_MEASURED * len(values)
-            and len(measured) > 0
-            and np.ptp(measured) > 0.0
-        ):
-            names.append(name)
-    return tuple(sorted(names))
+        return 0 < len(measured) >= _LEAST_MEASURED * len(values) and bool(np.ptp(measured) > 0.0)
+
+    columns = observations.extra.items()
+    return tuple(sorted(name for name, values in columns if name not in _NOT_FEATURES and is_usable(values)))
 
 
 def usable_torques(chain: Chain, x: Floats, observations: Observations) -> tuple[str, ...]:
-    """Columns `torque_<joint>_Nm`, `torque_<joint>_N` of the loads that are known in every row and vary."""
+    """Names `torque_<joint>_Nm`, `torque_<joint>_N` of the loads that are known in every row and vary."""
     torques = gravity_torques(chain, x, observations)
     known = np.isfinite(torques).all(axis=0)
     loads = np.where(known, torques, 0.0)
@@ -107,13 +104,13 @@ def usable_torques(chain: Chain, x: Floats, observations: Observations) -> tuple
 
 
 def usable_loads(chain: Chain, x: Floats, observations: Observations) -> tuple[str, ...]:
-    """Columns of loads that are known and vary, and of the deflection that they would make."""
+    """Names of loads that are known and vary, and of the deflection that they would make."""
     torques = usable_torques(chain, x, observations)
     return (*torques, *DEFLECTION) if any(name.endswith("_Nm") for name in torques) else torques
 
 
 def missing_signals(rig: Rig, observations: Observations, signals: Sequence[str]) -> tuple[str, ...]:
-    """Signals that the observations have in no row; loads are computed wherever the rig has masses."""
+    """Names of signals that the observations have in no row; loads are computed wherever the rig has masses."""
     sources = {column: f"{joint.name}_Nm" for column, joint in zip(torque_columns(rig), rig.joints, strict=True)}
     found: list[str] = []
     for name in signals:
@@ -125,56 +122,56 @@ def missing_signals(rig: Rig, observations: Observations, signals: Sequence[str]
     return tuple(found)
 
 
-def feature_names(rig: Rig, signals: Sequence[str]) -> tuple[str, ...]:
-    """Names of the columns that an `Extractor` computes."""
+def _feature_names(rig: Rig, signals: Sequence[str]) -> tuple[str, ...]:
     joints = [j.column for j in rig.joints]
     frames = [f"frame{i + 1}_{axis}_mm" for i in range(len(rig.rows)) for axis in "xyz"]
     return (*joints, *frames, *(f"prism_{axis}_mm" for axis in "xyz"), *signals)
 
 
 def no_features(chain: Chain, signals: Sequence[str]) -> Features:
-    """The columns that a chain's features have, without a row."""
-    names, joints = feature_names(chain.rig, signals), len(chain.rig.joints)
+    """Features of no row, with the columns of a chain's."""
+    names, joints = _feature_names(chain.rig, signals), len(chain.rig.joints)
     return Features(
         names,
         np.empty((0, len(names) - len(signals))),
         np.empty((0, len(signals))),
         np.empty((0, 3, joints)),
-        np.empty((0, 3, chain.base_start + kernel.RIGID)),
+        np.empty((0, 3, chain.base_start + _RIGID)),
     )
 
 
 def is_frame_origin(name: str) -> bool:
-    """Whether a column is a coordinate of a frame's origin."""
+    """True for a coordinate of a frame's origin."""
     return _FRAME_ORIGIN.fullmatch(name) is not None
 
 
 def is_place(name: str) -> bool:
-    """Whether a column is a coordinate of a frame's origin or of the prism, which follow from the joints."""
+    """True for a coordinate of a frame's origin or of the prism, which follow from the joints."""
     return _PLACE.fullmatch(name) is not None
 
 
 class Extractor:
-    """Puts the features of a rig's observations together; build it once for a model.
+    """Function from rows of observations to features; build it once for a model.
 
     Args:
-        chain, x: the identified kinematics.
+        chain: the identified kinematics.
+        x: (p,) their parameters.
         signals: optional columns to use, joint torques among them; one that is absent is NaN throughout.
     """
 
     def __init__(self, chain: Chain, x: Floats, signals: Sequence[str]) -> None:
         computed = (*torque_columns(chain.rig), *DEFLECTION)
-        self._names = feature_names(chain.rig, signals)
+        self._names = _feature_names(chain.rig, signals)
         self._measured = tuple(name for name in signals if name not in computed)
         place = {name: index for index, name in enumerate((*self._measured, *computed))}
         self._source = np.array([place[name] for name in signals], dtype=np.intp)
         turning = np.array([joint.kind == "revolute" for joint in chain.rig.joints])
         self._deg_per_nm = math.degrees(_COMPLIANCE_RAD_PER_NM) * turning
-        self._loads = None if set(signals).isdisjoint(computed) else GravityLoads(chain, x)
-        self._parameters = chain.base_start + kernel.RIGID
+        self._loads = None if set(signals).isdisjoint(computed) else GravityModel(chain, x)
+        self._parameters = chain.base_start + _RIGID
 
     def __call__(self, readings: Floats, located: Located, extra: Mapping[str, Floats]) -> Features:
-        """Features of n rows.
+        """Compute the features of n rows.
 
         Args:
             readings: (n, joints) deg or mm, where the effects have them.
@@ -191,7 +188,7 @@ class Extractor:
             located.joint_jacobian,
             np.empty((n, 3, self._parameters)),
         )
-        kernel.fill(
+        _fill(
             np.ascontiguousarray(readings),
             located.frames_mm,
             located.prism_mm,
@@ -206,3 +203,62 @@ class Extractor:
             out.parameter_jacobian,
         )
         return out
+
+
+@part()
+def _deflection(by_joint: Floats, loads: Floats, deg_per_nm: Floats) -> float:
+    """Displacement of one coordinate by joints that give way."""
+    moved = 0.0
+    for j in range(len(loads)):
+        if math.isfinite(loads[j]):
+            moved += by_joint[j] * (loads[j] * deg_per_nm[j])
+    return moved
+
+
+@part()
+def _rigid(place: Floats, out: Floats) -> None:
+    """Fill `out` (3, 6) with how shifts along the base frame's axes and turns about them move a place."""
+    out[:] = 0.0
+    for axis in range(3):
+        one, other = (axis + 1) % 3, (axis + 2) % 3
+        out[axis, axis] = 1.0
+        out[one, 3 + axis], out[other, 3 + axis] = -place[other], place[one]
+
+
+@compiled
+def _fill(
+    readings: Floats,
+    frames: Floats,
+    place: Floats,
+    by_joint: Floats,
+    by_parameter: Floats,
+    loads: Floats,
+    deg_per_nm: Floats,
+    measured: Floats,
+    source: NDArray[np.intp],
+    geometry: Floats,
+    signals: Floats,
+    parameters: Floats,
+) -> None:
+    """Fill `geometry`, `signals` and `parameters`, the Jacobian, of a `Features` of n rows.
+
+    `frames` to `by_parameter` are as a `Located` has them; `loads` (n, joints) N m or N are NaN where not known, as if
+    there were none; `deg_per_nm` (joints,) is by how much each joint gives way to its load. `source` (s,) tells where
+    each signal is among the `measured` columns (m, n), the loads and the three coordinates of the deflection.
+    """
+    joints, places, first = readings.shape[1], frames.shape[1] - 1, parameters.shape[2] - _RIGID
+    for n in range(len(readings)):
+        geometry[n, :joints] = readings[n]
+        for frame in range(places):
+            geometry[n, joints + 3 * frame : joints + 3 * frame + 3] = frames[n, 1 + frame]
+        geometry[n, joints + 3 * places :] = place[n]
+        for k in range(len(source)):
+            column = source[k]
+            if column < len(measured):
+                signals[n, k] = measured[column, n]
+            elif column < len(measured) + joints:
+                signals[n, k] = loads[n, column - len(measured)]
+            else:
+                signals[n, k] = _deflection(by_joint[n, column - len(measured) - joints], loads[n], deg_per_nm)
+        parameters[n, :, :first] = by_parameter[n, :, :first]
+        _rigid(place[n], parameters[n, :, first:])

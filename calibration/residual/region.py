@@ -9,38 +9,43 @@ signal. All weights are smooth: a rig that moves out of the region sees no step.
 
 from __future__ import annotations
 
-import io
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.kernels import region as kernel
-from calibration.model_checks import LARGEST, float_array
-from calibration.npz import read_npz
+from calibration.numerics.jit import compiled, part
+from calibration.numerics.stored_arrays import LARGEST, float_array, read_npz, write_npz
 from calibration.observations import Floats
 from calibration.residual.features import Features
-from calibration.rig import Joint
+from calibration.rig.description import Joint
 
-FILE = "region.npz"
+_FILE = "region.npz"
 
-_MARGIN = 0.1  # of a range, that readings may leave it before anything fades
+# Rows of the table of joints, deg or mm.
+_CENTRE, _HALF, _MARGIN, _SCALE, _TURN = range(5)
+# Rows of the table of signals, in the signal's unit; LOSS is a share and GAPS 0 or 1.
+_LOW, _HIGH, _ROOM, _USUAL, _LOSS, _GAPS = range(6)
+
+_MARGIN_SHARE = 0.1  # of a range, that readings may leave it before anything fades
 _LEAST_MARGIN = {"revolute": 1.0, "prismatic": 10.0}  # deg, mm
 _POSES = 256
 _MOST_ROWS = 5000  # that representatives are chosen from
-_USUAL = 0.99  # of the held-out rows are no farther from trained poses than "near"
-_ROOM = 1.25  # in that distance
+_QUANTILE = 0.99  # of the held-out rows are no farther from trained poses than "near"
+_NEAR_FACTOR = 1.25  # in that distance
 _LEAST_NEAR = 0.02  # in ranges of the joints
 _OFTEN_MISSING = 0.05
 _PROBED = 500  # rows that tell what a signal matters
+_FADE = 2.0  # margins beyond the margin until nothing is left
 _NOTABLE = 0.01  # of a residual's gain; signals that matter less are not spoken of
 _FADED = 0.9  # weights above are not spoken of
 
 
 @dataclass(frozen=True)
 class Region:
-    """What a residual was trained on.
+    """The region of a learner.
 
     Attributes:
         joints: (5, j) centre and half of each joint's trained range, margin, scale of distances (deg or mm), and 360
@@ -58,8 +63,8 @@ class Region:
     signals: tuple[str, ...]
     table: Floats
 
-    def settle(self, features: Features) -> tuple[Features, Floats]:
-        """The features as the learner knows them, and how much its estimate counts.
+    def confine(self, features: Features) -> tuple[Features, Floats]:
+        """Bring features into the region, and weigh the estimate there.
 
         Args:
             features: n rows with the columns that the region was fitted to.
@@ -68,11 +73,11 @@ class Region:
             Features with angles less whole turns, and strange signals at their usual values; (n,) weights, 0 to 1.
         """
         geometry, signals = features.geometry.copy(), features.signals.copy()
-        weight = kernel.settle(self.joints, self.poses, self.near, self.table, geometry, signals)
+        weight = _confine(self.joints, self.poses, self.near, self.table, geometry, signals)
         return replace(features, geometry=geometry, signals=signals), weight
 
-    def doubts(self, features: Features, joints: Sequence[Joint]) -> Iterator[str]:
-        """Sentences on rows outside the region, and on signals that are not what they were in training."""
+    def warnings(self, features: Features, joints: Sequence[Joint]) -> Iterator[str]:
+        """Warn of rows outside the region, and of signals that are not what they were in training."""
         if len(features) == 0:
             return
         for name, values, (low, high, room, _, loss, _) in self._notable(features):
@@ -83,7 +88,7 @@ class Region:
                     f"training data (a shifted sensor, or another unit?); there the residual does without it, which "
                     f"costs {loss:.0%} of what it gains"
                 )
-        _, weight = self.settle(features)
+        _, weight = self.confine(features)
         faded = int((weight < _FADED).sum())
         if faded:
             yield (
@@ -93,7 +98,7 @@ class Region:
 
     def _notable(self, features: Features) -> Iterator[tuple[str, Floats, Floats]]:
         """Name, values and column of the table of each signal that matters."""
-        for k in np.flatnonzero(self.table[kernel.LOSS] >= _NOTABLE):
+        for k in np.flatnonzero(self.table[_LOSS] >= _NOTABLE):
             yield self.signals[k], features.signals[:, k], self.table[:, k]
 
     def _reasons(self, features: Features, joints: Sequence[Joint]) -> Iterator[str]:
@@ -108,7 +113,7 @@ class Region:
                 if strange:
                     yield f"{joint.name} {side} {limit[k]:.1f} {joint.unit} in {strange}"
         by_joints = replace(self, signals=(), table=self.table[:, :0])
-        _, weight = by_joints.settle(replace(features, signals=features.signals[:, :0]))
+        _, weight = by_joints.confine(replace(features, signals=features.signals[:, :0]))
         far = int(((weight < _FADED) & inside).sum())
         if far:
             yield f"far from every trained pose in {far}"
@@ -119,7 +124,7 @@ class Region:
                     yield f"{name} {what} in {int(rows.sum())}"
 
     def fits(self, joints: int) -> bool:
-        """Whether its tables have the shapes and the numbers that `settle` relies on."""
+        """True if its tables have the shapes and the numbers that `confine` relies on."""
         return (
             self.joints.shape == (5, joints)
             and self.poses.ndim == 2
@@ -129,27 +134,25 @@ class Region:
             and all(bool((np.abs(part) <= LARGEST).all()) for part in (self.joints, self.poses))
             and bool((np.abs(self.table) <= LARGEST**2).all())
             and 0.0 < self.near <= LARGEST
-            and bool((self.joints[[kernel.MARGIN, kernel.SCALE]] > 0.0).all() and (self.table[kernel.ROOM] > 0.0).all())
-            and bool((self.joints[[kernel.HALF, kernel.TURN]] >= 0.0).all())
-            and bool((self.table[kernel.LOW] <= self.table[kernel.HIGH]).all())
-            and bool(((self.table[kernel.LOSS] >= 0.0) & (self.table[kernel.LOSS] <= 1.0)).all())
+            and bool((self.joints[[_MARGIN, _SCALE]] > 0.0).all() and (self.table[_ROOM] > 0.0).all())
+            and bool((self.joints[[_HALF, _TURN]] >= 0.0).all())
+            and bool((self.table[_LOW] <= self.table[_HIGH]).all())
+            and bool(((self.table[_LOSS] >= 0.0) & (self.table[_LOSS] <= 1.0)).all())
         )
 
     def to_files(self) -> dict[str, bytes]:
         """One npz file without pickled objects."""
-        buffer = io.BytesIO()
-        signals = np.array(self.signals, dtype=np.str_)
-        np.savez(buffer, joints=self.joints, poses=self.poses, near=[self.near], signals=signals, table=self.table)
-        return {FILE: buffer.getvalue()}
+        parts = {"joints": self.joints, "poses": self.poses, "near": np.array([self.near]), "table": self.table}
+        return {_FILE: write_npz({**parts, "signals": np.array(self.signals, dtype=np.str_)})}
 
     @classmethod
     def from_files(cls, files: Mapping[str, bytes]) -> Region:
         """Inverse of `to_files`; KeyError or ValueError where parts are missing. `fits` says whether they match."""
-        stored = read_npz(files[FILE])
+        stored = read_npz(files[_FILE])
         joints, poses, near, table = (float_array(stored, k) for k in ("joints", "poses", "near", "table"))
         signals = np.asarray(stored["signals"])
         if near.shape != (1,) or signals.ndim != 1 or signals.dtype.kind != "U":
-            raise ValueError(f"{FILE} holds no list of signals, or not one distance")
+            raise ValueError(f"{_FILE} holds no list of signals, or not one distance")
         return cls(joints, poses, float(near[0]), tuple(signals.tolist()), table)
 
 
@@ -162,7 +165,7 @@ def fit_region(
     predict: Callable[[Features], Floats],
     gain_mm2: float,
 ) -> Region:
-    """The region of a learner.
+    """Find the region of a learner.
 
     Args:
         features: n rows that it was trained on.
@@ -176,13 +179,13 @@ def fit_region(
     readings = features.geometry[:, : len(joints)]
     low, high = readings.min(axis=0), readings.max(axis=0)
     least = np.array([_LEAST_MARGIN[joint.kind] for joint in joints])
-    margin = np.maximum(_MARGIN * (high - low), least)
-    table = np.array([(low + high) / 2.0, (high - low) / 2.0, margin, margin / _MARGIN, turns])
-    scaled = readings / table[kernel.SCALE]
+    margin = np.maximum(_MARGIN_SHARE * (high - low), least)
+    table = np.array([(low + high) / 2.0, (high - low) / 2.0, margin, margin / _MARGIN_SHARE, turns])
+    scaled = readings / table[_SCALE]
     return Region(
         table,
         np.ascontiguousarray(readings[_representatives(scaled)]),
-        _ROOM * max(_usual_distance(scaled, split), _LEAST_NEAR),
+        _NEAR_FACTOR * max(_usual_distance(scaled, split), _LEAST_NEAR),
         tuple(signals),
         _signal_table(features, predict, gain_mm2),
     )
@@ -201,14 +204,14 @@ def _representatives(scaled: Floats) -> NDArray[np.intp]:
 
 
 def _usual_distance(scaled: Floats, split: NDArray[np.intp]) -> float:
-    """How far held-out rows lie from the representatives of the others, nearly all of them."""
+    """Distance of held-out rows from the representatives of the others, 99 % quantile."""
     found = []
     for fold in np.unique(split):
         training, held = scaled[split != fold], scaled[split == fold]
         poses = training[_representatives(training)]
         square = (held**2).sum(axis=1)[:, None] + (poses**2).sum(axis=1) - 2.0 * held @ poses.T
         found.append(np.sqrt(np.maximum(square.min(axis=1), 0.0)))
-    return float(np.quantile(np.concatenate(found), _USUAL))
+    return float(np.quantile(np.concatenate(found), _QUANTILE))
 
 
 def _signal_table(features: Features, predict: Callable[[Features], Floats], gain_mm2: float) -> Floats:
@@ -218,7 +221,7 @@ def _signal_table(features: Features, predict: Callable[[Features], Floats], gai
     if count == 0:
         return np.empty((6, 0))
     low, high, usual = np.nanmin(signals, axis=0), np.nanmax(signals, axis=0), np.nanmedian(signals, axis=0)
-    room = np.maximum(_MARGIN * (high - low), 1e-9 * np.maximum(np.abs(low), np.abs(high)))
+    room = np.maximum(_MARGIN_SHARE * (high - low), 1e-9 * np.maximum(np.abs(low), np.abs(high)))
     room = np.maximum(room, 1e-12)
     gaps = np.isnan(signals).mean(axis=0) > _OFTEN_MISSING
     rows = np.unique(np.linspace(0, len(features) - 1, min(len(features), _PROBED)).astype(np.intp))
@@ -235,3 +238,91 @@ def _signal_table(features: Features, predict: Callable[[Features], Floats], gai
     together = cost_mm2(np.arange(count)) / max(float(cost.sum()), 1e-12)
     share = cost * max(1.0, together) / max(gain_mm2, 1e-12)
     return np.array([low, high, room, usual, np.minimum(share, 1.0), gaps.astype(float)])
+
+
+# -- compiled: a call for one pose costs microseconds ------------------------------------------------------------------
+
+
+@part()
+def _falling(excess: float) -> float:
+    """From 1 at no excess to 0 at 1, smooth at both ends."""
+    if excess <= 0.0:
+        return 1.0
+    if excess >= 1.0:
+        return 0.0
+    return 1.0 - excess * excess * (3.0 - 2.0 * excess)
+
+
+@part()
+def _short_way(change: float, turn: float) -> float:
+    """A change of an angle without the whole turns in it; other values, whose turn is 0, as they are."""
+    if turn > 0.0 and 2.0 * abs(change) > turn:
+        return change - turn * math.floor(change / turn + 0.5)
+    return change
+
+
+@part()
+def _joint_weight(joints: Floats, row: int, readings: Floats) -> float:
+    """Weight by the ranges of the joints; readings beyond theirs are taken on the turn nearest its centre."""
+    weight = 1.0
+    for k in range(joints.shape[1]):
+        away = readings[row, k] - joints[_CENTRE, k]
+        if abs(away) > joints[_HALF, k]:
+            near = _short_way(away, joints[_TURN, k])
+            if near != away:
+                readings[row, k] = joints[_CENTRE, k] + near
+                away = near
+        weight *= _falling((abs(away) - joints[_HALF, k] - joints[_MARGIN, k]) / (_FADE * joints[_MARGIN, k]))
+    return weight
+
+
+@part()
+def _nearness(joints: Floats, poses: Floats, near: float, row: int, readings: Floats) -> float:
+    """Weight by the distance to the nearest of the poses: 1 up to `near`, nothing from twice that on."""
+    least = 4.0 * near * near
+    for m in range(len(poses)):
+        square = 0.0
+        for k in range(joints.shape[1]):
+            away = _short_way(readings[row, k] - poses[m, k], joints[_TURN, k]) / joints[_SCALE, k]
+            square += away * away
+            if square >= least:
+                break
+        if square < least:
+            least = square
+            if least <= near * near:
+                return 1.0
+    return _falling(math.sqrt(least) / near - 1.0)
+
+
+@part()
+def _signal_weight(table: Floats, row: int, signals: Floats) -> float:
+    """Weight by the signals; what is missing or out of range is drawn to its usual value."""
+    lost = 0.0
+    for k in range(table.shape[1]):
+        value, trust = signals[row, k], 0.0
+        if math.isfinite(value):
+            away = max(table[_LOW, k] - value, value - table[_HIGH, k])
+            trust = _falling((away - table[_ROOM, k]) / (_FADE * table[_ROOM, k]))
+            if trust < 1.0:
+                signals[row, k] = table[_USUAL, k] + trust * (value - table[_USUAL, k])
+        elif table[_GAPS, k] > 0.0:
+            trust = 1.0
+        else:
+            signals[row, k] = table[_USUAL, k]
+        lost += (1.0 - trust) * table[_LOSS, k]
+    return max(0.0, 1.0 - lost)
+
+
+@compiled
+def _confine(joints: Floats, poses: Floats, near: float, table: Floats, readings: Floats, signals: Floats) -> Floats:
+    """Weigh a residual in each row, (n,) from 0 to 1, and bring readings and signals into its region in place.
+
+    `joints`, `poses`, `near` and `table` are those of a `Region`; joints are in the first columns of `readings`.
+    """
+    weight = np.empty(len(readings))
+    for row in range(len(readings)):
+        weight[row] = _joint_weight(joints, row, readings)
+        if weight[row] > 0.0:
+            weight[row] *= _nearness(joints, poses, near, row, readings)
+        weight[row] *= _signal_weight(table, row, signals)
+    return weight

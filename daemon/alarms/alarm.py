@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from daemon.alarms.evidence import Evidence
-from daemon.plain_text import shown
+from daemon.host.safe_output import shown
 
 Severity = Literal["warning", "critical"]
 # Subject and text of what is wrong, and its severity where it is not the rule's usual one.
@@ -36,7 +36,7 @@ class Alarm:
 
     @property
     def key(self) -> tuple[str, str]:
-        """What makes it this alarm, whatever its text says."""
+        """Kind and subject, which make it this alarm, whatever its text says."""
         return self.kind, self.subject
 
 
@@ -63,7 +63,7 @@ class Rule:
     find: Callable[[Evidence], Iterable[Finding]]
 
     def __call__(self, evidence: Evidence) -> Iterator[Alarm]:
-        """What is wrong now."""
+        """Yield an alarm for everything that is wrong now."""
         for subject, text, *severity in self.find(evidence):
             how = severity[0] if severity else self.severity
             plain = shown(text).removeprefix(f"{subject}: ")[:TEXT_MAX]  # the subject is shown before it

@@ -11,14 +11,14 @@ import sqlite3
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from daemon.alarms.alarm import Alarm, Rule, Severity
 from daemon.alarms.evidence import Evidence
 from daemon.alarms.library import library
-from daemon.present_state import duration
-from daemon.store.alarms import AlarmRow, AlarmTable
+from daemon.host.safe_output import duration
+from daemon.store.alarms import AlarmTable
 from daemon.store.errors import StoreError
 from drivers.clock import NS_PER_S, Clock, Stamp
 
@@ -71,7 +71,7 @@ class AlarmBoard:
         self._rules = library() if rules is None else rules
         self._turn = threading.Lock()
         self._looked = clock.now()
-        self._active = {(row.kind, row.subject): self._carried(row) for row in self._left_over()}
+        self._active = {(row["kind"], row["subject"]): self._carried(row) for row in self._table.active()}
         self._sighted: dict[tuple[str, str], Stamp] = {}  # since when a fault has stood that is no alarm yet
         self._unwritten: deque[_Active] = deque(maxlen=UNWRITTEN_MAX)  # cleared ones
         self._failed_rules: dict[str, str] = {}
@@ -93,7 +93,7 @@ class AlarmBoard:
             self._told = str(error)
 
     def status(self) -> dict[str, Any]:
-        """What `status` shows: the active alarms, the critical and then the oldest first, and when they were looked at.
+        """Return the active alarms, the critical and then the oldest first, and when they were looked at.
 
         Returns:
             `active`: kind, subject, severity, text, remedy, since_utc_ns and age_s of each; `looked_age_s`.
@@ -104,11 +104,7 @@ class AlarmBoard:
         active.sort(key=lambda one: (one.alarm.severity != "critical", -now.since(one.raised)))
         shown = [
             {
-                "kind": one.alarm.kind,
-                "subject": one.alarm.subject,
-                "severity": one.alarm.severity,
-                "text": one.alarm.text,
-                "remedy": one.alarm.remedy,
+                **asdict(one.alarm),
                 "since_utc_ns": one.raised.utc_ns,
                 "age_s": max(now.since(one.raised) / NS_PER_S, 0.0),
             }
@@ -123,21 +119,13 @@ class AlarmBoard:
 
     # ---- parts -------------------------------------------------------------------------------------------------------
 
-    def _left_over(self) -> list[AlarmRow]:
-        """Alarms of an earlier run; none where their table is damaged, which must not keep the daemon from starting."""
-        try:
-            return list(self._table.active())
-        except sqlite3.Error as error:
-            log.error("the alarms of earlier runs cannot be read: %s", error)
-            return []
-
-    def _carried(self, row: AlarmRow) -> _Active:
-        severity: Severity = "critical" if row.severity == "critical" else "warning"
-        alarm = Alarm(row.kind, row.subject, severity, row.text, row.remedy)
-        return _Active(alarm, row.raised, self._looked, GRACE_S, row.id, alarm)
+    def _carried(self, row: Mapping[str, Any]) -> _Active:
+        """Go on with an alarm of an earlier run."""
+        alarm = Alarm(row["kind"], row["subject"], row["severity"], row["text"], row["remedy"])
+        return _Active(alarm, row["raised"], self._looked, GRACE_S, row["id"], alarm)
 
     def _found(self, evidence: Evidence) -> dict[tuple[str, str], tuple[Alarm, Rule]]:
-        """What is wrong now, by the rules that work."""
+        """Apply the rules; one that fails is left out."""
         found: dict[tuple[str, str], tuple[Alarm, Rule]] = {}
         failed: dict[str, str] = {}
         for rule in self._rules:
@@ -159,14 +147,8 @@ class AlarmBoard:
                 active.alarm, active.seen, active.hold_s = alarm, now, rule.hold_s
             elif now.since(self._sighted[key]) >= rule.after_s * NS_PER_S:
                 self._active[key] = _Active(alarm, now, now, rule.hold_s)
-                log.log(
-                    _LEVELS[alarm.severity],
-                    "alarm %s, %s: %s. %s",
-                    alarm.kind,
-                    alarm.subject,
-                    alarm.text,
-                    alarm.remedy,
-                )
+                said = alarm.kind, alarm.subject, alarm.text, alarm.remedy
+                log.log(_LEVELS[alarm.severity], "alarm %s, %s: %s. %s", *said)
 
     def _clear(self, found: Mapping[tuple[str, str], object], now: Stamp) -> None:
         for key, active in list(self._active.items()):
@@ -192,11 +174,10 @@ class AlarmBoard:
 
     def _write_one(self, active: _Active) -> None:
         alarm = active.alarm
-        said = {"severity": alarm.severity, "text": alarm.text, "remedy": alarm.remedy}
         if active.row is None:
-            active.row = self._table.add(active.raised, kind=alarm.kind, subject=alarm.subject, **said)
+            active.row = self._table.add(active.raised, **asdict(alarm))
         elif alarm != active.written:
-            self._table.change(active.row, **said)
+            self._table.change(active.row, severity=alarm.severity, text=alarm.text, remedy=alarm.remedy)
         active.written = alarm
         if active.cleared is not None:
             self._table.clear(active.row, active.cleared)

@@ -1,92 +1,20 @@
-"""Everything that rules may look at, at one instant. What nobody has told is "nothing known", and raises nothing."""
+"""Evidence that rules may look at, at one instant. What nobody has told is "nothing known", and raises nothing."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
-from daemon.acquisition_status import AcquisitionStatus, EventStatus, LinkStatus
-from daemon.prism_guard import Suspicion
-from drivers.clock import Stamp
+from daemon.acquisition.status import AcquisitionStatus, EventStatus, LinkStatus
+from daemon.models.live_model import LiveModelHealth
+from daemon.sessions.prism_guard import Suspicion
+from daemon.store.health import StoreHealth
+from daemon.store.jobs import FailedJob
+from daemon.store.sessions import OpenSessionRow
+from daemon.store.setups import SetupRow
+from drivers.clock import NS_PER_S, Clock, Stamp
 from drivers.readings import EventKind
-
-
-@dataclass(frozen=True)
-class SessionEvidence:
-    """The open calibration session.
-
-    Attributes:
-        id: of the session.
-        age_s: since it was opened.
-        jumped: joints whose encoder has jumped in it.
-        suspicions: stations that may be on another prism than its own.
-    """
-
-    id: str
-    age_s: float
-    jumped: tuple[str, ...] = ()
-    suspicions: tuple[Suspicion, ...] = ()
-
-
-@dataclass(frozen=True)
-class SetupEvidence:
-    """The newest station set-up.
-
-    Attributes:
-        id: of the set-up.
-        is_moved: its control points no longer fit.
-    """
-
-    id: str
-    is_moved: bool
-
-
-@dataclass(frozen=True)
-class FailedJob:
-    """The newest failed job of its kind, with no later one done.
-
-    Attributes:
-        id, kind: of the job.
-        error: why it failed.
-    """
-
-    id: int
-    kind: str
-    error: str
-
-
-@dataclass(frozen=True)
-class ModelEvidence:
-    """The live model.
-
-    Attributes:
-        id: its number.
-        jumped: joints whose encoder has jumped since it was trained, their zeros not being checked.
-        defect: why it cannot be used; "" if it can.
-        drifted_with: the check session with which it was found to have drifted; None before.
-    """
-
-    id: int
-    jumped: tuple[str, ...] = ()
-    defect: str = ""
-    drifted_with: str | None = None
-
-
-@dataclass(frozen=True)
-class StoreEvidence:
-    """The store and its disk.
-
-    Attributes:
-        fault: what is wrong with its files (damaged, replaced, missing), and what to do; "" if nothing is known to be.
-        free_bytes: on its disk; None while not known.
-        is_low: little of the disk is free, as `daemon.store.health` has it.
-        is_new_beside_models: it has never seen a job, and yet models lie beside it.
-    """
-
-    fault: str = ""
-    free_bytes: int | None = None
-    is_low: bool = False
-    is_new_beside_models: bool = False
 
 
 @dataclass(frozen=True)
@@ -98,10 +26,12 @@ class Evidence:
         running_s: since the daemon began to watch.
         acquisition: links, channels, stations, gaps and the last events.
         session: the open one.
+        suspicions: stations that may be on another prism than the session's own.
         setup: the newest one.
         failed_jobs: those that somebody should look at.
         model: the live one.
-        store: its file and its disk.
+        store: its file and its disk; None while not known.
+        is_store_new: the store has never seen a job, and yet models lie beside it.
         previous_run: when the daemon's run before this one was last alive, by a clock that can be compared.
         control_faults: control socket on which no one can connect -> why.
         untrained_sessions: closed sessions that nothing trains on -> why; those that newer ones make up for are not
@@ -112,19 +42,26 @@ class Evidence:
     now: Stamp
     running_s: float = 0.0
     acquisition: AcquisitionStatus = field(default_factory=AcquisitionStatus)
-    session: SessionEvidence | None = None
-    setup: SetupEvidence | None = None
-    failed_jobs: tuple[FailedJob, ...] = ()
-    model: ModelEvidence | None = None
-    store: StoreEvidence = StoreEvidence()
+    session: OpenSessionRow | None = None
+    suspicions: Sequence[Suspicion] = ()
+    setup: SetupRow | None = None
+    failed_jobs: Sequence[FailedJob] = ()
+    model: LiveModelHealth | None = None
+    store: StoreHealth | None = None
+    is_store_new: bool = False
     previous_run: Stamp | None = None
     control_faults: Mapping[str, str] = field(default_factory=dict)
     untrained_sessions: Mapping[str, str] = field(default_factory=dict)
     unwatched: Mapping[str, str] = field(default_factory=dict)
 
     @property
+    def session_age_s(self) -> float:
+        """Age of the open session; 0 without one."""
+        return 0.0 if self.session is None else self.now.since(self.session.started) / NS_PER_S
+
+    @property
     def is_storing(self) -> bool:
-        """Whether captures are stored, and so decoded: until they are, every device looks silent and may not be."""
+        """True if captures are stored, and so decoded: until they are, every device looks silent and may not be."""
         return self.acquisition.error is None
 
     def standing(self, kind: EventKind, *ended_by: EventKind) -> list[EventStatus]:
@@ -148,6 +85,50 @@ class Evidence:
         return next((link for link in self.acquisition.links if link.name == name), None)
 
     def is_cut_off(self, device: str) -> bool:
-        """Whether the device's link is closed, which explains whatever else is wrong with it."""
+        """True if the device's link is closed, which explains whatever else is wrong with it."""
         link = self.link_of(device)
         return link is not None and link.up is False
+
+
+# Part of the evidence -> its name in the alarm that it cannot be watched.
+_PARTS = {
+    "acquisition": "acquisition",
+    "session": "the open session",
+    "suspicions": "the prisms",
+    "setup": "the set-ups",
+    "failed_jobs": "the jobs",
+    "model": "the live model",
+    "store": "the store's files",
+    "is_store_new": "the models",
+    "untrained_sessions": "the sessions",
+    "control_faults": "the control sockets",
+}
+
+
+class Gatherer:
+    """Takes a snapshot of everything, again and again. A part that fails keeps what it was last known to be.
+
+    Args:
+        clock: time of the snapshots.
+        previous_run: as of `Evidence`.
+        parts: field of `Evidence` -> function that tells it.
+    """
+
+    def __init__(self, clock: Clock, previous_run: Stamp | None, parts: Mapping[str, Callable[[], object]]) -> None:
+        self._clock, self._parts = clock, parts
+        self._began = clock.now()
+        self._known = Evidence(self._began, previous_run=previous_run)
+
+    def __call__(self) -> Evidence:
+        """Return the present evidence."""
+        known: dict[str, Any] = {}
+        failed: dict[str, str] = {}
+        now = self._clock.now()
+        for name, look in self._parts.items():
+            try:
+                known[name] = look()
+            except Exception as error:  # noqa: BLE001 - whatever fails must not keep the others from being looked at
+                failed[_PARTS[name]] = f"{type(error).__name__}: {error}"
+        running_s = now.since(self._began) / NS_PER_S
+        self._known = replace(self._known, now=now, running_s=running_s, unwatched=failed, **known)
+        return self._known

@@ -1,7 +1,7 @@
-"""`rigcal demo --hidden`: an effect that nobody knows, behind real protocols; its name, and then the truth.
+"""`rigcal demo --hidden`: the gap workflow looks for an effect that the simulated machine draws by its seed.
 
-The simulated machine draws the effect and seals it before the first fix. The analysis sees observations as they are
-exported from the store, and answers before the simulation ends and the envelope can be opened.
+The truth is in a file that the analysis is not given. The analysis sees observations as they are exported from the
+store.
 """
 
 from __future__ import annotations
@@ -16,15 +16,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from rich.console import Console
-from rich.table import Table
-
-from calibration.rig import Rig
+from calibration.rig.description import Rig
 from daemon.cli.simulated_operator import DEADLINE_S, PRISMS, RIG, Advance, DemoError, Operator
-from daemon.cli.tables import say
-from daemon.rigs import load_rig
-from daemon.session_data import sessions_csv, time_zero_ns
+from daemon.cli.terminal import echo, echo_error, echo_table
+from daemon.config import load_rig
+from daemon.sessions.session_data import sessions_csv
 from daemon.store.reader import Reader
+from daemon.store.sessions import first_observation_ns
 from drivers.clock import NS_PER_S
 
 NO_JOBS = "\n[jobs]\nenabled = false  # the workflow is asked by rigcal gap, before and after the poses it proposes\n"
@@ -34,56 +32,53 @@ CHECK_POSES = 4
 PROPOSED = 20
 STORE = "rigcal.sqlite"
 LONGEST_S = 1800.0  # simulated, that the rounds of the proposed poses may be apart, first to last
-ENVELOPE, SEALED, COMMITMENT = "envelope", "envelope.sealed", "envelope.sha256"
-BEGIN, PAD = "envelope.begin", "envelope.pad"
+HIDDEN = "hidden_effect.json"
 
 Outcome = Literal["right", "set", "missed"]
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What was hidden.
+    """The hidden effect.
 
     Attributes:
-        family, where: the effect.
+        family, where: its name and place.
         coefficients: name -> value, as the simulator has it.
-        visible_over_noise: RMS of what calibration cannot absorb, in units of a fix's noise.
+        visible_over_noise: RMS of the part that calibration cannot absorb, in units of a fix's noise.
+        begin_utc_ns: simulated second 0, from which its instants count.
     """
 
     family: str
     where: str
     coefficients: Mapping[str, float]
     visible_over_noise: float
+    begin_utc_ns: int
 
 
 def steps() -> int:
-    """How many steps of progress there are, without poses that a set may ask for."""
+    """Number of progress steps, without poses that a set may ask for."""
     return len(PRISMS) * TRAINING_POSES + len(CHECKED) * CHECK_POSES
 
 
-def play(out: Path, rate: float, seed: int, advance: Advance, tell: Console) -> dict[str, Any]:
-    """The whole game; everything is left in `out`.
+def play(out: Path, rate: float, seed: int, advance: Advance) -> dict[str, Any]:
+    """Play the whole game; everything is left in `out`.
 
     Args:
         out: a new directory, absolute.
         rate: simulated seconds per second.
-        seed: which machine, and which secret.
+        seed: which machine, and which effect.
         advance: told of progress.
-        tell: where the commitment is printed before anything is measured.
 
     Raises:
         DemoError: it did not come to its end.
     """
-    from daemon.gap_files import REPORT
+    from daemon.models.gap_files import REPORT
 
     rig = load_rig(RIG).rig
-    envelope = out / ENVELOPE
-    envelope.mkdir()
-    operator = Operator(out, rate, seed, ["--secret", str(envelope)], NO_JOBS)
+    operator = Operator(out, rate, seed, ["--secret", str(out)], NO_JOBS)
     try:
         operator.begin()
-        commitment = (envelope / COMMITMENT).read_text(encoding="utf-8").strip()
-        say(tell, f"An effect is hidden in the machine. Sealed envelope, SHA-256 {commitment}")
+        echo_error(f"An effect is hidden in the machine. {HIDDEN} names it; the analysis is not given that file.")
         training = [operator.record(prism, "static_poses", TRAINING_POSES, advance) for prism in PRISMS]
         checks = [operator.record(prism, "check", CHECK_POSES, advance) for prism in CHECKED]
         advance("finding the gap", 0)
@@ -91,9 +86,9 @@ def play(out: Path, rate: float, seed: int, advance: Advance, tell: Console) -> 
         found = [_find_gap(out, rig, name, training, checks, seed)]
         poses = _proposed(found[0])
         if poses:
-            say(tell, f"The data cannot tell {_set_of(found[0])} apart. Measuring {len(poses)} poses that can.")
+            echo_error(f"The data cannot tell {_set_of(found[0])} apart. Measuring {len(poses)} poses that can.")
             for sentence in concessions(rig, poses):
-                say(tell, sentence)
+                echo_error(sentence)
             for pause_s, rows in rounds(poses):
                 advance("waiting for the next round", 0)
                 operator.pause(pause_s)
@@ -103,11 +98,12 @@ def play(out: Path, rate: float, seed: int, advance: Advance, tell: Console) -> 
             found.append(_find_gap(out, rig, name, training, checks, seed))
     finally:
         operator.close()
-    truth = _timed_as(opened(envelope, commitment), envelope, out / STORE)
+    content = (out / HIDDEN).read_bytes()
+    truth = _timed_as(Truth(**json.loads(content)), out / STORE)
     answer = found[-1]
     return {
         "seed": seed,
-        "commitment": commitment,
+        "commitment": hashlib.sha256(content).hexdigest(),
         "outcome": outcome(answer, truth),
         "truth": {"family": truth.family, "where": truth.where, "coefficients": dict(truth.coefficients)},
         "visible_over_noise": truth.visible_over_noise,
@@ -118,35 +114,18 @@ def play(out: Path, rate: float, seed: int, advance: Advance, tell: Console) -> 
     }
 
 
-def opened(envelope: Path, commitment: str) -> Truth:
-    """What an open envelope holds.
-
-    Raises:
-        DemoError: it is not open, or not what was sealed.
-    """
-    try:
-        sealed, pad = (envelope / SEALED).read_bytes(), (envelope / PAD).read_bytes()
-    except OSError as error:
-        raise DemoError(f"the envelope cannot be opened: {error.filename}: {error.strerror}") from error
-    text = bytes(a ^ b for a, b in zip(sealed, pad, strict=False))
-    if hashlib.sha256(text).hexdigest() != commitment:
-        raise DemoError(f"{envelope} does not hold what was sealed: its SHA-256 is another than {commitment}")
-    content = json.loads(text)
-    return Truth(content["family"], content["where"], content["coefficients"], content["visible_over_noise"])
-
-
-def _timed_as(truth: Truth, envelope: Path, store: Path) -> Truth:
-    """The truth with instants counted as the store's observations are, and not from simulated second 0."""
+def _timed_as(truth: Truth, store: Path) -> Truth:
+    """Count the instants of the truth as the store's observations do, and not from simulated second 0."""
     if "time_s" not in truth.coefficients:
         return truth
     with Reader(store) as reader:
-        later_s = (time_zero_ns(reader) - int((envelope / BEGIN).read_text(encoding="utf-8"))) / NS_PER_S
+        later_s = (first_observation_ns(reader) - truth.begin_utc_ns) / NS_PER_S
     time_s = truth.coefficients["time_s"] - later_s
     return replace(truth, coefficients={**truth.coefficients, "time_s": time_s})
 
 
 def outcome(gap: Mapping[str, Any], truth: Truth) -> Outcome:
-    """How an answer of the workflow, the contract's object, stands beside the truth.
+    """Compare an answer of the workflow, as `rigcal gap --json` gives it, with the truth.
 
     `right` names it and nothing else; `set` has it among those that the data cannot tell apart, and named nothing that
     is not there.
@@ -161,23 +140,19 @@ def outcome(gap: Mapping[str, Any], truth: Truth) -> Outcome:
     return "missed"
 
 
-def show(console: Console, result: Mapping[str, Any]) -> None:
-    """Truth beside verdict, for people."""
+def show(result: Mapping[str, Any]) -> None:
+    """Print the truth beside the verdict."""
     gap, truth = result["gap"], result["truth"]
-    console.print(_verdict(gap), style="bold", highlight=False, markup=False)
+    echo(_verdict(gap), bold=True)
     if gap["description"]:
-        say(console, f"On what it depends: {gap['description']}")
-    table = Table(
-        title="The envelope is open", title_justify="left", title_style="bold", box=None, padding=(0, 2, 0, 0)
-    )
-    for heading in ("", "hidden", "found", "+-"):
-        table.add_column(heading, justify="left" if heading == "" else "right", no_wrap=True)
+        echo(f"On what it depends: {gap['description']}")
+    rows = []
     own = next((e for e in gap["effects"] if (e["family"], e["where"]) == (truth["family"], truth["where"])), None)
     for name, value in truth["coefficients"].items():
         told = (own or {"coefficients": {}})["coefficients"].get(name)
         cells = ("", "") if told is None else (f"{told['value']:.4g}", f"{told['standard_error']:.2g} {told['unit']}")
-        table.add_row(name, f"{value:.4g}", *cells)
-    console.print(table)
+        rows.append([name, f"{value:.4g}", *cells])
+    echo_table(("", "hidden", "found", "+-"), rows, title="The hidden effect", text_columns=(0,))
     name = _name(truth["family"], truth["where"])
     sizes = f"visible at {result['visible_over_noise']:.1f} times the noise of a fix"
     lines = {
@@ -185,12 +160,12 @@ def show(console: Console, result: Mapping[str, Any]) -> None:
         "set": f"A set that contains it: it is {name}, {sizes}.",
         "missed": f"Missed: it is {name}, {sizes}.",
     }
-    console.print(lines[result["outcome"]], style="bold", highlight=False, markup=False)
-    say(console, f"report: {os.path.relpath(result['report'])}")
+    echo(lines[result["outcome"]], bold=True)
+    echo(f"report: {os.path.relpath(result['report'])}")
 
 
 def _name(family: str, where: str) -> str:
-    from daemon.report.gap_words import place_name
+    from daemon.report.words import place_name
 
     return place_name(family, where)
 
@@ -211,7 +186,7 @@ def _set_of(gap: Mapping[str, Any]) -> str:
 
 
 def _proposed(gap: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The poses that an answer asks for."""
+    """Return the poses that an answer proposes."""
     if gap["verdict"] != "indistinguishable":
         return []
     return [row for experiment in gap["experiments"] for row in experiment.get("poses", ())][:PROPOSED]
@@ -232,7 +207,7 @@ def rounds(rows: Sequence[Mapping[str, Any]]) -> list[tuple[float, list[dict[str
 
 
 def concessions(rig: Rig, rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """In which respects the simulated boom does less than the rows of a plan ask for, in sentences."""
+    """Sentences on the conditions in a plan's rows that the simulated boom cannot bring about."""
     times = [float(row["time_s"]) for row in rows if "time_s" in row]
     out = []
     if times and max(times) - min(times) > LONGEST_S:
@@ -249,7 +224,7 @@ def concessions(rig: Rig, rows: Sequence[Mapping[str, Any]]) -> list[str]:
 def _find_gap(
     out: Path, rig: Rig, name: str, training: Sequence[str], checks: Sequence[str], seed: int
 ) -> dict[str, Any]:
-    """Ask `rigcal gap` about sessions of the store, by the files it reads of anyone."""
+    """Run `rigcal gap` on sessions of the store, exported as files."""
     files = {}
     with Reader(out / STORE) as reader:
         for kind, sessions in (("observations", training), ("checks", checks)):

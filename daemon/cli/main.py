@@ -1,48 +1,29 @@
-"""`rigcal`: every command there is."""
+"""`rigcal`: finds its commands in their folder, one file each.
+
+`commands/NAME.py` defines the command or group NAME as a function of that name. A module is imported for its help or
+when its command is used, so at its top level it imports nothing heavy.
+"""
 
 from __future__ import annotations
 
 import importlib
+import pkgutil
 
 import click
 
-# Command -> where it is defined. Imported when used: status must not wait for what only calibration needs.
-COMMANDS = {
-    "alarms": "operator",
-    "bench": "bench",
-    "calibrate": "offline",
-    "compare": "compare",
-    "config": "run",
-    "demo": "demo",
-    "devices": "operator",
-    "effects": "effects",
-    "evaluate": "offline",
-    "gap": "gap",
-    "inverse": "inverse",
-    "jobs": "operator",
-    "model": "model",
-    "plan": "plan",
-    "predict": "offline",
-    "replay": "run",
-    "run": "run",
-    "session": "operator",
-    "setup": "operator",
-    "status": "operator",
-    "tip": "tip",
-}
+from daemon.cli import commands
 
 
 class _Commands(click.Group):
-    """The commands, each imported when it is asked for."""
+    """The group of all commands."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
-        return list(COMMANDS)
+        return sorted(module.name for module in pkgutil.iter_modules(commands.__path__))
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002 - as above
-        if cmd_name not in COMMANDS:
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in self.list_commands(ctx):
             return None
-        module = importlib.import_module(f"daemon.cli.{COMMANDS[cmd_name]}")
-        command = module.COMMANDS[cmd_name]
+        command = getattr(importlib.import_module(f"{commands.__name__}.{cmd_name}"), cmd_name)
         assert isinstance(command, click.Command)
         return command
 

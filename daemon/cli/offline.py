@@ -1,56 +1,57 @@
-"""`calibrate`, `evaluate`, `predict`: files in, files out, with the functions that the daemon's jobs run."""
+"""The offline commands' common parts: options, observations in, results out."""
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
-from collections.abc import Iterator
-from concurrent.futures import Executor, ThreadPoolExecutor
+import csv
+import io
+import logging
+import sys
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from calibration.errors import DataError
-from calibration.observations import Floats, Observations, parse_observations
-from calibration.rig import Rig
-from calibration.single_thread import one_blas_thread
-from daemon.checkpoint import FileCheckpoint
-from daemon.cli.csv_output import check_out, deliver, with_columns
-from daemon.cli.options import DIRECTORY, data_option, model_option, prior_option, rig_option, seed_option
-from daemon.cli.output import Command, json_option, progress_display
-from daemon.cli.tables import say, show_evaluation
-from daemon.cli.terminal import Terminal
-from daemon.numba_cache import prepare
-from daemon.rigs import load_rig
+from daemon.cli.terminal import echo, echo_error, echo_list, echo_table
+from daemon.host.safe_output import shown_lines, write_file
 from drivers.clock import NS_PER_S, SystemClock
-from drivers.files import read_whole
 
 if TYPE_CHECKING:
-    from calibration.identification.refinement import Prior
-    from calibration.prediction import Prediction
-    from calibration.residual.conformal import Intervals
-    from calibration.residual.hybrid import Kind
+    from calibration.observations import Floats, Observations
+    from calibration.rig.description import Rig
 
-METHODS = ("default", "pde-paper", "km", "skcm", "rbf-tcm")
-RESIDUALS = ("default", "none", "rbfn", "lightgbm", "chain", "gp")
-CONNECT_TIMEOUT_S = 5
-_DATA_MAX_BYTES = 128 << 20  # half a million fixes
-PREDICTED_COLUMNS = tuple(f"{name}_pred_mm" for name in ("x", "y", "z", "sigma_x", "sigma_y", "sigma_z"))
-INTERVAL_COLUMNS = tuple(f"{name}_pred_mm" for name in ("half90_x", "half90_y", "half90_z", "radius90"))
+DATA_MAX_BYTES = 128 << 20  # half a million fixes
+FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+DIRECTORY = click.Path(path_type=Path)
 
-
-def read_observations(path: Path, rig: Rig, *, positions_required: bool = True) -> tuple[Observations, bytes]:
-    """An observations CSV and its bytes; DataError if it cannot be read or does not fit the rig."""
-    try:
-        data = read_whole(path, _DATA_MAX_BYTES)
-    except OSError as error:
-        raise DataError(str(path), f"cannot be read: {error.strerror}") from error
-    return parse_observations(data, rig, path.name, positions_required=positions_required), data
+rig_option = click.option("--rig", required=True, metavar="RIG", help="Name of a shipped rig, or path of a rig file.")
+data_option = click.option("--data", type=FILE, required=True, metavar="CSV", help="Observations, one row per fix.")
+model_option = click.option(
+    "--model", "directory", type=DIRECTORY, required=True, metavar="DIR", help="The directory calibrate wrote."
+)
+prior_option = click.option(
+    "--prior",
+    type=click.Choice(("recalibration", "as-built")),
+    default="recalibration",
+    show_default=True,
+    help="Trust the rig's build tolerances, or estimate from the data how far off the drawings are.",
+)
+seed_option = click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of every random choice."
+)
+csv_out_option = click.option(
+    "--out", type=DIRECTORY, metavar="CSV", help="Where to write; standard output by default."
+)
+time_limit_option = click.option(
+    "--time-limit",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="SECONDS",
+    help="End each global search after this time, and go on with the best until then.",
+)
 
 
 class Stopwatch:
-    """How long a command takes, and when."""
+    """The time that a command takes, from now on."""
 
     def __init__(self) -> None:
         self._clock = SystemClock()
@@ -58,218 +59,172 @@ class Stopwatch:
 
     @property
     def seconds(self) -> float:
+        """Seconds since it was made."""
         return round((self._clock.monotonic_ns() - self._started_ns) / NS_PER_S, 3)
 
     @property
     def utc_ns(self) -> int:
+        """The present instant."""
         return self._clock.now().utc_ns
 
 
-@click.command(cls=Command)
-@rig_option
-@data_option
-@click.option("--out", type=DIRECTORY, required=True, metavar="DIR", help="Where to write; replaces a model there.")
-@click.option("--method", type=click.Choice(METHODS), default="default", show_default=True, help="How to identify.")
-@click.option(
-    "--effects",
-    default="auto",
-    show_default=True,
-    metavar="auto|none|FAMILY@WHERE,...",
-    help="Named physics to add to the kinematics: `auto` what the data ask for, found as `rigcal gap` does; `rigcal "
-    "effects` lists the families and where they may be.",
-)
-@click.option(
-    "--residual",
-    type=click.Choice(RESIDUALS),
-    default="default",
-    show_default=True,
-    help="Learner of what is left; `default` takes the one that helps on data it has not seen, or none.",
-)
-@prior_option
-@seed_option
-@click.option(
-    "--time-limit",
-    type=click.FloatRange(min=0, min_open=True),
-    metavar="SECONDS",
-    help="End the global search after this time, and go on with the best until then.",
-)
-@click.option(
-    "--dask",
-    metavar="ADDRESS",
-    help="Address of a dask scheduler whose workers share the work (needs the `dask` extra); the result is the same.",
-)
-@json_option
-def calibrate(
-    rig: str,
-    data: Path,
-    out: Path,
-    method: str,
-    effects: str,
-    residual: Kind,
-    prior: Prior,
-    seed: int,
-    time_limit: float | None,
-    dask: str | None,
-    *,
-    as_json: bool,
-) -> dict[str, object]:
-    """Calibrate a rig from observations; write the model and its report to a directory.
+# ---- observations in -------------------------------------------------------------------------------------------------
 
-    The figures are about the rows it was fitted to; `evaluate` gives those for rows it never saw. A global search keeps
-    its state beside DIR (DIR.checkpoint): the same command, killed and given again, goes on where it was.
+
+def read_observations(path: Path, rig: Rig, *, positions_required: bool = True) -> tuple[Observations, bytes]:
+    """Read an observations CSV; return the table and the file's bytes.
+
+    Raises:
+        DataError: the file cannot be read or does not fit the rig.
     """
-    watch = Stopwatch()
-    prepare()
-    from calibration import pipeline
-    from daemon import modelfiles
-    from daemon.report import build_report
-    from daemon.report.from_model import report_input
+    from calibration.errors import DataError
+    from calibration.observations import parse_observations
+    from drivers.files import read_whole
 
-    source = load_rig(rig)
-    _check_effects(effects, method, source.rig)
-    modelfiles.check_target(out)
-    observations, raw = read_observations(data, source.rig)
-    with (
-        FileCheckpoint(out.resolve().with_name(f"{out.resolve().name}.checkpoint")) as checkpoint,
-        progress_display(as_json=as_json) as progress,
-        _cluster(dask) as executor,
-    ):
-        model, training = pipeline.calibrate(
-            source.rig,
-            source.text,
-            observations,
-            seed=seed,
-            prior=prior,
-            method=method,
-            effects=effects,
-            residual=residual,
-            executor=executor,
-            progress=progress,
-            should_stop=None if time_limit is None else lambda: watch.seconds > time_limit,
-            checkpoint=checkpoint,
+    try:
+        data = read_whole(path, DATA_MAX_BYTES)
+    except OSError as error:
+        raise DataError(str(path), f"cannot be read: {error.strerror}") from error
+    return parse_observations(data, rig, path.name, positions_required=positions_required), data
+
+
+def source_line(path: Path, data: bytes) -> str:
+    """Return a file's name and SHA-256, for a report."""
+    import hashlib
+
+    return f"{path.name}, SHA-256 {hashlib.sha256(data).hexdigest()}"
+
+
+# ---- results out -----------------------------------------------------------------------------------------------------
+
+
+def check_out(out: Path | None, data: Path) -> None:
+    """Refuse to write a result over the data that it is made from."""
+    if out is not None and out.exists() and out.samefile(data):
+        raise click.UsageError(f"{out} is the data itself; name another file with --out")
+
+
+def with_columns(raw: bytes, columns: Mapping[str, Floats], dropped: Collection[str] = ()) -> str:
+    """Return an observations CSV as it came, with some columns replaced and others added.
+
+    Args:
+        raw: the file's bytes, which `parse_observations` has read.
+        columns: name -> (n,) numbers, put in place of a column of that name or else after all others.
+        dropped: names of columns to leave out, where they are there.
+    """
+    reader = csv.reader(io.StringIO(raw.decode("utf-8-sig"), newline=""), strict=True)
+    header, *rows = [row for row in reader if row]
+    names = [name.strip() for name in header]
+    keep = [i for i, name in enumerate(names) if name not in dropped]
+    added = [name for name in columns if name not in names]
+    cells = {name: [repr(float(value)) for value in values] for name, values in columns.items()}
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow([*(names[i] for i in keep), *added])
+    for number, row in enumerate(rows):
+        own = (cells[names[i]][number] if names[i] in cells else row[i] for i in keep)
+        writer.writerow([*own, *(cells[name][number] for name in added)])
+    return out.getvalue()
+
+
+def deliver(table: str, result: dict[str, object], warnings: Sequence[str], out: Path | None, *, as_json: bool) -> None:
+    """Give a table and warnings out: to the file, or into the JSON object as "csv", or to standard output.
+
+    Args:
+        table: the CSV.
+        result: the JSON object, which is told where the table is.
+        warnings: for people; in the object they are already.
+        out: the file, None for none.
+        as_json: True if standard output is the object's.
+    """
+    if out is not None:
+        write_file(out, table.encode("utf-8"))
+        result["out"] = str(out)
+    elif as_json:
+        result["csv"] = table
+    else:
+        click.echo(shown_lines(table) if sys.stdout.isatty() else table, nl=False)
+    for warning in () if as_json else warnings:
+        echo_error(f"Warning: {warning}", logging.WARNING)
+
+
+def show_stages(result: Mapping[str, Any], title: str) -> None:
+    """Print errors stage by stage, of all rows and of each prism's, from the result of an evaluation."""
+    from daemon.report.words import number
+
+    figures = ("mean", "rms", "max", "std")
+    rows = []
+    for i, stage in enumerate(result["stages"]):
+        cells = [number(stage[f"{name}_mm"]) for name in figures]
+        cells += [number(stages[i]["rms_mm"]) for stages in result["per_prism"].values()]
+        rows.append([stage["stage"], *cells])
+    header = ["stage", *figures, *(f"rms {prism}" for prism in result["per_prism"])]
+    echo_table(header, rows, title=title, text_columns=(0,), bold=[row[0] == "hybrid" for row in rows])
+
+
+def show_evaluation(result: Mapping[str, Any], rows: str) -> None:
+    """Print the result of `calibrate` or `evaluate`.
+
+    Args:
+        result: the JSON object (docs/formats.md).
+        rows: the rows that the errors are of, e.g. "the 250 fixes it was fitted to".
+    """
+    from daemon.report.words import number
+
+    show_stages(result, f"Position error in mm on {rows}")
+    seen = result["identifiability"]
+    effects = ", ".join(f"{e['family']}@{e['where']}" for e in result["effects"])
+    echo(
+        f"scatter of a fix {number(result['noise_mm'])} mm; effects: {effects or 'none'}; "
+        f"learned residual: {result['residual'] or 'none'}; "
+        f"{seen['rank']} of {seen['parameters']} parameters determined by the data"
+    )
+    covered = result["intervals"]
+    axes = ", ".join(f"{share:.0%}" for share in covered["axis_coverage"])
+    echo(
+        f"{covered['level']:.0%} intervals hold {axes} of the errors of x, y, z and {covered['radius_coverage']:.0%} "
+        "of the 3-D ones"
+    )
+    expected = result["expected_accuracy"]
+    if expected is not None:
+        place = f" at set-up {expected['setup']!r}" if expected["setup"] else ""
+        echo(
+            f"expected of the model itself over the work volume{place}: {number(expected['rms_mm'])} mm RMS, 95 % "
+            f"within {number(expected['p95_mm'])} mm, {expected['where']}"
         )
-        sources = {"data": f"{data.name}, SHA-256 {hashlib.sha256(raw).hexdigest()}"}
-        with ThreadPoolExecutor(1) as pool:  # another process loads the model while this one draws
-            loaded = pool.submit(modelfiles.check_loads, model, out)
-            document = build_report(report_input(training, None, made_utc_ns=watch.utc_ns, sources=sources))
-            loaded.result()
-        modelfiles.write_model(out, model, {modelfiles.REPORT: document.encode("utf-8")})
-    result = training.as_dict(watch.seconds)
-    if not as_json:
-        console = Terminal()
-        show_evaluation(console, result, f"the {len(training)} fixes it was fitted to")
-        say(console, f"Model: {out}   report: {out / modelfiles.REPORT}   {result['seconds']} s")
-    return result
+    if result["axes"]:
+        _show_axes(result["axes"])
+    echo_list("Not determined", seen["unidentifiable"])
+    echo_list("Please note", result["warnings"])
+    if result["ignored_columns"]:
+        echo(f"Ignored columns: {', '.join(result['ignored_columns'])}")
 
 
-@click.command(cls=Command)
-@model_option
-@data_option
-@click.option(
-    "--refit-base",
-    is_flag=True,
-    help="Fit where the base stands in the station's frame, and nothing else, on these rows first.",
-)
-@json_option
-def evaluate(directory: Path, data: Path, *, refit_base: bool, as_json: bool) -> dict[str, object]:
-    """Errors of a model, stage by stage, on observations that it was not fitted to."""
-    watch = Stopwatch()
-    prepare()
-    from calibration import pipeline
-    from daemon.modelfiles import read_model
+def _show_axes(axes: Sequence[Mapping[str, Any]]) -> None:
+    """Print, for each joint, the single-joint sweep that disagrees most with the model."""
+    from daemon.report.words import number
 
-    model = read_model(directory)
-    observations, _ = read_observations(data, model.rig)
-    evaluation = pipeline.evaluate(model, observations, refit_base=refit_base)
-    result = evaluation.as_dict(watch.seconds)
-    if not as_json:
-        show_evaluation(Terminal(), result, f"the {len(evaluation)} fixes of {data.name}")
-    return result
+    def chance(axis: Mapping[str, Any]) -> float:
+        return float(min(axis["p_axis"], axis["p_curve"]))
 
-
-@click.command(cls=Command)
-@model_option
-@data_option
-@click.option("--out", type=DIRECTORY, metavar="CSV", help="Where to write; standard output by default.")
-@click.option(
-    "--intervals",
-    is_flag=True,
-    help="Add half90_x_pred_mm, half90_y_pred_mm, half90_z_pred_mm (a fix is that near to x, y, z with 90 % "
-    "probability, each) and radius90_pred_mm (all three together).",
-)
-@json_option
-def predict(directory: Path, data: Path, out: Path | None, *, intervals: bool, as_json: bool) -> dict[str, object]:
-    """Positions and their standard deviations for joint readings; positions in the data are not needed.
-
-    The result is the data's own columns and the predicted ones. With --json it goes to the file of --out, or else into
-    the object as "csv".
-    """
-    watch = Stopwatch()
-    prepare()
-    from daemon.modelfiles import read_model
-
-    check_out(out, data)
-    model = read_model(directory)
-    observations, raw = read_observations(data, model.rig, positions_required=False)
-    with one_blas_thread(), ThreadPoolExecutor() as pool:
-        prediction = model.predict(observations, pool)
-    columns = _predicted_columns(prediction, model.intervals if intervals else None)
-    table = with_columns(raw, columns, {*PREDICTED_COLUMNS, *INTERVAL_COLUMNS} - set(columns))
-    doubts = model.doubts(observations)
-    result: dict[str, object] = {
-        "rig": model.rig.name,
-        "n": len(observations),
-        "seconds": watch.seconds,
-        "warnings": list(doubts),
-        "ignored_columns": list(observations.ignored_columns),
-    }
-    deliver(table, result, doubts, out, as_json=as_json)
-    return result
-
-
-def _predicted_columns(prediction: Prediction, intervals: Intervals | None) -> dict[str, Floats]:
-    """What predictions add to an observations CSV, and their intervals where they are wanted."""
-    columns = {name: prediction.position_mm[:, i] for i, name in enumerate(PREDICTED_COLUMNS[:3])}
-    columns |= {name: prediction.sigma_mm[:, i] for i, name in enumerate(PREDICTED_COLUMNS[3:])}
-    if intervals is not None:
-        half_mm = intervals.half_mm(prediction.sigma_mm)
-        columns |= {name: half_mm[:, i] for i, name in enumerate(INTERVAL_COLUMNS[:3])}
-        columns[INTERVAL_COLUMNS[3]] = intervals.radius_mm(prediction.sigma_mm)
-    return columns
-
-
-def _check_effects(effects: str, method: str, rig: Rig) -> None:
-    """Refuse effects that are misspelt, that the rig has no place for, or that the method does not take."""
-    if effects in ("auto", "none"):
-        return
-    from calibration.effects.library import parse_effects
-
-    try:
-        parse_effects(effects, rig)
-    except ValueError as error:
-        raise click.BadParameter(str(error), param_hint="--effects") from error
-    if method != "default":
-        raise click.BadParameter(f"--method {method} takes none", param_hint="--effects")
-
-
-@contextlib.contextmanager
-def _cluster(address: str | None) -> Iterator[Executor | None]:
-    """The executor of a dask cluster; None without an address, for threads on this machine."""
-    if address is None:
-        yield None
-        return
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise click.BadParameter(
-            "the `dask` extra is not installed: pip install 'rigcal[dask]'", param_hint="--dask"
-        ) from error
-    try:
-        client = Client(address, timeout=CONNECT_TIMEOUT_S)
-    except (OSError, ValueError) as error:
-        raise click.BadParameter(f"no dask scheduler at {address}: {error}", param_hint="--dask") from error
-    with client:
-        yield client.get_executor()
-
-
-COMMANDS = {"calibrate": calibrate, "evaluate": evaluate, "predict": predict}
+    worst = [
+        min((axis for axis in axes if axis["joint"] == joint), key=chance)
+        for joint in dict.fromkeys(axis["joint"] for axis in axes)
+    ]
+    rows = [
+        [
+            axis["joint"],
+            axis["prism"],
+            f"{number(axis['angle_deg'])} ± {number(axis['angle_sigma_deg'])}",
+            f"{number(axis['offset_mm'])} ± {number(axis['offset_sigma_mm'])}",
+            f"{chance(axis):.2g}",
+        ]
+        for axis in worst
+    ]
+    echo_table(
+        ("joint", "prism", "angle, deg", "offset, mm", "by chance"),
+        rows,
+        title="Axes of single-joint sweeps, measured against the model",
+        text_columns=(0, 1),
+        bold=[bool(axis["sentence"]) for axis in worst],
+    )

@@ -1,4 +1,4 @@
-"""An operator's hands at a simulated rig: starts the daemon, and holds sessions with the commands of any operator."""
+"""A simulated operator: starts the daemon on a simulated rig and holds sessions with the usual commands."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from daemon.control import CommandError, request
+from daemon.commands import CommandError
+from daemon.control.protocol import request
 
 RIG = "swdt82"
 CONFIG = """# Written by rigcal demo. The simulated rig takes the place of the two ports.
@@ -32,7 +33,7 @@ DWELL_S = 3.5
 DEADLINE_S = 600.0
 
 Advance = Callable[[str, int], None]
-"""Told what is going on, and how many steps it has come further."""
+"""Receives a sentence on the progress, and the number of steps done since."""
 
 
 class DemoError(Exception):
@@ -94,7 +95,7 @@ class Operator:
     def record(
         self, prism: str, kind: str, poses: int, advance: Advance, planned: Sequence[dict[str, Any]] = ()
     ) -> str:
-        """One session: control points first and last, poses in between.
+        """Hold one session: control points first and last, poses in between.
 
         Args:
             prism: which the station is aimed at.
@@ -149,7 +150,7 @@ class Operator:
             self.say("session.shoot", point=point)
 
     def _is_ready(self) -> bool:
-        """Whether the daemon answers and the station is locked to a prism."""
+        """Return True if the daemon answers and the station is locked to a prism."""
         try:
             stations = self.say("status")["acquisition"]["stations"]
         except CommandError:

@@ -1,49 +1,106 @@
-"""What commands print for people: text as it is, whoever it comes from.
+"""Lines and tables for people on the terminal.
 
-Names of set-ups, operators, prisms and files are never taken for markup, emoji codes or escape sequences. Colour comes
-from `style=` alone, and from `coloured`.
+Names of set-ups, operators, prisms and files come from anyone: everything is escaped by `shown`. Colour comes from
+styles alone, and only where a terminal shows it.
 """
 
 from __future__ import annotations
 
+import logging
+import os
 import sys
-from typing import Any
+import unicodedata
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 import click
-from rich.console import Console
-from rich.text import Text
 
-from daemon.journal import is_journal, priority_prefix
-from daemon.plain_text import shown, shown_lines
+from daemon.host.safe_output import shown, shown_lines
+from daemon.host.systemd import is_journal, priority_prefix
 
-
-class Terminal(Console):
-    """A console that prints plain text, in tables too; settings are those of `rich.console.Console`."""
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(markup=False, emoji=False, highlight=False, **settings)
-
-    def render_str(self, text: str, **options: Any) -> Text:
-        """Return the text of a line or a cell, safe to show."""
-        return super().render_str(shown(text), **options)
+_LISTED = 10
 
 
-def coloured(text: str, style: str) -> Text:
-    """Return plain text in a colour."""
-    return Text(shown(text), style=style)
+class Coloured(NamedTuple):
+    """A cell of a table in a colour, as `click.style` names it."""
+
+    text: str
+    colour: str
 
 
-def echo(text: object) -> None:
-    """Print lines on standard output."""
-    click.echo(shown_lines(str(text)))
+def echo(text: object = "", **style: Any) -> None:
+    """Print one line on standard output, with the style options of `click.style`."""
+    click.secho(shown(text), color=_color(), **style)
 
 
-def echo_error(text: str, level: int) -> None:
-    """Print lines on standard error; where that is the journal, each with its priority.
+def echo_error(text: str, level: int = logging.INFO) -> None:
+    """Print lines on standard error; in the journal each with its priority.
 
     Args:
-        text: what people should know.
-        level: how important it is, as `logging` has it.
+        text: the lines.
+        level: how important they are, as `logging` has it.
     """
     prefix = priority_prefix(level) if is_journal(sys.stderr) else ""
     click.echo("\n".join(prefix + line for line in shown_lines(text).split("\n")), err=True)
+
+
+def echo_list(title: str, sentences: Sequence[str], most: int = _LISTED) -> None:
+    """Print a titled list of at most `most` sentences; nothing where there are none."""
+    if not sentences:
+        return
+    echo(f"{title}:", bold=True)
+    for sentence in sentences[:most]:
+        echo(f"  - {shown(sentence)}")
+    if len(sentences) > most:
+        echo(f"  and {len(sentences) - most} more (--json has all)")
+
+
+def echo_table(
+    header: Sequence[str],
+    rows: Iterable[Sequence[str | Coloured]],
+    *,
+    title: str = "",
+    text_columns: Sequence[int] | None = None,
+    bold: Sequence[bool] = (),
+) -> None:
+    """Print a table. On a narrow terminal its lines wrap: no number is cut short.
+
+    Args:
+        header: a heading for each column.
+        rows: the cells.
+        title: the line above.
+        text_columns: columns that are set flush left; all by default.
+        bold: one flag a row.
+    """
+    cells = [[cell if isinstance(cell, Coloured) else Coloured(cell, "") for cell in row] for row in rows]
+    texts = [[shown(name) for name in header], *([shown(cell.text) for cell in row] for row in cells)]
+    widths = [max(map(_width, column)) for column in zip(*texts, strict=True)]
+
+    def padded(column: int, text: str) -> str:
+        space = " " * (widths[column] - _width(text))
+        return text + space if text_columns is None or column in text_columns else space + text
+
+    if title:
+        echo(title, bold=True)
+    echo("  ".join(padded(i, text) for i, text in enumerate(texts[0])).rstrip())
+    echo("  ".join("\N{BOX DRAWINGS LIGHT HORIZONTAL}" * width for width in widths))
+    for number, (row, line) in enumerate(zip(cells, texts[1:], strict=True)):
+        is_bold = bool(bold) and bold[number]
+        styled = [
+            click.style(padded(i, text), fg=cell.colour or None, bold=is_bold or None)
+            for i, (cell, text) in enumerate(zip(row, line, strict=True))
+        ]
+        click.echo("  ".join(styled).rstrip(), color=_color())
+
+
+def _width(text: str) -> int:
+    """Return the number of columns that a terminal gives to a text."""
+    if text.isascii():
+        return len(text)
+    narrow = sum(not unicodedata.combining(c) for c in text)
+    return narrow + sum(unicodedata.east_asian_width(c) in "WF" for c in text)
+
+
+def _color() -> bool | None:
+    """Return click's `color`: none where NO_COLOR is set, else as the terminal can (https://no-color.org)."""
+    return False if os.environ.get("NO_COLOR") else None

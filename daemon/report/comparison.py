@@ -7,28 +7,28 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.comparison import FIGURES, NOMINAL, Comparison, MethodResult
-from calibration.residual_comparison import EFFECTS, RESIDUALS
-from daemon.report.drawing import AFTER, BEFORE, INK, MIDDLE, new_figure, plain_log_axis, styled, svg_image
-from daemon.report.markup import escape, items, number, page, paragraph, picture, section, table
+from calibration.experiments.comparison import NOMINAL, Comparison
+from calibration.experiments.residual_comparison import EFFECTS, FIGURES, RESIDUALS, MethodResult
+from daemon.report import drawing, markup
+from daemon.report.words import number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLOURS: Mapping[str, str] = {  # methods and residuals are drawn in two panels, where colours return
-    NOMINAL: BEFORE,
+    NOMINAL: drawing.BEFORE,
     "km": "#e69f00",
     "skcm": "#009e73",
     "rbf-tcm": "#cc79a7",
-    "effects": INK,
-    "table": BEFORE,
-    "rbfn-paper": MIDDLE,
+    "effects": drawing.INK,
+    "table": drawing.BEFORE,
+    "rbfn-paper": drawing.MIDDLE,
     "rbfn": "#e69f00",
     "lightgbm": "#009e73",
     "chain": "#cc79a7",
     "gp": "#56b4e9",
-    "default": AFTER,
-    "pde-paper": MIDDLE,
+    "default": drawing.AFTER,
+    "pde-paper": drawing.MIDDLE,
 }
 HEADER = ("method", "mean", "max", "std", "rms", "mean, training", "seconds", "on top of the kinematics")
 LOWEST = "*"
@@ -38,41 +38,43 @@ _BARS = (("mean_mm", "mean"), ("max_mm", "max"), ("std_mm", "standard deviation"
 
 
 def comparison_page(comparison: Comparison, sources: Mapping[str, str]) -> str:
-    """One self-contained HTML document; `sources` says where the data come from."""
-    with styled():
+    """Return one self-contained HTML document; `sources` is label -> origin of the data."""
+    with drawing.styled():
         content = [
             _head(comparison),
-            section(
+            markup.section(
                 "Errors",
-                table(
+                markup.table(
                     HEADER,
                     table_rows(comparison),
                     caption=f"Position error in mm on {comparison.held_out} held-out fixes; {LOWEST} the lowest",
                     text_columns=TEXT_COLUMNS,
                     classes=["best" if r.method == "default" else "" for r in comparison.results],
                 ),
-                _refusals(comparison),
-                picture(
-                    svg_image(bars(comparison), "Mean, greatest and standard deviation of the error per method"),
+                markup.items(refused) if (refused := refusals(comparison)) else "",
+                drawing.picture(
+                    bars(comparison),
+                    "Mean, greatest and standard deviation of the error per method",
                     "On the held-out fixes; the axes are logarithmic.",
                 ),
-                picture(
-                    svg_image(curves(comparison), "Held-out errors of every method, sorted by size"),
+                drawing.picture(
+                    curves(comparison),
+                    "Held-out errors of every method, sorted by size",
                     "Every method's held-out errors, sorted: at 50 % is the median, at 100 % the worst fix.",
                 ),
             ),
-            section("Where this comes from", table((), list(map(list, sources.items())), text_columns=(0, 1))),
+            markup.sources_section(sources),
         ]
-    return page(f"Methods compared: {comparison.rig}", "".join(content))
+    return markup.page(f"Methods compared: {comparison.rig}", "".join(content))
 
 
 def label(method: str) -> str:
-    """A row's name: a method by the name that `calibrate --method` takes, a residual by that of `--residual`."""
+    """Return a row's name: a method by the name that `calibrate --method` takes, a residual by that of `--residual`."""
     return f"residual {'none' if method == EFFECTS else method}" if method in RESIDUALS else method
 
 
 def table_rows(comparison: Comparison) -> list[list[str]]:
-    """Cells as in `HEADER`, the lowest of each column of held-out errors marked."""
+    """Return cells as in `HEADER`, the lowest of each column of held-out errors marked."""
     lowest = {figure: comparison.lowest(figure) for figure in FIGURES if figure != _TRAINING}
     rows = []
     for result in comparison.results:
@@ -93,20 +95,20 @@ def table_rows(comparison: Comparison) -> list[list[str]]:
 
 
 def refusals(comparison: Comparison) -> list[str]:
-    """A sentence for every method that does not apply."""
+    """Return a sentence for every method that does not apply."""
     return [f"{label(r.method)}: not applicable: {r.reason}" for r in comparison.results if r.reason is not None]
 
 
 def bars(comparison: Comparison) -> Figure:
-    """Mean, greatest and standard deviation of the held-out error, a bar for every method."""
+    """Draw mean, greatest and standard deviation of the held-out error, a bar for every method."""
     from matplotlib.ticker import LogLocator
 
     results = _applicable(comparison)
-    figure = new_figure(0.9 + 0.34 * len(results))
+    figure = drawing.new_figure(0.9 + 0.34 * len(results))
     for axes, (key, title) in zip(figure.subplots(1, len(_BARS), sharey=True), _BARS, strict=True):
         values = [value for r in results if isinstance(value := r.as_dict()[key], float)]
         drawn = axes.barh(range(len(values)), values, height=0.62, color=[_COLOURS[r.method] for r in results])
-        plain_log_axis(axes, "x")
+        drawing.plain_log_axis(axes, "x")
         axes.xaxis.set_major_locator(LogLocator(10))
         low, high = max(min(values), 1e-6), max(values)
         span = max(high / low, 2.0)
@@ -115,21 +117,21 @@ def bars(comparison: Comparison) -> Figure:
         axes.set_title(title)
         axes.set_xlabel("mm")
         axes.grid(False, axis="y")
-        axes.tick_params(axis="y", length=0, labelcolor=INK)
+        axes.tick_params(axis="y", length=0, labelcolor=drawing.INK)
         axes.set_yticks(range(len(results)), [label(r.method) for r in results])
     figure.axes[0].invert_yaxis()
     return figure
 
 
 def curves(comparison: Comparison) -> Figure:
-    """Held-out errors in rising order: of the methods, and of the residuals on the default's kinematics."""
+    """Draw held-out errors in rising order: of the methods, and of the residuals on the default's kinematics."""
     results = _applicable(comparison)
     panels = {
         "methods": [r for r in results if r.method not in RESIDUALS],
         "residuals on the default's kinematics": [r for r in results if r.method in (*RESIDUALS, "default")],
     }
     drawn = {title: part for title, part in panels.items() if len(part) > 1}
-    figure = new_figure(4.6)
+    figure = drawing.new_figure(4.6)
     for axes, (title, part) in zip(
         figure.subplots(1, len(drawn), sharey=True, squeeze=False)[0], drawn.items(), strict=True
     ):
@@ -138,7 +140,7 @@ def curves(comparison: Comparison) -> Figure:
             share = 100.0 * (np.arange(len(result.error_mm)) + 1) / len(result.error_mm)
             look = {"color": _COLOURS[result.method], "label": label(result.method)}
             axes.plot(share, np.sort(result.error_mm), linewidth=2.4 if result.method == "default" else 1.4, **look)
-        plain_log_axis(axes)
+        drawing.plain_log_axis(axes)
         axes.set_xlim(0, 100)
         axes.set_title(title)
         axes.set_xlabel("share of the held-out fixes with at most this error, %")
@@ -152,7 +154,7 @@ def _applicable(comparison: Comparison) -> list[MethodResult]:
 
 
 def headline(comparison: Comparison) -> str:
-    """The result in one sentence."""
+    """Say the result in one sentence."""
     lowest = comparison.lowest("mean_mm")
     # Residuals that are left out tie with none.
     best = max((r for r in comparison.results if r.method in lowest), key=lambda r: r.method == "default")
@@ -167,31 +169,15 @@ def headline(comparison: Comparison) -> str:
 
 
 def _head(comparison: Comparison) -> str:
-    result = comparison.as_dict()
-    warnings = result["warnings"]
-    assert isinstance(warnings, list)
-    return (
-        f"<header><h1>Methods compared: {escape(comparison.rig)}</h1>"
-        + paragraph(f"{comparison.training} training fixes and {comparison.held_out} held-out ones")
-        + f'<p class="headline">{escape(headline(comparison)).replace(" mm", "&nbsp;mm")}</p>'
-        + paragraph(
-            "Every method was calibrated on the same training fixes and judged on the held-out ones, by its last "
-            "stage. Names are those of `calibrate --method` and `--residual`. Rows from \u201cresidual none\u201d to "
-            "the default share one identification, and differ in what is learned on top of it; `table` is a table of "
-            "corrections and `rbfn-paper` a published network. Seconds are of the whole calibration.",
-            "lead",
-        )
-        + f"</header>{notice(warnings)}"
+    lead = (
+        "Every method was calibrated on the same training fixes and judged on the held-out ones, by its last "
+        "stage. Names are those of `calibrate --method` and `--residual`. Rows from \u201cresidual none\u201d to "
+        "the default share one identification, and differ in what is learned on top of it; `table` is a table of "
+        "corrections and `rbfn-paper` a published network. Seconds are of the whole calibration."
     )
-
-
-def notice(warnings: list[str]) -> str:
-    """A box of sentences, nothing where there are none."""
-    if not warnings:
-        return ""
-    return f'<div class="notice" role="note"><strong>Please note</strong>{items(warnings)}</div>'
-
-
-def _refusals(comparison: Comparison) -> str:
-    sentences = refusals(comparison)
-    return items(sentences) if sentences else ""
+    warnings = comparison.as_dict()["warnings"]  # with the methods' notes
+    assert isinstance(warnings, list)
+    fixes = f"{comparison.training} training fixes and {comparison.held_out} held-out ones"
+    return markup.header(f"Methods compared: {comparison.rig}", fixes, headline(comparison), lead) + markup.notice(
+        warnings
+    )

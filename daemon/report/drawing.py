@@ -1,16 +1,24 @@
-"""How every plot of a report looks, and how a figure becomes bytes; drawn on Agg and SVG canvases, with no display."""
+"""The look of all plots, the parts that several of them have, and figures as SVG; drawn with no display."""
 
 from __future__ import annotations
 
 import base64
 import html
 import io
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calibration.observations import Floats
+from daemon.host.safe_output import shown
+from daemon.report.markup import escape
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 # Okabe and Ito's palette: told apart by readers with any colour vision, and apart in grey as well.
 BEFORE = "#8c8c8c"
@@ -51,40 +59,41 @@ _STYLE: Any = {
 RASTER_DPI = 150
 WIDTH_IN = 9.6
 LABEL_CHARACTERS = 60  # of a name beside an axis
-MINUS = "\N{MINUS SIGN}"
+_DOTS_MAX = 4000  # in a map
+FLOOR_MM = 1e-3  # below this an error has no place on a logarithmic axis
 
 
 def styled() -> AbstractContextManager[None]:
-    """A context in which figures have the report's look; settings are the process's, so one thread draws."""
+    """Return a context in which figures have the report's look; settings are the process's, so one thread draws."""
     import matplotlib
 
     return matplotlib.rc_context(_STYLE)
 
 
 def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
-    """An empty figure that belongs to no window."""
+    """Return an empty figure that belongs to no window."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_in, height_in), layout="constrained")
 
 
-def svg_image(figure: Figure, description: str) -> str:
-    """An `<img>` element that holds the figure itself; `description` is read out to those who cannot see it."""
+def picture(figure: Figure, description: str, caption: str) -> str:
+    """Return the HTML of a figure, which holds the drawing itself, with its caption.
+
+    Args:
+        figure: the drawing.
+        description: its content in words, which screen readers read out.
+        caption: the sentences below.
+    """
     out = io.BytesIO()
     figure.savefig(out, format="svg", dpi=RASTER_DPI, metadata={"Date": None, "Creator": None})
     data = base64.b64encode(out.getvalue()).decode("ascii")
-    return f'<img alt="{html.escape(description, quote=True)}" src="data:image/svg+xml;base64,{data}">'
-
-
-def png_bytes(figure: Figure, dpi: int = 150) -> bytes:
-    """The figure as a PNG file."""
-    out = io.BytesIO()
-    figure.savefig(out, format="png", dpi=dpi, metadata={"Software": None})
-    return out.getvalue()
+    image = f'<img alt="{html.escape(description, quote=True)}" src="data:image/svg+xml;base64,{data}">'
+    return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
 def plain_log_axis(axes: Axes, which: str = "y") -> None:
-    """Logarithmic scale with ticks written as plain numbers (0.5, 1, 2, 5, 10, ...)."""
+    """Set a logarithmic scale with ticks written as plain numbers (0.5, 1, 2, 5, 10, ...)."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axis = axes.yaxis if which == "y" else axes.xaxis
@@ -95,3 +104,134 @@ def plain_log_axis(axes: Axes, which: str = "y") -> None:
     axis.set_major_locator(LogLocator(10, subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
+
+
+def sizes_mm(errors_mm: Floats) -> Floats:
+    """Return the (n,) lengths of (n, 3) errors."""
+    return np.asarray(np.linalg.norm(errors_mm, axis=1))
+
+
+def scatter(axes: Axes, x: Floats, y: Floats, colour: str, *, size: float = 7.0, alpha: float = 0.55) -> None:
+    """Draw dots without edges."""
+    # Many dots are drawn as a picture inside the SVG, a few as shapes.
+    axes.scatter(x, y, s=size, c=colour, alpha=alpha, linewidths=0, rasterized=len(x) > 200)
+
+
+def key(colour: str, label: str) -> Line2D:
+    """Return a dot for a legend."""
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], marker="o", linestyle="", color=colour, markersize=5, label=label)
+
+
+def robust_reach(errors_mm: Floats) -> float:
+    """Return the limit of an axis of errors, mm."""
+    # Five standard deviations of the bulk: a few gross errors must not flatten everything else.
+    reach = 5 * 1.4826 * float(np.median(np.abs(errors_mm)))
+    return max(min(reach, 1.05 * float(np.max(np.abs(errors_mm)))), FLOOR_MM)
+
+
+def running_median(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """Return rising places along x and the median of y about each."""
+    # Medians of groups with equally many fixes; a joint that did not move has one.
+    order = np.argsort(x, kind="stable")
+    groups = np.array_split(order, max(1, min(40, len(x) // 12)))
+    middles = np.array([np.median(x[group]) for group in groups])
+    keep = np.append(True, np.diff(middles) > 0)
+    medians = np.array([np.median(y[group]) for group in groups])
+    return middles[keep], medians[keep]
+
+
+def forward_axis(position_mm: Floats) -> int:
+    """Return the axis, x (0) or y (1), along which a machine with its prisms at (n, 3), base frame, reaches forward.
+
+    In the side view that direction runs across the page.
+    """
+    x, y, _ = np.abs(np.median(position_mm, axis=0))
+    return int(y > x)
+
+
+def views(plan: Axes, side: Axes, forward: int) -> None:
+    """Label a plan and a side view, m, and mark the base's origin."""
+    for axes, title, horizontal, vertical in ((plan, "Plan view", "x", "y"), (side, "Side view", "xy"[forward], "z")):
+        axes.set_title(title)
+        axes.set_xlabel(f"{horizontal}, m")
+        axes.set_ylabel(f"{vertical}, m")
+        axes.plot(0, 0, marker="+", color=INK, markersize=9)
+        axes.set_aspect("equal", adjustable="datalim")
+
+
+def name_rows(axes: Axes, names: Sequence[str], ends: tuple[float, float], *, size: float | None = None) -> None:
+    """Give horizontal bars their names.
+
+    Args:
+        axes: with a bar at each of 0, 1, 2, ... from the top.
+        names: of the bars; long ones are cut.
+        ends: lower and upper end of the axis.
+        size: of the names, points; the usual one by default.
+    """
+    axes.set_yticks(range(len(names)), [shown(name, LABEL_CHARACTERS) for name in names])
+    axes.tick_params(axis="y", length=0, labelcolor=INK, labelsize=size)
+    axes.set_ylim(*ends)
+    axes.grid(False, axis="y")
+
+
+def dots_and_medians(
+    axes: Axes, x: Floats, layers: Sequence[tuple[Floats, str]], limit: float, *, size: float, alpha: float
+) -> None:
+    """Draw layers of values, each with its colour, against x with running medians; outliers are put at the edge."""
+    for values, colour in layers:
+        scatter(axes, x, np.clip(values, -limit, limit), colour, size=size, alpha=alpha)
+    for values, colour in layers:
+        line = running_median(x, values)
+        axes.plot(*line, color="white", linewidth=3.2)
+        axes.plot(*line, color=colour, linewidth=1.6)
+    axes.axhline(0, color=SOFT, linewidth=0.7)
+    axes.set_ylim(-limit * 1.05, limit * 1.05)
+
+
+def map_errors(
+    figure: Figure,
+    layers: Sequence[tuple[str, Floats]],
+    place_mm: Floats,
+    forward: int,
+    *,
+    size: float,
+    shrink: float,
+    label: str,
+) -> None:
+    """Draw errors over the work volume from above and from the side, on one scale of colours.
+
+    Args:
+        figure: an empty one.
+        layers: for each row of views a word for their titles and the (n,) sizes of the errors, mm.
+        place_mm: (n, 3) positions in the base frame.
+        forward: as `forward_axis`.
+        size: of a dot.
+        shrink: length of the scale, as a share of the figure.
+        label: of the scale.
+    """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    first = layers[0][1]
+    top = min(float(first.max()), 3.0 * float(np.median(first)))  # gross errors must not flatten the rest
+    scale = Normalize(0.0, max(top, FLOOR_MM))
+    grid = figure.subplots(len(layers), 2, squeeze=False)
+    for (word, errors_mm), (plan, side) in zip(layers, grid, strict=True):
+        order = np.argsort(errors_mm, kind="stable")[-_DOTS_MAX:]  # the largest on top
+        x, y, z = place_mm[order].T / 1000.0
+        for axes, horizontal, vertical in ((plan, x, y), (side, (x, y)[forward], z)):
+            axes.scatter(
+                horizontal, vertical, c=errors_mm[order], s=size, norm=scale, linewidths=0, cmap="viridis_r",
+                rasterized=len(order) > 200,
+            )  # fmt: skip
+        views(plan, side, forward)
+        if word:
+            plan.set_title(f"Plan view, {word}")
+            side.set_title(f"Side view, {word}")
+    bar = figure.colorbar(
+        ScalarMappable(scale, "viridis_r"), ax=grid.ravel().tolist(), shrink=shrink, pad=0.01, extend="max"
+    )
+    bar.set_label(label)
+    bar.outline.set_visible(False)

@@ -1,4 +1,4 @@
-"""From a calibrated model and its evaluations to what a report shows."""
+"""The calibration report's input from a calibrated model and its evaluations."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import numpy as np
 
 from calibration.effects.base import FittedCoefficient
 from calibration.effects.fitted import AppliedEffects
-from calibration.identification.samples import joint_rates, reading_covariance, station_covariance
-from calibration.model import CalibratedModel
+from calibration.evaluation.evaluation import Evaluation
+from calibration.identification.noise import joint_rates, reading_covariance, station_covariance
+from calibration.model.model import CalibratedModel
+from calibration.model.prediction import Predictor
 from calibration.observations import Observations
-from calibration.pipeline import Evaluation
-from calibration.residual.hybrid import tree_importance
+from calibration.residual.learners import tree_importance
 from daemon.report.inputs import (
     STAGES,
     EffectLine,
@@ -25,7 +26,7 @@ from daemon.report.inputs import (
     ReportInput,
     SetupLine,
 )
-from daemon.report.units import readable_unit
+from daemon.report.words import readable_unit
 from drivers.clock import NS_PER_S
 
 _LIBRARIES = ("rigcal", "numpy", "scipy", "numba", "lightgbm")
@@ -48,7 +49,7 @@ def report_input(
     sources: Mapping[str, str] | None = None,
     setups: Sequence[SetupLine] = (),
 ) -> ReportInput:
-    """Gather what a report shows.
+    """Gather the content of a calibration report.
 
     Args:
         training: the model on the rows it was fitted to.
@@ -88,19 +89,25 @@ def report_input(
 
 def _error_table(evaluation: Evaluation) -> ErrorTable:
     model, observations = evaluation.model, evaluation.observations
-    chain = model.chain
-    origin = np.array([chain.base(model.values, s).translation_mm for s in range(len(chain.setups))])
-    from_base_mm = observations.position_mm - origin[chain.bind(observations).setup]
+    predictor = Predictor.of(model)
     return ErrorTable(
         prism=observations.prism,
         joints=observations.joints,
-        position_mm=model.to_base(observations, from_base_mm),
-        errors_mm={stage: model.to_base(observations, evaluation.errors_mm[stage]) for stage in STAGES},
+        position_mm=measured_in_base_mm(model, observations),
+        errors_mm={stage: predictor.to_base(observations, evaluation.errors_mm[stage]) for stage in STAGES},
     )
 
 
+def measured_in_base_mm(model: CalibratedModel, observations: Observations) -> Floats:
+    """Return the (n, 3) measured positions in the rig's base frame."""
+    chain = model.chain
+    origin = np.array([chain.base(model.values, s).translation_mm for s in range(len(chain.setups))])
+    from_base_mm = observations.position_mm - origin[chain.bind(observations).setup]
+    return Predictor.of(model).to_base(observations, from_base_mm)
+
+
 def _instrument_mm(model: CalibratedModel, observations: Observations) -> float:
-    lin, _ = model.linearise(observations)
+    lin = Predictor.of(model).linearise(observations)
     station: Floats = station_covariance(model.rig, lin.position_mm, observations.sigma_mm)
     readings = reading_covariance(model.rig, lin.joint_jacobian, joint_rates(model.rig, observations))
     return math.sqrt(float(np.trace(station + readings, axis1=1, axis2=2).mean()))
@@ -123,15 +130,14 @@ def _parameters(model: CalibratedModel) -> Iterator[ParameterLine]:
 
 def _effects(training: Evaluation) -> Iterator[EffectLine]:
     model, observations = training.model, training.observations
-    situation = model.predictor.situation(observations)
+    situation = Predictor.of(model).context(observations)
     for effect in model.effects:
         alone = AppliedEffects((effect,), model.chain)
         columns = alone.columns(situation)
-        shifted_mm = alone.shifted_mm(columns)
-        if shifted_mm is None:
-            change, unit = np.abs(alone.change(columns)).max(), model.rig.joint(effect.where).unit
+        if columns.shift_mm is None:
+            change, unit = np.abs(columns.column @ alone.values).max(), model.rig.joint(effect.where).unit
         else:
-            change, unit = np.linalg.norm(shifted_mm, axis=1).max(), "mm"
+            change, unit = np.linalg.norm(columns.shifted_mm(alone.values), axis=1).max(), "mm"
         yield EffectLine(
             family=effect.family,
             where=effect.where,
@@ -142,7 +148,7 @@ def _effects(training: Evaluation) -> Iterator[EffectLine]:
 
 
 def _readable(coefficient: FittedCoefficient) -> tuple[str, float, float, str]:
-    """Name, value, standard error and unit, without long rows of zeros."""
+    """Return name, value, standard error and unit, without long rows of zeros."""
     suffix, scale, unit = _SMALL_UNITS.get(
         coefficient.unit, ("", *readable_unit(coefficient.unit, abs(coefficient.value)))
     )
@@ -161,7 +167,13 @@ def _outliers(training: Evaluation) -> Iterator[OutlierLine]:
 
 
 def provenance(model: CalibratedModel, made_utc_ns: int | None, sources: Mapping[str, str]) -> dict[str, str]:
-    """Label -> text: when, from what and by which versions; `sources` are further lines, before those of the model."""
+    """Return label -> text: time, sources, the model's own provenance, and versions.
+
+    Args:
+        model: the model.
+        made_utc_ns: time of the report; None to leave it out.
+        sources: further lines, before those of the model.
+    """
     lines = {"rig": model.rig.name, **sources}
     if made_utc_ns is not None:
         made = datetime.fromtimestamp(made_utc_ns // NS_PER_S, UTC)

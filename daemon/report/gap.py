@@ -1,4 +1,4 @@
-"""The gap workflow's report: one HTML file that says what the simulation lacks, and how that is known."""
+"""The gap report: one HTML page on the effects that the simulation lacks, and the evidence for them."""
 
 from __future__ import annotations
 
@@ -8,43 +8,46 @@ from typing import TypeVar
 
 import numpy as np
 
-from calibration.effects.base import Situation
+from calibration.effects.context import EffectContext
 from calibration.effects.fitted import FittedEffect
 from calibration.effects.library import library
-from calibration.gap.result import Candidate, Forecast, Gap
+from calibration.gap.result import Candidate, Forecast, GapResult
+from daemon.report import drawing, markup
 from daemon.report import gap_figures as figures
-from daemon.report.drawing import styled, svg_image
 from daemon.report.gap_figures import Bar, Interval
-from daemon.report.gap_words import (
-    before_and_after,
+from daemon.report.gap_words import before_and_after, closed_share, dependence, gap_headline, remaining
+from daemon.report.words import (
+    DASH,
+    INTERVAL_SIGMAS,
+    PLUS_MINUS,
     chance,
-    closed_share,
-    dependence,
-    gap_headline,
     listed,
+    number,
     odds,
     place_name,
     probability,
-    remaining,
+    readable_unit,
     spoken,
 )
-from daemon.report.markup import escape, items, number, page, paragraph, picture, section, table
-from daemon.report.units import readable_unit
 
 _Key = TypeVar("_Key", bound=Hashable)
 _CANDIDATES_SHOWN = 6
 _POSES_SHOWN = 12
 _LEAST_SEPARATION = 0.1
-_CHANCE = 2.0  # standard errors of a 95 % interval
 _COLUMNS = {
     "time_s": ("Time", "time since the first fix, h", 3600.0),
     "temperature_degC": ("Temperature", "deg C", 1.0),
 }
 
 
-def gap_report(gap: Gap, sources: Mapping[str, str]) -> str:
-    """One self-contained HTML document, the same bytes for the same input; `sources` says where the data are from."""
-    with styled():
+def gap_report(gap: GapResult, sources: Mapping[str, str]) -> str:
+    """Return one self-contained HTML document, the same bytes for the same input.
+
+    Args:
+        gap: the workflow's answer.
+        sources: label -> origin of the data.
+    """
+    with drawing.styled():
         parts = [
             _head(gap),
             _steps(gap),
@@ -53,13 +56,13 @@ def gap_report(gap: Gap, sources: Mapping[str, str]) -> str:
             _candidates(gap),
             _not_shown(gap),
             _next(gap),
-            section("Where this comes from", table((), [list(s) for s in sources.items()], text_columns=(0, 1))),
+            markup.sources_section(sources),
         ]
-    return page(f"Gap between simulation and {gap.model.rig.name}", "".join(parts))
+    return markup.page(f"Gap between simulation and {gap.model.rig.name}", "".join(parts))
 
 
-def intervals(gap: Gap) -> list[Interval]:
-    """Every adopted coefficient that has bounds, in units for people."""
+def intervals(gap: GapResult) -> list[Interval]:
+    """Return every adopted coefficient that has bounds, in readable units."""
     found = []
     for effect in gap.effects:
         bounds = coefficient_bounds(gap, effect)
@@ -82,9 +85,9 @@ def intervals(gap: Gap) -> list[Interval]:
     return found
 
 
-def coefficient_bounds(gap: Gap, effect: FittedEffect) -> dict[str, tuple[float, float]]:
-    """Name of a coefficient -> its hard limits, where it has any: those it was weighed with, else the library's."""
-    situation = Situation(gap.model.chain, gap.model.values, gap.observations)
+def coefficient_bounds(gap: GapResult, effect: FittedEffect) -> dict[str, tuple[float, float]]:
+    """Return coefficient -> its hard limits, if any: those it was weighed with, else the library's."""
+    situation = EffectContext(gap.model.chain, gap.model.values, gap.observations)
     family = library()[effect.family]
     limits = {c.name: (c.lower, c.upper) for c in family.coefficients(situation, effect.where, effect.settings)}
     limits |= family.reported_limits()
@@ -97,31 +100,22 @@ def coefficient_bounds(gap: Gap, effect: FittedEffect) -> dict[str, tuple[float,
 # ---- sections --------------------------------------------------------------------------------------------------------
 
 
-def _head(gap: Gap) -> str:
-    before, after, what = before_and_after(gap)
-    tiles = [("", f"error of the simulation, {what}", number(before), "mm")]
+def _head(gap: GapResult) -> str:
+    before, after, rows = before_and_after(gap)
+    tiles = [markup.Tile(f"error of the simulation, {rows}", number(before))]
     if gap.effects:
         share = closed_share(before, after, gap.noise_mm)
-        closed = "\N{EN DASH}" if share is None else f"{100 * share:.0f}"
+        closed = DASH if share is None else f"{100 * share:.0f}"
         tiles += [
-            ("after", "error with the effects found", number(after), "mm"),
-            ("after", "of the gap above the noise closed", closed, "%"),
+            markup.Tile("error with the effects found", number(after), kind="after"),
+            markup.Tile("of the gap above the noise closed", closed, "%", "after"),
         ]
-    tiles.append(("", f"noise floor, {gap.noise_source}", number(gap.noise_mm), "mm"))
-    figures_ = "".join(
-        f'<div class="{kind}"><dt>{escape(label)}</dt><dd>{escape(value)} <small>{unit}</small></dd></div>'
-        for kind, label, value, unit in tiles
-    )
-    notice = f'<div class="notice" role="note"><strong>Please note</strong>{items(gap.warnings)}</div>'
-    return (
-        f"<header><h1>Gap report: {escape(gap.model.rig.name)}</h1>"
-        f"{paragraph(f'{len(gap.observations)} fixes; verdict: {gap.verdict}')}"
-        f'<p class="headline">{escape(gap_headline(gap))}</p>{paragraph(_meaning(gap), "lead")}'
-        f'<dl class="figures">{figures_}</dl></header>{notice if gap.warnings else ""}'
-    )
+    tiles.append(markup.Tile(f"noise floor, {gap.noise_source}", number(gap.noise_mm)))
+    title, below = f"Gap report: {gap.model.rig.name}", f"{len(gap.observations)} fixes; verdict: {gap.verdict}"
+    return markup.header(title, below, gap_headline(gap), _meaning(gap), tiles) + markup.notice(gap.warnings)
 
 
-def _meaning(gap: Gap) -> str:
+def _meaning(gap: GapResult) -> str:
     sentences = []
     if gap.verdict == "named":
         sentences.append("It is part of the model now, fitted together with the lengths and angles.")
@@ -139,26 +133,25 @@ def _meaning(gap: Gap) -> str:
     return " ".join(sentences)
 
 
-def _steps(gap: Gap) -> str:
+def _steps(gap: GapResult) -> str:
     if not gap.rounds:
         return ""
-    return section(
+    return markup.section(
         "From the simulation down to the noise",
-        paragraph(
+        markup.paragraph(
             "How far the simulation is off in poses that it was not fitted to, each time after the effect that the "
             "data named was added. Where the bars reach the dashed line there is nothing left to find."
         ),
-        picture(
-            svg_image(
-                figures.steps(list(bars(gap)), gap.noise_mm), "Held-out error round by round, and the noise floor"
-            ),
+        drawing.picture(
+            figures.steps(list(bars(gap)), gap.noise_mm),
+            "Held-out error round by round, and the noise floor",
             f"Root mean square error {before_and_after(gap)[2]}. The noise floor is {gap.noise_source}.",
         ),
     )
 
 
-def bars(gap: Gap) -> Iterator[Bar]:
-    """The rounds as steps; a round's error is that before its own effects were adopted."""
+def bars(gap: GapResult) -> Iterator[Bar]:
+    """Return the rounds as steps; a round's error is that before its own effects were adopted."""
     label = "calibrated kinematics"
     for number_, round_ in enumerate(gap.rounds):
         if number_ == 0 or gap.rounds[number_ - 1].adopted:
@@ -166,56 +159,72 @@ def bars(gap: Gap) -> Iterator[Bar]:
         label = "+ " + spoken([(family, where) for family, _, where in (a.partition("@") for a in round_.adopted)])
 
 
-def _found(gap: Gap) -> str:
+def _found(gap: GapResult) -> str:
     if not gap.effects:
         return ""
     rows = []
     for effect in gap.effects:
-        certain = probability(gap.posterior[f"{effect.family}@{effect.where}"])
+        posterior = probability(gap.posterior[f"{effect.family}@{effect.where}"])
         name = effect.family.replace("_", " ")
-        head = [f"{name} ({effect.form})" if effect.form else name, effect.where, certain]
+        head = [f"{name} ({effect.form})" if effect.form else name, effect.where]
         bounds = coefficient_bounds(gap, effect)
         for c in effect.reported:
             ends = bounds.get(c.name)
             scale, unit = readable_unit(c.unit, max(map(abs, ends)) if ends else abs(c.value))
             limits = f"{number(ends[0] * scale)} .. {number(ends[1] * scale)}" if ends else ""
-            interval = f"\N{PLUS-MINUS SIGN} {number(_CHANCE * c.standard_error * scale, 2)}"
-            rows.append([*head, c.name, number(c.value * scale), interval, limits, unit])
-            head = [""] * 3
-    header = ["effect", "where", "probability", "coefficient", "value", "95 % interval", "hard bounds", "unit"]
+            interval = f"{PLUS_MINUS} {number(INTERVAL_SIGMAS * c.standard_error * scale, 2)}"
+            rows.append([*head, c.name, number(c.value * scale), interval, unit, limits, posterior])
+            head, posterior = ["", ""], ""
+    columns = [
+        "effect",
+        "where",
+        "coefficient",
+        "value",
+        "95 % interval",
+        "unit",
+        "hard bounds",
+        "posterior probability",
+    ]
     lines = intervals(gap)
-    drawn = lines and picture(
-        svg_image(figures.coefficients(lines), "Coefficients with their intervals between their hard bounds"),
+    drawn = lines and drawing.picture(
+        figures.coefficients(lines),
+        "Coefficients with their intervals between their hard bounds",
         "From one hard bound (black) to the other; light blue is what is plausible beforehand (1 sigma). The dot is "
         "what was found, the line its 95 % interval.",
     )
     names = dict.fromkeys(effect.family for effect in gap.effects)
-    return section(
+    return markup.section(
         "What was missing",
-        "".join(paragraph(f"{name.replace('_', ' ').capitalize()}: {library()[name].equation}.") for name in names),
-        table(header, rows, text_columns=(0, 1, 3, 7)),
+        "".join(
+            markup.paragraph(f"{name.replace('_', ' ').capitalize()}: {library()[name].equation}.") for name in names
+        ),
+        markup.table(columns, rows, text_columns=(0, 1, 2, 5)),
         drawn or "",
     )
 
 
-def _where(gap: Gap) -> str:
+def _where(gap: GapResult) -> str:
     rows = [[d.where, d.variable, chance(d.p)] for d in gap.disagreements]
     found = (
-        paragraph("Patterns in what calibrated kinematics leave, beyond chance; corrected for all that was looked at.")
-        + table(["where", "depends on", "by chance"], rows, text_columns=(0, 1))
+        markup.paragraph(
+            "Patterns in what calibrated kinematics leave, beyond chance; corrected for all that was looked at."
+        )
+        + markup.table(["where", "depends on", "by chance"], rows, text_columns=(0, 1))
         if rows
-        else paragraph("No pattern in what calibrated kinematics leave is beyond chance.")
+        else markup.paragraph("No pattern in what calibrated kinematics leave is beyond chance.")
     )
     content = [
         found,
         "<h3>Over the work volume</h3>",
-        picture(
-            svg_image(figures.error_maps(gap), "Error over the work volume in plan and side view"),
+        drawing.picture(
+            figures.error_maps(gap),
+            "Error over the work volume in plan and side view",
             "Prism positions in the rig's base frame; the cross is its origin, dark is worse.",
         ),
         "<h3>Joint by joint</h3>",
-        picture(
-            svg_image(figures.by_joint(gap), "Apparent error of each joint against its reading"),
+        drawing.picture(
+            figures.by_joint(gap),
+            "Apparent error of each joint against its reading",
             "The error each joint would have to make, were it alone to blame, with running medians. A joint to blame "
             "shows a curve; one beside it shows an echo.",
         ),
@@ -224,8 +233,9 @@ def _where(gap: Gap) -> str:
     if direction is not None:
         content += [
             "<h3>By direction of approach</h3>",
-            picture(
-                svg_image(direction, "Mean apparent error of each joint by the direction of its last motion"),
+            drawing.picture(
+                direction,
+                "Mean apparent error of each joint by the direction of its last motion",
                 "Mean error of each joint with its 95 % interval, after its reading fell (\N{DOWNWARDS ARROW}) and "
                 "after it rose (\N{UPWARDS ARROW}). A slope is play or friction.",
             ),
@@ -237,23 +247,24 @@ def _where(gap: Gap) -> str:
         shown = (values - (np.nanmin(values) if column == "time_s" else 0.0)) / unit
         content += [
             f"<h3>{title}</h3>",
-            picture(
-                svg_image(figures.against(gap, shown, label), f"Components of the error against {title.lower()}"),
+            drawing.picture(
+                figures.against(gap, shown, label),
+                f"Components of the error against {title.lower()}",
                 "Measured minus simulated, in the station's frame, with running medians.",
             ),
         ]
     content += [
         "<h3>By prism and component</h3>",
-        picture(svg_image(figures.by_prism(gap), "Error by prism and by component"), "Over all fixes, outliers too."),
+        drawing.picture(figures.by_prism(gap), "Error by prism and by component", "Over all fixes, outliers too."),
     ]
-    return section("Where simulation and measurement disagree", *content)
+    return markup.section("Where simulation and measurement disagree", *content)
 
 
-def _candidates(gap: Gap) -> str:
+def _candidates(gap: GapResult) -> str:
     content = [
-        paragraph(
-            "Every effect of the library was weighed against all others and against none. Probabilities are of the "
-            "family among all families; odds are of the effect against no effect at all."
+        markup.paragraph(
+            "Every effect of the library was weighed against all others and against none. The posterior probability is "
+            "the family's among all families; the Bayes factor compares the effect with no effect at all."
         )
     ]
     for place, round_ in enumerate(gap.rounds, start=1):
@@ -263,14 +274,14 @@ def _candidates(gap: Gap) -> str:
         rows = [_candidate_row(c, place, gap) for c in shown]
         classes = ["best" if f"{c.family}@{c.where}" in round_.adopted else "" for c in shown]
         title = f"<h3>Round {place}</h3>" if len(gap.rounds) > 1 else ""
-        header = ["effect", "probability", "odds against none", "coefficients", "verdict"]
-        content.append(title + table(header, rows, text_columns=(0, 3, 4), classes=classes))
+        columns = ["effect", "verdict", "coefficients", "posterior probability", "Bayes factor"]
+        content.append(title + markup.table(columns, rows, text_columns=(0, 1, 2), classes=classes))
     if len(content) == 1:
         return ""
-    return section("Candidates, and why they were rejected", *content)
+    return markup.section("Candidates, and why they were rejected", *content)
 
 
-def _candidate_row(candidate: Candidate, place: int, gap: Gap) -> list[str]:
+def _candidate_row(candidate: Candidate, place: int, gap: GapResult) -> list[str]:
     name = f"{candidate.family}@{candidate.where}"
     pending = any(name == f"{c.family}@{c.where}" for c in gap.indistinguishable)
     verdict = candidate.reason or ("cannot be told apart" if pending else "")
@@ -284,18 +295,20 @@ def _candidate_row(candidate: Candidate, place: int, gap: Gap) -> list[str]:
         values.append(f"{number(c.value * scale)} {unit}".rstrip())
     return [
         place_name(candidate.family, candidate.where),
+        verdict,
+        ", ".join(values),
         probability(candidate.posterior),
         odds(candidate.log_bayes_factor),
-        ", ".join(values),
-        verdict,
     ]
 
 
-def _not_shown(gap: Gap) -> str:
+def _not_shown(gap: GapResult) -> str:
     hidden = [f for f in gap.forecasts if not math.isfinite(f.nameable)]
-    alike = [f for f in gap.forecasts if math.isfinite(f.nameable) and f.rival and f.separation < _LEAST_SEPARATION]
+    alike = [
+        f for f in gap.forecasts if math.isfinite(f.nameable) and f.alternative and f.separation < _LEAST_SEPARATION
+    ]
     content = [
-        paragraph(
+        markup.paragraph(
             "An effect that is not named may be absent, or this data could not show it. Before any was weighed, it was "
             "worked out what each would have looked like in these very poses."
         )
@@ -310,8 +323,11 @@ def _not_shown(gap: Gap) -> str:
             ]
             for family, own in _by(hidden, lambda f: f.family).items()
         ]
-        header = ["effect", "where", "share that calibration leaves", "at most, at a plausible size"]
-        content += ["<h3>Too small to be named, even at its hard bound</h3>", table(header, rows, text_columns=(0, 1))]
+        columns = ["effect", "where", "share that calibration leaves", "at most, at a plausible size"]
+        content += [
+            "<h3>Too small to be named, even at its hard bound</h3>",
+            markup.table(columns, rows, text_columns=(0, 1)),
+        ]
     if alike:
         rows = [
             [
@@ -320,23 +336,23 @@ def _not_shown(gap: Gap) -> str:
                 pair[1].replace("_", " "),
                 _share_range([f.separation for f in own]),
             ]
-            for pair, own in _by(alike, lambda f: (f.family, f.rival.partition("@")[0])).items()
+            for pair, own in _by(alike, lambda f: (f.family, f.alternative.partition("@")[0])).items()
         ]
-        header = ["effect", "where", "closest rival", "share that the rival cannot imitate"]
-        content += ["<h3>Hard to tell from another</h3>", table(header, rows, text_columns=(0, 1, 2))]
+        columns = ["effect", "where", "closest rival", "share that the rival cannot imitate"]
+        content += ["<h3>Hard to tell from another</h3>", markup.table(columns, rows, text_columns=(0, 1, 2))]
     if gap.disabled:
         content += [
             "<h3>Not looked for</h3>",
-            items(f"{family.replace('_', ' ')}: {reason}" for family, reason in sorted(gap.disabled.items())),
+            markup.items(f"{family.replace('_', ' ')}: {reason}" for family, reason in sorted(gap.disabled.items())),
         ]
     seen = [f for f in gap.forecasts if math.isfinite(f.nameable)]
     if seen:
-        content.append(_details(f"What it could have shown ({len(seen)} effects)", _forecast_table(seen)))
-    return section("What this data could not have shown", *content)
+        content.append(markup.details(f"What it could have shown ({len(seen)} effects)", _forecast_table(seen)))
+    return markup.section("What this data could not have shown", *content)
 
 
 def _by(forecasts: Sequence[Forecast], key: Callable[[Forecast], _Key]) -> dict[_Key, list[Forecast]]:
-    """Forecasts by what they have in common."""
+    """Group forecasts by a key."""
     found: dict[_Key, list[Forecast]] = {}
     for forecast in forecasts:
         found.setdefault(key(forecast), []).append(forecast)
@@ -354,49 +370,38 @@ def _forecast_table(forecasts: Sequence[Forecast]) -> str:
         scale, unit = readable_unit(f.unit, f.nameable)
         rows.append(
             [
-                _family(f),
+                f.family.replace("_", " "),
                 f.where,
                 f"{number(f.nameable * scale, 2)} {unit}".rstrip(),
                 f"{100 * f.visible:.0f} %",
-                f.rival.replace("_", " ").replace("@", " at "),
-                f"{100 * f.separation:.0f} %" if f.rival else "",
+                f.alternative.replace("_", " ").replace("@", " at "),
+                f"{100 * f.separation:.0f} %" if f.alternative else "",
             ]
         )
-    header = ["effect", "where", "named from this size on", "visible", "closest rival", "rival cannot imitate"]
-    return table(header, rows, text_columns=(0, 1, 4))
+    columns = ["effect", "where", "named from this size on", "visible", "closest rival", "rival cannot imitate"]
+    return markup.table(columns, rows, text_columns=(0, 1, 4))
 
 
-def _next(gap: Gap) -> str:
+def _next(gap: GapResult) -> str:
     if not gap.experiments:
         return ""
     poses = [dict(row) for experiment in gap.experiments for row in experiment.poses]
-    return section(
+    return markup.section(
         "What to measure next",
-        items(experiment.text for experiment in gap.experiments),
+        markup.items(experiment.text for experiment in gap.experiments),
         _pose_table(poses) if poses else "",
     )
 
 
 def _pose_table(poses: Sequence[Mapping[str, object]]) -> str:
-    header = list(dict.fromkeys(name for row in poses for name in row))
-    rows = [[_cell(row.get(name, "")) for name in header] for row in poses[:_POSES_SHOWN]]
+    columns = list(dict.fromkeys(name for row in poses for name in row))
+    rows = [[_cell(row.get(name, "")) for name in columns] for row in poses[:_POSES_SHOWN]]
     more = len(poses) - len(rows)
-    note = paragraph(f"and {more} more; plan.csv beside this report has all of them", "note") if more else ""
-    return table(header, rows, caption="Next poses, as `rigcal plan` writes them") + note
-
-
-# ---- words -----------------------------------------------------------------------------------------------------------
-
-
-def _family(forecast: Forecast) -> str:
-    return forecast.family.replace("_", " ")
+    note = markup.paragraph(f"and {more} more; plan.csv beside this report has all of them", "note") if more else ""
+    return markup.table(columns, rows, caption="Next poses, as `rigcal plan` writes them") + note
 
 
 def _cell(value: object) -> str:
     if isinstance(value, float):
         return number(value, 4)
     return " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
-
-
-def _details(title: str, content: str) -> str:
-    return f"<details><summary>{escape(title)}</summary>{content}</details>"

@@ -1,7 +1,4 @@
-"""What a calibration report is made from: plain tables, shared by the offline commands and the daemon's jobs.
-
-Nothing here knows how the numbers were computed; `daemon.report.from_model` fills it from a calibrated model.
-"""
+"""The calibration report's input: plain tables, which `daemon.report.from_model` fills from a calibrated model."""
 
 from __future__ import annotations
 
@@ -13,10 +10,10 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.rig import BEYOND_BUILDING, Joint
+from calibration.rig.description import BEYOND_BUILDING, Joint
 
 if TYPE_CHECKING:  # both bring numba, which `status` and `--help` must not wait for
-    from calibration.accuracy import ExpectedAccuracy
+    from calibration.design.accuracy import ExpectedAccuracy
     from calibration.identification.sweeps.cross_check import AxisCheck
 
 Floats = NDArray[np.float64]
@@ -38,7 +35,7 @@ class Spread:
 
 
 def spread(errors_mm: Floats) -> Spread:
-    """The spread of (n, 3) error vectors in mm; n must be at least 1."""
+    """Return the spread of (n, 3) error vectors in mm; n must be at least 1."""
     norms = np.linalg.norm(errors_mm, axis=1)
     return Spread(
         n=len(norms),
@@ -74,7 +71,7 @@ class ErrorTable:
         return tuple(str(name) for name in np.unique(self.prism))
 
     def stage(self, stage: Stage, prism: str | None = None) -> Spread:
-        """Spread of a stage's errors, over all rows or over one prism's."""
+        """Return the spread of a stage's errors, over all rows or over one prism's."""
         errors = self.errors_mm[stage]
         return spread(errors if prism is None else errors[self.prism == prism])
 
@@ -106,12 +103,12 @@ class ParameterLine:
 
     @property
     def is_unusual(self) -> bool:
-        """Whether it is larger than 95 % of the corrections that building asks for."""
+        """True if it is larger than 95 % of the corrections that building asks for."""
         return abs(self.in_tolerances) > USUAL
 
     @property
     def is_beyond_building(self) -> bool:
-        """Whether it is larger than building can explain."""
+        """True if it is larger than building can explain."""
         return abs(self.in_tolerances) > BEYOND_BUILDING
 
 
@@ -164,7 +161,7 @@ class SetupLine:
 
 @dataclass(frozen=True, eq=False)
 class ReportInput:
-    """Everything a report shows.
+    """The content of a calibration report.
 
     Attributes:
         rig: the rig's name.
@@ -182,7 +179,7 @@ class ReportInput:
         unidentifiable: names of parameters or combinations that the data cannot see.
         outliers: fixes that the fit set aside.
         warnings: sentences for the operator.
-        ignored_columns: columns of the data that are not part of the contract.
+        ignored_columns: columns of the data that rigcal does not know (docs/formats.md).
         setups: station set-ups with their control points, where known.
         provenance: label -> value: data hashes, versions, seed, time.
         expected: how true the model expects itself to be over the work volume, where that is known.

@@ -1,13 +1,12 @@
-"""HTML pieces: escaping, tables, numbers, and the style sheet. Text that comes from data or files is always escaped."""
+"""HTML of all pages: the style sheet and the pieces. Text that comes from data or files is always escaped."""
 
 from __future__ import annotations
 
 import html
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
-from daemon.plain_text import shown
-from daemon.report.drawing import MINUS
+from daemon.host.safe_output import shown
 
 STYLE = """
 :root { color-scheme: light; --ink: #1d2733; --soft: #5b6670; --line: #dfe4e8; --blue: #0072b2; --warn: #b3261e; }
@@ -57,24 +56,8 @@ code { font: .88em/1.4 ui-monospace, "DejaVu Sans Mono", monospace; }
 
 
 def escape(text: object) -> str:
-    """Text made safe to stand in HTML."""
+    """Make text safe to stand in HTML."""
     return html.escape(shown(text), quote=True)
-
-
-def number(value: float, digits: int = 3) -> str:
-    """A number to `digits` significant digits and at most three decimals, with a real minus sign; a dash for NaN."""
-    if not math.isfinite(value):
-        return "\N{EN DASH}"
-    if value == 0:
-        return "0"
-    decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
-    most = 3 if abs(value) >= 0.001 else decimals
-    return f"{value:.{min(decimals, most)}f}".replace("-", MINUS)
-
-
-def signed(value: float, digits: int = 3) -> str:
-    """As `number`, with a plus sign where the value is positive."""
-    return ("+" if value > 0 else "") + number(value, digits)
 
 
 def table(
@@ -85,7 +68,15 @@ def table(
     classes: Sequence[str] = (),
     caption: str = "",
 ) -> str:
-    """A table of escaped cells; `classes` gives one class a row, `text_columns` are set flush left."""
+    """Return a table of escaped cells.
+
+    Args:
+        header: headings of the columns; none if empty.
+        rows: the cells.
+        text_columns: columns that are set flush left.
+        classes: a CSS class for each row.
+        caption: the line above.
+    """
     head = "".join(f'<th{_text(i, text_columns)} scope="col">{escape(name)}</th>' for i, name in enumerate(header))
     body = []
     for line, row in enumerate(rows):
@@ -102,27 +93,70 @@ def _text(column: int, text_columns: Sequence[int]) -> str:
 
 
 def section(title: str, *content: str) -> str:
-    """A titled section of ready HTML."""
+    """Return a titled section of ready HTML."""
     return f"<section><h2>{escape(title)}</h2>{''.join(content)}</section>"
 
 
 def paragraph(text: str, kind: str = "") -> str:
-    """A paragraph of escaped text."""
+    """Return a paragraph of escaped text."""
     return f'<p class="{kind}">{escape(text)}</p>' if kind else f"<p>{escape(text)}</p>"
 
 
 def items(sentences: Iterable[str]) -> str:
-    """A list of escaped sentences."""
+    """Return a list of escaped sentences."""
     return "<ul>" + "".join(f"<li>{escape(s)}</li>" for s in sentences) + "</ul>"
 
 
-def picture(image: str, caption: str) -> str:
-    """A figure from an image element and an escaped caption."""
-    return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"
+def details(title: str, content: str) -> str:
+    """Return ready HTML that a click unfolds."""
+    return f"<details><summary>{escape(title)}</summary>{content}</details>"
+
+
+def notice(sentences: Sequence[str]) -> str:
+    """Return a box of sentences; nothing where there are none."""
+    if not sentences:
+        return ""
+    return f'<div class="notice" role="note"><strong>Please note</strong>{items(sentences)}</div>'
+
+
+class Tile(NamedTuple):
+    """A figure in large type; `after` marks the result among the others."""
+
+    label: str
+    value: str
+    unit: str = "mm"
+    kind: str = ""
+
+
+def header(title: str, below: str, headline: str, lead: str, tiles: Iterable[Tile] = ()) -> str:
+    """Return the top of a page.
+
+    Args:
+        title: of the page.
+        below: a line under the title; none if empty.
+        headline: the result in one sentence.
+        lead: its meaning in a few sentences.
+        tiles: the figures of the result.
+    """
+    figures = "".join(
+        f'<div class="{tile.kind}"><dt>{escape(tile.label)}</dt>'
+        f"<dd>{escape(tile.value)} <small>{tile.unit}</small></dd></div>"
+        for tile in tiles
+    )
+    return (
+        f"<header><h1>{escape(title)}</h1>{paragraph(below) if below else ''}"
+        f'<p class="headline">{escape(headline).replace(" mm", "&nbsp;mm")}</p>{paragraph(lead, "lead")}'
+        + (f'<dl class="figures">{figures}</dl></header>' if figures else "</header>")
+    )
+
+
+def sources_section(sources: Mapping[str, str], extra: str = "") -> str:
+    """Return the last section of a page: label -> origin of data and model."""
+    return section("Where this comes from", table((), list(sources.items()), text_columns=(0, 1)), extra)
 
 
 def page(title: str, content: str) -> str:
-    """The whole document: one file, nothing loaded from elsewhere."""
+    """Return the whole document: one file, nothing loaded from elsewhere."""
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'

@@ -8,21 +8,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.published.zhou2022.front import Front
-from calibration.published.zhou2022.learning import LearningPoint
-from calibration.published.zhou2022.protocol import PAPER_BEFORE, Protocol
-from calibration.published.zhou2022.table3 import PAPER_AFTER, Way
-from calibration.published.zhou2022.trajectory import PAPER as PAPER_TRAJECTORY
-from calibration.published.zhou2022.trajectory import Trajectory
-from daemon.report.comparison import notice
-from daemon.report.drawing import AFTER, BEFORE, INK, MIDDLE, SOFT, WARN, new_figure, styled, svg_image
-from daemon.report.markup import escape, number, page, paragraph, picture, section, table
+from calibration.experiments.zhou2022.held_out import PAPER as PAPER_TRAJECTORY
+from calibration.experiments.zhou2022.held_out import LearningPoint, Trajectory
+from calibration.experiments.zhou2022.protocol import PAPER_BEFORE, Protocol
+from calibration.experiments.zhou2022.table3 import PAPER_AFTER, Way
+from calibration.experiments.zhou2022.weights import Front
+from daemon.report import drawing, markup
+from daemon.report.words import DASH, PLUS_MINUS, number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WAYS: Mapping[Way, str] = {"paper": "the paper's DE", "converged": "converged", "base free": "converged, base free"}
-_WAY_COLOURS: Mapping[Way, str] = {"paper": MIDDLE, "converged": AFTER, "base free": "#56b4e9"}
+_WAY_COLOURS: Mapping[Way, str] = {"paper": drawing.MIDDLE, "converged": drawing.AFTER, "base free": "#56b4e9"}
 PATH_NAMES: Mapping[str, str] = {
     "before": "before (nominal)",
     "geometric": "geometric",
@@ -31,14 +29,13 @@ PATH_NAMES: Mapping[str, str] = {
     "chain": "geometric + RBFN + LightGBM (the paper's hybrid)",
     "hybrid": "hybrid (rigcal's default)",
 }
-_PATH_LINES = (("before", BEFORE, 1.2), ("geometric", MIDDLE, 1.2), ("hybrid", AFTER, 1.8))
-_DASH = "\N{EN DASH}"
+_PATH_LINES = (("before", drawing.BEFORE, 1.2), ("geometric", drawing.MIDDLE, 1.2), ("hybrid", drawing.AFTER, 1.8))
 _SMOOTHED = 24  # points, below which every one is drawn as it is
 
 
 def protocol_page(protocol: Protocol, sources: Mapping[str, str]) -> str:
-    """One self-contained HTML document; `sources` says where the data come from."""
-    with styled():
+    """Return one self-contained HTML document; `sources` is label -> origin of the data."""
+    with drawing.styled():
         content = [
             _head(protocol),
             _before(protocol),
@@ -46,17 +43,17 @@ def protocol_page(protocol: Protocol, sources: Mapping[str, str]) -> str:
             _front(protocol.front),
             _learning(protocol),
             _trajectory(protocol.trajectory),
-            section("Where this comes from", table((), list(map(list, sources.items())), text_columns=(0, 1))),
+            markup.sources_section(sources),
         ]
-    return page(f"Zhou et al. 2022, section 4: {protocol.rig}", "".join(content))
+    return markup.page(f"Zhou et al. 2022, section 4: {protocol.rig}", "".join(content))
 
 
 def before_table(protocol: Protocol) -> tuple[list[str], list[list[str]]]:
-    """Header and rows: prism, then fixes, mean and the paper's mean of each kind of motion."""
+    """Return header and rows: prism, then fixes, mean and the paper's mean of each kind of motion."""
     published = any(prism in PAPER_BEFORE["multi-joint"] for prism in prisms_of(protocol))
-    header = ["prism"]
+    columns = ["prism"]
     for before in protocol.before:
-        header += [f"{before.motion} fixes", "mean, mm", *(["paper, mm"] if published else [])]
+        columns += [f"{before.motion} fixes", "mean, mm", *(["paper, mm"] if published else [])]
     rows = []
     for prism in prisms_of(protocol):
         cells = [prism]
@@ -64,14 +61,14 @@ def before_table(protocol: Protocol) -> tuple[list[str], list[list[str]]]:
             cells += [str(before.fixes.get(prism, 0)), _cell(before.mean_mm.get(prism))]
             cells += [_cell(PAPER_BEFORE[before.motion].get(prism))] if published else []
         rows.append(cells)
-    return header, rows
+    return columns, rows
 
 
 def identification_table(protocol: Protocol) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of Table 3: mean held-out error per prism, the objective, and the paper's values below each."""
+    """Return header and rows of Table 3: mean held-out error per prism, and the objective."""
     prisms = prisms_of(protocol)
-    header = ["data", "by", *prisms, "objective, mm\N{SUPERSCRIPT TWO}", "at bounds", "seconds"]
-    rows = [["nominal", _DASH, *(_cell(protocol.held_out_before_mm.get(p)) for p in prisms), "", "", ""]]
+    columns = ["data", "by", *prisms, "objective, mm\N{SUPERSCRIPT TWO}", "at bounds", "seconds"]
+    rows = [["nominal", DASH, *(_cell(protocol.held_out_before_mm.get(p)) for p in prisms), "", "", ""]]
     rows += [
         [
             line.data,
@@ -83,11 +80,11 @@ def identification_table(protocol: Protocol) -> tuple[list[str], list[list[str]]
         ]
         for line in protocol.identified
     ]
-    return header, rows
+    return columns, rows
 
 
 def paper_rows(protocol: Protocol) -> list[list[str]]:
-    """The paper's own Table 3, in the columns of `identification_table`; none where the prisms are others."""
+    """Return the paper's own Table 3 in the columns of `identification_table`; nothing for other prisms."""
     prisms = prisms_of(protocol)
     if not any(prism in values for prism in prisms for values in PAPER_AFTER.values()):
         return []
@@ -98,7 +95,7 @@ def paper_rows(protocol: Protocol) -> list[list[str]]:
 
 
 def trajectory_table(path: Trajectory) -> tuple[list[str], list[list[str]]]:
-    """Header and rows: mean and standard deviation along the path, the paper's beside."""
+    """Return header and rows: mean and standard deviation along the path, the paper's beside."""
     rows = []
     for name, label in PATH_NAMES.items():
         error = path.error_mm[name]
@@ -109,11 +106,11 @@ def trajectory_table(path: Trajectory) -> tuple[list[str], list[list[str]]]:
 
 
 def learning_table(points: tuple[LearningPoint, ...]) -> tuple[list[str], list[list[str]]]:
-    """Header and rows: median and range of the held-out RMS by number of training poses."""
+    """Return header and rows: median and range of the held-out RMS by number of training poses."""
 
     def span(values: tuple[float, ...]) -> list[str]:
         if not values:
-            return [_DASH, _DASH]
+            return [DASH, DASH]
         whole = number(min(values)) if len(values) == 1 else f"{number(min(values))} .. {number(max(values))}"
         return [number(float(np.median(values))), whole]
 
@@ -122,19 +119,19 @@ def learning_table(points: tuple[LearningPoint, ...]) -> tuple[list[str], list[l
 
 
 def prisms_of(protocol: Protocol) -> list[str]:
-    """Prisms of the training or held-out rows, the tip's first as in the paper."""
+    """Return the prisms of the training or held-out rows, the tip's first as in the paper."""
     found = [name for before in protocol.before for name in before.mean_mm] + list(protocol.held_out_before_mm)
     order = {name: place for place, name in enumerate("rsbw")}
     return sorted(dict.fromkeys(found), key=lambda name: order.get(name, len(order)))
 
 
 def not_taken(path: Trajectory) -> list[str]:
-    """Sentences about the learners that were left out."""
+    """Return a sentence for each learner that was left out."""
     return [f"{PATH_NAMES[name]}: no learner was taken: {reason}" for name, reason in path.left_out.items()]
 
 
 def weights_sentence(front: Front) -> str:
-    """The chosen weights in words."""
+    """Say the chosen weights."""
     weights = ", ".join(f"{name} {number(mu, 2)}" for name, mu in front.weight.items())
     return (
         f"Chosen weights: {weights}: of the {sum(not p.dominated for p in front.points)} points of the front among "
@@ -143,7 +140,7 @@ def weights_sentence(front: Front) -> str:
 
 
 def _cell(value: float | None) -> str:
-    return _DASH if value is None else number(value)
+    return DASH if value is None else number(value)
 
 
 def _head(protocol: Protocol) -> str:
@@ -158,31 +155,28 @@ def _head(protocol: Protocol) -> str:
         "The experiments of Zhou et al. (2022), section 4, on other data. The paper's own figures are of a machine "
         "whose drawings were a metre off: compare ratios, not millimetres."
     )
-    return (
-        f"<header><h1>Zhou et al. 2022, section 4: {escape(protocol.rig)}</h1>{paragraph(size)}"
-        f'<p class="headline">{escape(sentence).replace(" mm", "&nbsp;mm")}</p>'
-        f"{paragraph(lead, 'lead')}</header>{notice(list(protocol.warnings))}"
-    )
+    title = f"Zhou et al. 2022, section 4: {protocol.rig}"
+    return markup.header(title, size, sentence, lead) + markup.notice(protocol.warnings)
 
 
 def _before(protocol: Protocol) -> str:
-    header, rows = before_table(protocol)
-    return section(
+    columns, rows = before_table(protocol)
+    return markup.section(
         "Before calibration",
-        paragraph("Mean error of the nominal model on the training fixes, its base placed with the same fixes."),
-        table(header, rows),
+        markup.paragraph("Mean error of the nominal model on the training fixes, its base placed with the same fixes."),
+        markup.table(columns, rows),
     )
 
 
 def _identification(protocol: Protocol) -> str:
-    header, rows = identification_table(protocol)
+    columns, rows = identification_table(protocol)
     published = ""
     if paper := paper_rows(protocol):
         caption = "The paper's own table, of its machine, in mm"
-        published = table(header[:-3], [row[:-3] for row in paper], text_columns=(0, 1), caption=caption)
-    return section(
+        published = markup.table(columns[:-3], [row[:-3] for row in paper], text_columns=(0, 1), caption=caption)
+    return markup.section(
         "Identification (Table 3)",
-        paragraph(
+        markup.paragraph(
             "The rows' constants identified from single-joint data, multi-joint data, and from all data with the "
             "weights chosen below; base and unknown prism offsets are held where the nominal model puts them, as the "
             "paper takes them for known. Each is solved by "
@@ -192,25 +186,26 @@ def _identification(protocol: Protocol) -> str:
             "offsets are searched along, which shows what holding them costs. At bounds: how many of the constants "
             "ended at the edge of where they may go."
         ),
-        table(header, rows, text_columns=(0, 1), caption="Mean error on the held-out fixes in mm, per prism"),
+        markup.table(columns, rows, text_columns=(0, 1), caption="Mean error on the held-out fixes in mm, per prism"),
         published,
-        picture(
-            svg_image(identification_figure(protocol), "Held-out mean error per prism, data set and way of solving"),
+        drawing.picture(
+            identification_figure(protocol),
+            "Held-out mean error per prism, data set and way of solving",
             "Mean error on the held-out fixes; every prism has its own scale.",
         ),
     )
 
 
 def identification_figure(protocol: Protocol) -> Figure:
-    """A panel for each prism: bars by data set and way of solving."""
+    """Draw a panel for each prism: bars by data set and way of solving."""
     prisms = [p for p in prisms_of(protocol) if p in protocol.held_out_before_mm]
     sets = list(dict.fromkeys(line.data for line in protocol.identified))
-    figure = new_figure(1.35 + 0.7 * max(len(sets), 1))
+    figure = drawing.new_figure(1.35 + 0.7 * max(len(sets), 1))
     grid = figure.subplots(1, len(prisms), sharey=True, squeeze=False)[0]
     for axes, prism in zip(grid, prisms, strict=True):
         nominal = protocol.held_out_before_mm[prism]
         most = max(nominal, *(line.held_out_mm[prism] for line in protocol.identified), 0.0)
-        axes.axvline(nominal, color=INK, linewidth=1, linestyle=(0, (4, 3)), label="nominal model")
+        axes.axvline(nominal, color=drawing.INK, linewidth=1, linestyle=(0, (4, 3)), label="nominal model")
         for number_of_way, (way, colour) in enumerate(_WAY_COLOURS.items()):
             lines = [line for line in protocol.identified if line.way == way]
             values = [line.held_out_mm[prism] for line in lines]
@@ -224,7 +219,7 @@ def identification_figure(protocol: Protocol) -> Figure:
         axes.set_xlim(0, 1.28 * most)
         axes.set_xlabel("mm")
         axes.grid(False, axis="y")
-        axes.tick_params(axis="y", length=0, labelcolor=INK)
+        axes.tick_params(axis="y", length=0, labelcolor=drawing.INK)
         axes.set_yticks(range(len(sets)), sets)
     grid[0].invert_yaxis()
     handles, labels_ = grid[0].get_legend_handles_labels()
@@ -235,14 +230,15 @@ def identification_figure(protocol: Protocol) -> Figure:
 def _front(front: Front | None) -> str:
     if front is None:
         return ""
-    return section(
+    return markup.section(
         "Pareto front of the weights",
-        paragraph(
+        markup.paragraph(
             "The optimum of Eq. 19 was found for every set of weights on two thirds of the training poses; the errors "
             f"are those of the other third. {weights_sentence(front)} The held-out fixes played no part."
         ),
-        picture(
-            svg_image(front_figure(front), "Errors of every two prisms over all sets of weights"),
+        drawing.picture(
+            front_figure(front),
+            "Errors of every two prisms over all sets of weights",
             "Root mean square errors of two prisms against each other. Blue: no other set of weights is better at one "
             "prism and worse at none (of all prisms, not only of these two); grey: dominated; red star: chosen.",
         ),
@@ -250,18 +246,18 @@ def _front(front: Front | None) -> str:
 
 
 def front_figure(front: Front) -> Figure:
-    """Pairwise scatter of the prisms' errors over the grid of weights."""
+    """Draw the prisms' errors over the grid of weights, every two against each other."""
     names = list(front.weight)
     pairs = list(combinations(names, 2))
     columns = min(3, len(pairs))
     lines = -(-len(pairs) // columns)
-    figure = new_figure(0.4 + 2.7 * lines)
+    figure = drawing.new_figure(0.4 + 2.7 * lines)
     grid = figure.subplots(lines, columns, squeeze=False)
     for axes in grid.ravel()[len(pairs) :]:
         axes.set_visible(False)
     groups = (
-        (BEFORE, 12, 0.5, [p for p in front.points if p.dominated], "dominated"),
-        (AFTER, 18, 0.85, [p for p in front.points if not p.dominated], "Pareto front"),
+        (drawing.BEFORE, 12, 0.5, [p for p in front.points if p.dominated], "dominated"),
+        (drawing.AFTER, 18, 0.85, [p for p in front.points if not p.dominated], "Pareto front"),
     )
     chosen = front.points[front.chosen]
     for axes, (first, second) in zip(grid.ravel(), pairs, strict=False):
@@ -269,8 +265,8 @@ def front_figure(front: Front) -> Figure:
             x, y = ([p.rms_mm[name] for p in points] for name in (first, second))
             axes.scatter(x, y, s=size, c=colour, alpha=alpha, linewidths=0, label=label)
         axes.plot(
-            chosen.rms_mm[first], chosen.rms_mm[second], "*", color=WARN, markersize=13, markeredgecolor="white",
-            linestyle="", label="chosen weights",
+            chosen.rms_mm[first], chosen.rms_mm[second], "*", color=drawing.WARN, markersize=13,
+            markeredgecolor="white", linestyle="", label="chosen weights",
         )  # fmt: skip
         axes.set_xlabel(f"prism {first}, mm")
         axes.set_ylabel(f"prism {second}, mm")
@@ -280,30 +276,31 @@ def front_figure(front: Front) -> Figure:
 
 
 def _learning(protocol: Protocol) -> str:
-    header, rows = learning_table(protocol.learning)
-    return section(
+    columns, rows = learning_table(protocol.learning)
+    return markup.section(
         "How much data is enough",
-        paragraph(
+        markup.paragraph(
             "Root mean square error on the held-out fixes after training on so many poses, drawn at random with all "
             "their fixes."
         ),
-        picture(
-            svg_image(learning_figure(protocol.learning), "Held-out error against the number of training poses"),
+        drawing.picture(
+            learning_figure(protocol.learning),
+            "Held-out error against the number of training poses",
             "Lines: medians of the draws; bands: from the best draw to the worst.",
         ),
-        table(header, rows),
+        markup.table(columns, rows),
     )
 
 
 def learning_figure(points: tuple[LearningPoint, ...]) -> Figure:
-    """Median and range of both stages' held-out error against the number of poses."""
-    figure = new_figure(3.6)
+    """Draw median and range of both stages' held-out error against the number of poses."""
+    figure = drawing.new_figure(3.6)
     axes = figure.add_subplot()
     known = [point for point in points if point.hybrid_mm]
     poses = [point.poses for point in known]
     for label, colour, values in (
-        ("geometric", MIDDLE, [point.geometric_mm for point in known]),
-        ("hybrid", AFTER, [point.hybrid_mm for point in known]),
+        ("geometric", drawing.MIDDLE, [point.geometric_mm for point in known]),
+        ("hybrid", drawing.AFTER, [point.hybrid_mm for point in known]),
     ):
         axes.fill_between(poses, list(map(min, values)), list(map(max, values)), color=colour, alpha=0.18, linewidth=0)
         axes.plot(poses, [float(np.median(v)) for v in values], "o-", color=colour, markersize=4.5, label=label)
@@ -318,32 +315,33 @@ def learning_figure(points: tuple[LearningPoint, ...]) -> Figure:
 
 
 def _trajectory(path: Trajectory) -> str:
-    header, rows = trajectory_table(path)
-    return section(
+    columns, rows = trajectory_table(path)
+    return markup.section(
         "Along the trajectory (Fig. 12)",
-        picture(
-            svg_image(trajectory_figure(path), "Error of every point of the trajectory before and after"),
+        drawing.picture(
+            trajectory_figure(path),
+            "Error of every point of the trajectory before and after",
             f"Held-out points of prism {path.prism}{' in the order of time' if path.in_time else ''}. Thin lines: "
             "every point; thick lines: the mean of seven neighbours.",
         ),
-        table(header, rows, caption="The paper's figures are of its own machine"),
-        paragraph(
+        markup.table(columns, rows, caption="The paper's figures are of its own machine"),
+        markup.paragraph(
             "The paper's three learners are put on the same identified kinematics, without effects. rigcal's default "
             "adds the named effects that the data ask for, and a learner only where it helps.",
             "note",
         ),
-        *(paragraph(f"{sentence}.", "note") for sentence in not_taken(path)),
+        *(markup.paragraph(f"{sentence}.", "note") for sentence in not_taken(path)),
     )
 
 
 def trajectory_figure(path: Trajectory) -> Figure:
-    """Error along the path before, after the kinematics and after everything; means and deviations beside."""
-    figure = new_figure(4.2)
+    """Draw the error along the path before and after, with means and standard deviations beside."""
+    figure = drawing.new_figure(4.2)
     along, beside = figure.subplots(1, 2, width_ratios=[2.6, 1.0])
     points = np.arange(1, len(path.rows) + 1)
     for name, colour, width in _PATH_LINES:
         error = path.error_mm[name]
-        label = f"{PATH_NAMES[name]}: {number(float(error.mean()))} \N{PLUS-MINUS SIGN} {number(float(error.std()))} mm"
+        label = f"{PATH_NAMES[name]}: {number(float(error.mean()))} {PLUS_MINUS} {number(float(error.std()))} mm"
         along.plot(points, error, color=colour, linewidth=0.8, alpha=0.45)
         if len(error) >= _SMOOTHED:
             smooth = np.convolve(np.pad(error, 3, mode="edge"), np.ones(7) / 7, mode="valid")
@@ -358,14 +356,14 @@ def trajectory_figure(path: Trajectory) -> Figure:
     short = {"rbfn": "RBFN", "lightgbm": "LightGBM", "chain": "paper's hybrid", "hybrid": "rigcal"}
     for place, name in enumerate(names):
         error = path.error_mm[name]
-        colour = {"geometric": MIDDLE, "hybrid": AFTER}.get(name, SOFT)
+        colour = {"geometric": drawing.MIDDLE, "hybrid": drawing.AFTER}.get(name, drawing.SOFT)
         mean, std = float(error.mean()), float(error.std())
         beside.errorbar(mean, place, xerr=std, fmt="o", color=colour, capsize=3, markersize=5)
         beside.annotate(number(mean), (mean, place - 0.16), ha="center", va="bottom", fontsize=8)
     beside.set_yticks(range(len(names)), [short.get(name, name) for name in names])
     beside.set_ylim(len(names) - 0.4, -0.7)
     beside.set_xlim(left=0)
-    beside.tick_params(axis="y", length=0, labelcolor=INK)
+    beside.tick_params(axis="y", length=0, labelcolor=drawing.INK)
     beside.grid(False, axis="y")
     beside.set_xlabel("mean and standard deviation, mm")
     figure.legend(loc="outside upper left", ncols=3)

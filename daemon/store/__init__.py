@@ -1,4 +1,11 @@
-"""The store: one SQLite file, one connection that writes, any number of read-only ones."""
+"""The store: one SQLite file, one connection that writes, any number of read-only ones. All SQL is in this room.
+
+migrations  the tables
+connection  transactions, rows by table and column;  store  what acquisition writes;  reader  read-only views
+sessions, setups, jobs, models, alarms  the queries, one module a subject
+captures, rows  values as they are stored;  files  which files, and the lock;  health  damage, and free space
+errors  the errors, and the sentences that tell them
+"""
 
 from daemon.store.errors import StoreBusyError, StoreError
 from daemon.store.reader import Reader

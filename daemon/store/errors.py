@@ -1,4 +1,4 @@
-"""What can go wrong with the store, and how to say it."""
+"""Errors of the store, and the sentences that tell them."""
 
 from __future__ import annotations
 
@@ -15,12 +15,18 @@ _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _READ_ONLY = {errno.EROFS}
 _NO_PLACE = {errno.ENOENT, errno.ENOTDIR, errno.EACCES, errno.EPERM}
 
+# What a busy computer lacks for a while, whatever is asked of it.
+LACKING = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM, errno.EAGAIN})
 NOTHING_BYTES = 2**20  # a disk with less than this has no room
 _UNWRITABLE = {sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN}
 
 
 class StoreError(Exception):
     """The store cannot be opened or used; the message names the file and what to do."""
+
+
+class NotInStoreError(StoreError):
+    """A row that is asked for by its name or number does not exist; the message says where they are listed."""
 
 
 class StoreBusyError(StoreError):
@@ -51,7 +57,7 @@ def is_damage(error: BaseException) -> bool:
 
 
 def storage_sentence(path: Path, error: sqlite3.Error | OSError) -> str:
-    """What the disk or SQLite refused to do with a file, and what to do about it, in one sentence.
+    """Say in one sentence what the disk or SQLite refused to do with a file, and what to do about it.
 
     Args:
         path: of the store; an OSError that names a file is told with that name.
@@ -104,6 +110,24 @@ def storage_errors(path: Path) -> Iterator[None]:
         yield
     except (sqlite3.Error, OSError) as error:
         raise StoreError(storage_sentence(path, error)) from error
+
+
+@contextlib.contextmanager
+def unwritable_errors(path: Path) -> Iterator[None]:
+    """Raise a refusal of the disk as a StoreError that says what to do before a command is given again.
+
+    Args:
+        path: of the store.
+
+    Raises:
+        StoreError: in place of the sqlite3.Error of a disk that is full, faulty or read-only.
+    """
+    try:
+        yield
+    except sqlite3.Error as error:
+        if not is_unwritable(error):
+            raise
+        raise StoreError(f"{storage_sentence(path, error)}; nothing was changed, so give the command again") from error
 
 
 def _existing(directory: Path) -> Path:

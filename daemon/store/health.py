@@ -1,4 +1,4 @@
-"""Whether the store can be trusted: its files are those that were opened, sound, and have room to grow.
+"""Health of the store: its files are those that were opened, sound, and have room to grow.
 
 A run that ended without order (a power cut, a kill, a full disk), or that met with damage, is followed by SQLite's
 `quick_check`, beside acquisition. Files are looked at with every beat of the daemon.
@@ -17,10 +17,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from daemon.store.errors import storage_sentence
-from daemon.store.identity import FileIdentity
+from daemon.store.files import FileIdentity
 from daemon.store.store import Store
-from daemon.time_budget import TimeBudget
-from drivers.clock import Clock, Stamp
+from drivers.clock import Clock, Stamp, TimeBudget
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +46,7 @@ SOUND = "ok"
 
 @dataclass(frozen=True)
 class StoreHealth:
-    """How the store is.
+    """Health of the store.
 
     Attributes:
         state: ok; checking: it is being searched for damage; damaged: damage was found; replaced, missing: a file of
@@ -63,6 +62,11 @@ class StoreHealth:
     since: Stamp
     free_bytes: int | None
     is_low: bool
+
+    @property
+    def is_unsound(self) -> bool:
+        """True if the store cannot be trusted."""
+        return self.state in ("damaged", "replaced", "missing")
 
     def as_dict(self) -> dict[str, Any]:
         """As `status` tells it."""
@@ -168,7 +172,7 @@ class StoreWatch:
     # ---- the check for damage ----------------------------------------------------------------------------------------
 
     def _is_unsettled(self) -> bool:
-        """Whether the newest check never came to its end, or found damage."""
+        """True if the newest check never came to its end, or found damage."""
         try:
             checks = self._store.rows("SELECT result FROM store_checks ORDER BY id DESC LIMIT 1")
         except sqlite3.Error:
@@ -187,7 +191,7 @@ class StoreWatch:
         check.note(self._clock.now(), "ended_", result=findings or SOUND)
 
     def _damage(self) -> str | None:
-        """What is damaged, "" if nothing is; None when the check was stopped, or cannot be made at present."""
+        """Search for damage: its description, "" if there is none; None if the check was stopped or cannot be made."""
         try:
             uri = f"{self._store.path.absolute().as_uri()}?mode=ro"
             connection = sqlite3.connect(uri, uri=True, check_same_thread=False)

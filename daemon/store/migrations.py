@@ -56,7 +56,7 @@ def m001_runs_and_raw_captures(db: Database) -> None:
 
 @MIGRATIONS()
 def m002_records(db: Database) -> None:
-    """What decoders make of captures."""
+    """The records that decoders make of captures."""
     sample = f"""(id INTEGER PRIMARY KEY, channel_id INTEGER NOT NULL REFERENCES channels(id), {_instant()},
         value REAL, status TEXT NOT NULL, raw_counts INTEGER, CHECK ((status = 'ok') = (value IS NOT NULL))) STRICT"""
     _create(
@@ -196,7 +196,7 @@ def m007_checks_show_drift(db: Database) -> None:
         "ALTER TABLE model_states ADD COLUMN after_session INTEGER",
         # live_since: the change by which the model went live; with each new one the sums begin anew. ratio: RMS of the
         # errors over their predicted sigma, NULL where the session could not be used, as reason says. upper, lower: as
-        # calibration.cusum has them.
+        # calibration.numerics.statistics has them.
         f"""CREATE TABLE drift_checks (id INTEGER PRIMARY KEY, live_since INTEGER NOT NULL REFERENCES model_states(id),
             session_id TEXT NOT NULL REFERENCES calibration_sessions(id), {_instant()}, fixes INTEGER NOT NULL,
             standstills INTEGER NOT NULL, ratio REAL, reason TEXT NOT NULL DEFAULT '', upper REAL NOT NULL,
@@ -293,7 +293,7 @@ def m012_comparisons_know_the_live_model(db: Database) -> None:
 
 @MIGRATIONS()
 def m013_alarms(db: Database) -> None:
-    """What is wrong, since when, and what to do about it."""
+    """Alarms: faults, since when, and what to do about them."""
     _create(
         db,
         # raised_: when it was noticed; cleared_ is NULL while it is active.

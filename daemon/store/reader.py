@@ -10,10 +10,21 @@ from typing import Any
 
 from daemon.store.captures import decode_captures
 from daemon.store.errors import StoreError
-from daemon.store.identity import FileIdentity
+from daemon.store.files import FileIdentity
 from daemon.store.rows import sql_value, stamp_of, stored_text
 from drivers.clock import Stamp
 from drivers.readings import Capture
+
+_SAMPLE = "channels.name AS channel, unit, utc_ns, value, status, raw_counts"
+_RECORDS = {
+    "joint_samples": _SAMPLE,
+    "signals": _SAMPLE,
+    "fixes": "station, utc_ns, last_byte_utc_ns, status, lock, hz_angle_rad, zenith_angle_rad, slope_distance_m, "
+    "north_m, east_m, up_m, face, prism_constant_mm, ppm, tilt_ok, edm_level, reason, raw",
+    "device_events": "device, utc_ns, kind, text, code",
+    "decode_failures": "device, utc_ns, reason, excerpt, count",
+    "gaps": "channel, reason, start_utc_ns, end_utc_ns, missed",
+}
 
 
 class Reader:
@@ -29,6 +40,7 @@ class Reader:
 
     def __init__(self, path: Path, identity: FileIdentity | None = None) -> None:
         self.path = path
+        self._boots: dict[int, str] = {}
         if identity is not None and FileIdentity.of(path) != identity:
             raise StoreError(
                 f"{path}: this is not the store that the daemon writes to: the file was replaced or removed while it "
@@ -72,6 +84,25 @@ class Reader:
         """Kernel boot ids by row id, for `rows.stamp_of`."""
         return {row["id"]: row["kernel_boot_id"] for row in self._connection.execute("SELECT * FROM boots")}
 
+    def links(self) -> list[dict[str, Any]]:
+        """Name and kind of every link that captures are stored of."""
+        return list(self.rows("SELECT name, kind FROM links ORDER BY id"))
+
+    def count(self, table: str) -> int:
+        """Number of rows of a table."""
+        return int(next(self.rows(f'SELECT count(*) AS n FROM "{table}"'))["n"])
+
+    def records(self) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Everything that decoding has stored, by nothing but what follows from the captures.
+
+        Yields:
+            table, and a row of it; each table's in the order they were stored.
+        """
+        for table, columns in _RECORDS.items():
+            join = " JOIN channels ON channels.id = channel_id" if "channels.name" in columns else ""
+            for row in self.rows(f"SELECT {columns} FROM {table}{join} ORDER BY {table}.id"):
+                yield table, row
+
     def captures(
         self, link: str | None = None, since: Stamp | None = None, until: Stamp | None = None
     ) -> Iterator[Capture]:
@@ -79,8 +110,9 @@ class Reader:
 
         Args:
             link: name of the link; all when None.
-            since, until: bounds, both inclusive; unbounded when None. They hold on the monotonic clock of their boots:
-                the wall clock may have been set in between.
+            since: the first instant, on the monotonic clock of its boot (the wall clock may have been set in between);
+                unbounded when None.
+            until: the last instant, likewise.
 
         Raises:
             StoreError: a chunk is damaged; the message names it.
@@ -107,4 +139,6 @@ class Reader:
 
     def stamp(self, row: Mapping[str, object], prefix: str = "") -> Stamp:
         """The instant in a row's `<prefix>utc_ns`, `<prefix>monotonic_ns`, `<prefix>boot_id`."""
-        return stamp_of(row, self.boots(), prefix)
+        if row[f"{prefix}boot_id"] not in self._boots:
+            self._boots = self.boots()
+        return stamp_of(row, self._boots, prefix)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -15,6 +16,14 @@ SqlValue = int | float | str | bytes | None
 SqlRow = tuple[SqlValue, ...]
 
 EXCERPT_BYTES = 64  # of a decode failure; all the bytes are in the raw chunks
+
+
+class RowSource(Protocol):
+    """Anything that queries may be asked of: the writing connection, or a reader."""
+
+    def rows(self, sql: str, parameters: Sequence[object] = ()) -> Iterable[dict[str, Any]]:
+        """The rows of a query as mappings."""
+
 
 FIX_NUMBERS = (
     "hz_angle_rad",

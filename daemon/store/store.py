@@ -1,9 +1,4 @@
-"""The one connection that writes.
-
-WAL with synchronous=FULL: what `transaction` has committed survives power loss. One connection writes and
-checkpoints, because SQLite up to 3.51.2 can corrupt a WAL that two connections reset at once; readers
-(`daemon.store.reader`) are read-only.
-"""
+"""The store that acquisition writes to: runs of the daemon, captured bytes, and the records that are made of them."""
 
 from __future__ import annotations
 
@@ -11,42 +6,23 @@ import importlib.metadata
 import logging
 import os
 import sqlite3
-import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast
+from typing import Any, Literal
 
 from sqlite_utils import Database
 
 from daemon.store.captures import decode_captures, encode_captures
-from daemon.store.errors import StoreError, is_damage, storage_sentence
-from daemon.store.identity import StoreFiles
-from daemon.store.lock import WriterLock
-from daemon.store.migrations import MIGRATIONS, unknown_migrations
-from daemon.store.reader import Reader
-from daemon.store.rows import (
-    EXCERPT_BYTES,
-    FIX_COLUMNS,
-    SqlRow,
-    SqlValue,
-    counted_failures,
-    fix_row,
-    sample_row,
-    sql_value,
-    stamp_of,
-    stored_text,
-)
+from daemon.store.connection import Connection
+from daemon.store.errors import StoreError, is_damage
+from daemon.store.rows import EXCERPT_BYTES, FIX_COLUMNS, SqlRow, counted_failures, fix_row, sample_row, sql_value
 from drivers.clock import Stamp
 from drivers.readings import Capture, DecodeFailure, DeviceEvent, Fix, Gap, GapReason, Reading, Record
 
 log = logging.getLogger(__name__)
 
-T = TypeVar("T")
 ChannelKind = Literal["joint", "signal"]
 
-OLDEST_SQLITE = (3, 38, 0)  # STRICT tables (3.37) and JSON built in (3.38)
-CLOSE_TIMEOUT_S = 5.0  # a thread that hangs in a commit keeps its turn for ever
 WHOLE_DAEMON = "daemon"  # the channel of gaps in which rigcal itself was not there
 
 _SAMPLE_COLUMNS = "(channel_id, utc_ns, monotonic_ns, boot_id, value, status, raw_counts) VALUES (?, ?, ?, ?, ?, ?, ?)"
@@ -75,234 +51,84 @@ _UNDECODED = """SELECT chunk_id, captures FROM undecoded_chunks LEFT JOIN raw_ch
     WHERE chunk_id > ? ORDER BY chunk_id"""
 
 
-class Store:
-    """A store opened for writing, exclusively, created or migrated as needed.
-
-    May be used by several threads: transactions take turns.
+class Store(Connection):
+    """A store opened for writing.
 
     Args:
         path: the database; by convention it ends in `.sqlite`.
 
     Attributes:
-        run_id: row of `daemon_runs`, 0 while no run has begun.
+        run_id: row of `daemon_runs`; 0 while no run has begun, and where its row cannot be written.
         begun: when the run began; None while none has.
+        previous_end: when the run before this one was last known to be alive; None before the first.
         ended_in_order: whether the run before this one did; known once a run has begun, true before and without one.
-        files: which files it is made of, as they were when it was opened.
-        damage: what was found damaged while it was used; "" as long as nothing was.
 
     Raises:
-        StoreBusyError: another process writes to it.
-        StoreError: it is no such database, is damaged, was made by a newer rigcal, its directory cannot be used, or
-            the disk is full.
+        StoreError: as a Connection.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        if sqlite3.sqlite_version_info < OLDEST_SQLITE:
-            wanted = ".".join(map(str, OLDEST_SQLITE))
-            raise StoreError(f"SQLite {sqlite3.sqlite_version} is too old; rigcal needs {wanted} or newer")
-        self._turn = threading.RLock()
-        self._lock = WriterLock(path)
-        try:
-            # Transactions take turns under `_turn`, so the connection need not belong to one thread.
-            connection = sqlite3.connect(path, check_same_thread=False)
-            connection.text_factory = stored_text
-            try:
-                self._db = Database(connection)
-                self._prepare(connection)
-            except BaseException:
-                connection.close()
-                raise
-        except sqlite3.Error as error:
-            self._lock.release()
-            raise StoreError(storage_sentence(path, error)) from error
-        except BaseException:
-            self._lock.release()
-            raise
-        self._boots: dict[str, int] = {}
-        self._boot_ids: dict[int, str] = {}
+        super().__init__(path)
         self._links: dict[str, int] = {}
         self._channels: dict[tuple[str, str], tuple[int, ChannelKind]] = {}
         self._joints: frozenset[str] = frozenset()
         self.run_id = 0
         self.begun: Stamp | None = None
+        self.previous_end: Stamp | None = None
         self.ended_in_order = True
-        self.files = StoreFiles.of(path)
-        self.damage = ""
-        log.info("store %s open, SQLite %s", path, sqlite3.sqlite_version)
 
-    def _prepare(self, connection: sqlite3.Connection) -> None:
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = FULL")
-        connection.execute("PRAGMA foreign_keys = ON")
-        connection.execute("PRAGMA temp_store = MEMORY")  # what a statement may undo needs no file, hence no descriptor
-        connection.execute("PRAGMA journal_size_limit = 67108864")  # a WAL grown behind a slow reader shrinks again
-        if later := unknown_migrations(self._db):
-            raise StoreError(f"{self.path}: made by a newer rigcal (it has {later[0]}); install that version")
-        MIGRATIONS.apply(self._db)
-
-    def close(self) -> None:
-        """Close the database and let others write to it; harmless when it was closed before.
-
-        Where a thread hangs in a commit, the database stays open and locked until the process ends.
-        """
-        if not self._turn.acquire(timeout=CLOSE_TIMEOUT_S):
-            log.error("%s: a write does not end; the store is left open", self.path)
-            return
-        try:
-            self._db.close()
-            self._lock.release()
-        finally:
-            self._turn.release()
-
-    # ---- transactions and rows -------------------------------------------------------------------------------------
-
-    @contextmanager
-    def transaction(self) -> Iterator[Database]:
-        """A transaction: committed, durably, when the block ends, rolled back when it raises.
-
-        Nested transactions are savepoints of the outermost one. Other threads wait for their turn.
-        """
-        with self._turn:
-            try:
-                with self._db.atomic() as db:
-                    yield db
-            except BaseException as error:
-                self.note_damage(error)
-                # Rows that the caches know may have been rolled back.
-                self._boots.clear()
-                self._boot_ids.clear()
-                self._links.clear()
-                self._channels.clear()
-                raise
-
-    def reader(self) -> Reader:
-        """A read-only view of this very store, for what the writing connection must not wait for.
-
-        Raises:
-            StoreError: its file was replaced, moved or removed.
-        """
-        return Reader(self.path, self.files.database)
-
-    def write(self, work: Callable[[Database], T]) -> T:
-        """What `work` returns, its changes committed in one transaction."""
-        with self.transaction() as db:
-            return work(db)
-
-    def insert(self, table: str, row: Mapping[str, object]) -> int:
-        """Insert one row; numpy scalars, NaN, lists and mappings are made storable (`rows.sql_value`).
-
-        Returns:
-            its rowid.
-        """
-        names = ", ".join(f'"{name}"' for name in row)
-        marks = ", ".join("?" * len(row))
-        with self.transaction() as db:
-            cursor = db.execute(f'INSERT INTO "{table}" ({names}) VALUES ({marks})', [*map(sql_value, row.values())])
-            return _rowid(cursor)
-
-    def update(self, table: str, where: Mapping[str, object], changes: Mapping[str, object]) -> int:
-        """Change the rows whose columns equal `where`.
-
-        Returns:
-            how many there were.
-        """
-        settings = ", ".join(f'"{name}" = ?' for name in changes)
-        conditions = " AND ".join(f'"{name}" IS ?' for name in where)
-        values = [*map(sql_value, changes.values()), *map(sql_value, where.values())]
-        with self.transaction() as db:
-            return db.execute(f'UPDATE "{table}" SET {settings} WHERE {conditions}', values).rowcount
-
-    def rows(self, sql: str, parameters: Sequence[object] = ()) -> list[dict[str, Any]]:
-        """The rows of a query, on the writing connection: it sees the open transaction's own changes."""
-        with self._turn:
-            try:
-                cursor = self._db.execute(sql, [*map(sql_value, parameters)])
-                names = [column[0] for column in cursor.description]
-                return [dict(zip(names, row, strict=True)) for row in cursor]
-            except sqlite3.Error as error:
-                self.note_damage(error)
-                raise
-
-    def note_damage(self, error: BaseException) -> None:
-        """Remember what was raised where the store was used, if it tells that the store is damaged."""
-        if is_damage(error):
-            self.damage = self.damage or str(error)
-
-    def _number(self, sql: str, parameters: Sequence[object]) -> int | None:
-        """The integer in the first column of a query's first row; None where there is no row."""
-        with self._turn:
-            row = self._db.execute(sql, [*parameters]).fetchone()
-        return None if row is None else int(row[0])
-
-    def instant(self, stamp: Stamp, prefix: str = "") -> dict[str, SqlValue]:
-        """The three columns of an instant, to be merged into a row: `<prefix>utc_ns`, ..."""
-        return {
-            f"{prefix}utc_ns": stamp.utc_ns,
-            f"{prefix}monotonic_ns": stamp.monotonic_ns,
-            f"{prefix}boot_id": self.boot_row(stamp),
-        }
-
-    def stamp(self, row: Mapping[str, object], prefix: str = "") -> Stamp | None:
-        """The instant in a row's `<prefix>utc_ns`, ...; None where they are NULL."""
-        if row[f"{prefix}utc_ns"] is None:
-            return None
-        with self._turn:
-            if row[f"{prefix}boot_id"] not in self._boot_ids:
-                self._boot_ids = {boot["id"]: boot["kernel_boot_id"] for boot in self.rows("SELECT * FROM boots")}
-            return stamp_of(row, self._boot_ids, prefix)
-
-    def boot_row(self, stamp: Stamp) -> int:
-        """The row of `boots` that `stamp` belongs to, made on first sight."""
-        row = self._boots.get(stamp.boot_id)
-        if row is None:
-            with self.transaction():
-                row = self._number("SELECT id FROM boots WHERE kernel_boot_id = ?", [stamp.boot_id])
-                if row is None:
-                    booted = {"kernel_boot_id": stamp.boot_id, "booted_utc_ns": stamp.utc_ns - stamp.monotonic_ns}
-                    row = self.insert("boots", booted)
-                self._boots[stamp.boot_id] = row
-        return row
-
-    def order(self, stamp: Stamp) -> tuple[int, int]:
-        """Where an instant lies among all that the store knows (`drivers.clock.Order`)."""
-        return self.boot_row(stamp), stamp.monotonic_ns
+    def _forget_rows(self) -> None:
+        super()._forget_rows()
+        self._links.clear()
+        self._channels.clear()
 
     # ---- runs of the daemon ----------------------------------------------------------------------------------------
 
     def begin_run(self, now: Stamp) -> None:
-        """A run of the daemon begins: the time since the last one ended is a gap, and ends all gaps left open."""
-        with self.transaction() as db:
-            before = self.rows("SELECT clean FROM daemon_runs ORDER BY id DESC LIMIT 1")
-            self.ended_in_order = not before or bool(before[0]["clean"])
-            last = self._last_alive()
-            if last is not None:
-                ended = self.instant(last, "end_")
-                settings = ", ".join(f"{name} = ?" for name in ended)
-                db.execute(f"UPDATE gaps SET {settings} WHERE end_utc_ns IS NULL", [*ended.values()])
-                self.insert_records([Gap(WHOLE_DAEMON, GapReason.NOT_RUNNING, last, now)])
-            run = {
-                "pid": os.getpid(),
-                "software_version": importlib.metadata.version("rigcal"),
-                "sqlite_version": sqlite3.sqlite_version,
-            }
-            run_id = self.insert("daemon_runs", run | self.instant(now, "started_") | self.instant(now, "alive_"))
-        self.run_id = run_id
-        self.begun = now
+        """Begin a run of the daemon: the time since the last one ended is a gap, and ends all gaps left open.
 
-    def _last_alive(self) -> Stamp | None:
-        """When the last run was last known to be alive; None before the first."""
+        Where a table of runs or gaps is damaged, the run begins without it, and counts as one after an unclean end.
+        """
+        self.begun = now
+        try:
+            with self.transaction() as db:
+                self._note_gap(db, now)
+                run_id = self._note_run(now)
+        except sqlite3.DatabaseError as error:
+            if not is_damage(error):
+                raise
+            log.error("%s: damaged, so what an earlier run left cannot be read or ended: %s", self.path, error)
+            self.ended_in_order = False
+            run_id = self.unless_damaged(lambda: self._note_run(now), 0)
+        self.run_id = run_id
+
+    def _note_run(self, now: Stamp) -> int:
+        run = {
+            "pid": os.getpid(),
+            "software_version": importlib.metadata.version("rigcal"),
+            "sqlite_version": sqlite3.sqlite_version,
+        }
+        return self.insert("daemon_runs", run | self.instant(now, "started_") | self.instant(now, "alive_"))
+
+    def _note_gap(self, db: Database, now: Stamp) -> None:
+        """Store the gap since the last run, and end those that it left open."""
         runs = self.rows("SELECT * FROM daemon_runs ORDER BY id DESC LIMIT 1")
         if not runs:
-            return None
-        alive = self.stamp(runs[0], "ended_") or self.stamp(runs[0], "alive_")
+            return
+        self.ended_in_order = bool(runs[0]["clean"])
+        last = self.stamp_or_none(runs[0], "ended_") or self.stamp(runs[0], "alive_")
+        # A killed run may have captured something after its last sign of life.
         for row in self.rows(
             "SELECT last_utc_ns, last_monotonic_ns, last_boot_id FROM raw_chunks ORDER BY id DESC LIMIT 1"
         ):
             captured = self.stamp(row, "last_")
-            if captured and alive and captured.boot_id == alive.boot_id and captured.monotonic_ns > alive.monotonic_ns:
-                return captured
-        return alive
+            if captured.boot_id == last.boot_id and captured.monotonic_ns > last.monotonic_ns:
+                last = captured
+        self.previous_end = last
+        ended = self.instant(last, "end_")
+        settings = ", ".join(f"{name} = ?" for name in ended)
+        db.execute(f"UPDATE gaps SET {settings} WHERE end_utc_ns IS NULL", [*ended.values()])
+        self.insert_records([Gap(WHOLE_DAEMON, GapReason.NOT_RUNNING, last, now)])
 
     def note_alive(self, now: Stamp) -> None:
         """The running daemon is alive; without it the end of a killed run is known by its last capture alone.
@@ -335,14 +161,14 @@ class Store:
                     *(self._link_row(chunk.link, chunk.kind), first.utc_ns, first.monotonic_ns, boot),
                     *(last.utc_ns, last.monotonic_ns, boot, chunk.captures, chunk.payload_bytes, chunk.blob),
                 )
-                ids.append(_rowid(db.execute(_CHUNKS, values)))
+                ids.append(db.execute(_CHUNKS, values).lastrowid or 0)
             db.conn.executemany("INSERT INTO undecoded_chunks (chunk_id) VALUES (?)", [(i,) for i in ids])
         return ids
 
     def _link_row(self, link: str, kind: str) -> int:
         row = self._links.get(link)
         if row is None:
-            row = self._number("SELECT id FROM links WHERE name = ?", [link])
+            row = self.number("SELECT id FROM links WHERE name = ?", [link])
             if row is None:
                 row = self.insert("links", {"name": link, "kind": kind})
             self._links[link] = row
@@ -371,7 +197,7 @@ class Store:
 
     def newest_undecoded(self) -> int:
         """Id of the newest chunk that waits to be decoded; 0 where none does."""
-        return self._number("SELECT coalesce(max(chunk_id), 0) FROM undecoded_chunks", []) or 0
+        return self.number("SELECT coalesce(max(chunk_id), 0) FROM undecoded_chunks", []) or 0
 
     def chunk_captures(self, chunk_id: int) -> list[Capture]:
         """The captures of one chunk.
@@ -405,7 +231,7 @@ class Store:
         if found is None:
             kind: ChannelKind = "joint" if name in self._joints else "signal"
             key = {"name": name, "unit": unit, "kind": kind}
-            row = self._number("SELECT id FROM channels WHERE name = ? AND unit = ? AND kind = ?", [*key.values()])
+            row = self.number("SELECT id FROM channels WHERE name = ? AND unit = ? AND kind = ?", [*key.values()])
             found = self.insert("channels", key) if row is None else row, kind
             self._channels[name, unit] = found
         return found
@@ -446,15 +272,26 @@ class Store:
                 (_GAPS, gaps),
             ):
                 if rows:
-                    db.conn.executemany(statement, rows)
+                    self._insert_rows(db, statement, rows)
+
+    def _insert_rows(self, db: Database, statement: str, rows: Sequence[SqlRow]) -> None:
+        """Insert rows; those of a damaged table that stand beside the captures must not keep the captures out."""
+        try:
+            db.conn.executemany(statement, rows)
+        except sqlite3.DatabaseError as error:
+            if statement not in (_GAPS, _EVENTS) or not is_damage(error):
+                raise
+            if not self.damage:
+                log.error("%s: damaged, so gaps and events may not be stored: %s", self.path, error)
+            self.note_damage(error)
+
+    def newest_events(self, most: int) -> list[dict[str, Any]]:
+        """Device, utc_ns, kind and text of the newest device events, newest first."""
+        return self.rows("SELECT device, utc_ns, kind, text FROM device_events ORDER BY id DESC LIMIT ?", (most,))
 
     def fix_id(self, fix: Fix) -> int | None:
         """The row of `fixes` that holds `fix`; None if it is not stored."""
-        return self._number(
+        return self.number(
             "SELECT id FROM fixes WHERE station = ? AND boot_id = ? AND monotonic_ns = ? ORDER BY id DESC LIMIT 1",
             [fix.station, self.boot_row(fix.stamp), fix.stamp.monotonic_ns],
         )
-
-
-def _rowid(cursor: sqlite3.Cursor) -> int:
-    return cast(int, cursor.lastrowid)  # None only before a connection's first INSERT

@@ -1,15 +1,15 @@
-"""What an effect may see of the machine, and what it may do to it."""
+"""Base of hidden effects: the quantities of the machine that they depend on, and the displacements they cause."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.rig import Rig
+from calibration.rig.description import Rig
 
 Floats = NDArray[np.float64]
 
@@ -19,11 +19,11 @@ class Body(Protocol):
 
     @property
     def rig(self) -> Rig:
-        """The rig description (names, limits)."""
+        """Rig description (names, limits)."""
 
     @property
     def read(self) -> Mapping[str, Floats]:
-        """Joint name -> (n,) what its encoder or transducer says, rad or mm."""
+        """Joint name -> (n,) reading of its encoder or transducer, rad or mm."""
 
     @property
     def gravity(self) -> Floats:
@@ -33,7 +33,7 @@ class Body(Protocol):
         """(n,) of an observation column (`theta4_dir`, ...); ValueError when the caller did not give it."""
 
     def has(self, name: str) -> bool:
-        """Whether the caller gave an observation column."""
+        """True if the caller gave an observation column."""
 
     @property
     def true(self) -> Mapping[str, Floats]:
@@ -52,7 +52,7 @@ class Body(Protocol):
         """(n, 3) moment of all weights about the base's origin, in the base frame."""
 
     def beam(self, row: int) -> Beam:
-        """The beam that row's driven length `a` is, and what hangs on it."""
+        """Beam of a row's driven length `a`, with the loads on it."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Beam:
         tip_mm: (n, 3).
         force_newton: (n, 3) weight of everything beyond the tip.
         moment_newton_m: (n, 3) its moment about the tip.
-        own_weight_newton: weight of what is fixed to the root section, spread evenly over the length.
+        own_weight_newton: weight of the masses on the root section, spread evenly over the length.
     """
 
     axis: Floats
@@ -108,27 +108,75 @@ class Sight:
     axes: Floats
 
 
+class DrawContext(Protocol):
+    """Machine and time span for which an effect is drawn at random."""
+
+    @property
+    def rig(self) -> Rig:
+        """Rig description."""
+
+    @property
+    def first_s(self) -> float:
+        """Instant at which the data begin, s."""
+
+    @property
+    def last_s(self) -> float:
+        """Instant at which the data end, s."""
+
+    def largest_load(self, joint: str) -> float:
+        """Largest load of the rig's own weights on a revolute joint in its work volume, N m."""
+
+
 @dataclass(frozen=True)
 class Effect:
-    """A hidden imperfection.
+    """A hidden imperfection of the machine.
+
+    A subclass is one file of `simulators/effects`, states the class attributes, and overrides the methods by which it
+    acts.
 
     Attributes:
-        family: its name.
-        size: names of the coefficients that are its amplitude: twice of each is twice the effect.
+        family: its name, which is that of its file.
+        amplitudes: coefficients that scale the effect (twice of each is twice the effect) -> hard bound of
+            plausible values.
+        bounded_at: the quantity that the bounds limit: the coefficient itself, the angle (rad) at the largest load of
+            the rig's own weights on the joint, or the displacement (mm) of the last prism in the work volume.
+        has_either_sign: drawn amplitudes are positive or negative.
+        needs_load: it acts only on joints that carry a noticeable part of the rig's weight.
+        acts_at: kinds of places: `joint`, `revolute`, `prismatic`, `prism`, or `boom`, `base`, `clock`, `station`.
+        positive: further coefficients that must be above 0.
         where: the joint value's name, a prism's, or `boom`, `base`, `clock`, `station`.
     """
 
     family: ClassVar[str]
-    size: ClassVar[tuple[str, ...]]
+    amplitudes: ClassVar[Mapping[str, float]]
+    bounded_at: ClassVar[Literal["coefficient", "largest_load", "full_reach"]] = "coefficient"
+    has_either_sign: ClassVar[bool] = False
+    needs_load: ClassVar[bool] = False
+    acts_at: ClassVar[tuple[str, ...]] = ("joint",)
+    positive: ClassVar[tuple[str, ...]] = ()
     where: str
 
+    def __init_subclass__(cls) -> None:
+        cls.family = cls.__module__.rpartition(".")[2]
+
     def check(self, rig: Rig) -> None:
-        """ValueError when the rig has no such place."""
-        if self.where not in rig.joint_names:
-            raise ValueError(f"{self.family}@{self.where}: rig {rig.name!r} has joints {', '.join(rig.joint_names)}")
+        """Raise ValueError if the rig has no such place, or a coefficient is impossible."""
+        kinds = {"joint": rig.joint_names, "prism": rig.prism_names}
+        kinds |= {kind: tuple(j.name for j in rig.joints if j.kind == kind) for kind in ("revolute", "prismatic")}
+        places = [place for kind in self.acts_at for place in kinds.get(kind, (kind,))]
+        if self.where not in places:
+            raise ValueError(f"{self.family}@{self.where}: it acts at {', '.join(places) or 'no place of this rig'}")
+        for name in self.positive:
+            if getattr(self, name) <= 0.0:
+                raise ValueError(f"{self.family}@{self.where}: {name} must be positive, not {getattr(self, name):g}")
+
+    def draw_shape(self, data: DrawContext, rng: np.random.Generator) -> Effect:
+        """Return the effect with random values of its coefficients other than the amplitudes."""
+        del data, rng
+        return self
 
     def anchored(self, first_s: float, mean_degC: float) -> Effect:
-        """The same effect with the instant and the temperature from which it counts fixed, where they were left open.
+        """Return the effect with its reference instant and temperature set, if they were left open.
 
         Left open, they are those of the rows that a call gives: the earliest time and the mean temperature.
         """
@@ -137,7 +185,7 @@ class Effect:
         return replace(self, **left_open) if left_open else self
 
     def delay_s(self, body: Body) -> Floats | None:
-        """(n,) how much earlier than the readings the fix was; None when it is of their instant."""
+        """(n,) time of the fix before the readings; None if they are of one instant."""
         del body
         return None
 
@@ -147,7 +195,7 @@ class Effect:
         return None
 
     def row_turns(self, body: Body) -> Mapping[int, Floats]:
-        """Row number -> (n,) by how much it turns further than its joints say, rad."""
+        """Row number -> (n,) angle by which it turns further than its joints, rad."""
         del body
         return {}
 
@@ -162,21 +210,42 @@ class Effect:
         return ()
 
     def fix_shift_mm(self, sight: Sight) -> Floats | None:
-        """(n, 3) by what the fix lies beside the prism, in the station's frame; None when it does not."""
+        """(n, 3) displacement of the fix from the prism, in the station's frame; None if there is no such effect."""
         del sight
         return None
 
 
-def check_kind(effect: Effect, rig: Rig, kind: str) -> None:
-    """ValueError unless the effect sits at a joint of the given kind."""
-    if rig.joint(effect.where).kind != kind:
-        raise ValueError(f"{effect.family}@{effect.where}: {effect.where} is not a {kind} joint")
+@dataclass(frozen=True)
+class BoomEffect(Effect):
+    """An effect of the telescoping boom."""
+
+    acts_at = ("boom",)
+    where: str = "boom"
+
+    def check(self, rig: Rig) -> None:
+        super().check(rig)
+        boom_row(rig)
 
 
-def check_place(effect: Effect, *places: str) -> None:
-    """ValueError unless the effect is at one of these."""
-    if effect.where not in places:
-        raise ValueError(f"{effect.family}@{effect.where}: it acts at {', '.join(places)}")
+def boom_row(rig: Rig) -> int:
+    """Number of the row whose length `a` a transducer drives (the telescoping boom); ValueError if there is none."""
+    row = next((n for n, driven, _, _ in rig.couplings() if driven == "a"), None)
+    if row is None:
+        raise ValueError(f"rig {rig.name!r} has no row with a driven length a")
+    return row
+
+
+def boom_stroke(rig: Rig) -> str:
+    """Name of the first prismatic joint; ValueError if there is none."""
+    stroke = next((joint.name for joint in rig.joints if joint.kind == "prismatic"), None)
+    if stroke is None:
+        raise ValueError(f"rig {rig.name!r} has no prismatic joint")
+    return stroke
+
+
+def step_time_s(data: DrawContext, rng: np.random.Generator) -> float:
+    """Draw the instant of a step, in the middle half of the data."""
+    return data.first_s + (data.last_s - data.first_s) * float(rng.uniform(0.25, 0.75))
 
 
 def hours_since(body: Body, first_s: float | None) -> Floats:

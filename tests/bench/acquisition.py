@@ -26,15 +26,18 @@ from typing import Any
 
 import can
 
-from daemon.acquisition import Acquisition
+from daemon.acquisition.acquisition import Acquisition
 from daemon.store import Reader, Store
+from drivers.can.ports import CanLinkConfig
 from drivers.can_decoder import CanDecoder
-from drivers.canbus import CanLink, CanLinkConfig
-from drivers.cia406 import EncoderChannel, EncoderDecoder
+from drivers.can_link import CanLink
+from drivers.canopen.cia406 import EncoderChannel, EncoderDecoder
+from drivers.canopen.pdo import TransmitPdo
 from drivers.clock import SystemClock
-from drivers.pdo import TransmitPdo
-from drivers.serialport import SerialConfig
-from drivers.station import StationConfig, StationDecoder, StationLink
+from drivers.stations.config import StationConfig
+from drivers.stations.decoder import StationDecoder
+from drivers.stations.link import StationLink
+from drivers.stations.serial_port import SerialConfig
 from tests.bench.traffic import (
     ENCODER_NODES,
     MULTICAST_GROUP,

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from calibration.identification.refinement import Fit, refine
 from calibration.identification.samples import Samples
-from calibration.kernels import Fitness
-from calibration.kinematics import Chain, ChainData, Placement
-from calibration.rig import Rig, shipped_rig
+from calibration.kinematics.chain import Chain, ChainData, Placement
+from calibration.kinematics.fitness import Fitness
+from calibration.rig.description import Rig, shipped_rig
 
 Floats = NDArray[np.float64]
 NOISE_MM = 3.0
@@ -108,7 +108,9 @@ class Boom:
         x = self.truth.copy()
         for _ in range(20):
             error = self.samples.position_mm - self.chain.positions_mm(x, self.samples.data)
-            jacobian = self.chain.jacobian(x, self.samples.data)[:, :, self.free].reshape(-1, int(self.free.sum()))
+            jacobian = (
+                self.chain.linearise(x, self.samples.data).jacobian[:, :, self.free].reshape(-1, int(self.free.sum()))
+            )
             scale = 1.0 / np.linalg.norm(jacobian, axis=0)
             x[self.free] += scale * np.linalg.lstsq(jacobian * scale, error.ravel(), rcond=1e-9)[0]
         return float(self.fitness(x[self.free][None])[0])

@@ -15,16 +15,17 @@ from dataclasses import dataclass
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from calibration.design.candidates import CANDIDATES, Candidates, draw, work_volume
 from calibration.design.knowledge import Knowledge
-from calibration.design.poses import CANDIDATES, Candidates, draw, plan, work_volume
+from calibration.design.poses import plan
 from calibration.design.visibility import Bodies, Site, in_view, site
 from calibration.identification.refinement import refine
 from calibration.identification.solve import place
-from calibration.kinematics import Chain, ChainData, Placement
+from calibration.kinematics.chain import Chain, ChainData, Placement
 from calibration.observations import Floats, Observations, parse_observations
-from calibration.rig import Rig, shipped_rig
-from simulators.dataset import simulate_observations
-from simulators.truth import RigTruth
+from calibration.rig.description import Rig, shipped_rig
+from simulators.rig.truth import RigTruth
+from tests.simulated.observations import simulate_observations
 
 HELD_OUT = 300
 

@@ -9,15 +9,15 @@ import argparse
 
 import numpy as np
 
-from calibration import pipeline
-from calibration.cusum import Cusum
-from calibration.drift import check
+from calibration.evaluation.drift import check
+from calibration.numerics.statistics import Cusum
 from calibration.observations import Observations, parse_observations
-from daemon.numba_cache import prepare
-from daemon.rigs import load_rig
-from simulators.dataset import simulate_observations
-from simulators.effects.spec import parse_effects
-from simulators.truth import RigTruth
+from calibration.pipeline.calibrate import identify
+from daemon.config import load_rig
+from daemon.warm_up import prepare
+from simulators.effects.library import parse_effects
+from simulators.rig.truth import RigTruth
+from tests.simulated.observations import simulate_observations
 
 SOURCE = load_rig("swdt82")
 TRAINING_POSES, CHECK_POSES, SESSIONS = 30, 4, 40
@@ -41,7 +41,7 @@ def main() -> None:
     prepare()
     machines = range(options.first, options.first + options.machines)
     live = {
-        machine: pipeline.identify(
+        machine: identify(
             SOURCE.rig, SOURCE.text, observed(machine, "", TRAINING_POSES, 500 + machine, "S1"), effects="none"
         )
         for machine in machines

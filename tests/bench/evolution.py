@@ -22,6 +22,7 @@ from scipy.optimize import differential_evolution
 from threadpoolctl import threadpool_limits
 
 from calibration.published.paper_evolution import PaperSettings, evolve_paper
+from calibration.run import Run
 from tests.bench.boom import Boom, boom
 
 Floats = NDArray[np.float64]
@@ -69,10 +70,8 @@ def search(
         problem.fitness,
         -problem.width,
         problem.width,
-        seed=0,
-        executor=executor,
+        run=Run(0, executor, progress=clock),
         settings=settings,
-        progress=clock,
     )
     return clock, problem.rms_mm(found.cost)
 

@@ -20,17 +20,19 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from calibration.errors import CalibrationError
-from calibration.identification.approach import PRIOR_SCALE, approach
-from calibration.identification.refinement import prior_precision, refine
+from calibration.identification.linear_model import prior_precision
+from calibration.identification.refinement import refine
 from calibration.identification.samples import averaged
 from calibration.identification.solve import solve
-from calibration.kinematics import Chain, Placement
+from calibration.identification.start import PRIOR_SCALE, approach
+from calibration.kinematics.chain import Chain, Placement
 from calibration.observations import parse_observations
-from calibration.rig import Rig, shipped_rig
-from simulators.dataset import simulate_observations
-from simulators.truth import RigTruth
+from calibration.rig.description import Rig, shipped_rig
+from calibration.run import Run
+from simulators.rig.truth import RigTruth
 from tests.bench.boom import NOISE_MM, boom
 from tests.calibration.conftest import rms
+from tests.simulated.observations import simulate_observations
 
 POSES, REACH_MM = 200, 400.0
 WITHIN = 1.001
@@ -94,7 +96,7 @@ def all_unknown(seed: int, reach_deg: float) -> Outcome:
     with ThreadPoolExecutor(2) as pool:
         began = time.perf_counter()
         try:
-            found = solve(rig, observations, prior="as-built", seed=0, executor=pool, progress=lambda share, what: None)
+            found = solve(rig, observations, prior="as-built", run=Run(0, pool))
         except CalibrationError as error:
             print(f"    seed {seed}: {error}")
             return Outcome(np.inf, optimum, time.perf_counter() - began)

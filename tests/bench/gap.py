@@ -12,17 +12,18 @@ import time
 
 from threadpoolctl import threadpool_limits
 
-from calibration.effects.base import Situation
+from calibration.effects.context import EffectContext
 from calibration.effects.library import library
+from calibration.gap.candidates import candidate_effects
 from calibration.gap.projection import Projection
-from calibration.gap.screen import Screen, possible
-from calibration.gap.workflow import find_gap
+from calibration.gap.screening import Screen
 from calibration.identification.solve import solve
 from calibration.observations import Observations, parse_observations
-from calibration.pipeline import executor_or_threads
-from daemon.rigs import RigSource, load_rig
-from simulators.effects import parse_effects
-from simulators.scene import SceneSettings, draw_scene
+from calibration.pipeline.find_gap import find_gap
+from calibration.run import Run
+from daemon.config import RigSource, load_rig
+from simulators.blind.scene import SceneSettings, draw_scene
+from simulators.effects.library import parse_effects
 
 ONE = "boom_droop@boom:flexibility_per_Nm2=1e-8"
 FOUR = f"{ONE},backlash@theta1:width_rad=2e-3,angle_scale@theta4:scale=2e-3,transducer_scale@L3:scale=4e-3"
@@ -39,15 +40,13 @@ def measured(source: RigSource, poses: int, effects: str, seed: int) -> Observat
 
 def screening_seconds(source: RigSource, observations: Observations, seed: int) -> float:
     """One weighing of the whole library, the least of three."""
-    with executor_or_threads(None) as pool:
-        solution = solve(
-            source.rig, observations, prior="recalibration", seed=seed, executor=pool, progress=lambda share, what: None
-        )
-    over = Projection(solution, Situation(solution.chain, solution.fit.x, observations))
+    with Run().workers() as pool:
+        solution = solve(source.rig, observations, prior="recalibration", run=Run(seed, pool))
+    over = Projection(solution, EffectContext(solution.chain, solution.fit.x, observations))
     seconds = []
     for _ in range(3):
         started = time.monotonic()
-        Screen(over, possible(over.situation, over, library()).places).weigh()
+        Screen(over, candidate_effects(over.situation, over, library()).candidates).score()
         seconds.append(time.monotonic() - started)
     return min(seconds)
 
@@ -63,7 +62,7 @@ def main() -> None:
         for hidden in (ONE, FOUR):
             observations = measured(source, poses, hidden, options.seed)
             started = time.monotonic()
-            gap = find_gap(source.rig, source.text, observations, seed=options.seed)
+            gap = find_gap(source.rig, source.text, observations, run=Run(options.seed))
             seconds = time.monotonic() - started
             named = ", ".join(f"{e.family}@{e.where}" for e in gap.effects) or "nothing"
             bar = BARS_S.get(poses)

@@ -16,16 +16,16 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from calibration.numerics.single_thread import SingleThreaded, one_blas_thread
 from calibration.observations import Floats
 from calibration.residual.features import Features
-from calibration.residual.hybrid import Decision, decide
-from calibration.single_thread import SingleThreaded, one_blas_thread
+from calibration.residual.selection import Selection, select_residual
 
 NOISES = ("normal", "heavy", "sessions", "uneven")
 SIGNALS = (0.25, 0.5, 1.0)
 
 
-def trial(noise: str, signal: float, rows: int, seed: int) -> Decision:
+def trial(noise: str, signal: float, rows: int, seed: int) -> Selection:
     """The gate's decision on one data set."""
     rng = np.random.default_rng([seed, 77])
     joints = rng.uniform(-1.0, 1.0, (rows, 3))
@@ -44,7 +44,7 @@ def trial(noise: str, signal: float, rows: int, seed: int) -> Decision:
     target = error + signal * curve / np.sqrt((curve**2).mean())
     groups = np.array([f"s{s}" for s in session]) if noise == "sessions" else cells
     with one_blas_thread(), ThreadPoolExecutor(2) as pool:
-        return decide(
+        return select_residual(
             seen,
             target,
             groups,

@@ -25,11 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from calibration.kernels import Fitness, evaluate
-from calibration.kinematics import Chain, ChainData, Placement
+from calibration.kinematics.chain import Chain, ChainData, Placement
+from calibration.kinematics.fitness import Fitness, evaluate
 from calibration.observations import Floats
 from calibration.published.paper_evolution import PaperSettings
-from calibration.rig import shipped_rig
+from calibration.rig.description import shipped_rig
+from tests.calibration.kinematics.numpy_chain import NumpyChain
 
 POSES = 200
 CANDIDATES = 8192  # a small part of the published search's population; a call takes some milliseconds
@@ -63,6 +64,7 @@ class Problem:
         self.full = np.where(self.free, rng.uniform(-1, 1, (candidates, len(chain))) * width, 0.0)
         self.population = np.ascontiguousarray(self.full[:, self.free])
         truth = np.where(self.free, rng.uniform(-0.5, 0.5, len(chain)) * width, 0.0)
+        self.reference = NumpyChain(chain)
         self.measured = chain.positions_mm(truth, self.data) + rng.normal(0, 3, (len(self.data), 3))
 
     def fitness(self, precision: str) -> Fitness:
@@ -92,8 +94,8 @@ class Problem:
     # -- the same sums in NumPy --------------------------------------------------------------------------------------
 
     def by_reference(self, candidates: Floats) -> Floats:
-        """`Chain.positions_mm`, one candidate at a time."""
-        return np.array([((self.chain.positions_mm(x, self.data) - self.measured) ** 2).sum() for x in candidates])
+        """Transform by transform, one candidate at a time."""
+        return np.array([((self.reference.positions_mm(x, self.data) - self.measured) ** 2).sum() for x in candidates])
 
     def by_matrices(self, candidates: Floats) -> Floats:
         """One 4 x 4 matrix for each row, for all candidates and poses at once."""

@@ -29,6 +29,7 @@ from threadpoolctl import threadpool_limits
 
 from calibration.identification.search.islands import Settings, evolve
 from calibration.published.paper_evolution import PaperSettings, evolve_paper
+from calibration.run import Run
 from tests.bench.boom import Boom, boom
 
 Floats = NDArray[np.float64]
@@ -69,7 +70,7 @@ class _Watch:
 def ours(problem: Boom, watch: _Watch, executor: Executor, seed: int) -> None:
     start = np.zeros((1, len(problem.width)))
     found = evolve(
-        problem.fitness, -problem.width, problem.width, seed=seed, executor=executor, settings=Settings(), start=start
+        problem.fitness, -problem.width, problem.width, run=Run(seed, executor), settings=Settings(), start=start
     )
     watch(problem.refined(found.x).x[problem.free][None])
 
@@ -122,9 +123,7 @@ def de1220(problem: Boom, watch: _Watch, executor: Executor, seed: int) -> None:
 
 def papers(problem: Boom, watch: _Watch, executor: Executor, seed: int) -> None:
     settings = PaperSettings()
-    evolve_paper(
-        [watch], problem.fitness, -problem.width, problem.width, seed=seed, executor=executor, settings=settings
-    )
+    evolve_paper([watch], problem.fitness, -problem.width, problem.width, run=Run(seed, executor), settings=settings)
 
 
 SEARCHES: dict[str, Callable[[Boom, _Watch, Executor, int], None]] = {

@@ -25,15 +25,17 @@ from dataclasses import replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from calibration.inverse import CLOSURE_MM, inverse
-from calibration.model import CalibratedModel
+from calibration.model.inverse import CLOSURE_MM, inverse
+from calibration.model.model import CalibratedModel
+from calibration.model.prediction import Predictor
 from calibration.observations import Observations, parse_observations
-from calibration.pipeline import identify, train_residual
-from calibration.rig import Rig, shipped_rig
-from simulators.dataset import simulate_observations
-from simulators.effects import parse_effects
-from simulators.truth import RigTruth
+from calibration.pipeline.calibrate import identify, train_residual
+from calibration.rig.description import Rig, shipped_rig
+from calibration.run import Run
+from simulators.effects.library import parse_effects
+from simulators.rig.truth import RigTruth
 from tests.calibration.conftest import rig_text
+from tests.simulated.observations import simulate_observations
 
 RIG = "swdt82"
 TRAINING_POSES, SEED = 1000, 1000
@@ -80,7 +82,7 @@ def models(signals: int) -> dict[str, CalibratedModel]:
     found["5 effects"] = identify(rig, rig_text(RIG), training, effects=EFFECTS)
     # Whether a learner helps is not the question here: each is trained on kinematics alone, which leave it something.
     for kind in KINDS:
-        learned = train_residual(found["kinematics"], training, kind=kind, seed=SEED)
+        learned = train_residual(found["kinematics"], training, kind=kind, run=Run(SEED))
         found[f"5 effects, {kind}"] = replace(found["5 effects"], residual=learned.residual)
     return found
 
@@ -96,7 +98,7 @@ def inversions(model: CalibratedModel, rows: Observations, prisms: tuple[str, ..
         for joint in model.rig.joints:
             off = 0.01 * (joint.limits[1] - joint.limits[0]) * rng.normal()
             nominal[joint.name] = np.clip(there.joints[joint.name] + off, *joint.limits)
-        targets = replace(there, joints=nominal, position_mm=model.predict(there).position_mm)
+        targets = replace(there, joints=nominal, position_mm=Predictor.of(model).predict(there).position_mm)
         began = time.thread_time()
         found = inverse(model, targets)
         times.append(1e3 * (time.thread_time() - began))
@@ -124,9 +126,14 @@ def main() -> None:
         for name, model in models(options.signals).items():
             one = rows.select(np.array([0]))
             times = {
-                "one_us": (1e6, lambda m=model, o=one: m.predict(o), options.repetitions, time.thread_time),
-                "many_ms": (1e3, lambda m=model: m.predict(rows, pool), few, time.perf_counter),
-                "many_one_thread_ms": (1e3, lambda m=model: m.predict(rows), few, time.thread_time),
+                "one_us": (
+                    1e6,
+                    lambda m=model, o=one: Predictor.of(m).predict(o),
+                    options.repetitions,
+                    time.thread_time,
+                ),
+                "many_ms": (1e3, lambda m=model: Predictor.of(m).predict(rows, pool), few, time.perf_counter),
+                "many_one_thread_ms": (1e3, lambda m=model: Predictor.of(m).predict(rows), few, time.thread_time),
             }
             result[name] = {"learner": model.residual.learner.kind if model.residual else "none"}
             for what, (unit, run, repetitions, clock) in times.items():

@@ -9,12 +9,12 @@ from __future__ import annotations
 import argparse
 from statistics import fmean
 
-from calibration import pipeline
+from calibration.evaluation.promotion import compare_held_out
 from calibration.observations import Observations, parse_observations
-from calibration.promotion import compare_held_out
-from daemon.rigs import load_rig
-from simulators.dataset import simulate_observations
-from simulators.truth import RigTruth
+from calibration.pipeline.calibrate import identify
+from daemon.config import load_rig
+from simulators.rig.truth import RigTruth
+from tests.simulated.observations import simulate_observations
 
 LIVE_POSES, CANDIDATE_POSES = 15, 80
 STANDSTILLS = (4, 10, 20, 40)
@@ -37,8 +37,8 @@ def main() -> None:
     gains = []
     for seed in range(options.first, options.first + options.machines):
         truth = RigTruth(SOURCE.rig, seed)
-        live = pipeline.identify(SOURCE.rig, SOURCE.text, measured(truth, LIVE_POSES, seed))
-        candidate = pipeline.identify(SOURCE.rig, SOURCE.text, measured(truth, CANDIDATE_POSES, seed + 5000))
+        live = identify(SOURCE.rig, SOURCE.text, measured(truth, LIVE_POSES, seed))
+        candidate = identify(SOURCE.rig, SOURCE.text, measured(truth, CANDIDATE_POSES, seed + 5000))
         for count in STANDSTILLS:
             checks = measured(truth, count, seed + 9000)
             found = compare_held_out(candidate, live, checks)

@@ -21,15 +21,16 @@ import scipy
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
-from calibration.identification.refinement import prior_precision, refine
+from calibration.identification.linear_model import prior_precision
+from calibration.identification.refinement import refine
 from calibration.identification.samples import Samples, averaged
 from calibration.identification.start import rough_start
-from calibration.kernels.lineariser import Lineariser
-from calibration.kinematics import Chain, Linearisation, Placement
+from calibration.kinematics.chain import Chain, Linearisation, Placement
 from calibration.observations import Floats, parse_observations
-from calibration.rig import shipped_rig
-from simulators.dataset import simulate_observations
-from simulators.truth import RigTruth
+from calibration.rig.description import shipped_rig
+from simulators.rig.truth import RigTruth
+from tests.calibration.kinematics.numpy_chain import NumpyChain
+from tests.simulated.observations import simulate_observations
 
 POSES, NOISE_MM, TARGET_MS = 250, 3.0, 50.0
 
@@ -75,16 +76,16 @@ def main() -> None:
     options = parser.parse_args()
     chain, samples, nominal = problem(options.seed)
     fit = refine(chain, samples, nominal)
-    lineariser = Lineariser(chain)
+    in_numpy = NumpyChain(chain)
     peers = {
-        "least_squares": Residuals(chain, samples, fit.x, fit.excess_variance, chain.linearise),
-        "least_squares_compiled": Residuals(chain, samples, fit.x, fit.excess_variance, lineariser),
+        "least_squares": Residuals(chain, samples, fit.x, fit.excess_variance, in_numpy.linearise),
+        "least_squares_compiled": Residuals(chain, samples, fit.x, fit.excess_variance, chain.linearise),
     }
     runs: dict[str, Callable[[], object]] = {"refine": lambda: refine(chain, samples, nominal)}
     for name, residuals in peers.items():
         runs[name] = lambda r=residuals: least_squares(r, nominal, jac=r.jacobian, x_scale="jac")
-    runs["linearise_numpy"] = lambda: chain.linearise(nominal, samples.data)
-    runs["linearise_compiled"] = lambda: lineariser(nominal, samples.data)
+    runs["linearise_numpy"] = lambda: in_numpy.linearise(nominal, samples.data)
+    runs["linearise_compiled"] = lambda: chain.linearise(nominal, samples.data)
     times: dict[str, list[float]] = {name: [] for name in runs}
     processor: dict[str, list[float]] = {name: [] for name in runs}
     with threadpool_limits(1, user_api="blas"):

@@ -25,18 +25,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from calibration.model import CalibratedModel
+from calibration.evaluation.evaluation import evaluate
+from calibration.model.model import CalibratedModel
+from calibration.model.prediction import Predictor
 from calibration.observations import Observations, parse_observations
-from calibration.pipeline import evaluate, identify, train_residual
+from calibration.pipeline.calibrate import identify, train_residual
 from calibration.residual.features import usable_signals
-from calibration.residual.hybrid import Kind
-from calibration.rig import shipped_rig
-from simulators.dataset import simulate_observations
-from simulators.effects import parse_effects
-from simulators.runs import simulate_runs
-from simulators.truth import RigTruth
+from calibration.residual.selection import Kind
+from calibration.rig.description import shipped_rig
+from calibration.run import Run
+from simulators.effects.library import parse_effects
+from simulators.rig.truth import RigTruth
 from tests.bench.tuned_boosting import tune_boosting
 from tests.calibration.conftest import rig_text
+from tests.simulated.observations import simulate_observations
+from tests.simulated.runs import simulate_runs
 
 Floats = NDArray[np.float64]
 
@@ -142,13 +145,13 @@ def outcome(seed: int, magnitude: float, effects: str, setting: Setting) -> Outc
     """Calibrate one machine with each method and measure it where it was never seen."""
     truth = boom(seed, magnitude)
     training, held_out, noise_mm = train_and_held_out(truth, seed, setting)
-    model = identify(truth.rig, rig_text(RIG), training, seed=seed, effects=effects)
-    plain_mm = held_out.position_mm - model.effects_mm(held_out)
+    model = identify(truth.rig, rig_text(RIG), training, run=Run(seed), effects=effects)
+    plain_mm = held_out.position_mm - Predictor.of(model).effects_mm(held_out)
     errors_mm, seconds, covered = {NO_RESIDUAL: plain_mm}, 0.0, (0.0, 0.0)
     chosen: dict[str, str] = {}
     for method in (*setting.against, HYBRID):
         began = time.perf_counter()
-        trained = train_residual(model, training, kind=method, seed=seed)
+        trained = train_residual(model, training, kind=method, run=Run(seed))
         seconds = time.perf_counter() - began
         evaluation = evaluate(trained, held_out)
         errors_mm[method] = evaluation.errors_mm["hybrid"]
@@ -174,10 +177,12 @@ def tuned_estimate_mm(
 ) -> Floats:
     """(n, 3) what trees tuned apart from the residual's own say of held-out rows, in the station's frame."""
     signals = usable_signals(training)
-    target_mm = model.to_base(training, training.position_mm - model.effects_mm(training))
-    table = model.residual_features(training, signals).table()
+    target_mm = Predictor.of(model).to_base(training, training.position_mm - Predictor.of(model).effects_mm(training))
+    table = Predictor.of(model).features(training, signals).table()
     trees = tune_boosting(table, target_mm, training.groups(), seed=seed, trials=trials)
-    return model.to_station(held_out, trees.predict(model.residual_features(held_out, signals).table()))
+    return Predictor.of(model).to_station(
+        held_out, trees.predict(Predictor.of(model).features(held_out, signals).table())
+    )
 
 
 def summary(outcomes: Sequence[Outcome]) -> None:
@@ -235,8 +240,8 @@ def nothing(seeds: Sequence[int], effects: str, n: int) -> None:
         for seed in seeds:
             truth = boom(seed, 0.0)
             training = fixes(truth, n, seed, "runs")[0] if source == "runs" else poses(truth, n, seed)
-            model = identify(truth.rig, rig_text(RIG), training, seed=seed, effects=effects)
-            trained = train_residual(model, training, seed=seed)
+            model = identify(truth.rig, rig_text(RIG), training, run=Run(seed), effects=effects)
+            trained = train_residual(model, training, run=Run(seed))
             off += trained.residual is None
             trials = ", ".join(f"{t.kind} {t.before_mm:.3f} -> {t.after_mm:.3f} p {t.p:.2g}" for t in trained.trials)
             kept = trained.residual.learner.kind if trained.residual else "none"
@@ -254,10 +259,10 @@ def timing(n: int, seed: int) -> None:
     """Train `default` once."""
     truth = boom(seed, 1.0)
     training, _ = fixes(truth, n, seed, "runs")
-    model = identify(truth.rig, rig_text(RIG), training.select(np.arange(min(n, 1000))), seed=seed, effects="none")
+    model = identify(truth.rig, rig_text(RIG), training.select(np.arange(min(n, 1000))), run=Run(seed), effects="none")
     count = len(truth.rig.joints) + 3 * len(truth.rig.rows) + len(usable_signals(training))
     began, used = time.perf_counter(), time.process_time()
-    trained = train_residual(model, training, seed=seed)
+    trained = train_residual(model, training, run=Run(seed))
     seconds, cpu = time.perf_counter() - began, time.process_time() - used
     kept = trained.residual.learner.kind if trained.residual else "none"
     print(f"{n} x {count} features: {seconds:.1f} s ({cpu:.1f} s of processors), kept {kept} (bars: {BARS})")

@@ -3,7 +3,7 @@
 A sending process puts 8,000 frames of 8 bytes a second on a bus that the kernel stamps on arrival: `vcan0` where there
 is one, else UDP on this host, whose datagrams have true receive stamps as SocketCAN's frames have (a socket pair's are
 stamped only when they are read). Two processes per core spin beside it. Side by side listen rigcal's link
-(`drivers.canbus.CanLink`) and python-can's own logger (`Notifier` with its candump writer). Each frame carries its
+(`drivers.can_link.CanLink`) and python-can's own logger (`Notifier` with its candump writer). Each frame carries its
 number, and the sender notes when it sent it. A bus does not wait for the computer, so the sender runs with real-time
 priority where it may; the rate that it reached is told. Exit status 1: rigcal lost a frame that it had received, or its
 stamps go back.
@@ -30,12 +30,12 @@ from typing import Any
 import can
 import numpy as np
 
-from drivers.can_ports import OVERFLOW
-from drivers.canbus import CanLink, CanLinkConfig
-from drivers.canlog import read_can_log
+from drivers.can.ports import OVERFLOW, CanLinkConfig
+from drivers.can_link import CanLink
 from drivers.clock import SystemClock
+from drivers.logs.can_log import read_can_log
 from drivers.readings import CanCapture, EventKind, LinkItem
-from simulators.frame import Frame
+from simulators.devices.can.bus import Frame
 from tests.bench.acquisition import SETTLE_S, START_S, Child, cpu_s
 from tests.bench.traffic import FRAMES_PER_MS, MULTICAST_GROUP, Bus, MulticastSender, frame_at, number_of, send_all
 

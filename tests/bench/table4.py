@@ -12,17 +12,19 @@ import argparse
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from calibration.effects.base import Situation
-from calibration.effects.fitted import coefficient_values, corrected, fitted_additions
-from calibration.gap.adopt import Adopted
+from calibration.effects.context import EffectContext
+from calibration.effects.fitted import coefficient_values, corrected, fitted_columns
+from calibration.evaluation.evaluation import evaluate
+from calibration.gap.adoption import Adopted
 from calibration.identification.solve import Solution
 from calibration.observations import Floats, Observations
-from calibration.pipeline import calibrate, evaluate
+from calibration.pipeline.calibrate import calibrate
 from calibration.published.second_paper import km, skcm
 from calibration.residual.features import usable_torques
 from calibration.residual.folds import group_labels, standstill_labels
-from calibration.residual.hybrid import torque_compensation
-from calibration.rig import Rig
+from calibration.residual.selection import torque_compensation
+from calibration.rig.description import Rig
+from calibration.run import Run
 from tests.calibration.conftest import features, rig_text
 from tests.calibration.simulated_ys100 import linear, robot, stiffening
 
@@ -38,9 +40,9 @@ PAPER = {
 
 def table(rig: Rig, training: Observations, held_out: Observations, seed: int) -> Floats:
     """(methods, 3) mean, greatest and standard deviation of the errors on the held-out poses, mm."""
-    geometric = km(rig, training, progress=_silent)
-    compliant = skcm(rig, training, progress=_silent)
-    model, _ = calibrate(rig, rig_text("ys100"), training, seed=seed)
+    geometric = km(rig, training, Run())
+    compliant = skcm(rig, training, Run())
+    model, _ = calibrate(rig, rig_text("ys100"), training, run=Run(seed))
     errors = (
         _error_mm(geometric, geometric.nominal.x, held_out),
         _error_mm(geometric, geometric.fit.x, held_out),
@@ -60,8 +62,8 @@ def _error_mm(solution: Solution, x: Floats, observations: Observations) -> Floa
 
 def _with_effects_mm(found: Adopted, observations: Observations) -> Floats:
     solution, names = found.solution, found.solution.chain.rig.joint_names
-    situation = Situation(solution.chain, solution.fit.x[: len(solution.chain)], observations)
-    change = fitted_additions(found.effects, situation).change(coefficient_values(found.effects), len(names))
+    situation = EffectContext(solution.chain, solution.fit.x[: len(solution.chain)], observations)
+    change = fitted_columns(found.effects, situation).change(coefficient_values(found.effects), len(names))
     return _error_mm(solution, solution.fit.x, corrected(observations, change, names))
 
 
@@ -81,10 +83,6 @@ def _compensated_mm(solution: Solution, training: Observations, held_out: Observ
     if decision.residual is None:
         return error
     return error - decision.residual.predict(features(chain, x, held_out, names)) @ rotation.T
-
-
-def _silent(share: float, what: str) -> None:
-    """Progress that nobody watches."""
 
 
 def main() -> None:

@@ -17,8 +17,8 @@ from typing import Literal, Protocol
 
 import can
 
-from simulators.frame import Frame
-from simulators.slcan_adapter import SlcanAdapter
+from simulators.devices.can.bus import Frame
+from simulators.devices.can.slcan_adapter import SlcanAdapter
 
 Transport = Literal["udp_multicast", "slcan"]
 

@@ -24,9 +24,11 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from calibration.identification.solve import solve
+from calibration.model.prediction import Predictor
 from calibration.observations import Observations, format_observations, parse_observations
-from calibration.rig import shipped_rig
-from daemon.modelfiles import read_model
+from calibration.rig.description import shipped_rig
+from calibration.run import Run
+from daemon.models.model_files import read_model
 
 DATA = Path(__file__).parents[1] / "data"
 SHARE = 0.7
@@ -63,9 +65,7 @@ def kinematics(name: str, divisions: int) -> None:
 def _left(data: Observations, held_out: Observations, pool: ThreadPoolExecutor) -> tuple[float, float]:
     """RMS on the held-out rows of kinematics fitted to others, and how many seconds the fit took."""
     started = time.monotonic()
-    solution = solve(
-        shipped_rig("ur10"), data, prior="recalibration", seed=0, executor=pool, progress=lambda share, what: None
-    )
+    solution = solve(shipped_rig("ur10"), data, prior="recalibration", run=Run(0, pool))
     seconds = time.monotonic() - started
     chain = solution.chain
     error = held_out.position_mm - chain.positions_mm(solution.fit.x[: len(chain)], chain.bind(held_out))
@@ -81,7 +81,7 @@ def predict_seconds(model: Path, data: Path) -> float:
     with ThreadPoolExecutor(2) as pool, threadpool_limits(1, user_api="blas"):
         for _ in range(REPETITIONS):
             started = time.monotonic()
-            loaded.predict(many, pool)
+            Predictor.of(loaded).predict(many, pool)
             seconds.append(time.monotonic() - started)
     return min(seconds)
 

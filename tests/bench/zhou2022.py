@@ -18,10 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from calibration.rig import Rig, shipped_rig
-from simulators.dataset import SimulatedObservations, random_poses, simulate_observations
-from simulators.effects import parse_effects
-from simulators.truth import RigTruth
+from calibration.rig.description import Rig, shipped_rig
+from simulators.effects.library import parse_effects
+from simulators.rig.dataset import SimulatedObservations, random_poses
+from simulators.rig.truth import RigTruth
+from tests.simulated.observations import simulate_observations
 
 Floats = NDArray[np.float64]
 

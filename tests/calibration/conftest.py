@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from calibration.kernels.machine import Machine
-from calibration.kinematics import Chain
-from calibration.model import CalibratedModel
+from calibration.kinematics.chain import Chain
+from calibration.kinematics.compiled_chain import CompiledChain
+from calibration.model.model import CalibratedModel
 from calibration.observations import Floats, Observations, parse_observations
-from calibration.pipeline import identify
+from calibration.pipeline.calibrate import identify
 from calibration.residual.features import Extractor, Features
-from calibration.rig import Rig, shipped_rig
-from simulators.dataset import simulate_observations
-from simulators.truth import RigTruth
+from calibration.rig.description import Rig, shipped_rig
+from simulators.rig.truth import RigTruth
+from tests.simulated.observations import simulate_observations
 
 DATA = Path(__file__).parent.parent / "data"
 
@@ -49,7 +49,7 @@ def simulated(truth: RigTruth, fixes: int, seed: int, setup: str = "", repeats: 
 def features(chain: Chain, x: Floats, observations: Observations, signals: Sequence[str]) -> Features:
     """What a residual learner sees of observations: `Extractor` for kinematics without a model."""
     data = chain.bind(observations)
-    return Extractor(chain, x, signals)(data.readings, Machine(chain, x).linearise(data), observations.extra)
+    return Extractor(chain, x, signals)(data.readings, CompiledChain(chain, x).linearise(data), observations.extra)
 
 
 def rms(error_mm: np.ndarray) -> float:

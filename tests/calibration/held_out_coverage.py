@@ -19,15 +19,17 @@ from typing import Literal
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from calibration.model import CalibratedModel
+from calibration.model.model import CalibratedModel
+from calibration.model.prediction import Predictor
 from calibration.observations import Floats, Observations, parse_observations
-from calibration.pipeline import identify, train_residual
+from calibration.pipeline.calibrate import identify, train_residual
 from calibration.residual.conformal import Intervals
-from calibration.rig import shipped_rig
-from simulators.dataset import simulate_observations
-from simulators.effects.spec import parse_effects
-from simulators.truth import RigTruth
+from calibration.rig.description import shipped_rig
+from calibration.run import Run
+from simulators.effects.library import parse_effects
+from simulators.rig.truth import RigTruth
 from tests.calibration.conftest import DATA, rig_text, split_by_cells
+from tests.simulated.observations import simulate_observations
 
 EFFECTS = (
     "",
@@ -74,14 +76,14 @@ def measured_case(name: str, seed: int) -> Case:
 
 def models(case: Case, seed: int) -> Iterator[CalibratedModel]:
     """Kinematics alone, and with what the residual's gate makes of the rest."""
-    model = identify(shipped_rig(case.rig), rig_text(case.rig), case.training, effects="none", seed=seed)
+    model = identify(shipped_rig(case.rig), rig_text(case.rig), case.training, effects="none", run=Run(seed))
     yield model
-    yield train_residual(model, case.training, seed=seed)
+    yield train_residual(model, case.training, run=Run(seed))
 
 
 def shares(model: CalibratedModel, held_out: Observations) -> Floats:
     """(5,) covered shares of x, y, z, of the balls, and of the axes if errors were normal."""
-    prediction = model.predict(held_out)
+    prediction = Predictor.of(model).predict(held_out)
     error = held_out.position_mm - prediction.position_mm
     found = model.intervals.coverage(error, prediction.sigma_mm)
     normal = Intervals().coverage(error, prediction.sigma_mm)

@@ -31,15 +31,16 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
 
+from calibration.identification.noise import reading_covariance, station_covariance
 from calibration.identification.refinement import Prior, refine
-from calibration.identification.samples import reading_covariance, station_covariance
 from calibration.identification.solve import place
-from calibration.kinematics import Chain
+from calibration.kinematics.chain import Chain
 from calibration.observations import Floats, Observations, parse_observations
-from calibration.rig import Rig, Row, shipped_rig
-from simulators.dataset import SimulatedObservations, simulate_observations
-from simulators.screws import nominal_constants
-from simulators.truth import RigTruth
+from calibration.rig.description import Rig, Row, shipped_rig
+from simulators.rig.dataset import SimulatedObservations
+from simulators.rig.screws import nominal_constants
+from simulators.rig.truth import RigTruth
+from tests.simulated.observations import simulate_observations
 
 FIXES, HELD_OUT = 250, 200
 BUILT = 10.0  # build tolerances that a machine is off where the fit does not trust them

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.identification.search.checkpoint import Checkpoint
 from calibration.identification.search.islands import Evolved, Settings, evolve
 from calibration.observations import Floats
 from calibration.published.paper_evolution import PaperSettings, evolve_paper
+from calibration.run import Checkpoint, Run
 
 LOWER, UPPER = np.full(6, -5.0), np.full(6, 5.0)
 SMALL = Settings(islands=3, population=40, evaluations=3000, epochs=5)
@@ -65,12 +65,12 @@ def sphere_with_holes(population: Floats) -> Floats:
 
 
 def default_search(executor: Executor, checkpoint: Checkpoint | None = None) -> Evolved:
-    return evolve(rastrigin, LOWER, UPPER, seed=5, executor=executor, settings=SMALL, checkpoint=checkpoint)
+    return evolve(rastrigin, LOWER, UPPER, run=Run(5, executor, checkpoint=checkpoint), settings=SMALL)
 
 
 def paper_search(executor: Executor, checkpoint: Checkpoint | None = None) -> Evolved:
     return evolve_paper(
-        [sphere, rastrigin], rastrigin, LOWER, UPPER, seed=5, executor=executor, settings=PAPER, checkpoint=checkpoint
+        [sphere, rastrigin], rastrigin, LOWER, UPPER, run=Run(5, executor, checkpoint=checkpoint), settings=PAPER
     )
 
 

@@ -16,12 +16,15 @@ from typing import Literal
 
 import numpy as np
 
+from calibration.evaluation.evaluation import evaluate
 from calibration.observations import Observations, parse_observations
-from calibration.pipeline import evaluate, identify
-from calibration.rig import Rig, shipped_rig
-from simulators.dataset import SimulatedObservations, simulate_observations
-from simulators.truth import RigTruth
+from calibration.pipeline.calibrate import identify
+from calibration.rig.description import Rig, shipped_rig
+from calibration.run import Run
+from simulators.rig.dataset import SimulatedObservations
+from simulators.rig.truth import RigTruth
 from tests.calibration.conftest import rig_text
+from tests.simulated.observations import simulate_observations
 
 FIXES, HELD_OUT, NOISE_MM = 250, 1000, 3.0
 
@@ -55,7 +58,7 @@ def session(seed: int, prisms_per_pose: Literal["all", "one"] = "one") -> Outcom
     training = simulate_observations(truth, poses, seed, prisms_per_pose=prisms_per_pose, noise_mm=NOISE_MM)
     held_out = simulate_observations(truth, HELD_OUT, seed + 500_000, prisms_per_pose="one", noise_mm=NOISE_MM)
     began = time.perf_counter()
-    model = identify(rig, rig_text("swdt82"), observations(training, rig, FIXES), seed=seed)
+    model = identify(rig, rig_text("swdt82"), observations(training, rig, FIXES), run=Run(seed))
     seconds = time.perf_counter() - began
     evaluation = evaluate(model, observations(held_out, rig, HELD_OUT))
     stages = {str(s["stage"]): float(s["rms_mm"]) for s in evaluation.stages()}

@@ -9,10 +9,13 @@ from __future__ import annotations
 import numpy as np
 
 from calibration.observations import Observations, parse_observations
-from calibration.rig import Rig, shipped_rig
-from simulators.dataset import random_poses, simulate_observations
-from simulators.effects import Effect, JointCompliance, StiffeningCompliance
-from simulators.truth import RigTruth
+from calibration.rig.description import Rig, shipped_rig
+from simulators.effects.base import Effect
+from simulators.effects.families.joint_compliance import JointCompliance
+from simulators.effects.variants.stiffening_compliance import StiffeningCompliance
+from simulators.rig.dataset import random_poses
+from simulators.rig.truth import RigTruth
+from tests.simulated.observations import simulate_observations
 
 POSES = 50
 NOISE_MM = 0.03

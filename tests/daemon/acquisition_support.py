@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from daemon.acquisition import Acquisition
+from daemon.acquisition.acquisition import Acquisition
 from daemon.store import Store
 from drivers.clock import Stamp, SystemClock
 from drivers.readings import CanCapture, Capture, Gap, GapReason, LinkItem, Reading, Record, SerialCapture, Status

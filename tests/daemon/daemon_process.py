@@ -11,7 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from daemon.control import CommandError, request
+from daemon.commands import CommandError
+from daemon.control.protocol import request
 
 CONFIG = """rig = "swdt82"
 state_directory = "."

@@ -7,14 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration import pipeline
 from calibration.effects.base import FittedCoefficient
-from calibration.gap.result import Candidate, Disagreement, Experiment, Forecast, Gap, Round
+from calibration.gap.result import Candidate, Disagreement, Experiment, Forecast, GapResult, Round
+from calibration.model.prediction import Predictor
 from calibration.observations import Floats, Observations, parse_observations
-from daemon.rigs import load_rig
-from simulators.dataset import simulate_observations
-from simulators.effects.spec import parse_effects
-from simulators.truth import RigTruth
+from calibration.pipeline.calibrate import identify
+from daemon.config import load_rig
+from simulators.effects.library import parse_effects
+from simulators.rig.truth import RigTruth
+from tests.simulated.observations import simulate_observations
 
 SOURCE = load_rig("swdt82")
 EFFECT = "backlash@theta4"
@@ -32,15 +33,15 @@ def session_csv(poses: int = POSES, seed: int = 5, setup: str = "S1", hidden: st
 
 
 @functools.cache
-def named() -> Gap:
+def named() -> GapResult:
     """A backlash at theta4 was found and adopted in the first round, nothing in the second."""
     observations = parse_observations(session_csv(), SOURCE.rig, "session.csv")
-    model = pipeline.identify(SOURCE.rig, SOURCE.text, observations, effects=EFFECT)
-    before = observations.position_mm - model.geometric_mm(observations)
-    after = observations.position_mm - model.effects_mm(observations)
+    model = identify(SOURCE.rig, SOURCE.text, observations, effects=EFFECT)
+    before = observations.position_mm - Predictor.of(model).geometric_mm(observations)
+    after = observations.position_mm - Predictor.of(model).effects_mm(observations)
     (effect,) = model.effects
     backlash = Candidate("backlash", "theta4", 0.9997, 310.2, effect.coefficients, WIDTH_BOUNDS)
-    return Gap(
+    return GapResult(
         verdict="named",
         effects=model.effects,
         posterior={EFFECT: 0.9997},
@@ -75,7 +76,7 @@ def named() -> Gap:
     )
 
 
-def nothing() -> Gap:
+def nothing() -> GapResult:
     """The same data, had nothing been found."""
     gap = named()
     left = gap.error_after_mm
@@ -94,7 +95,7 @@ def nothing() -> Gap:
     )
 
 
-def pending() -> Gap:
+def pending() -> GapResult:
     """A set of two: what moves both apart is proposed."""
     gap = named()
     return replace(
@@ -115,7 +116,7 @@ def pending() -> Gap:
     )
 
 
-def unidentified() -> Gap:
+def unidentified() -> GapResult:
     """Structure that nothing of the library explains."""
     return replace(
         pending(),
@@ -163,12 +164,12 @@ def rms(error_mm: Floats) -> float:
     return float(np.sqrt((error_mm**2).sum(axis=1).mean()))
 
 
-def of_time(gap: Gap) -> Observations:
+def of_time(gap: GapResult) -> Observations:
     """The rows with a temperature that rises with the time."""
     time_s = gap.observations.extra["time_s"]
     return replace(gap.observations, extra={**gap.observations.extra, "temperature_degC": 5.0 + time_s / 600.0})
 
 
-def _of_kinematics(gap: Gap) -> Floats:
+def _of_kinematics(gap: GapResult) -> Floats:
     size = len(gap.model.values)
     return gap.model.covariance[:size, :size]

@@ -10,7 +10,7 @@ from typing import Any
 
 from daemon.composition import Parts, joiner
 from daemon.config import Config, JobsSection
-from daemon.notify import Notifier
+from daemon.host.systemd import Notifier
 from daemon.service import Daemon
 from daemon.store.store import Store
 from drivers.clock import SystemClock

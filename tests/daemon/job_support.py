@@ -9,15 +9,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from daemon.config import Config, JobsSection
-from daemon.job_child import JOB_COMMAND
-from daemon.jobs import JobRunner
-from daemon.rigs import load_rig
-from daemon.scheduler import CHECK
+from daemon.commands import CHECK
+from daemon.config import Config, JobsSection, load_rig
+from daemon.jobs.child import JOB_COMMAND
+from daemon.jobs.runner import JobRunner
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, ManualClock, Stamp, SystemClock
-from simulators.dataset import SimulatedObservations, simulate_observations
-from simulators.truth import RigTruth
+from simulators.rig.dataset import SimulatedObservations
+from simulators.rig.truth import RigTruth
+from tests.simulated.observations import simulate_observations
 
 SOURCE = load_rig("swdt82")
 TRUTH = RigTruth(SOURCE.rig, 1)

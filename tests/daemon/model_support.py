@@ -13,23 +13,23 @@ from typing import Any
 
 import numpy as np
 
-from calibration import pipeline
 from calibration.observations import parse_observations
-from calibration.rig import Rig
+from calibration.pipeline.calibrate import identify
+from calibration.rig.description import Rig
 from daemon.composition import joiner
 from daemon.config import Config
-from daemon.job_process import perform
-from daemon.job_table import JobTable
-from daemon.live_model import LiveModel, Loaded, Missing
-from daemon.live_tip import FRESH_S, LiveTip
-from daemon.model_table import ModelTable
-from daemon.modelfiles import model_sha256, write_model
-from daemon.order import Outcome
-from daemon.registry import ModelRegistry
+from daemon.jobs.job_queue import JobQueue
+from daemon.jobs.order import Outcome
+from daemon.jobs.process import perform
+from daemon.models.live_model import LiveModel, Loaded, Missing
+from daemon.models.live_tip import FRESH_S, LiveTip
+from daemon.models.model_files import model_sha256, write_model
+from daemon.models.registry import ModelRegistry
+from daemon.store.models import ModelTable
 from drivers.clock import Stamp
 from drivers.readings import Reading, Record, Status
-from simulators.dataset import simulate_observations
 from tests.daemon.job_support import SOURCE, TRUTH, JobRig
+from tests.simulated.observations import simulate_observations
 
 PRISMS = ("r", "s")
 DEADLINE_S = 60.0
@@ -43,7 +43,7 @@ def written(poses: int) -> Path:
     directory = Path(scratch) / f"trained-on-{poses}"
     data = simulate_observations(TRUTH, poses, 20, setup="S1", prisms=PRISMS)
     observations = parse_observations(data.csv_text().encode(), SOURCE.rig, "simulated.csv")
-    write_model(directory, pipeline.identify(SOURCE.rig, SOURCE.text, observations))
+    write_model(directory, identify(SOURCE.rig, SOURCE.text, observations))
     return directory
 
 
@@ -59,7 +59,7 @@ class ModelRig:
         self.jobs = JobRig(directory)
         self.store, self.clock, self.config = self.jobs.store, self.jobs.clock, self.jobs.config
         self.models = ModelTable(self.store, "swdt82", self.clock)
-        self.job_table = JobTable(self.store, "swdt82", self.clock)
+        self.job_table = JobQueue(self.store, "swdt82", self.clock)
         self.live = LiveModel(self.models, rig)
         self.registry = ModelRegistry(self.models, "swdt82", self.live, compare=self.job_table.compare)
         self.joiner = joiner(Config(rig="swdt82"), rig)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import functools
 from pathlib import Path
 
-from calibration import pipeline
-from calibration.model import CalibratedModel
+from calibration.evaluation.evaluation import Evaluation
+from calibration.model.model import CalibratedModel
 from calibration.observations import parse_observations
-from calibration.pipeline import Evaluation
-from daemon.rigs import load_rig
+from calibration.pipeline.calibrate import calibrate
+from daemon.config import load_rig
 
 UR10_CSV = Path(__file__).parents[1] / "data" / "ur10_random_poses.csv"
 TRAIN_ROWS, TEST_ROWS = 240, 60
@@ -37,6 +37,6 @@ def small_calibration() -> tuple[CalibratedModel, Evaluation]:
     """
     source = load_rig("ur10")
     observations = parse_observations(train_csv(), source.rig, "train.csv")
-    model, evaluation = pipeline.calibrate(source.rig, source.text, observations, effects="none", residual="lightgbm")
+    model, evaluation = calibrate(source.rig, source.text, observations, effects="none", residual="lightgbm")
     assert model.residual is not None
     return model, evaluation

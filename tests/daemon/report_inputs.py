@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.rig import Joint, Rig, shipped_rig
+from calibration.rig.description import Joint, Rig, shipped_rig
 from daemon.report.inputs import (
     ControlPoint,
     ErrorTable,

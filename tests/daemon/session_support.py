@@ -10,12 +10,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from daemon.config import SessionsSection
-from daemon.control import CommandError
-from daemon.joiner import ObservationJoiner, joint_inputs, signal_inputs
-from daemon.rigs import load_rig
-from daemon.sessions import SessionKeeper
-from daemon.setups import SetupBook
+from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_inputs
+from daemon.commands import CommandError
+from daemon.config import SessionsSection, load_rig
+from daemon.sessions.manager import SessionKeeper
+from daemon.sessions.station_setups import SetupBook
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, ManualClock
 from drivers.readings import Fix, LockState, Reading, Record, Status

@@ -17,14 +17,14 @@ import pytest
 from click.testing import CliRunner
 
 from daemon.cli.main import main
-from daemon.cli.terminal import Terminal
+from daemon.cli.terminal import echo, echo_list, echo_table
+from daemon.commands import CommandError
 from daemon.config import Config
-from daemon.control import CommandError, request
-from daemon.notify import Notifier
-from daemon.plain_text import shown
-from daemon.report import build_report
+from daemon.control.protocol import request
+from daemon.host.safe_output import shown
+from daemon.host.systemd import Notifier
+from daemon.report.calibration import calibration_report
 from daemon.report.inputs import ControlPoint, ParameterLine, SetupLine
-from daemon.report.summary import summary_png
 from daemon.service import declare_channels
 from daemon.store.store import Store
 from drivers.clock import ManualClock
@@ -58,7 +58,7 @@ CONTROL = {
 }
 ANY = MARKUP | CONTROL
 MIXED = "".join(ANY.values())
-_RICH_ON_A_TERMINAL = re.compile(r"\x1b\[[0-9;]*m")
+_STYLES = re.compile(r"\x1b\[[0-9;]*m")
 
 
 def assert_plain(text: str) -> None:
@@ -68,7 +68,7 @@ def assert_plain(text: str) -> None:
 
 
 def on_terminal(*arguments: str) -> str:
-    """What a command writes to a terminal of 400 columns, without the colours that rich adds."""
+    """What a command writes to a terminal of 400 columns, without the colours of styles."""
     ours, theirs = pty.openpty()
     command = [sys.executable, "-m", "daemon.cli.main", *arguments]
     environ = os.environ | {"COLUMNS": "400", "TERM": "xterm-256color"}
@@ -81,7 +81,7 @@ def on_terminal(*arguments: str) -> str:
         os.close(ours)
     said = text.decode("utf-8").replace("\r\n", "\n")
     assert process.returncode == 0, said
-    return _RICH_ON_A_TERMINAL.sub("", said)
+    return _STYLES.sub("", said)
 
 
 # ---- from clients ----------------------------------------------------------------------------------------------------
@@ -303,13 +303,12 @@ def test_a_text_without_end_is_cut_off() -> None:
     assert len(shown("x" * 1_000_000)) < 5000
 
 
-def test_no_command_prints_markup_or_past_the_terminal() -> None:
-    """Colour comes from `style=`: square brackets in a text are the operator's."""
-    for path in CLI.glob("*.py"):
-        source = path.read_text(encoding="utf-8")
-        assert not re.search(r"\[/?(bold|dim|red|green|yellow|blue)?\](?=[^\w\]])", re.sub(r"\[\]", "", source)), path
-        if path.name != "terminal.py":
-            assert not re.search(r"(?<!\w)Console\(", source), f"{path}: use daemon.cli.terminal.Terminal"
+def test_every_line_for_people_is_escaped() -> None:
+    """Lines and tables are printed by `terminal` alone; a result by `command`, `offline` and `tip`."""
+    for path in CLI.rglob("*.py"):
+        if path.name not in {"terminal.py", "command.py", "offline.py", "tip.py"}:
+            source = path.read_text(encoding="utf-8")
+            assert not re.search(r"click\.s?echo\(|(?<!\w)print\(", source), f"{path}: use daemon.cli.terminal.echo"
 
 
 def test_the_service_manager_is_told_one_state_a_line(tmp_path: Path) -> None:
@@ -322,13 +321,9 @@ def test_the_service_manager_is_told_one_state_a_line(tmp_path: Path) -> None:
 
 
 def test_titles_and_cells_of_tables_are_plain_too(capsys: pytest.CaptureFixture[str]) -> None:
-    from rich.table import Table
-
-    table = Table(MIXED, title=MIXED, caption=MIXED)
-    table.add_row(MIXED)
-    terminal = Terminal(width=4000)
-    terminal.print(table)
-    terminal.print(MIXED, style="bold")
+    echo_table((MIXED,), [(MIXED,)], title=MIXED)
+    echo_list("title", [MIXED])
+    echo(MIXED, bold=True)
     said = capsys.readouterr().out
     assert_plain(said)
     assert said.count(shown(MIXED)) == 5
@@ -346,9 +341,7 @@ def test_names_in_a_report_are_neither_markup_nor_formulas(caplog: pytest.LogCap
         provenance={"made": MIXED, MIXED: MIXED},
     )
     with caplog.at_level(logging.WARNING):
-        document = build_report(report)
-        picture = summary_png(report)
+        document = calibration_report(report)
     assert_plain(document)
     assert "<script" not in document
     assert r"$\frac{$" in document
-    assert picture.startswith(b"\x89PNG")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.numba_cache import is_compiled, prepare
+from daemon.warm_up import is_compiled, prepare
 
 
 def test_a_directory_the_user_set_is_kept(tmp_path: Path) -> None:

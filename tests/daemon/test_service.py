@@ -62,6 +62,7 @@ def _ended(jobs: list[dict[str, Any]]) -> bool:
     return any(j["kind"] == "report" for j in jobs) and all(j["state"] not in {"queued", "running"} for j in jobs)
 
 
+@pytest.mark.slow
 def test_closed_sessions_become_a_model_and_a_report(finished: DaemonProcess) -> None:
     jobs = {job["kind"]: job for job in finished.say("jobs.list")}
     assert [jobs[kind]["state"] for kind in ("gap", "residual", "report")] == ["done"] * 3, jobs
@@ -73,6 +74,7 @@ def test_closed_sessions_become_a_model_and_a_report(finished: DaemonProcess) ->
     assert "cp1" in page
 
 
+@pytest.mark.slow
 def test_the_model_in_the_store_is_the_one_on_the_disk(finished: DaemonProcess) -> None:
     out = finished.directory / "evaluated.csv"
     model = next(j for j in finished.say("jobs.list") if j["kind"] == "residual")["result"]["model"]
@@ -83,6 +85,7 @@ def test_the_model_in_the_store_is_the_one_on_the_disk(finished: DaemonProcess) 
     assert json.loads(evaluated.stdout)["n"] > 12
 
 
+@pytest.mark.slow
 def test_an_exported_session_replays_to_the_same_observations(finished: DaemonProcess, tmp_path: Path) -> None:
     for suffix in ("log", "blf"):
         out = tmp_path / suffix
@@ -171,6 +174,7 @@ def test_an_operator_confirms_the_prism_and_status_says_whether_it_is_suspected(
     finished.say("session.abort")
 
 
+@pytest.mark.slow
 def test_an_accepted_model_gives_the_live_tip_on_the_socket_and_on_the_bus(finished: DaemonProcess) -> None:
     socket = ("--socket", str(finished.socket))
     early, best = finished.say("model.list")
@@ -238,6 +242,7 @@ def test_the_store_lost_nothing(finished: DaemonProcess) -> None:
     store.close()
 
 
+@pytest.mark.slow
 def test_a_killed_daemon_loses_no_committed_row_and_goes_on(tmp_path: Path) -> None:
     daemon = DaemonProcess(tmp_path, *SIM, jobs=False)
     try:
@@ -266,7 +271,7 @@ def test_a_killed_daemon_loses_no_committed_row_and_goes_on(tmp_path: Path) -> N
 
 
 def test_a_replay_runs_the_same_daemon_apart_from_the_rigs_own_store_and_ends_with_the_logs(tmp_path: Path) -> None:
-    golden = Path(__file__).parents[1] / "golden" / "moving"
+    golden = Path(__file__).parents[1] / "golden" / "simulated" / "moving"
     files = ("--replay", str(golden / "boom.log"), str(golden / "station.serial"))
     daemon = DaemonProcess(tmp_path, *files, "--rate", "20", jobs=False)
     assert daemon.process.wait(timeout=60) == 0, daemon.log_text()
@@ -282,8 +287,9 @@ def test_a_replay_runs_the_same_daemon_apart_from_the_rigs_own_store_and_ends_wi
     assert samples == sum('"table":"joint_samples"' in line for line in lines)
 
 
+@pytest.mark.slow
 def test_a_malformed_log_is_refused_before_anything_runs(tmp_path: Path) -> None:
-    golden = Path(__file__).parents[1] / "golden" / "moving"
+    golden = Path(__file__).parents[1] / "golden" / "simulated" / "moving"
     bad = tmp_path / "bad.log"
     bad.write_text((golden / "boom.log").read_text(encoding="ascii")[:2000] + "\nnonsense\n", encoding="ascii")
     config = str(tmp_path / "rigcal.toml")
@@ -299,7 +305,7 @@ def test_a_malformed_log_is_refused_before_anything_runs(tmp_path: Path) -> None
 
 
 def test_a_log_is_played_back_in_place_of_a_bus(tmp_path: Path) -> None:
-    golden = Path(__file__).parents[1] / "golden" / "standing"
+    golden = Path(__file__).parents[1] / "golden" / "simulated" / "standing"
     daemon = DaemonProcess(tmp_path, jobs=False, bus=f'interface = "playback"\nchannel = "{golden / "boom.log"}"')
     try:
         daemon.wait("theta1", lambda: daemon.answers() and "theta1" in _channels(daemon))

@@ -8,9 +8,9 @@ import pytest
 from daemon.composition import Parts, joiner
 from daemon.service import Daemon
 from daemon.store.store import Store
+from drivers.can.tip_frames import TipStatus
 from drivers.clock import ManualClock
 from drivers.readings import DeviceEvent, EventKind, Fix, LockState, Reading, Record, Status
-from drivers.tip_frames import TipStatus
 from tests.daemon.job_support import SOURCE
 from tests.daemon.model_support import ModelRig, pose, wait
 

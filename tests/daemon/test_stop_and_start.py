@@ -13,13 +13,14 @@ from pathlib import Path
 
 import pytest
 
-from daemon import acquisition as acquisition_module
-from daemon import backlog
-from daemon.acquisition import Acquisition, AcquisitionError
+from daemon.acquisition import acquisition as acquisition_module
+from daemon.acquisition import backlog
+from daemon.acquisition.acquisition import Acquisition, AcquisitionError
+from daemon.commands import CommandError
 from daemon.composition import Parts, joiner
 from daemon.config import Config
-from daemon.control import CommandError, request
-from daemon.notify import Notifier
+from daemon.control.protocol import request
+from daemon.host.systemd import Notifier
 from daemon.service import Daemon
 from daemon.store import Reader, Store
 from drivers.clock import SystemClock
@@ -140,7 +141,7 @@ def test_a_stop_does_not_wait_for_a_commit_that_never_ends(
     path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(acquisition_module, "STOP_S", 0.3, raising=False)
-    monkeypatch.setattr("daemon.store.store.CLOSE_TIMEOUT_S", 0.1, raising=False)
+    monkeypatch.setattr("daemon.store.connection.CLOSE_TIMEOUT_S", 0.1, raising=False)
     gate, go_on, closed = threading.Event(), threading.Event(), threading.Event()
     link = ListLink("boom", [frame(n) for n in range(100)], gate)
     acquisition = acquisition_on(store, [link])

@@ -117,6 +117,7 @@ def test_a_tool_that_is_only_wanted_stops_nothing(tree: Tree) -> None:
     assert "until you run: sudo apt-get install its-package\n" in result.stdout
 
 
+@pytest.mark.slow
 def test_an_index_that_does_not_answer_is_a_sentence_after_pips_own_words(tree: Tree) -> None:
     result = tree.bootstrap(
         PIP_CONFIG_FILE=os.devnull, PIP_INDEX_URL="http://127.0.0.1:9/simple", PIP_RETRIES="0", PIP_FIND_LINKS=""
@@ -126,6 +127,7 @@ def test_an_index_that_does_not_answer_is_a_sentence_after_pips_own_words(tree: 
     assert result.stdout.splitlines()[-1].startswith("rigcal set-up: pip could not install the locked packages")
 
 
+@pytest.mark.slow
 def test_a_package_that_is_not_the_locked_one_is_refused(tree: Tree) -> None:
     wheel = tree.path / "wheels/numpy-2.4.6-py3-none-any.whl"
     wheel.parent.mkdir()

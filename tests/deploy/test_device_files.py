@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from daemon.config import read_config
-from drivers.canbus import CanLinkConfig
+from drivers.can.ports import CanLinkConfig
 from tests.deploy.conftest import DEPLOY, private_namespaces, program, run
 
 NETWORK = Path("etc/systemd/network")

@@ -17,7 +17,8 @@ from pathlib import Path
 
 import can
 
-from drivers.canbus import CanLink, CanLinkConfig
+from drivers.can.ports import CanLinkConfig
+from drivers.can_link import CanLink
 from drivers.clock import Clock, Stamp, SystemClock
 from drivers.readings import CanCapture, DeviceEvent, EventKind, Gap, Reading, Record
 
@@ -41,7 +42,7 @@ def at(seconds: float) -> Stamp:
 
 
 def capture(text: str, seconds: float = 0.0, **flags: bool) -> CanCapture:
-    """A capture from the notation of the protocol facts: `1A0 4E 61 BC 00`; an identifier of 8 digits is extended."""
+    """Make a capture from its notation: `1A0 4E 61 BC 00`; an identifier of 8 digits is extended."""
     identifier, *data = text.split()
     return CanCapture(
         "boom", at(seconds), int(identifier, 16), bytes.fromhex("".join(data)), len(identifier) == 8, **flags
@@ -66,7 +67,7 @@ def events(records: object) -> list[DeviceEvent]:
 
 
 class Heard:
-    """What a link emitted; waits for conditions instead of sleeping."""
+    """Items that a link emitted; waits for conditions instead of sleeping."""
 
     def __init__(self) -> None:
         self._items: list[CanCapture | DeviceEvent | Gap | Record] = []
@@ -184,7 +185,7 @@ class Adapter:
         os.write(self._master, data)
 
     def commands(self, until: bytes) -> bytes:
-        """What rigcal sent, up to and with `until`."""
+        """Return the frames that rigcal sent, up to and with `until`."""
         data = b""
         deadline = time.monotonic() + DEADLINE_S
         while not data.endswith(until):

@@ -1,4 +1,4 @@
-"""Real pseudo-terminals and the frames of the protocol facts, for tests of serial drivers."""
+"""Real pseudo-terminals and the frames of docs/protocols.md, for tests of serial drivers."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from pathlib import Path
 
 from drivers.clock import Clock, Stamp, SystemClock
 from drivers.readings import DeviceEvent, EventKind, Gap, LinkItem, SerialCapture
-from drivers.station import StationConfig, StationLink
+from drivers.stations.config import StationConfig
+from drivers.stations.link import StationLink
 
 DEADLINE_S = 5.0
 
-# Samples of protocol facts 1.5, BCC included.
+# Samples of docs/protocols.md 1.5, BCC included.
 SLOPE_MM = b"?+00001060m0905356+3545105d+00001060t60+00+00096"
 SLOPE_FINE = b"(+000021760m26822425+34706355d+000021751t00+0000+000**070"
 ANGLES = b"<0905356+3545105-0032d080"

@@ -6,13 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.can.dbc import DbcFile
+from drivers.can.raw_signal import BitField, Multiplexing, SignalChannel, SignalDecoder
 from drivers.can_decoder import CanDecoder
-from drivers.cia404 import AnalogueChannel, AnalogueDecoder
-from drivers.cia406 import EncoderChannel, EncoderDecoder
+from drivers.canopen.cia404 import AnalogueChannel, AnalogueDecoder
+from drivers.canopen.cia406 import EncoderChannel, EncoderDecoder
+from drivers.canopen.pdo import TransmitPdo
 from drivers.clock import Stamp
-from drivers.dbc import DbcFile
-from drivers.pdo import TransmitPdo
-from drivers.raw_signal import BitField, Multiplexing, SignalChannel, SignalDecoder
 from drivers.readings import (
     CanCapture,
     DecodeFailure,

@@ -22,7 +22,7 @@ SHORT_S = 0.3
 
 
 def wakes(watch: DeviceWatch, cause: Callable[[], object]) -> bool:
-    """Whether `cause` ends a long wait that had begun before."""
+    """Return True if `cause` ends a long wait that had begun before."""
     assert not watch.wait(threading.Event(), SHORT_S)
     woken: list[bool] = []
     waiter = threading.Thread(target=lambda: woken.append(watch.wait(threading.Event(), LONG_S)))

@@ -17,7 +17,7 @@ import traceback
 import warnings
 from pathlib import Path
 
-from daemon.modelcheck import limit_memory
+from daemon.models.first_load import limit_memory
 from tests.fuzz.mutate import SIZE_MAX, mutate
 from tests.fuzz.target import Target, find_targets
 

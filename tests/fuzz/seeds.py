@@ -18,23 +18,24 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from calibration import pipeline
 from calibration.identification.search.checkpoint import pack
+from calibration.model.files import model_to_files
 from calibration.observations import parse_observations
-from daemon.modelcheck import encode
-from daemon.rigs import load_rig
-from daemon.session_file import SessionFile
+from calibration.pipeline.calibrate import calibrate
+from daemon.config import load_rig
+from daemon.models.first_load import encode
+from daemon.sessions.session_file import SessionFile
 from daemon.store.captures import encode_captures
-from drivers.canlog import read_can_log, write_can_log
+from drivers.logs.can_log import read_can_log, write_can_log
+from drivers.logs.serial_log import read_serial_log
 from drivers.readings import CanCapture, SerialCapture
-from drivers.seriallog import read_serial_log
 from tests.daemon.offline_support import held_out_csv, train_csv
 from tests.fuzz.streams import pack_frames, pack_pieces
 from tests.fuzz.target import CORPUS
 from tests.fuzz.targets.control import commands
 from tests.fuzz.targets.models import sealed
 
-_GOLDEN = Path(__file__).parents[1] / "golden"
+_GOLDEN = Path(__file__).parents[1] / "golden" / "simulated"
 _RIGS = Path(__file__).parents[2] / "calibration" / "rigs"
 _MORE_RIGS = Path(__file__).parents[1] / "rigs"
 _PROFILES = {"topcon_gts8": 0, "classic-pushed": 1, "sokkia-pushed": 3}
@@ -302,8 +303,8 @@ def _of_models() -> Iterator[tuple[str, str, bytes]]:
     source = load_rig("ur10")
     observations = parse_observations(train_csv(), source.rig, "train.csv")
     for residual in ("none", "rbfn", "lightgbm", "gp"):
-        model, _ = pipeline.calibrate(source.rig, source.text, observations, effects="none", residual=residual)
-        files = model.to_files()
+        model, _ = calibrate(source.rig, source.text, observations, effects="none", residual=residual)
+        files = model_to_files(model)
         for name in [name for name in files if name.startswith("lightgbm_")]:
             files[name] = _few_trees(files[name])
         yield "model", residual, encode(sealed(files))

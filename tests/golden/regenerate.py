@@ -1,7 +1,9 @@
-"""Makes the golden logs anew: `python -m tests.golden.regenerate [NAME...]`.
+"""Makes golden cases anew: `python -m tests.golden.regenerate [simulated/NAME | real/NAME ...]`.
 
-Each case is a folder: what a listener on a simulated rig would have captured (`boom.log`, `station.serial`), the
-configuration it is of, and the readings that it must yield (`readings.jsonl`). Say in the commit why a golden changed.
+Each case is a folder: captured logs (`boom.log`, `station.serial`), the configuration they are of, and the readings
+that they must yield (`readings.jsonl`). Simulated cases are made whole, all of them where none is named. The logs of
+real cases come from their sources: only their readings are made, and only where the case is named. Say in the commit
+why a golden changed.
 """
 
 from __future__ import annotations
@@ -13,20 +15,22 @@ from pathlib import Path
 
 from click.testing import CliRunner
 
-from calibration.rig import shipped_rig
+from calibration.rig.description import shipped_rig
 from daemon.cli.main import main
-from drivers.canlog import write_can_log
 from drivers.clock import ManualClock
+from drivers.logs.can_log import write_can_log
+from drivers.logs.serial_log import SerialLogHeader, SerialLogWriter
 from drivers.readings import CanCapture, SerialCapture
-from drivers.seriallog import SerialLogHeader, SerialLogWriter
+from simulators.devices.stations.total_station import StationSettings
 from simulators.faults import parse_faults
-from simulators.generate import Step, generate
+from simulators.rig.truth import RigTruth
 from simulators.rig_simulator import RigSimulator, SimulatorSettings
-from simulators.scripted_host import ScriptedHost
-from simulators.total_station import StationSettings
-from simulators.truth import RigTruth
+from tests.simulated.captures import Step, generate
+from tests.simulated.scripted_host import ScriptedHost
 
 HERE = Path(__file__).parent
+SIMULATED, REAL = HERE / "simulated", HERE / "real"
+CAN_SUFFIXES = ("log", "asc", "blf")
 NODES = (32, 33, 34, 35, 36, 37, 38, 48, 49, 50, 60)
 CONFIG = """rig = "swdt82"
 state_directory = "."
@@ -42,7 +46,7 @@ profile = "{profile}"
 
 @dataclass(frozen=True)
 class Case:
-    """A golden case.
+    """A simulated case.
 
     Attributes:
         duration_s: how long it lasts.
@@ -89,8 +93,8 @@ CASES = {
 
 
 def write_case(name: str, case: Case) -> None:
-    """Write one case's folder."""
-    folder = HERE / name
+    """Write one simulated case's folder."""
+    folder = SIMULATED / name
     folder.mkdir(exist_ok=True)
     settings = SimulatorSettings(
         bus_master="host" if case.host else "machine", sync_period_s=0.2, signal_period_s=0.1, station=case.station
@@ -109,15 +113,26 @@ def write_case(name: str, case: Case) -> None:
                 writer.write(capture)
     options = 'listen_to = "sokkia"\n' if case.station.profile == "sokkia_set" else ""
     (folder / "rigcal.toml").write_text(CONFIG.format(profile=profile, options=options), encoding="utf-8")
-    replay(folder, "log", folder / "readings.jsonl")
+    replay(folder, folder / "readings.jsonl")
 
 
-def replay(folder: Path, suffix: str, readings: Path) -> None:
-    """Replay a case, as `rigcal replay` does, and write what it yields."""
-    store = readings.with_name(f"{readings.stem}-{suffix}.sqlite")
-    files = [str(folder / f"boom.{suffix}"), str(folder / "station.serial")]
+def can_logs(folder: Path) -> list[str]:
+    """Return the formats of a case's CAN log; [] for a case of a station alone."""
+    return [suffix for suffix in CAN_SUFFIXES if (folder / f"boom.{suffix}").is_file()]
+
+
+def replay(folder: Path, readings: Path, can_format: str = "log") -> None:
+    """Replay a case, as `rigcal replay` does, and write what it yields.
+
+    Args:
+        folder: the case; it has a CAN log, a serial log, or both.
+        readings: the file to write.
+        can_format: which of its CAN logs to take.
+    """
+    store = readings.with_name(f"{readings.stem}-{can_format}.sqlite")
+    files = [str(log) for log in (folder / f"boom.{can_format}", folder / "station.serial") if log.is_file()]
     options = ["--config", str(folder / "rigcal.toml"), "--store", str(store), "--readings", str(readings)]
-    prism = CASES[folder.name].prism
+    prism = CASES[folder.name].prism if folder.parent == SIMULATED else ""
     options += ["--prism", prism] if prism else []
     result = CliRunner().invoke(main, ["replay", *files, *options], catch_exceptions=False)
     for file in store.parent.glob(f"{store.name}*"):
@@ -127,6 +142,12 @@ def replay(folder: Path, suffix: str, readings: Path) -> None:
 
 
 if __name__ == "__main__":
-    for wanted in sys.argv[1:] or CASES:
-        write_case(wanted, CASES[wanted])
+    for wanted in sys.argv[1:] or [f"simulated/{name}" for name in CASES]:
+        kind, _, case_name = wanted.partition("/")
+        if kind == "simulated" and case_name in CASES:
+            write_case(case_name, CASES[case_name])
+        elif kind == "real" and (REAL / case_name / "SOURCE.md").is_file():
+            replay(REAL / case_name, REAL / case_name / "readings.jsonl")
+        else:
+            sys.exit(f"{wanted}: no such case; give simulated/NAME or real/NAME")
         print(wanted)

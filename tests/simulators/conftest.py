@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from calibration.rig import Rig, parse_rig, shipped_rig
+from calibration.rig.description import Rig, parse_rig, shipped_rig
 
 # What the shipped rigs do not use: fixed transforms, scaled couplings, two joints on one row, rows that branch.
 ODD_RIG = """

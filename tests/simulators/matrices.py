@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.truth import RigTruth
+from simulators.rig.truth import RigTruth
 
 Matrix = NDArray[np.float64]
 
@@ -25,7 +25,7 @@ def move(axis: int, length: float) -> Matrix:
 
 
 def frames_by_matrices(truth: RigTruth, joints: dict[str, float]) -> list[Matrix]:
-    """Frame 0, 1, ... in the base frame, by the conventions as calibration/rig.py words them."""
+    """Frame 0, 1, ... in the base frame, by the conventions as calibration/rig/description.py words them."""
     rig = truth.rig
     value = {j.name: np.deg2rad(joints[j.name]) if j.kind == "revolute" else joints[j.name] for j in rig.joints}
     out = [np.eye(4)]

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 import serial
 
-from calibration.rig import shipped_rig
-from simulators.truth import RigTruth
+from calibration.rig.description import shipped_rig
+from simulators.rig.truth import RigTruth
 
 DEADLINE_S = 20.0
 RATE = 20.0

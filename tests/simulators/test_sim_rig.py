@@ -7,16 +7,16 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from calibration.rig import Rig, parse_rig, shipped_rig
+from calibration.rig.description import Rig, parse_rig, shipped_rig
 from drivers.clock import ManualClock
 from drivers.readings import CanCapture, SerialCapture
+from simulators.devices.stations.topcon_text import checked, from_dms
+from simulators.devices.stations.total_station import StationSettings
 from simulators.faults import parse_faults
-from simulators.generate import Generated, Step, generate
+from simulators.rig.truth import RigTruth
 from simulators.rig_simulator import RigSimulator, SimulatorSettings
-from simulators.scripted_host import ScriptedHost
-from simulators.topcon_text import checked, from_dms
-from simulators.total_station import StationSettings
-from simulators.truth import RigTruth
+from tests.simulated.captures import Generated, Step, generate
+from tests.simulated.scripted_host import ScriptedHost
 
 
 def record(

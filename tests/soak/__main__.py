@@ -12,8 +12,8 @@ import time
 from dataclasses import asdict
 from pathlib import Path
 
-from calibration.rig import shipped_rig
-from daemon.control_server import ControlServer
+from calibration.rig.description import shipped_rig
+from daemon.control.server import ControlServer
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S
 from tests.soak.consistency import inconsistencies, untruths

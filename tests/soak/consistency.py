@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from calibration.rig import Rig
+from calibration.rig.description import Rig
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S
 from tests.soak.losses import Measured, Wire

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from daemon.control import CommandError, request
+from daemon.commands import CommandError
+from daemon.control.protocol import request
 from tests.soak.rig_process import RigProcess
 
 CONFIG = """rig = "{rig}"

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from daemon.control import CommandError
+from daemon.commands import CommandError
 from drivers.clock import NS_PER_S
 from tests.soak.daemon_process import DaemonProcess
 from tests.soak.rig_process import RigProcess

@@ -13,8 +13,8 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from calibration.channels import Cia404Analogue, Cia406Encoder, Cia406Linear
-from calibration.rig import Rig
+from calibration.rig.channels import Cia404Analogue, Cia406Encoder, Cia406Linear
+from calibration.rig.description import Rig
 from drivers.clock import NS_PER_S
 from tests.soak.daemon_process import DaemonProcess
 from tests.soak.evidence import Blackout, Case, Expected, Watch

@@ -7,7 +7,7 @@ import threading
 from collections import Counter
 from typing import Any
 
-from daemon.control import CommandError
+from daemon.commands import CommandError
 from tests.soak.daemon_process import DaemonProcess
 from tests.soak.rig_process import RigProcess
 

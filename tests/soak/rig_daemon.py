@@ -10,10 +10,9 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from daemon.cli import run as run_module
+from daemon import composition
 from daemon.cli.main import main
-from daemon.composition import live
-from daemon.control import request
+from daemon.control.protocol import request
 from drivers.clock import ScaledClock, Stamp
 
 
@@ -24,7 +23,7 @@ def run(config: str, rate: str, origin: str, operator: str) -> None:
     def aim(target: str) -> None:
         request(Path(operator), "aim", {"target": target})
 
-    vars(run_module)["live"] = partial(live, clock=clock, aim=aim)
+    vars(composition)["live"] = partial(composition.live, clock=clock, aim=aim)
     main(["run", "--config", config])
 
 

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from calibration.rig import shipped_rig
+from calibration.rig.description import shipped_rig
 from daemon.store.reader import Reader
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import CanCapture
+from simulators.devices.can.bus import Frame
 from simulators.faults import KINDS
-from simulators.frame import Frame
 from simulators.wire_log import WireLog
 from tests.soak.__main__ import main
 from tests.soak.consistency import inconsistencies, untruths

@@ -3,44 +3,35 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Literal
 
 import numpy as np
 
-from calibration.effects.base import Coefficient, JointFamily, Settings, Situation, refuse_settings
+from calibration.effects.base import Coefficient, JointFamily, Settings
+from calibration.effects.context import EffectContext
 from calibration.observations import Floats
 
 _HALF_A_RAD_DEG = math.degrees(0.5)
 
 
 class Backlash(JointFamily):
-    """Of encoder and joint one lags behind the other by half the play: the one that is driven through it.
+    """Play makes encoder or joint lag by half its width: the one that is driven through it.
 
     An encoder on the joint's own side lags behind the joint, which is further along its last motion: the width is
     positive. Behind an encoder at the motor the joint lags, and the width is negative.
     """
 
-    name: ClassVar[str] = "backlash"
-    equation: ClassVar[str] = (
-        "d_theta = width / 2 * direction of the last motion (column <joint>_dir); width < 0: the joint lags"
-    )
-    source: ClassVar[str] = "gear play; the approach from the other side shows it"
-    confused_with: ClassVar[tuple[str, ...]] = ("load_hysteresis", "gravity_flip_play")
-    revealed_by: ClassVar[str] = "coming to the same pose from both sides"
-    column: ClassVar[str] = "{where}_dir"
-    kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
+    name = "backlash"
+    equation = "d_theta = width / 2 * direction of the last motion (column <joint>_dir); width < 0: the joint lags"
+    source = "gear play; the approach from the other side shows it"
+    confused_with = ("load_hysteresis", "gravity_flip_play")
+    revealed_by = "coming to the same pose from both sides"
+    fixed = (Coefficient("width_rad", "rad", 1e-3, -5e-3, 5e-3),)
+    column = "{where}_dir"
+    kind = "revolute"
 
-    def names(self, settings: Settings) -> tuple[str, ...]:
-        refuse_settings(settings)
-        return ("width_rad",)
-
-    def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
-        del situation, where, settings
-        return (Coefficient("width_rad", "rad", 1e-3, -5e-3, 5e-3),)
-
-    def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
+    def columns(self, context: EffectContext, where: str, settings: Settings) -> Floats:
         del settings
-        direction = situation.extra(f"{where}_dir")
+        direction = context.extra(f"{where}_dir")
         change: Floats = _HALF_A_RAD_DEG * np.where(np.isfinite(direction), direction, 0.0)[:, None]
         return change
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar
 
 import numpy as np
 
-from calibration.effects.base import Coefficient, Settings, Situation
+from calibration.effects.base import Coefficient, Settings
 from calibration.effects.boom import Boom, BoomFamily, boom_in
+from calibration.effects.context import EffectContext
 from calibration.effects.load_shapes import LoadShapes, OfUncertainLoad, shapes_by_design
 from calibration.errors import ModelError
+from calibration.kinematics.torques import MASS_SIGMA
 from calibration.observations import Floats
-from calibration.torques import MASS_SIGMA
 
 _FLEXIBILITY = "flexibility_per_Nm2"
 _UNIT = "1/(N m^2)"
@@ -34,19 +34,19 @@ class BoomDroop(OfUncertainLoad, BoomFamily):
     `about_per_Nm2` add; what makes all of it larger or smaller is no shape and counts in the standard error.
     """
 
-    name: ClassVar[str] = "boom_droop"
-    equation: ClassVar[str] = "shift = (F L^3/3 + M L^2/2 + W L^3/8) / EI, slope = (F L^2/2 + M L + W L^2/6) / EI"
-    source: ClassVar[str] = "Euler-Bernoulli beam theory: cantilever with a load and a moment at its end"
-    confused_with: ClassVar[tuple[str, ...]] = ("joint_compliance", "transducer_quadratic", "pad_play")
-    revealed_by: ClassVar[str] = "the same attitude of the boom drawn in and run out, once with a load and once without"
+    name = "boom_droop"
+    equation = "shift = (F L^3/3 + M L^2/2 + W L^3/8) / EI, slope = (F L^2/2 + M L + W L^2/6) / EI"
+    source = "Euler-Bernoulli beam theory: cantilever with a load and a moment at its end"
+    confused_with = ("joint_compliance", "transducer_quadratic", "pad_play")
+    revealed_by = "the same attitude of the boom drawn in and run out, once with a load and once without"
 
-    def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
-        boom = boom_in(situation)
-        if boom is None or not boom.carries_prism.any() or _greatest_mm(situation) == 0.0:
+    def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
+        boom = boom_in(context)
+        if boom is None or not boom.carries_prism.any() or _greatest_mm(context) == 0.0:
             return ()
-        shapes = _shapes(situation)
+        shapes = _shapes(context)
         plain = {"load_sigma": shapes.load_sigma}
-        sigma = self.coefficients(situation, where, plain)[0].sigma
+        sigma = self.coefficients(context, where, plain)[0].sigma
         return (plain, {**plain, "about_per_Nm2": sigma, "parts": float(len(shapes))}) if len(shapes) else (plain,)
 
     def names(self, settings: Settings) -> tuple[str, ...]:
@@ -59,9 +59,9 @@ class BoomDroop(OfUncertainLoad, BoomFamily):
             raise ValueError("the settings are load_sigma, and about_per_Nm2 with parts, the number of shapes")
         return (_FLEXIBILITY, *(f"part{number}_per_Nm2" for number in range(1, int(settings.get("parts", 0.0)) + 1)))
 
-    def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
+    def coefficients(self, context: EffectContext, where: str, settings: Settings) -> tuple[Coefficient, ...]:
         del where
-        most = _greatest_mm(situation)
+        most = _greatest_mm(context)
         first, *others = self.names(settings)
         bound = _BOUND_MM / most
         return (
@@ -69,39 +69,39 @@ class BoomDroop(OfUncertainLoad, BoomFamily):
             *(Coefficient(name, _UNIT, settings["about_per_Nm2"], -bound, bound) for name in others),
         )
 
-    def shift_mm(self, situation: Situation, where: str, settings: Settings) -> Floats:
+    def shift_mm(self, context: EffectContext, where: str, settings: Settings) -> Floats:
         del where
-        boom, (_, *shaped) = boom_in(situation), self.names(settings)
-        if boom is None or not situation.rig.masses:
-            return np.zeros((len(situation), 3, 1 + len(shaped)))
+        boom, (_, *shaped) = boom_in(context), self.names(settings)
+        if boom is None or not context.rig.masses:
+            return np.zeros((len(context), 3, 1 + len(shaped)))
         loads = _whole(boom)
         if shaped:
-            shapes = _shapes(situation)
+            shapes = _shapes(context)
             if len(shapes) != len(shaped):
                 raise ModelError(
                     f"the model has {len(shaped)} shapes of a droop that has {len(shapes)}; calibrate again"
                 )
             loads = np.hstack([loads, (_parts(boom) - loads * shapes.share) @ shapes.mixing])
-        moved = _moved_mm(boom, situation.located.prism_mm - boom.tip_mm, loads)
-        return situation.to_station(moved * boom.carries_prism[:, None, None])
+        moved = _moved_mm(boom, context.located.prism_mm - boom.tip_mm, loads)
+        return context.to_station(moved * boom.carries_prism[:, None, None])
 
 
-def _greatest_mm(situation: Situation) -> float:
-    """The greatest droop of the tip in the work volume, mm per unit of flexibility; 0 where nothing bends it."""
-    boom = boom_in(situation.work_volume)
-    if boom is None or not situation.rig.masses:
+def _greatest_mm(context: EffectContext) -> float:
+    """Return the greatest droop of the tip in the work volume, mm per unit of flexibility; 0 where nothing bends it."""
+    boom = boom_in(context.work_volume)
+    if boom is None or not context.rig.masses:
         return 0.0
-    moved = _moved_mm(boom, np.zeros((len(boom.situation), 3)), _whole(boom))
+    moved = _moved_mm(boom, np.zeros((len(boom.context), 3)), _whole(boom))
     return float(np.linalg.norm(moved[:, :, 0], axis=1).max())
 
 
-def _shapes(situation: Situation) -> LoadShapes:
-    """What uncertain weights do to the droop beside making it larger."""
-    return shapes_by_design(situation, BoomDroop.name, _in_volume)
+def _shapes(context: EffectContext) -> LoadShapes:
+    """Return the shapes by which uncertain weights change the droop over the poses."""
+    return shapes_by_design(context, BoomDroop.name, _in_volume)
 
 
-def _in_volume(volume: Situation) -> tuple[Floats, Floats]:
-    """(m,) how far the tip, and a place ahead of it, sink per unit of flexibility, and (m, parts) by parts, mm."""
+def _in_volume(volume: EffectContext) -> tuple[Floats, Floats]:
+    """Return how far the tip and a place ahead of it sink per unit of flexibility, mm: (m,), by parts (m, parts)."""
     boom = boom_in(volume)
     assert boom is not None  # who asks for its shapes has one
     loads = np.hstack([_whole(boom), _parts(boom)])
@@ -114,17 +114,17 @@ def _in_volume(volume: Situation) -> tuple[Floats, Floats]:
 
 
 def _whole(boom: Boom) -> Floats:
-    """(4 * points, 1) how far each weight counts at the tip, with its moment, with its centre's, and along the boom."""
+    """Return (4 * points, 1) factors on each weight: at the tip, its moment, its centre's moment, along the boom."""
     none = np.zeros(len(boom.hanging))
     return np.concatenate([boom.hanging, boom.hanging, none, boom.own])[:, None]
 
 
 def _parts(boom: Boom) -> Floats:
-    """(4 * points, parts) the same for what is uncertain of the weights, one sigma of each."""
-    mass_of = boom.situation.loads.point_mass
+    """Return (4 * points, parts) the same factors for one sigma of every uncertain part of the weights."""
+    mass_of = boom.context.loads.point_mass
     none = np.zeros(len(mass_of))
     parts = []
-    for index, mass in enumerate(boom.situation.rig.masses):
+    for index, mass in enumerate(boom.context.rig.masses):
         hangs = MASS_SIGMA * (boom.hanging & (mass_of == index))
         if mass.kg > 0.0 and hangs.any():
             parts.append(np.concatenate([hangs, hangs, none, none]))
@@ -136,7 +136,7 @@ def _parts(boom: Boom) -> Floats:
 
 
 def _moved_mm(boom: Boom, arm_mm: Floats, loads: Floats) -> Floats:
-    """(n, 3, k) displacement in the base frame at `arm_mm` (n, 3) from the tip, mm per unit of 1 / EI.
+    """Return the displacement (n, 3, k) in the base frame at `arm_mm` (n, 3) from the tip, mm per unit of 1 / EI.
 
     With the boom's axis e, gravity's direction g and a point at s from the tip: a weight w at the tip bends by the part
     of w g across e and turns about e x g; one at r from it adds the moment m = w r x g, less its part along e.
@@ -146,7 +146,7 @@ def _moved_mm(boom: Boom, arm_mm: Floats, loads: Floats) -> Floats:
     weighed = newton[:, :, None] * 1e-3
     first = (weighed * (places_mm - boom.tip_mm[:, None, :])).transpose(0, 2, 1) @ moment
     if centre.any():
-        origins_mm = boom.situation.located.frames_mm[:, boom.situation.loads.point_frame]
+        origins_mm = boom.context.located.frames_mm[:, boom.context.loads.point_frame]
         first += (weighed * (places_mm - origins_mm)).transpose(0, 2, 1) @ centre
     e, g, s = boom.axis, boom.down, arm_mm * 1e-3
     length = boom.length_mm[:, None] * 1e-3
@@ -163,7 +163,7 @@ def _moved_mm(boom: Boom, arm_mm: Floats, loads: Floats) -> Floats:
 
 
 def _crossing(v: Floats) -> Floats:
-    """(n, 3, 3) matrices of the cross products v x with vectors (n, 3)."""
+    """Return the matrices (n, 3, 3) of the cross products v x with vectors (n, 3)."""
     out = np.zeros((len(v), 3, 3))
     out[:, 1, 0], out[:, 2, 1], out[:, 0, 2] = v[:, 2], v[:, 0], v[:, 1]
     return out - out.transpose(0, 2, 1)

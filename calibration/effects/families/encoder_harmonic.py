@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
-
 import numpy as np
 
-from calibration.effects.base import Coefficient, JointFamily, Settings, Situation
+from calibration.effects.base import Coefficient, JointFamily, Settings
+from calibration.effects.context import EffectContext
 from calibration.observations import Floats
 
 _SINGLE: tuple[Settings, ...] = ({"k": 1.0}, {"k": 2.0})
@@ -20,17 +19,17 @@ class EncoderHarmonic(JointFamily):
     Over less than half a turn both together bend like any curve, a straight line too: they are no form of it there.
     """
 
-    name: ClassVar[str] = "encoder_harmonic"
-    equation: ClassVar[str] = (
+    name = "encoder_harmonic"
+    equation = (
         "d_theta = cosk cos(k theta) + sink sin(k theta), k = 1 or 2; for k = 1 also with the same of 2k beside it"
     )
-    source: ClassVar[str] = "eccentricity of a rotary encoder's disc: e / r = error in rad, once a turn"
-    confused_with: ClassVar[tuple[str, ...]] = ("angle_scale", "joint_error_map", "joint_compliance")
-    revealed_by: ClassVar[str] = "the joint alone over its whole range, in even steps"
-    kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
+    source = "eccentricity of a rotary encoder's disc: e / r = error in rad, once a turn"
+    confused_with = ("angle_scale", "joint_error_map", "joint_compliance")
+    revealed_by = "the joint alone over its whole range, in even steps"
+    kind = "revolute"
 
-    def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
-        reading = situation.reading(where)
+    def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
+        reading = context.reading(where)
         covers_both = len(reading) > 0 and np.ptp(reading) >= _HALF_A_TURN_DEG
         return (*_SINGLE, _BOTH) if covers_both else _SINGLE
 
@@ -44,12 +43,12 @@ class EncoderHarmonic(JointFamily):
             )
         return ("cosk_rad", "sink_rad", *(("cos2k_rad", "sin2k_rad") if "doubled" in settings else ()))
 
-    def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
-        del situation, where
+    def coefficients(self, context: EffectContext, where: str, settings: Settings) -> tuple[Coefficient, ...]:
+        del context, where
         return tuple(Coefficient(name, "rad", 1.5e-3, -6e-3, 6e-3) for name in self.names(settings))
 
-    def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
-        once = settings["k"] * np.radians(situation.reading(where))
+    def columns(self, context: EffectContext, where: str, settings: Settings) -> Floats:
+        once = settings["k"] * np.radians(context.reading(where))
         angles = (once, 2.0 * once) if "doubled" in settings else (once,)
         change: Floats = np.degrees([turn(angle) for angle in angles for turn in (np.cos, np.sin)]).T
         return change

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar
 
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from calibration.effects.base import Coefficient, FittedCoefficient, Settings, Situation
+from calibration.effects.base import Coefficient, FittedCoefficient, Settings
+from calibration.effects.context import EffectContext
 from calibration.effects.load_shapes import TorqueFamily, gravity_shapes
 from calibration.errors import ModelError
-from calibration.halton import halton
+from calibration.numerics.statistics import halton
 from calibration.observations import Floats
 
 _SIGMA_RAD = 1e-3
@@ -37,45 +37,45 @@ class GravityFlipPlay(TorqueFamily):
     Wellner 1986, chapter 5). The first of them have coefficients of their own.
     """
 
-    name: ClassVar[str] = "gravity_flip_play"
-    equation: ClassVar[str] = "d_theta = width / 2 * sign(torque)"
-    source: ClassVar[str] = "clearance of pins and gears under a load that changes sides"
-    confused_with: ClassVar[tuple[str, ...]] = ("joint_compliance", "backlash", "encoder_harmonic")
-    revealed_by: ClassVar[str] = "poses close to either side of where the joint's load changes its sign"
+    name = "gravity_flip_play"
+    equation = "d_theta = width / 2 * sign(torque)"
+    source = "clearance of pins and gears under a load that changes sides"
+    confused_with = ("joint_compliance", "backlash", "encoder_harmonic")
+    revealed_by = "poses close to either side of where the joint's load changes its sign"
 
-    def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
-        largest = situation.greatest_torque(where)
+    def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
+        largest = context.greatest_torque(where)
         if largest == 0.0:
             return ()
-        if situation.is_torque_measured(where) or not situation.rig.masses:
+        if context.is_torque_measured(where) or not context.rig.masses:
             return ({},)
-        shapes = gravity_shapes(situation, where, constant=True)
-        load = situation.torque(where)
-        change = shapes(np.nan_to_num(load), situation.torque_parts(where))
+        shapes = gravity_shapes(context, where, constant=True)
+        load = context.torque(where)
+        change = shapes(np.nan_to_num(load), context.torque_parts(where))
         if not len(shapes) or not (np.abs(load) < _NEAR * np.sqrt((change**2).sum(axis=1))).any():
             return ({},)
         common = {_SPREAD: _STEP, _OTHER: _LEAST_LOAD * largest}
         return ({}, *({**common, _shape(0): at} for at in _GRID))
 
-    def refined(self, situation: Situation, where: str, settings: Settings) -> tuple[Settings, ...]:
-        """Masses drawn from what is known of them: points of a sequence of low discrepancy, made normal."""
-        variants = self.variants(situation, where)
+    def refined(self, context: EffectContext, where: str, settings: Settings) -> tuple[Settings, ...]:
+        """Return forms with masses drawn from their prior: a low-discrepancy sequence, made normal."""
+        variants = self.variants(context, where)
         if len(variants) < 2:
             return ()
-        shapes = min(len(gravity_shapes(situation, where, constant=True)), _MOST_SHAPES)
+        shapes = min(len(gravity_shapes(context, where, constant=True)), _MOST_SHAPES)
         cloud = ndtri(halton(shapes, _CLOUD + 1)[1:])
         common = {**variants[1], _SPREAD: _FINER}
         return (settings, *({**common, **{_shape(k): p for k, p in enumerate(at)}} for at in cloud.tolist()))
 
     def settled(self, forms: Sequence[Settings], probability: Floats) -> Settings:
-        """The mean of the masses; what was chosen before where that is more likely than all others together."""
+        """Return the mean of the masses; the first form where that is more likely than all others together."""
         if probability[0] > 0.5:
             return forms[0]
         finer, weight = forms[1:], probability[1:] / probability[1:].sum()
         return {name: float(weight @ [form[name] for form in finer]) for name in finer[0]}
 
     def odds(self, settings: Settings) -> float:
-        """Those of the masses; the rig file's are the middle of the grid as well."""
+        """Return the prior odds of the masses; those of the rig file are in the middle of the grid as well."""
         return math.exp(-0.5 * settings.get(_shape(0), 0.0) ** 2)
 
     def names(self, settings: Settings) -> tuple[str, ...]:
@@ -87,8 +87,8 @@ class GravityFlipPlay(TorqueFamily):
             raise ValueError(f"the settings are {_SPREAD}, to 1, {_OTHER}, and {_shape(0)} ... for the load's shapes")
         return ("width_rad", *(f"flip{number}_rad" for number in range(1, _TERMS + 1)))
 
-    def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
-        del situation, where
+    def coefficients(self, context: EffectContext, where: str, settings: Settings) -> tuple[Coefficient, ...]:
+        del context, where
         width, *flips = self.names(settings)
         return (
             Coefficient(width, "rad", _SIGMA_RAD, 0.0, _BOUND_RAD),
@@ -101,18 +101,18 @@ class GravityFlipPlay(TorqueFamily):
         del settings
         return coefficients[:1]
 
-    def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
-        load = situation.torque(where)
+    def columns(self, context: EffectContext, where: str, settings: Settings) -> Floats:
+        load = context.torque(where)
         known = np.isfinite(load)[:, None]
         load = np.nan_to_num(load)
         if not settings:
             sharp: Floats = np.degrees(0.5) * known * np.sign(load)[:, None]
             return sharp
-        shapes = gravity_shapes(situation, where, constant=True)
+        shapes = gravity_shapes(context, where, constant=True)
         at = [settings[_shape(number)] for number in range(len(settings) - 2)]
         if len(at) > len(shapes):
             raise ModelError(f"the model has {len(at)} shapes of a load that has {len(shapes)}; calibrate again")
-        change = shapes(load, situation.torque_parts(where))
+        change = shapes(load, context.torque_parts(where))
         open_to = np.where(np.arange(len(shapes)) < len(at), settings[_SPREAD], 1.0)
         wide = np.sqrt(((change * open_to) ** 2).sum(axis=1) + settings[_OTHER] ** 2)
         u = ndtr((load + change[:, : len(at)] @ at) / wide)
@@ -127,7 +127,7 @@ class GravityFlipPlay(TorqueFamily):
 
 
 def _shape(number: int) -> str:
-    """Name of the setting that tells by how many sigmas a shape of the load differs from the rig file's masses."""
+    """Return the name of a setting: by how many sigmas a shape of the load differs from the rig file's masses."""
     return f"shape{number + 1}"
 
 

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import ClassVar
 
 import numpy as np
 
-from calibration.effects.base import Coefficient, Settings, Situation
+from calibration.effects.base import Coefficient, Settings
+from calibration.effects.context import EffectContext
 from calibration.effects.load_shapes import (
     UNIT,
     OfUncertainLoad,
     TorqueFamily,
     gravity_shapes,
+    load_columns,
     load_variants,
     part_coefficients,
     part_names,
-    shape_columns,
 )
-from calibration.kernels.jit import compiled
+from calibration.numerics.jit import compiled
 from calibration.observations import Floats
 
 _LINEAR = "compliance_rad_per_Nm"
@@ -51,21 +51,19 @@ class JointCompliance(OfUncertainLoad, TorqueFamily):
     highest torque, and even knots; gears are rarely so.
     """
 
-    name: ClassVar[str] = "joint_compliance"
-    equation: ClassVar[str] = "d_theta = compliance * torque [+ g(s), g a spline, s the torque over the largest]"
-    source: ClassVar[str] = "ICIC 2020, Eqs. 16, 17; curve: stiffness of harmonic drives (Tuttle and Seering 1996)"
-    confused_with: ClassVar[tuple[str, ...]] = ("boom_droop", "encoder_harmonic", "payload_change")
-    revealed_by: ClassVar[str] = (
-        "the same readings of the joint under little and great load: near and far, with a payload and without"
-    )
+    name = "joint_compliance"
+    equation = "d_theta = compliance * torque [+ g(s), g a spline, s the torque over the largest]"
+    source = "ICIC 2020, Eqs. 16, 17; curve: stiffness of harmonic drives (Tuttle and Seering 1996)"
+    confused_with = ("boom_droop", "encoder_harmonic", "payload_change")
+    revealed_by = "the same readings of the joint under little and great load: near and far, with a payload and without"
 
-    def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
-        torque = situation.greatest_torque(where)
+    def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
+        torque = context.greatest_torque(where)
         if torque == 0.0:
             return ()
-        measured = situation.is_torque_measured(where)
-        straight = ({},) if measured else load_variants(gravity_shapes(situation, where), _SIGMA_RAD / torque)
-        known = situation.torque(where)[self.known(situation, where)]
+        measured = context.is_torque_measured(where)
+        straight = ({},) if measured else load_variants(gravity_shapes(context, where), _SIGMA_RAD / torque)
+        known = context.torque(where)[self.known(context, where)]
         low, high = float(known.min(initial=np.inf)), float(known.max(initial=-np.inf))
         if high <= low:
             return straight
@@ -96,12 +94,12 @@ class JointCompliance(OfUncertainLoad, TorqueFamily):
             )
         return (_LINEAR, *(f"bend{knot}_rad" for knot in range(1, _KNOTS + 1)))
 
-    def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
-        torque = situation.greatest_torque(where)
+    def coefficients(self, context: EffectContext, where: str, settings: Settings) -> tuple[Coefficient, ...]:
+        torque = context.greatest_torque(where)
         linear, *bends = self.names(settings)
         most = _BOUND_RAD / torque
         # A drive may report the torque that holds the load in place of the load: the same curve, the other way round.
-        least = -most if situation.is_torque_measured(where) else 0.0
+        least = -most if context.is_torque_measured(where) else 0.0
         own = Coefficient(linear, UNIT, _SIGMA_RAD / torque, least, most)
         if "bend_rad" not in settings:
             return (own, *part_coefficients(settings, most))
@@ -113,20 +111,19 @@ class JointCompliance(OfUncertainLoad, TorqueFamily):
     def strained(self, settings: Settings, values: Floats, standard_errors: Floats) -> bool:
         return "bend_rad" not in settings and super().strained(settings, values, standard_errors)
 
-    def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
-        load = situation.torque(where)
+    def columns(self, context: EffectContext, where: str, settings: Settings) -> Floats:
+        load = context.torque(where)
         known = np.isfinite(load)
         torque = np.where(known, load, 0.0)
         if "bend_rad" in settings:
             return np.degrees(known[:, None] * _curved(torque, settings))
-        own = torque[:, None]
-        if part_names(settings):
-            shapes = gravity_shapes(situation, where)
-            own = np.hstack([own, shape_columns(shapes, torque, situation.torque_parts(where), settings)])
-        return np.degrees(own)
+        columns = load_columns(
+            torque, settings, lambda: gravity_shapes(context, where), lambda: context.torque_parts(where)
+        )
+        return np.degrees(columns)
 
     def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
-        """Of a link that may point anywhere up or down: its load goes as the sine between those of training."""
+        """Return the mean square for a link that may point anywhere: its load is a sine between those of training."""
         most = _SIGMA_RAD / float(plausible[0])  # as `coefficients` has it
         low, high = (settings["low_Nm"], settings["high_Nm"]) if "low_Nm" in settings else (-most, most)
         turns = np.sin(np.linspace(-0.5, 0.5, _UNKNOWN_LOADS) * np.pi)
@@ -137,12 +134,12 @@ class JointCompliance(OfUncertainLoad, TorqueFamily):
 
 
 def _curved(torque: Floats, settings: Settings) -> Floats:
-    """(n, k) deflection in rad per unit of each coefficient of a curve."""
+    """Return the deflection (n, k) in rad per unit of each coefficient of a curve."""
     return np.hstack([torque[:, None], _curves(torque, settings)])
 
 
 def _curves(torque: Floats, settings: Settings) -> Floats:
-    """(n, knots) splines, rad per unit change of slope at each knot.
+    """Return the splines (n, knots), rad per unit change of slope at each knot.
 
     The straight line that fits each best over the whole range is taken from it, so that the compliance is the mean one.
     """
@@ -153,7 +150,7 @@ def _curves(torque: Floats, settings: Settings) -> Floats:
 
 
 def _straightened(s: Floats, knot_power: float | None) -> Floats:
-    """(n, knots) splines at loads between -1 and 1, symmetric ones where the knots have a power."""
+    """Return the splines (n, knots) at loads between -1 and 1, symmetric ones where the knots have a power."""
     knots, line = _shape(knot_power)
     out = np.empty((len(s), _KNOTS))
     _bent(np.ascontiguousarray(s), knots, line, knot_power is not None, out)
@@ -162,7 +159,7 @@ def _straightened(s: Floats, knot_power: float | None) -> Floats:
 
 @cache
 def _shape(knot_power: float | None) -> tuple[Floats, Floats]:
-    """Knots, and (2, knots) the straight lines that fit the splines best between -1 and 1."""
+    """Return the knots, and (2, knots) the straight lines that fit the splines best between -1 and 1."""
     spread = np.linspace(0.0, 1.0, _KNOTS + 2)
     knots = 2.0 * spread - 1.0 if knot_power is None else spread**knot_power
     whole = np.linspace(-1.0, 1.0, 201)

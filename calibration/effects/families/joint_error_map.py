@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import cache
-from typing import ClassVar, Literal
 
 import numpy as np
 
-from calibration.effects.base import Coefficient, FittedCoefficient, JointFamily, Settings, Situation
-from calibration.kernels.jit import compiled
+from calibration.effects.base import Coefficient, FittedCoefficient, JointFamily, Settings
+from calibration.effects.context import EffectContext
+from calibration.numerics.jit import compiled
 from calibration.observations import Floats
 
 _RMS, _RMS_RAD, _RMS_BOUND_RAD = "rms_rad", 1e-3, 5e-3
@@ -37,15 +37,15 @@ class JointErrorMap(JointFamily):
     stays at its end. A range of more than 300 deg is a turn, and the curve closes.
     """
 
-    name: ClassVar[str] = "joint_error_map"
-    equation: ClassVar[str] = "d_theta = sum of c_i B_i(theta), B_i even cubic B-splines, theta as read"
-    source: ClassVar[str] = "P-splines (Eilers and Marx 1996) with independent weights (Higdon 2002)"
-    kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
-    confused_with: ClassVar[tuple[str, ...]] = ("encoder_harmonic", "angle_scale", "joint_compliance")
-    revealed_by: ClassVar[str] = "poses that fill the joint's range densely, several in each wave of the curve"
+    name = "joint_error_map"
+    equation = "d_theta = sum of c_i B_i(theta), B_i even cubic B-splines, theta as read"
+    source = "P-splines (Eilers and Marx 1996) with independent weights (Higdon 2002)"
+    kind = "revolute"
+    confused_with = ("encoder_harmonic", "angle_scale", "joint_compliance")
+    revealed_by = "poses that fill the joint's range densely, several in each wave of the curve"
 
-    def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
-        reading = situation.reading(where)
+    def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
+        reading = context.reading(where)
         poses = len(np.unique(np.rint(reading / _SAME_DEG)))
         range_deg = float(np.ptp(reading)) if len(reading) else 0.0
         span: dict[str, float] = {}
@@ -71,14 +71,14 @@ class JointErrorMap(JointFamily):
             )
         return tuple(f"basis{number}_rad" for number in range(1, _count(settings) + 1))
 
-    def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
-        """Weights; a wave of the greatest RMS is within their bounds."""
-        del situation, where
+    def coefficients(self, context: EffectContext, where: str, settings: Settings) -> tuple[Coefficient, ...]:
+        """Return the weights of the splines; a wave of the greatest RMS is within their bounds."""
+        del context, where
         bound = math.sqrt(2.0) * _RMS_BOUND_RAD
         return tuple(Coefficient(name, "rad", settings["sigma_rad"], -bound, bound) for name in self.names(settings))
 
-    def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
-        return _splines(situation.reading(where), settings, math.degrees(1.0))
+    def columns(self, context: EffectContext, where: str, settings: Settings) -> Floats:
+        return _splines(context.reading(where), settings, math.degrees(1.0))
 
     def reported_limits(self) -> Mapping[str, tuple[float, float]]:
         return {_RMS: (0.0, _RMS_BOUND_RAD)}
@@ -86,7 +86,7 @@ class JointErrorMap(JointFamily):
     def reported(
         self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
     ) -> tuple[FittedCoefficient, ...]:
-        """The RMS of the curve about its mean over its range: the mean is as well an offset of the joint.
+        """Return the RMS of the curve about its mean over its range: the mean is as well an offset of the joint.
 
         Its standard error takes those of the weights for independent.
         """
@@ -99,12 +99,12 @@ class JointErrorMap(JointFamily):
 
 
 def _count(settings: Settings) -> int:
-    """How many splines there are; those at the ends of a range reach over it."""
+    """Return the number of splines; those at the ends of a range reach beyond it."""
     return int(settings["pieces"]) + (3 if "low_deg" in settings else 0)
 
 
 def _splines(angle_deg: Floats, settings: Settings, unit: float = 1.0) -> Floats:
-    """(n, k) values of all splines, times `unit`."""
+    """Return the values (n, k) of all splines, times `unit`."""
     is_turn = "low_deg" not in settings
     low, high = (0.0, 360.0) if is_turn else (settings["low_deg"], settings["high_deg"])
     out = np.zeros((len(angle_deg), _count(settings)))
@@ -114,7 +114,7 @@ def _splines(angle_deg: Floats, settings: Settings, unit: float = 1.0) -> Floats
 
 @cache
 def _squares(pieces: int, is_turn: bool) -> Floats:
-    """(k, k) covariance of the splines over the range: w' S w is the mean square of a curve about its mean."""
+    """Return the covariance (k, k) of the splines over the range: w' S w is a curve's mean square about its mean."""
     settings = {"pieces": float(pieces), "sigma_rad": 1.0} | ({} if is_turn else {"low_deg": 0.0, "high_deg": 360.0})
     middle_deg = np.asarray((np.arange(_GRID * pieces) + 0.5) * (360.0 / (_GRID * pieces)), dtype=np.float64)
     values = _splines(middle_deg, settings)

@@ -2,56 +2,49 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.effects.base import Coefficient, Settings, Situation
-from calibration.effects.motion import has_rates, velocity_mm_per_s
-from calibration.effects.trained import TrainedFamily, check_settings, sizes
+from calibration.effects.base import Coefficient, Settings, SizedFamily, check_sizes, sizes
+from calibration.effects.context import EffectContext
 from calibration.observations import Floats
 
 
-class Latency(TrainedFamily):
+class Latency(SizedFamily):
     """The fix stamped t shows the boom where it was at t - latency; nothing where it stands."""
 
-    name: ClassVar[str] = "latency"
-    equation: ClassVar[str] = "shift = -J_q (dq/dt) * seconds"
-    source: ClassVar[str] = "delay of a total station's fixes against other sensors (Thalmann and Neuner 2021)"
-    confused_with: ClassVar[tuple[str, ...]] = ("clock_drift", "backlash", "load_hysteresis")
-    revealed_by: ClassVar[str] = "the same path driven through without a stop at two speeds, and stopped on"
-    place: ClassVar[str] = "clock"
-    moves_machine: ClassVar[bool] = False
+    name = "latency"
+    equation = "shift = -J_q (dq/dt) * seconds"
+    source = "delay of a total station's fixes against other sensors (Thalmann and Neuner 2021)"
+    confused_with = ("clock_drift", "backlash", "load_hysteresis")
+    revealed_by = "the same path driven through without a stop at two speeds, and stopped on"
+    fixed = (Coefficient("seconds", "s", 0.05, -0.3, 0.3),)
+    place = "clock"
+    moves_machine = False
 
     def needs(self, where: str) -> str:
         del where
         return "columns <joint>_rate with fixes of a moving boom"
 
-    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
+    def known(self, context: EffectContext, where: str) -> NDArray[np.bool_]:
         del where
-        return has_rates(situation)
+        return context.has_rates
 
-    def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
+    def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
         del where
-        found = sizes(_shift_mm(situation))
+        found = sizes(_shift_mm(context))
         return (found,) if any(found.values()) else ()
 
-    def names(self, settings: Settings) -> tuple[str, ...]:
-        check_settings(settings, (), 1)
-        return ("seconds",)
+    def check_settings(self, settings: Settings) -> None:
+        check_sizes(settings, (), 1)
 
-    def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
-        del situation, where, settings
-        return (Coefficient("seconds", "s", 0.05, -0.3, 0.3),)
-
-    def shift_mm(self, situation: Situation, where: str, settings: Settings) -> Floats:
+    def shift_mm(self, context: EffectContext, where: str, settings: Settings) -> Floats:
         del where, settings
-        return _shift_mm(situation)
+        return _shift_mm(context)
 
 
-def _shift_mm(situation: Situation) -> Floats:
-    return -velocity_mm_per_s(situation)[:, :, None]
+def _shift_mm(context: EffectContext) -> Floats:
+    return -context.velocity_mm_per_s[:, :, None]
 
 
 FAMILY = Latency()

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar
 
 import numpy as np
 
-from calibration.effects.base import Coefficient, FittedCoefficient, Settings, Situation
+from calibration.effects.base import Coefficient, FittedCoefficient, Settings
 from calibration.effects.boom import BoomFamily, boom_in
+from calibration.effects.context import EffectContext
 from calibration.observations import Floats
 
 _LEAST = 1e-6  # cosine of an elevation
@@ -28,23 +28,24 @@ class PadPlay(BoomFamily):
     deviation of its logarithm.
     """
 
-    name: ClassVar[str] = "pad_play"
-    equation: ClassVar[str] = "tilt = clearance / overlap * sign(M), overlap = L_max + left stroke - L"
-    source: ClassVar[str] = "geometry of telescopic booms: clearance of the slide pads over their distance"
-    confused_with: ClassVar[tuple[str, ...]] = ("boom_droop", "transducer_quadratic", "gravity_flip_play")
-    revealed_by: ClassVar[str] = "the same attitude of the boom at many extensions, the last tenth of the stroke too"
+    name = "pad_play"
+    equation = "tilt = clearance / overlap * sign(M), overlap = L_max + left stroke - L"
+    source = "geometry of telescopic booms: clearance of the slide pads over their distance"
+    confused_with = ("boom_droop", "transducer_quadratic", "gravity_flip_play")
+    revealed_by = "the same attitude of the boom at many extensions, the last tenth of the stroke too"
+    fixed = (Coefficient("clearance_mm", "mm", 2.0, 0.0, 8.0),)
 
-    def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
+    def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
         forms = tuple({_LEFT: share, _SPREAD: _STEP / math.sqrt(12.0)} for share in _OVERLAPS)
-        return forms if self.shift_mm(situation, where, forms[0]).any() else ()
+        return forms if self.shift_mm(context, where, forms[0]).any() else ()
 
-    def refined(self, situation: Situation, where: str, settings: Settings) -> tuple[Settings, ...]:
-        """All of them: what is settled is between them."""
+    def refined(self, context: EffectContext, where: str, settings: Settings) -> tuple[Settings, ...]:
+        """Return all variants: the settled form lies between them."""
         del settings
-        return self.variants(situation, where)
+        return self.variants(context, where)
 
     def settled(self, forms: Sequence[Settings], probability: Floats) -> Settings:
-        """The mean of the logarithm, and what all of the forms leave open about it."""
+        """Return the mean of the logarithm, and the standard deviation that all of the forms leave about it."""
         left = np.log([form[_LEFT] for form in forms])
         own = np.array([form[_SPREAD] for form in forms])
         mean = float(probability @ left)
@@ -53,7 +54,7 @@ class PadPlay(BoomFamily):
     def reported(
         self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
     ) -> tuple[FittedCoefficient, ...]:
-        """What the data fix is by how much more the boom tilts run out than drawn in, clearance / (left (1 + left))."""
+        """Return the clearance; data only fix clearance / (left (1 + left)), the tilt run out less that drawn in."""
         clearance = coefficients[0]
         share = settings[_SPREAD] * (1.0 + settings[_LEFT] / (1.0 + settings[_LEFT]))
         return (replace(clearance, standard_error=math.hypot(clearance.standard_error, share * clearance.value)),)
@@ -61,25 +62,20 @@ class PadPlay(BoomFamily):
     def form(self, settings: Settings) -> str:
         return f"{settings[_LEFT]:.2g} of the stroke overlap when run out"
 
-    def names(self, settings: Settings) -> tuple[str, ...]:
+    def check_settings(self, settings: Settings) -> None:
         if set(settings) != {_LEFT, _SPREAD} or not settings[_LEFT] > 0.0 or settings[_SPREAD] < 0.0:
             raise ValueError(
                 f"the settings are {_LEFT}, the overlap of the boom run out as a share of the stroke, and {_SPREAD}, "
                 "the standard deviation of its logarithm"
             )
-        return ("clearance_mm",)
 
-    def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
-        del situation, where, settings
-        return (Coefficient("clearance_mm", "mm", 2.0, 0.0, 8.0),)
-
-    def shift_mm(self, situation: Situation, where: str, settings: Settings) -> Floats:
+    def shift_mm(self, context: EffectContext, where: str, settings: Settings) -> Floats:
         del where
-        boom = boom_in(situation)
-        if boom is None or not situation.rig.masses:
-            return np.zeros((len(situation), 3, 1))
-        low, high = situation.rig.joint(boom.joint).limits
-        overlap_mm = np.maximum(high - situation.reading(boom.joint), 0.0) + settings[_LEFT] * (high - low)
+        boom = boom_in(context)
+        if boom is None or not context.rig.masses:
+            return np.zeros((len(context), 3, 1))
+        low, high = context.rig.joint(boom.joint).limits
+        overlap_mm = np.maximum(high - context.reading(boom.joint), 0.0) + settings[_LEFT] * (high - low)
         mouth_mm = boom.root_mm + boom.axis * boom.outer_mm
         places_mm, newton = boom.weights
         hanging = newton * boom.hanging
@@ -89,8 +85,8 @@ class PadPlay(BoomFamily):
         side = np.sign((about * boom.axis).sum(axis=1) - (about * boom.down).sum(axis=1) * rise)
         level = np.sqrt(np.maximum(1.0 - rise**2, 0.0))  # cosine of the boom's elevation; none if it stands on end
         tilt = np.where(level > _LEAST, side / (overlap_mm * np.maximum(level, _LEAST)), 0.0)
-        moved = boom.lowered(situation.located.prism_mm - mouth_mm) * (tilt * boom.carries_prism)[:, None]
-        return situation.to_station(moved[:, :, None])
+        moved = boom.lowered(context.located.prism_mm - mouth_mm) * (tilt * boom.carries_prism)[:, None]
+        return context.to_station(moved[:, :, None])
 
 
 FAMILY = PadPlay()

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 
-from calibration.effects.base import Coefficient, PrismFamily, Settings, Situation
-from calibration.effects.sight import of_prism, sight
+from calibration.effects.base import Coefficient, PrismFamily, Settings
+from calibration.effects.context import EffectContext
 from calibration.observations import Floats
-from calibration.rig import Rig
+from calibration.rig.description import Rig
 
 _SHARED = "station"
 _USUAL_MM = 30.0  # what one confuses: 0, 30 and 34.4 mm are the makers' constants
@@ -22,20 +20,20 @@ class PrismConstant(PrismFamily):
     The error is small, or it is the difference of two makers' constants: the variant that has `sigma_mm`.
     """
 
-    name: ClassVar[str] = "prism_constant"
-    equation: ClassVar[str] = "shift = mm * (unit vector from the station to the prism)"
-    source: ClassVar[str] = "additive constant of reflectors (ISO 17123-4); makers' usual ones are 0, 30 and 34.4 mm"
-    confused_with: ClassVar[tuple[str, ...]] = ("prism_incidence", "station_scale")
-    revealed_by: ClassVar[str] = "the same poses from a second set-up that sees the prism from another side"
-    moves_machine: ClassVar[bool] = False
+    name = "prism_constant"
+    equation = "shift = mm * (unit vector from the station to the prism)"
+    source = "additive constant of reflectors (ISO 17123-4); makers' usual ones are 0, 30 and 34.4 mm"
+    confused_with = ("prism_incidence", "station_scale")
+    revealed_by = "the same poses from a second set-up that sees the prism from another side"
+    moves_machine = False
 
     def places(self, rig: Rig) -> tuple[str, ...]:
         return (*rig.prism_names, _SHARED) if len(rig.prisms) > 1 else rig.prism_names
 
-    def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
-        seen = np.unique(situation.data.prism)
+    def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
+        seen = np.unique(context.data.prism)
         # With a single prism in the data its own constant and that of all are the same.
-        possible = len(seen) > 1 if where == _SHARED else situation.rig.prism_names.index(where) in seen
+        possible = len(seen) > 1 if where == _SHARED else context.rig.prism_names.index(where) in seen
         return ({}, {"sigma_mm": _USUAL_MM}) if possible else ()
 
     def odds(self, settings: Settings) -> float:
@@ -46,15 +44,15 @@ class PrismConstant(PrismFamily):
             raise ValueError("the only setting is sigma_mm, above 0")
         return ("mm",)
 
-    def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
-        del situation, where
+    def coefficients(self, context: EffectContext, where: str, settings: Settings) -> tuple[Coefficient, ...]:
+        del context, where
         return (Coefficient("mm", "mm", settings.get("sigma_mm", 3.0), -40.0, 40.0),)
 
-    def shift_mm(self, situation: Situation, where: str, settings: Settings) -> Floats:
+    def shift_mm(self, context: EffectContext, where: str, settings: Settings) -> Floats:
         del settings
-        away = sight(situation)
+        away = context.line_of_sight
         if where != _SHARED:
-            away = away * of_prism(situation, where)[:, None]
+            away = away * context.rows_of_prism(where)[:, None]
         return away[:, :, None]
 
 

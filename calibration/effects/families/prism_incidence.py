@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 
-from calibration.effects.base import Coefficient, PrismFamily, Settings, Situation
-from calibration.effects.sight import of_prism, sight
+from calibration.effects.base import Coefficient, PrismFamily, Settings
+from calibration.effects.context import EffectContext
 from calibration.observations import Floats
-from calibration.rig import Rig
+from calibration.rig.description import Rig
 
 _LEAST = 1e-9  # cosine of a line of sight that is along the prism's own axis
 _AXIS = "axis"
@@ -23,39 +21,35 @@ class PrismIncidence(PrismFamily):
     have it: 1 for x, 2 for y, 3 for z. psi is 0 along the axis that follows it (x after z), 90 deg along the next.
     """
 
-    name: ClassVar[str] = "prism_incidence"
-    equation: ClassVar[str] = "shift = (cos1 cos psi + sin1 sin psi) * (unit vector from the station to the prism)"
-    source: ClassVar[str] = "360 degree prisms err by several mm with the angle of incidence (Favre and Hennes 2000)"
-    confused_with: ClassVar[tuple[str, ...]] = ("prism_constant", "encoder_harmonic", "angle_scale")
-    revealed_by: ClassVar[str] = "poses that turn the prism all round before the station, or a second set-up"
-    moves_machine: ClassVar[bool] = False
+    name = "prism_incidence"
+    equation = "shift = (cos1 cos psi + sin1 sin psi) * (unit vector from the station to the prism)"
+    source = "360 degree prisms err by several mm with the angle of incidence (Favre and Hennes 2000)"
+    confused_with = ("prism_constant", "encoder_harmonic", "angle_scale")
+    revealed_by = "poses that turn the prism all round before the station, or a second set-up"
+    fixed = (Coefficient("cos1_mm", "mm", 1.0, -8.0, 8.0), Coefficient("sin1_mm", "mm", 1.0, -8.0, 8.0))
+    moves_machine = False
 
     def places(self, rig: Rig) -> tuple[str, ...]:
         return rig.prism_names
 
-    def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
-        return tuple({_AXIS: axis} for axis in _AXES) if of_prism(situation, where).any() else ()
+    def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
+        return tuple({_AXIS: axis} for axis in _AXES) if context.rows_of_prism(where).any() else ()
 
     def form(self, settings: Settings) -> str:
         return f"about {' xyz'[int(settings[_AXIS])]} of the prism's frame"
 
-    def names(self, settings: Settings) -> tuple[str, ...]:
+    def check_settings(self, settings: Settings) -> None:
         if set(settings) != {_AXIS} or settings[_AXIS] not in _AXES:
             raise ValueError("the only setting is the prism's axis: 1, 2 or 3 for x, y or z of its frame")
-        return "cos1_mm", "sin1_mm"
 
-    def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
-        del situation, where
-        return tuple(Coefficient(name, "mm", 1.0, -8.0, 8.0) for name in self.names(settings))
-
-    def shift_mm(self, situation: Situation, where: str, settings: Settings) -> Floats:
+    def shift_mm(self, context: EffectContext, where: str, settings: Settings) -> Floats:
         across = [int(settings[_AXIS]) % 3, (int(settings[_AXIS]) + 1) % 3]
-        away = sight(situation)
-        back = -(situation.rotation.transpose(0, 2, 1) @ away[:, :, None])
-        level = (situation.facing.axes @ back)[:, across, 0]  # towards the station, along the axes across the prism's
+        away = context.line_of_sight
+        back = -(context.rotation.transpose(0, 2, 1) @ away[:, :, None])
+        level = (context.facing.axes @ back)[:, across, 0]  # towards the station, along the axes across the prism's
         size = np.sqrt((level**2).sum(axis=1))[:, None]
         harmonic = np.where(size > _LEAST, level / np.maximum(size, _LEAST), 0.0)
-        return (away * of_prism(situation, where)[:, None])[:, :, None] * harmonic[:, None, :]
+        return (away * context.rows_of_prism(where)[:, None])[:, :, None] * harmonic[:, None, :]
 
 
 FAMILY = PrismIncidence()

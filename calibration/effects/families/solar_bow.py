@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
-
 import numpy as np
 
-from calibration.effects.base import Coefficient, JointFamily, Settings, Situation
+from calibration.effects.base import Coefficient, JointFamily, Settings
+from calibration.effects.context import EffectContext
 from calibration.errors import ModelError
 from calibration.observations import Floats
-from calibration.rig import Rig
+from calibration.rig.description import Rig
 
 _COLUMN = "temperature_degC"
 _SETTINGS = ("mean_degC", "change_degC", "frame")
@@ -24,45 +23,41 @@ class SolarBow(JointFamily):
     Where a link is level when its joint reads zero, the joint's angle is taken for the elevation; that is a variant.
     """
 
-    name: ClassVar[str] = "solar_bow"
-    equation: ClassVar[str] = "d_theta = k (T - mean T of the training data) cos(elevation of the link)"
-    source: ClassVar[str] = "temperature gradient over a beam's height h: slope alpha dT L / h (EN 1991-1-5)"
-    confused_with: ClassVar[tuple[str, ...]] = ("thermal_expansion", "base_settlement", "joint_compliance")
-    revealed_by: ClassVar[str] = "the same flat and steep poses of the link, cold in the morning and warm at noon"
-    column: ClassVar[str] = _COLUMN
-    kind: ClassVar[Literal["revolute", "prismatic"]] = "revolute"
+    name = "solar_bow"
+    equation = "d_theta = k (T - mean T of the training data) cos(elevation of the link)"
+    source = "temperature gradient over a beam's height h: slope alpha dT L / h (EN 1991-1-5)"
+    confused_with = ("thermal_expansion", "base_settlement", "joint_compliance")
+    revealed_by = "the same flat and steep poses of the link, cold in the morning and warm at noon"
+    fixed = (Coefficient("rad_per_K", "rad/K", 1e-4, -5e-4, 5e-4),)
+    column = _COLUMN
+    kind = "revolute"
 
     def places(self, rig: Rig) -> tuple[str, ...]:
         turning = {joint for _, driven, joint, _ in rig.couplings() if driven == "theta"}
         return tuple(name for name in super().places(rig) if name in turning)
 
-    def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
-        known, frame = self.known(situation, where), _link_end(situation, where)
-        carries = situation.greatest_torque(where) > 0.0 or not situation.rig.masses
+    def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
+        known, frame = self.known(context, where), _link_end(context, where)
+        carries = context.greatest_torque(where) > 0.0 or not context.rig.masses
         if not carries or not known.any():
             return ()
-        mean = float(situation.extra(_COLUMN)[known].mean())
+        mean = float(context.extra(_COLUMN)[known].mean())
         found = []
         for end in (_JOINT_ANGLE,) if frame is None else (frame, _JOINT_ANGLE):
             settings = {"mean_degC": mean, "frame": float(end)}
-            usual = float(np.sqrt(np.mean(_change_K(situation, where, settings)[known] ** 2)))
+            usual = float(np.sqrt(np.mean(_change_K(context, where, settings)[known] ** 2)))
             found += [{**settings, "change_degC": usual}] if usual > 0.0 else []
         return tuple(found)
 
     def form(self, settings: Settings) -> str:
         return "the joint's angle is the elevation" if settings["frame"] == _JOINT_ANGLE else "elevation of the link"
 
-    def names(self, settings: Settings) -> tuple[str, ...]:
+    def check_settings(self, settings: Settings) -> None:
         if set(settings) != set(_SETTINGS) or settings["change_degC"] <= 0.0 or settings["frame"] < 0.0:
             raise ValueError(f"the settings are {', '.join(_SETTINGS)}")
-        return ("rad_per_K",)
 
-    def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
-        del situation, where, settings
-        return (Coefficient("rad_per_K", "rad/K", 1e-4, -5e-4, 5e-4),)
-
-    def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
-        return np.degrees(_change_K(situation, where, settings))[:, None]
+    def columns(self, context: EffectContext, where: str, settings: Settings) -> Floats:
+        return np.degrees(_change_K(context, where, settings))[:, None]
 
     def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
         del plausible
@@ -70,7 +65,7 @@ class SolarBow(JointFamily):
 
 
 def _axis_frame(rig: Rig, where: str) -> tuple[int, int]:
-    """The row that a revolute joint turns first, and the frame whose origin lies on the joint's axis."""
+    """Return the row that a revolute joint turns first, and the frame whose origin lies on the joint's axis."""
     row = next(number for number, driven, joint, _ in rig.couplings() if joint == where and driven == "theta")
     if rig.convention != "dh":
         return row, row
@@ -78,9 +73,9 @@ def _axis_frame(rig: Rig, where: str) -> tuple[int, int]:
     return row, before[-1] if before else 0
 
 
-def _link_end(situation: Situation, where: str) -> int | None:
-    """The frame at which the link ends that a joint moves; None where it moves none."""
-    rig, frames_mm = situation.rig, situation.located.frames_mm
+def _link_end(context: EffectContext, where: str) -> int | None:
+    """Return the frame at which the link ends that a joint moves; None where it moves none."""
+    rig, frames_mm = context.rig, context.located.frames_mm
     row, own = _axis_frame(rig, where)
     for frame in range(own + 1, len(rig.rows) + 1):
         if row in rig.path(frame):
@@ -90,19 +85,19 @@ def _link_end(situation: Situation, where: str) -> int | None:
     return None
 
 
-def _change_K(situation: Situation, where: str, settings: Settings) -> Floats:  # noqa: N802 - the unit is K
-    """(n,) how much warmer it is, times the cosine of the link's elevation."""
-    warmer: Floats = np.nan_to_num(situation.extra(_COLUMN) - settings["mean_degC"])
-    rig, end = situation.rig, int(settings["frame"])
+def _change_K(context: EffectContext, where: str, settings: Settings) -> Floats:  # noqa: N802 - the unit is K
+    """Return the change of temperature (n,) times the cosine of the link's elevation."""
+    warmer: Floats = np.nan_to_num(context.extra(_COLUMN) - settings["mean_degC"])
+    rig, end = context.rig, int(settings["frame"])
     if end == _JOINT_ANGLE:
-        warmer *= np.cos(np.radians(situation.reading(where)))
+        warmer *= np.cos(np.radians(context.reading(where)))
         return warmer
-    frames_mm = situation.located.frames_mm
+    frames_mm = context.located.frames_mm
     _, own = _axis_frame(rig, where)
     if end >= frames_mm.shape[1]:
         raise ModelError(f"the model has a link that ends at frame {end}, which its rig lacks; calibrate again")
     link = frames_mm[:, end] - frames_mm[:, own]
-    along = (link * situation.down).sum(axis=1)
+    along = (link * context.down).sum(axis=1)
     square = (link**2).sum(axis=1)
     warmer *= np.sqrt(np.clip(1.0 - along**2 / np.maximum(square, np.finfo(np.float64).tiny), 0.0, 1.0))
     return warmer

@@ -2,36 +2,26 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
-from calibration.effects.base import Coefficient, PrismFamily, Settings, Situation, refuse_settings
+from calibration.effects.base import Coefficient, PrismFamily, Settings
+from calibration.effects.context import EffectContext
 from calibration.observations import Floats
 
 
 class StationScale(PrismFamily):
     """All coordinates grow from the instrument's centre: a wrong atmosphere, a frequency that is off."""
 
-    name: ClassVar[str] = "station_scale"
-    equation: ClassVar[str] = "shift = ppm * 1e-6 * position in the station's frame"
-    source: ClassVar[str] = (
-        "electronic distance meters: 1 ppm per K, or per 3.6 hPa, of a wrong atmosphere (Rueger 1990)"
-    )
-    confused_with: ClassVar[tuple[str, ...]] = ("thermal_expansion", "prism_constant", "transducer_scale")
-    revealed_by: ClassVar[str] = "the same poses from a second set-up at another distance, or control points"
-    place: ClassVar[str] = "station"
-    moves_machine: ClassVar[bool] = False
+    name = "station_scale"
+    equation = "shift = ppm * 1e-6 * position in the station's frame"
+    source = "electronic distance meters: 1 ppm per K, or per 3.6 hPa, of a wrong atmosphere (Rueger 1990)"
+    confused_with = ("thermal_expansion", "prism_constant", "transducer_scale")
+    revealed_by = "the same poses from a second set-up at another distance, or control points"
+    fixed = (Coefficient("ppm", "ppm", 10.0, -50.0, 50.0),)
+    place = "station"
+    moves_machine = False
 
-    def names(self, settings: Settings) -> tuple[str, ...]:
-        refuse_settings(settings)
-        return ("ppm",)
-
-    def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
-        del situation, where, settings
-        return (Coefficient("ppm", "ppm", 10.0, -50.0, 50.0),)
-
-    def shift_mm(self, situation: Situation, where: str, settings: Settings) -> Floats:
+    def shift_mm(self, context: EffectContext, where: str, settings: Settings) -> Floats:
         del where, settings
-        return 1e-6 * situation.located.position_mm[:, :, None]
+        return 1e-6 * context.located.position_mm[:, :, None]
 
 
 FAMILY = StationScale()

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
-
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.effects.base import Coefficient, JointFamily, Settings, Situation
+from calibration.effects.base import Coefficient, JointFamily, Settings
+from calibration.effects.context import EffectContext
 from calibration.observations import Floats
 
 _MEAN = "mean_m"
@@ -23,27 +22,28 @@ class TransducerCumulative(JointFamily):
     mean path of the training belongs to the kinematics.
     """
 
-    name: ClassVar[str] = "transducer_cumulative"
-    equation: ClassVar[str] = "d_L = k * (path travelled - its mean in the training data), in m"
-    source: ClassVar[str] = "slip of a draw wire or a measuring wheel"
-    confused_with: ClassVar[tuple[str, ...]] = ("transducer_index_jump", "base_settlement", "base_step")
-    revealed_by: ClassVar[str] = "returning to a pose measured before, after running the joint to and fro many times"
-    kind: ClassVar[Literal["revolute", "prismatic"]] = "prismatic"
-    goes_by_travel: ClassVar[bool] = True
+    name = "transducer_cumulative"
+    equation = "d_L = k * (path travelled - its mean in the training data), in m"
+    source = "slip of a draw wire or a measuring wheel"
+    confused_with = ("transducer_index_jump", "base_settlement", "base_step")
+    revealed_by = "returning to a pose measured before, after running the joint to and fro many times"
+    fixed = (Coefficient("mm_per_m", "mm/m", 0.03, -0.3, 0.3),)
+    kind = "prismatic"
+    goes_by_travel = True
 
     def needs(self, where: str) -> str:
         del where
         return "the column time_s in all rows or in none"
 
-    def known(self, situation: Situation, where: str) -> NDArray[np.bool_]:
+    def known(self, context: EffectContext, where: str) -> NDArray[np.bool_]:
         del where
-        timed = np.isfinite(situation.extra("time_s"))
+        timed = np.isfinite(context.extra("time_s"))
         return timed if timed.any() else ~timed
 
-    def variants(self, situation: Situation, where: str) -> tuple[Settings, ...]:
-        known, time_s = self.known(situation, where), situation.extra("time_s")
+    def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
+        known, time_s = self.known(context, where), context.extra("time_s")
         order = np.argsort(time_s[known], kind="stable")  # as they come where there are no times
-        path_m = _travelled_m(situation.reading(where)[known][order])
+        path_m = _travelled_m(context.reading(where)[known][order])
         if not len(path_m) or path_m[-1] == 0.0:
             return ()
         mean = float(path_m.mean())
@@ -59,37 +59,32 @@ class TransducerCumulative(JointFamily):
     def goes_by_order(self, settings: Settings) -> bool:
         return not _table(settings).size
 
-    def names(self, settings: Settings) -> tuple[str, ...]:
+    def check_settings(self, settings: Settings) -> None:
         knots = len(settings) // 2
         expected = {_MEAN, *(name for i in range(knots) for name in _knot(i))}
         if set(settings) != expected or knots > _MOST_KNOTS or not (np.diff(_table(settings)) > [[0.0], [-1e-9]]).all():
             raise ValueError(f"the settings are {_MEAN}, and up to {_MOST_KNOTS} rising time_0_s with path_0_m")
-        return ("mm_per_m",)
 
-    def coefficients(self, situation: Situation, where: str, settings: Settings) -> tuple[Coefficient, ...]:
-        del situation, where, settings
-        return (Coefficient("mm_per_m", "mm/m", 0.03, -0.3, 0.3),)
-
-    def columns(self, situation: Situation, where: str, settings: Settings) -> Floats:
-        time_s, (times, paths) = situation.extra("time_s"), _table(settings)
-        known, path_m = self.known(situation, where), np.zeros(len(situation))
+    def columns(self, context: EffectContext, where: str, settings: Settings) -> Floats:
+        time_s, (times, paths) = context.extra("time_s"), _table(settings)
+        known, path_m = self.known(context, where), np.zeros(len(context))
         if len(times) and np.isfinite(time_s).any():
             path_m[known] = np.interp(time_s[known], times, paths)
         else:
             run = np.flatnonzero(known)[np.argsort(time_s[known], kind="stable")]
-            path_m[run] = _travelled_m(situation.reading(where)[run])
+            path_m[run] = _travelled_m(context.reading(where)[run])
         change: Floats = np.where(known, path_m - settings[_MEAN], 0.0)[:, None]
         return change
 
     def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
-        """The path may be any that there was in the training."""
+        """Return the mean square for a path that may be any of those in training."""
         del plausible
         paths = _table(settings)[1]
         return (float(values[0]) * float(np.std(paths if len(paths) else [0.0, 2.0 * settings[_MEAN]]))) ** 2
 
 
 def _travelled_m(reading_mm: Floats) -> Floats:
-    """(n,) path from the first of the rows, in their order."""
+    """Return the path (n,) from the first of the rows, in their order."""
     path_m: Floats = np.abs(np.diff(reading_mm, prepend=reading_mm[:1])).cumsum() / 1e3
     return path_m
 
@@ -99,7 +94,7 @@ def _knot(number: int) -> tuple[str, str]:
 
 
 def _table(settings: Settings) -> Floats:
-    """(2, knots) times and paths."""
+    """Return times and paths of the knots, (2, knots)."""
     return np.array([[settings[name] for name in names] for names in zip(*_knots(settings), strict=True)]).reshape(
         2, -1
     )

@@ -1,19 +1,19 @@
-"""What a search needs to go on after it was interrupted: the protocol of a store, and states as plain arrays.
+"""States of a search as plain arrays, with which it goes on after an interruption.
 
 A state names the problem that it belongs to, so that a search of other data, bounds or settings never continues it.
 """
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.npz import read_npz
+from calibration.numerics.stored_arrays import read_npz, write_npz
 from calibration.observations import Floats
+from calibration.run import Checkpoint
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -21,16 +21,6 @@ _FORMAT = "1"  # of the state; another one cannot be continued
 _PROBES = 8
 _SAME = 1e-9
 _PREFIX = "problem."
-
-
-class Checkpoint(Protocol):
-    """Where a search keeps its state; the caller owns the file."""
-
-    def load(self) -> bytes | None:
-        """What was saved last; None where there is nothing."""
-
-    def save(self, state: bytes) -> None:
-        """Keep a state in place of the one before, whole or not at all; OSError where it cannot be kept."""
 
 
 def problem(
@@ -43,7 +33,7 @@ def problem(
     seed: int,
     settings: object,
 ) -> Arrays:
-    """What makes two searches the same one, by the words that say what differs.
+    """Describe a search such that two are the same if all parts agree; the names of the parts say what differs.
 
     Data are known by their effect: the fitness of a few candidates spread over the box. Numbers that an earlier fit
     found may differ in their last bits from one process to the next, so they are compared to a billionth.
@@ -61,15 +51,12 @@ def problem(
 
 
 def pack(identity: Mapping[str, NDArray[Any]], arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    """The arrays and the problem that they belong to, as an npz archive without pickle."""
-    named = {_PREFIX + word: value for word, value in identity.items()}
-    out = io.BytesIO()
-    np.savez(out, allow_pickle=False, **named, **arrays)
-    return out.getvalue()
+    """Pack arrays and the problem that they belong to, as an npz archive without pickled objects."""
+    return write_npz({_PREFIX + word: value for word, value in identity.items()} | dict(arrays))
 
 
 def unpack(state: bytes | None, identity: Mapping[str, NDArray[Any]]) -> tuple[Arrays | None, str | None]:
-    """The arrays of a state of this very problem, or None; a sentence where a state had to be left aside."""
+    """Read the arrays of a state of this very problem, or None; a sentence where a state had to be left aside."""
     if state is None:
         return None, None
     try:
@@ -83,13 +70,35 @@ def unpack(state: bytes | None, identity: Mapping[str, NDArray[Any]]) -> tuple[A
     return arrays, None
 
 
-def keep(checkpoint: Checkpoint, state: bytes) -> str | None:
-    """Save a state; a sentence where it cannot be kept, which is no reason to end the search."""
-    try:
-        checkpoint.save(state)
-    except OSError as error:
-        return f"the search's checkpoint could not be written ({error}), so a search that is killed may begin anew"
-    return None
+class SavedSearch:
+    """The state of a search in a run's checkpoint, if the run has one.
+
+    Args:
+        checkpoint: of the run.
+        identity: function that returns the `problem`.
+
+    Attributes:
+        arrays: state to go on from; None to begin anew.
+        set_aside: reason why a state was not continued; None where there was none or it was.
+        unsaved: reason why a state was not saved; None where each was.
+    """
+
+    def __init__(self, checkpoint: Checkpoint | None, identity: Callable[[], Arrays]) -> None:
+        self._checkpoint, self._identity = checkpoint, {} if checkpoint is None else identity()
+        state = None if checkpoint is None else checkpoint.load()
+        self.arrays, self.set_aside = unpack(state, self._identity)
+        self.unsaved: str | None = None
+
+    def save(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Save a state; that it cannot be saved is no reason to end the search."""
+        if self._checkpoint is None:
+            return
+        try:
+            self._checkpoint.save(pack(self._identity, arrays))
+        except OSError as error:
+            self.unsaved = (
+                f"the search's checkpoint could not be written ({error}), so a search that is killed may begin anew"
+            )
 
 
 def _same(one: NDArray[Any], other: NDArray[Any]) -> bool:

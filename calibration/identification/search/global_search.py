@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.identification.approach import PRIOR_SCALE
-from calibration.identification.refinement import Fit, Prior, prior_precision
+from calibration.identification.linear_model import prior_precision
+from calibration.identification.refinement import Prior
 from calibration.identification.samples import Samples
-from calibration.identification.search.checkpoint import Checkpoint
-from calibration.identification.search.islands import Settings, evolve
-from calibration.identification.subset import drawn
-from calibration.kernels import Fitness
-from calibration.kinematics import Chain
+from calibration.identification.search.islands import Evolved, Settings, evolve
+from calibration.identification.start import PRIOR_SCALE, draw_rows
+from calibration.kinematics.chain import Chain
+from calibration.kinematics.fitness import Fitness
 from calibration.observations import Floats
+from calibration.run import Run
 
 _SEARCH_ROWS = 400  # enough to tell basins apart
 _SEARCH_WIDTH = {"recalibration": 4.0, "as-built": 60.0}  # half-width of the search in build tolerances
@@ -36,48 +34,33 @@ class PenalisedFitness:
         return cost
 
 
-@dataclass(frozen=True)
-class Found:
-    """Result of `search_globally`.
-
-    Attributes:
-        x: (p,) a better start; None where nothing is better than where the local fit ended.
-        complete: False if the search was stopped before its end.
-        warnings: what went wrong with the checkpoint.
-    """
-
-    x: Floats | None
-    complete: bool
-    warnings: tuple[str, ...] = ()
-
-
 def search_globally(
     chain: Chain,
     samples: Samples,
-    nominal: Fit,
-    local: Fit,
+    nominal: Floats,
+    local: Floats,
     scale_mm: float,
     prior: Prior,
-    seed: int,
-    executor: Executor,
-    progress: Callable[[float, str], None],
-    should_stop: Callable[[], bool] | None = None,
-    checkpoint: Checkpoint | None = None,
-) -> Found:
+    run: Run,
+) -> tuple[Floats | None, Evolved]:
     """Look for a start for the refinement that is better than where the local one ended.
 
     Args:
-        chain, samples: kinematics and rows.
-        nominal: the middle of the search.
-        local: the fit to beat.
+        chain: kinematics.
+        samples: rows.
+        nominal: (p,) the middle of the search.
+        local: (p,) the optimum to beat.
         scale_mm: robust size of the misfit at the middle.
         prior: gives the width of the search.
-        seed, executor, progress, should_stop, checkpoint: as `evolve`.
+        run: as `evolve`.
+
+    Returns:
+        (p,) a better start, None where nothing is better than the local fit; the search.
     """
-    rows = drawn(samples.data, samples.position_mm, _SEARCH_ROWS, seed)
+    rows = draw_rows(samples.data, samples.position_mm, _SEARCH_ROWS, run.seed)
     searched = samples.select(rows)
     data, position = searched.data, searched.position_mm
-    lin = chain.linearise(nominal.x, data)
+    lin = chain.linearise(nominal, data)
     # Noise far below the misfit would make the basin a needle's eye; the refinement has the true noise.
     variance = searched.variance(chain.rig, lin.joint_jacobian) + (scale_mm / 30.0) ** 2
     weight = np.full(len(rows), 1.0 / variance)
@@ -90,15 +73,11 @@ def search_globally(
     penalised = PenalisedFitness(fitness, precision)
     evolved = evolve(
         penalised,
-        nominal.x - width,
-        nominal.x + width,
-        seed=seed,
-        executor=executor,
+        nominal - width,
+        nominal + width,
+        run=run,
         settings=Settings(evaluations=_EVALUATIONS_PER_PARAMETER * len(chain)),
-        start=nominal.x[None],
-        progress=lambda share: progress(0.3 + 0.45 * share, "searching globally"),
-        should_stop=should_stop,
-        checkpoint=checkpoint,
+        start=nominal[None],
     )
-    better = evolved.cost < float(penalised(local.x[None])[0])
-    return Found(evolved.x if better else None, evolved.complete, evolved.warnings)
+    better = evolved.cost < float(penalised(local[None])[0])
+    return evolved.x if better else None, evolved

@@ -10,16 +10,17 @@ result depends neither on the executor, nor on the number of its workers, nor on
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from calibration.identification.search import lshade
-from calibration.identification.search.checkpoint import Arrays, Checkpoint, keep, pack, problem, unpack
+from calibration.identification.search.checkpoint import Arrays, SavedSearch, problem
 from calibration.identification.search.lshade import Island, Settings
 from calibration.observations import Floats
+from calibration.run import Run
 
 __all__ = ["Evolved", "Settings", "evolve"]
 
@@ -31,10 +32,10 @@ class Evolved:
     Attributes:
         x: (p,) best candidate.
         cost: its cost.
-        evaluations: how many candidates were evaluated, those before an interruption too.
+        evaluations: number of candidates that were evaluated, those before an interruption too.
         complete: False if the search was stopped before its end.
-        set_aside: why a checkpoint was not continued; None where there was none or it was.
-        unsaved: why a checkpoint was not written; None where each was.
+        set_aside: reason why a checkpoint was not continued; None where there was none or it was.
+        unsaved: reason why a checkpoint was not written; None where each was.
     """
 
     x: Floats
@@ -46,7 +47,7 @@ class Evolved:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What went wrong with the checkpoint."""
+        """Sentences on a checkpoint that was not continued or not written."""
         return tuple(s for s in (self.set_aside, self.unsaved) if s is not None)
 
 
@@ -55,52 +56,43 @@ def evolve(
     lower: Floats,
     upper: Floats,
     *,
-    seed: int,
-    executor: Executor,
+    run: Run,
     settings: Settings,
     start: Floats | None = None,
-    progress: Callable[[float], None] | None = None,
-    should_stop: Callable[[], bool] | None = None,
-    checkpoint: Checkpoint | None = None,
 ) -> Evolved:
     """Minimise `fitness` in a box.
 
     Args:
-        fitness: (candidates, p) -> (candidates,); sent to the executor with every epoch of an island, so picklable
-            where that is a process pool (sending `Fitness` costs what evaluating some hundred candidates costs).
-        lower, upper: (p,) bounds.
-        seed: of all random streams.
-        executor: runs the islands.
-        settings: how much to search.
+        fitness: function from (candidates, p) to costs (candidates,); sent to the executor with every epoch of an
+            island, so picklable where that is a process pool (sending `Fitness` costs as much as evaluating some
+            hundred candidates).
+        lower: (p,) bounds.
+        upper: (p,) bounds.
+        run: seed of all random streams, workers for the islands; it is reported to, asked to stop and saved after
+            every epoch, and goes on from a checkpoint of this very search.
+        settings: budget.
         start: (k, p) candidates that every island begins with.
-        progress: told the share that is done, after every epoch.
-        should_stop: asked after every epoch; the best so far is returned once it says so.
-        checkpoint: continued if it holds a state of this very search, and saved after every epoch.
 
     Raises:
         ValueError: islands of fewer than four candidates.
     """
     if min(settings.population, settings.least_population) < lshade.LEAST:
         raise ValueError(f"an island needs {lshade.LEAST} candidates; the settings are {settings}")
-    identity: Arrays = {}
-    arrays, set_aside, unsaved = None, None, None
-    if checkpoint is not None:
-        identity = problem("islands", fitness, lower, upper, start=start, seed=seed, settings=settings)
-        arrays, set_aside = unpack(checkpoint.load(), identity)
-    if arrays is None:
-        first = partial(lshade.begin, fitness, lower, upper, start, seed, settings)
-        done, islands = 0, list(executor.map(first, range(settings.islands)))
-    else:
-        done, islands = _from_arrays(arrays, settings)
-    advance = partial(lshade.advance, fitness, lower, upper, seed, settings)
-    while done < settings.epochs and not (should_stop is not None and should_stop()):
-        target = settings.evaluations * (done + 1) // settings.epochs
-        islands = _migrated(list(executor.map(partial(advance, target), islands)))
-        done += 1
-        if checkpoint is not None:
-            unsaved = keep(checkpoint, pack(identity, _to_arrays(done, islands))) or unsaved
-        if progress is not None:
-            progress(done / settings.epochs)
+    identity = partial(problem, "islands", fitness, lower, upper, start=start, seed=run.seed, settings=settings)
+    saved = SavedSearch(run.checkpoint, identity)
+    with run.workers() as executor:
+        if saved.arrays is None:
+            first = partial(lshade.begin, fitness, lower, upper, start, run.seed, settings)
+            done, islands = 0, list(executor.map(first, range(settings.islands)))
+        else:
+            done, islands = _from_arrays(saved.arrays, settings)
+        advance = partial(lshade.advance, fitness, lower, upper, run.seed, settings)
+        while done < settings.epochs and not run.should_stop():
+            target = settings.evaluations * (done + 1) // settings.epochs
+            islands = _migrated(list(executor.map(partial(advance, target), islands)))
+            done += 1
+            saved.save(_to_arrays(done, islands))
+            run.progress(done / settings.epochs, "searching globally")
     best = min(islands, key=lambda island: float(island.cost.min()))
     index = int(best.cost.argmin())
     return Evolved(
@@ -108,13 +100,13 @@ def evolve(
         float(best.cost[index]),
         sum(island.evaluations for island in islands),
         done == settings.epochs,
-        set_aside,
-        unsaved,
+        saved.set_aside,
+        saved.unsaved,
     )
 
 
 def _migrated(islands: Sequence[Island]) -> list[Island]:
-    """The best of each island takes the place of the next island's worst; one island alone stays as it is."""
+    """Put the best of each island in the place of the next one's worst; one island alone stays as it is."""
     if len(islands) == 1:
         return list(islands)
     guests = [(i.population[i.cost.argmin()], float(i.cost.min())) for i in islands]
@@ -139,18 +131,10 @@ def _to_arrays(done: int, islands: Sequence[Island]) -> Arrays:
 
 def _from_arrays(arrays: Arrays, settings: Settings) -> tuple[int, list[Island]]:
     def island(number: int) -> Island:
-        def of(name: str) -> Floats:
-            return arrays[f"{number}.{name}"]
-
-        return Island(
-            number,
-            int(of("generation")),
-            int(of("evaluations")),
-            of("population"),
-            of("cost"),
-            of("archive"),
-            of("memory"),
-            int(of("slot")),
-        )
+        parts: dict[str, Any] = {}
+        for field in fields(Island):
+            value = arrays[f"{number}.{field.name}"]
+            parts[field.name] = value if value.ndim else int(value)
+        return Island(**parts)
 
     return int(arrays["done"]), [island(number) for number in range(settings.islands)]

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.identification.search.streams import below, scatter, stream, uniform, word
-from calibration.kernels.jit import compiled
+from calibration.numerics.jit import compiled
 from calibration.observations import Floats
 
 _MEMORY = 6  # H
@@ -30,7 +30,7 @@ _ISLAND = 1 << 32  # candidates of island k are numbered from k times this
 
 @dataclass(frozen=True)
 class Settings:
-    """How much to search.
+    """Budget of a search.
 
     The defaults lead into the basin that Gauss-Newton finishes in, for some forty parameters that are up to 400 mm and
     30 deg off; they end nowhere near the optimum themselves.
@@ -85,7 +85,7 @@ def begin(
     settings: Settings,
     number: int,
 ) -> Island:
-    """Candidates drawn uniformly from the box, the given ones (k, p) in front."""
+    """Draw candidates uniformly from the box, the given ones (k, p) in front."""
     population = np.empty((settings.population, len(lower)))
     scatter(word(seed), 0, number * _ISLAND, np.array(lower), np.array(upper), population)
     if start is not None:
@@ -105,7 +105,7 @@ def advance(
     target: int,
     island: Island,
 ) -> Island:
-    """Generations until the island has spent `target` evaluations."""
+    """Evolve generations until the island has spent `target` evaluations."""
     lower, upper = np.array(lower), np.array(upper)
     population, cost, memory = np.array(island.population), np.array(island.cost), np.array(island.memory)
     archive = np.empty((max(1, int(_ARCHIVE * len(population))), len(lower)))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.kernels.jit import compiled
+from calibration.numerics.jit import compiled
 from calibration.observations import Floats
 
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)
@@ -34,7 +34,7 @@ def mixed(z: np.uint64) -> np.uint64:
 
 @compiled
 def stream(seed: np.uint64, generation: int, candidate: int) -> np.uint64:
-    """Where the draws of one candidate of one generation begin."""
+    """Key of the draws of one candidate of one generation."""
     key = mixed(np.uint64(seed) + _GAMMA)
     key = mixed(key ^ (np.uint64(generation) + _GAMMA))
     return mixed(key ^ (np.uint64(candidate) + _GAMMA))

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from calibration.identification.refinement import prior_precision
+from calibration.identification.linear_model import prior_precision
 from calibration.identification.samples import Samples
 from calibration.identification.start import rigid_fit, rough_start
 from calibration.identification.sweeps.circle_fit import CENTRE, DIRECTION, FEATURES, RADIUS, Curve, fit_curve
 from calibration.identification.sweeps.circles import Axis, drives_several, joint_values, predicted_curve
-from calibration.kinematics import Chain, ChainData, Placement
+from calibration.kinematics.chain import Chain, ChainData, Placement
 from calibration.observations import Floats
 
 _FAR_PRIOR = 100.0  # build tolerances within which a far start may lie, 1 sigma: angles may be tens of degrees off
@@ -23,7 +23,7 @@ _FLOOR_RAD, _FLOOR_MM = np.radians(0.2), 5.0  # weights of a start: no axis coun
 
 
 def start_from_axes(chain: Chain, samples: Samples, axes: Sequence[Axis]) -> Floats:
-    """Parameters that bring the model's axes and circles onto the measured ones: a start for the refinement.
+    """Bring the model's axes and circles onto the measured ones, as a start for the refinement.
 
     Directions depend on angles alone, and hardly on one another's errors: base and angles are fitted to them first,
     joints from the base outwards; then lengths to the centres and radii as well. Where a prism is on its circle takes
@@ -51,15 +51,15 @@ def start_from_axes(chain: Chain, samples: Samples, axes: Sequence[Axis]) -> Flo
     joints = list(dict.fromkeys(axis.joint for axis in single))
     for count in range(1, len(joints) + 1):
         inner = [a for a in single if a.joint in joints[:count]]
-        x = _settle(chain, x, inner, angles, precision, directions_only=True)
+        x = _fit_axes(chain, x, inner, angles, precision, directions_only=True)
     for setup in seen:
         own = [a for a in axes if a.setup == chain.setups[setup]]
         shift = [a.centre_mm - predicted_curve(chain, x, a).features[CENTRE] for a in own]
         x[chain.base_index(setup)][:3] += np.median(shift, axis=0)
     everything = np.ones(len(chain), dtype=bool)
-    x = _settle(chain, x, single, everything, precision, directions_only=False)
+    x = _fit_axes(chain, x, single, everything, precision, directions_only=False)
     if len(single) < len(axes):
-        x = _settle(chain, x, list(axes), everything, precision, directions_only=False)
+        x = _fit_axes(chain, x, list(axes), everything, precision, directions_only=False)
     return _place_others(chain, samples, x, seen)
 
 
@@ -76,7 +76,7 @@ def _turn_base(chain: Chain, x: Floats, setup: int, axes: Sequence[Axis]) -> Non
     x[chain.base_index(setup)] = chain.base_values(setup, Placement(turn, chain.base(x, setup).translation_mm))
 
 
-def _settle(
+def _fit_axes(
     chain: Chain, x: Floats, axes: Sequence[Axis], free: NDArray[np.bool_], precision: Floats, *, directions_only: bool
 ) -> Floats:
     """Least squares of the axes' features, and the prior, over the free parameters."""

@@ -1,4 +1,4 @@
-"""Circles and lines through the places of a prism while one joint moves, with what each place does to the result.
+"""Circles and lines through the places of a prism while one joint moves, with their sensitivity to each place.
 
 Least squares of the geometric distance (a circle: out of its plane and off its radius), by Levenberg-Marquardt from
 the algebraic fit. Gross outliers go first: the circle or line of the three or two places that leaves the smallest
@@ -39,13 +39,11 @@ class Curve:
             mm, of a line its middle; radius, mm, 0 for a line; travel, rad or mm per unit of reading.
         sensitivity: (8, n, 3) derivative of the features by the places.
         distance_mm: (n,) of the places from the curve.
-        arc: rad or mm from the first to the last place along it.
     """
 
     features: Floats
     sensitivity: Floats
     distance_mm: Floats
-    arc: float
 
     @property
     def freedom(self) -> int:
@@ -54,7 +52,7 @@ class Curve:
 
 
 def fit_curve(kind: Kind, places_mm: Floats, readings: Floats) -> Curve:
-    """The circle or line of least squared distance.
+    """Fit the circle or line of least squared distance.
 
     Args:
         kind: `revolute` for a circle, `prismatic` for a line.
@@ -67,7 +65,7 @@ def fit_curve(kind: Kind, places_mm: Floats, readings: Floats) -> Curve:
 
 
 def without_outliers(kind: Kind, places_mm: Floats, sigma_mm: float) -> NDArray[np.bool_]:
-    """(n,) the places that lie on one circle or line within a few `sigma_mm` or of their own scatter."""
+    """(n,) True for places that lie on one circle or line within a few `sigma_mm` or of their own scatter."""
     n, taken = len(places_mm), 3 if kind == "revolute" else 2
     some = np.linspace(0, n - 1, min(n, _TRIED)).astype(int).tolist()
     every = np.array(list(itertools.combinations(some, taken)))
@@ -248,7 +246,7 @@ def _curve_of_circle(found: _Round, places: Floats, readings: Floats) -> Curve:
     share = sense * centred / float(centred @ centred) / np.maximum(found.radius + found.excess, 1e-9)
     sensitivity[TRAVEL] = share[:, None] * tangent - np.tensordot(share @ tangent, unknowns[2:5], axes=1)
     features = np.concatenate([sense * found.normal, found.centre, [found.radius, abs(travel)]])
-    return Curve(features, sensitivity, np.hypot(found.height, found.excess), float(np.ptp(phase)))
+    return Curve(features, sensitivity, np.hypot(found.height, found.excess))
 
 
 # -- line ------------------------------------------------------------------------------------------------------------
@@ -270,7 +268,7 @@ def _line(places: Floats, readings: Floats) -> Curve:
     sensitivity[CENTRE] = np.broadcast_to(np.eye(3)[:, None, :] / n, (3, n, 3))
     sensitivity[TRAVEL] = sense * (centred / float(centred @ centred))[:, None] * direction
     features = np.concatenate([sense * direction, middle, [0.0, abs(travel)]])
-    return Curve(features, sensitivity, np.linalg.norm(off, axis=1), float(np.ptp(along)))
+    return Curve(features, sensitivity, np.linalg.norm(off, axis=1))
 
 
 def _across(direction: Floats) -> Floats:

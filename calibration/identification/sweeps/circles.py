@@ -13,21 +13,20 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from calibration.identification.samples import Samples, reading_variance
-from calibration.identification.standing import LEAST_STOPS, standing_spread, stops
+from calibration.identification.noise import reading_variance
+from calibration.identification.samples import LEAST_STOPS, Samples, standing_spread, stops
 from calibration.identification.sweeps.circle_fit import (
     CENTRE,
     DIRECTION,
-    RADIUS,
     TRAVEL,
     Curve,
     Kind,
     fit_curve,
     without_outliers,
 )
-from calibration.kinematics import Chain, ChainData, Integers
+from calibration.kinematics.chain import Chain, ChainData, Integers
 from calibration.observations import Floats
-from calibration.rig import Joint
+from calibration.rig.description import Joint
 
 _MOST_SWEEPS = 10  # of one joint, prism and set-up
 _REACH = 0.75  # of the spread, about a row in the middle of its group
@@ -48,10 +47,8 @@ class Axis:
         features: (8,) direction, centre in mm, radius in mm, travel (`circle_fit.Curve`): direction by the right-hand
             rule, or the way of travel, as readings grow.
         covariance: (8, 8) of the features.
-        rms_mm: distance of the places from the curve.
         freedom: degrees of freedom behind the covariance.
         sweep: (n) readings of the places that count, those of the standing joints at their medians.
-        outliers: how many places were left out.
     """
 
     joint: str
@@ -60,10 +57,8 @@ class Axis:
     kind: Kind
     features: Floats
     covariance: Floats
-    rms_mm: float
     freedom: int
     sweep: ChainData
-    outliers: int
 
     @property
     def direction(self) -> Floats:
@@ -81,18 +76,8 @@ class Axis:
         return self.features[CENTRE]
 
     @property
-    def radius_mm(self) -> float:
-        """Radius; 0 for a line."""
-        return float(self.features[RADIUS])
-
-    @property
-    def radius_sigma_mm(self) -> float:
-        """Standard error of the radius."""
-        return float(np.sqrt(self.covariance[RADIUS, RADIUS]))
-
-    @property
     def travel(self) -> float:
-        """How far it moves along the curve for each rad or mm that its reading grows; 1 for a sound encoder."""
+        """Motion along the curve for each rad or mm that the reading grows; 1 for a sound encoder."""
         return float(self.features[TRAVEL])
 
 
@@ -103,11 +88,10 @@ class _Measured:
     sweep: ChainData
     curve: Curve
     variance: Floats  # (n,) mm^2 per axis that the station explains
-    outliers: int
 
 
 def find_axes(chain: Chain, samples: Samples) -> tuple[Axis, ...]:
-    """The axes that single-joint sweeps show, from the base outwards.
+    """Find the axes that single-joint sweeps show, from the base outwards.
 
     A sweep is at least five different positions of one joint, seen by one prism at one set-up, while all joints that
     could move that prism stand still within their reading noise. What moves, turns or only shifts the prism is taken
@@ -132,13 +116,13 @@ def find_axes(chain: Chain, samples: Samples) -> tuple[Axis, ...]:
 
 
 def predicted_curve(chain: Chain, x: Floats, axis: Axis) -> Curve:
-    """The curve of the same sweep as the kinematics at `x` (p,) have it."""
+    """Curve of the same sweep by the kinematics at `x` (p,)."""
     places = chain.positions_mm(x, axis.sweep)
     return fit_curve(axis.kind, places, joint_values(chain, axis.joint, axis.sweep))
 
 
 def drives_several(chain: Chain, axis: Axis) -> bool:
-    """Whether the joint moves the prism in several places at once, so that its circle is about no axis of the rig."""
+    """True if the joint moves the prism in several places at once, so that its circle is about no axis of the rig."""
     prism, joint = chain.rig.prism_names.index(axis.prism), chain.rig.joint_names.index(axis.joint)
     return sum(driven == joint for op in chain.prism_chain(prism) for driven, _ in op.drive) > 1
 
@@ -147,7 +131,7 @@ def drives_several(chain: Chain, axis: Axis) -> bool:
 
 
 def _sweeps(chain: Chain, samples: Samples) -> Iterator[tuple[int, Kind, Integers]]:
-    """Every joint with the rows of one of its sweeps."""
+    """Every joint and kind of curve with the rows of one of its sweeps."""
     spread = standing_spread(chain.rig)
     data = samples.data
     for setup, prism in np.unique(np.column_stack([data.setup, data.prism]), axis=0).tolist():
@@ -162,7 +146,7 @@ def _sweeps(chain: Chain, samples: Samples) -> Iterator[tuple[int, Kind, Integer
 
 
 def _standing(values: Floats) -> Iterator[Integers]:
-    """The largest few groups of rows (n, k) that agree in every column, at least five in each; 1 is their spread."""
+    """Largest few groups of rows (n, k) that agree in every column, at least five in each; 1 is their spread."""
     if values.shape[1] == 0:
         yield np.arange(len(values))
         return
@@ -201,7 +185,7 @@ def _measured(chain: Chain, samples: Samples, joint: int, kind: Kind, rows: Inte
     first = rows[: len(level)]
     sweep = ChainData(level, samples.data.prism[first], samples.data.setup[first])
     curve = fit_curve(kind, places[kept], joint_values(chain, name, sweep))
-    return _Measured(joint, kind, sweep, curve, variance[kept], int((~kept).sum()))
+    return _Measured(joint, kind, sweep, curve, variance[kept])
 
 
 def _medians(values: Floats, stop: Integers) -> Floats:
@@ -210,7 +194,7 @@ def _medians(values: Floats, stop: Integers) -> Floats:
 
 
 def _enough(joint: Joint, readings: Floats) -> bool:
-    """Whether rising readings have enough places, reach and no step so wide that the way round is a guess."""
+    """True if rising readings have enough places, reach and no step so wide that the way round is a guess."""
     if len(readings) < LEAST_STOPS:
         return False
     steps = np.diff(readings)
@@ -245,8 +229,6 @@ def _axis(chain: Chain, measured: _Measured, pooled: float, freedom: int) -> Axi
         kind=measured.kind,
         features=curve.features,
         covariance=covariance,
-        rms_mm=float(np.sqrt((curve.distance_mm**2).mean())),
         freedom=freedom,
         sweep=measured.sweep,
-        outliers=measured.outliers,
     )

@@ -1,6 +1,6 @@
-"""The identified model held against the axes that single-joint sweeps show, joint by joint.
+"""Comparison of the identified model with the axes that single-joint sweeps show, joint by joint.
 
-What the model says of a sweep is the circle or line through its own places of that sweep, so that both sides pass
+The model's axis of a sweep is that of the circle or line through its own places of that sweep, so that both sides pass
 through the same fit. Two things are told apart: the joint's axis itself, which a wrong constant further out leaves
 where it is, and the curve of the prism about or along it (a circle's radius and plane, a line's place), in which
 everything out to the prism takes part.
@@ -8,16 +8,16 @@ everything out to the prism takes part.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import fdtrc
 
-from calibration.identification.samples import reading_variance
+from calibration.identification.noise import reading_variance
 from calibration.identification.sweeps.circle_fit import CENTRE, DIRECTION, FEATURES, RADIUS, TRAVEL
 from calibration.identification.sweeps.circles import Axis, drives_several, predicted_curve
-from calibration.kinematics import Chain
+from calibration.kinematics.chain import Chain
 from calibration.observations import Floats
 
 _CHANCE = 0.001  # that any axis of a right model is found wrong
@@ -29,15 +29,23 @@ class AxisCheck:
     """A sweep's axis as measured against the model's; sigma includes measurement, readings and model.
 
     Attributes:
-        joint, setup, prism: whose sweep it is.
-        angle_deg, angle_sigma_deg: between the axes.
-        offset_mm, offset_sigma_mm: distance of the centres across the axis.
-        along_mm, along_sigma_mm: measured minus modelled place of the circle's plane along its axis; 0 for a line.
-        radius_mm, radius_sigma_mm: measured minus modelled radius; 0 for a line.
-        travel, travel_sigma: measured over modelled motion for the same change of reading.
+        joint: that is swept.
+        setup: of the sweep.
+        prism: of the sweep.
+        angle_deg: between the axes.
+        angle_sigma_deg: its standard error.
+        offset_mm: distance of the centres across the axis.
+        offset_sigma_mm: its standard error.
+        along_mm: measured minus modelled place of the circle's plane along its axis; 0 for a line.
+        along_sigma_mm: its standard error.
+        radius_mm: measured minus modelled radius; 0 for a line.
+        radius_sigma_mm: its standard error.
+        travel: measured over modelled motion for the same change of reading.
+        travel_sigma: its standard error.
         p_axis: probability of so large a difference of the axis and its travel by chance.
-        p_curve: the same for what depends on the prism as well: the circle's radius and plane, a line's place.
-        sentence: what is wrong, if anything is beyond chance.
+        p_curve: the same for the features that depend on the prism as well: the circle's radius and plane, a line's
+            place.
+        sentence: about a difference beyond chance; None without one.
     """
 
     joint: str
@@ -76,23 +84,16 @@ def cross_check(chain: Chain, x: Floats, covariance: Floats, axes: Sequence[Axis
     return tuple(_check(chain, x, covariance, axis, _CHANCE / (2 * len(axes))) for axis in axes)
 
 
-def disagreements(checks: Iterable[AxisCheck]) -> tuple[str, ...]:
+def disagreements(checks: Sequence[AxisCheck]) -> tuple[str, ...]:
     """One sentence for each joint that disagrees by more than chance, the joint nearest to the base first.
 
     An axis that is itself elsewhere is named rather than a curve that only differs in size or place.
     """
     worst: dict[str, AxisCheck] = {}
-    for check in checks:
-        if check.sentence is None:
-            continue
-        before = worst.get(check.joint)
-        if before is None or _rank(check) < _rank(before):
-            worst[check.joint] = check
-    return tuple(str(check.sentence) for check in worst.values())
-
-
-def _rank(check: AxisCheck) -> tuple[float, float]:
-    return check.p_axis, check.p_curve
+    for check in sorted((c for c in checks if c.sentence), key=lambda c: (c.p_axis, c.p_curve)):
+        worst.setdefault(check.joint, check)
+    joints = dict.fromkeys(check.joint for check in checks)
+    return tuple(str(worst[joint].sentence) for joint in joints if joint in worst)
 
 
 def _check(chain: Chain, x: Floats, covariance: Floats, axis: Axis, chance: float) -> AxisCheck:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from daemon.acquisition.present_state import is_present
 from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
-from daemon.present_state import is_present
 from drivers.readings import EventKind
 
 _CABLING = "Check cabling, termination (120 ohm at both ends) and bit rate."
@@ -14,8 +14,11 @@ _CABLING = "Check cabling, termination (120 ohm at both ends) and bit rate."
 
 @rule("critical", f"{_CABLING} Set restart-ms of the interface, so that the controller restarts by itself.", hold_s=3.0)
 def bus_off(evidence: Evidence) -> Iterator[Finding]:
-    """The controller of a CAN link has gone bus-off. Cleared when it says that it works again, when the link is opened
-    anew, or when a channel of the link is heard again."""
+    """The controller of a CAN link has gone bus-off.
+
+    Cleared when it says that it works again, when the link is opened anew, or when a channel of the link is heard
+    again.
+    """
     ended_by = EventKind.BUS_ERROR_ACTIVE, EventKind.BUS_ERROR_WARNING, EventKind.BUS_ERROR_PASSIVE, EventKind.LINK_UP
     for event in evidence.standing(EventKind.BUS_OFF, *ended_by):
         channels = [c for c in evidence.acquisition.channels if c.link == event.device]
@@ -26,8 +29,10 @@ def bus_off(evidence: Evidence) -> Iterator[Finding]:
 
 @rule("warning", _CABLING, hold_s=10.0)
 def bus_error_passive(evidence: Evidence) -> Iterator[Finding]:
-    """The controller of a CAN link is error-passive: every second frame or so is disturbed. Cleared 10 s after it says
-    that it is not, or after the link was opened anew."""
+    """The controller of a CAN link is error-passive: every second frame or so is disturbed.
+
+    Cleared 10 s after it says that it is not, or after the link was opened anew.
+    """
     ended_by = EventKind.BUS_ERROR_ACTIVE, EventKind.BUS_ERROR_WARNING, EventKind.BUS_OFF, EventKind.LINK_UP
     for event in evidence.standing(EventKind.BUS_ERROR_PASSIVE, *ended_by):
         if not evidence.is_cut_off(event.device):
@@ -36,8 +41,10 @@ def bus_error_passive(evidence: Evidence) -> Iterator[Finding]:
 
 @rule("warning", "Look at the node: it may be about to fail, or was set up anew without a heartbeat.", after_s=3.0)
 def heartbeat_lost(evidence: Evidence) -> Iterator[Finding]:
-    """A CANopen node has stopped its heartbeat and still sends values: it is not supervised any more. One that sends
-    nothing at all is a joint or signal that is silent. Cleared when the heartbeat is heard again."""
+    """A CANopen node has stopped its heartbeat and still sends values: it is not supervised any more.
+
+    One that sends nothing at all is a joint or signal that is silent. Cleared when the heartbeat is heard again.
+    """
     present = {channel.name for channel in evidence.acquisition.channels if is_present(channel.status)}
     for event in evidence.standing(EventKind.HEARTBEAT_LOST, EventKind.HEARTBEAT_RESTORED):
         if event.device in present:
@@ -46,7 +53,10 @@ def heartbeat_lost(evidence: Evidence) -> Iterator[Finding]:
 
 @rule("critical", "Look the code up in the device's manual; switch it off and on if it says nothing else.")
 def emergency(evidence: Evidence) -> Iterator[Finding]:
-    """A CANopen node has sent an emergency (EMCY) and has not taken it back. Cleared when it does, or boots."""
+    """A CANopen node has sent an emergency (EMCY) and has not taken it back.
+
+    Cleared when it does, or boots.
+    """
     for event in evidence.standing(EventKind.EMERGENCY, EventKind.EMERGENCY_CLEARED, EventKind.BOOT_UP):
         if not evidence.is_cut_off(event.device):
             yield event.device, event.text
@@ -54,8 +64,10 @@ def emergency(evidence: Evidence) -> Iterator[Finding]:
 
 @rule("critical", "Look at the device; `rigcal devices configure` sets it up again where set-up is what failed.")
 def device_alarm(evidence: Evidence) -> Iterator[Finding]:
-    """A device reports an alarm (object 6503h), or its set-up has failed. Cleared when it says that the alarm is gone,
-    or boots; one of its set-up when it has been set up."""
+    """A device reports an alarm (object 6503h), or its set-up has failed.
+
+    Cleared when it says that the alarm is gone, or boots; one of its set-up when it has been set up.
+    """
     set_up = {event.device for event in evidence.standing(EventKind.ALARM, EventKind.CONFIGURED)}
     for event in evidence.standing(EventKind.ALARM, EventKind.BOOT_UP):
         is_mended = event.code is None and event.device not in set_up
@@ -65,8 +77,10 @@ def device_alarm(evidence: Evidence) -> Iterator[Finding]:
 
 @rule("warning", "Do what the warning says; values are used as before.")
 def device_warning(evidence: Evidence) -> Iterator[Finding]:
-    """A device has given a warning (object 6505h, its set-up, a station's settings) and has not taken it back. Cleared
-    when it does or boots; one that nothing takes back when the link is opened anew."""
+    """A device has given a warning (object 6505h, its set-up, a station's settings) and has not taken it back.
+
+    Cleared when it does or boots; one that nothing takes back when the link is opened anew.
+    """
     for event in evidence.standing(EventKind.WARNING, EventKind.BOOT_UP):
         link = evidence.link_of(event.device)
         is_of_before = event.code is None and link is not None and link.up is True and link.since_s < event.age_s

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from daemon.acquisition_status import ChannelStatus
+from daemon.acquisition.present_state import SILENT, is_present
+from daemon.acquisition.status import ChannelStatus
 from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
-from daemon.present_state import SILENT, is_present
 from drivers.readings import EventKind, Status
 
 START_S = 5.0  # devices take so long to start after their link was opened
@@ -24,7 +24,9 @@ _WHY = {
 @rule("critical", "Check that the machine is switched on, and the cable between bus and adapter.", after_s=1, hold_s=3)
 def link_silent(evidence: Evidence) -> Iterator[Finding]:
     """A CAN link has been open for 5 s, channels of it are silent, and no other frame has come since they were heard.
-    It explains that they are silent, and they raise no alarms of their own. Cleared 3 s after a frame has come."""
+
+    It explains that they are silent, and they raise no alarms of their own. Cleared 3 s after a frame has come.
+    """
     for link, channels in _by_link(evidence).items():
         if evidence.is_storing and _is_quiet(evidence, link, channels) and _has_started(evidence, channels[0]):
             yield link, "the link is open, and nothing is heard on it"
@@ -32,28 +34,39 @@ def link_silent(evidence: Evidence) -> Iterator[Finding]:
 
 @rule("critical", "Check the encoder's power and cable; without it no fix can be used.", after_s=1.0, hold_s=3.0)
 def joint_silent(evidence: Evidence) -> Iterator[Finding]:
-    """A joint has not been read for 1 s longer than its time-out, and its link has been open for 5 s. Cleared when it
-    has been read again for 3 s."""
+    """A joint has not been read for 1 s longer than its time-out, and its link has been open for 5 s.
+
+    Cleared when it has been read again for 3 s.
+    """
     yield from _silent(evidence, "joint")
 
 
 @rule("warning", "Check the signal's device and cable; effects that need it cannot be told.", after_s=1.0, hold_s=3.0)
 def signal_silent(evidence: Evidence) -> Iterator[Finding]:
-    """A machine signal has not been read for 1 s longer than its time-out. Raised and cleared as for joints."""
+    """A machine signal has not been read for 1 s longer than its time-out.
+
+    Raised and cleared as for joints.
+    """
     yield from _silent(evidence, "signal")
 
 
 @rule("critical", "Look at the device; without the joint no fix can be used.", after_s=1.5, hold_s=3.0)
 def joint_not_usable(evidence: Evidence) -> Iterator[Finding]:
-    """The readings of a joint carry no value: the device has none, reports an alarm, is out of its range, or cannot be
-    decoded. Raised after 1.5 s, so that one bad sample is no alarm; cleared after 3 s of good ones. Where the device's
-    own alarm or emergency stands, it explains that its values are void."""
+    """The readings of a joint carry no value.
+
+    The device has none, reports an alarm, is out of its range, or its value cannot be decoded. Raised after 1.5 s,
+    so that one bad sample is no alarm; cleared after 3 s of good ones. Where the device's own alarm or emergency
+    stands, it explains that its values are void.
+    """
     yield from _not_usable(evidence, "joint")
 
 
 @rule("warning", "Look at the device; effects that need the signal cannot be told.", after_s=1.5, hold_s=3.0)
 def signal_not_usable(evidence: Evidence) -> Iterator[Finding]:
-    """The readings of a machine signal carry no value. Raised and cleared as for joints."""
+    """The readings of a machine signal carry no value.
+
+    Raised and cleared as for joints.
+    """
     yield from _not_usable(evidence, "signal")
 
 
@@ -65,7 +78,7 @@ def _by_link(evidence: Evidence) -> dict[str, list[ChannelStatus]]:
 
 
 def _is_quiet(evidence: Evidence, link: str, channels: list[ChannelStatus]) -> bool:
-    """Whether the link itself seems to be cut: it has several channels, and nothing came since a silent one was heard.
+    """True if the link itself seems to be cut: it has several channels, and nothing came since a silent one was heard.
 
     Other channels may have longer time-outs: they will be silent in a moment.
     """

@@ -26,8 +26,10 @@ def clock_stepped(evidence: Evidence) -> Iterator[Finding]:
 
 @rule("critical", "Set the computer's clock; if it starts so each time, change the battery of its clock.")
 def clock_behind(evidence: Evidence) -> Iterator[Finding]:
-    """The computer's clock stands before the year 2025, or at an earlier time than when rigcal last ran. Cleared when
-    it is set."""
+    """The computer's clock stands before the year 2025, or at an earlier time than when rigcal last ran.
+
+    Cleared when it is set.
+    """
     now_ns, before = evidence.now.utc_ns, evidence.previous_run
     if now_ns < EARLIEST_NS:
         yield "clock", f"the computer's clock stands at {_utc(now_ns):%Y-%m-%d}"
@@ -38,22 +40,30 @@ def clock_behind(evidence: Evidence) -> Iterator[Finding]:
 
 @rule("warning", "Look what else the computer does; nothing is lost, and it stops by itself.", after_s=60.0, hold_s=5.0)
 def decoding_behind(evidence: Evidence) -> Iterator[Finding]:
-    """Captures have waited in the store to be decoded for a minute, as after a kill, or where the computer is too slow:
-    readings and fixes come late, and no job is started."""
+    """Captures have waited in the store to be decoded for a minute.
+
+    After a kill, or where the computer is too slow: readings and fixes come late, and no job is started.
+    """
     if evidence.acquisition.is_behind:
         yield "decoding", "captures wait to be decoded: readings and fixes come late, and jobs wait"
 
 
 @rule("critical", "Put right what the text says; if the alarm stays, restart rigcal: `systemctl restart rigcal`.")
 def control_dead(evidence: Evidence) -> Iterator[Finding]:
-    """No one can connect to a control socket of the daemon's: its file was replaced or cannot be made, or the computer
-    lacks descriptors. Cleared when commands are taken again."""
+    """No one can connect to a control socket of the daemon.
+
+    Its file was replaced or cannot be made, or the computer lacks descriptors. Cleared when commands are taken
+    again.
+    """
     yield from evidence.control_faults.items()
 
 
 @rule("warning", "Report the fault with rigcal's log; alarms of this sort stand as they were.", hold_s=5.0)
 def not_watched(evidence: Evidence) -> Iterator[Finding]:
-    """A rule of an alarm, or what it looks at, has failed itself. Cleared 5 s after it works again."""
+    """A rule of an alarm, or what it looks at, has failed itself.
+
+    Cleared 5 s after it works again.
+    """
     for part, why in evidence.unwatched.items():
         yield part, f"{part} cannot be watched: {why}"
 

@@ -10,15 +10,20 @@ from daemon.alarms.evidence import Evidence
 
 @rule("warning", "Do what the error says, then `rigcal jobs retry SUBJECT`; too few data need another session instead.")
 def job_failed(evidence: Evidence) -> Iterator[Finding]:
-    """A job has failed or was given up, and is the newest of its kind that has. Cleared when it is retried, or when a
-    newer one of its kind is done."""
+    """A job has failed or was given up, and is the newest of its kind that has.
+
+    Cleared when it is retried, or when a newer one of its kind is done.
+    """
     for job in evidence.failed_jobs:
         yield str(job.id), f"job {job.id} ({job.kind}) has failed: {job.error}"
 
 
 @rule("warning", "Calibrate again; `rigcal status` and the report of the gap workflow tell what has changed.")
 def model_drifted(evidence: Evidence) -> Iterator[Finding]:
-    """Check sessions show that the machine has left the live model. Cleared when another model goes live."""
+    """Check sessions show that the machine has left the live model.
+
+    Cleared when another model goes live.
+    """
     if evidence.model is not None and evidence.model.drifted_with is not None:
         yield (
             f"model {evidence.model.id}",

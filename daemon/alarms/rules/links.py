@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from daemon.acquisition.decode_failures import kind_of
 from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
-from daemon.decode_failures import kind_of
 from drivers.readings import EventKind
 
 OPENING_S = 15.0  # a link that has said nothing of its port for so long does not open
@@ -15,9 +15,11 @@ LATELY_S = 300.0
 
 @rule("critical", "Check the plug, the adapter and its power; rigcal opens the link again by itself.", hold_s=3.0)
 def link_down(evidence: Evidence) -> Iterator[Finding]:
-    """A link is closed: its port cannot be opened, or was lost. What its channels lack is explained by this alarm and
-    raises none of its own. A station's link is a warning while no session is open. Cleared 3 s after the link has been
-    opened, so that a loose plug is one alarm."""
+    """A link is closed: its port cannot be opened, or was lost.
+
+    What its channels lack is explained by this alarm and raises none of its own. A station's link is a warning
+    while no session is open. Cleared 3 s after the link has been opened, so that a loose plug is one alarm.
+    """
     stations = {station.name for station in evidence.acquisition.stations}
     for link in evidence.acquisition.links:
         if link.up is False:
@@ -55,8 +57,11 @@ def frames_lost(evidence: Evidence) -> Iterator[Finding]:
 
 @rule("warning", "See what else keeps the computer busy, and whether its clock is set while rigcal runs.")
 def time_doubtful(evidence: Evidence) -> Iterator[Finding]:
-    """Within the last 5 minutes captures came of which it is not known when: the link was not read for a while, or the
-    clock was set. They are stored and marked, and their readings are not used."""
+    """Within the last 5 minutes captures came at instants that are not known.
+
+    The link was not read for a while, or the clock was set. They are stored and marked, and their readings are not
+    used.
+    """
     for event in evidence.lately(EventKind.TIME_DOUBTFUL, LATELY_S):
         yield event.device, event.text
 
@@ -64,7 +69,9 @@ def time_doubtful(evidence: Evidence) -> Iterator[Finding]:
 @rule("warning", "Check bit rate, wiring and the description of the device (DBC, EDS, profile).", hold_s=60.0)
 def decode_failures(evidence: Evidence) -> Iterator[Finding]:
     """One in a hundred captures of a device or more, and ten at least, could not be decoded in the last minute or so.
-    Cleared when it has been fewer for a minute."""
+
+    Cleared when it has been fewer for a minute.
+    """
     for device in evidence.acquisition.decoding:
         if device.lately >= 10 and device.lately_share >= 0.01 and not evidence.is_cut_off(device.device):
             yield device.device, f"captures cannot be decoded, mostly: {kind_of(device.reason)}"

@@ -13,9 +13,11 @@ LONG_S = 86_400.0
 
 @rule("warning", "Describe where the station stands now with `rigcal setup new`, and hold a new session.")
 def setup_moved(evidence: Evidence) -> Iterator[Finding]:
-    """The newest station set-up has moved: a control point is not where it was. Critical while a session is open.
-    Cleared when a new set-up is described."""
-    if evidence.setup is not None and evidence.setup.is_moved:
+    """The newest station set-up has moved: a control point is not where it was.
+
+    Critical while a session is open. Cleared when a new set-up is described.
+    """
+    if evidence.setup is not None and evidence.setup.state == "moved":
         text = "the station has moved: its control points no longer fit"
         yield evidence.setup.id, text, "warning" if evidence.session is None else "critical"
 
@@ -27,29 +29,34 @@ def session_without_fixes(evidence: Evidence) -> Iterator[Finding]:
     if session is None:
         return
     good_s = [s.good_age_s for s in evidence.acquisition.stations if s.good_age_s is not None]
-    if min(session.age_s, evidence.running_s, *good_s) > WITHOUT_FIX_S:
+    if min(evidence.session_age_s, evidence.running_s, *good_s) > WITHOUT_FIX_S:
         yield session.id, f"no good fix for {WITHOUT_FIX_S / 60:g} minutes"
 
 
 @rule("warning", "Close it with `rigcal session stop`, or `rigcal session abort` if it is of no use.")
 def session_open_long(evidence: Evidence) -> Iterator[Finding]:
     """A session has been open for more than 24 hours; no job runs meanwhile."""
-    if evidence.session is not None and evidence.session.age_s > LONG_S:
+    if evidence.session is not None and evidence.session_age_s > LONG_S:
         yield evidence.session.id, "the session has been open for more than 24 hours, and jobs wait for its end"
 
 
 @rule("warning", "Hold a new session with control shots at both ends, or accept it: `rigcal session accept SUBJECT`.")
 def session_not_trained(evidence: Evidence) -> Iterator[Finding]:
     """Calibration does not use a closed session: control shots are missing at its start or end, or the station moved.
-    Cleared when an operator accepts it, and by a newer session that is used."""
+
+    Cleared when an operator accepts it, and by a newer session that is used.
+    """
     for name, why in evidence.untrained_sessions.items():
         yield name, f"calibration does not use the session: {why}"
 
 
 @rule("critical", "Check the joint's zero; then `rigcal model zeros-checked`, or calibrate again.", hold_s=10.0)
 def zero_lost(evidence: Evidence) -> Iterator[Finding]:
-    """The encoder of a joint has jumped since the live model was trained, or in the open session, and nobody has
-    checked its zero: the model gives no tip, the session takes no more fixes. Cleared 10 s after neither holds."""
+    """The encoder of a joint has jumped, and nobody has checked its zero.
+
+    It has jumped since the live model was trained, or in the open session: the model gives no tip, the session
+    takes no more fixes. Cleared 10 s after neither holds.
+    """
     model = () if evidence.model is None else evidence.model.jumped
     session = () if evidence.session is None else evidence.session.jumped
     for joint in dict.fromkeys((*model, *session)):

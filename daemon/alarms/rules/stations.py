@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from daemon.acquisition.present_state import SILENT, is_present
 from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
-from daemon.present_state import SILENT, is_present
 from drivers.readings import EventKind, LockState
 
 _TURNED_AWAY = (LockState.STANDBY, LockState.SEARCHING, LockState.WAITING, LockState.ROTATING)
@@ -19,8 +19,10 @@ _TURNED_AWAY = (LockState.STANDBY, LockState.SEARCHING, LockState.WAITING, LockS
     hold_s=3.0,
 )
 def station_silent(evidence: Evidence) -> Iterator[Finding]:
-    """A station gives no records for 1 s longer than its time-out; a warning while no session is open. Cleared 3 s
-    after it is heard again. While its link is closed that alarm stands for this one."""
+    """A station gives no records for 1 s longer than its time-out; a warning while no session is open.
+
+    Cleared 3 s after it is heard again. While its link is closed that alarm stands for this one.
+    """
     for station in evidence.acquisition.stations:
         if evidence.is_storing and station.status == SILENT:
             yield station.name, "the station gives no records", "warning" if evidence.session is None else "critical"
@@ -29,7 +31,9 @@ def station_silent(evidence: Evidence) -> Iterator[Finding]:
 @rule("warning", "Aim the station at the session's prism; check what blocks the line of sight.", after_s=2.5, hold_s=3)
 def station_not_locked(evidence: Evidence) -> Iterator[Finding]:
     """A station follows no prism for 2.5 s while a session is open; it has gone on as if it did for a second before.
-    Searching and waiting are usual at other times. Cleared when it has been locked for 3 s."""
+
+    Searching and waiting are usual at other times. Cleared when it has been locked for 3 s.
+    """
     for station in evidence.acquisition.stations:
         if evidence.session is not None and is_present(station.status) and station.lock in _TURNED_AWAY:
             yield station.name, f"the station is {station.lock} while session {evidence.session.id} is open"
@@ -47,8 +51,11 @@ def station_tilted(evidence: Evidence) -> Iterator[Finding]:
 
 @rule("warning", "Look at the instrument's display; its manual explains an error code.")
 def instrument_error(evidence: Evidence) -> Iterator[Finding]:
-    """A station has reported an error, refused a command or not answered. Cleared when it has given a good fix since,
-    and half a minute after the last error at the earliest. While it is silent that alarm stands for this one."""
+    """A station has reported an error, refused a command or not answered.
+
+    Cleared when it has given a good fix since, and half a minute after the last error at the earliest. While it is
+    silent that alarm stands for this one.
+    """
     good_s = {station.name: station.good_age_s for station in evidence.acquisition.stations}
     silent = {station.name for station in evidence.acquisition.stations if station.status == SILENT}
     for event in evidence.standing(EventKind.INSTRUMENT_ERROR):
@@ -60,9 +67,10 @@ def instrument_error(evidence: Evidence) -> Iterator[Finding]:
 
 @rule("critical", "Aim the station at the session's prism; if it is on it, say `rigcal session confirm-prism`.")
 def prism_jump(evidence: Evidence) -> Iterator[Finding]:
-    """A station's target jumped further than a boom can move while a session is open: it may follow another prism, and
-    its fixes do not count. Cleared when the target is the earlier one again, when an operator confirms the prism, and
-    with the session; never by time."""
-    if evidence.session is not None:
-        for suspicion in evidence.session.suspicions:
-            yield suspicion.station, f"{suspicion.reason}; its fixes do not count"
+    """A station's target jumped further than a boom can move while a session is open.
+
+    It may follow another prism, and its fixes do not count. Cleared when the target is the earlier one again, when
+    an operator confirms the prism, and with the session; never by time.
+    """
+    for suspicion in evidence.suspicions:
+        yield suspicion.station, f"{suspicion.reason}; its fixes do not count"

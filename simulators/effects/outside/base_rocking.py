@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from calibration.rig import Rig
-from simulators.effects.base import Bend, Body, Effect, check_place
+from calibration.rig.description import Rig
+from simulators.effects.base import Bend, Body, Effect
 
 
 @dataclass(frozen=True)
@@ -20,13 +20,14 @@ class BaseRocking(Effect):
         rad_per_Nm: c.
     """
 
-    family: ClassVar[str] = "base_rocking"
-    size: ClassVar[tuple[str, ...]] = ("rad_per_Nm",)
+    amplitudes: ClassVar[Mapping[str, float]] = {"rad_per_Nm": 5e-3}
+    bounded_at = "largest_load"
+    acts_at = ("base",)
     where: str = "base"
     rad_per_Nm: float = 5e-9  # noqa: N815 - the unit is N m
 
     def check(self, rig: Rig) -> None:
-        check_place(self, "base")
+        super().check(rig)
         if not rig.masses:
             raise ValueError(f"{self.family}: rig {rig.name!r} has no masses")
 

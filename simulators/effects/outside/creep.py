@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from calibration.rig import Rig
-from simulators.effects.base import Body, Effect, Floats, check_kind
+from simulators.effects.base import Body, Effect, Floats
 
 
 @dataclass(frozen=True)
@@ -20,16 +20,13 @@ class Creep(Effect):
         tau_s: tau.
     """
 
-    family: ClassVar[str] = "creep"
-    size: ClassVar[tuple[str, ...]] = ("rad_per_Nm",)
+    amplitudes: ClassVar[Mapping[str, float]] = {"rad_per_Nm": 5e-3}
+    bounded_at = "largest_load"
+    needs_load = True
+    acts_at = ("revolute",)
+    positive = ("tau_s",)
     rad_per_Nm: float = 2e-9  # noqa: N815 - the unit is N m
     tau_s: float = 10.0
-
-    def check(self, rig: Rig) -> None:
-        super().check(rig)
-        check_kind(self, rig, "revolute")
-        if self.tau_s <= 0.0:
-            raise ValueError(f"{self.family}@{self.where}: tau_s must be positive, not {self.tau_s:g}")
 
     def joint_change(self, body: Body) -> Floats:
         change: Floats = self.rad_per_Nm * body.torque(self.where) * np.log1p(body.column("dwell_s") / self.tau_s)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from calibration.rig import Rig
-from simulators.effects.base import Effect, Floats, Sight, check_place
+from simulators.effects.base import Effect, Floats, Sight
 
 
 @dataclass(frozen=True)
@@ -21,12 +21,9 @@ class PrismMastBend(Effect):
         mm: k, for a level mast.
     """
 
-    family: ClassVar[str] = "prism_mast_bend"
-    size: ClassVar[tuple[str, ...]] = ("mm",)
+    amplitudes: ClassVar[Mapping[str, float]] = {"mm": 15.0}
+    acts_at = ("prism",)
     mm: float = 3.0
-
-    def check(self, rig: Rig) -> None:
-        check_place(self, *rig.prism_names)
 
     def fix_shift_mm(self, sight: Sight) -> Floats | None:
         if self.where != sight.prism:

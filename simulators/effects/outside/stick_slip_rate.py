@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from calibration.rig import Rig
-from simulators.effects.base import Body, Effect, Floats, check_kind
+from simulators.effects.base import Body, Effect, Floats
 
 
 @dataclass(frozen=True)
@@ -20,16 +20,11 @@ class StickSlipRate(Effect):
         deg_per_s: v.
     """
 
-    family: ClassVar[str] = "stick_slip_rate"
-    size: ClassVar[tuple[str, ...]] = ("rad",)
+    amplitudes: ClassVar[Mapping[str, float]] = {"rad": 6e-3}
+    acts_at = ("revolute",)
+    positive = ("deg_per_s",)
     rad: float = 1.5e-3
     deg_per_s: float = 0.15
-
-    def check(self, rig: Rig) -> None:
-        super().check(rig)
-        check_kind(self, rig, "revolute")
-        if self.deg_per_s <= 0.0:
-            raise ValueError(f"{self.family}@{self.where}: deg_per_s must be positive, not {self.deg_per_s:g}")
 
     def joint_change(self, body: Body) -> Floats:
         change: Floats = self.rad * np.tanh(body.column(f"{self.where}_rate") / self.deg_per_s)

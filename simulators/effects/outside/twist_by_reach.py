@@ -2,37 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from calibration.rig import Rig
-from simulators.effects.base import Bend, Body, Effect
-from simulators.effects.boom_droop import boom_row, check_boom
+from simulators.effects.base import Bend, Body, BoomEffect, boom_row
 
 
 @dataclass(frozen=True)
-class TwistByReach(Effect):
+class TwistByReach(BoomEffect):
     """Twist = moment about the boom's axis * length / (G J); everything from the boom's tip on turns.
 
     Attributes:
         flexibility_per_Nm2: 1 / (G J), of the torsional stiffness.
     """
 
-    family: ClassVar[str] = "twist_by_reach"
-    size: ClassVar[tuple[str, ...]] = ("flexibility_per_Nm2",)
-    where: str = "boom"
+    amplitudes: ClassVar[Mapping[str, float]] = {"flexibility_per_Nm2": 100.0}
+    bounded_at = "full_reach"
     flexibility_per_Nm2: float = 1e-7  # noqa: N815 - the unit is N m^2
-
-    def check(self, rig: Rig) -> None:
-        check_boom(self, rig)
 
     def bends(self, body: Body) -> Sequence[Bend]:
         row = boom_row(body.rig)
-        if row is None:
-            return ()
         beam = body.beam(row)
         twist = self.flexibility_per_Nm2 * np.sum(beam.moment_newton_m * beam.axis, axis=1) * beam.length_m
         return (Bend(row, beam.tip_mm, twist[:, None] * beam.axis, np.zeros_like(beam.axis)),)

@@ -11,10 +11,11 @@ import pytest
 
 from daemon.alarms.alarm import Finding, Rule, rule
 from daemon.alarms.board import GRACE_S, AlarmBoard
-from daemon.alarms.evidence import Evidence, FailedJob
+from daemon.alarms.evidence import Evidence
 from daemon.alarms.library import library
 from daemon.store import Store
 from daemon.store.alarms import AlarmTable
+from daemon.store.jobs import FailedJob
 from drivers.clock import ManualClock
 from tests.daemon.store_support import at, table
 

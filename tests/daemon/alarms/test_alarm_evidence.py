@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NoReturn
 
 import pytest
 
-from daemon.acquisition_status import AcquisitionStatus
-from daemon.alarms.evidence import FailedJob, SetupEvidence
-from daemon.alarms.gather import Gatherer
-from daemon.drift_table import DriftTable
-from daemon.order import Outcome
-from daemon.prism_guard import Suspicion
-from daemon.store.health import StoreHealth
+from daemon.alarms.evidence import Gatherer
+from daemon.jobs.order import Outcome
+from daemon.models.drift import note_drift
+from daemon.service import is_store_new
+from daemon.store.jobs import FailedJob, JobTable
+from daemon.store.sessions import SessionTable
+from daemon.store.setups import SetupRow, SetupTable
 from drivers.readings import DeviceEvent, EventKind
 from tests.daemon.model_support import ModelRig, wait
 
@@ -27,21 +27,22 @@ def rig(tmp_path: Path) -> Iterator[ModelRig]:
 
 
 @pytest.fixture
-def gather(rig: ModelRig) -> Gatherer:
-    drift = DriftTable(rig.store, "swdt82", rig.clock)
-    return Gatherer(
-        rig.store,
-        "swdt82",
-        rig.live,
-        drift,
-        rig.clock,
-        None,
-        acquisition=AcquisitionStatus,
-        health=lambda: StoreHealth("replaced", "another file", rig.clock.now(), 5, is_low=True),
-        suspicions=lambda: [Suspicion("station", rig.clock.now(), 9.5)],
-        control_faults=lambda: {"control.sock": "the file is gone"},
-        models_directory=rig.store.path.with_name("models of an earlier store"),
-    )
+def parts(rig: ModelRig) -> dict[str, Callable[[], object]]:
+    """The parts of the evidence that the store and the live model tell, as the daemon composes them."""
+    sessions, jobs = SessionTable(rig.store, "swdt82"), JobTable(rig.store, "swdt82")
+    return {
+        "session": sessions.open_session,
+        "setup": SetupTable(rig.store).newest,
+        "failed_jobs": jobs.failed,
+        "model": rig.live.health,
+        "untrained_sessions": sessions.untrained,
+        "control_faults": lambda: {"control.sock": "the file is gone"},
+    }
+
+
+@pytest.fixture
+def gather(rig: ModelRig, parts: dict[str, Callable[[], object]]) -> Gatherer:
+    return Gatherer(rig.clock, None, parts)
 
 
 def job(rig: ModelRig, kind: str, session: str) -> int:
@@ -53,18 +54,18 @@ def test_a_failed_job_is_told_until_it_is_retried_or_a_newer_one_is_done(rig: Mo
     rig.jobs.session("a")
     rig.jobs.session("other", rig="ur10")
     first, second, foreign = job(rig, "gap", "a"), job(rig, "report", "a"), job(rig, "gap", "other")
-    assert gather().failed_jobs == ()
+    assert gather().failed_jobs == []
     for number in (first, second, foreign):
         rig.job_table.end(number, Outcome("failed", "too poor"))
-    assert gather().failed_jobs == (FailedJob(first, "gap", "too poor"), FailedJob(second, "report", "too poor"))
+    assert gather().failed_jobs == [FailedJob(first, "gap", "too poor"), FailedJob(second, "report", "too poor")]
     rig.job_table.retry(second)
-    assert gather().failed_jobs == (FailedJob(first, "gap", "too poor"),)
+    assert gather().failed_jobs == [FailedJob(first, "gap", "too poor")]
     newer = job(rig, "gap", "a")
     rig.job_table.end(newer, Outcome("failed", "poorer"))
-    assert gather().failed_jobs == (FailedJob(newer, "gap", "poorer"),)
+    assert gather().failed_jobs == [FailedJob(newer, "gap", "poorer")]
     done = job(rig, "gap", "a")
     rig.store.update("jobs", {"id": done}, {"state": "done"})
-    assert gather().failed_jobs == ()
+    assert gather().failed_jobs == []
 
 
 def test_an_open_session_is_told_with_its_age_and_the_joints_that_jumped_in_it(rig: ModelRig, gather: Gatherer) -> None:
@@ -74,10 +75,9 @@ def test_an_open_session_is_told_with_its_age_and_the_joints_that_jumped_in_it(r
     rig.jobs.session("a", state="open")
     rig.clock.advance(99.0)
     rig.store.insert_records([DeviceEvent("theta3", rig.clock.now(), EventKind.PRESET_JUMP, "position jumped")])
-    session = gather().session
-    assert session is not None
-    assert (session.id, session.age_s, session.jumped) == ("a", 100.0, ("theta3",))
-    assert [suspicion.distance_m for suspicion in session.suspicions] == [9.5]
+    evidence = gather()
+    assert evidence.session is not None
+    assert (evidence.session.id, evidence.session_age_s, evidence.session.jumped) == ("a", 100.0, ("theta3",))
     rig.jobs.close_session("a")
     assert gather().session is None
 
@@ -87,9 +87,9 @@ def test_the_newest_set_up_is_told_and_whether_it_has_moved(rig: ModelRig, gathe
     created = rig.store.instant(rig.clock.now(), "created_")
     for name, state in (("S1", "ok"), ("S2", "moved")):
         rig.store.insert("station_setups", {"id": name, "instrument": "", "serial": "", "state": state, **created})
-    assert gather().setup == SetupEvidence("S2", True)
+    assert gather().setup == SetupRow("S2", "moved")
     rig.store.insert("station_setups", {"id": "S3", "instrument": "", "serial": "", "state": "ok", **created})
-    assert gather().setup == SetupEvidence("S3", False)
+    assert gather().setup == SetupRow("S3", "ok")
 
 
 def test_the_live_model_is_told_with_jumps_defects_and_drift(rig: ModelRig, gather: Gatherer) -> None:
@@ -103,11 +103,10 @@ def test_the_live_model_is_told_with_jumps_defects_and_drift(rig: ModelRig, gath
     rig.take([DeviceEvent("theta1", rig.clock.now(), EventKind.PRESET_JUMP, "position jumped")])
     wait(lambda: (found := gather().model) is not None and found.jumped == ("theta1",))
     rig.jobs.session("c", kind="check")
-    drift = DriftTable(rig.store, "swdt82", rig.clock)
-    run = drift.run()
+    run = rig.models.live_run()
     assert run is not None
     check = {"session": "c", "fixes": 8, "scores": [9.0] * 9, "ratio": 3.0, "reason": ""}
-    drift.note({"live_since": run.since, "checks": [check]})
+    note_drift(rig.models, {"live_since": run.since, "checks": [check]})
     found = gather().model
     assert found is not None
     assert found.drifted_with == "c"
@@ -127,34 +126,34 @@ def test_a_session_that_is_not_used_is_told_until_a_newer_one_is(rig: ModelRig, 
     assert gather().untrained_sessions == {}
 
 
-def test_a_new_store_beside_old_models_is_told_until_it_has_a_job(rig: ModelRig, gather: Gatherer) -> None:
-    models = rig.store.path.with_name("models of an earlier store")
-    assert not gather().store.is_new_beside_models
+def test_a_new_store_beside_old_models_is_told_until_it_has_a_job(rig: ModelRig, tmp_path: Path) -> None:
+    jobs, models = JobTable(rig.store, "swdt82"), tmp_path / "models of an earlier store"
+    assert not is_store_new(jobs, models)
     models.mkdir()
-    assert not gather().store.is_new_beside_models
+    assert not is_store_new(jobs, models)
     (models / "7").mkdir()
-    assert gather().store.is_new_beside_models
+    assert is_store_new(jobs, models)
     rig.jobs.session("a")
     job(rig, "gap", "a")
-    assert not gather().store.is_new_beside_models
+    assert not is_store_new(jobs, models)
 
 
-def test_the_store_and_the_control_socket_are_told_as_they_are(gather: Gatherer) -> None:
-    evidence = gather()
-    assert (evidence.store.fault, evidence.store.free_bytes, evidence.store.is_low) == ("another file", 5, True)
-    assert evidence.control_faults == {"control.sock": "the file is gone"}
+def test_a_control_socket_that_fails_is_told(gather: Gatherer) -> None:
+    assert gather().control_faults == {"control.sock": "the file is gone"}
 
 
-def test_a_part_that_fails_keeps_what_it_was_last_known_to_be(rig: ModelRig, gather: Gatherer) -> None:
+def test_a_part_that_fails_keeps_what_it_was_last_known_to_be(
+    rig: ModelRig, gather: Gatherer, parts: dict[str, Callable[[], object]]
+) -> None:
     rig.jobs.session("a", state="open")
     assert gather().session is not None
 
     def fail() -> NoReturn:
         raise OSError("it fails")
 
-    gather._session = fail  # type: ignore[method-assign]
+    parts["session"] = fail
     evidence = gather()
     assert evidence.session is not None
     assert evidence.session.id == "a"
     assert evidence.unwatched == {"the open session": "OSError: it fails"}
-    assert (evidence.store.free_bytes or 0) > 0
+    assert evidence.control_faults

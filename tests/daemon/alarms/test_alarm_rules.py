@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from daemon.acquisition_status import (
+from daemon.acquisition.decode_failures import DecodeStatus
+from daemon.acquisition.status import (
     AcquisitionStatus,
     ChannelStatus,
     EventStatus,
@@ -18,23 +19,19 @@ from daemon.acquisition_status import (
     StationStatus,
 )
 from daemon.alarms.alarm import Alarm
-from daemon.alarms.evidence import (
-    Evidence,
-    FailedJob,
-    ModelEvidence,
-    SessionEvidence,
-    SetupEvidence,
-    StoreEvidence,
-)
-from daemon.alarms.library import library
-from daemon.alarms.page import page
-from daemon.decode_failures import DecodeStatus
-from daemon.prism_guard import Suspicion
+from daemon.alarms.evidence import Evidence
+from daemon.alarms.library import library, page
+from daemon.models.live_model import LiveModelHealth
+from daemon.sessions.prism_guard import Suspicion
+from daemon.store.health import HealthState, StoreHealth
+from daemon.store.jobs import FailedJob
+from daemon.store.sessions import OpenSessionRow
+from daemon.store.setups import SetupRow
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import EventKind
 
 NOW = Stamp(1_790_000_000 * NS_PER_S, 5000 * NS_PER_S, "boot")
-SESSION = SessionEvidence("s001-r", 100.0)
+SESSION = OpenSessionRow("s001-r", NOW.shifted(-100 * NS_PER_S))
 DOCS = Path(__file__).parents[3] / "docs"
 
 
@@ -81,6 +78,16 @@ def known(
         is_behind=is_behind,
     )
     return Evidence(NOW, **{"running_s": 1000.0, "acquisition": acquisition, **more})
+
+
+def opened(seconds_ago: int) -> OpenSessionRow:
+    return replace(SESSION, started=NOW.shifted(-seconds_ago * NS_PER_S))
+
+
+def store_health(
+    state: HealthState = "ok", text: str = "", free_bytes: int | None = None, *, is_low: bool = False
+) -> StoreHealth:
+    return StoreHealth(state, text, NOW, free_bytes, is_low)
 
 
 def failures(lately: int, share: float) -> DecodeStatus:
@@ -254,48 +261,50 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
     ],
     "prism_jump": [
         (
-            known(session=replace(SESSION, suspicions=(Suspicion("station", NOW, 9.5),))),
+            known(session=SESSION, suspicions=[Suspicion("station", NOW, 9.5)]),
             ["station"],
             known(event(E.PRISM_JUMP, "station"), session=SESSION),
         )
     ],
     "decoding_behind": [(known(is_behind=True), ["decoding"], known())],
     "not_storing": [(known(error="disk full"), ["store"], known())],
-    "store_unsound": [(known(store=StoreEvidence("the file is gone")), ["store"], known())],
-    "store_new": [(known(store=StoreEvidence(is_new_beside_models=True)), ["store"], known())],
+    "store_unsound": [(known(store=store_health("missing", "the file is gone")), ["store"], known())],
+    "store_new": [(known(is_store_new=True), ["store"], known())],
     "disk_nearly_full": [
-        (known(store=StoreEvidence(is_low=True)), ["store"], known(store=StoreEvidence(free_bytes=10**10))),
-        (known(store=StoreEvidence(free_bytes=10**8)), ["store"], known(store=StoreEvidence(free_bytes=10**9))),
+        (known(store=store_health(is_low=True)), ["store"], known(store=store_health(free_bytes=10**10))),
+        (known(store=store_health(free_bytes=10**8)), ["store"], known(store=store_health(free_bytes=10**9))),
     ],
-    "setup_moved": [(known(setup=SetupEvidence("S2", True)), ["S2"], known(setup=SetupEvidence("S3", False)))],
+    "setup_moved": [(known(setup=SetupRow("S2", "moved")), ["S2"], known(setup=SetupRow("S3", "ok")))],
     "session_without_fixes": [
         (
-            known(session=replace(SESSION, age_s=601), stations=[station(good_age_s=None)]),
+            known(session=opened(601), stations=[station(good_age_s=None)]),
             ["s001-r"],
-            known(session=replace(SESSION, age_s=601)),
+            known(session=opened(601)),
         ),
         (
-            known(session=replace(SESSION, age_s=9000), stations=[station(good_age_s=601)]),
+            known(session=opened(9000), stations=[station(good_age_s=601)]),
             ["s001-r"],
-            known(session=replace(SESSION, age_s=9000), stations=[station(good_age_s=None)], running_s=60.0),
+            known(session=opened(9000), stations=[station(good_age_s=None)], running_s=60.0),
         ),
     ],
     "session_open_long": [
-        (known(session=replace(SESSION, age_s=86_401)), ["s001-r"], known(session=replace(SESSION, age_s=86_399))),
+        (known(session=opened(86_401)), ["s001-r"], known(session=opened(86_399))),
     ],
     "session_not_trained": [(known(untrained_sessions={"s001-r": "no control point was shot"}), ["s001-r"], known())],
     "zero_lost": [
         (
-            known(model=ModelEvidence(1, ("theta1",)), session=replace(SESSION, jumped=("theta1", "theta3"))),
+            known(model=LiveModelHealth(1, ("theta1",)), session=replace(SESSION, jumped=("theta1", "theta3"))),
             ["theta1", "theta3"],
-            known(model=ModelEvidence(1), session=SESSION),
+            known(model=LiveModelHealth(1), session=SESSION),
         )
     ],
     "job_failed": [(known(failed_jobs=(FailedJob(7, "gap", "too poor"),)), ["7"], known())],
     "model_drifted": [
-        (known(model=ModelEvidence(2, drifted_with="s009-r")), ["model 2"], known(model=ModelEvidence(3))),
+        (known(model=LiveModelHealth(2, drifted_with="s009-r")), ["model 2"], known(model=LiveModelHealth(3))),
     ],
-    "model_unusable": [(known(model=ModelEvidence(2, defect="damaged")), ["model 2"], known(model=ModelEvidence(2)))],
+    "model_unusable": [
+        (known(model=LiveModelHealth(2, defect="damaged")), ["model 2"], known(model=LiveModelHealth(2)))
+    ],
     "clock_stepped": [
         (known(event(E.CLOCK_STEP, "clock")), ["clock"], known(event(E.CLOCK_STEP, "clock", age_s=901))),
     ],
@@ -373,7 +382,7 @@ def test_what_an_instrument_says_comes_without_control_characters_and_bounded() 
 
 def test_every_kind_is_in_the_documentation_with_what_to_do() -> None:
     written = (DOCS / "alarms.md").read_text(encoding="utf-8")
-    assert written == page(), "make it anew: python -m daemon.alarms.page > docs/alarms.md"
+    assert written == page(), "make it anew: python -m daemon.alarms.library > docs/alarms.md"
     for rule in library():
         assert f"## {rule.kind}\n" in written
         assert rule.remedy in written

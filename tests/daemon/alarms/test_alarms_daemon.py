@@ -17,16 +17,15 @@ from typing import Any
 import pytest
 
 from daemon.composition import live
-from daemon.config import parse_config
-from daemon.control import request
-from daemon.notify import Notifier
-from daemon.rigs import load_rig
+from daemon.config import load_rig, parse_config
+from daemon.control.protocol import request
+from daemon.host.systemd import Notifier
 from daemon.service import Daemon
 from daemon.store import Store
+from tests.daemon.acquisition.test_clock_watch import SetClock
 from tests.daemon.acquisition_support import wait_until
 from tests.daemon.daemon_process import DaemonProcess
 from tests.daemon.store_support import table
-from tests.daemon.test_clock_watch import SetClock
 
 CONFIG = """rig = "swdt82"
 state_directory = "."
@@ -99,6 +98,7 @@ def test_a_clock_that_was_set_back_while_rigcal_did_not_run_is_an_event_and_alar
     assert steps == [pytest.approx(-7_200_000, abs=100), pytest.approx(7_200_000, abs=100)]
 
 
+@pytest.mark.slow
 def test_a_rig_that_falls_silent_raises_few_alarms_and_clears_them_when_it_speaks_again(tmp_path: Path) -> None:
     daemon = DaemonProcess(tmp_path, "--sim", "--rate", "2", "--seed", "3", jobs=False)
     try:

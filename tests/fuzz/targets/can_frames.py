@@ -6,14 +6,13 @@ import contextlib
 
 import msgpack
 
-from daemon.channels import decoder_factories
-from daemon.rigs import load_rig
+from daemon.acquisition.channels import decoder_factories
+from daemon.config import load_rig
+from drivers.can.error_frames import BusErrors
+from drivers.can.frame import DATA_MAX, EXTENDED_ID_MAX, Frame, SlcanLines, parse_can_frame, parse_multicast
+from drivers.can.j1939 import J1939Id
+from drivers.can.raw_signal import BitField, SignalChannel, SignalDecoder
 from drivers.can_decoder import CanDecoder
-from drivers.can_errors import BusErrors
-from drivers.can_wire import SlcanLines, parse_can_frame, parse_multicast
-from drivers.canframe import DATA_MAX, EXTENDED_ID_MAX, Frame
-from drivers.j1939 import J1939Id
-from drivers.raw_signal import BitField, SignalChannel, SignalDecoder
 from tests.fuzz.streams import frames
 from tests.fuzz.target import Run, Target
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import contextlib
 import struct
 
-from daemon.channels import decoder_factories, node_setups
-from daemon.rigs import load_rig
-from drivers.can_channel import PdoChannelDecoder
-from drivers.canframe import Frame
-from drivers.canopen_setup import SetupConversation
-from drivers.canopen_supervision import NodeSupervision
-from drivers.cia301 import classify, decode_time
+from daemon.acquisition.channels import decoder_factories, node_setups
+from daemon.config import load_rig
+from drivers.can.frame import Frame
+from drivers.canopen.cia301 import classify
+from drivers.canopen.node_setup import SetupRunner
+from drivers.canopen.pdo import PdoChannelDecoder
+from drivers.canopen.sdo import Download, SdoExchange, Upload, decode_response
+from drivers.canopen.supervision import NodeSupervision
 from drivers.errors import DeviceError
-from drivers.sdo import Download, SdoExchange, Upload, decode_response
 from tests.fuzz.streams import START, frames
 from tests.fuzz.target import Run, Target
 
@@ -41,7 +41,7 @@ def _setup() -> Run:
     setups = [s for s in node_setups(source.rig, source.directory, "boom") if s.node in (32, 48, 60)]
 
     def run(data: bytes) -> None:
-        conversation = SetupConversation()
+        conversation = SetupRunner()
         for setup in setups:
             conversation.add(setup)
         now, asked = START, b"\x40\0\0\0\0\0\0\0"
@@ -95,8 +95,6 @@ def _supervision() -> Run:
             classify(capture.arbitration_id & 0x7FF)
             node.tick(capture.stamp)
             handlers[capture.arbitration_id % len(handlers)](capture.stamp, capture.data)
-            with contextlib.suppress(ValueError):
-                decode_time(capture.data)
 
     return run
 

@@ -10,17 +10,16 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-from calibration.rig import shipped_rig
+from calibration.rig.description import shipped_rig
 from daemon.composition import replayed
-from daemon.config import parse_config
-from daemon.control import MAX_LINE_BYTES
-from daemon.notify import Notifier
-from daemon.rigs import load_rig
+from daemon.config import load_rig, parse_config
+from daemon.control.protocol import MAX_LINE_BYTES
+from daemon.host.systemd import Notifier
 from daemon.service import Daemon
 from daemon.store.store import Store
 from tests.fuzz.target import Run, Target, check_refusal, scratch_directory
 
-GOLDEN = Path(__file__).parents[2] / "golden" / "standing"
+GOLDEN = Path(__file__).parents[2] / "golden" / "simulated" / "standing"
 _CONFIG = """rig = "swdt82"
 state_directory = "."
 sessions.shot_timeout_s = 1.0

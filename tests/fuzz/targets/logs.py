@@ -9,13 +9,13 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
-from drivers.canlog import read_can_log
+from drivers.can.dbc import DbcFile
+from drivers.can.raw_signal import SignalDecoder
+from drivers.canopen.pdo import TransmitPdo
 from drivers.clock import Stamp
-from drivers.dbc import DbcFile
 from drivers.errors import DescriptionError
-from drivers.pdo import TransmitPdo
-from drivers.raw_signal import SignalDecoder
-from drivers.seriallog import read_serial_log
+from drivers.logs.can_log import read_can_log
+from drivers.logs.serial_log import read_serial_log
 from tests.fuzz.mutate import change
 from tests.fuzz.target import Run, Target, check_refusal, scratch_directory
 

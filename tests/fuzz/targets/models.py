@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from calibration.errors import CalibrationError
-from calibration.npz import read_npz
-from calibration.residual.tree_text import read_trees
-from daemon.modelcheck import encode, smoke_test
-from daemon.numba_cache import prepare
+from calibration.numerics.stored_arrays import read_npz
+from calibration.residual.trees.tree_text import read_trees
+from daemon.models.first_load import encode, smoke_test
+from daemon.warm_up import prepare
 from tests.fuzz.mutate import change
 from tests.fuzz.target import Run, Target, check_refusal
 
@@ -35,7 +35,7 @@ _VALUES = (0.0, -1.0, 1e9, 1e18, 1e300, 1e-300, float("nan"), float("inf"))
 
 
 def unbundle(data: bytes) -> dict[str, bytes]:
-    """The files of a bundle, which `daemon.modelcheck.encode` made; none where it is damaged."""
+    """The files of a bundle, which `daemon.models.first_load.encode` made; none where it is damaged."""
     first, _, rest = data.partition(b"\n")
     try:
         sizes = json.loads(first)

@@ -1,4 +1,4 @@
-"""Total stations: framers with interpreters, the whole decoder, and the conversations."""
+"""Total stations: framers with parsers, the whole decoder, and the pollers."""
 
 from __future__ import annotations
 
@@ -7,16 +7,19 @@ import random
 import re
 from itertools import cycle
 
-from drivers.bytestream import Frame, Framer
+from drivers.clock import Stamp
 from drivers.readings import SerialCapture
-from drivers.serialport import SerialConfig
-from drivers.sokkia.interpreter import SetInterpreter
-from drivers.sokkia.set import SetFramer, checksum
-from drivers.station import Interpreter, StationConfig, StationDecoder, start_conversation
-from drivers.survey import RecordError
-from drivers.topcon.codec import GtsFramer, block_check
-from drivers.topcon.interpreter import GtsInterpreter
-from drivers.topcon.records import CorrectionScales
+from drivers.stations.config import StationConfig
+from drivers.stations.decoder import StationDecoder
+from drivers.stations.link import start_poller
+from drivers.stations.profile import Codec
+from drivers.stations.replies import ACK, NAK, Frame
+from drivers.stations.serial_port import SerialConfig
+from drivers.stations.sokkia.codec import CODEC as SOKKIA
+from drivers.stations.sokkia.codec import checksum
+from drivers.stations.survey import RecordError
+from drivers.stations.topcon.codec import CODEC as TOPCON
+from drivers.stations.topcon.framing import block_check
 from tests.fuzz.streams import START, pieces
 from tests.fuzz.target import Run, Target
 
@@ -56,26 +59,27 @@ _RECORD = re.compile(rb"[?(<U/QE][ -~]*?\d{3}\x03")
 _REPLY = re.compile(rb"[^\r\n]* [0-9A-F]{2}\r")
 
 
-def _framed(framer: Framer, interpreter: Interpreter, data: bytes) -> None:
+def _framed(codec: Codec, data: bytes) -> None:
+    framer, parser = codec.framer(), codec.parser("station", _CONFIGS[0])
     sizes = cycle((1, 3, 17, 64))
     at = 0
     while at < len(data):
         size = next(sizes)
         for found in framer.feed(data[at : at + size]):
-            if isinstance(found, Frame):
+            if isinstance(found, Frame) and found.data not in (ACK, NAK):
                 with contextlib.suppress(RecordError):
-                    interpreter.interpret(found.data, START, START)
+                    parser.parse(found.data, START, START)
         assert framer.pending <= 256
         at += size
     framer.flush("end")
 
 
 def _topcon() -> Run:
-    return lambda data: _framed(GtsFramer(), GtsInterpreter("station", CorrectionScales(0.1, 0.1)), data)
+    return lambda data: _framed(TOPCON, data)
 
 
 def _sokkia() -> Run:
-    return lambda data: _framed(SetFramer(), SetInterpreter("station"), data)
+    return lambda data: _framed(SOKKIA, data)
 
 
 def _decoder() -> Run:
@@ -90,21 +94,21 @@ def _decoder() -> Run:
     return run
 
 
-def _conversation() -> Run:
+def _poller() -> Run:
     def run(data: bytes) -> None:
-        conversation = start_conversation(_CONFIGS[data[0] % 5] if data else _CONFIGS[0])
-        assert conversation is not None
+        poller = start_poller(_CONFIGS[data[0] % 5] if data else _CONFIGS[0])
+        assert poller is not None
         now_ns = 1_000_000_000
         for pause_ns, _, piece in pieces(data[1:]):
             now_ns += pause_ns
-            conversation.feed(piece, now_ns)
+            poller.feed(SerialCapture("station", Stamp(0, now_ns, "fuzz"), piece))
             steps = 0
-            while conversation.step(now_ns) is not None:
+            while poller.step(now_ns) is not None:
                 steps += 1
                 assert steps < _MOST_STEPS, "it would send for ever"
-            conversation.wake_ns(now_ns)
-            conversation.take_notices()
-        conversation.closing()
+            poller.wake_ns(now_ns)
+            poller.take_notices()
+        poller.closing()
 
     return run
 
@@ -125,5 +129,5 @@ TARGETS = [
     Target("topcon", _topcon, words=_TOPCON, repair=_bcc),
     Target("sokkia", _sokkia, words=_SOKKIA, repair=_sum),
     Target("station-decoder", _decoder, words=_TOPCON + _SOKKIA, repair=_bcc_or_sum),
-    Target("conversation", _conversation, words=_TOPCON + _SOKKIA, repair=_bcc_or_sum),
+    Target("conversation", _poller, words=_TOPCON + _SOKKIA, repair=_bcc_or_sum),
 ]

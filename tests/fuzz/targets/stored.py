@@ -10,8 +10,8 @@ from contextlib import suppress
 import numpy as np
 
 from calibration.identification.search.checkpoint import unpack
-from calibration.npz import read_npz
-from daemon.order import parse_message
+from calibration.numerics.stored_arrays import read_npz
+from daemon.jobs.order import parse_message
 from daemon.store.captures import decode_captures
 from daemon.store.errors import StoreError
 from tests.fuzz.mutate import change

@@ -7,12 +7,11 @@ from pathlib import Path
 
 from calibration.errors import DataError, RigError
 from calibration.observations import parse_observations
-from calibration.rig import parse_rig
-from daemon.channels import decoder_factories, node_setups
-from daemon.cli.csv_output import with_columns
-from daemon.config import ConfigError, parse_config
-from daemon.rigs import load_rig
-from daemon.session_file import read_session_file
+from calibration.rig.description import parse_rig
+from daemon.acquisition.channels import decoder_factories, node_setups
+from daemon.cli.offline import with_columns
+from daemon.config import ConfigError, load_rig, parse_config
+from daemon.sessions.session_file import read_session_file
 from drivers.can_decoder import CanDecoder
 from drivers.errors import DescriptionError
 from tests.fuzz.streams import frames, pack_frames

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import struct
 
-from drivers.canframe import DATA_MAX
-from drivers.tip_frames import FRAMES, TipMessage, TipStatus, encode_tip
+from drivers.can.frame import DATA_MAX
+from drivers.can.tip_frames import FRAMES, TipMessage, TipStatus, encode_tip
 from tests.fuzz.target import Run, Target
 
 _INPUT = struct.Struct("<BBIddddd")

@@ -1,0 +1,161 @@
+"""Effects as columns of a linear model: the change of joint values and prisms per unit of each coefficient."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.kinematics.chain import ChainData, Linearisation
+from calibration.observations import Floats
+
+Integers = NDArray[np.intp]
+
+NO_JOINT = -1
+_FEW = 50  # coefficients that are summed by one small product, with many zeros
+
+
+@dataclass(frozen=True)
+class EffectColumns:
+    """k coefficients that stand beside the parameters of a chain, for m rows.
+
+    The true value of joint `joint[i]` is its reading plus `column[:, i]` times coefficient i, before couplings. The
+    prism is `shift_mm[:, :, i]` times coefficient i away from where the kinematics have it then.
+
+    Attributes:
+        names: of the coefficients, `family@where:name`.
+        joint: (k,) index of the joint that each changes, `NO_JOINT` for none.
+        column: (m, k) deg or mm of that joint per unit of the coefficient; zero where there is none.
+        prior_sigma: (k,) plausible size of each coefficient, 1 sigma, in its unit.
+        shift_mm: (m, 3, k) in the station's frame, per unit of the coefficient; None where none moves a prism itself.
+    """
+
+    names: tuple[str, ...]
+    joint: Integers
+    column: Floats
+    prior_sigma: Floats
+    shift_mm: Floats | None = None
+
+    def __len__(self) -> int:
+        return len(self.joint)
+
+    def apply(self, data: ChainData, coefficients: Floats) -> tuple[ChainData, Floats]:
+        """Apply the effects to rows of observations.
+
+        Args:
+            data: m rows, with the readings as they are.
+            coefficients: (k,) values.
+
+        Returns:
+            The rows with the joints where the effects have them, for the kinematics; (m, 3) displacements in the
+            station's frame, to be added to the positions that the kinematics find.
+        """
+        shift_mm = self.shifted_mm(coefficients)
+        return (data.moved(self.change(coefficients, data.readings.shape[1])) if self.joint.size else data), shift_mm
+
+    def linearise(
+        self, kinematics: Callable[[ChainData], Linearisation], data: ChainData, coefficients: Floats
+    ) -> Linearisation:
+        """Linearise kinematics and effects together.
+
+        Args:
+            kinematics: (m rows) -> positions with derivatives by p parameters, in the station's frame.
+            data: m rows, with the readings as they are.
+            coefficients: (k,) values.
+
+        Returns:
+            Positions with the effects applied; the Jacobian (m, 3, p + k) has those by coefficients last.
+        """
+        moved, shift_mm = self.apply(data, coefficients)
+        lin = kinematics(moved)
+        jacobian = np.concatenate([lin.jacobian, self.moved_mm(lin.joint_jacobian)], axis=2)
+        return Linearisation(lin.position_mm + shift_mm, jacobian, lin.joint_jacobian)
+
+    def change(self, coefficients: Floats, joints: int) -> Floats:
+        """Return the change of all readings (m, joints), deg or mm, by coefficients (k,)."""
+        if self.joint.size <= _FEW:
+            few: Floats = self.column @ _by_joint(self.joint.tobytes(), coefficients.tobytes(), joints)
+            return few
+        out = np.zeros((len(self.column), joints))
+        for joint, own in _runs(self.joint.tobytes()):
+            out[:, joint] += self.column[:, own] @ coefficients[own]
+        return out
+
+    def shifted_mm(self, coefficients: Floats) -> Floats:
+        """Return the displacement of the prisms beside that, (m, 3) in the station's frame, by coefficients (k,)."""
+        if self.shift_mm is None:
+            return np.zeros((len(self.column), 3))
+        shifted: Floats = self.shift_mm @ coefficients
+        return shifted
+
+    def moved_mm(self, joint_jacobian: Floats) -> Floats:
+        """Return the whole displacement (m, 3, k) of the prisms per unit of each coefficient.
+
+        Args:
+            joint_jacobian: (m, 3, joints) by readings, mm per deg or mm.
+        """
+        moved = np.empty((len(self.column), 3, len(self)))
+        for joint, own in _runs(self.joint.tobytes()):
+            np.multiply(joint_jacobian[:, :, joint, None], self.column[:, None, own], out=moved[:, :, own])
+        if self.shift_mm is not None:
+            moved += self.shift_mm
+        return moved
+
+    def over(self, rows: Callable[[Floats], Floats]) -> EffectColumns:
+        """Return the same coefficients for other rows.
+
+        Args:
+            rows: makes values (m', ...) of the other rows from values (m, ...) of these, such as a mean.
+        """
+        shift = None if self.shift_mm is None else rows(self.shift_mm)
+        return replace(self, column=rows(self.column), shift_mm=shift)
+
+    def select(self, rows: NDArray[np.bool_] | Integers) -> EffectColumns:
+        """Return the same coefficients for the given rows, by mask or by index."""
+        return self.over(lambda values: values[rows])
+
+
+def joined(parts: Sequence[EffectColumns], rows: int) -> EffectColumns:
+    """Join the coefficients of several effects, all for the same number of rows."""
+    shift = None
+    if any(part.shift_mm is not None for part in parts):
+        zero = [np.zeros((rows, 3, len(part))) if part.shift_mm is None else part.shift_mm for part in parts]
+        shift = np.concatenate(zero, axis=2)
+    return EffectColumns(
+        tuple(name for part in parts for name in part.names),
+        np.concatenate([np.empty(0, dtype=np.intp), *(part.joint for part in parts)]),
+        np.hstack([np.empty((rows, 0)), *(part.column for part in parts)]),
+        np.concatenate([np.empty(0), *(part.prior_sigma for part in parts)]),
+        shift,
+    )
+
+
+def same_columns(a: EffectColumns, b: EffectColumns) -> bool:
+    """Return True if two sets of coefficients differ in their names and priors alone."""
+    if not (np.array_equal(a.joint, b.joint) and np.array_equal(a.column, b.column)):
+        return False
+    if a.shift_mm is None or b.shift_mm is None:
+        return a.shift_mm is b.shift_mm
+    return np.array_equal(a.shift_mm, b.shift_mm)
+
+
+@lru_cache
+def _by_joint(joints: bytes, coefficients: bytes, count: int) -> Floats:
+    """Return (k, count): each coefficient at its joint, else 0; kept for a model that predicts row by row."""
+    at = np.frombuffer(joints, dtype=np.intp)[:, None] == np.arange(count)
+    return np.where(at, np.frombuffer(coefficients)[:, None], 0.0)
+
+
+@lru_cache
+def _runs(joints: bytes) -> tuple[tuple[int, slice], ...]:
+    """Return each run of coefficients at one joint: its index, and a slice, which copies nothing.
+
+    The columns of those at none are zero, whichever joint `NO_JOINT` is taken for.
+    """
+    joint = np.frombuffer(joints, dtype=np.intp)
+    edges = [0, *(np.flatnonzero(np.diff(joint)) + 1).tolist(), len(joint)]
+    return tuple((int(joint[a]), slice(a, b)) for a, b in itertools.pairwise(edges) if a < b)

@@ -1,0 +1,239 @@
+"""Everything that an effect may look at: a machine, its observations, and quantities that follow from both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.kinematics.chain import Chain, ChainData
+from calibration.kinematics.compiled_chain import CompiledChain, Facing, Located
+from calibration.kinematics.torques import GravityModel
+from calibration.numerics.statistics import halton
+from calibration.observations import Floats, Observations
+from calibration.rig.description import Rig
+
+_VOLUME_POSES = 256
+_LEAST_LOAD = 1e-6  # of the largest on any revolute joint; less is rounding
+_LEAST_NM = 1e-6  # a milligram on a lever of 100 mm: less is no load
+_LEAST_RANGE_MM = 1e-6
+_STEEP = 0.9  # cosine; an axis nearer to the vertical has no level direction to speak of
+
+
+@dataclass(frozen=True)
+class EffectContext:
+    """A machine and n observations of it; its properties are computed when first asked for, and kept.
+
+    Attributes:
+        chain: kinematics.
+        x: (p,) its parameters. How the base stands to the station's vertical counts in loads.
+        observations: n rows.
+        prepared_loads: the weights of `chain` at `x`, where they have been prepared.
+        prepared_machine: `chain` compiled at `x`, where it has been prepared.
+        levelled: True if gravity is along the station's vertical; otherwise it is as the rig file says.
+    """
+
+    chain: Chain
+    x: Floats
+    observations: Observations
+    prepared_loads: GravityModel | None = None
+    prepared_machine: CompiledChain | None = None
+    levelled: bool = True
+
+    def __len__(self) -> int:
+        return len(self.observations)
+
+    @property
+    def rig(self) -> Rig:
+        """The rig description."""
+        return self.chain.rig
+
+    # -- columns of the observations -----------------------------------------------------------------------------------
+
+    def reading(self, joint: str) -> Floats:
+        """Return the (n,) readings of a joint, deg or mm."""
+        return self.observations.joints[joint]
+
+    def extra(self, column: str) -> Floats:
+        """Return an optional column (n,), NaN where it was not measured."""
+        measured = self.observations.extra.get(column)
+        return np.full(len(self), np.nan) if measured is None else measured
+
+    @cached_property
+    def has_rates(self) -> NDArray[np.bool_]:
+        """(n,) True if the rates of joints are recorded; an empty cell beside others is a joint that stands still."""
+        columns = (f"{name}_rate" for name in self.rig.joint_names)
+        return np.full(len(self), any(column in self.observations.extra for column in columns))
+
+    @cached_property
+    def data(self) -> ChainData:
+        """The observations bound to the chain."""
+        return self.chain.bind(self.observations)
+
+    # -- geometry, from the kinematics and the readings alone, without any effect --------------------------------------
+
+    @cached_property
+    def machine(self) -> CompiledChain:
+        """The chain compiled at its parameters."""
+        return self.prepared_machine or CompiledChain(self.chain, self.x)
+
+    @cached_property
+    def located(self) -> Located:
+        """Positions of prisms and frames."""
+        return self.machine.locate(self.data)
+
+    @cached_property
+    def facing(self) -> Facing:
+        """Orientation of the prisms, and the displacement by each drive of a row."""
+        return self.machine.face(self.data)
+
+    @cached_property
+    def prism_frame(self) -> NDArray[np.intp]:
+        """(n,) the frame that each fix's prism is mounted on."""
+        frames = np.array([prism.frame for prism in self.rig.prisms], dtype=np.intp)
+        return frames[self.data.prism]
+
+    def rows_of_prism(self, prism: str) -> NDArray[np.bool_]:
+        """Return an (n,) mask of the rows of one prism."""
+        rows: NDArray[np.bool_] = self.data.prism == self.rig.prism_names.index(prism)
+        return rows
+
+    @cached_property
+    def rotation(self) -> Floats:
+        """(n, 3, 3) rotations from the base frame to the station's."""
+        return self.machine.rotations(self.data)
+
+    def to_station(self, vectors: Floats) -> Floats:
+        """Turn vectors (n, 3, k) of the base frame into the station's frame."""
+        return self.rotation @ vectors
+
+    @cached_property
+    def line_of_sight(self) -> Floats:
+        """(n, 3) unit vectors from the instrument's centre to the prism, in the station's frame."""
+        position_mm = self.located.position_mm
+        range_mm = np.sqrt((position_mm**2).sum(axis=1))
+        lines: Floats = position_mm / np.maximum(range_mm, _LEAST_RANGE_MM)[:, None]
+        return lines
+
+    @cached_property
+    def velocity_mm_per_s(self) -> Floats:
+        """(n, 3) velocity of the prism in the station's frame; a joint without a measured rate stands still."""
+        rates = np.column_stack([self.extra(f"{name}_rate") for name in self.rig.joint_names])
+        moved = self.located.joint_jacobian @ np.nan_to_num(rates)[:, :, None]
+        return self.to_station(moved)[:, :, 0]
+
+    def base_motion_mm(self, amount: Floats) -> Floats:
+        """Return (n, 3, 3) displacements in the station's frame as the base tilts and rises by `amount` (n,).
+
+        The columns are tilts about the level axes x and y through the base frame's origin, mm per rad, and a rise,
+        mm per mm; see `level_axes`.
+        """
+        axes = level_axes(self.rig.gravity)
+        place = self.located.prism_mm
+        tilts = [np.cross(axis, place) for axis in axes[:2]]
+        moved = np.stack([*tilts, np.tile(axes[2], (len(self), 1))], axis=2)
+        return self.to_station(moved * amount[:, None, None])
+
+    # -- loads ---------------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def loads(self) -> GravityModel:
+        """The weights of the machine."""
+        return self.prepared_loads or GravityModel(self.chain, self.x)
+
+    @cached_property
+    def down(self) -> Floats:
+        """(n, 3) unit vectors of gravity in the base frame."""
+        loads = self.loads
+        return loads.down[self.data.setup] if self.levelled else np.repeat(loads.direction, len(self), axis=0)
+
+    def torque(self, joint: str) -> Floats:
+        """Return the (n,) load on a joint, N m or N; NaN where it is not known."""
+        return self._torques[:, self.chain.joint_index[joint]]
+
+    def torque_parts(self, joint: str) -> Floats:
+        """Return (n, parts) changes of the load on a joint when a weight, or its lever, is `MASS_SIGMA` larger."""
+        return self._parts[:, self.chain.joint_index[joint]]
+
+    def is_torque_measured(self, joint: str) -> bool:
+        """Return True if most rows have the joint's own torque column."""
+        return bool(np.isfinite(self.extra(f"{joint}_Nm")).mean() > 0.5) if len(self) else False
+
+    def payload_torque(self, joint: str) -> Floats:
+        """Return the (n,) load that the payload of each row adds to a joint, N m or N; 0 where it is not known."""
+        with_payload, without = (self.loads(self.data.readings, extra, self.down) for extra in self._payloads)
+        # Not a number where there are no masses
+        return np.nan_to_num(with_payload - without)[:, self.chain.joint_index[joint]]
+
+    def payload_parts(self, joint: str) -> Floats:
+        """Return the (n, parts) changes of `payload_torque`, as `torque_parts` has those of the whole load."""
+        with_payload, without = (self.loads.parts(self.data.readings, extra, self.down) for extra in self._payloads)
+        return (with_payload - without)[:, self.chain.joint_index[joint]]
+
+    def greatest_torque(self, joint: str) -> float:
+        """Return the largest load on a joint in the work volume; in the observations if the rig has no masses.
+
+        0 where it is nothing beside the loads of the other revolute joints as designed: the little that a vertical
+        axis carries because it was not built quite so depends on more than is known.
+        """
+        designed = self.as_designed
+        by_joint = [designed._greatest(j.name) for j in self.rig.joints if j.kind == "revolute"]
+        carries = designed._greatest(joint) > _LEAST_LOAD * max(by_joint, default=0.0)
+        return self._greatest(joint) if carries else 0.0
+
+    def _greatest(self, joint: str) -> float:
+        loads = self.work_volume.torque(joint) if self.rig.masses else self.torque(joint)
+        greatest = float(np.abs(loads[np.isfinite(loads)]).max(initial=0.0))
+        return greatest if greatest > _LEAST_NM else 0.0
+
+    @cached_property
+    def _torques(self) -> Floats:
+        return self.loads(self.data.readings, self.observations.extra, self.down)
+
+    @cached_property
+    def _parts(self) -> Floats:
+        return self.loads.parts(self.data.readings, self.observations.extra, self.down)
+
+    @property
+    def _payloads(self) -> tuple[dict[str, Floats], dict[str, Floats]]:
+        """Optional columns with the payload and without."""
+        kg = np.nan_to_num(self.extra("payload_kg"))
+        return {"payload_kg": kg}, {"payload_kg": np.zeros_like(kg)}
+
+    # -- other contexts of the same machine ----------------------------------------------------------------------------
+
+    @cached_property
+    def work_volume(self) -> EffectContext:
+        """The same machine in poses spread evenly between the limits of its joints, nothing else measured."""
+        unit = halton(len(self.rig.joints), _VOLUME_POSES)
+        blank = np.full((_VOLUME_POSES, 3), np.nan)
+        empty = np.full(_VOLUME_POSES, "")
+        joints = {j.name: j.limits[0] + (j.limits[1] - j.limits[0]) * unit[:, i] for i, j in enumerate(self.rig.joints)}
+        prism = np.full(_VOLUME_POSES, self.rig.prism_names[0])
+        setup = np.full(_VOLUME_POSES, next(iter(self.chain.setups), ""))
+        return replace(self, observations=Observations(prism, joints, blank, blank, setup, empty, empty))
+
+    @cached_property
+    def as_designed(self) -> EffectContext:
+        """The same observations of a machine that is as its rig file has it."""
+        x = np.zeros_like(self.x)
+        return replace(self, x=x, prepared_loads=None, prepared_machine=None, levelled=False)
+
+
+def level_axes(gravity: tuple[float, float, float]) -> Floats:
+    """Return two level axes of the base frame and the one that points up, as rows (3, 3).
+
+    Up is against the rig file's gravity, and x is the frame's own x axis made level: the frame's axes themselves, where
+    its z axis is up.
+
+    Args:
+        gravity: its direction in the base frame, of any length.
+    """
+    up = -np.array(gravity) / np.linalg.norm(gravity)
+    own = np.eye(3)[0 if abs(up[0]) < _STEEP else 1]
+    x = own - (own @ up) * up
+    x /= np.linalg.norm(x)
+    axes: Floats = np.array([x, np.cross(up, x), up])
+    return axes

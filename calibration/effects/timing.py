@@ -1,0 +1,163 @@
+"""Settings of effects in time: drifts since the first row of the training, and steps at one instant.
+
+The instants of steps lie between the rows, on a coarse grid first and then finely about one of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from calibration.effects.base import Family, FittedCoefficient, Settings
+from calibration.effects.context import EffectContext
+from calibration.observations import Floats
+
+DRIFT_SETTINGS = ("from_s", "span_s")
+STEP_SETTINGS = ("time_s", "time_error_s", "span_s")
+
+_GRID = 40
+_FINE = 80
+_LEAST_SIDE = 0.05  # share of the rows on either side
+_LEAST_ROWS = 3
+
+
+def drift_settings(time_s: Floats) -> Settings | None:
+    """Return the settings of a drift for the training rows' known times (m,); None if these are all the same."""
+    if len(time_s) == 0 or np.ptp(time_s) == 0.0:
+        return None
+    return {"from_s": float(time_s.min()), "span_s": float(np.ptp(time_s))}
+
+
+def check_drift(settings: Settings) -> None:
+    """Raise ValueError where the training took no time; all of `DRIFT_SETTINGS` are there."""
+    if settings["span_s"] <= 0.0:
+        raise ValueError("the setting span_s is not above 0")
+
+
+def elapsed_s(context: EffectContext, settings: Settings) -> Floats:
+    """Return (n,) the time since the first row of the training; 0 where it is not known.
+
+    No drift goes on for ever, and a model serves for months: before and after the training it is taken to go on for as
+    long again as that lasted, and to rest there.
+    """
+    since = context.extra("time_s") - settings["from_s"]
+    held: Floats = np.nan_to_num(np.clip(since, -settings["span_s"], 2.0 * settings["span_s"]))
+    return held
+
+
+class StepFamily(Family):
+    """An effect from an instant on, its variants those of `step_grid` and `refined_steps`."""
+
+    column = "time_s"
+
+    def odds(self, settings: Settings) -> float:
+        """Return the prior odds of an instant beside the others: the length of time that it stands for."""
+        return settings["time_error_s"]
+
+    def settled(self, forms: Sequence[Settings], probability: Floats) -> Settings:
+        """Return the most probable step, with the standard deviation that all of them leave about its instant."""
+        times, errors = (np.array([form[name] for form in forms]) for name in ("time_s", "time_error_s"))
+        weight = probability * [self.odds(form) for form in forms]
+        weight /= weight.sum()
+        best = int(np.argmax(weight))
+        variance = weight @ ((times - times[best]) ** 2 + errors**2)
+        return {**forms[best], "time_error_s": math.sqrt(float(variance))}
+
+    def reported(
+        self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
+    ) -> tuple[FittedCoefficient, ...]:
+        plausible = settings["span_s"] / math.sqrt(12.0)  # anywhere between the first row and the last
+        instant = FittedCoefficient("time_s", "s", settings["time_s"], settings["time_error_s"], plausible)
+        return (*coefficients, instant)
+
+
+class _Instants(NamedTuple):
+    """Instants midway between successive times of rows, with enough rows on either side.
+
+    Attributes:
+        time_s: (m,) rising.
+        error_s: (m,) standard deviation of a step anywhere between the two rows.
+        before: (m,) number of rows before.
+        span_s: from the first row to the last.
+    """
+
+    time_s: Floats
+    error_s: Floats
+    before: Floats
+    span_s: float
+
+    @classmethod
+    def between(cls, time_s: Floats) -> _Instants:
+        """Find the instants between the known ones of times (n,)."""
+        known = np.sort(time_s[np.isfinite(time_s)])
+        times, rows = np.unique(known, return_counts=True)
+        before = np.cumsum(rows)[:-1].astype(np.float64)
+        least = max(_LEAST_ROWS, math.ceil(_LEAST_SIDE * len(known)))
+        inside = (before >= least) & (before <= len(known) - least)
+        gap = np.diff(times)
+        span = float(times[-1] - times[0]) if len(times) else 0.0
+        return cls((times[:-1] + gap / 2.0)[inside], (gap / math.sqrt(12.0))[inside], before[inside], span)
+
+    def settings(self, index: int, least_error_s: float = 0.0) -> Settings:
+        """Return the settings of a step at one of them."""
+        error = max(float(self.error_s[index]), least_error_s)
+        return {"time_s": float(self.time_s[index]), "time_error_s": error, "span_s": self.span_s}
+
+    def grid(self) -> list[int]:
+        """Choose the instants of a coarse search, with as many rows between any two, as nearly as possible."""
+        if len(self.time_s) <= _GRID:
+            return list(range(len(self.time_s)))
+        wanted = np.linspace(self.before[0], self.before[-1], _GRID)
+        index = np.minimum(np.searchsorted(self.before, wanted), len(self.before) - 1)
+        return sorted(set(index.tolist()))
+
+
+def step_grid(time_s: Floats) -> tuple[Settings, ...]:
+    """Return steps at quantiles of the rows' times; none where too few rows have a time.
+
+    Each stands for those about it: its error is that of a step anywhere among them.
+
+    Args:
+        time_s: (n,) times of the rows, NaN where not known.
+    """
+    instants = _Instants.between(time_s)
+    grid = instants.grid()
+    if not grid:
+        return ()
+    nearest = np.abs(np.arange(len(instants.time_s))[:, None] - grid).argmin(axis=1)
+    errors = np.bincount(nearest, instants.error_s)
+    return tuple(instants.settings(index, error) for index, error in zip(grid, errors.tolist(), strict=True))
+
+
+def refined_steps(time_s: Floats, settings: Settings) -> tuple[Settings, ...]:
+    """Return the steps about one of a grid's, between its neighbours; thinned out evenly where there are very many.
+
+    Args:
+        time_s: (n,) times of the rows, NaN where not known.
+        settings: the step of the grid.
+
+    Returns:
+        None where the grid has all there are.
+    """
+    instants = _Instants.between(time_s)
+    grid = instants.grid()
+    if not grid or len(grid) == len(instants.time_s):
+        return ()
+    own = min(range(len(grid)), key=lambda i: abs(instants.time_s[grid[i]] - settings["time_s"]))
+    low = grid[own - 1] + 1 if own > 0 else 0
+    high = grid[own + 1] if own + 1 < len(grid) else len(instants.time_s)
+    step = math.ceil((high - low) / _FINE)
+    chosen = sorted({*range(low, high, step), grid[own]})
+    apart_s = float(instants.time_s[high - 1] - instants.time_s[low]) / max(len(chosen) - 1, 1)
+    least = apart_s / math.sqrt(12.0) if step > 1 else 0.0
+    return tuple(instants.settings(index, least) for index in chosen)
+
+
+def check_step(settings: Settings) -> None:
+    """Raise ValueError for an instant that no search finds; all of `STEP_SETTINGS` are there."""
+    negative = [name for name in ("time_error_s", "span_s") if settings[name] < 0.0]
+    if negative:
+        raise ValueError(f"the setting {negative[0]} is negative")

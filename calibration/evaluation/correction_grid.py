@@ -1,0 +1,239 @@
+"""A grid of corrections: at nodes of joint values, where each prism is by the drawings and by the model.
+
+Between nodes the difference is interpolated linearly in every joint value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
+
+from calibration.design.knowledge import setup_of
+from calibration.design.visibility import Bodies, Flags, is_reachable, site
+from calibration.effects.fitted import left_out
+from calibration.effects.library import library
+from calibration.errors import DataError
+from calibration.model.model import CalibratedModel
+from calibration.model.prediction import Predictor
+from calibration.numerics.single_thread import one_blas_thread
+from calibration.observations import Floats, Observations
+from calibration.rig.description import Joint
+
+T = TypeVar("T", bound=np.generic)
+
+_CURVATURE_POSES = 256
+_CURVATURE_STEP = 0.05  # of a joint's range
+_PROOF_POSES = 500
+_LEAST_RANGE = 1.0  # deg or mm, of a joint that stood still in training
+_CHUNK = 10_000
+_LATER_S = 1e12  # `time_s` of the grid, after any training: what has jumped then has jumped
+
+
+@dataclass(frozen=True)
+class CorrectionGrid:
+    """Corrections at the nodes of a grid of joint values, in the base frame.
+
+    Attributes:
+        nodes: joint -> its values on the grid, rising, deg or mm.
+        readings: (g, joints) all combinations, the last joint changing fastest.
+        nominal_mm, corrected_mm: prism -> (g, 3) by the drawings, and by the model.
+        reachable: (g,) True where the rig touches neither itself nor the floor.
+        left_out: a sentence for every effect of the machine that needs more than joint values.
+        rms_mm, p95_mm, max_mm: how far the interpolated corrections are from the model's own, in random poses on the
+            grid, all prisms taken together.
+        correction_rms_mm: how large the model's own corrections are there.
+    """
+
+    nodes: Mapping[str, Floats]
+    readings: Floats
+    nominal_mm: Mapping[str, Floats]
+    corrected_mm: Mapping[str, Floats]
+    reachable: Flags
+    left_out: tuple[str, ...]
+    rms_mm: float
+    p95_mm: float
+    max_mm: float
+    correction_rms_mm: float
+
+    @property
+    def is_coarse(self) -> bool:
+        """True if interpolating leaves more than half of the error that the grid is there to take away."""
+        return self.rms_mm > 0.5 * self.correction_rms_mm
+
+
+@one_blas_thread()
+def correction_grid(
+    model: CalibratedModel, prisms: Sequence[str], most_poses: int, rng: np.random.Generator
+) -> CorrectionGrid:
+    """Compute corrections over the joint values that the model was trained on, with more nodes where they bend more.
+
+    Elsewhere a model says what its kinematics say, and a grid that reached there would be coarser everywhere.
+
+    Args:
+        model: the model. Effects and residual are taken as for data that have joint values and nothing else, measured
+            after the training.
+        prisms: of its rig, at least one.
+        most_poses: the grid has no more nodes.
+        rng: draws the poses by which nodes are placed and the interpolation is judged.
+
+    Raises:
+        DataError: a prism that the rig lacks, too few nodes for two at each joint, or a joint that was trained beyond
+            its limits alone.
+    """
+    unknown = sorted(set(prisms) - set(model.rig.prism_names))
+    if unknown:
+        raise DataError("grid", f"rig {model.rig.name!r} has no prism {unknown[0]!r}; it has {model.rig.prism_names}")
+    joints = model.rig.joints
+    least = 2 ** len(joints)
+    if most_poses < least:
+        raise DataError("grid", f"two values for each of {len(joints)} joints make {least} poses; allow so many")
+    machine = _Machine(model, setup_of(model))
+    low, high = np.array([_range(model, joint) for joint in joints]).T
+    counts = _counts(_curvature_mm(machine, prisms, low, high, rng), most_poses)
+    nodes = {joint.name: np.linspace(*ends) for joint, *ends in zip(joints, low, high, counts, strict=True)}
+    readings = np.stack(np.meshgrid(*nodes.values(), indexing="ij"), axis=-1).reshape(-1, len(joints))
+    nominal_mm = {prism: machine.nominal_mm(prism, readings) for prism in prisms}
+    corrected_mm = {prism: machine.corrected_mm(prism, readings) for prism in prisms}
+    poses = rng.uniform(low, high, (_PROOF_POSES, len(joints)))
+    wanted_mm = np.concatenate([machine.correction_mm(prism, poses) for prism in prisms])
+    given_mm = np.concatenate([interpolated(nodes, corrected_mm[prism] - nominal_mm[prism], poses) for prism in prisms])
+    off_mm = np.linalg.norm(given_mm - wanted_mm, axis=1)
+    return CorrectionGrid(
+        nodes,
+        readings,
+        nominal_mm,
+        corrected_mm,
+        machine.reachable(readings),
+        machine.left_out(prisms[0], readings[:1]),
+        rms_mm=float(np.sqrt((off_mm**2).mean())),
+        p95_mm=float(np.quantile(off_mm, 0.95)),
+        max_mm=float(off_mm.max()),
+        correction_rms_mm=float(np.sqrt((wanted_mm**2).sum(axis=1).mean())),
+    )
+
+
+def interpolated(nodes: Mapping[str, Floats], values: Floats, readings: Floats) -> Floats:
+    """Interpolate values at the nodes of a grid linearly in every joint.
+
+    Args:
+        nodes: joint -> its values on the grid, rising.
+        values: (g, 3) at all combinations, the last joint changing fastest.
+        readings: (n, joints) inside the grid.
+
+    Returns:
+        (n, 3).
+    """
+    shape = tuple(len(own) for own in nodes.values())
+    table = RegularGridInterpolator(tuple(nodes.values()), values.reshape(*shape, 3))
+    return np.asarray(table(readings), dtype=np.float64)
+
+
+def _range(model: CalibratedModel, joint: Joint) -> tuple[float, float]:
+    """Least and greatest value of a joint on the grid: as in training, inside its limits, and some way apart."""
+    trained_low, trained_high = model.coverage.ranges[joint.name]
+    spare = max(0.0, 0.5 * (_LEAST_RANGE - (trained_high - trained_low)))
+    low, high = max(trained_low - spare, joint.limits[0]), min(trained_high + spare, joint.limits[1])
+    if low >= high:
+        raise DataError(
+            "grid",
+            f"{joint.name} was trained at {trained_low:.1f} .. {trained_high:.1f} {joint.unit}, beyond its limits "
+            f"{joint.limits[0]:g} .. {joint.limits[1]:g}: no command inside them was measured; correct limits or zero "
+            f"in the rig file and calibrate again",
+        )
+    return low, high
+
+
+@dataclass(frozen=True)
+class _Machine:
+    """Places of prisms in the base frame at joint values (n, joints), by the drawings and by the model."""
+
+    model: CalibratedModel
+    setup: int
+
+    def nominal_mm(self, prism: str, readings: Floats) -> Floats:
+        model = self.model
+        base = model.chain.base(model.nominal_values, self.setup)
+        nominal_mm = Predictor.of(model).nominal_mm(self._rows(prism, readings))
+        turned: Floats = (nominal_mm - base.translation_mm) @ base.rotation
+        return turned
+
+    def corrected_mm(self, prism: str, readings: Floats) -> Floats:
+        return _in_chunks(lambda some: Predictor.of(self.model).base_mm(self._rows(prism, some)), readings)
+
+    def correction_mm(self, prism: str, readings: Floats) -> Floats:
+        difference: Floats = self.corrected_mm(prism, readings) - self.nominal_mm(prism, readings)
+        return difference
+
+    def reachable(self, readings: Floats) -> Flags:
+        chain, values = self.model.chain, self.model.values
+        at = site(chain, values, setup=self.setup)
+        return _in_chunks(lambda some: is_reachable(Bodies.of(chain, values, some), at), readings)
+
+    def left_out(self, prism: str, readings: Floats) -> tuple[str, ...]:
+        model = self.model
+        of_machine = [effect for effect in model.effects if library()[effect.family].moves_machine]
+        return left_out(of_machine, Predictor.of(model).context(self._rows(prism, readings)))
+
+    def _rows(self, prism: str, readings: Floats) -> Observations:
+        n = len(readings)
+        return Observations(
+            prism=np.full(n, prism),
+            joints=dict(zip(self.model.rig.joint_names, readings.T, strict=True)),
+            position_mm=np.full((n, 3), np.nan),
+            sigma_mm=np.full((n, 3), np.nan),
+            setup=np.full(n, self.model.chain.setups[self.setup]),
+            session=np.full(n, ""),
+            pose=np.full(n, ""),
+            extra={"time_s": np.full(n, _LATER_S)},
+        )
+
+
+def _in_chunks(function: Callable[[Floats], NDArray[T]], readings: Floats) -> NDArray[T]:
+    return np.concatenate([function(readings[first : first + _CHUNK]) for first in range(0, len(readings), _CHUNK)])
+
+
+def _curvature_mm(
+    machine: _Machine, prisms: Sequence[str], low: Floats, high: Floats, rng: np.random.Generator
+) -> Floats:
+    """(joints,) RMS error of interpolating the corrections linearly between the ends of each joint's range, mm.
+
+    Of a parabola as bent as the corrections are on the average: it is range^2 |f''| / sqrt(120).
+    """
+    span = high - low
+    middle = rng.uniform(low + _CURVATURE_STEP * span, high - _CURVATURE_STEP * span, (_CURVATURE_POSES, len(span)))
+    found = np.zeros(len(span))
+    for prism in prisms:
+        centre = machine.correction_mm(prism, middle)
+        for joint in range(len(span)):
+            step = np.zeros(len(span))
+            step[joint] = _CURVATURE_STEP * span[joint]
+            bend = (
+                machine.correction_mm(prism, middle + step) + machine.correction_mm(prism, middle - step) - 2 * centre
+            )
+            found[joint] += (bend**2).sum(axis=1).mean()
+    scale: Floats = np.sqrt(found / len(prisms)) / _CURVATURE_STEP**2 / math.sqrt(120.0)
+    return scale
+
+
+def _counts(error_mm: Floats, most: int) -> list[int]:
+    """Number of nodes of each joint: one more, again and again, where it lowers the squared error most for its price.
+
+    The error of n nodes is that of two over (n - 1)^2; the price is the factor by which the grid grows.
+    """
+    counts = [2] * len(error_mm)
+    while True:
+        gains = [
+            (e / (n - 1) ** 2) ** 2 - (e / n**2) ** 2 if math.prod(counts) // n * (n + 1) <= most else -1.0
+            for e, n in zip(error_mm.tolist(), counts, strict=True)
+        ]
+        worth = [gain / math.log((n + 1) / n) for gain, n in zip(gains, counts, strict=True)]
+        best = int(np.argmax(worth))
+        if worth[best] <= 0.0:
+            return counts
+        counts[best] += 1

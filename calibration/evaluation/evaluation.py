@@ -1,0 +1,192 @@
+"""Evaluation of a model on observations: errors of every stage, warnings, axes and expected accuracy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+
+from calibration.design.accuracy import ExpectedAccuracy, expected_accuracy
+from calibration.errors import DataError, UnsafeError
+from calibration.identification.checks import row_warnings
+from calibration.identification.reading_steps import rounding
+from calibration.identification.samples import averaged
+from calibration.identification.sweeps.circles import find_axes
+from calibration.identification.sweeps.cross_check import AxisCheck, cross_check, disagreements
+from calibration.model.model import CalibratedModel, Outlier
+from calibration.model.prediction import Predictor
+from calibration.model.rebase import with_refitted_base
+from calibration.model.warnings import model_warnings
+from calibration.numerics.single_thread import one_blas_thread
+from calibration.observations import Floats, Observations, data_sha256, originals
+from calibration.residual.learners import tree_importance
+
+_STRANGE = 3.0  # times the expected error, in the median; a right model's are 0.9
+_LEAST_TO_JUDGE = 10
+_FEATURES_SHOWN = 10  # as in Zhou et al. 2022, Fig. 10
+STAGES = ("nominal", "geometric", "effects", "hybrid")
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A model on observations.
+
+    Attributes:
+        model: the model, with the base refitted where that was asked for.
+        observations: the rows.
+        errors_mm: stage -> (n, 3) measured minus modelled, in the station's frame.
+        sigma_mm: (n, 3) standard deviation that the model expects of the hybrid stage's errors.
+        outliers: rows farther off than noise explains.
+        warnings: about model and data.
+        axes: the model held against the axes that single-joint sweeps among the rows show.
+        expected: accuracy that the model expects over the work volume; None where the rig can take no pose.
+    """
+
+    model: CalibratedModel
+    observations: Observations
+    errors_mm: Mapping[str, Floats]
+    sigma_mm: Floats
+    outliers: tuple[Outlier, ...]
+    warnings: tuple[str, ...]
+    axes: tuple[AxisCheck, ...]
+    expected: ExpectedAccuracy | None
+
+    def __len__(self) -> int:
+        return len(self.observations)
+
+    def stages(self, prism: str | None = None) -> list[dict[str, str | float]]:
+        """Mean, RMS, greatest and standard deviation of the 3-D error of every stage, over all rows or one prism's."""
+        rows = np.ones(len(self), dtype=bool) if prism is None else self.observations.prism == prism
+        return [{"stage": stage, **statistics(sizes_mm(self.errors_mm[stage][rows]))} for stage in STAGES]
+
+    def as_dict(self, seconds: float) -> dict[str, object]:
+        """Return the JSON object of `calibrate` and `evaluate` (docs/formats.md); `seconds` is the caller's measure."""
+        return {
+            "rig": self.model.rig.name,
+            "n": len(self),
+            "seconds": seconds,
+            "stages": self.stages(),
+            "per_prism": {prism: self.stages(prism) for prism in np.unique(self.observations.prism).tolist()},
+            "effects": [effect.as_dict() for effect in self.model.effects],
+            "residual": self.model.residual.learner.kind if self.model.residual else None,
+            "noise_mm": self.model.noise_mm,
+            "identifiability": self.model.identifiability.as_dict(),
+            "warnings": list(self.warnings),
+            "ignored_columns": list(self.observations.ignored_columns),
+            "expected_accuracy": self.expected.as_dict() if self.expected else None,
+            "axes": [asdict(axis) for axis in self.axes],
+            "importance": self._importance(),
+            "intervals": self.model.intervals.coverage(self.errors_mm["hybrid"], self.sigma_mm).as_dict(),
+        }
+
+    def _importance(self) -> list[dict[str, str | float]] | None:
+        found = tree_importance(self.model.residual.learner) if self.model.residual else None
+        return None if found is None else [asdict(feature) for feature in found[:_FEATURES_SHOWN]]
+
+
+@one_blas_thread()
+def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: bool = False) -> Evaluation:
+    """Compute the errors of every stage on observations.
+
+    Args:
+        model: the model.
+        observations: rows with positions.
+        refit_base: fit the base transform of every set-up, and nothing else, on these rows, for each stage by itself.
+
+    Raises:
+        UnsafeError: a set-up that the model does not know, or whose base cannot be placed with these rows.
+    """
+    require_positions(observations)
+    effects = model
+    if refit_base:
+        effects = with_refitted_base(replace(model, residual=None), observations)
+        model = effects if model.residual is None else with_refitted_base(model, observations)
+    prediction = Predictor.of(model).predict(observations)
+    warnings = _of_training(model, observations)
+    if refit_base:
+        names = ", ".join(repr(s) for s in model.placements)
+        fixes = len(np.unique(originals(observations)))
+        warnings.append(f"the base transform of set-up {names} was fitted on these {fixes} fixes")
+    warnings += [w for w in model_warnings(model, observations) if w not in warnings]
+    errors = {
+        "nominal": observations.position_mm - Predictor.of(effects).nominal_mm(observations),
+        "geometric": observations.position_mm - Predictor.of(effects).geometric_mm(observations),
+        "effects": observations.position_mm - Predictor.of(effects).effects_mm(observations),
+        "hybrid": observations.position_mm - prediction.position_mm,
+    }
+    left_mm = statistics(sizes_mm(errors["hybrid"]))["rms_mm"]
+    _, rounded = rounding(Predictor.of(effects).context(observations), left_mm)
+    warnings += [
+        w for w in (*row_warnings(model.rig, observations), *([rounded] if rounded else [])) if w not in warnings
+    ]
+    warnings += _strange(errors["hybrid"], prediction.sigma_mm)
+    axes = _axes(effects, observations)
+    warnings += [w for w in disagreements(axes) if w not in warnings]
+    return Evaluation(
+        model,
+        observations,
+        errors,
+        prediction.sigma_mm,
+        Predictor.of(effects).find_outliers(observations),
+        tuple(warnings),
+        axes,
+        _expected(model),
+    )
+
+
+def _of_training(model: CalibratedModel, observations: Observations) -> list[str]:
+    """The model's own warnings, told apart where the rows are not those that it was fitted to."""
+    if not model.warnings or model.provenance.get("data_sha256") == data_sha256(observations, model.rig):
+        return list(model.warnings)
+    return [f"in training: {warning}" for warning in model.warnings]
+
+
+def _strange(error_mm: Floats, sigma_mm: Floats) -> Iterator[str]:
+    """Warn of errors far beyond the expected: the model is not of this machine, or no longer."""
+    times = float(np.median(sizes_mm(error_mm) / sizes_mm(sigma_mm)))
+    if len(error_mm) >= _LEAST_TO_JUDGE and times > _STRANGE:
+        yield (
+            f"the model does not describe this data: half of the fixes are off by more than {times:.1f} times the "
+            f"expected; another machine or rig file, a moved base or prism, or a column that was read differently"
+        )
+
+
+def _axes(model: CalibratedModel, observations: Observations) -> tuple[AxisCheck, ...]:
+    """The model against the single-joint sweeps among the rows, with the joints where the effects have them.
+
+    The uncertainty of the effects' coefficients is left out, which makes an axis disagree a little sooner.
+    """
+    parameters = len(model.chain)
+    axes = find_axes(model.chain, averaged(model.chain, Predictor.of(model).corrected(observations)))
+    return cross_check(model.chain, model.values, model.covariance[:parameters, :parameters], axes)
+
+
+def _expected(model: CalibratedModel) -> ExpectedAccuracy | None:
+    try:
+        return expected_accuracy(model, np.random.default_rng(0))
+    except UnsafeError:
+        return None
+
+
+def require_positions(observations: Observations) -> None:
+    """Raise DataError unless there are rows, each with a measured position."""
+    if len(observations) == 0:
+        raise DataError("observations", "there are none")
+    if not np.isfinite(observations.position_mm).all():
+        raise DataError("observations", "every row needs a measured position", column="x_mm")
+
+
+def sizes_mm(error_mm: Floats) -> Floats:
+    """Return the sizes (n,) of (n, 3) errors."""
+    return np.asarray(np.linalg.norm(error_mm, axis=1))
+
+
+def statistics(size_mm: Floats) -> dict[str, float]:
+    """Return the statistics of (n,) sizes of errors, for JSON."""
+    return {
+        "mean_mm": float(size_mm.mean()),
+        "rms_mm": float(np.sqrt((size_mm**2).mean())),
+        "max_mm": float(size_mm.max()),
+        "std_mm": float(size_mm.std()),
+    }

@@ -1,0 +1,144 @@
+"""Candidates: every effect of the library at every place where these data can show it, with its prior probability.
+
+Beforehand all families are equally likely, and all places of a family: an effect that a rig may have at seven joints is
+tried seven times and must not win by that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from calibration.effects.columns import EffectColumns, same_columns
+from calibration.effects.context import EffectContext
+from calibration.effects.fitted import Choice
+from calibration.effects.library import library
+from calibration.gap.projection import Projection
+from calibration.observations import Floats
+
+LEAST_KNOWN = 0.5  # share of the rows that have what an effect needs
+
+
+@dataclass(frozen=True)
+class CandidateEffect:
+    """An effect at one place of the machine, in all its variants.
+
+    Attributes:
+        family, where: which effect, and at which joint, prism, `boom`, `base`, `station` or `clock`.
+        options: its o variants at this place.
+        additions: displacements of the samples by each variant.
+        log_odds: (o,) log prior probability of each variant, given the candidate.
+        log_prior: log prior probability of the candidate among all.
+    """
+
+    family: str
+    where: str
+    options: tuple[Choice, ...]
+    additions: tuple[EffectColumns, ...]
+    log_odds: Floats
+    log_prior: float
+
+    def __str__(self) -> str:
+        return f"{self.family}@{self.where}"
+
+    @cached_property
+    def first_equal(self) -> tuple[int, ...]:
+        """(o,) for each variant the first one with the same columns; the two differ in their prior alone."""
+        # Columns of different sums are told apart without comparing them.
+        sums = [(len(a), a.column.sum(), 0.0 if a.shift_mm is None else a.shift_mm.sum()) for a in self.additions]
+        return tuple(
+            next((k for k in range(n) if sums[k] == sums[n] and same_columns(self.additions[k], own)), n)
+            for n, own in enumerate(self.additions)
+        )
+
+
+@dataclass(frozen=True)
+class CandidateEffects:
+    """All candidates of the library.
+
+    Attributes:
+        candidates: effects that these data can show.
+        disabled: family -> what the data or the rig lack for it.
+    """
+
+    candidates: tuple[CandidateEffect, ...]
+    disabled: Mapping[str, str]
+
+
+def candidate_effects(
+    situation: EffectContext, over: Projection, families: Collection[str], without: Collection[str] = ()
+) -> CandidateEffects:
+    """Return the candidates of the given families.
+
+    Args:
+        situation: of the observations.
+        over: the projection to whose samples the columns belong.
+        families: names in the library.
+        without: `family@where` of the effects that are in the model already.
+    """
+    found: list[tuple[str, str, tuple[Choice, ...]]] = []
+    disabled: dict[str, str] = {}
+    for name in sorted(families):
+        family = library()[name]
+        places = family.places(situation.rig)
+        known = [where for where in places if family.known(situation, where).mean() >= LEAST_KNOWN]
+        here = [
+            (name, where, variants_at(situation, name, where)) for where in known if f"{name}@{where}" not in without
+        ]
+        if not places:
+            disabled[name] = f"rig {situation.rig.name!r} has no place for it"
+        elif not known:
+            disabled[name] = f"needs {family.needs(places[0])}"
+        elif here and not any(choices for _, _, choices in here):
+            disabled[name] = "these poses show nothing of it"
+        found += [one for one in here if one[2]]
+    log_prior = _log_priors([name for name, _, _ in found], {name.partition("@")[0] for name in without})
+    return CandidateEffects(
+        tuple(candidate_at(situation, over, name, where, choices, log_prior[name]) for name, where, choices in found),
+        disabled,
+    )
+
+
+def _log_priors(names: Sequence[str], again: Collection[str]) -> dict[str, float]:
+    """Return the log prior probability of one candidate of each family; families of `again` share half of it all.
+
+    Args:
+        names: the family of every candidate.
+        again: families that are in the model already.
+    """
+    count = {name: names.count(name) for name in names}
+    twice = sum(name in again for name in count)
+    once = len(count) - twice
+    share = {
+        name: (0.5 / twice if name in again else 0.5 / once) if twice and once else 1.0 / len(count) for name in count
+    }
+    return {name: math.log(share[name] / number) for name, number in count.items()}
+
+
+def candidate_at(
+    situation: EffectContext,
+    over: Projection,
+    family: str,
+    where: str,
+    choices: Sequence[Choice],
+    log_prior: float = 0.0,
+) -> CandidateEffect:
+    """Return the candidate with the given variants."""
+    odds = np.array([library()[family].odds(choice.settings) for choice in choices])
+    return CandidateEffect(
+        family,
+        where,
+        tuple(choices),
+        tuple(choice.columns(situation).over(over.samples.average) for choice in choices),
+        np.log(odds / odds.sum()),
+        log_prior,
+    )
+
+
+def variants_at(situation: EffectContext, family: str, where: str) -> tuple[Choice, ...]:
+    """Return the variants of an effect at a place; none where it cannot do anything there."""
+    return tuple(Choice(family, where, settings) for settings in library()[family].variants(situation, where))

@@ -1,0 +1,256 @@
+"""Criteria by which an effect is named: its evidence, its alternatives, and its stability under resampling.
+
+The posterior alone is conditional on the library, the noise and the linear model. Half-samples and held-out groups ask
+the data themselves, after projecting out the kinematics that all of them determine: half of a few poses determines
+none.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from calibration.effects.context import EffectContext
+from calibration.effects.fitted import Choice
+from calibration.effects.library import library
+from calibration.gap.candidates import CandidateEffect
+from calibration.gap.formulas.grammar import Formula
+from calibration.gap.projection import Projection, SoftProjection, from_products, rows_of, without_folds
+from calibration.gap.screening import ScoredEffect, Screen
+from calibration.numerics.statistics import chance_of_mean
+from calibration.observations import Floats
+from calibration.residual.folds import folds
+
+_ODDS, _FURTHER_ODDS = math.log(19.0), math.log(999.0)  # for a first effect, and for a further one
+_CHANCE, _FURTHER_CHANCE = 0.01, 0.003  # p-values, corrected for the number of candidates, of a first and a further one
+NEAR = 5.0  # log Bayes factor: families this near are not told apart
+_PLAIN = 100.0  # log Bayes factor beyond any doubt
+_EQUAL = math.log(19.0)  # log odds at which an alternative has a posterior of 0.05
+_POSSIBLE = 0.02  # posterior of an alternative
+_BOTH = 1.1  # sum of the posteriors of two effects that are both there
+_RELEVANT = 0.1  # of the leading log Bayes factor: less is neither like it nor seen in addition to it
+_COMPARED = 30  # candidates at least
+_SAME_FAMILY = 2  # forms and places of a family that a plan tells from the others as well
+_HALF_SAMPLES = 25
+_FOLDS = 10
+
+
+def promising(scored: Sequence[ScoredEffect]) -> list[CandidateEffect]:
+    """Return the candidates that may matter to the leading one; those like it or added to it stand out as well."""
+    order = sorted(scored, key=lambda w: -w.log_bayes_factor)
+    least = _RELEVANT * scored[0].log_bayes_factor
+    return [w.candidate for i, w in enumerate(order) if i < _COMPARED or w.log_bayes_factor > least or w is scored[0]]
+
+
+def further_places(screen: Screen, scored: Sequence[ScoredEffect]) -> list[ScoredEffect]:
+    """Return further places where the leading family is beyond any doubt, given that it is at the leading one."""
+    leading, found = scored[0], list[ScoredEffect]()
+    for w in sorted(scored[1:], key=lambda w: -w.log_bayes_factor):
+        own = w.candidate
+        if own.family != leading.candidate.family or w.log_bayes_factor < _PLAIN:
+            continue
+        there = [leading, *found]
+        without = screen.together(there)
+        gain = screen.together([*there, w]) - without
+        others = [v for v in scored if v.candidate.where == own.where and v.candidate.family != own.family]
+        alternative = max((screen.together([*there, v]) - without for v in others), default=-math.inf)
+        if gain > max(_PLAIN, alternative + 2 * NEAR):
+            found.append(w)
+    return found
+
+
+def joint_log_bayes_factor(screen: Screen, chosen: Mapping[int, tuple[int, float]]) -> float:
+    """Return the log Bayes factor of several effects together; 0 for none.
+
+    Args:
+        screen: the candidates.
+        chosen: number of the candidate -> its variant and scale.
+    """
+    if not chosen:
+        return 0.0
+    options = [(number, option) for number, (option, _) in chosen.items()]
+    return screen.log_bayes_factor(options, [scale for _, scale in chosen.values()])
+
+
+def may_stand_out(scored: Sequence[ScoredEffect]) -> bool:
+    """True if any candidate beats the no-effect model at that model's noise."""
+    return max(w.log_bayes_factor + w.candidate.log_prior for w in scored) > 0.0
+
+
+def stands_out(leading: ScoredEffect, log_bayes_factor: float, tested: int, *, is_further: bool) -> bool:
+    """True if an effect is there: by its evidence, and by the p-value of what it explains.
+
+    Args:
+        leading: the most probable candidate, scored with the noise that it leaves.
+        log_bayes_factor: of it against no effect, each with the noise that it leaves.
+        tested: number of candidates.
+        is_further: something is adopted already. Every further test is another chance of a false alarm, and an effect
+            that does not quite fit leaves traces that look like others.
+    """
+    odds, chance = (_FURTHER_ODDS, _FURTHER_CHANCE) if is_further else (_ODDS, _CHANCE)
+    return log_bayes_factor + leading.candidate.log_prior > odds and leading.p * tested < chance
+
+
+def stands_for(scored: ScoredEffect, formula: Formula, over: Projection) -> bool:
+    """True if an effect does what a formula says, though the formula explains the data better.
+
+    The effect may explain as much with more coefficients than these data ask for, at the same place; a simpler error of
+    another place that explains more is something else.
+    """
+    return scored.candidate.where == formula.term.source.where and explains(scored, formula, over)
+
+
+def explains(scored: ScoredEffect, formula: Formula, over: Projection) -> bool:
+    """True if the data do not ask for a formula in addition to an effect."""
+    additions = scored.scaled_additions
+    columns = over.columns(over.moved_mm(additions)) * additions.prior_sigma
+    return not formula.adds_to(columns, over.residual)
+
+
+def best_of_each_family(scored: Sequence[ScoredEffect]) -> list[ScoredEffect]:
+    """Return the best candidate of each family, the leading one first, then by evidence."""
+    found: dict[str, ScoredEffect] = {}
+    for w in sorted(scored, key=lambda w: -w.log_bayes_factor):
+        found.setdefault(w.candidate.family, w)
+    leading = scored[0]
+    return [leading, *(w for family, w in found.items() if family != leading.candidate.family)]
+
+
+def near_alternatives(scored: Sequence[ScoredEffect]) -> list[ScoredEffect]:
+    """Return the leading effect, and the best of each other family that could be the true effect instead."""
+    found = {scored[0].candidate.family: scored[0]}
+    for w in sorted(scored[1:], key=lambda w: -w.log_bayes_factor):
+        if is_near(scored[0], w):
+            found.setdefault(w.candidate.family, w)
+    return list(found.values())
+
+
+def is_near(leading: ScoredEffect, other: ScoredEffect) -> bool:
+    """True if `other` could be the true effect instead of `leading`, and is not there in addition to it."""
+    near = other.log_bayes_factor > leading.log_bayes_factor - NEAR or other.posterior > _POSSIBLE
+    return near and other.posterior + leading.posterior < _BOTH
+
+
+def with_same_family(alternative: ScoredEffect, screen: Screen, scored: Sequence[ScoredEffect]) -> ScoredEffect:
+    """Return one of a set with the other forms and places of its family that could be true, the most probable first."""
+    least = scored[0].log_bayes_factor - NEAR
+    elsewhere = [w for w in scored if w.candidate.family == alternative.candidate.family and w is not alternative]
+    near = [w for w in elsewhere if w.log_bayes_factor >= least and is_near(scored[0], w)]
+    others = sorted([*near, *screen.forms(alternative, least)], key=lambda w: -w.log_bayes_factor)
+    return replace(alternative, same_family=tuple(others[:_SAME_FAMILY]))
+
+
+def beyond_doubt(best: Sequence[ScoredEffect]) -> bool:
+    """True if the leading effect is plain and no other family comes near, by the best of each family."""
+    leading, *others = (w.log_bayes_factor for w in best)
+    return leading > max([_PLAIN, *(other + 2 * NEAR for other in others)])
+
+
+def as_simple(leading: ScoredEffect, alternative: ScoredEffect) -> bool:
+    """True if an alternative explains the data nearly as well with no more coefficients.
+
+    Its prior probability is no evidence, neither by the number of its places nor by the size that it asks for. That
+    something simpler explains as much as a part of the leading effect is.
+    """
+    better = leading.log_bayes_factor - alternative.log_bayes_factor
+    fits_better = leading.log_likelihood - alternative.log_likelihood
+    return alternative.size <= leading.size and better < NEAR and min(better, fits_better) < _EQUAL
+
+
+def with_finer(
+    candidate: CandidateEffect, option: int, choice: Choice, over: Projection, situation: EffectContext
+) -> CandidateEffect:
+    """Return a candidate with a finer form of one of its variants added, at that form's own prior odds."""
+    choice, family = replace(choice, scale=1.0), library()[candidate.family]
+    additions = choice.columns(situation).over(over.samples.average)
+    log_odds = math.log(family.odds(choice.settings) / family.odds(candidate.options[option].settings))
+    return replace(
+        candidate,
+        options=(*candidate.options, choice),
+        additions=(*candidate.additions, additions),
+        log_odds=np.append(candidate.log_odds, candidate.log_odds[option] + log_odds),
+    )
+
+
+def odds_text(best: ScoredEffect, other: ScoredEffect) -> str:
+    """Return a clause: how much better the best explains the data than another."""
+    log_odds = best.log_bayes_factor - other.log_bayes_factor
+    times = f"e^{log_odds:.0f}" if log_odds > math.log(1000.0) else f"{math.exp(max(log_odds, 0.0)):.0f}"
+    return f"{best.candidate} explains the data {times} times better"
+
+
+def half_sample_wins(
+    projection: Projection, family: Sequence[ScoredEffect], alternatives: Sequence[ScoredEffect], seed: int
+) -> dict[str, float]:
+    """Return the share of half-samples, drawn by group, in which each family has the greatest evidence.
+
+    A likely partner of the first candidate is added to each of them. Both halves share the cost of not knowing a form.
+
+    Args:
+        projection: about the fit.
+        family: the candidate, and other places of its family that come near.
+        alternatives: those of other families that come near; no effect is an alternative too.
+        seed: of the halves.
+
+    Returns:
+        `family@where` -> share, the greatest first, of all that win any; the family by the name of the candidate.
+    """
+    scored = [*family, *alternatives]
+    left = _whitened(projection, family[0], scored)
+    edges = np.cumsum([0, *(len(w.additions) for w in scored)])
+    labels, group = np.unique(projection.groups, return_inverse=True)
+    rng = np.random.default_rng(seed)
+    names = [str(family[0].candidate)] * len(family) + [str(w.candidate) for w in alternatives]
+    won = Counter[str]()
+    for _ in range(_HALF_SAMPLES):
+        half = np.isin(group, rng.permutation(len(labels))[: (len(labels) + 1) // 2])
+        rows = left[rows_of(np.flatnonzero(half))]
+        values = []
+        for w, (a, b) in zip(scored, itertools.pairwise(edges.tolist()), strict=True):
+            own = rows[:, a:b]
+            values.append(0.5 * w.form_averaging + from_products(own.T @ own, own.T @ rows[:, -1], np.ones(b - a)))
+        best = int(np.argmax(values))
+        if values[best] > 0.0:
+            won[names[best]] += 1
+    return {name: count / _HALF_SAMPLES for name, count in won.most_common()}
+
+
+def cross_validation_p(projection: Projection, scored: ScoredEffect, seed: int) -> float:
+    """Return the p-value of an effect's predictions of held-out groups (t-test, one-sided).
+
+    Of a few groups that have all of the evidence none predicts the others.
+    """
+    left = _whitened(projection, scored, [scored])
+    columns, target = left[:, :-1], left[:, -1]
+    along = np.empty(len(projection.groups))
+    fold = folds(projection.groups, _FOLDS, seed)
+    for number, x in without_folds(columns, target, fold):
+        rows = rows_of(np.flatnonzero(fold == number))
+        along[fold == number] = ((columns[rows] @ x) * target[rows]).reshape(-1, 3).sum(axis=1)
+    group = np.unique(projection.groups, return_inverse=True)[1]
+    return chance_of_mean(np.bincount(group, along).astype(np.float64))
+
+
+def beyond(situation: EffectContext, scored: ScoredEffect) -> tuple[str, ...]:
+    """Return names of the coefficients whose linear estimate is beyond their hard limits by more than chance."""
+    return scored.choice.beyond(situation, scored.estimate, scored.standard_error)
+
+
+def _whitened(projection: Projection, leading: ScoredEffect, scored: Sequence[ScoredEffect]) -> Floats:
+    """Return (3 m, k + 1) columns of several effects and the target, without kinematics and the first's partner."""
+    columns = [_columns(projection, w) for w in scored]
+    without = projection.without_kinematics
+    if leading.partner is not None:
+        without = SoftProjection(np.hstack([projection.kinematics, _columns(projection, leading.partner)]))
+    return without(np.column_stack([*columns, projection.target]))
+
+
+def _columns(projection: Projection, scored: ScoredEffect) -> Floats:
+    """Return (3 m, k) whitened columns, in prior sigmas."""
+    whitened = projection.whitened(projection.moved_mm(scored.additions))
+    return whitened * (scored.additions.prior_sigma * scored.scale)

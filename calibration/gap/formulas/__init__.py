@@ -1,0 +1,1 @@
+"""Formulas for errors that no effect of the library explains."""

@@ -1,0 +1,116 @@
+"""The terms of the grammar: an error at a source, proportional to one variable or to the product of two."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from calibration.gap.formulas.variables import ErrorSource, Variable, Variables
+from calibration.gap.projection import Projection
+from calibration.observations import Floats
+
+Kind = Literal["single", "crossing", "product"]
+
+_SHARES: Mapping[Kind, float] = {"single": 0.8, "crossing": 0.1, "product": 0.1}  # of the terms' odds beforehand
+_SAME = 0.9995  # correlation of two variables that one source tells apart in no data
+_COMPARED = 1500  # samples are enough to see that
+_ROUNDING = 1e-9
+_AT_ONCE = 2e6  # numbers of a block of columns
+_TINY = float(np.finfo(np.float64).tiny)
+
+
+@dataclass(frozen=True)
+class Term:
+    """A formula of one coefficient.
+
+    Attributes:
+        source: what is off.
+        variable: what it is proportional to.
+        kind: a variable of the source itself, one of another joint, or two together.
+        log_prior: beforehand, among all terms.
+    """
+
+    source: ErrorSource
+    variable: Variable
+    kind: Kind
+    log_prior: float
+
+    def __str__(self) -> str:
+        return f"{self.variable.text} at {self.source.where}"
+
+    @property
+    def moved_mm(self) -> Floats:
+        """(m, 3) displacement of the prism per unit of the coefficient, station's frame."""
+        moved: Floats = self.source.moved_mm * self.variable.values[:, None]
+        return moved
+
+
+def all_terms(variables: Variables) -> tuple[Term, ...]:
+    """All terms but those that are another one of the same source in these data.
+
+    Single variables share most of the odds beforehand, what happens at other joints and products the rest.
+    """
+    found: list[tuple[ErrorSource, Variable, Kind]] = []
+    for source in variables.sources():
+        words: tuple[tuple[Kind, Iterable[Variable]], ...] = (
+            ("single", variables.singles(source)),
+            ("crossing", variables.crossings(source)),
+            ("product", variables.products(source)),
+        )
+        own = [(variable, kind) for kind, some in words for variable in some]
+        different = (
+            _different(np.column_stack([v.values for v, _ in own]), has_offset=source.constant is None) if own else ()
+        )
+        found += [(source, *own[i]) for i in different]
+    count = Counter(kind for _, _, kind in found)
+    return tuple(
+        Term(source, variable, kind, math.log(_SHARES[kind] / count[kind])) for source, variable, kind in found
+    )
+
+
+def modulations(projection: Projection, source: ErrorSource) -> tuple[Term, ...]:
+    """Return an error of known pattern times each of the variables that its size may depend on.
+
+    Each counts from the value at which the product shows nothing of the error itself. The size is fitted, and shrunk by
+    its prior: along the error there is always something left that follows the size.
+    """
+    every = Variables(projection).conditions(source.where)
+    own = [every[i] for i in _different(np.column_stack([v.values for v in every]), has_offset=True)]
+    values = np.column_stack([np.ones(len(source.moved_mm)), *(v.values for v in own)])
+    itself, *products = projection.columns(source.moved_mm[:, :, None] * values[:, None]).T
+    square = max(float(itself @ itself), _TINY)
+    about = [replace(v, values=v.values - product @ itself / square) for v, product in zip(own, products, strict=True)]
+    return tuple(Term(source, variable, "single", -math.log(len(about))) for variable in about)
+
+
+def _different(values: Floats, *, has_offset: bool) -> list[int]:
+    """Return columns of (m, k) that repeat none before them, nor a constant where the kinematics have one."""
+    values = values[:: max(len(values) // _COMPARED, 1)]
+    least = _ROUNDING * np.linalg.norm(values, axis=0)
+    values = values - values.mean(axis=0) if has_offset else values
+    length = np.linalg.norm(values, axis=0)
+    varies = length > least
+    unit = values / np.where(varies, length, 1.0)
+    same = np.triu(np.abs(unit.T @ unit) > _SAME, 1).any(axis=0)
+    different: list[int] = np.flatnonzero(varies & ~same).tolist()
+    return different
+
+
+def chunks(terms: Sequence[Term], samples: int) -> Iterator[Sequence[Term]]:
+    """Yield the terms in batches whose columns fit into the caches and the memory of a small machine."""
+    step = max(int(_AT_ONCE) // (3 * samples), 1)
+    for start in range(0, len(terms), step):
+        yield terms[start : start + step]
+
+
+def columns_of(projection: Projection, terms: Sequence[Term]) -> tuple[Floats, Floats, Floats]:
+    """Return displacements (m, 3, k) of terms, mm; (3 m, k) unit columns of the projected space; (k,) their lengths."""
+    moved = np.stack([term.moved_mm for term in terms], axis=2)
+    columns = projection.columns(moved)
+    length = np.linalg.norm(columns, axis=0)
+    return moved, columns / np.maximum(length, _TINY), length

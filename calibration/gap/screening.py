@@ -1,0 +1,311 @@
+"""Screening: every effect of the library at every place, scored by its evidence in the data.
+
+An effect's evidence is a closed form in the projected space (`projection`), averaged over its variants. Candidates are
+scored one at a time, and the best in pairs: of two effects that are there, a third that looks like their sum may beat
+each alone.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import chdtrc, logsumexp
+
+from calibration.effects.base import FittedCoefficient
+from calibration.effects.columns import EffectColumns, joined
+from calibration.effects.context import EffectContext
+from calibration.effects.fitted import Choice, FittedEffect
+from calibration.effects.library import library
+from calibration.gap.candidates import CandidateEffect
+from calibration.gap.projection import Projection, from_products
+from calibration.observations import Floats
+
+_PAIRED = 10
+_SECOND = math.log(0.05)  # prior probability that a second effect is there
+_AT_ONCE = 128  # columns
+_KEPT = 16  # variants whose rows are cached; all of them are gigabytes where there are thousands of fixes
+_SEEN = 1e-10  # least eigenvalue of products of columns, of their largest
+_TINY = float(np.finfo(np.float64).tiny)
+_EQUAL = 5.0  # log Bayes factor; less is no difference
+SCALES = (1 / 3, 1.0, 3.0, 10.0)  # of plausible sizes, which are not known better than that
+_SQUARED_SCALES = np.square(SCALES)[:, None]
+LOG_SCALE_ODDS = dict(zip(SCALES, np.log([0.2, 0.5, 0.25, 0.05]).tolist(), strict=True))
+
+
+@dataclass(frozen=True)
+class ScoredEffect:
+    """A candidate with its evidence.
+
+    Attributes:
+        candidate: the effect at its place.
+        option: index of its best variant.
+        scale: of that variant's plausible sizes.
+        estimate, standard_error: (k,) of its coefficients in the linear model.
+        log_bayes_factor: against no effect, averaged over its variants.
+        form_averaging: that less the log Bayes factor of its best variant alone, the cost of not knowing the form.
+        log_likelihood: log likelihood ratio against no effect at the best coefficients, averaged over variants.
+        p: p-value of the squares that the best variant explains, corrected for its variants.
+        posterior: probability of the candidate among all candidates, pairs and no effect.
+        log_evidence: log posterior odds against no effect of the most probable model with this candidate.
+        partner: the other effect of the pair, where that model is a pair.
+        same_family: other forms and places of its family that the data do not tell from it.
+    """
+
+    candidate: CandidateEffect
+    option: int
+    scale: float
+    estimate: Floats
+    standard_error: Floats
+    log_bayes_factor: float
+    form_averaging: float
+    log_likelihood: float
+    p: float
+    posterior: float = 0.0
+    log_evidence: float = -math.inf
+    partner: ScoredEffect | None = None
+    same_family: tuple[ScoredEffect, ...] = ()
+
+    @property
+    def choice(self) -> Choice:
+        """The best variant, at the scale that the data ask for."""
+        return replace(self.candidate.options[self.option], scale=self.scale)
+
+    def fitted(self, situation: EffectContext) -> FittedEffect:
+        """Return the effect with the coefficients of the linear model."""
+        return self.choice.fitted(situation, self.estimate, self.standard_error)
+
+    @property
+    def additions(self) -> EffectColumns:
+        """Displacements of the samples by the best variant."""
+        return self.candidate.additions[self.option]
+
+    @property
+    def scaled_additions(self) -> EffectColumns:
+        """`additions` with prior sigmas at the scale that the data ask for."""
+        return replace(self.additions, prior_sigma=self.additions.prior_sigma * self.scale)
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients that outputs list; the others only shape the effect."""
+        choice, names = self.choice, [name.partition(":")[2] for name in self.additions.names]
+        fitted = [FittedCoefficient(name, "", 0.0, 1.0, 1.0) for name in names]
+        listed = {c.name for c in library()[choice.family].reported(choice.settings, tuple(fitted))}
+        return sum(name in listed for name in names) or len(names)
+
+
+class Screen:
+    """Products of the columns of all candidates in the projected space, so that any set of them is scored at once.
+
+    Args:
+        projection: the projected space.
+        candidates: the effects.
+    """
+
+    def __init__(self, projection: Projection, candidates: Sequence[CandidateEffect]) -> None:
+        self.projection, self.candidates = projection, tuple(candidates)
+        self._number = {id(candidate): number for number, candidate in enumerate(self.candidates)}
+        self._block: dict[tuple[int, int], int] = {}
+        blocks: list[EffectColumns] = []
+        for number, candidate in enumerate(self.candidates):
+            for option, first in enumerate(candidate.first_equal):
+                self._block[number, option] = len(blocks) if first == option else self._block[number, first]
+                if first == option:
+                    blocks.append(candidate.additions[option])
+        target = projection.target
+        removed_target = projection.without_kinematics.removed(target)
+        self._blocks, self._kept = blocks, dict[int, Floats]()
+        self._removed: list[Floats] = []
+        self._along: list[Floats] = []
+        self._gram: dict[tuple[int, int], Floats] = {}
+        for together in _batches(blocks):
+            whitened = projection.whitened(projection.moved_mm(joined(together, len(projection.samples))))
+            removed = projection.without_kinematics.removed(whitened)
+            along = whitened.T @ target - removed.T @ removed_target
+            edges = np.cumsum([len(additions) for additions in together])[:-1]
+            self._along += np.split(along, edges)
+            both = zip(np.split(whitened, edges, axis=1), np.split(removed, edges, axis=1), strict=True)
+            for number, (rows, own) in enumerate(both, len(self._removed)):
+                self._gram[number, number] = rows.T @ rows - own.T @ own
+                self._removed.append(own)
+
+    def columns(self, candidate: int, option: int) -> Floats:
+        """Return (3 m, k) the projected columns of a variant."""
+        return self.projection.without_kinematics(self._whitened(self._block[candidate, option]))
+
+    def distinct(self, candidate: int) -> tuple[tuple[int, ...], ...]:
+        """Return the variants of a candidate, grouped where they differ in their prior alone."""
+        found: dict[int, list[int]] = {}
+        for option in range(len(self.candidates[candidate].options)):
+            found.setdefault(self._block[candidate, option], []).append(option)
+        return tuple(map(tuple, found.values()))
+
+    def log_bayes_factor(self, chosen: Sequence[tuple[int, int]], scales: Sequence[float] | None = None) -> float:
+        """Return the log Bayes factor of several variants together against no effect.
+
+        Args:
+            chosen: (candidate, option) of each.
+            scales: of the plausible sizes of each; 1 by default.
+        """
+        blocks = [self._block[which] for which in chosen]
+        gram = np.block([[self._product(a, b) for b in blocks] for a in blocks])
+        along = np.concatenate([self._along[block] for block in blocks])
+        sigma = np.concatenate(
+            [
+                self.candidates[candidate].additions[option].prior_sigma * scale
+                for (candidate, option), scale in zip(chosen, scales or [1.0] * len(chosen), strict=True)
+            ]
+        )
+        return from_products(gram, along, sigma)
+
+    def together(self, scored: Sequence[ScoredEffect]) -> float:
+        """Return the log Bayes factor of several effects together, in their best variants."""
+        chosen = [(self._number[id(w.candidate)], w.option) for w in scored]
+        return self.log_bayes_factor(chosen, [w.scale for w in scored])
+
+    def score(self, without: Collection[str] = ()) -> tuple[ScoredEffect, ...]:
+        """Score all candidates, sorted by the most probable model that has them.
+
+        Of a pair the one that shows more by itself comes first: two similar effects share the probability of the one
+        that is there, and a small effect added to either of them would keep all of its own.
+
+        Args:
+            without: `family@where` of candidates to leave out.
+        """
+        each = {n: self._score_one(n) for n, c in enumerate(self.candidates) if str(c) not in without}
+        best = sorted(each, key=lambda n: -(each[n].log_bayes_factor + each[n].candidate.log_prior))[:_PAIRED]
+        models: list[tuple[tuple[int, ...], float]] = [((), 0.0)]
+        models += [((n,), w.log_bayes_factor + w.candidate.log_prior) for n, w in each.items()]
+        for i, k in itertools.combinations(best, 2):
+            pair = [each[i], each[k]]
+            prior = sum(w.candidate.log_prior for w in pair) + math.log(2.0) + _SECOND
+            models.append(((i, k), self.together(pair) + each[i].form_averaging + each[k].form_averaging + prior))
+        total = logsumexp([value for _, value in models])
+        share, top = dict.fromkeys(each, 0.0), dict.fromkeys(each, -math.inf)
+        partner: dict[int, ScoredEffect | None] = dict.fromkeys(each)
+        for members, value in models:
+            for number in members:
+                share[number] += math.exp(value - total)
+                if value > top[number]:
+                    top[number] = value
+                    partner[number] = next((each[other] for other in members if other != number), None)
+        scored = [replace(w, posterior=share[n], log_evidence=top[n], partner=partner[n]) for n, w in each.items()]
+        return tuple(sorted(scored, key=lambda w: (-w.log_evidence, -w.log_bayes_factor, str(w.candidate))))
+
+    def forms(self, scored: ScoredEffect, least: float) -> Iterator[ScoredEffect]:
+        """Yield a scored effect in its other forms, finer ones aside, with at least this log Bayes factor."""
+        choice, situation = scored.choice, self.projection.situation
+        if library()[choice.family].refined(situation, choice.where, choice.settings):
+            return
+        number = self._number[id(scored.candidate)]
+        values, odds, likelihood = self._values(number)
+        for together in self.distinct(number):
+            of_form = np.full_like(values, -math.inf)
+            of_form[list(together)] = values[list(together)]
+            if scored.option not in together and logsumexp(of_form) >= least:
+                yield self._score_best(number, of_form, odds, likelihood)
+
+    def _score_one(self, number: int) -> ScoredEffect:
+        """Score one candidate without its strained variants, as long as these would be the best.
+
+        Variants whose coefficients are beyond their limits are left out where another explains the data as well: of
+        forms that mirror or outgrow each other, only the sign and the size of the coefficients say which it is.
+        """
+        values, odds, likelihood = self._values(number)
+        while True:
+            found = self._score_best(number, values, odds, likelihood)
+            estimate, error = found.estimate, found.standard_error
+            is_strained = found.choice.strained(estimate, error)
+            if not is_strained and not found.choice.beyond(self.projection.situation, estimate, error):
+                return found
+            rest = values.copy()
+            rest[found.option] = -math.inf
+            if rest.max() < (-math.inf if is_strained else values.max() - _EQUAL) or np.isneginf(rest).all():
+                return found
+            values = rest
+
+    def _values(self, number: int) -> tuple[Floats, Floats, float]:
+        """Return (options, scales) log evidence and prior odds of a candidate, and its log likelihood ratio."""
+        candidate = self.candidates[number]
+        each = [self._at_scales(number, option) for option in range(len(candidate.options))]
+        odds = candidate.log_odds[:, None] + np.array(list(LOG_SCALE_ODDS.values()))
+        values = odds + [at_scales for at_scales, _ in each]
+        return values, odds, float(logsumexp(candidate.log_odds + [0.5 * explained for _, explained in each]))
+
+    def _score_best(self, number: int, values: Floats, odds: Floats, log_likelihood: float) -> ScoredEffect:
+        """Score a candidate by its best variant and scale; `values` and `odds` are those of `_values`."""
+        candidate = self.candidates[number]
+        option, best = np.unravel_index(int(np.argmax(values)), values.shape)
+        prior = candidate.additions[option].prior_sigma * SCALES[best]
+        size, axes, along = self._eigen(number, int(option))
+        size, along = size * SCALES[best] ** 2, along * SCALES[best]
+        explained, degrees = _explained(size, along)
+        p = float(chdtrc(degrees, explained))
+        together = float(logsumexp(values))
+        tested = len({self._block[number, o] for o in range(len(values))})
+        return ScoredEffect(
+            candidate,
+            int(option),
+            SCALES[best],
+            prior * (axes @ (along / (1.0 + size))),
+            prior * np.sqrt(np.clip(1.0 - axes**2 @ (size / (1.0 + size)), 0.0, 1.0)),
+            together,
+            together - float(values[option, best] - odds[option, best]),
+            log_likelihood,
+            min(p * tested, 1.0),
+        )
+
+    def _at_scales(self, number: int, option: int) -> tuple[Floats, float]:
+        """Return (scales,) log Bayes factors of a variant by itself, and the squares that it explains at most."""
+        one, _, along_one = self._eigen(number, option)
+        size, squares = one * _SQUARED_SCALES, along_one**2 * _SQUARED_SCALES
+        values: Floats = 0.5 * (squares / (1.0 + size) - np.log1p(size)).sum(axis=1)
+        return values, _explained(one, along_one)[0]
+
+    def _eigen(self, number: int, option: int) -> tuple[Floats, Floats, Floats]:
+        """Return eigenvalues (k,) and axes (k, k) of a variant's G'G in prior sigmas, and G'r along these axes."""
+        block = self._block[number, option]
+        sigma = self.candidates[number].additions[option].prior_sigma
+        size, axes = np.linalg.eigh(self._product(block, block) * sigma * sigma[:, None])
+        return np.maximum(size, 0.0), axes, axes.T @ (self._along[block] * sigma)
+
+    def _product(self, a: int, b: int) -> Floats:
+        if (a, b) not in self._gram:
+            product = self._whitened(a).T @ self._whitened(b) - self._removed[a].T @ self._removed[b]
+            self._gram[a, b], self._gram[b, a] = product, product.T
+        return self._gram[a, b]
+
+    def _whitened(self, block: int) -> Floats:
+        """Return (3 m, k) the whitened columns of a block."""
+        if block not in self._kept:
+            if len(self._kept) == _KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[block] = self.projection.whitened(self.projection.moved_mm(self._blocks[block]))
+        return self._kept[block]
+
+
+def _explained(size: Floats, along: Floats) -> tuple[float, int]:
+    """Return the squares that columns explain and their rank, from the eigenvalues (k,) of G'G and G'r along these."""
+    seen = size > _SEEN * max(float(size[-1]), _TINY)
+    return float((along[seen] ** 2 / size[seen]).sum()), int(seen.sum())
+
+
+def _batches(blocks: Sequence[EffectColumns]) -> Iterator[Sequence[EffectColumns]]:
+    """Yield the blocks in batches of some columns: one pass over the rows serves a batch."""
+    first, width = 0, 0
+    for number, additions in enumerate(blocks, 1):
+        width += len(additions)
+        if width >= _AT_ONCE or number == len(blocks):
+            yield blocks[first:number]
+            first, width = number, 0
+
+
+def by_family(scored: Iterable[ScoredEffect]) -> dict[str, float]:
+    """Return family -> posterior, the greatest first; a family at several places at once counts once."""
+    found: dict[str, float] = {}
+    for w in scored:
+        found[w.candidate.family] = min(1.0, found.get(w.candidate.family, 0.0) + w.posterior)
+    return dict(sorted(found.items(), key=lambda item: -item[1]))

@@ -1,0 +1,1 @@
+"""Forward kinematics of any rig, compiled, with Jacobians and gravity loads."""

@@ -1,0 +1,1 @@
+"""The calibrated model: its data, files, predictions, warnings and inverse."""

@@ -1,0 +1,401 @@
+"""Inverse of a calibrated model: the joint values to command for wanted positions of prisms.
+
+Newton's method through the whole model: the kinematics have an exact Jacobian, effects and learned residual one by
+differences over a thousandth of each joint's range, which smooths over the steps of trees. Of all joint values that
+bring the prisms to their targets (a boom has more joints than a target has coordinates) the step goes to those nearest
+the nominal command, distances in ranges of the joints: d = d_0 + A+ (e - A d_0), A the Jacobian in these units, with
+the joints at their limits taken out (active set). It is damped as by Levenberg and Marquardt where it would not bring
+the prisms nearer. Only the branch of solutions at the nominal command is searched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.errors import DataError
+from calibration.model.model import CalibratedModel
+from calibration.model.prediction import Predictor, check_setups
+from calibration.model.warnings import model_warnings
+from calibration.observations import Floats, Observations
+
+Integers = NDArray[np.intp]
+Flags = NDArray[np.bool_]
+
+CLOSURE_MM = 0.01  # a target is reached if the model has its prism so near
+
+_CLOSE_MM = 1e-3  # what the iterations aim at
+_STILL = 1e-5  # in ranges of the joints: a smaller move towards the nominal command is none
+_NO_STEP = 1e-9  # in ranges of the joints
+_LONGEST = 0.1  # step, in the same
+_DIFFERENCE = 1e-3  # of a joint's range
+_STIFF, _SOFT = 1e-6, 1e-12  # of the largest eigenvalue of A A': what moves prisms so little is left alone
+_ROUNDS, _SOFT_ROUNDS, _DAMPED_ROUNDS = 8, 16, 50
+_FIRST_DAMPING = 1e-3  # of the largest eigenvalue
+_LEAST_GAIN = 1e-3  # of the distance; a pose that gains less for some rounds stays where it is
+_PATIENCE = 4
+_STUCK_MM = 1.0  # nearer than this, the learned residual may be what keeps a pose from its target
+_NUDGES = (3e-3, 1e-2, 3e-2)  # in ranges of the joints
+_CHORDS = 8
+_TOGETHER = 500  # poses
+
+
+@dataclass(frozen=True)
+class Inverse:
+    """Commands for targets.
+
+    Attributes:
+        observations: the rows given, with the joint values to command.
+        closure_mm: (n,) distance that the model then has between each prism and its target.
+        warnings: about targets out of reach, and about using the model for these commands.
+    """
+
+    observations: Observations
+    closure_mm: Floats
+    warnings: tuple[str, ...]
+
+    @property
+    def reached(self) -> Flags:
+        """(n,) True for targets reached to 0.01 mm."""
+        return self.closure_mm <= CLOSURE_MM
+
+
+def inverse(model: CalibratedModel, targets: Observations) -> Inverse:
+    """Find the joint values with which the model has prisms at their targets.
+
+    Rows of one session, set-up and pose are one pose and are solved together: two prisms of a feed give its attitude.
+    Where not all can be reached inside the limits of the joints, a pose comes as near as it can (least squares over its
+    rows), and the closures say how near.
+
+    Args:
+        model: the whole model counts: effects and residual too. Columns that they need are taken from the rows.
+        targets: n rows whose positions are where the prisms should be, in the frame of their set-up's station, and
+            whose joints are the nominal command: where the search begins and what the result stays nearest to.
+            Positions are those that the station would measure, as `predict` gives them, with what its fixes err by.
+
+    Raises:
+        DataError: a row without a position, a joint value that is no number, rows of one pose with different commands.
+        UnsafeError: a set-up that the model does not know.
+    """
+    check_setups(model, targets)
+    poses = _poses(targets)
+    _check(model, targets, poses)
+    joints = np.array([targets.joints[name] for name in model.rig.joint_names]).T.copy()
+    closure = np.empty(len(targets))
+    for size in sorted({len(rows) for rows in poses}):
+        together = np.array([rows for rows in poses if len(rows) == size], dtype=np.intp)
+        for first in range(0, len(together), _TOGETHER):
+            rows = together[first : first + _TOGETHER]
+            found = _Search(model, targets, rows).run()
+            joints[rows] = found.readings[:, None, :]
+            closure[rows] = np.linalg.norm(found.error.reshape(len(rows), size, 3), axis=2)
+    commanded = replace(targets, joints=dict(zip(model.rig.joint_names, joints.T.copy(), strict=True)))
+    warnings = (*_out_of_reach(model, commanded, closure, poses), *model_warnings(model, commanded))
+    return Inverse(commanded, closure, warnings)
+
+
+@dataclass
+class _State:
+    """Poses during the search.
+
+    Attributes:
+        readings: (p, joints) deg or mm.
+        error: (p, 3 m) from the prisms to their targets, mm.
+        slope: (p, 3 m, joints) mm per range of each joint.
+    """
+
+    readings: Floats
+    error: Floats
+    slope: Floats
+
+    def select(self, rows: Flags | Integers) -> _State:
+        return _State(self.readings[rows], self.error[rows], self.slope[rows])
+
+    def take(self, rows: Flags | Integers, other: _State) -> None:
+        """Put the poses of another state in place of these rows."""
+        self.readings[rows], self.error[rows], self.slope[rows] = other.readings, other.error, other.slope
+
+    @property
+    def distance(self) -> Floats:
+        """(p,) mm, over all prisms of a pose."""
+        size: Floats = np.sqrt((self.error**2).sum(axis=1))
+        return size
+
+
+class _Search:
+    """p poses of m rows each.
+
+    Args:
+        model: what has to be inverted.
+        targets: all rows.
+        rows: (p, m) those of each pose.
+    """
+
+    def __init__(self, model: CalibratedModel, targets: Observations, rows: Integers) -> None:
+        self._predictor: Predictor = Predictor.of(model)
+        self._names = model.rig.joint_names
+        self._targets, self._rows = targets, rows
+        self._low, self._high = np.array([joint.limits for joint in model.rig.joints], dtype=np.float64).T
+        self._range = self._high - self._low
+        self._bends = bool(model.effects) or model.residual is not None
+        self._nominal = np.array([targets.joints[name][rows[:, 0]] for name in self._names]).T
+        self._wanted = targets.position_mm[rows].reshape(len(rows), -1)
+
+    def run(self) -> _State:
+        """Solve all poses."""
+        every = np.arange(len(self._rows))
+        state = self._at(every, np.clip(self._nominal, self._low, self._high))
+        self._freely(every, state, _STIFF, _ROUNDS)
+        if self._bends and self._rows.shape[1] > 1:
+            self._freely(self._far(state), state, _SOFT, _SOFT_ROUNDS)
+        for pose in self._far(state).tolist() if self._bends else ():
+            if state.distance[pose] < _STUCK_MM:
+                self._nudge(pose, state)
+        self._damped(self._far(state), state)
+        return state
+
+    @staticmethod
+    def _far(state: _State) -> Integers:
+        return np.flatnonzero(state.distance > _CLOSE_MM)
+
+    def _freely(self, moving: Integers, state: _State, rank: float, rounds: int) -> None:
+        """Take Newton's steps, nearer or not, and keep the nearest places.
+
+        Most poses need no more. Prisms on one body, though, keep their distance but for what the learned residual makes
+        of it. To close that little the joints have to move far, along a curve that a straight step leaves: then a step
+        along it (small `rank`) and steps back to it take turns, and those do not lead towards the nominal command.
+        """
+        now = state.select(moving)
+        for _ in range(rounds):
+            along = (now.distance < _STUCK_MM) | (rank == _STIFF)
+            step, home = self._step(
+                moving, now, np.zeros(len(moving)), along.astype(float), np.where(along, rank, _STIFF)
+            )
+            closed = (now.distance <= _CLOSE_MM) & (np.abs(home).max(axis=1, initial=0.0) < _STILL)
+            going = ~closed & (np.abs(step).max(axis=1, initial=0.0) > _NO_STEP)
+            moving, now, step = moving[going], now.select(going), step[going]
+            if len(moving) == 0:
+                break
+            step *= np.minimum(1.0, _LONGEST / np.abs(step).max(axis=1))[:, None]
+            now = self._at(moving, np.clip(now.readings + step * self._range, self._low, self._high))
+            better = (now.distance <= _CLOSE_MM) | (now.distance < state.distance[moving])
+            state.take(moving[better], now.select(better))
+
+    def _damped(self, moving: Integers, state: _State) -> None:
+        """Take damped steps (Levenberg and Marquardt) for as long as they bring the prisms nearer."""
+        damping, ease = np.zeros(len(self._rows)), np.ones(len(self._rows))
+        idle = np.zeros(len(self._rows), dtype=np.intp)
+        for _ in range(_DAMPED_ROUNDS):
+            if len(moving) == 0:
+                break
+            now = state.select(moving)
+            step, _ = self._step(moving, now, damping[moving], ease[moving], np.full(len(moving), _SOFT))
+            reached = self._at(moving, np.clip(now.readings + step * self._range, self._low, self._high))
+            before, after = now.distance, reached.distance
+            better = after < before
+            state.take(moving[better], reached.select(better))
+            largest = np.square(now.slope).sum(axis=(1, 2))
+            worse, good = moving[~better], moving[better]
+            damping[worse] = np.maximum(10.0 * damping[worse], _FIRST_DAMPING * largest[~better])
+            damping[good] *= np.where(damping[good] > _SOFT * largest[better], 0.1, 0.0)
+            ease[worse] *= 0.25
+            ease[good] = np.minimum(4.0 * ease[good], 1.0)
+            idle[moving] = np.where(before - after > _LEAST_GAIN * before, 0, idle[moving] + 1)
+            moving = moving[(idle[moving] < _PATIENCE) & (state.distance[moving] > _CLOSE_MM)]
+
+    def _at(self, poses: Integers, readings: Floats) -> _State:
+        """Poses at readings (p, joints)."""
+        p, m, joints = len(poses), self._rows.shape[1], len(self._names)
+        moved = readings[:, None, :]
+        if self._bends:
+            moved = moved + np.vstack([np.zeros(joints), np.diag(_DIFFERENCE * self._range)])
+        parts = self._predictor.parts(self._observations(self._rows[poses], moved))
+        position = parts.position_mm.reshape(p, -1, m, 3)
+        kinematics = parts.joint_jacobian.reshape(p, -1, m, 3, joints)[:, 0]
+        if self._bends:
+            true = parts.readings.reshape(p, -1, m, joints)[:, :, 0]
+            added = parts.correction_mm.reshape(p, -1, m, 3)
+            per_range = (true[:, 1:] - true[:, :1]).transpose(0, 2, 1) / _DIFFERENCE
+            slope = kinematics @ per_range[:, None]
+            slope += (added[:, 1:] - added[:, :1]).transpose(0, 2, 3, 1) / _DIFFERENCE
+        else:
+            slope = kinematics * self._range
+        error = self._wanted[poses] - position[:, 0].reshape(p, -1)
+        return _State(readings, error, slope.reshape(p, 3 * m, joints))
+
+    def _observations(self, rows: Integers, readings: Floats) -> Observations:
+        """The rows (p, m) of each pose at readings (p, k, joints), prisms fastest."""
+        p, k, joints = readings.shape
+        m = rows.shape[1]
+        index = np.broadcast_to(rows[:, None, :], (p, k, m)).reshape(-1)
+        table = np.broadcast_to(readings[:, :, None, :], (p, k, m, joints)).reshape(-1, joints)
+        found = self._targets.select(index)
+        return replace(found, joints=dict(zip(self._names, table.T.copy(), strict=True)))
+
+    def _step(self, poses: Integers, now: _State, damping: Floats, ease: Floats, rank: Floats) -> tuple[Floats, Floats]:
+        """(p, joints) step inside the limits, in ranges, and the part of it that leads towards the nominal command."""
+        away = (now.readings - self._nominal[poses]) / self._range
+        low, high = (self._low - now.readings) / self._range, (self._high - now.readings) / self._range
+        step, home = _least_change(now.slope, now.error, away, damping, ease, rank)
+        for i in np.flatnonzero(((step < low) | (step > high)).any(axis=1)).tolist():
+            one = slice(i, i + 1)
+            pose = now.slope[one], now.error[one], away[one], damping[one], ease[one], rank[one]
+            step[i], home[i] = _within(*pose, low[i], high[i])
+        return step, home
+
+    def _nudge(self, pose: int, state: _State) -> None:
+        """Try starts beside a pose that steps of the residual keep from its target, along the null space."""
+        one = np.array([pose])
+        slope = state.slope[pose]
+        _, size, rows = np.linalg.svd(slope)
+        free = rows[int((size**2 > _STIFF * size[0] ** 2).sum()) :]
+        back = np.linalg.pinv(slope, rcond=_STIFF**0.5)
+        for nudge in _NUDGES if len(free) else ():
+            start = state.readings[pose] + nudge * np.vstack([free, -free]) * self._range
+            readings = np.clip(start, self._low, self._high)
+            for chord in range(_CHORDS):
+                parts = self._predictor.parts(self._observations(self._rows[one], readings[None]))
+                error = self._wanted[one] - parts.position_mm.reshape(len(readings), -1)
+                closed = np.sqrt((error**2).sum(axis=1)) <= _CLOSE_MM
+                if closed.any() or chord == _CHORDS - 1:
+                    break
+                readings = np.clip(readings + error @ back.T * self._range, self._low, self._high)
+            if closed.any():
+                change = np.square((readings - self._nominal[pose]) / self._range).sum(axis=1)
+                best = int(np.argmin(np.where(closed, change, np.inf)))
+                state.readings[pose], state.error[pose] = readings[best], error[best]
+                return
+
+
+def _least_change(
+    slope: Floats, error: Floats, away: Floats, damping: Floats, ease: Floats, rank: Floats
+) -> tuple[Floats, Floats]:
+    """Damped step towards the targets and, across it, towards the nominal command.
+
+    Args:
+        slope: (p, 3 m, joints) A.
+        error: (p, 3 m) e.
+        away: (p, joints) from the nominal command.
+        damping: (p,) added to the eigenvalues of A A'.
+        ease: (p,) share of the way towards the nominal command.
+        rank: (p,) of the largest eigenvalue; what moves the prisms less is left alone.
+
+    Returns:
+        (p, joints) the step and (p, joints) the part of it that leaves the prisms in place.
+    """
+    turned = slope.transpose(0, 2, 1)
+    size, axes = np.linalg.eigh(slope @ turned)
+    seen = size > rank[:, None] * size[:, -1:]
+    inside = np.where(seen, size, 1.0)
+    into = axes.transpose(0, 2, 1)
+    towards = np.where(seen, (into @ error[:, :, None])[:, :, 0] / (inside + damping[:, None]), 0.0)
+    across = np.where(seen, (into @ (slope @ away[:, :, None]))[:, :, 0] / inside, 0.0)
+    home = -ease[:, None] * (away - (turned @ (axes @ across[:, :, None]))[:, :, 0])
+    return (turned @ (axes @ towards[:, :, None]))[:, :, 0] + home, home
+
+
+def _within(
+    slope: Floats,
+    error: Floats,
+    away: Floats,
+    damping: Floats,
+    ease: Floats,
+    rank: Floats,
+    low: Floats,
+    high: Floats,
+) -> tuple[Floats, Floats]:
+    """Do the same for a single pose, between bounds (joints,) of the step (active set).
+
+    Of a held joint, the multiplier says whether letting it go would bring the prisms nearer or lessen the change.
+    """
+    held = np.zeros(len(low), dtype=bool)
+    step, home = np.zeros(len(low)), np.zeros(len(low))
+    for _ in range(3 * len(low)):
+        at_bound = np.where(held, step, 0.0)
+        free_slope = np.where(held, 0.0, slope)
+        left = error - slope[0] @ at_bound
+        found, across = _least_change(free_slope, left, np.where(held, 0.0, away), damping, ease, rank)
+        step, home = at_bound + found[0], across[0]
+        outside = ~held & ((step < low) | (step > high))
+        if outside.any():
+            held |= outside
+            step = np.clip(step, low, high)
+            continue
+        pull = _multiplier(slope[0], free_slope[0], rank[0], left[0] - free_slope[0] @ found[0], away[0] + step)
+        wrong = held & (((step >= high) & (pull > 0.0)) | ((step <= low) & (pull < 0.0)))
+        if not wrong.any():
+            break
+        held[int(np.argmax(np.where(wrong, np.abs(pull), -1.0)))] = False
+    return np.clip(step, low, high), home
+
+
+def _multiplier(slope: Floats, free_slope: Floats, rank: float, left: Floats, change: Floats) -> Floats:
+    """(joints,) derivative of the cost by each joint: of the miss where some is left, else of the change."""
+    by_miss = -slope.T @ left
+    if np.abs(by_miss).max() > 1e-6 * np.square(slope).sum():
+        return by_miss
+    force = np.linalg.pinv(free_slope.T, rcond=rank**0.5) @ change
+    return change - slope.T @ force
+
+
+def _check(model: CalibratedModel, targets: Observations, poses: list[list[int]]) -> None:
+    """Raise DataError for rows without numbers, and for poses that are commanded to be in two places."""
+    if len(targets) == 0:
+        raise DataError("targets", "there are none")
+    if not np.isfinite(targets.position_mm).all():
+        raise DataError("targets", "every row needs a position", column="x_mm")
+    for name, values in targets.joints.items():
+        if not np.isfinite(values).all():
+            raise DataError("targets", "every row needs the nominal command of every joint", column=name)
+    for rows in poses:
+        for joint in model.rig.joints if len(rows) > 1 else ():
+            values = targets.joints[joint.name][rows]
+            if np.ptp(values) > 0.0:
+                raise DataError(
+                    "targets",
+                    f"the rows of pose {str(targets.pose[rows[0]])!r} give {values.min():g} and {values.max():g} "
+                    f"{joint.unit}; rows of one pose are solved together and need the same nominal command",
+                    column=joint.column,
+                )
+
+
+def _poses(targets: Observations) -> list[list[int]]:
+    """Rows of each pose, in the order of their first rows."""
+    labels = zip(targets.session.tolist(), targets.setup.tolist(), targets.pose.tolist(), strict=True)
+    poses: dict[tuple[str, str, str] | int, list[int]] = {}
+    for row, label in enumerate(labels):
+        poses.setdefault(label if label[2] else row, []).append(row)
+    return list(poses.values())
+
+
+def _out_of_reach(
+    model: CalibratedModel, commanded: Observations, closure_mm: Floats, poses: list[list[int]]
+) -> Iterator[str]:
+    missed = closure_mm > CLOSURE_MM
+    if missed.any():
+        worst = int(np.argmax(closure_mm))
+        most, joints = max(len(rows) for rows in poses if missed[rows].any()), len(model.rig.joints)
+        asked = f"; {most} prisms of one pose ask for {3 * most} coordinates of {joints} joints"
+        yield (
+            f"{int(missed.sum())} of {len(missed)} targets are out of reach from their nominal commands, within the "
+            f"limits of the joints: they are missed by up to {closure_mm[worst]:.3g} mm (row {worst + 1})"
+            f"{asked if 3 * most > joints else ''}"
+        )
+    position = None
+    for rows in poses:
+        if len(rows) == 1 or not missed[rows].any():
+            continue
+        position = Predictor.of(model).predict(commanded).position_mm if position is None else position
+        first, second = rows[:2]
+        wanted, there = (
+            float(np.linalg.norm(places[first] - places[second])) for places in (commanded.position_mm, position)
+        )
+        if abs(wanted - there) > closure_mm[rows].max():
+            yield (
+                f"pose {str(commanded.pose[first])!r}: the targets of {commanded.prism[first]} and "
+                f"{commanded.prism[second]} are {wanted:.2f} mm apart and the prisms are {there:.2f} mm: both cannot "
+                f"be reached"
+            )

@@ -1,0 +1,394 @@
+"""Prediction with a calibrated model: its parts prepared once, and one path through them for one row or many."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibration.effects.columns import EffectColumns
+from calibration.effects.context import EffectContext
+from calibration.effects.fitted import AppliedEffects, corrected
+from calibration.errors import CalibrationError, UnsafeError
+from calibration.identification.noise import reading_variance
+from calibration.kinematics import fix_loops
+from calibration.kinematics.chain import ChainData, Linearisation
+from calibration.kinematics.compiled_chain import CompiledChain, Located
+from calibration.kinematics.torques import GravityModel
+from calibration.model.model import CalibratedModel, Outlier
+from calibration.observations import Floats, Observations
+from calibration.residual.features import Extractor, Features
+
+OUTLIER_SIGMA = 5.0
+
+_PIECE = 1250  # rows that are worked on at a time
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Positions with their uncertainty.
+
+    Attributes:
+        position_mm: (n, 3) in the station's frame, as its fixes would be, systematic errors of fixes included.
+        sigma_mm: (n, 3) standard deviation of a fix about it: by parameters, readings, timing, station, effects left
+            out for want of a column, and the error that the model leaves.
+    """
+
+    position_mm: Floats
+    sigma_mm: Floats
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """n observations as the kinematics take them.
+
+    Attributes:
+        data: bound, with the joints where the effects have them.
+        context: the observations as read.
+        columns: effects per unit of their coefficients.
+        shift_mm: (n, 3) by what the effects move the prisms beside the joints, in the station's frame.
+    """
+
+    data: ChainData
+    context: EffectContext
+    columns: EffectColumns
+    shift_mm: Floats
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Positions of n rows by the whole model, and their parts; all in the station's frame.
+
+    Attributes:
+        position_mm: (n, 3).
+        readings: (n, joints) where the effects have the joints, deg or mm.
+        joint_jacobian: (n, 3, joints) by these, mm per deg or mm, without the correction's part.
+        correction_mm: (n, 3) part by the residual learner.
+    """
+
+    position_mm: Floats
+    readings: Floats
+    joint_jacobian: Floats
+    correction_mm: Floats
+
+
+class Predictor:
+    """Everything that a model computes for observations, its parts prepared once.
+
+    `Predictor.of(model)` prepares a model at the first call and keeps the result with it. Unless said otherwise,
+    methods raise UnsafeError for observations of a set-up that the model does not know (as `check_setups`), and
+    CalibrationError where a position or its standard deviation is not a finite number.
+
+    Args:
+        model: the model to predict with.
+    """
+
+    def __init__(self, model: CalibratedModel) -> None:
+        self._model, self._chain, rig = model, model.chain, model.rig
+        self._effects = AppliedEffects(model.effects, model.chain)
+        self._loads = GravityModel(model.chain, model.values)
+        self._machine = CompiledChain(
+            model.chain, model.values, model.covariance, self._effects.joint, model.repeat_sigma_mm
+        )
+        self._reading_variance = reading_variance(rig)
+        self._rate_columns = [(index, f"{name}_rate") for index, name in enumerate(rig.joint_names)]
+        self._made_good = 1.0 - self._random_share(model.noise_mm**2)
+        self._excess_mm2 = np.full((2, 3), model.excess_sigma_mm**2)
+        if model.residual is not None:
+            self._excess_mm2[1] = model.residual.excess_variance_mm2
+            self._extract = Extractor(model.chain, model.values, model.residual.signals)
+            self._trained = np.array([name in model.residual.prisms for name in rig.prism_names])
+
+    @classmethod
+    def of(cls, model: CalibratedModel) -> Predictor:
+        """Return the model's predictor, prepared once."""
+        found: Predictor | None = model.prepared.get(cls)
+        if found is None:
+            found = model.prepared[cls] = cls(model)
+        return found
+
+    def predict(self, observations: Observations, executor: Executor | None = None) -> Prediction:
+        """Predict positions and the standard deviation of a fix about each.
+
+        Args:
+            observations: n rows; their positions, if any, are not looked at.
+            executor: threads among which many rows are divided; the result does not depend on it.
+        """
+        found = self._in_pieces(observations, executor)
+        _refuse_infinite(found.position_mm, found.sigma_mm)
+        return found
+
+    def nominal_mm(self, observations: Observations) -> Floats:
+        """(n, 3) positions of the nominal rig, in the station's frame."""
+        return self._by_kinematics(self._model.nominal_values, observations)
+
+    def geometric_mm(self, observations: Observations) -> Floats:
+        """(n, 3) positions by the kinematics identified without effects, in the station's frame."""
+        return self._by_kinematics(self._model.geometric_values, observations)
+
+    def effects_mm(self, observations: Observations) -> Floats:
+        """(n, 3) positions by kinematics and effects, in the station's frame."""
+        rows = self._rows(observations)
+        position_mm = self._machine.locate(rows.data).position_mm + rows.shift_mm
+        _refuse_infinite(position_mm)
+        return position_mm
+
+    def parts(self, observations: Observations) -> Parts:
+        """The whole model without its uncertainty, part by part."""
+        rows = self._rows(observations)
+        located, estimate, _ = self._located(rows)
+        rotation = self._machine.rotations(rows.data)
+        correction, by_joint = _turned(rotation, estimate), rotation @ located.joint_jacobian
+        _refuse_infinite(located.position_mm, correction)
+        return Parts(located.position_mm + rows.shift_mm + correction, rows.data.readings, by_joint, correction)
+
+    def base_mm(self, observations: Observations) -> Floats:
+        """(n, 3) places of the prisms in the base frame, by the whole model.
+
+        Effects that change fixes alone (of station, prisms and clocks) or that move the base are no part of them.
+        """
+        rows = self._rows(observations)
+        located, estimate, _ = self._located(rows)
+        place_mm = located.prism_mm + estimate
+        if rows.columns.shift_mm is not None:
+            shift_mm = rows.columns.shifted_mm(self._effects.machine_values)
+            place_mm += _turned(self._machine.rotations(rows.data).transpose(0, 2, 1), shift_mm)
+        _refuse_infinite(place_mm)
+        return place_mm
+
+    def to_station(self, observations: Observations, vector_mm: Floats) -> Floats:
+        """(n, 3) vectors of the base frame turned into the station's."""
+        return _turned(self._machine.rotations(self._chain.bind(observations)), vector_mm)
+
+    def to_base(self, observations: Observations, vector_mm: Floats) -> Floats:
+        """(n, 3) vectors of the station's frame turned into the base frame."""
+        return _turned(self._machine.rotations(self._chain.bind(observations)).transpose(0, 2, 1), vector_mm)
+
+    def corrected(self, observations: Observations) -> Observations:
+        """The observations with the joints where the effects have them, and not where they read."""
+        if not self._model.effects:
+            return observations
+        columns = self._effects.columns(self.context(observations))
+        change = columns.change(self._effects.values, len(self._model.rig.joints))
+        return corrected(observations, change, self._model.rig.joint_names)
+
+    def correction(self, observations: Observations) -> tuple[Floats, Floats]:
+        """Correction by the residual learner, zero for prisms it was not trained on; both in the station's frame.
+
+        Returns:
+            (n, 3) correction, mm; (n, 3, 3) covariance of the errors that the model leaves even so, mm^2.
+        """
+        rows = self._rows(observations)
+        rotation = self._machine.rotations(rows.data)
+        _, estimate, weight = self._located(rows)
+        without, learned = self._excess_mm2
+        excess = (1.0 - weight)[:, None] * without + weight[:, None] * learned
+        return _turned(rotation, estimate), (rotation * excess[:, None, :]) @ rotation.transpose(0, 2, 1)
+
+    def features(self, observations: Observations, signals: Sequence[str]) -> Features:
+        """Features of a residual learner with these signal columns, effects taken into account."""
+        rows = self._rows(observations)
+        located = self._linearise(rows)
+        residual = self._model.residual
+        prepared = residual is not None and tuple(signals) == residual.signals
+        extract = self._extract if prepared else Extractor(self._chain, self._model.values, signals)
+        return extract(rows.data.readings, located, observations.extra)
+
+    def linearise(self, observations: Observations) -> Linearisation:
+        """Positions by kinematics and effects with their derivatives; the Jacobian by parameters and coefficients."""
+        rows = self._rows(observations)
+        located = self._linearise(rows)
+        rotation = self._machine.rotations(rows.data)
+        return Linearisation(
+            located.position_mm + rows.shift_mm, rotation @ located.jacobian, rotation @ located.joint_jacobian
+        )
+
+    def deviations(self, observations: Observations) -> Floats:
+        """(n,) errors of kinematics and effects in sigma (Mahalanobis length).
+
+        Raises:
+            CalibrationError: an uncertainty that is no machine's.
+        """
+        position, known, parameters = self._covariances(observations)
+        error = observations.position_mm - position
+        try:
+            factor = np.linalg.cholesky(known + parameters + self._model.excess_sigma_mm**2 * np.eye(3))
+        except np.linalg.LinAlgError as failure:
+            raise CalibrationError(
+                "the model's uncertainty of a position is so large that rounding hides its noise; calibrate again"
+            ) from failure
+        whitened = np.linalg.solve(factor, error[:, :, None])[:, :, 0]
+        return np.asarray(np.linalg.norm(whitened, axis=1), dtype=np.float64)
+
+    def find_outliers(self, observations: Observations) -> tuple[Outlier, ...]:
+        """Fixes farther from kinematics and effects than noise and parameters explain."""
+        size = self.deviations(observations)
+        return tuple(Outlier(int(row), float(size[row])) for row in np.flatnonzero(size > OUTLIER_SIGMA))
+
+    def unexplained_mm2(self, observations: Observations, variance_mm2: Floats) -> Floats:
+        """Mean squared errors of a learner less the known noise.
+
+        The training rows' errors are those of kinematics that were fitted to them, smaller by the parameters' share
+        than what new rows see; predictions add that share.
+
+        Args:
+            observations: the training rows.
+            variance_mm2: (3,) squared errors on them, along the axes of the base frame.
+
+        Returns:
+            (3,) along the same axes, not negative.
+        """
+        _, known, parameters = self._covariances(observations)
+        rotation = self._machine.rotations(self._chain.bind(observations))
+        parameters *= self._random_share(float(variance_mm2.sum()))
+        in_base = rotation.transpose(0, 2, 1) @ (known - parameters) @ rotation
+        left: Floats = np.maximum(variance_mm2 - np.diagonal(in_base, axis1=1, axis2=2).mean(axis=0), 0.0)
+        return left
+
+    def unknown_variance(self, observations: Observations) -> Floats:
+        """(n, joints) variance of the joints' values by effects left out for want of a column, deg^2 or mm^2."""
+        return self._effects.unknown_variance(self.context(observations))
+
+    def context(self, observations: Observations) -> EffectContext:
+        """The observations as effects see them; of any set-up."""
+        return EffectContext(self._chain, self._model.values, observations, self._loads, self._machine)
+
+    def _by_kinematics(self, values: Floats, observations: Observations) -> Floats:
+        """(n, 3) positions by parameters (p,) without effects."""
+        check_setups(self._model, observations)
+        return CompiledChain(self._chain, values).locate(self._chain.bind(observations)).position_mm
+
+    def _random_share(self, variance_mm2: float) -> float:
+        """Share of the parameters' covariance that noise makes, and not what a learner corrects.
+
+        The learner is trained on what these very parameters leave, and makes good what structure did to them.
+        """
+        return min(1.0, variance_mm2 / max(self._model.effects_noise_mm**2, 1e-12))
+
+    def _in_pieces(self, observations: Observations, executor: Executor | None) -> Prediction:
+        if len(observations) <= _PIECE or self._effects.goes_by_order:
+            return self._predict(observations)
+        rows = np.arange(len(observations))
+        pieces = [observations.select(rows[first : first + _PIECE]) for first in range(0, len(rows), _PIECE)]
+        found = list((executor.map if executor is not None else map)(self._predict, pieces))
+        return Prediction(
+            np.concatenate([piece.position_mm for piece in found]), np.concatenate([piece.sigma_mm for piece in found])
+        )
+
+    def _predict(self, observations: Observations) -> Prediction:
+        rows = self._rows(observations)
+        located, of_fix, of_parameters = self._spread(rows, jacobian=self._model.residual is not None)
+        estimate, weight = self._learned(rows, located)
+        position_mm, sigma_mm = np.empty((len(rows.data), 3)), np.empty((len(rows.data), 3))
+        fix_loops.add_learned(
+            rows.data.setup,
+            self._machine.bases,
+            np.ascontiguousarray(located.position_mm + rows.shift_mm),
+            np.ascontiguousarray(estimate),
+            weight,
+            of_fix,
+            of_parameters,
+            self._by_refitted_base(rows, located),
+            self._made_good,
+            self._excess_mm2,
+            position_mm,
+            sigma_mm,
+        )
+        return Prediction(position_mm, sigma_mm)
+
+    def _covariances(self, observations: Observations) -> tuple[Floats, Floats, Floats]:
+        """(n, 3) positions of stage effects; (n, 3, 3) covariance of a fix, and that by parameters and coefficients."""
+        rows = self._rows(observations)
+        located, of_fix, of_parameters = self._spread(rows, jacobian=False)
+        return located.position_mm + rows.shift_mm, of_fix, of_parameters
+
+    def _rows(self, observations: Observations) -> _Rows:
+        check_setups(self._model, observations)
+        context = self.context(observations)
+        columns = self._effects.columns(context)
+        data, shift_mm = columns.apply(context.data, self._effects.values)
+        return _Rows(data, context, columns, shift_mm)
+
+    def _located(self, rows: _Rows) -> tuple[Located, Floats, Floats]:
+        """Positions by the kinematics, with the residual learner's estimate and weight as `_learned` gives them."""
+        located = self._machine.locate(rows.data) if self._model.residual is None else self._linearise(rows)
+        return located, *self._learned(rows, located)
+
+    def _linearise(self, rows: _Rows) -> Located:
+        return self._machine.linearise(rows.data, rows.columns.column, self._shift_in_base(rows))
+
+    def _shift_in_base(self, rows: _Rows) -> Floats | None:
+        """(n, 3, k) displacements by unit coefficients in the base frame."""
+        shift_mm = rows.columns.shift_mm
+        return None if shift_mm is None else self._machine.rotations(rows.data).transpose(0, 2, 1) @ shift_mm
+
+    def _spread(self, rows: _Rows, *, jacobian: bool) -> tuple[Located, Floats, Floats]:
+        observations = rows.context.observations
+        rates = np.zeros(rows.data.readings.shape)
+        for index, name in self._rate_columns:
+            measured = observations.extra.get(name)
+            if measured is not None:
+                rates[:, index] = measured
+        variance = self._effects.unknown_variance(rows.context) + self._reading_variance
+        located, of_fix, of_parameters = self._machine.spread(
+            rows.data,
+            rows.columns.column,
+            self._shift_in_base(rows),
+            observations.sigma_mm,
+            rates,
+            variance,
+            jacobian=jacobian,
+        )
+        if rows.columns.shift_mm is not None:
+            of_fix += self._effects.unknown_mm2(rows.context)[:, None, None] * np.eye(3)
+        return located, of_fix, of_parameters
+
+    def _by_refitted_base(self, rows: _Rows, located: Located) -> Floats:
+        """(n, 3) variance by a refitted base, known from few fixes; no learner makes it good."""
+        if self._model.residual is None or self._model.base_covariance is None:
+            return np.zeros((len(rows.data), 3))
+        base = slice(self._chain.base_start, len(self._chain))
+        jacobian = self._machine.rotations(rows.data) @ located.jacobian[:, :, base]
+        variance: Floats = ((jacobian @ self._model.base_covariance) * jacobian).sum(axis=2)
+        return variance
+
+    def _learned(self, rows: _Rows, located: Located) -> tuple[Floats, Floats]:
+        """(n, 3) estimate of the residual learner in the base frame, mm; (n,) its weight, 0 to 1."""
+        residual, data = self._model.residual, rows.data
+        if residual is None:
+            return np.zeros((len(data), 3)), np.zeros(len(data))
+        seen = self._extract(data.readings, located, rows.context.observations.extra)
+        return residual.estimate(seen, self._trained[data.prism])
+
+
+def check_setups(model: CalibratedModel, observations: Observations) -> None:
+    """Raise UnsafeError where the observations come from a set-up that the model does not know."""
+    unknown = sorted(set(observations.setup.tolist()) - set(model.placements))
+    if unknown:
+        known = ", ".join(repr(s) for s in sorted(model.placements))
+        blank = "" if unknown[0] else " (no setup in the row)"
+        raise UnsafeError(
+            f"set-up {unknown[0]!r}{blank} is unknown to the model (known: {known}); its base transform would be a "
+            f"guess. Use --refit-base to fit it on these fixes"
+        )
+
+
+def _refuse_infinite(*numbers: Floats) -> None:
+    """Raise CalibrationError where one of the arrays (n, 3) of predictions is not finite."""
+    for predicted in numbers:
+        # One sum costs less than a look at each, and hides neither infinity nor NaN.
+        if not math.isfinite(predicted.sum()):
+            row = int(np.argmin(np.isfinite(predicted).all(axis=1)))
+            raise CalibrationError(
+                f"the prediction of row {row} (from 0) is not a finite number; look for a reading or signal of that "
+                f"row that no machine can have, else calibrate again"
+            )
+
+
+def _turned(rotation: Floats, vector: Floats) -> Floats:
+    """(n, 3) vectors (n, 3), each turned by its rotation (n, 3, 3)."""
+    turned: Floats = (rotation @ vector[:, :, None])[:, :, 0]
+    return turned

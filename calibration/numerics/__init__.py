@@ -1,0 +1,1 @@
+"""Small numerical tools without knowledge of rigs."""

@@ -1,0 +1,71 @@
+"""Products of columns that are mostly zero, and roots of covariances.
+
+A curve of a joint's angle has dozens of splines, and a fix touches four of them: of the hundreds of coefficients of
+several curves a row has a few. What each row has it adds, so zeros cost no more than a look.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.numerics.jit import compiled
+from calibration.observations import Floats
+
+Integers = NDArray[np.intp]
+
+_RARE = 0.25  # share of the rows that have anything in a rare column, at most
+_WORTHWHILE = 50  # rare columns: with fewer, products of all columns are as fast
+
+
+def gram(rows: Floats) -> Floats:
+    """Return the (q, q) products of all columns of `rows` (r, q) with each other: rows' rows."""
+    rare = (rows != 0.0).mean(axis=0) <= _RARE
+    if rare.sum() < _WORTHWHILE:
+        product: Floats = rows.T @ rows
+        return product
+    seldom, often = np.flatnonzero(rare), np.flatnonzero(~rare)
+    beside, own = np.zeros((len(seldom), len(often))), np.zeros((len(seldom), len(seldom)))
+    _add(np.ascontiguousarray(rows), seldom, often, beside, own)
+    out = np.empty((rows.shape[1], rows.shape[1]))
+    out[np.ix_(often, often)] = rows[:, often].T @ rows[:, often]
+    out[np.ix_(seldom, often)] = beside
+    out[np.ix_(often, seldom)] = beside.T
+    out[np.ix_(seldom, seldom)] = own + np.tril(own, -1).T
+    return out
+
+
+@compiled
+def _add(rows: Floats, seldom: Integers, often: Integers, beside: Floats, own: Floats) -> None:
+    """Add the products of the columns `seldom` (s,) of rows (r, q) with those `often` (p,) and with each other.
+
+    `beside` is (s, p); of `own` (s, s) only the lower triangle is filled.
+    """
+    at, value, usual = np.empty(len(seldom), dtype=np.intp), np.empty(len(seldom)), np.empty(len(often))
+    for r in range(len(rows)):
+        row, found = rows[r], 0
+        for i in range(len(seldom)):
+            at[found], value[found] = i, row[seldom[i]]
+            found += value[found] != 0.0
+        for k in range(len(often)):
+            usual[k] = row[often[k]]
+        for a in range(found):
+            with_usual, with_rare = beside[at[a]], own[at[a]]
+            for k in range(len(often)):
+                with_usual[k] += value[a] * usual[k]
+            for b in range(a + 1):
+                with_rare[at[b]] += value[a] * value[b]
+
+
+def root_of(covariance: Floats) -> Floats:
+    """Return a root (q, q) of a covariance that may be singular: root @ root' is the covariance."""
+    scale = np.sqrt(np.diag(covariance))
+    scale[scale == 0.0] = 1.0
+    value, vector = np.linalg.eigh(covariance / scale[:, None] / scale)
+    root: Floats = scale[:, None] * vector * np.sqrt(np.maximum(value, 0.0))
+    return root
+
+
+def triangular(root: Floats) -> Floats:
+    """Return the lower triangular root (q, q) of the same covariance as another root (q, q)."""
+    return np.ascontiguousarray(np.linalg.qr(root.T).R.T)

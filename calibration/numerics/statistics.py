@@ -1,0 +1,153 @@
+"""A paired t-test, a cumulative sum chart, and evenly spread points.
+
+scipy.stats has relatives of all three; its import takes half a second, which every command would pay.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtr
+
+from calibration.observations import Floats
+
+Alarm = Literal["none", "worse", "better"]
+
+CHANCE = 0.01  # probability of a gain by chance below which it counts
+WORTHWHILE = 0.01  # relative; a smaller gain is not worth a change
+
+# A standstill of three coordinates. More fixes of it share the errors of its readings, and scatter less than this.
+_FREEDOM = 3.0
+_MIDDLE = 1.0 - 2.0 / (9.0 * _FREEDOM)
+_SPREAD = math.sqrt(2.0 / (9.0 * _FREEDOM))
+REFERENCE = 1.0  # a mean that is off by less is let pass: errors of 1.3 times the predicted RMS
+DECISION = 5.0  # of independent N(0, 1) scores, one false alarm in some 100,000 (Siegmund 1985)
+CLIP = 3.0  # one wrong shot never decides: a winsorised chart
+
+
+@dataclass(frozen=True)
+class PairedTest:
+    """Two estimates compared on the same rows.
+
+    Attributes:
+        before_mm: RMS of the first estimate's 3-D error over all rows.
+        after_mm: the same of the second estimate.
+        p: probability of such a gain by chance; 1 where fewer than two groups, or groups without any spread, allow
+            no test.
+        rows: how many there were.
+        groups: how many there were.
+        no_worse: share of the groups in which the second estimate is no worse.
+    """
+
+    before_mm: float
+    after_mm: float
+    p: float
+    rows: int
+    groups: int
+    no_worse: float
+
+    @property
+    def is_better(self) -> bool:
+        """True if the second estimate is better beyond chance, and by enough to matter."""
+        return self.p < CHANCE and self.after_mm < (1.0 - WORTHWHILE) * self.before_mm
+
+
+def chance_of_mean(draws: Floats) -> float:
+    """Return the p-value of a one-sided one-sample t-test of mean > 0.
+
+    Args:
+        draws: (n,) independent; fewer than two, or without any spread, allow no test, and p is 1.
+    """
+    if len(draws) < 2 or (spread := float(draws.std(ddof=1))) == 0.0:
+        return 1.0
+    return float(stdtr(len(draws) - 1, -draws.mean() / (spread / np.sqrt(len(draws)))))
+
+
+def paired_test(before_mm2: Floats, after_mm2: Floats, groups: NDArray[np.str_] | NDArray[np.intp]) -> PairedTest:
+    """Compare the squared errors of two estimates by a paired one-sided t-test over groups of rows.
+
+    Everything that is said to help is judged by this test: a residual learner within a calibration, and a model that is
+    to take another's place.
+
+    Args:
+        before_mm2: (n,) squared 3-D errors of the first estimate, n > 0.
+        after_mm2: (n,) the same of the second.
+        groups: (n,) labels of rows whose errors hang together; each group's mean gain is one draw.
+    """
+    _, index, size = np.unique(groups, return_inverse=True, return_counts=True)
+    gain = np.bincount(index, before_mm2 - after_mm2) / size
+    return PairedTest(
+        before_mm=float(np.sqrt(before_mm2.mean())),
+        after_mm=float(np.sqrt(after_mm2.mean())),
+        p=chance_of_mean(gain),
+        rows=len(before_mm2),
+        groups=len(gain),
+        no_worse=float((gain >= 0.0).mean()),
+    )
+
+
+def score(mean_square: float) -> float:
+    """Return the score of a standstill, about N(0, 1) where the model is right.
+
+    The cube root of a mean of squares is close to normal (Wilson and Hilferty, PNAS 17, 1931).
+
+    Args:
+        mean_square: of the standardised errors of its three coordinates.
+    """
+    normal = (math.cbrt(mean_square) - _MIDDLE) / _SPREAD
+    return min(max(normal, -CLIP), CLIP)
+
+
+@dataclass(frozen=True)
+class Cusum:
+    """A two-sided cumulative sum chart of scores (Page, Biometrika 41, 1954).
+
+    Attributes:
+        upper: rises with errors larger than the model predicts.
+        lower: rises with errors smaller than it predicts.
+    """
+
+    upper: float = 0.0
+    lower: float = 0.0
+
+    def after(self, scores: Iterable[float]) -> Cusum:
+        """Return the chart after further scores, in their order."""
+        upper, lower = self.upper, self.lower
+        for value in scores:
+            upper = max(0.0, upper + value - REFERENCE)
+            lower = max(0.0, lower - value - REFERENCE)
+        return Cusum(upper, lower)
+
+    @property
+    def alarm(self) -> Alarm:
+        """`worse`: the machine is no longer what the model describes; `better`: the model's sigma is too large."""
+        if self.upper > DECISION:
+            return "worse"
+        return "better" if self.lower > DECISION else "none"
+
+
+def halton(dimensions: int, count: int) -> Floats:
+    """Return points that fill the unit box evenly (Halton 1960).
+
+    Args:
+        dimensions: columns, one prime base each.
+        count: rows: the numbers 0, 1, 2, ... with their digits mirrored at the point.
+
+    Returns:
+        (count, dimensions) in [0, 1).
+    """
+    points = np.zeros((count, dimensions))
+    primes = (n for n in itertools.count(2) if all(n % divisor for divisor in range(2, n)))
+    for axis, base in zip(range(dimensions), primes, strict=False):
+        left, unit = np.arange(count), 1.0 / base
+        while left.any():
+            left, digit = np.divmod(left, base)
+            points[:, axis] += unit * digit
+            unit /= base
+    return points

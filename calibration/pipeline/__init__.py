@@ -1,0 +1,1 @@
+"""From observations to a calibrated model, in one call."""

@@ -1,0 +1,225 @@
+"""Find what the simulation lacks: calibrate, and keep the search's evidence, forecasts and proposals as an answer."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from calibration.effects.fitted import AppliedEffects
+from calibration.effects.library import library
+from calibration.evaluation.evaluation import require_positions
+from calibration.gap.detection import detect
+from calibration.gap.discrimination import propose_experiments
+from calibration.gap.forecast import forecasts
+from calibration.gap.formulas.grammar import Grammar
+from calibration.gap.joint_fit import JointFit
+from calibration.gap.result import Candidate, GapResult, Round, Verdict
+from calibration.gap.screening import ScoredEffect, Screen
+from calibration.gap.search_result import Remaining, SearchResult, SelectionStep
+from calibration.identification.noise import reading_covariance, station_covariance
+from calibration.identification.refinement import Prior
+from calibration.identification.samples import Samples
+from calibration.model.model import CalibratedModel
+from calibration.model.prediction import Predictor
+from calibration.model.warnings import model_warnings
+from calibration.observations import Floats, Observations
+from calibration.pipeline.build_model import build_model
+from calibration.pipeline.calibrate import require_known_setups
+from calibration.pipeline.methods import effects_rng, find_effects
+from calibration.residual.folds import folds
+from calibration.rig.description import Rig
+from calibration.run import DEFAULT_RUN, Run
+
+_FOLDS = 10
+_LISTED = 12  # candidates of a round
+_EXCESS_SEEN = 0.2  # of the known noise's standard deviation; less is none
+
+
+def find_gap(
+    rig: Rig,
+    rig_text: str,
+    observations: Observations,
+    *,
+    holdout: Observations | None = None,
+    prior: Prior = "recalibration",
+    families: Collection[str] | None = None,
+    run: Run = DEFAULT_RUN,
+) -> GapResult:
+    """Find where simulation and measurement disagree, name the effect that is missing, and add it.
+
+    This is `calibrate` without a residual, with all that it found on the way kept as an answer.
+
+    Args:
+        rig: the rig description.
+        rig_text: the TOML that it was read from; it travels in the model.
+        observations: n training rows, all with positions, mm in the station's frame.
+        holdout: further rows, at set-ups of the training rows, that no fit sees.
+        prior: `recalibration` trusts the rig file's build tolerances, `as-built` estimates their scale.
+        families: of effects that may be named; the whole library by default.
+        run: seed, workers, progress and checkpoint.
+
+    Returns:
+        The verdict with its evidence, the model with the effects that were named, and what to measure next.
+
+    Raises:
+        DataError: rows without positions, prisms that the rig lacks.
+        UnsafeError: too few fixes, a base that cannot be placed, mirrored coordinates, another rig's data, a set-up of
+            the held-out rows that the training rows lack.
+    """
+    require_positions(observations)
+    if holdout is not None:
+        require_positions(holdout)
+        remedy = "hold out rows of those, or judge the model on these afterwards with evaluate --refit-base"
+        require_known_setups(observations, holdout, remedy)
+    with run.workers() as pool:
+        run = replace(run, executor=pool)
+        rng = effects_rng(run.seed)
+        rest = find_effects(
+            rig, observations, library() if families is None else families, prior, run.part(0.0, 0.9), rng
+        )
+        run.progress(0.9, "building the model")
+        model = build_model(rig, rig_text, observations, rest.adopted, prior, {"seed": run.seed, "method": "gap"})
+        return _answer(rest, model, observations, holdout, run.seed, rng)
+
+
+def _answer(
+    rest: Remaining,
+    model: CalibratedModel,
+    observations: Observations,
+    holdout: Observations | None,
+    seed: int,
+    rng: np.random.Generator,
+) -> GapResult:
+    """Return the answer: what the search found, as errors, evidence, forecasts and proposals."""
+    found, samples = rest.found, rest.adopted.solution.samples
+    before = detect(Grammar(found.initial), rng) if found.joint.choices else rest.detection
+    effects = found.adopted.effects
+    verdict: Verdict = "none"
+    if found.alternatives:
+        verdict = "indistinguishable"
+    elif effects:
+        verdict = "named"
+    elif rest.significant:
+        verdict = "unidentified"
+    predictor = Predictor.of(model)
+    error_before = observations.position_mm - predictor.geometric_mm(observations)
+    error_after = observations.position_mm - predictor.effects_mm(observations)
+    is_counted = found.joint.fit.weight[samples.of_row] > 0.5  # gross outliers are no structure
+    noise_mm, source = _noise(samples, found, observations, scatter_is_noise=not rest.significant)
+    held_out = None
+    if holdout is not None:
+        measured = holdout.position_mm
+        held_out = rms(measured - predictor.geometric_mm(holdout)), rms(measured - predictor.effects_mm(holdout))
+    candidates = tuple(_candidate(found.steps[-1], w) for w in found.alternatives)
+    situation = found.joint.situation
+    alternatives = [
+        [w.fitted(situation) for w in (alternative, *alternative.same_family)] for alternative in found.alternatives
+    ]
+    proposed = propose_experiments(model, observations, alternatives, rng) if alternatives else ()
+    return GapResult(
+        verdict=verdict,
+        effects=effects,
+        posterior=found.posterior,
+        indistinguishable=candidates,
+        description=rest.description,
+        remaining_significant=rest.significant,
+        remaining_mm=float(np.sqrt(max(rms(error_after[is_counted]) ** 2 - noise_mm**2, 0.0))),
+        disabled=found.candidates.disabled,
+        before_mm=rms(error_before),
+        after_mm=rms(error_after),
+        noise_mm=noise_mm,
+        noise_source=source,
+        held_out=held_out,
+        disagreements=before.disagreements,
+        experiments=proposed,
+        rounds=tuple(_rounds(found, observations, holdout, seed)),
+        forecasts=forecasts(Screen(found.initial, found.candidates.candidates)),
+        model=model,
+        observations=observations,
+        error_before_mm=error_before,
+        error_after_mm=error_after,
+        warnings=tuple(_warnings(found, model, holdout)),
+    )
+
+
+def rms(error_mm: Floats) -> float:
+    """Return the RMS 3-D length of errors (n, 3)."""
+    return float(np.sqrt((error_mm**2).sum(axis=1).mean()))
+
+
+def _rounds(
+    found: SearchResult, observations: Observations, holdout: Observations | None, seed: int
+) -> Iterator[Round]:
+    """Yield the search's steps for outputs, each with its error on held-out groups or rows."""
+    fold, samples = folds(found.initial.groups, _FOLDS, seed), found.initial.samples
+    # Repeats of a standstill are one sample of a fit; the noise is that of a fix.
+    from_mean = observations.position_mm - samples.position_mm[samples.of_row]
+    for step in found.steps:
+        if holdout is None:
+            error = step.projection.held_out_mm(fold)[samples.of_row] + from_mean
+            counts = step.fit.fit.weight[samples.of_row, None] ** 0.5
+            held_out = rms(error * counts) / float(np.sqrt(np.mean(counts**2)))
+        else:
+            held_out = rms(holdout.position_mm - _positions(step.fit, holdout))
+        taken = tuple(str(c) for c in step.adopted)
+        listed = step.scored[:_LISTED]
+        yield Round(held_out, taken, tuple(_candidate(step, w) for w in listed))
+
+
+def _positions(joint: JointFit, observations: Observations) -> Floats:
+    """Return (n, 3) positions of other rows by kinematics and effects of a fit."""
+    chain = joint.situation.chain
+    x = joint.fit.x[: len(chain)]
+    situation = replace(joint.situation, x=x, observations=observations)
+    applied = AppliedEffects(joint.effects, chain)
+    data, shift_mm = applied.columns(situation).apply(chain.bind(observations), applied.values)
+    return chain.positions_mm(x, data) + shift_mm
+
+
+def _candidate(step: SelectionStep, scored: ScoredEffect) -> Candidate:
+    """Return one of a step's candidates for outputs."""
+    situation, choice = step.fit.situation, scored.choice
+    family = library()[choice.family]
+    coefficients = family.coefficients(situation, choice.where, choice.settings)
+    named = any((choice.family, choice.where) == (c.family, c.where) for c in step.adopted)
+    return Candidate(
+        choice.family,
+        choice.where,
+        scored.posterior,
+        scored.log_bayes_factor,
+        scored.fitted(situation).reported,
+        {c.name: (c.lower, c.upper) for c in coefficients} | dict(family.reported_limits()),
+        "" if named else step.reasons.get(str(scored.candidate), "nothing asks for it beside the others"),
+    )
+
+
+def _noise(
+    samples: Samples, found: SearchResult, observations: Observations, *, scatter_is_noise: bool
+) -> tuple[float, str]:
+    """Return the RMS 3-D noise of one fix, and where it is known from, a clause.
+
+    Scatter beyond the known noise is noise too, unless it depends on something.
+    """
+    rig, fit = found.joint.situation.rig, found.joint.fit
+    station = station_covariance(rig, observations.position_mm, observations.sigma_mm)
+    readings = reading_covariance(rig, found.final.projection.joint_jacobian, samples.rates)
+    known = sum(float(np.trace(c, axis1=1, axis2=2).mean()) for c in (station, readings))
+    given = np.isfinite(observations.sigma_mm).all(axis=1).mean() > 0.5
+    source = "the sigma columns of the data" if given else "the station's and the readings' noise in the rig file"
+    if samples.repeat_variance > 0.0:
+        known += 3.0 * samples.repeat_variance
+        source += ", raised to the scatter of repeats"
+    excess = 3.0 * fit.excess_variance if scatter_is_noise else 0.0
+    if excess > _EXCESS_SEEN**2 * known:
+        source += f", and {np.sqrt(excess):.2g} mm that the data scatter beyond it"
+    return float(np.sqrt(known + excess)), source
+
+
+def _warnings(found: SearchResult, model: CalibratedModel, holdout: Observations | None) -> Iterator[str]:
+    yield from model.warnings
+    if holdout is not None:
+        yield from (f"in the held-out rows: {warning}" for warning in model_warnings(model, holdout))
+    if found.formulas and found.adopted.effects:
+        yield "what is left over depends on what no effect of the library explains"

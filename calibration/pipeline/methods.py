@@ -1,0 +1,144 @@
+"""Registry of the methods that identify a rig: the default and those of two published papers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from calibration.effects.library import library
+from calibration.gap.adoption import Adopted, adopt
+from calibration.gap.search import search
+from calibration.gap.search_result import Remaining, remaining
+from calibration.identification.refinement import Prior
+from calibration.identification.solve import Solution, solve
+from calibration.observations import Observations
+from calibration.published.first_paper import pde_paper
+from calibration.published.second_paper import km, require_torques, skcm
+from calibration.residual.selection import Kind
+from calibration.rig.description import Rig
+from calibration.run import Run
+
+
+@dataclass(frozen=True)
+class Task:
+    """Observations to identify a rig from.
+
+    Attributes:
+        rig: the rig description.
+        observations: rows with positions.
+        prior: trust the build tolerances, or estimate their scale.
+        effects: `auto`, `none` or FAMILY@WHERE,...
+        run: seed, workers, progress and checkpoint.
+    """
+
+    rig: Rig
+    observations: Observations
+    prior: Prior
+    effects: str
+    run: Run
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to identify a rig.
+
+    Attributes:
+        identify: fits kinematics and effects.
+        residual: the learner that completes it where no other is asked for.
+        takes_effects: True if effects may be asked for by name.
+    """
+
+    identify: Callable[[Task], Adopted]
+    residual: Kind | Literal["torque network"] = "none"
+    takes_effects: bool = False
+
+
+def find_effects(
+    rig: Rig,
+    observations: Observations,
+    families: Collection[str],
+    prior: Prior,
+    run: Run,
+    rng: np.random.Generator,
+) -> Remaining:
+    """Solve the kinematics, search for missing effects, and test the remaining errors.
+
+    Args:
+        rig: the rig description.
+        observations: rows with positions.
+        families: of effects that may be named.
+        prior: trust the build tolerances, or estimate their scale.
+        run: seed, workers, progress and checkpoint.
+        rng: draws the signs of the last test.
+
+    Raises:
+        DataError, UnsafeError: as `solve`.
+    """
+    solution = solve(rig, observations, prior=prior, run=run.part(0.0, 0.4))
+    run.progress(0.4, "looking for missing effects")
+    found = search(solution, observations, families, prior=prior, seed=run.seed)
+    run.progress(0.9, "testing the remaining errors")
+    return remaining(found, rng)
+
+
+def effects_rng(seed: int) -> np.random.Generator:
+    """Return the generator for `find_effects` and for what follows from its result."""
+    return np.random.default_rng([seed, 1])
+
+
+def identify_by(method: str, task: Task) -> Adopted:
+    """Fit kinematics and effects by one of `METHODS`.
+
+    Raises:
+        ValueError: an unknown method or effect, or effects for a method that takes none.
+        DataError: data that the method cannot use.
+        UnsafeError: as the method refuses.
+    """
+    if method not in METHODS:
+        raise ValueError(f"method {method!r} is not available; available: {', '.join(METHODS)}")
+    chosen = METHODS[method]
+    if not chosen.takes_effects and task.effects not in ("auto", "none"):
+        raise ValueError(f"method {method!r} takes no effects; leave {task.effects!r} out, or use the default method")
+    return chosen.identify(task)
+
+
+def _default(task: Task) -> Adopted:
+    rig, observations, prior, run = task.rig, task.observations, task.prior, task.run
+    if task.effects == "auto":
+        rest = find_effects(rig, observations, library(), prior, run, effects_rng(run.seed))
+        return replace(rest.adopted, warnings=(*rest.adopted.warnings, *rest.warnings()))
+    solution = solve(rig, observations, prior=prior, run=run.part(0.0, 0.8))
+    return adopt(solution, observations, task.effects, prior=prior)
+
+
+def _pde_paper(task: Task) -> Adopted:
+    return _without_effects(pde_paper(task.rig, task.observations, prior=task.prior, run=task.run))
+
+
+def _km(task: Task) -> Adopted:
+    return _without_effects(km(task.rig, task.observations, task.run))
+
+
+def _skcm(task: Task) -> Adopted:
+    return skcm(task.rig, task.observations, task.run)
+
+
+def _rbf_tcm(task: Task) -> Adopted:
+    require_torques(task.rig, task.observations, "rbf-tcm")
+    return _km(task)
+
+
+def _without_effects(solution: Solution) -> Adopted:
+    return Adopted(solution, solution.fit, reason="the method has none of its own")
+
+
+METHODS: Mapping[str, Method] = {
+    "default": Method(_default, residual="default", takes_effects=True),
+    "pde-paper": Method(_pde_paper, residual="chain"),
+    "km": Method(_km),
+    "skcm": Method(_skcm),
+    "rbf-tcm": Method(_rbf_tcm, residual="torque network"),
+}

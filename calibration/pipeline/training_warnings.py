@@ -1,0 +1,187 @@
+"""Warnings about a calibration, its data and its result, one sentence each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from calibration.effects.library import library
+from calibration.identification.reading_steps import rounding
+from calibration.identification.solve import Solution
+from calibration.model.model import CalibratedModel, Outlier
+from calibration.model.prediction import Predictor
+from calibration.model.warnings import times_computed, torque_unit_warnings
+from calibration.observations import Observations
+from calibration.rig.description import ANOTHER_VALUE, BEYOND_BUILDING
+from calibration.rig.limits import beyond_limits, never_moved
+
+_LISTED = 10
+_TOGETHER = 0.9  # of the outliers
+_NOT_ALL = 0.7  # of all fixes
+_BADLY = 0.3  # of what build tolerances explain
+_FAR_RAD = math.radians(10.0)
+_BEYOND_LIMITS = 0.05  # of the span between a joint's limits
+_TOO_SMALL = 0.4  # of the expected scatter
+_FAR_NOISIER = 2.0  # times what instruments and repeats account for
+_FEW_FIXES = 6
+
+
+def training_warnings(model: CalibratedModel, observations: Observations, solution: Solution) -> Iterator[str]:
+    """Yield all warnings of a calibration.
+
+    Args:
+        model: the model with its outliers.
+        observations: the rows that it was fitted to, each once where there are copies.
+        solution: what it was made from.
+    """
+    yield from solution.warnings
+    situation = Predictor.of(model).context(observations)
+    yield from torque_unit_warnings(times_computed(situation))
+    rounding_mm, rounded = rounding(situation, model.effects_noise_mm)
+    if rounded:
+        yield rounded
+    yield from _of_fit(model, observations, solution, rounding_mm)
+    yield from _of_coverage(model, observations)
+    yield from _of_outliers(model, observations, solution)
+    yield from _of_result(model)
+    if solution.has_priors:  # without them, parameters that nearly repeat each other go far, and no file is wrong
+        yield from _of_corrections(model)
+
+
+def _of_fit(
+    model: CalibratedModel, observations: Observations, solution: Solution, rounding_mm: float
+) -> Iterator[str]:
+    if not solution.fit.settled:
+        yield "the fit had not come to rest when it ended; treat the result with care"
+    unexplained_mm = math.sqrt(max(0.0, 3.0 * model.excess_sigma_mm**2 - rounding_mm**2))
+    if unexplained_mm > _BADLY * solution.tolerated_mm:
+        hint = "; try --prior as-built" if model.prior == "recalibration" else ""
+        yield (
+            f"the kinematics fit badly: {unexplained_mm:.1f} mm RMS are left beyond what station and readings explain, "
+            f"where build tolerances explain {solution.tolerated_mm:.0f} mm before the fit; check zeros and signs of "
+            f"the joints, the rig file, and whether the station stood still{hint}"
+        )
+        return
+    known_mm = math.sqrt(model.known_noise_mm2 + rounding_mm**2)
+    if model.effects_noise_mm > _FAR_NOISIER * known_mm:
+        given = ", whether the sigma columns are too small" if np.isfinite(observations.sigma_mm).any() else ""
+        yield (
+            f"the fixes scatter by {model.effects_noise_mm:.2g} mm RMS about the model, where station and readings "
+            f"account for {known_mm:.2g} mm: see whether the columns are there that effects need{given}, whether the "
+            f"prism sits tight and the station stood still, and whether readings and fixes are of the same instant"
+        )
+    left = observations.position_mm - Predictor.of(model).effects_mm(observations)
+    left_mm = math.sqrt(float((left**2).sum(axis=1).mean()))
+    if left_mm < _TOO_SMALL * model.effects_noise_mm:
+        yield (
+            f"the fixes scatter by {left_mm:.2g} mm RMS where their standard deviations say "
+            f"{model.effects_noise_mm:.2g}: too large ones make a loose fit; check the sigma columns or the rig file's "
+            f"station, for fixes of a moving machine its timing_sigma_s (data computed without noise do so too)"
+        )
+
+
+def _of_coverage(model: CalibratedModel, observations: Observations) -> Iterator[str]:
+    for setup in sorted(model.placements):
+        fixes = int((observations.setup == setup).sum())
+        if fixes < _FEW_FIXES and len(model.placements) > 1:
+            yield (
+                f"set-up {setup!r} rests on {fixes} fixes: its base is known by them alone, and the prisms seen from "
+                f"there to {_seen_mm(model, observations, setup):.2g} mm RMS over the poses of all set-ups"
+            )
+    for prism, fixes in model.coverage.fixes.items():
+        if fixes == 0:
+            yield f"prism {prism!r} has no fixes; its offset stays at its nominal value"
+    for joint in model.rig.joints:
+        low, high = model.coverage.ranges[joint.name]
+        if never_moved(joint, low, high):
+            yield (
+                f"{joint.name} never moved ({low:.2f} .. {high:.2f} {joint.unit}); "
+                f"what only its motion shows stays at its prior"
+            )
+        values = observations.joints[joint.name]
+        beyond = int(beyond_limits(joint, values, _BEYOND_LIMITS).sum())
+        if beyond:
+            yield (
+                f"{joint.name}: {beyond} of {len(values)} readings are beyond its limits {joint.limits[0]:g} .. "
+                f"{joint.limits[1]:g} {joint.unit}; check column and unit"
+            )
+
+
+def _seen_mm(model: CalibratedModel, observations: Observations, setup: str) -> float:
+    """RMS 3-D standard deviation of the prisms' places in a set-up's frame, by parameters and effects."""
+    there = replace(observations, setup=np.full(len(observations), setup))
+    moved = Predictor.of(model).linearise(there).jacobian
+    return math.sqrt(float(((moved @ model.covariance) * moved).sum()) / len(there))
+
+
+def _of_outliers(model: CalibratedModel, observations: Observations, solution: Solution) -> Iterator[str]:
+    if model.outliers:
+        worst = sorted(model.outliers, key=lambda o: -o.sigma)
+        rows = ", ".join(str(o.row + 1) for o in worst[:_LISTED])
+        more = f" and {len(worst) - _LISTED} more" if len(worst) > _LISTED else ""
+        share = (
+            "were weighted out" if (solution.fit.weight < 1.0).any() else "count as much as all others in this method"
+        )
+        outliers = Predictor.of(model).find_outliers(observations)
+        yield (
+            f"{len(worst)} of {len(observations)} training fixes are outliers and {share} (row {rows}{more}; "
+            f"up to {worst[0].sigma:.0f} sigma){_where_together(observations, outliers)}"
+        )
+
+
+def _where_together(observations: Observations, outliers: Sequence[Outlier]) -> str:
+    """Return a clause: the session, set-up or prism of nearly all outliers but not of most other fixes; or nothing."""
+    rows = [outlier.row for outlier in outliers]
+    for what, labels, cause in (
+        ("session", observations.session, "did the station move, or a joint's zero?"),
+        ("set-up", observations.setup, "did the station move?"),
+        ("prism", observations.prism, "does it sit tight, and was it always the one that was measured?"),
+    ):
+        names, fixes = np.unique(labels[rows], return_counts=True)
+        name, most = names[fixes.argmax()], int(fixes.max())
+        if len(rows) >= _LISTED and most >= _TOGETHER * len(rows) and (labels == name).mean() < _NOT_ALL:
+            return f"; {most} of them are of {what} {str(name)!r}: {cause}"
+    return ""
+
+
+def _of_result(model: CalibratedModel) -> Iterator[str]:
+    for effect in model.effects:
+        value = effect.coefficients[0].value
+        if effect.family == "joint_compliance" and effect.where in model.coverage.torques and value < 0.0:
+            yield (
+                f"joint_compliance@{effect.where} is negative: {effect.where}_Nm seems to be the torque that holds the "
+                f"load, not the load; the model takes it so"
+            )
+        scored = model.rig.masses or effect.where in model.coverage.torques
+        if "joint_compliance" in library()[effect.family].confused_with and not scored:
+            yield (
+                f"{effect.family}@{effect.where} may be a deflection under load, which nothing here tells: give masses "
+                f"in the rig file or measured torques in {effect.where}_Nm"
+            )
+
+
+def _of_corrections(model: CalibratedModel) -> Iterator[str]:
+    held = model.prior == "recalibration"
+    for parameter in model.parameters:
+        size = f"{parameter.value:+.1f} mm"
+        if parameter.unit == "rad":
+            size = f"{math.degrees(parameter.value):+.2f} deg"
+        if held and abs(parameter.pull) > ANOTHER_VALUE:
+            yield (
+                f"{parameter.name} is {size} off the rig file, {abs(parameter.pull):.0f} build tolerances, so it was "
+                f"not held to them: was a zero set anew, or a part mounted otherwise? correct the file"
+            )
+        elif parameter.kind == "row" and parameter.unit == "rad" and abs(parameter.value) > _FAR_RAD:
+            yield (
+                f"{parameter.name} came out {size} from the rig file; check how the joint and its encoder are mounted, "
+                f"and correct the file"
+            )
+    pulled = [p for p in model.parameters if BEYOND_BUILDING < abs(p.pull) <= ANOTHER_VALUE]
+    if pulled and held:
+        pulled.sort(key=lambda p: -abs(p.pull))
+        names = ", ".join(f"{p.name} ({p.pull:+.1f})" for p in pulled[:_LISTED])
+        size = f"{BEYOND_BUILDING:g} build tolerances"
+        yield f"corrected by more than {size}: {names}; an unmodelled effect may hide there"

@@ -1,0 +1,165 @@
+"""A Gaussian process on the joints' errors: the residual is J_q times a sum of curves, found by their evidence.
+
+Whatever bends, slips or reads wrong in an arm does so at a joint, and moves the tip by that joint's lever arm, which
+the kinematics know. So the process is not on the tip's error but on the joints': error = sum over terms of
+lever * f(variables), where a lever is a column of the joint Jacobian or an axis of the base frame, and f is a Gaussian
+process of one variable, or of two, among the joints' values, their loads, directions, rates and all signals. Terms
+are chosen by their evidence (`curve_search`). The parameters of the kinematics are corrected along with the curves:
+their fit has bent to what the curves now explain.
+
+Curves are finite sums (`curves`), so that the work grows with the number of rows and not with its cube.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.numerics.stored_arrays import read_npz, write_npz
+from calibration.observations import Floats
+from calibration.residual.features import Features, is_place
+from calibration.residual.gaussian.curve_search import CurveSearch, Rows
+from calibration.residual.gaussian.curves import Axis, Curve, CurveSum
+
+_FILE = "gaussian_process.npz"
+_META = "gaussian_process.json"
+
+_WHOLE_TURN_DEG = 300.0  # an angle that covers more than this goes round
+_MOST_ROWS = 1500  # to find the terms by, and of a block of the sums over all rows
+
+
+@dataclass(frozen=True)
+class GaussianProcess:
+    """A fitted process.
+
+    Attributes:
+        names: features of the variables, one an axis.
+        axes, curves: terms; the columns of the axes are those of `names`.
+        weights: of the curves' waves, deg, mm.
+        parameters: (p,) corrections of what `Features.parameter_jacobian` has, mm or rad.
+    """
+
+    kind: ClassVar[str] = "gp"
+
+    names: tuple[str, ...]
+    axes: tuple[Axis, ...]
+    curves: tuple[Curve, ...]
+    weights: Floats
+    parameters: Floats
+
+    @cached_property
+    def _sum(self) -> CurveSum:
+        return CurveSum(self.axes, self.curves, self.weights)
+
+    def predict(self, features: Features) -> Floats:
+        """(n, 3) estimate of the residual in the base frame, mm."""
+        moved = self._sum.moved_mm(features.columns(self.names), features.joint_jacobian)
+        return moved + features.parameter_jacobian @ self.parameters
+
+    def fits(self, features: Features) -> bool:
+        """True if its variables are among these columns, and its levers and parameters are the rig's."""
+        levers = features.joint_jacobian.shape[2] + 3
+        return (
+            set(self.names) <= set(features.names)
+            and all(curve.lever < levers for curve in self.curves)
+            and self.parameters.shape == features.parameter_jacobian.shape[2:]
+        )
+
+    def to_files(self) -> dict[str, bytes]:
+        """Weights in an npz file without pickled objects, axes and curves in JSON."""
+        document = {
+            "axes": [
+                {"feature": name, "low": a.low, "high": a.high, "is_periodic": a.is_periodic}
+                for name, a in zip(self.names, self.axes, strict=True)
+            ],
+            "curves": [{"lever": c.lever, "axes": c.axes, "counts": c.counts} for c in self.curves],
+        }
+        arrays = {"weights": self.weights, "parameters": self.parameters}
+        return {_FILE: write_npz(arrays), _META: json.dumps(document, indent=1).encode()}
+
+    @classmethod
+    def from_files(cls, files: Mapping[str, bytes]) -> GaussianProcess:
+        """Inverse of `to_files`; KeyError, TypeError or ValueError where parts are missing or do not fit."""
+        document = json.loads(files[_META])
+        stored = read_npz(files[_FILE])
+        weights, parameters = (np.asarray(stored[k], dtype=np.float64) for k in ("weights", "parameters"))
+        axes = tuple(Axis(float(a["low"]), float(a["high"]), bool(a["is_periodic"])) for a in document["axes"])
+        curves = tuple(
+            Curve(int(c["lever"]), tuple(map(int, c["axes"])), tuple(map(int, c["counts"]))) for c in document["curves"]
+        )
+        for axis in axes:
+            axis.check()
+        for curve in curves:
+            curve.check(axes)
+        if weights.shape != (sum(c.size for c in curves),) or parameters.ndim != 1:
+            raise ValueError("the weights of the Gaussian process do not fit its curves")
+        if not (np.isfinite(weights).all() and np.isfinite(parameters).all()):
+            raise ValueError("the Gaussian process has weights that are no numbers")
+        return cls(tuple(str(a["feature"]) for a in document["axes"]), axes, curves, weights, parameters)
+
+
+def fit_gaussian_process(features: Features, target_mm: Floats, seed: int) -> GaussianProcess | None:
+    """Find terms, their amplitudes and smoothness, and their weights.
+
+    Args:
+        features: n rows.
+        target_mm: (n, 3) residuals in the base frame.
+        seed: of the rows that terms are found by, where there are more than 1,500.
+
+    Returns:
+        None where no term is likely, or nothing varies.
+    """
+    names, axes = _variables(features)
+    if not names or not target_mm.any():
+        return None
+    values = features.columns(names)
+    scaled = np.column_stack([a.scaled(v) for a, v in zip(axes, values.T, strict=True)])
+    some = np.sort(np.random.default_rng(seed).permutation(len(features))[:_MOST_ROWS])
+    joints = features.joint_jacobian.shape[2]
+    own = {j: names.index(features.names[j]) for j in range(joints) if features.names[j] in names}
+    moved = np.sqrt((features.parameter_jacobian**2).sum(axis=1).mean(axis=0))
+    unit = np.where(moved > 0.0, 1.0 / np.where(moved > 0.0, moved, 1.0), 0.0)
+
+    def rows(of: NDArray[np.intp]) -> Rows:
+        along_base = np.broadcast_to(np.eye(3), (len(of), 3, 3))
+        levers = np.concatenate([features.joint_jacobian[of], along_base], axis=2)
+        return Rows(axes, scaled[of], levers, features.parameter_jacobian[of] * unit, target_mm[of])
+
+    search = CurveSearch(rows(some), own)
+    search.run()
+    if not search.curves:
+        return None
+    p = len(unit)
+    size = p + sum(curve.size for curve in search.curves)
+    gram, moment = np.zeros((size, size)), np.zeros(size)
+    for part in np.array_split(np.arange(len(features)), math.ceil(len(features) / _MOST_ROWS)):
+        matrix = rows(part).matrix(search.curves)
+        gram += matrix.T @ matrix
+        moment += matrix.T @ target_mm[part].ravel()
+    weights = search.weights(gram, moment)
+    used = sorted({axis for curve in search.curves for axis in curve.axes})
+    curves = tuple(replace(c, axes=tuple(used.index(a) for a in c.axes)) for c in search.curves)
+    return GaussianProcess(
+        tuple(names[a] for a in used), tuple(axes[a] for a in used), curves, weights[p:], weights[:p] * unit
+    )
+
+
+def _variables(features: Features) -> tuple[tuple[str, ...], tuple[Axis, ...]]:
+    """Variables of curves: joints and signals that vary, not the places that follow from the joints."""
+    table = features.table()
+    names, axes = [], []
+    for name, values in zip(features.names, table.T, strict=True):
+        known = values[np.isfinite(values)]
+        if is_place(name) or len(known) == 0 or np.ptp(known) <= 1e-9 * max(1.0, float(np.abs(known).max())):
+            continue
+        goes_round = name in features.names[: features.joint_jacobian.shape[2]] and name.endswith("_deg")
+        names.append(name)
+        axes.append(Axis(float(known.min()), float(known.max()), goes_round and bool(np.ptp(known) > _WHOLE_TURN_DEG)))
+    return tuple(names), tuple(axes)

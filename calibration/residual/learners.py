@@ -1,0 +1,106 @@
+"""The learners of the residual by kind: how each is read, and the chain of network and trees.
+
+The chain is Zhou et al. 2022's: trees see the network's estimate as further features. In training it is the
+*out-of-fold* estimate, so that the trees never lean on what the network has memorised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.observations import Floats
+from calibration.residual.features import Features
+from calibration.residual.folds import folds
+from calibration.residual.gaussian.process import GaussianProcess
+from calibration.residual.rbf.rbfn import Rbfn, Shape, fit_shape
+from calibration.residual.rbf.torque_network import TorqueNetwork
+from calibration.residual.trees.boosting import Boosting, Importance
+
+_NETWORK_SIGNALS = ("rbfn_x_mm", "rbfn_y_mm", "rbfn_z_mm")
+_INNER_FOLDS = 5
+
+
+class Residual(Protocol):
+    """A fitted learner of the residual."""
+
+    @property
+    def kind(self) -> str:
+        """`rbfn`, `lightgbm`, `chain`, `gp` or `rbf-tcm`."""
+
+    def predict(self, features: Features) -> Floats:
+        """(n, 3) estimate of the residual in the base frame, mm."""
+
+    def fits(self, features: Features) -> bool:
+        """True if it was trained on the columns that these features have."""
+
+    def to_files(self) -> dict[str, bytes]:
+        """Everything that is needed to predict again."""
+
+
+@dataclass(frozen=True)
+class Chained:
+    """Network, then trees that see its estimate."""
+
+    kind: ClassVar[str] = "chain"
+
+    rbfn: Rbfn
+    boosting: Boosting
+
+    def predict(self, features: Features) -> Floats:
+        """(n, 3) estimate of the residual in the base frame, mm."""
+        return self.boosting.predict(with_estimate(features, self.rbfn.predict(features)))
+
+    def fits(self, features: Features) -> bool:
+        """True if both parts fit."""
+        estimate = np.empty((len(features), len(_NETWORK_SIGNALS)))
+        return self.rbfn.fits(features) and self.boosting.fits(with_estimate(features, estimate))
+
+    def to_files(self) -> dict[str, bytes]:
+        """The files of both."""
+        return self.rbfn.to_files() | self.boosting.to_files()
+
+    @classmethod
+    def from_files(cls, files: Mapping[str, bytes]) -> Chained:
+        """Inverse of `to_files`."""
+        return cls(Rbfn.from_files(files), Boosting.from_files(files))
+
+
+LOADERS: Mapping[str, Callable[[Mapping[str, bytes]], Residual]] = {
+    learner.kind: learner.from_files for learner in (Rbfn, Boosting, Chained, GaussianProcess, TorqueNetwork)
+}
+
+
+def tree_importance(residual: Residual | None) -> tuple[Importance, ...] | None:
+    """Features of the learner's trees, the most important first; None without trees."""
+    trees = residual.boosting if isinstance(residual, Chained) else residual
+    return trees.importance if isinstance(trees, Boosting) else None
+
+
+def with_estimate(features: Features, estimate_mm: Floats) -> Features:
+    """Append a network's estimate (n, 3) to the features, as the chain's trees see them."""
+    return features.with_signals(_NETWORK_SIGNALS, estimate_mm)
+
+
+def with_out_of_fold_estimate(
+    features: Features, target_mm: Floats, labels: NDArray[np.str_], shape: Shape, seed: int
+) -> Features:
+    """Append to each row the estimate of a network that was trained without the row's fold.
+
+    Args:
+        features: n training rows.
+        target_mm: (n, 3) residuals in the base frame.
+        labels: (n,) no fold separates rows of one.
+        shape: of the networks.
+        seed: of folds and networks.
+    """
+    out = np.empty_like(target_mm)
+    split = folds(labels, _INNER_FOLDS, seed + 1)
+    for fold in np.unique(split):
+        held = split == fold
+        out[held] = fit_shape(features.select(~held), target_mm[~held], shape, seed).predict(features.select(held))
+    return with_estimate(features, out)

@@ -1,0 +1,355 @@
+"""Selection of the residual learner: candidates compared by cross-validation, the best kept if it helps beyond chance.
+
+Every learner is judged by its out-of-fold estimates: those of rows that it was not trained on.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.numerics.statistics import paired_test
+from calibration.observations import Floats
+from calibration.residual.features import Features
+from calibration.residual.folds import folds
+from calibration.residual.gaussian.process import fit_gaussian_process
+from calibration.residual.learners import Chained, Residual, with_estimate, with_out_of_fold_estimate
+from calibration.residual.rbf.rbfn import Shape, choose_shape, fit_shape
+from calibration.residual.rbf.torque_network import TorqueNetwork, fit_torque_network
+from calibration.residual.trees.boosting import Settings, Tuned, cross_validate, fit_boosting
+
+Kind = Literal["default", "none", "rbfn", "lightgbm", "chain", "gp"]
+Labels = NDArray[np.str_]
+_T = TypeVar("_T")
+
+_FOLDS = 5
+_LEAST_ROWS = 50
+_LEAST_UNITS = 10
+_ALL_ROWS = (0.5, 1.0)  # limits of what rows that the folds leave out may be hoped to gain
+_REACH = 1.5  # in error; the chain of Zhou et al. 2022 gains a quarter on the better of its parts
+_MOST_PROGRESS = 0.95
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Result of one learner on held-out groups.
+
+    Attributes:
+        kind: which learner.
+        before_mm: RMS of the 3-D error without it.
+        after_mm: RMS of the 3-D error with it.
+        p: probability of such a gain by chance (paired one-sided t-test over groups).
+        kept: it passed.
+    """
+
+    kind: str
+    before_mm: float
+    after_mm: float
+    p: float
+    kept: bool
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Result of `select_residual`.
+
+    Attributes:
+        residual: the learner, fitted to all rows; None where none helps.
+        trials: the learners that were compared.
+        reason: one sentence.
+        left_mm: (n, 3) errors of rows that the learner was trained without; the targets themselves without a learner.
+        split: (n,) fold that held each row out; all zero without a learner.
+        variance_mm2: (3,) expected squared error of the learner on rows it never saw, along the axes of the base
+            frame; zeros without a learner.
+    """
+
+    residual: Residual | None
+    trials: tuple[Trial, ...]
+    reason: str
+    left_mm: Floats
+    split: NDArray[np.intp]
+    variance_mm2: Floats = field(default_factory=lambda: np.zeros(3))
+
+
+def select_residual(
+    features: Features,
+    target_mm: Floats,
+    groups: Labels,
+    standstills: Labels,
+    *,
+    kind: Kind,
+    seed: int,
+    executor: Executor,
+    progress: Callable[[float], None],
+) -> Selection:
+    """Compare the candidates and fit the best one that helps.
+
+    The expected error is the winner's own out-of-fold error, the least of up to four on the same rows: a little less
+    than new rows will show, most so where the learners are about as good as each other.
+
+    Args:
+        features: n rows.
+        target_mm: (n, 3) residuals in the base frame.
+        groups: (n,) labels that no fold separates.
+        standstills: (n,) finer labels (`standstill_labels`), the units of the test where the groups are too few for
+            one.
+        kind: one learner, or `default` for whichever is best.
+        seed: of folds and learners.
+        executor: runs what is independent; the selection does not depend on it.
+        progress: told the share that is done.
+    """
+    if kind == "none":
+        return _nothing(target_mm, (), "switched off")
+    units = _units(groups, standstills)
+    if len(features) < _LEAST_ROWS or len(np.unique(groups)) < 2 or len(np.unique(units)) < _LEAST_UNITS:
+        return _nothing(target_mm, (), _too_few(groups))
+    data = Data(features, target_mm, groups, units)
+    steps = itertools.count(1)
+    validation = CrossValidation(
+        data, _FOLDS, seed, executor, lambda: progress(_MOST_PROGRESS * (1.0 - 0.9 ** next(steps)))
+    )
+    estimates: dict[str, tuple[Floats, Tuned | None]] = {}
+    trials: dict[str, Trial] = {}
+    tuned = None
+    for name in ("gp", "rbfn", "lightgbm", "chain") if kind == "default" else (kind,):
+        if kind == "default" and name == "chain" and not _may_win(trials):
+            continue
+        estimate_mm, tuned = estimates[name] = validation.estimate(name, tuned.settings if tuned else None)
+        trials[name] = _trial(name, target_mm, estimate_mm, units)
+    compared = tuple(trials.values())
+    best = min((t for t in compared if t.kept), key=lambda t: t.after_mm, default=None)
+    if best is None:
+        reason = "in cross-validation of the training data no learner lowers the error beyond chance"
+        return _nothing(target_mm, compared, reason)
+    estimate_mm, tuned = estimates[best.kind]
+    left_mm = target_mm - estimate_mm
+    gain = _gain_of_all_rows(validation, best.kind, left_mm, tuned, executor)
+    residual = _fit(best.kind, data, tuned, seed, executor)
+    progress(1.0)
+    if residual is None:
+        return _nothing(target_mm, compared, "all rows together show nothing to learn")
+    return Selection(
+        residual,
+        compared,
+        f"in cross-validation of the training data {best.kind} lowers the error from {best.before_mm:.3g} to "
+        f"{best.after_mm:.3g} mm RMS",
+        left_mm,
+        validation.split,
+        gain * (left_mm**2).mean(axis=0),
+    )
+
+
+def torque_compensation(
+    features: Features, target_mm: Floats, groups: Labels, standstills: Labels, names: Sequence[str], *, seed: int
+) -> Selection:
+    """Fit the second paper's network on the joint torques, and keep it whether it helps or not, as the paper does.
+
+    Args:
+        features: n rows.
+        target_mm: (n, 3) residuals in the base frame.
+        groups: (n,) as for `select_residual`.
+        standstills: (n,) as for `select_residual`.
+        names: columns of the torques among the features.
+        seed: of the folds.
+    """
+    units = _units(groups, standstills)
+    if len(np.unique(units)) < _LEAST_UNITS:
+        return _nothing(target_mm, (), _too_few(groups))
+    network, estimate_mm = fit_torque_network(features, target_mm, units, names, seed=seed)
+    trial = replace(_trial(TorqueNetwork.kind, target_mm, estimate_mm, units), kept=True)
+    left_mm = target_mm - estimate_mm
+    return Selection(
+        network,
+        (trial,),
+        f"a part of the method: {len(network.units)} units on the joint torques bring the error of rows left "
+        f"out from {trial.before_mm:.3g} to {trial.after_mm:.3g} mm RMS",
+        left_mm,
+        folds(units, _FOLDS, seed),
+        (left_mm**2).mean(axis=0),
+    )
+
+
+def _nothing(target_mm: Floats, trials: tuple[Trial, ...], reason: str) -> Selection:
+    return Selection(None, trials, reason, target_mm, np.zeros(len(target_mm), dtype=np.intp))
+
+
+def _units(groups: Labels, standstills: Labels) -> Labels:
+    """(n,) labels to test by: groups, or the standstills in them where the groups are too few for a test."""
+    return groups if len(np.unique(groups)) >= _LEAST_UNITS else np.char.add(np.char.add(groups, "|"), standstills)
+
+
+def _too_few(groups: Labels) -> str:
+    return f"{len(groups)} fixes in {len(np.unique(groups))} groups are too few to learn a residual from"
+
+
+def _trial(kind: str, target_mm: Floats, estimate_mm: Floats, units: Labels) -> Trial:
+    test = paired_test((target_mm**2).sum(axis=1), ((target_mm - estimate_mm) ** 2).sum(axis=1), units)
+    return Trial(kind, test.before_mm, test.after_mm, test.p, test.is_better)
+
+
+def _may_win(trials: Mapping[str, Trial]) -> bool:
+    """True if the chain may be the best: its parts help, and are not out of reach of the best so far.
+
+    The estimate of a network that does not help is noise to the trees.
+    """
+    best = min(trial.after_mm for trial in trials.values())
+    return trials["rbfn"].kept and trials["lightgbm"].after_mm < _REACH * best
+
+
+def _gain_of_all_rows(
+    validation: CrossValidation, kind: str, left_mm: Floats, tuned: Tuned | None, executor: Executor
+) -> float:
+    """Held-out squared error of a learner trained on all rows over that of the folds', trained on some.
+
+    Error against one over the number of rows is taken for a straight line through those with half the rows and with
+    all but a fold's. Two folds have no more than half, and nothing is hoped for.
+    """
+    if validation.count == 2:
+        return 1.0
+    data = validation.data
+    halves = CrossValidation(data, 2, validation.seed, executor)
+    half_mm, _ = halves.estimate(kind, tuned.settings if tuned else None)
+    with_most, with_half = float((left_mm**2).sum()), float(((data.target_mm - half_mm) ** 2).sum())
+    used = 1.0 - 1.0 / validation.count
+    gain = (with_half / with_most - 1.0) * (1.0 / used - 1.0) / (2.0 - 1.0 / used)
+    return float(np.clip(1.0 - gain, *_ALL_ROWS))
+
+
+def _fit(kind: str, data: Data, tuned: Tuned | None, seed: int, executor: Executor) -> Residual | None:
+    if kind == "gp":
+        return fit_gaussian_process(data.features, data.target_mm, seed)
+    if kind == "lightgbm" and tuned is not None:
+        return fit_boosting(data.features, data.target_mm, tuned, seed, executor)
+    shape = _best_shape(data, seed)
+    network = fit_shape(data.features, data.target_mm, shape, seed)
+    if tuned is None:
+        return network
+    seen = with_out_of_fold_estimate(data.features, data.target_mm, data.labels, shape, seed)
+    return Chained(network, fit_boosting(seen, data.target_mm, tuned, seed, executor))
+
+
+# -- cross-validation --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Data:
+    """Rows to learn a residual from.
+
+    Attributes:
+        features: n rows.
+        target_mm: (n, 3) residuals in the base frame.
+        groups: (n,) labels that no fold separates.
+        units: (n,) labels that are no coarser, for splits inside a single group.
+    """
+
+    features: Features
+    target_mm: Floats
+    groups: Labels
+    units: Labels
+
+    def select(self, rows: NDArray[np.bool_]) -> Data:
+        """Rows by mask."""
+        return Data(self.features.select(rows), self.target_mm[rows], self.groups[rows], self.units[rows])
+
+    @property
+    def labels(self) -> Labels:
+        """(n,) labels to split by: groups, or the units of the only one, or the rows of the only unit."""
+        for labels in (self.groups, self.units):
+            if len(np.unique(labels)) > 1:
+                return labels
+        return np.arange(len(self.features)).astype(np.str_)
+
+
+class CrossValidation:
+    """Out-of-fold estimates of the learners for one division into folds.
+
+    Args:
+        data: all rows.
+        count: number of folds; fewer where there are fewer groups.
+        seed: of folds and learners.
+        executor: runs what is independent; results do not depend on it.
+        advance: told after each piece of work.
+    """
+
+    def __init__(
+        self, data: Data, count: int, seed: int, executor: Executor, advance: Callable[[], None] = lambda: None
+    ) -> None:
+        self.data = data
+        self.seed = seed
+        self.split = folds(data.labels, count, seed)
+        self.count = int(self.split.max()) + 1
+        self._executor = executor
+        self._advance = advance
+        self._training = [data.select(self.split != fold) for fold in range(self.count)]
+        self._held = [data.features.select(self.split == fold) for fold in range(self.count)]
+        self._shapes: list[Shape] = []
+
+    def estimate(self, kind: str, settings: Settings | None = None) -> tuple[Floats, Tuned | None]:
+        """Estimate each row by a learner that was trained without its fold.
+
+        Args:
+            kind: `rbfn`, `lightgbm`, `chain` or `gp`.
+            settings: of the trees; tuned if left out.
+
+        Returns:
+            (n, 3) estimates, mm; settings and number of the trees, None without trees.
+        """
+        if kind == "gp":
+            return self._joined(self._map(_process_estimate, self._training, self._held)), None
+        if kind == "lightgbm":
+            seen = [training.features for training in self._training]
+            return self._trees(list(zip(seen, self._held, strict=True)), settings, None)
+        if not self._shapes:
+            self._shapes = self._map(_best_shape, self._training)
+        if kind == "rbfn":
+            return self._joined(self._map(_network_estimate, self._training, self._held, self._shapes)), None
+        parts = self._map(_chain_features, self._training, self._held, self._shapes)
+        return self._trees(parts, settings, parts[0][0].names)
+
+    def _map(self, work: Callable[..., _T], *of_folds: Sequence[object]) -> list[_T]:
+        found = []
+        for result in self._executor.map(partial(work, seed=self.seed), *of_folds):
+            found.append(result)
+            self._advance()
+        return found
+
+    def _joined(self, estimates: Sequence[Floats]) -> Floats:
+        out = np.empty_like(self.data.target_mm)
+        for fold, estimate in enumerate(estimates):
+            out[self.split == fold] = estimate
+        return out
+
+    def _trees(
+        self, parts: Sequence[tuple[Features, Features]], settings: Settings | None, names: Sequence[str] | None
+    ) -> tuple[Floats, Tuned]:
+        target, split = self.data.target_mm, self.split
+        found = cross_validate(parts, target, split, self.seed, self._executor, settings=settings, names=names)
+        self._advance()
+        return found
+
+
+def _best_shape(data: Data, seed: int) -> Shape:
+    return choose_shape(data.features, data.target_mm, data.labels, seed)
+
+
+def _network_estimate(training: Data, held: Features, shape: Shape, *, seed: int) -> Floats:
+    return fit_shape(training.features, training.target_mm, shape, seed).predict(held)
+
+
+def _process_estimate(training: Data, held: Features, *, seed: int) -> Floats:
+    process = fit_gaussian_process(training.features, training.target_mm, seed)
+    return np.zeros((len(held), 3)) if process is None else process.predict(held)
+
+
+def _chain_features(training: Data, held: Features, shape: Shape, *, seed: int) -> tuple[Features, Features]:
+    """Features of training rows and of held-out rows as the chain's trees see them."""
+    estimate = _network_estimate(training, held, shape, seed=seed)
+    seen = with_out_of_fold_estimate(training.features, training.target_mm, training.labels, shape, seed)
+    return seen, with_estimate(held, estimate)

@@ -1,0 +1,1 @@
+"""The description of a rig: joints, links, prisms, channels, limits."""

@@ -1,0 +1,353 @@
+"""Columns of observations that someone else wrote, as a CSV file or a data frame: read, and checked cell by cell."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+import unicodedata
+from array import array
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, Literal, NoReturn, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.errors import DataError
+from calibration.rig.description import Rig
+
+Floats = NDArray[np.float64]
+Strings = NDArray[np.str_]
+
+POSITION_COLUMNS = ("x_mm", "y_mm", "z_mm")
+SIGMA_COLUMNS = ("sigma_x_mm", "sigma_y_mm", "sigma_z_mm")
+LABEL_COLUMNS = ("setup", "session", "pose")
+
+_LONGEST = 200  # characters of a label or a number; every row's label takes as much memory as the longest
+_LONGEST_ROW = 1 << 20
+_MOST_COLUMNS = 1000
+_MOST_LABEL_BYTES = 64 << 20
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_NO_NUMBERS = {"nan", "na", "n/a", "null", "none", "inf", "-inf", "+inf", "infinity", "-"}
+_NOT_MEASURED = {"nan", "None", "<NA>", "NaT"}  # cells of data frames, as text
+_SIGNAL = re.compile(r"[A-Za-z][A-Za-z0-9_]*_(bar|mA)")
+
+
+class DataFrame(Protocol):
+    """A table with named columns, as pandas and polars have it."""
+
+    @property
+    def columns(self) -> Iterable[Any]:
+        """Names of the columns."""
+
+    def __getitem__(self, column: Any, /) -> Any:
+        """Return a column by its name; it has a method `to_numpy`."""
+
+
+class Table:
+    """The wanted columns of a table, row by row; numbers take eight bytes each, whatever was written.
+
+    Args:
+        source: name of the table for messages.
+        header: names of its columns.
+        rig: whose joints, prisms and channels are wanted.
+        positions_required: False where the columns of positions may be missing.
+        place: `line` of a file, from 1, or `row` of a data frame, from 0: what numbers the rows in messages.
+
+    Attributes:
+        header: names of its columns.
+
+    Raises:
+        DataError: a column is missing, appears twice or has no name.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        header: Sequence[str],
+        rig: Rig,
+        *,
+        positions_required: bool,
+        place: Literal["line", "row"] = "line",
+    ) -> None:
+        self.header = header
+        self._source, self._place = source, place
+        self._check_header(rig, positions_required)
+        self._lines = array("q")
+        self._numbers = {name: _Numbers() for name in header if name in _number_columns(header, rig)}
+        self._labels: dict[str, list[str]] = {name: [] for name in header if name in ("prism", *LABEL_COLUMNS)}
+        self._number_places = [(header.index(name), column) for name, column in self._numbers.items()]
+        self._label_places = [(header.index(name), cells) for name, cells in self._labels.items()]
+        self._alike: dict[str, str] = {}
+
+    def __len__(self) -> int:
+        return len(self._lines)
+
+    @property
+    def wanted(self) -> set[str]:
+        """Names of the columns that are read; all others are passed over."""
+        return {*self._numbers, *self._labels}
+
+    def append(self, row: Sequence[str], line: int) -> None:
+        """Take a row.
+
+        Raises:
+            DataError: it has another number of fields than the header.
+        """
+        if len(row) != len(self.header):
+            raise DataError(self._source, f"{len(row)} fields where the header has {len(self.header)}", line)
+        self._lines.append(line)
+        for place, column in self._number_places:
+            column.append(row[place].strip(), line)
+        for place, cells in self._label_places:
+            cell = row[place].strip()
+            cells.append(self._alike.setdefault(cell, cell))
+
+    def numbers(self, column: str, *, required: bool) -> Floats:
+        """Return a column (n,) of numbers, NaN where a cell is empty.
+
+        Raises:
+            DataError: a cell is no number, or is empty where every row needs it.
+        """
+        found = self._numbers[column]
+        first = found.empty_line if required else None
+        if found.bad is not None and (first is None or found.bad[0] < first):
+            line, cell = found.bad
+            self._refuse_line(line, column, _why_no_number(cell))
+        if first is not None:
+            self._refuse_line(first, column, "empty, but every observation needs it")
+        return np.frombuffer(found.values)
+
+    def triple(self, columns: tuple[str, ...], *, required: bool) -> Floats:
+        """Return three columns (n, 3) of numbers; NaN for those that the table lacks."""
+        out = np.full((len(self), 3), np.nan)
+        for i, name in enumerate(columns):
+            if name in self.header:
+                out[:, i] = self.numbers(name, required=required)
+        return out
+
+    def labels(self, column: str) -> Strings:
+        """Return a column (n,) of labels, "" where there is no such column.
+
+        Raises:
+            DataError: a label is too long, or two labels only look the same.
+        """
+        cells = self._labels.get(column, [""] * len(self))
+        alike: dict[str, str] = {}
+        longest = 1
+        for cell in dict.fromkeys(cells):
+            longest = max(longest, len(cell))
+            if len(cell) > _LONGEST:
+                self.refuse(cells.index(cell), column, f"a label of {len(cell)} characters; at most {_LONGEST}")
+            if 4 * longest * len(cells) > _MOST_LABEL_BYTES:
+                reason = f"a label of {len(cell)} characters among {len(cells)} rows; shorten it"
+                self.refuse(cells.index(cell), column, reason)
+            other = alike.setdefault(_plain(cell), cell)
+            if other != cell:
+                self.refuse(cells.index(cell), column, f"{cell!a} and {other!a} look the same; write them alike")
+        return np.array(cells, dtype=np.str_)
+
+    def refuse(self, row: int, column: str, reason: str) -> NoReturn:
+        """Raise DataError for a row, counted from 0."""
+        self._refuse_line(self._lines[row], column, reason)
+
+    def refuse_where(self, bad: NDArray[np.bool_], column: str, values: Floats, reason: str) -> None:
+        """Raise DataError for the first of the `bad` (n,) rows, if any, with its value."""
+        if bad.any():
+            row = int(np.argmax(bad))
+            self.refuse(row, column, f"{values[row]:g} {reason}")
+
+    def refuse_column(self, column: str, reason: str) -> NoReturn:
+        """Raise DataError for a whole column."""
+        raise DataError(self._source, reason, column=column)
+
+    def _refuse_line(self, line: int, column: str, reason: str) -> NoReturn:
+        if self._place == "row":
+            raise DataError(f"{self._source}, row {line} (from 0)", reason, column=column)
+        raise DataError(self._source, reason, line, column)
+
+    def _refuse_header(self, reason: str, column: str | None = None) -> NoReturn:
+        raise DataError(self._source, reason, 1 if self._place == "line" else None, column)
+
+    def _check_header(self, rig: Rig, positions_required: bool) -> None:
+        header = self.header
+        if not header or header == [""]:
+            self._refuse_header("the file is empty; a header is needed" if self._place == "line" else "no columns")
+        if len(header) > _MOST_COLUMNS:
+            self._refuse_header(f"{len(header)} columns; at most {_MOST_COLUMNS}")
+        doubled = sorted({name for name in header if header.count(name) > 1})
+        if doubled[:1] == [""]:
+            self._refuse_header(f"{header.count('')} columns have no name; name them, or leave them out")
+        if doubled:
+            self._refuse_header("column appears twice", doubled[0])
+        needed = ["prism", *(j.column for j in rig.joints), *(POSITION_COLUMNS if positions_required else ())]
+        missing = [name for name in needed if name not in header]
+        if len(header) == 1 and len(missing) == len(needed):
+            self._refuse_header("one column only: separate columns by commas, and write decimals with a point")
+        if missing:
+            alike = [name for name in header if _plain(name).casefold() == missing[0].casefold()]
+            hint = f" (there is {alike[0]!a})" if alike else ""
+            self._refuse_header(f"column missing{hint} for rig {rig.name!r}; needed: {', '.join(needed)}", missing[0])
+        sigmas = [name for name in SIGMA_COLUMNS if name in header]
+        if 0 < len(sigmas) < len(SIGMA_COLUMNS):
+            self._refuse_header(f"needs the other two of {', '.join(SIGMA_COLUMNS)} beside it", sigmas[0])
+
+
+def read_csv(data: bytes, rig: Rig, source: str, *, positions_required: bool) -> Table:
+    """Read a CSV file.
+
+    Args:
+        data: UTF-8, comma, header; a byte-order mark is tolerated.
+        rig: whose columns are wanted.
+        source: file name for messages.
+        positions_required: as for `Table`.
+
+    Raises:
+        DataError: with file, line, column and reason.
+    """
+    if b"\0" in data:
+        line = data.count(b"\n", 0, data.index(b"\0")) + 1
+        raise DataError(source, "a zero byte, as other encodings have; save the file as UTF-8", line)
+    text = _Lines(data)
+    reader = csv.reader(text, strict=True)
+    try:
+        header = [name.strip() for name in next(reader, [])]
+        table = Table(source, header, rig, positions_required=positions_required)
+        for row in reader:
+            text.taken = 0
+            if row:
+                table.append(row, reader.line_num)
+    except csv.Error as error:
+        raise DataError(source, f"not a CSV file: {error}", text.line) from error
+    except UnicodeDecodeError:
+        raise _not_utf8(data, source) from None
+    if not len(table):
+        raise DataError(source, "no observations below the header")
+    return table
+
+
+def read_frame(frame: DataFrame, rig: Rig, source: str, *, positions_required: bool) -> Table:
+    """Read a data frame.
+
+    Args:
+        frame: of pandas, polars or anything alike; cells that are None or not a number are not measured.
+        rig: whose columns are wanted.
+        source: name for messages.
+        positions_required: as for `Table`.
+
+    Raises:
+        DataError: with row, column and reason.
+    """
+    header = [str(name) for name in frame.columns]
+    table = Table(source, header, rig, positions_required=positions_required, place="row")
+    wanted = table.wanted
+    columns = {name: [_cell(v) for v in frame[name].to_numpy().tolist()] for name in header if name in wanted}
+    rows = len(columns["prism"])
+    if not rows:
+        raise DataError(source, "no observations")
+    for name, cells in columns.items():
+        if len(cells) != rows:
+            table.refuse_column(name, f"{len(cells)} cells where the column prism has {rows}")
+    nothing = [""] * rows
+    for number, row in enumerate(zip(*(columns.get(name, nothing) for name in header), strict=True)):
+        table.append(row, number)
+    return table
+
+
+def optional_columns(rig: Rig) -> set[str]:
+    """Return the names of all optional columns of numbers but signals, `<signal>_bar` and `<signal>_mA`."""
+    columns = {"time_s", "dwell_s", "temperature_degC", "payload_kg"}
+    for joint in rig.joints:
+        columns |= {f"{joint.name}_dir", f"{joint.name}_rate", f"{joint.name}_Nm"}
+    return columns | {c.column for c in rig.channels if c.name not in rig.joint_names}
+
+
+def extra_columns(header: Sequence[str], rig: Rig) -> list[str]:
+    """Return those of a table's columns that are optional columns of numbers, in their order."""
+    known = optional_columns(rig)
+    return [name for name in header if name in known or (_SIGNAL.fullmatch(name) and name not in SIGMA_COLUMNS)]
+
+
+def _number_columns(header: Sequence[str], rig: Rig) -> set[str]:
+    """Return the names of the columns of a table that are read as numbers."""
+    return {*(j.column for j in rig.joints), *POSITION_COLUMNS, *SIGMA_COLUMNS, *extra_columns(header, rig)}
+
+
+class _Numbers:
+    """A column of numbers as it is read; its faults are told when the column is wanted."""
+
+    def __init__(self) -> None:
+        self.values = array("d")
+        self.empty_line: int | None = None
+        self.bad: tuple[int, str] | None = None  # line and cell
+
+    def append(self, cell: str, line: int) -> None:
+        if not cell:
+            self.values.append(math.nan)
+            if self.empty_line is None:
+                self.empty_line = line
+            return
+        value = float(cell) if len(cell) <= _LONGEST and _NUMBER.fullmatch(cell) else math.nan
+        self.values.append(value)
+        if self.bad is None and not math.isfinite(value):
+            self.bad = line, cell
+
+
+class _Lines:
+    """Lines for the CSV reader, which puts a row together from as many as its quotes ask for: not more than a few.
+
+    Attributes:
+        taken: characters since it was last set to 0.
+        line: number of the last line.
+    """
+
+    def __init__(self, data: bytes) -> None:
+        self._text = io.TextIOWrapper(io.BytesIO(data), "utf-8-sig", newline="")
+        self.taken = 0
+        self.line = 0
+
+    def __iter__(self) -> Iterator[str]:
+        return self
+
+    def __next__(self) -> str:
+        line = self._text.readline(_LONGEST_ROW + 1)
+        if not line:
+            raise StopIteration
+        self.line += 1
+        self.taken += len(line)
+        if self.taken > _LONGEST_ROW:
+            raise csv.Error(f"a row of more than {_LONGEST_ROW:,} characters")
+        return line
+
+
+def _not_utf8(data: bytes, source: str) -> DataError:
+    try:
+        data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        return DataError(source, f"byte {error.start} is not UTF-8; save the file as UTF-8", line)
+    raise AssertionError("the text was not UTF-8")
+
+
+def _cell(value: object) -> str:
+    """Return a cell of a data frame as a CSV file would have it; whole numbers without a point, as labels have them."""
+    if isinstance(value, float) and value.is_integer():
+        return str(int(value))
+    text = str(value)
+    return "" if text in _NOT_MEASURED else text
+
+
+def _why_no_number(cell: str) -> str:
+    if len(cell) > _LONGEST:
+        return f"{cell[:20]!r}... of {len(cell)} characters is not a number"
+    if _NUMBER.fullmatch(cell):
+        return f"{cell!r} is beyond what a number can be"
+    advice = "not measured is an empty cell" if cell.lower() in _NO_NUMBERS else "write it as 1234.5 or 1e-3"
+    return f"{cell!r} is not a finite number; {advice}"
+
+
+def _plain(text: str) -> str:
+    """Return text as a reader sees it: accents one way, nothing invisible, every space alike."""
+    seen = "".join(c for c in unicodedata.normalize("NFC", text) if unicodedata.category(c) != "Cf")
+    return " ".join(seen.split())

@@ -1,0 +1,1 @@
+"""Acquisition: from links to the store."""

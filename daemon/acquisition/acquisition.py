@@ -1,0 +1,429 @@
+"""Acquisition: one thread per link, bounded queues, and the one thread that writes.
+
+The writer drains the queues, commits the raw captures, decodes them batch by batch, commits the records, and hands
+them on; whatever keeps it from decoding, raw captures are committed first. A process that ends between the two commits
+leaves chunks that the store knows as undecoded; the next one goes live at once and decodes them before what it captures
+itself (`daemon.acquisition.backlog`). A replay runs the same writer without threads (`run_inline`).
+"""
+
+from __future__ import annotations
+
+import heapq
+import logging
+import sqlite3
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from operator import itemgetter
+from typing import TypeVar
+
+from daemon.acquisition.backlog import BATCH_CAPTURES, Backlog, Batch
+from daemon.acquisition.clock_watch import ClockWatch
+from daemon.acquisition.link_decoders import TICK_NS, LinkDecoders
+from daemon.acquisition.link_intake import LinkIntake
+from daemon.acquisition.present_state import NOTHING_EXPECTED, Expected
+from daemon.acquisition.status import AcquisitionStatus
+from daemon.acquisition.status_board import StatusBoard
+from daemon.store import Store
+from daemon.store.errors import storage_sentence
+from drivers.clock import NS_PER_S, Clock, Stamp, TimeBudget
+from drivers.readings import (
+    CanCapture,
+    Capture,
+    DecodeFailure,
+    Decoder,
+    DeviceEvent,
+    EventKind,
+    Gap,
+    LinkItem,
+    LinkLoop,
+    Record,
+    SerialCapture,
+)
+
+log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+ALIVE_NS = 5 * NS_PER_S
+RETRY_S = 1.0
+STOP_S = 15.0  # real seconds
+LINKS_STOP_S = 5.0  # of them for all links together, which look at `stop` several times a second
+LAST_RETRIES = 3  # when stopping; then what could not be stored is given up, and the log says how much
+INLINE_CAPTURES = 4096
+INLINE_SPAN_NS = NS_PER_S
+
+# What is wrong with a record, in place of with the disk: out of a column's range or type, text that is no UTF-8.
+_REFUSED = (sqlite3.IntegrityError, sqlite3.ProgrammingError, ArithmeticError, TypeError, ValueError)
+
+_LINK_LEVELS = {EventKind.LINK_UP: logging.INFO, EventKind.LINK_LOST: logging.WARNING}
+
+
+class AcquisitionError(Exception):
+    """Acquisition has failed in a way that only a new start can mend."""
+
+
+class Acquisition:
+    """Takes captures from links to stored records.
+
+    Args:
+        links: the link loops.
+        decoders: for each link, what makes its decoder. A decoder lives within one boot: captures of another boot,
+            and those that a killed run left undecoded, get a fresh one. A link without a decoder is only captured.
+        store: where everything goes.
+        clock: for ticks, lags and ages.
+        batch_seconds: how long captures are gathered before they are committed, in real time: it bounds how often
+            the disk must sync.
+        queue_captures: how many captures of one link may wait while the disk is slow.
+        on_records: called in the writer's thread with records after they were committed, and with none when time has
+            passed (ten times a second). What it stores it commits itself.
+        expected: what should be heard, for `status`.
+        clock_watch: looks after the computer's clock, live; none where the clock is another one.
+    """
+
+    def __init__(
+        self,
+        links: Sequence[LinkLoop],
+        decoders: Mapping[str, Callable[[], Decoder]],
+        store: Store,
+        clock: Clock,
+        *,
+        batch_seconds: float = 0.05,
+        queue_captures: int = 200_000,
+        on_records: Callable[[Sequence[Record]], None],
+        expected: Expected = NOTHING_EXPECTED,
+        clock_watch: ClockWatch | None = None,
+    ) -> None:
+        self._store, self._clock, self._on_records = store, clock, on_records
+        self._batch_seconds = batch_seconds
+        self._intakes = [LinkIntake(link, clock, queue_captures, store.begun or clock.now()) for link in links]
+        self._factories = decoders
+        self._decoding = LinkDecoders(decoders)
+        self._backlog = Backlog(store, clock)
+        self._is_left_over = False  # what is decoded now, a run before this one captured
+        self._decoded: _Decoded | None = None
+        self._next_tick_ns = 0
+        self._unstored = 0  # captures that were drained and are not committed
+        self._troubles: dict[str, str] = {}
+        self._board = StatusBoard(clock, expected)
+        self._clock_watch = clock_watch
+        self._stop_links = threading.Event()
+        self._finish = threading.Event()
+        self._decode_until = TimeBudget(0.0)  # when stopping
+        self._writer: threading.Thread | None = None
+        self._failure: Exception | None = None
+        self._last_cycle_ns = clock.monotonic_ns()
+
+    # ---- live ------------------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Go live; what a run before this one left undecoded is decoded first, beside capturing."""
+        self._last_cycle_ns = self._clock.monotonic_ns()
+        for intake in self._intakes:
+            intake.start(self._stop_links)
+        self._writer = threading.Thread(target=self._write, name="writer", daemon=True)
+        self._writer.start()
+
+    def stop(self, budget: TimeBudget | None = None) -> bool:
+        """Stop the links, store all that they have captured, decode what time allows. Harmless when not started.
+
+        Raw captures come first; what is not decoded after half of the time is left to the next start.
+
+        Args:
+            budget: how long it may take, `STOP_S` by default. What is not stored by then is counted, and the log and
+                `check` tell.
+
+        Returns:
+            whether the writer has ended: where it hangs in a commit, it has the store for itself.
+        """
+        budget = budget or TimeBudget(STOP_S)
+        self._stop_links.set()
+        links = TimeBudget(min(LINKS_STOP_S, budget.left_s / 3))
+        for intake in self._intakes:
+            intake.join(links.left_s)
+        self._decode_until = TimeBudget(budget.left_s / 2)
+        self._finish.set()
+        if self._writer is None:
+            return True
+        self._writer.join(budget.left_s)
+        if self._writer.is_alive():
+            log.critical("%s: a write does not end; it is left behind", self._store.path)
+        lost = self._unstored + sum(intake.queued for intake in self._intakes)
+        if lost:
+            self._give_up(f"{lost} captures could not be stored before the end")
+        elif self._decoded is not None or not self._backlog.is_empty:
+            log.warning("all captures are stored; those that there was no time to decode, the next start decodes")
+        return not self._writer.is_alive()
+
+    def _give_up(self, why: str) -> None:
+        log.critical("%s", why)
+        self._failure = AcquisitionError(why)
+
+    def status(self) -> AcquisitionStatus:
+        """A snapshot, from any thread."""
+        summaries = self._decoding.summaries(self._clock.now())
+        return self._board.snapshot(self._intakes, summaries, self._decoding.defects(), is_behind=self.is_behind)
+
+    @property
+    def is_behind(self) -> bool:
+        """True while captures wait in the store to be decoded, as after a kill: readings and fixes come late."""
+        return self._backlog.is_behind
+
+    def check(self) -> None:
+        """Whether the writer lives; a disk that is full or slow is no reason to raise, it is waited for.
+
+        Raises:
+            AcquisitionError: the writer has ended, and nothing is stored any more.
+        """
+        if self._failure is not None:
+            raise AcquisitionError(f"the writer failed, nothing is stored any more: {self._failure}")
+
+    @property
+    def has_stored_all(self) -> bool:
+        """False once captures were lost because the store could not be written to."""
+        return self._failure is None
+
+    def alive(self, within_s: float) -> bool:
+        """Whether the writer has gone round within the last real `within_s`: a hung disk or a dead writer has not."""
+        since_s = (self._clock.monotonic_ns() - self._last_cycle_ns) / NS_PER_S
+        return self._writer is not None and self._writer.is_alive() and self._clock.real_seconds(since_s) <= within_s
+
+    def _write(self) -> None:
+        next_alive_ns = 0
+        try:
+            while not self._finish.is_set():
+                now = self._clock.now()
+                self._last_cycle_ns = now.monotonic_ns
+                self._take_in()
+                if now.monotonic_ns >= next_alive_ns:
+                    self._try("its sign of life", partial(self._store.note_alive, now))
+                    next_alive_ns = now.monotonic_ns + ALIVE_NS
+                is_done = self._decode_next(now)
+                if not is_done:
+                    self._finish.wait(RETRY_S)
+                elif self._backlog.is_empty:
+                    self._finish.wait(self._batch_seconds)
+            self._take_in()
+            while self._has_time() and not (self._backlog.is_empty and self._decoded is None):
+                if not self._decode_next(self._clock.now()):
+                    break
+        except Exception as error:
+            # The thread ends here; `alive` and `status` tell.
+            log.critical("the writer failed; nothing is stored any more", exc_info=error)
+            self._board.set_error(f"the writer failed: {error}; restart rigcal")
+            self._failure = error
+
+    def _has_time(self) -> bool:
+        return not self._decode_until.is_over
+
+    def _take_in(self) -> None:
+        """Commit what the links have captured, however long the disk is full or faulty; meanwhile captures queue."""
+        queues = [intake.drain() for intake in self._intakes]
+        if self._clock_watch is not None and (step := self._clock_watch.look(self._clock.now())) is not None:
+            queues.append([step])
+        items = [item for queue in queues for item in queue]
+        if not items:
+            return
+        if len(items) > BATCH_CAPTURES:
+            items = _in_time_order(queues)
+        self._unstored = sum(isinstance(item, CanCapture | SerialCapture) for item in items)
+        batches = self._insist(partial(self._commit_raw, items))
+        self._unstored = 0
+        for batch in batches:
+            self._board.captured(batch.captures)
+            self._backlog.add(batch)
+            _tell_of_links(batch.reports)
+
+    def _decode_next(self, now: Stamp) -> bool:
+        """Decode one batch and the time that has passed, if that is all, and store what comes of it.
+
+        Returns:
+            False where the disk refuses, and it is to be tried again.
+        """
+        if self._decoded is None and not self._try("what is decoded", partial(self._decode, now)):
+            return False
+        decoded = self._decoded
+        if decoded is None:
+            return True
+        if (decoded.records or decoded.chunk_ids) and not self._try(
+            "what is decoded", partial(self._commit_records, decoded.records, decoded.chunk_ids)
+        ):
+            return False
+        self._decoded = None
+        # What an earlier run left over says nothing of how things are now.
+        hand_on = self._pass_on if self._is_left_over else self._hand_on
+        hand_on([*decoded.reports, *decoded.records])
+        return True
+
+    def _decode(self, now: Stamp) -> None:
+        batch = self._backlog.next()
+        # Time passes for decoders only once they have been given all that was captured in it.
+        is_tick = self._backlog.is_empty and now.monotonic_ns >= self._next_tick_ns
+        if batch is None and not is_tick:
+            return
+        is_left_over = batch is not None and batch.is_left_over
+        if is_left_over != self._is_left_over:
+            self._tell_of_left_overs(is_left_over=is_left_over)
+        batch = batch or Batch((), ())
+        records = [*batch.failures, *self._decoding.feed(batch.captures)]
+        if is_tick and not is_left_over:
+            records += self._decoding.tick(now)
+            self._next_tick_ns = now.monotonic_ns + TICK_NS
+        self._decoded = _Decoded(batch.chunk_ids, batch.reports, records)
+
+    def _tell_of_left_overs(self, *, is_left_over: bool) -> None:
+        self._is_left_over = is_left_over
+        if is_left_over:
+            log.warning("captures that the last run left undecoded are being decoded")
+        else:
+            self._decoding = LinkDecoders(self._factories)  # what was left over is decoded apart from what comes live
+            log.info("what the last run left is decoded")
+
+    # ---- replay ----------------------------------------------------------------------------------------------------
+
+    def run_inline(self, items: Iterable[LinkItem]) -> None:
+        """Store and decode `items`, in order, as fast as it goes, in this thread.
+
+        Time is what the captures' stamps say, so the same items give the same rows, whatever the machine does.
+
+        Raises:
+            sqlite3.Error, StoreError: the store cannot be written to.
+        """
+        batch: list[LinkItem] = []
+        starts_ns = 0
+        for item in items:
+            now_ns = _stamp(item).monotonic_ns
+            if batch and (len(batch) >= INLINE_CAPTURES or not 0 <= now_ns - starts_ns < INLINE_SPAN_NS):
+                self._store_inline(batch)
+                batch = []
+            if not batch:
+                starts_ns = now_ns
+            batch.append(item)
+        if batch:
+            self._store_inline(batch)
+
+    def _store_inline(self, items: Sequence[LinkItem]) -> None:
+        for batch in self._commit_raw(items):
+            self._board.captured(batch.captures)
+            _tell_of_links(batch.reports)
+            records = self._decoding.feed_and_tick(batch.captures)
+            self._commit_records(records, batch.chunk_ids)
+            self._hand_on([*batch.reports, *records])
+
+    # ---- the writer's work -----------------------------------------------------------------------------------------
+
+    def _commit_raw(self, items: Sequence[LinkItem]) -> list[Batch]:
+        batches = []
+        with self._store.transaction():
+            for start in range(0, len(items), BATCH_CAPTURES):
+                captures: list[Capture] = []
+                reports: list[Record] = []
+                for item in items[start : start + BATCH_CAPTURES]:
+                    if isinstance(item, CanCapture | SerialCapture):
+                        captures.append(item)
+                    else:
+                        reports.append(item)
+                self._insert(reports)
+                batches.append(Batch(self._store.append_captures(captures), captures, reports))
+        return batches
+
+    def _commit_records(self, records: Sequence[Record], chunk_ids: Sequence[int]) -> None:
+        with self._store.transaction():
+            self._insert(records)
+            self._store.mark_decoded(chunk_ids)
+
+    def _insert(self, records: Sequence[Record]) -> None:
+        """Insert records; one that the store refuses must not keep the others out, nor come again at every start."""
+        try:
+            self._store.insert_records(records)
+        except _REFUSED as error:
+            if len(records) == 1:
+                log.exception("a record cannot be stored: %r", records[0])
+                reason = f"a {type(records[0]).__name__} cannot be stored: {str(error)!a}"
+                self._store.insert_records([DecodeFailure("store", _stamp(records[0]), reason, b"")])
+                return
+            for record in records:
+                self._insert([record])
+
+    def _hand_on(self, records: Sequence[Record]) -> None:
+        self._board.recorded(records)
+        self._pass_on(records)
+
+    def _pass_on(self, records: Sequence[Record]) -> None:
+        try:
+            self._on_records(records)
+        except Exception:
+            # The records are stored; a fault of their consumer must not end acquisition.
+            log.exception("records are stored, but could not be handed on")
+
+    def _insist(self, work: Callable[[], T]) -> T:
+        """What `work` returns, however long the disk is full or faulty; when stopping, only a few times."""
+        tries = 0
+        while True:
+            try:
+                result = work()
+            except sqlite3.DatabaseError as error:
+                tries += 1
+                if self._finish.is_set() and (tries > LAST_RETRIES or not self._has_time()):
+                    raise
+                self._note_trouble("captures", error)
+                self._finish.wait(RETRY_S)
+                self._last_cycle_ns = self._clock.monotonic_ns()
+            else:
+                self._note_trouble("captures", None)
+                return result
+
+    def _try(self, what: str, work: Callable[[], None]) -> bool:
+        """Whether the disk lets `work` be done; where it does not, captures are stored first, if they can be."""
+        try:
+            work()
+        except sqlite3.DatabaseError as error:
+            self._note_trouble(what, error)
+            return False
+        self._note_trouble(what, None)
+        return True
+
+    def _note_trouble(self, what: str, error: sqlite3.DatabaseError | None) -> None:
+        if error is None:
+            if self._troubles.pop(what, None) is None:
+                return
+            log.warning("%s: %s can be written again", self._store.path, what)
+        else:
+            sentence = storage_sentence(self._store.path, error)
+            if what not in self._troubles:
+                log.error("%s cannot be written and wait to be tried again: %s", what, sentence)
+            self._troubles[what] = sentence
+        self._board.set_error(next(iter(self._troubles.values()), None))
+
+
+@dataclass(frozen=True)
+class _Decoded:
+    """A batch, decoded, that is not stored yet: its chunks, what links told beside it, and its records."""
+
+    chunk_ids: Sequence[int]
+    reports: Sequence[Record]
+    records: Sequence[Record]
+
+
+def _in_time_order(queues: Iterable[Sequence[LinkItem]]) -> list[LinkItem]:
+    """Items of all links by their instants, so that a batch holds one time of all; a link's own stay in order."""
+
+    def keyed(items: Sequence[LinkItem]) -> Iterator[tuple[int, LinkItem]]:
+        newest_ns = -(2**63)
+        for item in items:
+            newest_ns = max(newest_ns, _stamp(item).monotonic_ns)
+            yield newest_ns, item
+
+    return [item for _, item in heapq.merge(*map(keyed, queues), key=itemgetter(0))]
+
+
+def _tell_of_links(reports: Iterable[Record]) -> None:
+    """A rig that is silent must say why in the service's journal, where people look first."""
+    for report in reports:
+        if isinstance(report, DeviceEvent) and report.kind in _LINK_LEVELS:
+            log.log(_LINK_LEVELS[report.kind], "%s", report.text)
+
+
+def _stamp(record: LinkItem | Record) -> Stamp:
+    return record.start if isinstance(record, Gap) else record.stamp

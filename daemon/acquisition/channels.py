@@ -1,0 +1,178 @@
+"""A rig's channels as the drivers' decoders and device set-ups: the rig file says what, the drivers know how."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TypedDict, assert_never
+
+from calibration.rig.channels import Channel, Cia404Analogue, Cia406Encoder, Cia406Linear, DbcSignal, RawSignal
+from calibration.rig.description import Rig
+from drivers.can.channel import ChannelDecoder
+from drivers.can.dbc import DbcFile
+from drivers.can.raw_signal import BitField, SignalChannel, SignalDecoder
+from drivers.canopen.cia404 import AnalogueChannel, AnalogueDecoder
+from drivers.canopen.cia406 import EncoderChannel, EncoderDecoder, LinearChannel, LinearDecoder
+from drivers.canopen.node_setup import PROFILE_ANALOGUE, PROFILE_ENCODER, NodeSetup
+from drivers.canopen.pdo import TransmitPdo
+from drivers.errors import DescriptionError
+
+# What the devices map to their TPDO1 by default (the rig file names an EDS for others): index, sub-index, bits.
+_USUAL_MAPPING = {"6004": 0x60040020, "6020": 0x60200120, "6130": 0x61300120, "7130": 0x71300110, "9130": 0x91300120}
+
+CanopenChannel = Cia406Encoder | Cia406Linear | Cia404Analogue
+
+
+def decoder_factories(rig: Rig, directory: Path, link: str) -> list[Callable[[], ChannelDecoder]]:
+    """For each channel of a link, what makes a fresh decoder of it.
+
+    Args:
+        rig: whose channels.
+        directory: where the rig's DBC and EDS files are.
+        link: name of the CAN link.
+
+    Raises:
+        DescriptionError: a DBC or EDS file is missing, malformed, or lacks what a channel names.
+    """
+    dbc_files: dict[str, DbcFile] = {}
+    factories = []
+    for channel in rig.channels:
+        if channel.link != link:
+            continue
+        if isinstance(channel, DbcSignal) and channel.dbc not in dbc_files:
+            dbc_files[channel.dbc] = DbcFile(directory / channel.dbc)
+        factories.append(_factory(channel, rig, directory, dbc_files))
+    return factories
+
+
+def node_setups(rig: Rig, directory: Path, link: str) -> list[NodeSetup]:
+    """What active set-up expects of each CANopen node of a link, and tells it to do."""
+    return [
+        NodeSetup(
+            node=channel.node,
+            name=channel.name,
+            profile=PROFILE_ANALOGUE if isinstance(channel, Cia404Analogue) else PROFILE_ENCODER,
+            pdo=_pdo(channel, directory),
+            pdo_number=channel.pdo,
+            mode=channel.mode,
+            period_ms=channel.period_ms,
+            heartbeat_ms=channel.heartbeat_ms,
+            units_per_revolution=channel.units_per_revolution if isinstance(channel, Cia406Encoder) else None,
+            total_units=channel.total_units if isinstance(channel, Cia406Encoder) else None,
+            step_nm=channel.step_nm if isinstance(channel, Cia406Linear) else None,
+            decimal_digits=channel.decimal_digits if isinstance(channel, Cia404Analogue) else None,
+        )
+        for channel in rig.channels
+        if isinstance(channel, CanopenChannel) and channel.link == link
+    ]
+
+
+def _factory(
+    channel: Channel, rig: Rig, directory: Path, dbc_files: dict[str, DbcFile]
+) -> Callable[[], ChannelDecoder]:
+    match channel:
+        case Cia406Encoder():
+            encoder = EncoderChannel(
+                **_canopen(channel, directory),
+                sign=channel.sign,
+                zero_counts=channel.zero_counts,
+                max_rate_per_s=_max_rate(rig, channel.name),
+                units_per_revolution=channel.units_per_revolution,
+                total_units=channel.total_units,
+            )
+            return lambda: EncoderDecoder(encoder)
+        case Cia406Linear():
+            linear = LinearChannel(
+                **_canopen(channel, directory),
+                sign=channel.sign,
+                zero_counts=channel.zero_counts,
+                max_rate_per_s=_max_rate(rig, channel.name),
+                position_object=int(channel.object, 16),
+                step_nm=channel.step_nm,
+                range_mm=channel.range_mm,
+            )
+            return lambda: LinearDecoder(linear)
+        case Cia404Analogue():
+            analogue = AnalogueChannel(
+                **_canopen(channel, directory),
+                process_value=int(channel.object, 16),
+                decimal_digits=channel.decimal_digits,
+                scale=channel.scale,
+                offset=channel.offset,
+                max_rate_per_s=_max_rate(rig, channel.name),
+            )
+            return lambda: AnalogueDecoder(analogue)
+        case DbcSignal():
+            signal = dbc_files[channel.dbc].channel(
+                channel.name,
+                channel.unit,
+                channel.message,
+                channel.signal,
+                scale=channel.scale,
+                offset=channel.offset,
+                timeout_s=channel.timeout_s,
+            )
+            signal = replace(signal, max_rate_per_s=_max_rate(rig, channel.name))
+            return lambda: SignalDecoder(signal)
+        case RawSignal():
+            raw = SignalChannel(
+                name=channel.name,
+                unit=channel.unit,
+                arbitration_id=channel.arbitration_id,
+                field=_bit_field(channel),
+                is_extended=channel.is_extended,
+                scale=channel.scale,
+                offset=channel.offset,
+                not_available=frozenset(channel.not_available),
+                timeout_s=channel.timeout_s,
+                max_rate_per_s=_max_rate(rig, channel.name),
+            )
+            return lambda: SignalDecoder(raw)
+        case _:
+            assert_never(channel)
+
+
+class _CanopenPart(TypedDict):
+    """What the drivers' CANopen channels have in common."""
+
+    name: str
+    unit: str
+    node: int
+    pdo: TransmitPdo
+    pdo_number: int
+    is_synchronous: bool
+    heartbeat_ms: int
+    timeout_s: float
+
+
+def _canopen(channel: CanopenChannel, directory: Path) -> _CanopenPart:
+    return {
+        "name": channel.name,
+        "unit": channel.unit,
+        "node": channel.node,
+        "pdo": _pdo(channel, directory),
+        "pdo_number": channel.pdo,
+        "is_synchronous": channel.mode == "sync",
+        "heartbeat_ms": channel.heartbeat_ms,
+        "timeout_s": channel.timeout_s,
+    }
+
+
+def _pdo(channel: CanopenChannel, directory: Path) -> TransmitPdo:
+    if channel.eds is not None:
+        return TransmitPdo.from_eds(directory / channel.eds, channel.node, channel.pdo)
+    carried = "6004" if isinstance(channel, Cia406Encoder) else channel.object
+    return TransmitPdo.usual(channel.node, channel.pdo, [_USUAL_MAPPING[carried]])
+
+
+def _bit_field(channel: RawSignal) -> BitField:
+    try:
+        return BitField(channel.start_bit, channel.length_bits, channel.byte_order, channel.is_signed)
+    except ValueError as error:
+        raise DescriptionError(f"channel {channel.name!r}", str(error)) from error
+
+
+def _max_rate(rig: Rig, name: str) -> float | None:
+    """The joint's fastest motion; None for a channel that is no joint, whose jumps are not looked for."""
+    return rig.joint(name).max_rate if name in rig.joint_names else None

@@ -1,0 +1,225 @@
+"""Joins each fix with the joints at its own instant: a pure state machine over records.
+
+A fix was measured `link_delay_s` before the first byte of its record arrived. Every joint is interpolated linearly
+between the two samples around that instant, on the monotonic clock; a fix therefore waits until every joint has been
+sampled a little beyond it, or other joints `deadline_s` beyond it. Time is what the records say: links may be read
+late, one later than another, and a log is joined as what came live. Beside the joints' values a joined fix carries what
+effects depend on: direction of approach, rate, dwell, and the latest signals.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from calibration.rig.channels import Cia406Encoder, Cia406Linear
+from calibration.rig.description import Rig
+from daemon.acquisition.tracks import (
+    HISTORY_NS,
+    MAX_GAP_S,
+    STILL_AFTER_NS,
+    JointInput,
+    JointTrack,
+    Motion,
+    SignalInput,
+    SignalTrack,
+)
+from drivers.clock import NS_PER_S, Stamp
+from drivers.readings import DeviceEvent, EventKind, Fix, Reading, Record, Status
+
+
+@dataclass(frozen=True)
+class JoinedFix:
+    """A fix with all that is known of the machine at its instant.
+
+    Attributes:
+        fix: as the station gave it.
+        stamp: when it was measured: the fix's stamp with the link delay taken off.
+        values: observations CSV column -> number (`theta1_deg`, `theta1_dir`, `theta1_rate`, `boom_valve_mA`, ...).
+        dwell_s: since the last motion of any joint, or since the joints were first seen; None before they were.
+        standstill: number of the standstill, rising with each; None while the boom moves or has not yet settled.
+        refused: why calibration must not use it, in words; "" when it may.
+    """
+
+    fix: Fix
+    stamp: Stamp
+    values: Mapping[str, float]
+    dwell_s: float | None
+    standstill: int | None
+    refused: str = ""
+
+    def columns(self) -> dict[str, float]:
+        """`values` with `dwell_s`: the numeric columns of the observations CSV, apart from the position."""
+        return {**self.values, **({} if self.dwell_s is None else {"dwell_s": self.dwell_s})}
+
+
+@dataclass(frozen=True)
+class MachineState:
+    """All that is known of the machine at the newest instant at which every joint is known.
+
+    Attributes:
+        monotonic_ns: that instant.
+        boot_id: which boot `monotonic_ns` belongs to.
+        oldest: the joint that was last read then; the others were read then or later.
+        values: observations CSV column -> number, as of a JoinedFix.
+        dwell_s: as of a JoinedFix.
+    """
+
+    monotonic_ns: int
+    boot_id: str
+    oldest: str
+    values: Mapping[str, float]
+    dwell_s: float | None
+
+
+def joint_inputs(rig: Rig) -> list[JointInput]:
+    """The joints of a rig, for an ObservationJoiner.
+
+    A joint moves when it changes by six standard deviations and three steps of its reading. Two samples of three may
+    be missing around a fix, and of a fast channel a quarter of a second.
+    """
+    period_s = {c.name: c.period_ms / 1000 for c in rig.channels if isinstance(c, Cia406Encoder | Cia406Linear)}
+    return [
+        JointInput(j.name, j.unit, max(6 * j.sigma, 3 * j.resolution), max(MAX_GAP_S, 3 * period_s.get(j.name, 0.0)))
+        for j in rig.joints
+    ]
+
+
+def signal_inputs(rig: Rig) -> list[SignalInput]:
+    """The signals of a rig: its channels that are no joints."""
+    return [SignalInput(c.name, c.column) for c in rig.channels if c.name not in rig.joint_names]
+
+
+class ObservationJoiner:
+    """Joins fixes with joints and signals.
+
+    Args:
+        joints: every joint that a fix needs.
+        signals: what is carried along where it is fresh.
+        link_delay_s: station -> how long before the first byte of its record it measured; 0 where not given.
+        settle_s: how long the boom must have stood for a fix to belong to a standstill.
+        deadline_s: how long a fix waits for joints that have fallen silent; where all are silent, it waits as long as
+            samples are kept.
+
+    Attributes:
+        refusals: reason -> how many fixes were refused for it.
+    """
+
+    def __init__(
+        self,
+        joints: Sequence[JointInput],
+        signals: Sequence[SignalInput] = (),
+        *,
+        link_delay_s: Mapping[str, float] | None = None,
+        settle_s: float = 1.0,
+        deadline_s: float = 2.0,
+    ) -> None:
+        self.refusals: Counter[str] = Counter()
+        self._delay_ns = {name: round(delay * NS_PER_S) for name, delay in (link_delay_s or {}).items()}
+        self._deadline_ns = round(deadline_s * NS_PER_S)
+        self._joints = {joint.name: JointTrack(joint) for joint in joints}
+        self._signals = {signal.name: SignalTrack(signal) for signal in signals}
+        self._motion = Motion(round(settle_s * NS_PER_S))
+        self._pending: deque[tuple[Fix, Stamp]] = deque()
+        self._boot_id = ""
+        self._newest_ns = 0
+
+    def feed(self, records: Iterable[Record]) -> list[JoinedFix]:
+        """Take records and return the fixes that they complete, refused ones included.
+
+        The records of one call may be in any order, and those of a link may come calls after those of another. Fixes
+        whose own status is not OK are passed over, and so are readings of doubtful time: they tell nothing of any
+        instant. Records of another boot end what was pending.
+        """
+        done: list[JoinedFix] = []
+        timed = [(r.stamp, r) for r in records if isinstance(r, Reading | Fix | DeviceEvent)]
+        for boot_id in dict.fromkeys(stamp.boot_id for stamp, _ in timed):
+            if boot_id != self._boot_id:
+                done += self._restart(boot_id)
+            of_boot = [(stamp.monotonic_ns, r) for stamp, r in timed if stamp.boot_id == boot_id]
+            # A preset jump comes before the reading that shows it.
+            of_boot.sort(key=lambda item: (item[0], not isinstance(item[1], DeviceEvent)))
+            for at_ns, record in of_boot:
+                self._newest_ns = max(self._newest_ns, at_ns)
+                self._take(record, at_ns)
+                if self._pending:
+                    done += self._release()
+        return done
+
+    def latest(self) -> MachineState | str:
+        """The machine at the newest instant at which every joint is known, or why there is none."""
+        last = min(self._joints.values(), key=lambda joint: joint.newest_ns)
+        if last.newest_ns < 0:
+            return f"{last.name}: no reading yet"
+        values, missing = self._values(last.newest_ns, "the newest instant that all joints were read")
+        if missing:
+            return missing
+        return MachineState(last.newest_ns, self._boot_id, last.name, values, self._motion.at(last.newest_ns)[0])
+
+    def _restart(self, boot_id: str) -> list[JoinedFix]:
+        """Another boot, another monotonic clock: nothing of the one before can be compared with it."""
+        ended = [self._join(fix, stamp) for fix, stamp in self._pending]
+        self._pending.clear()
+        for joint in self._joints.values():
+            joint.clear()
+        for signal in self._signals.values():
+            signal.clear()
+        self._motion.restart()
+        self._boot_id, self._newest_ns = boot_id, 0
+        return ended
+
+    def _take(self, record: Reading | Fix | DeviceEvent, at_ns: int) -> None:
+        if isinstance(record, Reading):
+            if record.status is Status.TIME_DOUBTFUL:
+                return
+            joint = self._joints.get(record.channel)
+            if joint is not None:
+                if joint.add(at_ns, record):
+                    self._motion.note(at_ns)
+            elif (signal := self._signals.get(record.channel)) is not None:
+                signal.add(at_ns, record.value)
+        elif isinstance(record, Fix):
+            if record.status is Status.OK:
+                self._pending.append((record, record.stamp.shifted(-self._delay_ns.get(record.station, 0))))
+        elif record.kind is EventKind.PRESET_JUMP and record.device in self._joints:
+            self._joints[record.device].jumped(at_ns)
+
+    def _release(self) -> list[JoinedFix]:
+        done: list[JoinedFix] = []
+        while self._pending:
+            fix, stamp = self._pending[0]
+            wanted_ns = stamp.monotonic_ns + STILL_AFTER_NS
+            sampled_ns = [joint.newest_ns for joint in self._joints.values()]
+            is_in_time = max(sampled_ns) - wanted_ns <= self._deadline_ns and self._newest_ns - wanted_ns <= HISTORY_NS
+            if is_in_time and min(sampled_ns) < wanted_ns:
+                break
+            self._pending.popleft()
+            done.append(self._join(fix, stamp))
+        return done
+
+    def _join(self, fix: Fix, stamp: Stamp) -> JoinedFix:
+        values, refused = self._values(stamp.monotonic_ns, "the fix")
+        if refused:
+            self.refusals[refused] += 1
+        dwell_s, standstill = self._motion.at(stamp.monotonic_ns)
+        return JoinedFix(fix, stamp, values, dwell_s, standstill, refused)
+
+    def _values(self, at_ns: int, of: str) -> tuple[dict[str, float], str]:
+        """Columns of joints and signals at an instant, and why a joint is missing among them; "" if none is."""
+        values: dict[str, float] = {}
+        missing = ""
+        for joint in self._joints.values():
+            found = joint.at(at_ns, of)
+            if isinstance(found, str):
+                missing = missing or f"{joint.name}: {found}"
+                continue
+            values[f"{joint.name}_{joint.unit}"] = found.value
+            values[f"{joint.name}_dir"] = float(found.direction)
+            if found.rate is not None:
+                values[f"{joint.name}_rate"] = found.rate
+        for signal in self._signals.values():
+            value = signal.at(at_ns)
+            if value is not None:
+                values[signal.column] = value
+        return values, missing

@@ -1,0 +1,93 @@
+"""The decoders of all links: captures in, records out; a decoder that fails ends neither the others nor acquisition."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+
+from drivers.can.summary import CanSummary
+from drivers.can_decoder import CanDecoder
+from drivers.clock import NS_PER_S, Stamp
+from drivers.readings import Capture, DecodeFailure, Decoder, Record
+
+log = logging.getLogger(__name__)
+
+TICK_NS = NS_PER_S // 10  # decoders are told the time this often
+
+
+class LinkDecoders:
+    """The decoders of all links, each within one boot.
+
+    Args:
+        factories: link -> what makes its decoder; captures of other links yield nothing.
+    """
+
+    def __init__(self, factories: Mapping[str, Callable[[], Decoder]]) -> None:
+        self._factories = factories
+        self._decoders: dict[str, Decoder] = {}
+        self._boots: dict[str, str] = {}
+        self._defects: dict[str, Stamp] = {}
+        self._ticked_ns = -TICK_NS
+
+    def feed(self, captures: Sequence[Capture]) -> list[Record]:
+        """Records of captures, in their order."""
+        records: list[Record] = []
+        link = boot = None
+        decoder: Decoder | None = None
+        for capture in captures:
+            if capture.link != link or capture.stamp.boot_id != boot:
+                link, boot = capture.link, capture.stamp.boot_id
+                decoder = self._decoder(link, boot) if link in self._factories else None
+            if decoder is None:
+                continue
+            try:
+                produced = decoder.feed(capture)
+            except Exception as error:  # noqa: BLE001 - see _failure
+                produced = [self._failure(capture.link, capture.stamp, error, capture.data)]
+            if produced:
+                records.extend(produced)
+        return records
+
+    def feed_and_tick(self, captures: Sequence[Capture]) -> list[Record]:
+        """Records of captures and of the time that passes by their stamps."""
+        records: list[Record] = []
+        start = 0
+        for i, capture in enumerate(captures):
+            if not 0 <= capture.stamp.monotonic_ns - self._ticked_ns < TICK_NS:
+                records += self.feed(captures[start:i])
+                records += self.tick(capture.stamp)
+                start, self._ticked_ns = i, capture.stamp.monotonic_ns
+        return records + self.feed(captures[start:])
+
+    def tick(self, now: Stamp) -> list[Record]:
+        """Records that time causes, at decoders that live in the boot of `now`."""
+        records: list[Record] = []
+        for link in self._factories:
+            if self._boots.setdefault(link, now.boot_id) != now.boot_id:
+                continue
+            try:
+                records.extend(self._decoder(link, now.boot_id).tick(now))
+            except Exception as error:  # noqa: BLE001 - see _failure
+                records.append(self._failure(link, now, error, b""))
+        return records
+
+    def summaries(self, now: Stamp) -> list[CanSummary]:
+        """What the CAN links have heard until `now`; from any thread."""
+        decoders = [self._decoders.get(link) for link in self._factories]
+        return [decoder.summary(now) for decoder in decoders if isinstance(decoder, CanDecoder)]
+
+    def defects(self) -> dict[str, Stamp]:
+        """Link -> when its decoder last showed a defect of its own; from any thread."""
+        return dict(self._defects)
+
+    def _failure(self, link: str, stamp: Stamp, error: Exception, raw: bytes) -> DecodeFailure:
+        """A decoder promises never to raise; a defect in one must not end acquisition, nor flood the log."""
+        if link not in self._defects:
+            log.critical("link %s: its decoder is defective; captures are kept", link, exc_info=error)
+        self._defects[link] = stamp
+        return DecodeFailure(link, stamp, f"the decoder failed: {type(error).__name__}: {error}", raw)
+
+    def _decoder(self, link: str, boot: str) -> Decoder:
+        if link not in self._decoders or self._boots[link] != boot:
+            self._decoders[link], self._boots[link] = self._factories[link](), boot
+        return self._decoders[link]

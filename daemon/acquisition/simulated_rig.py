@@ -1,0 +1,240 @@
+"""The simulated rig: its process, and the operator's actions of aiming and driving.
+
+The daemon talks to it over two pseudo-terminals exactly as to a real rig. This module starts and stops the process,
+aims the station at a prism, and drives the boom from pose to pose.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import logging
+import subprocess
+import sys
+import threading
+from collections import deque
+from collections.abc import Iterable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from calibration.rig.description import Rig
+from daemon.config import ConfigError
+from drivers.clock import ScaledClock
+
+log = logging.getLogger(__name__)
+
+BOOM_SPEED = 0.45  # of the joints' greatest rates
+APPROACH = {"deg": 3.0, "mm": 50.0}  # from how far a joint comes to a pose that says from which side
+_REFUSES = 2  # exit status of a simulator that was asked for what there is not
+POSES_AHEAD = 30  # drawn at a time, and visited by the short way
+
+
+Stop = tuple[Mapping[str, float], float]  # joint -> deg or mm; how long to stand there, s
+
+
+def stops_of(rig: Rig, rows: Iterable[Mapping[str, Any]], dwell_s: float) -> list[Stop]:
+    """Return the stops for the rows of a pose plan.
+
+    Where a row says from which side a joint comes, the boom first goes to that side of the pose, without a stop. Other
+    conditions than that and the dwell are nothing that driving could bring about.
+
+    Args:
+        rig: whose poses they are.
+        rows: as `rigcal plan` has them.
+        dwell_s: how long to stand at each, unless a row says longer.
+
+    Raises:
+        ValueError: a row without a number for each joint, or with one beyond its limits.
+    """
+    stops: list[Stop] = []
+    for row in rows:
+        try:
+            pose = {joint.name: float(row[joint.column]) for joint in rig.joints}
+            sides = {joint.name: float(row.get(f"{joint.name}_dir", 0.0)) for joint in rig.joints}
+            stand_s = max(dwell_s, float(row.get("dwell_s", 0.0)))
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"a pose has a number for each of {', '.join(j.column for j in rig.joints)}") from error
+        before = {
+            joint.name: min(
+                max(pose[joint.name] - sides[joint.name] * APPROACH[joint.unit], joint.limits[0]), joint.limits[1]
+            )
+            for joint in rig.joints
+        }
+        beyond = next((j for j in rig.joints if not j.limits[0] <= pose[j.name] <= j.limits[1]), None)
+        if beyond is not None:
+            raise ValueError(f"{beyond.name} = {pose[beyond.name]:g} {beyond.unit} is beyond its limits")
+        if before != pose:
+            stops.append((before, 0.0))
+        stops.append((pose, stand_s))
+    return stops
+
+
+class SimulationError(Exception):
+    """The simulated rig did not start, or refused a command."""
+
+
+class SimulatedRig:
+    """A rig simulated by another process, at the speed of a shared clock.
+
+    Args:
+        rig: shipped name or path.
+        rates: joint name -> its greatest rate, deg/s or mm/s.
+        directory: where the ports appear: `can` (an slcan adapter) and `station`.
+        clock: shared with the process; its rate is the simulation's speed.
+        station_delay_s: how old a measurement of the station is when its record starts.
+        seed: of the machine's imperfections, of all noise and of the poses.
+        effects: hidden effects, as the simulator spells them.
+        secret: directory in which the simulator names one more, which it draws; none by default.
+
+    Raises:
+        ConfigError: no such effect, or none that this rig can have; the process has said why on standard error.
+        SimulationError: it does not start.
+    """
+
+    def __init__(
+        self,
+        rig: str,
+        rates: Mapping[str, float],
+        directory: Path,
+        clock: ScaledClock,
+        *,
+        station_delay_s: float = 0.0,
+        seed: int = 1,
+        effects: tuple[str, ...] = (),
+        secret: Path | None = None,
+    ) -> None:
+        self.can_port = directory / "can"
+        self.station_port = directory / "station"
+        self._clock = clock
+        self._seed = seed
+        self._rates = rates
+        self._events: deque[dict[str, Any]] = deque()
+        self._arrived = threading.Condition()
+        self._commands = threading.Lock()
+        origin = f"{clock.origin.utc_ns},{clock.origin.monotonic_ns},{clock.origin.boot_id}"
+        command = [sys.executable, "-m", "simulators", "--rig", rig, "--seed", str(seed), "--rate", str(clock.rate)]
+        command += ["--origin", origin, "--can-port", str(self.can_port), "--station-port", str(self.station_port)]
+        command += ["--bus-master", "host", "--signal-ms", "200", "--effects", ",".join(effects)]
+        command += ["--latency-ms", str(station_delay_s * 1e3)]
+        command += [] if secret is None else ["--secret", str(secret)]
+        # In a session of its own: a Ctrl-C ends the daemon, which ends the rig when it is done with it.
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+        )
+        self._reader = threading.Thread(target=self._read, name="simulation", daemon=True)
+        self._reader.start()
+        self._stops: deque[Stop] = deque()
+        self._stopping = threading.Event()
+        self._autopilot: threading.Thread | None = None
+        try:
+            self._expect("ready")
+        except SimulationError as error:
+            self.close()
+            if self._process.returncode == _REFUSES:
+                raise ConfigError("the simulated rig refuses what it was asked for, as it says above") from error
+            raise
+
+    def aim(self, target: str) -> None:
+        """Turn the station to a prism or a control point."""
+        self._do("aim", "aimed", target=target)
+
+    def move(self, pose: Mapping[str, float]) -> None:
+        """Drive the joints (deg, mm) to `pose` and wait until they stand there."""
+        self._do("move", "moving", pose=dict(pose), speed=BOOM_SPEED)
+        self._expect("arrived")
+
+    def poses(self, number: int, seed: int) -> list[dict[str, float]]:
+        """Draw random poses inside the joints' limits."""
+        return list(self._do("poses", "poses", n=number, seed=seed)["poses"])
+
+    def visit(self, stops: Iterable[Stop]) -> int:
+        """Drive to these poses next, in this order; returns how many are still to come."""
+        self._stops.extend(stops)
+        return len(self._stops)
+
+    def drive_around(self, dwell_s: float) -> None:
+        """Keep moving from one random pose to the next, standing `dwell_s` at each, until closed."""
+        self._autopilot = threading.Thread(target=self._drive, args=(dwell_s,), name="autopilot", daemon=True)
+        self._autopilot.start()
+
+    def close(self) -> None:
+        """End the process."""
+        self._stopping.set()
+        if self._process.stdin is not None and not self._process.stdin.closed:
+            with contextlib.suppress(BrokenPipeError):  # it has ended with a command unread
+                self._process.stdin.close()
+        try:
+            self._process.wait(timeout=10)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._reader.join(timeout=5)
+        if self._autopilot is not None:
+            self._autopilot.join(timeout=5)
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+
+    def _drive(self, dwell_s: float) -> None:
+        try:
+            here: Mapping[str, float] = {}
+            for seed in itertools.count(self._seed):
+                ahead = self.poses(POSES_AHEAD, seed)
+                while ahead:
+                    stand_s = dwell_s
+                    if self._stops:
+                        here, stand_s = self._stops[0]
+                    else:
+                        ahead.sort(key=partial(self._way, here), reverse=True)
+                        here = ahead.pop()
+                    self.move(here)
+                    if stand_s > 0.0 and self._clock.wait(self._stopping, stand_s):
+                        return
+                    if self._stops and self._stops[0][0] is here:
+                        self._stops.popleft()
+        except SimulationError as error:
+            if not self._stopping.is_set():
+                log.error("the simulated boom stands still: %s", error)
+
+    def _way(self, here: Mapping[str, float], there: Mapping[str, float]) -> float:
+        """Return the time of the slowest joint from one pose to another, in units of the boom's speed."""
+        return max((abs(there[name] - here[name]) / self._rates[name] for name in here), default=0.0)
+
+    def _do(self, what: str, answer: str, **arguments: Any) -> dict[str, Any]:
+        with self._commands:
+            try:
+                assert self._process.stdin is not None
+                self._process.stdin.write(json.dumps({"do": what, **arguments}) + "\n")
+                self._process.stdin.flush()
+            except (OSError, ValueError) as error:
+                raise SimulationError(f"the simulated rig has ended: {error}") from error
+            return self._expect(answer, "error")
+
+    def _expect(self, *wanted: str, timeout_s: float = 60.0) -> dict[str, Any]:
+        """Return the next event of the process that is one of `wanted`; other events keep their order."""
+
+        def found() -> dict[str, Any] | None:
+            return next((e for e in self._events if e["event"] in {*wanted, "ended"}), None)
+
+        with self._arrived:
+            if not self._arrived.wait_for(lambda: found() is not None, timeout_s):
+                raise SimulationError(f"the simulated rig did not say {wanted[0]!r} within {timeout_s:g} s")
+            answer = found()
+            assert answer is not None
+            if answer["event"] != "ended":
+                self._events.remove(answer)
+        if answer["event"] != wanted[0]:
+            raise SimulationError(f"the simulated rig: {answer.get('text', 'the process has ended')}")
+        return answer
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            with self._arrived:
+                self._events.append(json.loads(line))
+                self._arrived.notify_all()
+        self._process.wait()
+        with self._arrived:
+            self._events.append({"event": "ended"})
+            self._arrived.notify_all()

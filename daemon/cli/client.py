@@ -1,0 +1,72 @@
+"""The daemon's client: where its socket is, how it is asked, and words for its answers."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import click
+
+from daemon.cli.command import json_option
+from daemon.control.protocol import request
+
+DEFAULT_SOCKET = Path("/run/rigcal/control.sock")
+
+operator_option = click.option(
+    "--operator", default=lambda: os.environ.get("USER", ""), help="Who is responsible; kept with the decision."
+)
+
+
+def socket_of(path: Path | None, config: Path | None) -> Path:
+    """Return where the daemon listens: --socket, --config, $RIGCAL_SOCKET, else the service's place."""
+    if path is not None:
+        return path
+    if config is not None:
+        from daemon.config import read_config
+
+        return read_config(config).socket_path
+    return Path(os.environ.get("RIGCAL_SOCKET", DEFAULT_SOCKET))
+
+
+def client_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options of every command to the daemon: `--socket`, `--config` and `--json`."""
+    command = json_option(command)
+    command = click.option(
+        "--config", type=click.Path(path_type=Path), help="Configuration of the daemon to talk to (gives its socket)."
+    )(command)
+    at = click.Path(path_type=Path, readable=False)  # who may only look is told what to do, by `request`
+    return click.option("--socket", type=at, help="Control socket of the daemon.")(command)
+
+
+def ask(
+    where: dict[str, Any], command: str, show: Callable[[Any], None], timeout_s: float = 120.0, **arguments: Any
+) -> Any:
+    """Send a command; show its result to people, and return it for `--json`.
+
+    Args:
+        where: the values of `client_options`.
+        command: its name in the protocol.
+        show: prints the result.
+        timeout_s: how long to wait for the answer.
+        arguments: of the command; those that are None are left out.
+    """
+    given = {key: value for key, value in arguments.items() if value is not None}
+    result = request(socket_of(where["socket"], where["config"]), command, given, timeout_s=timeout_s)
+    if not where["as_json"]:
+        show(result)
+    return result if isinstance(result, dict) else {"result": result}
+
+
+def who(operator: str, user: str | None) -> str:
+    """Return the operator that somebody named, and the user that the computer knew, where that is another name."""
+    if not user or user == operator:
+        return operator
+    return f"{operator} (user {user})" if operator else f"user {user}"
+
+
+def utc(utc_ns: int) -> str:
+    """Return an instant for people."""
+    return datetime.fromtimestamp(utc_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

@@ -1,0 +1,159 @@
+"""`rigcal calibrate`: observations in, a model and its report out."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from daemon.cli import offline
+from daemon.cli.command import Command, json_option, progress_display
+from daemon.cli.terminal import echo
+from daemon.warm_up import prepare
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from calibration.identification.refinement import Prior
+    from calibration.residual.selection import Kind
+    from calibration.rig.description import Rig
+
+METHODS = ("default", "pde-paper", "km", "skcm", "rbf-tcm")
+RESIDUALS = ("default", "none", "rbfn", "lightgbm", "chain", "gp")
+CONNECT_TIMEOUT_S = 5
+
+
+@click.command(cls=Command)
+@offline.rig_option
+@offline.data_option
+@click.option(
+    "--out", type=offline.DIRECTORY, required=True, metavar="DIR", help="Where to write; replaces a model there."
+)
+@click.option("--method", type=click.Choice(METHODS), default="default", show_default=True, help="How to identify.")
+@click.option(
+    "--effects",
+    default="auto",
+    show_default=True,
+    metavar="auto|none|FAMILY@WHERE,...",
+    help="Named physics to add to the kinematics: `auto` what the data ask for, found as `rigcal gap` does; `rigcal "
+    "effects` lists the families and where they may be.",
+)
+@click.option(
+    "--residual",
+    type=click.Choice(RESIDUALS),
+    default="default",
+    show_default=True,
+    help="Learner of what is left; `default` takes the one that helps on data it has not seen, or none.",
+)
+@offline.prior_option
+@offline.seed_option
+@offline.time_limit_option
+@click.option(
+    "--dask",
+    metavar="ADDRESS",
+    help="Address of a dask scheduler whose workers share the work (needs the `dask` extra); the result is the same.",
+)
+@json_option
+def calibrate(
+    rig: str,
+    data: Path,
+    out: Path,
+    method: str,
+    effects: str,
+    residual: Kind,
+    prior: Prior,
+    seed: int,
+    time_limit: float | None,
+    dask: str | None,
+    *,
+    as_json: bool,
+) -> dict[str, object]:
+    """Calibrate a rig from observations; write the model and its report to a directory.
+
+    The figures are about the rows it was fitted to; `evaluate` gives those for rows it never saw. A global search keeps
+    its state beside DIR (DIR.checkpoint): the same command, killed and given again, goes on where it was.
+    """
+    watch = offline.Stopwatch()
+    prepare()
+    from calibration.pipeline.calibrate import calibrate as calibrate_rig
+    from calibration.run import Run
+    from daemon.config import load_rig
+    from daemon.jobs.checkpoint import FileCheckpoint
+    from daemon.models import model_files
+    from daemon.report.calibration import calibration_report
+    from daemon.report.from_model import report_input
+
+    source = load_rig(rig)
+    _check_effects(effects, method, source.rig)
+    model_files.check_target(out)
+    observations, raw = offline.read_observations(data, source.rig)
+    with (
+        FileCheckpoint(out.resolve().with_name(f"{out.resolve().name}.checkpoint")) as checkpoint,
+        progress_display(as_json=as_json) as progress,
+        _cluster(dask) as executor,
+    ):
+        model, training = calibrate_rig(
+            source.rig,
+            source.text,
+            observations,
+            prior=prior,
+            method=method,
+            effects=effects,
+            residual=residual,
+            run=Run(
+                seed,
+                executor,
+                progress,
+                should_stop=lambda: time_limit is not None and watch.seconds > time_limit,
+                checkpoint=checkpoint,
+            ),
+        )
+        with ThreadPoolExecutor(1) as pool:  # another process loads the model while this one draws
+            loaded = pool.submit(model_files.check_loads, model, out)
+            sources = {"data": offline.source_line(data, raw)}
+            document = calibration_report(report_input(training, None, made_utc_ns=watch.utc_ns, sources=sources))
+            loaded.result()
+        model_files.write_model(out, model, {model_files.REPORT: document.encode("utf-8")})
+    result = training.as_dict(watch.seconds)
+    if not as_json:
+        offline.show_evaluation(result, f"the {len(training)} fixes it was fitted to")
+        echo(f"Model: {out}   report: {out / model_files.REPORT}   {result['seconds']} s")
+    return result
+
+
+def _check_effects(effects: str, method: str, rig: Rig) -> None:
+    """Refuse effects that are misspelt, that the rig has no place for, or that the method does not take."""
+    if effects in ("auto", "none"):
+        return
+    from calibration.effects.library import parse_effects
+
+    try:
+        parse_effects(effects, rig)
+    except ValueError as error:
+        raise click.BadParameter(str(error), param_hint="--effects") from error
+    if method != "default":
+        raise click.BadParameter(f"--method {method} takes none", param_hint="--effects")
+
+
+@contextlib.contextmanager
+def _cluster(address: str | None) -> Iterator[Executor | None]:
+    """The executor of a dask cluster; None without an address, for threads on this machine."""
+    if address is None:
+        yield None
+        return
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise click.BadParameter(
+            "the `dask` extra is not installed: pip install 'rigcal[dask]'", param_hint="--dask"
+        ) from error
+    try:
+        client = Client(address, timeout=CONNECT_TIMEOUT_S)
+    except (OSError, ValueError) as error:
+        raise click.BadParameter(f"no dask scheduler at {address}: {error}", param_hint="--dask") from error
+    with client:
+        yield client.get_executor()

@@ -1,0 +1,32 @@
+"""`rigcal config`: the configuration file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from daemon.cli.command import Command, json_option
+from daemon.cli.terminal import echo
+
+
+@click.group()
+def config() -> None:
+    """The configuration file."""
+
+
+@config.command("check", cls=Command)
+@click.argument("path", type=click.Path(path_type=Path))
+@json_option
+def config_check(path: Path, *, as_json: bool) -> dict[str, Any]:
+    """Check a configuration, its rig, and the DBC and EDS files they name, without opening any device."""
+    from daemon.composition import decoders
+    from daemon.config import load_rig, read_config
+
+    settings = read_config(path)
+    source = load_rig(settings.rig)
+    links = decoders(settings, source)
+    if not as_json:
+        echo(f"{path}: good: rig {source.rig.name}, links {', '.join(links) or 'none'}")
+    return {"rig": source.rig.name, "links": list(links)}

@@ -1,0 +1,119 @@
+"""`rigcal demo`: a simulated boom, real CANopen and serial traffic, the daemon, and an operator's commands."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+from daemon.cli.command import Command, json_option, progress_display
+from daemon.cli.offline import show_stages
+from daemon.cli.simulated_operator import PRISMS, Advance, DemoError, Operator
+from daemon.cli.terminal import echo
+
+EFFECTS = (  # hidden effects of the machine, beside its build tolerances
+    "boom_droop@boom",
+    "encoder_harmonic@theta1:k=2:cosk_rad=4e-3:sink_rad=3e-3",
+    "encoder_harmonic@theta4:k=2:cosk_rad=3e-3:sink_rad=3e-3",
+)
+TRAINING_POSES = 22
+CHECK_POSES = 4
+SEED = 1
+_SEEDS = 100_000
+
+
+@click.command(cls=Command)
+@click.option(
+    "--out",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=Path("rigcal-demo"),
+    show_default=True,
+    help="Directory for store, models and report; it must be new, empty, or of an earlier demo.",
+)
+@click.option("--rate", type=click.FloatRange(1, 100), default=20.0, show_default=True, help="Simulated s per second.")
+@click.option("--seed", type=click.IntRange(0), help=f"Which simulated machine.  [default: {SEED}; any with --hidden]")
+@click.option(
+    "--hidden",
+    "is_hidden",
+    is_flag=True,
+    help="The simulated machine draws a hidden effect; the workflow looks for it, and then the truth is shown.",
+)
+@json_option
+def demo(out: Path, rate: float, seed: int | None, *, is_hidden: bool, as_json: bool) -> dict[str, Any]:
+    """Run a whole calibration without hardware: simulated boom, real protocols, sessions, jobs, report.
+
+    With --hidden, a game: what physics does the simulated boom have that its model lacks?
+    """
+    from daemon.cli import hidden
+
+    started = time.monotonic()
+    _make_room(out)
+    total, done = hidden.steps() if is_hidden else _steps(), 0
+    with progress_display(as_json=as_json) as progress:
+
+        def advance(text: str, n: int) -> None:
+            nonlocal done
+            done += n
+            progress(done / total, text)
+
+        advance("starting the simulated rig and the daemon", 0)
+        if is_hidden:
+            seed = secrets.randbelow(_SEEDS) if seed is None else seed
+            result = hidden.play(out.resolve(), rate, seed, advance)
+        else:
+            result = _calibrate(out.resolve(), rate, SEED if seed is None else seed, advance)
+    result |= {"seconds": round(time.monotonic() - started, 1), "directory": str(out)}
+    if not as_json:
+        (hidden.show if is_hidden else _show)(result)
+    return result
+
+
+def _calibrate(out: Path, rate: float, seed: int, advance: Advance) -> dict[str, Any]:
+    operator = Operator(out, rate, seed, [word for effect in EFFECTS for word in ("--effect", effect)])
+    try:
+        operator.begin()
+        for kind, poses in (("static_poses", TRAINING_POSES), ("check", CHECK_POSES)):
+            for prism in PRISMS:
+                operator.record(prism, kind, poses, advance)
+        advance("identification, residual and report", 0)
+        operator.wait("the jobs", lambda: _jobs_ended(operator))
+        report = [job for job in operator.say("jobs.list") if job["kind"] == "report"][-1]
+        if report["state"] != "done":
+            failed = next(job for job in operator.say("jobs.list") if job["state"] == "failed")
+            raise DemoError(f"job {failed['id']} ({failed['kind']}) failed: {failed['error']}")
+        return dict(report["result"])
+    finally:
+        operator.close()
+
+
+def _jobs_ended(operator: Operator) -> bool:
+    jobs = operator.say("jobs.list")
+    reports = [job for job in jobs if job["kind"] == "report"]
+    return bool(reports) and all(job["state"] not in {"queued", "running"} for job in jobs)
+
+
+def _steps() -> int:
+    return len(PRISMS) * (TRAINING_POSES + CHECK_POSES)
+
+
+def _make_room(out: Path) -> None:
+    """Empty the directory of an earlier demo; UsageError for any other."""
+    if out.exists() and any(out.iterdir()):
+        config = out / "rigcal.toml"
+        if not (config.is_file() and (out / "daemon.log").is_file()):
+            raise click.UsageError(f"{out} is not empty and holds no earlier demo; name another directory with --out")
+        import shutil
+
+        shutil.rmtree(out)
+    out.mkdir(parents=True, exist_ok=True)
+
+
+def _show(result: Mapping[str, Any]) -> None:
+    evaluation = result["evaluation"]
+    show_stages(evaluation, f"Position error in mm on {evaluation['n']} held-out fixes")
+    echo(f"report: {os.path.relpath(result['report'])}   ({result['seconds']:.0f} s)")

@@ -1,0 +1,135 @@
+"""`rigcal gap`: the physics that the simulation lacks, by name, and the model that has it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import zip_longest
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from daemon.cli import offline
+from daemon.cli.command import Command, json_option, progress_display
+from daemon.cli.terminal import echo, echo_list, echo_table
+from daemon.report.words import number
+from daemon.warm_up import prepare
+
+if TYPE_CHECKING:
+    from calibration.gap.result import GapResult
+    from calibration.identification.refinement import Prior
+
+
+@click.command(cls=Command)
+@offline.rig_option
+@offline.data_option
+@click.option(
+    "--holdout", type=offline.FILE, metavar="CSV", help="Observations that nothing is fitted to, to judge by."
+)
+@click.option(
+    "--out",
+    type=offline.DIRECTORY,
+    required=True,
+    metavar="DIR",
+    help="Where model/, report.html and gap.json go, and plan.csv and plan.json where poses are asked for; "
+    "replaces an earlier answer.",
+)
+@offline.prior_option
+@offline.seed_option
+@json_option
+def gap(
+    rig: str,
+    data: Path,
+    holdout: Path | None,
+    out: Path,
+    prior: Prior,
+    seed: int,
+    *,
+    as_json: bool,
+) -> dict[str, object]:
+    """Find where simulation and measurement disagree, name the missing physics, and add it.
+
+    The verdict is `named` (the effects are part of the model that is written), `none` (nothing beyond the noise),
+    `indistinguishable` (at most three effects that this data cannot tell apart, with poses that will) or `unidentified`
+    (structure that no effect of the library explains, with what it depends on). All four end with exit status 0.
+    `rigcal effects` lists the library.
+    """
+    watch = offline.Stopwatch()
+    prepare()
+    from calibration.experiments.comparison import shared_rows
+    from calibration.pipeline.find_gap import find_gap
+    from calibration.run import Run
+    from daemon.config import load_rig
+    from daemon.models.gap_files import REPORT, check_gap_target, gap_answer, write_gap
+    from daemon.report.from_model import provenance
+    from daemon.report.gap import gap_report
+
+    source = load_rig(rig)
+    check_gap_target(out)
+    observations, raw = offline.read_observations(data, source.rig)
+    files = {"data": offline.source_line(data, raw)}
+    held_out = None
+    overlap: tuple[str, ...] = ()
+    if holdout is not None:
+        held_out, held_out_raw = offline.read_observations(holdout, source.rig)
+        overlap = shared_rows(observations, held_out, (data.name, holdout.name))
+        files["held-out data"] = offline.source_line(holdout, held_out_raw)
+    with progress_display(as_json=as_json) as progress:
+        run = Run(seed, progress=progress)
+        found = find_gap(source.rig, source.text, observations, holdout=held_out, prior=prior, run=run)
+    found = replace(found, warnings=(*overlap, *found.warnings))
+    document = gap_report(found, provenance(found.model, watch.utc_ns, files))
+    result = gap_answer(found, watch.seconds)
+    write_gap(out, found, result, document)
+    if not as_json:
+        show_gap(found)
+        echo(f"Model: {out / 'model'}   report: {out / REPORT}   {result['seconds']} s")
+    return result
+
+
+def show_gap(found: GapResult) -> None:
+    """Print the workflow's answer for people."""
+    from daemon.report.gap_words import before_and_after, dependence, gap_headline, remaining
+    from daemon.report.words import place_name
+
+    echo(gap_headline(found), bold=True)
+    if found.description:
+        echo(dependence(found))
+    before, after, where = before_and_after(found)
+    change = (
+        f"{number(before)} mm before, {number(after)} mm with the effects" if found.effects else f"{number(before)} mm"
+    )
+    echo(f"Error {where}: {change}; noise floor {number(found.noise_mm)} mm ({found.noise_source})")
+    if found.effects:
+        _show_effects(found)
+    echo_list(
+        "One of these, which this data cannot tell apart",
+        [f"{place_name(c.family, c.where)}: {c.posterior:.0%}" for c in found.indistinguishable],
+    )
+    echo_list(
+        "Where simulation and measurement disagree",
+        [f"{d.where}, by {d.variable} (p = {d.p:.1g})" for d in found.disagreements],
+    )
+    if found.remaining_significant:
+        echo(f"{remaining(found)} that was not named.")
+    echo_list("What to measure next", [experiment.text for experiment in found.experiments])
+    echo_list("Not looked for", [f"{name.replace('_', ' ')}: {reason}" for name, reason in found.disabled.items()])
+    echo_list("Please note", found.warnings)
+    if found.observations.ignored_columns:
+        echo(f"Ignored columns: {', '.join(found.observations.ignored_columns)}")
+
+
+def _show_effects(found: GapResult) -> None:
+    from daemon.report.words import INTERVAL_SIGMAS
+
+    rows = []
+    for effect in found.effects:
+        heads = [(effect.family, effect.where), *([(f"  {effect.form}", "")] if effect.form else [])]
+        values = [
+            (c.name, f"{c.value:.4g}", f"\N{PLUS-MINUS SIGN} {INTERVAL_SIGMAS * c.standard_error:.2g}", c.unit)
+            for c in effect.reported
+        ]
+        for head, value in zip_longest(heads, values, fillvalue=()):
+            rows.append([*(head or ("", "")), *(value or ("",) * 4)])
+    header = ("effect", "where", "coefficient", "value", "95 % interval", "unit")
+    echo_table(header, rows, title="Effects added to the model", text_columns=(0, 1, 2, 5))

@@ -1,0 +1,179 @@
+"""`rigcal model`: the live model, its candidates, and a model for other programs."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from daemon.cli.client import ask, client_options, operator_option, socket_of, utc, who
+from daemon.cli.command import Command
+from daemon.cli.terminal import echo, echo_error, echo_table
+from daemon.control.protocol import request
+from daemon.host.safe_output import write_file
+from daemon.warm_up import prepare
+
+
+@click.group()
+def model() -> None:
+    """Models of the rig: candidates, the live one, and those that it replaced."""
+
+
+@model.command(cls=Command, name="list")
+@client_options
+def model_list(**where: Any) -> Any:
+    """List all models, with how they compared with the live one on check sessions."""
+    return ask(where, "model.list", _show_list)
+
+
+@model.command(cls=Command, name="show")
+@click.argument("number", type=int, required=False)
+@client_options
+def model_show(number: int | None, **where: Any) -> Any:
+    """Show model NUMBER (the live one by default): its directory, its comparison, who put it live and when."""
+    return ask(where, "model.show", _show, id=number)
+
+
+@model.command(cls=Command, name="compare")
+@click.argument("number", type=int)
+@client_options
+def model_compare(number: int, **where: Any) -> Any:
+    """Compare model NUMBER with the one that is live now, on the check sessions that neither was trained on.
+
+    This happens by itself after each training and each check session, for the newest model.
+    """
+    return ask(where, "model.compare", echo, id=number)
+
+
+@model.command(cls=Command, name="accept")
+@click.argument("number", type=int)
+@operator_option
+@client_options
+def model_accept(number: int, operator: str, **where: Any) -> Any:
+    """Make candidate NUMBER the live model.
+
+    It must have been compared on check sessions that it was not trained on, and must have shown there a smaller error
+    than the live model, by more than chance; the first model that goes live must show no larger error than its own
+    nominal stage (the drawings). Else it is refused (exit status 3), as are damaged files and a model of another rig
+    file. `rigcal model list` shows how each compared.
+    """
+    return ask(where, "model.accept", _changed, id=number, operator=operator)
+
+
+@model.command(cls=Command, name="rollback")
+@click.argument("number", type=int, required=False)
+@operator_option
+@client_options
+def model_rollback(number: int | None, operator: str, **where: Any) -> Any:
+    """Put back the model that the live one replaced, or model NUMBER, which was live once."""
+    return ask(where, "model.rollback", _changed, id=number, operator=operator)
+
+
+@model.command(cls=Command, name="zeros-checked")
+@operator_option
+@client_options
+def model_zeros_checked(operator: str, **where: Any) -> Any:
+    """Use the live model again after a joint's encoder has jumped, its zero being checked or set back."""
+    return ask(where, "model.zeros-checked", echo, operator=operator)
+
+
+@model.command(cls=Command, name="export")
+@click.argument("number", type=int, required=False)
+@click.option("--model", "directory", type=click.Path(path_type=Path), metavar="DIR", help="A model's directory.")
+@click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True, help="Where to write.")
+@click.option("--prism", "prisms", multiple=True, help="Prisms of the grid; all when not given. May be repeated.")
+@click.option(
+    "--rows",
+    type=click.IntRange(64, 1_000_000),
+    default=20_000,
+    show_default=True,
+    help="Greatest number of poses in the grid; more of them are interpolated more closely.",
+)
+@client_options
+def model_export(
+    number: int | None,
+    directory: Path | None,
+    out: Path,
+    prisms: tuple[str, ...],
+    rows: int,
+    socket: Path | None,
+    config: Path | None,
+    *,
+    as_json: bool,
+) -> Any:
+    """Write a model for other programs: calibration.json and corrections.csv.
+
+    With --model no daemon is needed; else model NUMBER of the running daemon is taken, the live one by default.
+    calibration.json holds parameters with units and standard errors, effects, bases, accuracy and provenance;
+    corrections.csv holds, at the nodes of a grid of joint values, where each prism is nominally and by the model, in
+    the base frame. Between nodes the difference is meant to be interpolated linearly.
+    """
+    if directory is not None and number is not None:
+        raise click.UsageError("give either a model's NUMBER or --model DIR")
+    if directory is None:
+        found = request(socket_of(socket, config), "model.show", {} if number is None else {"id": number})
+        directory = Path(found["path"])
+    prepare()
+    from calibration.evaluation.export import export_files
+    from calibration.evaluation.exports import Export
+    from daemon.models.model_files import model_sha256, read_model
+
+    export = Export(read_model(directory), model_sha256(directory), prisms, rows)
+    files, summary = export_files(export), export.summary
+    out.mkdir(parents=True, exist_ok=True)
+    for name, data in files.items():
+        write_file(out / name, data)
+    result = {"model": str(directory), "files": [str(out / name) for name in files], **summary}
+    if not as_json:
+        for file in result["files"]:
+            echo(file)
+        echo(
+            f"{summary['rows']} rows; interpolated between them, corrections of {summary['correction_rms_mm']:.2g} mm "
+            f"RMS are within {summary['p95_mm']:.2g} mm of the model's in 95 % of random poses "
+            f"({summary['max_mm']:.2g} mm at most)"
+        )
+        for sentence in summary["warnings"]:
+            echo_error(f"Warning: {sentence}", logging.WARNING)
+    return result
+
+
+def _show_list(models: Sequence[Mapping[str, Any]]) -> None:
+    if not models:
+        echo("no models yet; the jobs of a closed session make them (`rigcal jobs list`)")
+        return
+    rows = []
+    for model in models:
+        compared = model["comparison"]
+        verdict = compared["sentence"] if compared else "not compared yet"
+        if compared and compared["is_stale"]:
+            then = "when none was live" if compared["live"] is None else f"with model {compared['live']}, live then"
+            verdict = f"out of date, compared {then}: {verdict}"
+        made = utc(model["created_utc_ns"])
+        rows.append([str(model["id"]), model["state"], model["stage"], made, str(model["sessions"]), verdict])
+    echo_table(("model", "state", "stage", "made", "sessions", "comparison"), rows)
+
+
+def _show(model: Mapping[str, Any]) -> None:
+    echo(f"model {model['id']} of rig {model['rig']} ({model['stage']}) is {model['state']}: {model['path']}")
+    echo(f"  trained on {', '.join(model['sessions'])}; manifest SHA-256 {model['manifest_sha256']}")
+    compared = model["metrics"].get("comparison")
+    if compared is not None:
+        other = "no live model" if compared["live"] is None else f"model {compared['live']}, live then"
+        echo(f"  beside {other}, check sessions {', '.join(compared['sessions']) or 'none'}:")
+        echo(f"  {compared['sentence']}")
+        for setup in compared.get("refitted", ()):
+            echo(f"  the base at set-up {setup} was fitted on these very fixes, for both alike")
+        for setup in compared.get("left_out", ()):
+            echo(f"  set-up {setup} is unknown and its fixes place no base: left out")
+    for change in model["history"]:
+        by = f" by {name}" if (name := who(change["operator"], change["user"])) else ""
+        echo(f"  {utc(change['utc_ns'])} {change['state']}{by}: {change['reason']}")
+
+
+def _changed(result: Mapping[str, Any]) -> None:
+    before = f"; model {result['retired']} is retired" if result["retired"] is not None else ""
+    why = f": {result['reason']}" if "reason" in result else ""
+    echo(f"model {result['live']} is live{before}{why}")

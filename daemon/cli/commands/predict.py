@@ -1,0 +1,75 @@
+"""`rigcal predict`: positions from joint readings."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from daemon.cli import offline
+from daemon.cli.command import Command, json_option
+from daemon.warm_up import prepare
+
+if TYPE_CHECKING:
+    from calibration.model.prediction import Prediction
+    from calibration.observations import Floats
+    from calibration.residual.conformal import Intervals
+
+PREDICTED_COLUMNS = tuple(f"{name}_pred_mm" for name in ("x", "y", "z", "sigma_x", "sigma_y", "sigma_z"))
+INTERVAL_COLUMNS = tuple(f"{name}_pred_mm" for name in ("half90_x", "half90_y", "half90_z", "radius90"))
+
+
+@click.command(cls=Command)
+@offline.model_option
+@offline.data_option
+@offline.csv_out_option
+@click.option(
+    "--intervals",
+    is_flag=True,
+    help="Add half90_x_pred_mm, half90_y_pred_mm, half90_z_pred_mm (a fix is that near to x, y, z with 90 % "
+    "probability, each) and radius90_pred_mm (all three together).",
+)
+@json_option
+def predict(directory: Path, data: Path, out: Path | None, *, intervals: bool, as_json: bool) -> dict[str, object]:
+    """Predict positions and their standard deviations from joint readings; the data need no positions.
+
+    The result is the data's own columns and the predicted ones. With --json it goes to the file of --out, or else into
+    the object as "csv".
+    """
+    watch = offline.Stopwatch()
+    prepare()
+    from calibration.model.prediction import Predictor
+    from calibration.model.warnings import model_warnings
+    from calibration.numerics.single_thread import one_blas_thread
+    from daemon.models.model_files import read_model
+
+    offline.check_out(out, data)
+    model = read_model(directory)
+    observations, raw = offline.read_observations(data, model.rig, positions_required=False)
+    with one_blas_thread(), ThreadPoolExecutor() as pool:
+        prediction = Predictor.of(model).predict(observations, pool)
+    columns = _predicted_columns(prediction, model.intervals if intervals else None)
+    table = offline.with_columns(raw, columns, {*PREDICTED_COLUMNS, *INTERVAL_COLUMNS} - set(columns))
+    warnings = model_warnings(model, observations)
+    result: dict[str, object] = {
+        "rig": model.rig.name,
+        "n": len(observations),
+        "seconds": watch.seconds,
+        "warnings": list(warnings),
+        "ignored_columns": list(observations.ignored_columns),
+    }
+    offline.deliver(table, result, warnings, out, as_json=as_json)
+    return result
+
+
+def _predicted_columns(prediction: Prediction, intervals: Intervals | None) -> dict[str, Floats]:
+    """Return the columns that predictions add to an observations CSV, with their intervals if they are wanted."""
+    columns = {name: prediction.position_mm[:, i] for i, name in enumerate(PREDICTED_COLUMNS[:3])}
+    columns |= {name: prediction.sigma_mm[:, i] for i, name in enumerate(PREDICTED_COLUMNS[3:])}
+    if intervals is not None:
+        half_mm = intervals.half_mm(prediction.sigma_mm)
+        columns |= {name: half_mm[:, i] for i, name in enumerate(INTERVAL_COLUMNS[:3])}
+        columns[INTERVAL_COLUMNS[3]] = intervals.radius_mm(prediction.sigma_mm)
+    return columns

@@ -1,0 +1,85 @@
+"""`rigcal replay`: captured logs into a store of their own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from daemon.cli.command import Command, json_option
+from daemon.cli.terminal import echo
+from daemon.commands import SESSION_KINDS
+from daemon.host.safe_output import write_file
+
+COUNTED = ("joint_samples", "signals", "fixes", "device_events", "decode_failures", "gaps", "observations")
+
+
+@click.command(cls=Command)
+@click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--config",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="Configuration whose rig and links the logs are of.",
+)
+@click.option(
+    "--store",
+    "path",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="Store to write; a new file, ending in .sqlite.",
+)
+@click.option("--prism", help="Take the fixes as one closed session on this prism, so that they become observations.")
+@click.option(
+    "--kind", type=click.Choice(SESSION_KINDS), default="static_poses", show_default=True, help="Kind of that session."
+)
+@click.option(
+    "--session",
+    "session_file",
+    type=click.Path(path_type=Path),
+    help="In place of both: the session as `rigcal session export` told of it (.json), observed as it was live.",
+)
+@click.option(
+    "--readings", type=click.Path(path_type=Path), help="Also write everything that was decoded as JSON lines."
+)
+@json_option
+def replay(
+    files: tuple[Path, ...],
+    config: Path,
+    path: Path,
+    prism: str | None,
+    kind: str,
+    session_file: Path | None,
+    readings: Path | None,
+    *,
+    as_json: bool,
+) -> dict[str, Any]:
+    """Feed captured logs through drivers and store at full speed; the same logs give the same rows.
+
+    FILES are CAN logs (candump .log, Vector .asc or .blf) and serial captures (.serial).
+    """
+    from daemon.cli.log_replay import replay_logs, whole_session
+    from daemon.config import load_rig, read_config
+    from daemon.sessions.replay import stored_readings
+    from daemon.sessions.session_file import read_session_file
+    from daemon.store.reader import Reader
+
+    settings = read_config(config)
+    source = load_rig(settings.rig)
+    if path.exists():
+        raise click.UsageError(f"{path} exists; a replay writes a store of its own, name a new file with --store")
+    if prism is not None and session_file is not None:
+        raise click.UsageError("give --prism or --session, not both")
+    told = None if session_file is None else read_session_file(session_file)
+    if prism is not None:
+        told = whole_session(prism, kind)
+    session = replay_logs(files, settings, source, path, told)
+    with Reader(path) as reader:
+        if readings is not None:
+            write_file(readings, "".join(f"{line}\n" for line in stored_readings(reader)).encode())
+        counts = {table: reader.count(table) for table in COUNTED}
+    if not as_json:
+        for table, n in counts.items():
+            echo(f"{n:9d} {table.replace('_', ' ')}")
+    return counts | ({} if session is None else {"session": session})

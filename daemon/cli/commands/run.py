@@ -1,0 +1,129 @@
+"""`rigcal run`: the daemon, with real, simulated or replayed links."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import tempfile
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from daemon.cli.command import Command, json_option
+from daemon.cli.terminal import echo
+from daemon.host.systemd import Notifier, set_up_logging
+
+if TYPE_CHECKING:
+    from daemon.config import Config
+
+SIMULATED_CONFIG = """
+rig = "swdt82"
+state_directory = "rigcal-sim"
+
+[[can]]
+channel = "can0"
+
+[[station]]
+serial.path = "/dev/rigcal-station"
+"""
+
+_RATE = click.FloatRange(0.1, 100)
+_DWELL = click.FloatRange(1, 600)
+
+
+@click.command(cls=Command)
+@click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[FILE]...")
+@click.option("--config", type=click.Path(path_type=Path), help="Configuration file (TOML); --sim has one of its own.")
+@click.option("--sim", is_flag=True, help="A simulated rig in place of the configured links.")
+@click.option("--replay", "is_replay", is_flag=True, help="The captured logs FILE... in place of the configured links.")
+@click.option("--rate", type=_RATE, default=1.0, show_default=True, help="Speed of the simulation or replay.")
+@click.option("--seed", type=int, default=1, show_default=True, help="Which simulated machine.")
+@click.option(
+    "--effect",
+    "effects",
+    multiple=True,
+    metavar="FAMILY@WHERE[:NAME=VALUE...]",
+    help="A hidden effect of the simulated machine, which else has build errors alone, such as "
+    "backlash@theta4:width_rad=4e-3; may be repeated.",
+)
+@click.option(
+    "--secret",
+    type=click.Path(file_okay=False, path_type=Path),
+    metavar="DIR",
+    help="Hide one more effect, which the simulated machine draws and names in a file there.",
+)
+@click.option("--dwell", "dwell_s", type=_DWELL, default=4.0, show_default=True, help="Simulated stand at a pose, s.")
+@click.option("-v", "--verbose", is_flag=True, help="Log more.")
+@json_option
+def run(
+    files: tuple[Path, ...],
+    config: Path | None,
+    rate: float,
+    seed: int,
+    effects: tuple[str, ...],
+    secret: Path | None,
+    dwell_s: float,
+    *,
+    sim: bool,
+    is_replay: bool,
+    verbose: bool,
+    as_json: bool,
+) -> dict[str, Any]:
+    """Run the daemon until it is told to stop (SIGTERM, Ctrl-C) or a replay has ended.
+
+    A replay keeps its store in a directory of its own, beside the configured one's.
+    """
+    from daemon.composition import live, replayed, simulated
+    from daemon.config import load_rig, parse_config, read_config
+    from daemon.service import Daemon, stop_on_signals
+    from daemon.store.store import Store
+
+    set_up_logging(level=logging.DEBUG if verbose else logging.INFO)
+    if not verbose:
+        logging.getLogger("can").setLevel(logging.WARNING)  # python-can tells of every socket that it makes
+    if bool(files) != is_replay or (sim and is_replay):
+        raise click.UsageError("give either --sim, or --replay FILE..., or neither")
+    if config is not None:
+        settings = read_config(config)
+    elif sim:
+        settings = parse_config(SIMULATED_CONFIG, Path("simulated").resolve())
+    else:
+        raise click.UsageError("give --config FILE (only --sim runs without one)")
+    source = load_rig(settings.rig)
+    if is_replay:
+        settings = _apart(settings)
+    stop, notifier = threading.Event(), Notifier()
+    with contextlib.ExitStack() as stack:
+        stack.callback(stop_on_signals(stop))
+        with notifier.extending(f"opening the store {settings.store_path}"):
+            _make_directory(settings)
+            # The store first: its lock keeps a second daemon from touching anything of the first one's.
+            store = stack.enter_context(contextlib.closing(Store(settings.store_path)))
+            if sim:
+                rig = simulated(settings, source, rate=rate, seed=seed, effects=effects, secret=secret, dwell_s=dwell_s)
+                parts = stack.enter_context(rig)
+            elif is_replay:
+                parts = replayed(settings, source, files, rate)
+            else:
+                parts = live(settings, source)
+            daemon = Daemon(settings, store, parts)
+        daemon.run(stop, notifier)
+    if not as_json:
+        echo(f"the store is {settings.store_path}")
+    return {"rig": source.rig.name, "mode": parts.mode, "store": str(settings.store_path)}
+
+
+def _make_directory(settings: Config) -> None:
+    from daemon.store.errors import storage_errors
+
+    with storage_errors(settings.store_path):
+        settings.state_directory.mkdir(parents=True, exist_ok=True)
+
+
+def _apart(settings: Config) -> Config:
+    """Return the configuration with a new state directory: a replayed log stays apart from the rig's own records."""
+    _make_directory(settings)
+    directory = Path(tempfile.mkdtemp(prefix="replay-", dir=settings.state_directory))
+    return settings.model_copy(update={"state_directory": directory, "socket": directory / "control.sock"})

@@ -1,0 +1,167 @@
+"""`rigcal session`: calibration sessions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from daemon.cli.client import ask, client_options, operator_option, who
+from daemon.cli.command import Command, json_option
+from daemon.cli.state_lines import job_line, show_session
+from daemon.cli.terminal import echo, echo_error, echo_table
+from daemon.commands import SESSION_KINDS
+
+SHOT_TIMEOUT_S = 600.0
+
+
+@click.group()
+def session() -> None:
+    """Calibration sessions."""
+
+
+@session.command(cls=Command, name="start")
+@click.option("--prism", required=True, help="The prism that the station follows.")
+@click.option("--kind", type=click.Choice(SESSION_KINDS), default="static_poses", show_default=True)
+@click.option("--setup", help="Station set-up; the newest when not given.")
+@operator_option
+@click.option("--id", help="Name of the session.")
+@click.option("--note", default="")
+@client_options
+def session_start(socket: Path | None, config: Path | None, as_json: bool, **about: Any) -> Any:
+    """Open a session: from now on fixes on the prism become its observations."""
+
+    def show(opened: Mapping[str, Any]) -> None:
+        echo(f"session {opened['id']} is open: prism {opened['prism']}, {opened['kind']}, set-up {opened['setup']}")
+        _advise(opened)
+
+    return ask({"socket": socket, "config": config, "as_json": as_json}, "session.start", show, **about)
+
+
+@session.command(cls=Command, name="stop")
+@client_options
+def session_stop(**where: Any) -> Any:
+    """Close the open session; identification with missing effects, residual and report follow by themselves."""
+
+    def show(closed: Mapping[str, Any]) -> None:
+        show_session(closed)
+        _advise(closed)
+
+    return ask(where, "session.stop", show)
+
+
+@session.command(cls=Command, name="abort")
+@client_options
+def session_abort(**where: Any) -> Any:
+    """Close the open session as unusable."""
+    return ask(where, "session.abort", show_session)
+
+
+@session.command(cls=Command, name="accept")
+@click.argument("name")
+@operator_option
+@client_options
+def session_accept(name: str, operator: str, **where: Any) -> Any:
+    """Use closed session NAME although its control points were not shot at both ends, or did not hold."""
+    return ask(where, "session.accept", show_session, id=name, operator=operator)
+
+
+@session.command(cls=Command, name="shoot")
+@click.argument("point")
+@client_options
+def session_shoot(point: str, **where: Any) -> Any:
+    """Measure control point POINT (the station is aimed at it); its first shot defines its place."""
+
+    def show(shot: Mapping[str, Any]) -> None:
+        if shot["misclosure_mm"] is None:
+            echo(f"{shot['point']} is known from now on; shoot it again before you stop the session")
+            return
+        verdict, colour = ("the set-up has moved", "red") if shot["moved"] else ("the set-up holds", None)
+        echo(f"{shot['point']}: misclosure {shot['misclosure_mm']:.1f} mm, {verdict}", fg=colour)
+        _advise(shot)
+
+    if not where["as_json"]:
+        echo_error(f"measuring {point}: keep the station on it; Ctrl-C gives up")
+    return ask(where, "session.shoot", show, timeout_s=SHOT_TIMEOUT_S, point=point)
+
+
+@session.command(cls=Command, name="confirm-prism")
+@operator_option
+@client_options
+def session_confirm_prism(operator: str, **where: Any) -> Any:
+    """Say that the station is on the prism of the open session, although it looks like another one.
+
+    Fixes count from now on; those that were in doubt before stay excluded.
+    """
+
+    def show(confirmed: Mapping[str, Any]) -> None:
+        echo(confirmed["text"])
+        _advise(confirmed)
+
+    return ask(where, "session.confirm-prism", show, operator=operator)
+
+
+@session.command(cls=Command, name="list")
+@client_options
+def session_list(**where: Any) -> Any:
+    """List all sessions."""
+    return ask(where, "session.list", _show_list)
+
+
+@session.command(cls=Command, name="show")
+@click.argument("name")
+@client_options
+def session_show(name: str, **where: Any) -> Any:
+    """Show one session, with its control points and jobs."""
+
+    def show(found: Mapping[str, Any]) -> None:
+        show_session(found)
+        for job in found["jobs"]:
+            echo(job_line(job))
+
+    return ask(where, "session.show", show, id=name)
+
+
+@session.command(cls=Command, name="export")
+@click.argument("name")
+@click.option("--config", type=click.Path(path_type=Path), required=True, help="Configuration of the store's daemon.")
+@click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True, help="Directory for the files.")
+@click.option("--format", "can_format", type=click.Choice(["log", "asc", "blf"]), default="log", show_default=True)
+@json_option
+def session_export(name: str, config: Path, out: Path, can_format: Any, *, as_json: bool) -> Any:
+    """Write a session's CAN and serial captures as logs that `rigcal replay` reads, and its observations as CSV."""
+    from daemon.config import read_config
+    from daemon.sessions.export import export_session
+
+    files = export_session(read_config(config), name, out, can_format)
+    if not as_json:
+        for file in files:
+            echo(file)
+    return {"files": [str(file) for file in files]}
+
+
+def _advise(result: Mapping[str, Any]) -> None:
+    for sentence in result["advice"]:
+        echo(f"  note: {sentence}")
+
+
+def _show_list(sessions: Sequence[Mapping[str, Any]]) -> None:
+    if not sessions:
+        echo("no sessions yet; `rigcal session start` opens one")
+        return
+    rows = [
+        [
+            found["id"],
+            found["kind"],
+            found["prism"],
+            found["setup"],
+            found["state"] if found["not_used"] is None else f"{found['state']}, not used",
+            str(found["poses"]),
+            str(found["observations"]),
+            who(found["operator"], found["user"]),
+        ]
+        for found in sessions
+    ]
+    echo_table(("session", "kind", "prism", "set-up", "state", "poses", "observations", "operator"), rows)

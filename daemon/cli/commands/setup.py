@@ -1,0 +1,80 @@
+"""`rigcal setup`: station set-ups."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import click
+
+from daemon.cli.client import ask, client_options
+from daemon.cli.command import Command
+from daemon.cli.terminal import echo, echo_table
+
+
+@click.group()
+def setup() -> None:
+    """Station set-ups: where and how the total station stands."""
+
+
+@setup.command(cls=Command, name="new")
+@click.argument("name")
+@click.option("--instrument", default="", help="Maker and model.")
+@click.option("--serial", default="", help="Serial number.")
+@click.option("--tilt-arcsec", type=float, help="Residual tilt shown after levelling.")
+@click.option("--ppm", type=float, help="Atmospheric correction set on the instrument.")
+@click.option("--prism-constant", multiple=True, metavar="PRISM=MM", help="Prism constant set for a prism.")
+@click.option(
+    "--control-point",
+    multiple=True,
+    metavar="NAME=X,Y,Z",
+    help="Known place of a control point in the station's frame, mm; without one its first shot defines it.",
+)
+@click.option("--note", default="")
+@client_options
+def setup_new(prism_constant: tuple[str, ...], control_point: tuple[str, ...], **options: Any) -> Any:
+    """Describe where the station stands now. A station that was moved is a new set-up."""
+    where = {key: options.pop(key) for key in ("socket", "config", "as_json")}
+    constants = _assignments("--prism-constant", prism_constant, "r=-30", 1)
+    return ask(
+        where,
+        "setup.new",
+        lambda result: echo(f"set-up {result['id']} is in use"),
+        id=options.pop("name"),
+        prism_constants_mm={prism: mm for prism, (mm,) in constants.items()},
+        control_points=_assignments("--control-point", control_point, "cp1=12000,3500,1800", 3),
+        **options,
+    )
+
+
+def _assignments(option: str, texts: tuple[str, ...], example: str, count: int) -> dict[str, list[float]]:
+    """Parse NAME=NUMBER,... options with `count` numbers each."""
+    result = {}
+    for text in texts:
+        name, _, numbers = text.partition("=")
+        try:
+            result[name] = [float(number) for number in numbers.split(",")]
+        except ValueError:
+            result[name] = []
+        if len(result[name]) != count:
+            raise click.BadParameter(f"{text!r}: write it as {example}", param_hint=option)
+    return result
+
+
+@setup.command(cls=Command, name="list")
+@client_options
+def setup_list(**where: Any) -> Any:
+    """List all set-ups with their control points."""
+    return ask(where, "setup.list", _show)
+
+
+def _show(setups: Sequence[Mapping[str, Any]]) -> None:
+    if not setups:
+        echo("no set-ups yet; describe one with `rigcal setup new`")
+        return
+    rows = []
+    for setup in setups:
+        points = ", ".join(point["name"] for point in setup["control_points"])
+        tilt, ppm = ("" if setup[key] is None else f"{setup[key]:g}" for key in ("tilt_arcsec", "ppm"))
+        rows.append([setup["id"], setup["instrument"], setup["state"], tilt, ppm, points])
+    echo_table(("set-up", "instrument", "state", "tilt arcsec", "ppm", "control points"), rows)

@@ -1,0 +1,64 @@
+"""`rigcal tip`: the present position of a prism, by the live model."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from typing import Any
+
+import click
+
+from daemon.cli.client import client_options, socket_of
+from daemon.cli.command import Command
+from daemon.cli.terminal import echo
+from daemon.control.protocol import request
+
+FOLLOW_S = 0.2
+
+
+@click.command(cls=Command)
+@click.option("--prism", help="Which prism; the configured one ([tip] prism) by default.")
+@click.option("--follow", is_flag=True, help="Again and again, five times a second, until stopped.")
+@client_options
+def tip(prism: str | None, *, follow: bool, **where: Any) -> Any:
+    """Show where a prism is now: the joints' latest readings through the live model.
+
+    The position is in the base frame, and in the station's, as it would measure the prism, if the model knows its
+    set-up. If the position is not known, the status says why. With --follow and --json, standard output holds one
+    object a line.
+    """
+    arguments = {} if prism is None else {"prism": prism}
+    socket = socket_of(where["socket"], where["config"])
+    if not follow:
+        result = request(socket, "tip", arguments)
+        if not where["as_json"]:
+            _show(result)
+        return result
+    try:
+        while True:
+            result = request(socket, "tip", arguments)
+            if where["as_json"]:
+                # A command's standard output is kept for its one result; here each line is one.
+                click.echo(json.dumps(result), file=sys.__stdout__)
+            else:
+                _show(result)
+            time.sleep(FOLLOW_S)
+    except KeyboardInterrupt:
+        raise click.exceptions.Exit(0) from None
+
+
+def _show(tip: dict[str, Any]) -> None:
+    if tip["base_mm"] is None:
+        echo(f"prism {tip['prism']}: {tip['status']}: {tip['reason']}")
+        return
+    line = f"prism {tip['prism']}: base {_place(tip['base_mm'])} mm, sigma {tip['sigma_mm']:.1f} mm"
+    if tip["setup"] is not None:
+        line += f"; station {tip['setup']} {_place(tip['station_mm'])} mm"
+    echo(f"{line}; {tip['age_s']:.2f} s ago, model {tip['model']}, {tip['status']}")
+    for warning in tip["warnings"]:
+        echo(f"  note: {warning}")
+
+
+def _place(place: list[float]) -> str:
+    return " ".join(f"{value:.1f}" for value in place)

@@ -1,0 +1,110 @@
+"""Captured logs through decoders and session into a store of their own, as fast as it goes."""
+
+from __future__ import annotations
+
+import contextlib
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from daemon.acquisition.acquisition import Acquisition
+from daemon.composition import decoders, joiner, motion_limits
+from daemon.config import Config, RigSource
+from daemon.service import declare_channels
+from daemon.sessions.manager import SessionKeeper
+from daemon.sessions.replay import BOOT_ID, LATEST_UTC_NS, first_captures, merged
+from daemon.sessions.session_file import SessionFile
+from daemon.sessions.station_setups import SetupBook
+from daemon.store.errors import storage_errors
+from daemon.store.store import Store
+from drivers.clock import ManualClock, Stamp
+from drivers.readings import Capture
+
+REPLAYED = "replayed"
+
+# UTC of an operator's command, and the command.
+Commands = deque[tuple[int, Callable[[], object]]]
+
+
+def whole_session(prism: str, kind: str) -> SessionFile:
+    """Return a session on one prism that holds every capture."""
+    return SessionFile(prism=prism, kind=kind, since_utc_ns=0, until_utc_ns=LATEST_UTC_NS, control_points={})
+
+
+def replay_logs(
+    files: Sequence[Path], settings: Config, source: RigSource, path: Path, told: SessionFile | None
+) -> dict[str, Any] | None:
+    """Write a store from captured logs; the same logs give the same rows.
+
+    Args:
+        files: the logs.
+        settings: configuration that the logs are of.
+        source: rig that the logs are of.
+        path: the new store.
+        told: the session that the fixes belong to; None for no session.
+
+    Returns:
+        The closed session, as `session.list` tells it; None where there is none.
+
+    Raises:
+        DescriptionError, ConfigError: a log is malformed, empty, or of a link that is not configured.
+        StoreError: the store cannot be written.
+    """
+    doubtful = {} if told is None else told.doubtful
+    starts = first_captures(files, settings, doubtful)  # a bad log is refused before a store is made
+    clock = ManualClock()
+    clock.set(min((capture.stamp for capture in starts.values()), key=lambda stamp: stamp.monotonic_ns))
+    made = decoders(settings, source)
+    with storage_errors(path), contextlib.closing(Store(path)) as store:
+        declare_channels(store, source.rig)
+        setups = SetupBook(source.rig, store, clock, settings.sessions.control_tolerance_mm)
+        keeper = SessionKeeper(
+            source.rig,
+            source.text,
+            store,
+            setups,
+            joiner(settings, source.rig),
+            settings.sessions,
+            clock,
+            run_id=0,
+            aim=None,
+            limits=motion_limits(settings),
+        )
+        commands = Commands()
+        if told is not None:
+            points = {name: list(place) for name, place in told.control_points.items()}
+            setups.new_command({"id": REPLAYED, "instrument": REPLAYED, "control_points": points})
+            commands = _commands_of(told, keeper, clock.monotonic_ns())
+        acquisition = Acquisition((), made, store, clock, on_records=keeper.on_records)
+        acquisition.run_inline(_followed(merged(files, settings, doubtful), clock, commands))
+        for _, command in commands:  # those after the last capture
+            command()
+        return keeper.list_command({})[0] if told is not None else None
+
+
+def _commands_of(told: SessionFile, keeper: SessionKeeper, begin_ns: int) -> Commands:
+    """Return the operator's commands of a session in the order of their instants."""
+    start = {"id": REPLAYED, "prism": told.prism, "kind": told.kind, "operator": "replay"}
+    confirm = partial(keeper.confirm_prism_command, {"operator": "replay"})
+    between = [(at_ns, confirm) for at_ns in told.prism_confirmed_utc_ns]
+    between += [(at_ns, partial(keeper.turned_command, {})) for at_ns in told.prism_turned_utc_ns]
+    return Commands(
+        [
+            (told.since_utc_ns or begin_ns, partial(keeper.start_command, start)),
+            *sorted(between, key=lambda command: command[0]),
+            (told.until_utc_ns, partial(keeper.stop_command, {})),
+        ]
+    )
+
+
+def _followed(captures: Iterable[Capture], clock: ManualClock, commands: Commands) -> Iterator[Capture]:
+    """Pass captures on; each one's instant is set on the clock, and due commands run before it."""
+    for capture in captures:
+        while commands and commands[0][0] <= capture.stamp.monotonic_ns:
+            at_ns, command = commands.popleft()
+            clock.set(Stamp(at_ns, at_ns, BOOT_ID))
+            command()
+        clock.set(capture.stamp)
+        yield capture

@@ -1,0 +1,129 @@
+"""Commands of operators, as the rooms that carry them out see them: caller, checked arguments, refusals."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextvars import ContextVar
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+FAILED, WRONG_USE, REFUSED = 1, 2, 3
+CHECK = "check"
+SESSION_KINDS = ("single_joint", "multi_joint", "static_poses", CHECK)
+MAX_TEXT_CHARACTERS = 500
+MAX_ENTRIES = 100
+
+_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+Handler = Callable[[Mapping[str, Any]], Any]
+
+
+class CommandError(Exception):
+    """A command that was not carried out.
+
+    Attributes:
+        status: 1 failed, 2 wrong use or bad input, 3 refused because the result would be unsafe.
+    """
+
+    def __init__(self, message: str, status: int = WRONG_USE) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+def reading_socket(control_path: Path) -> Path:
+    """Return the socket beside the control socket that takes only commands that read."""
+    return control_path.with_name("status.sock")
+
+
+# ---- the caller ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Caller:
+    """The process at the other end of a control connection.
+
+    Attributes:
+        user: login name of `uid`; "" where the computer knows none.
+        uid: user id, when it connected.
+        pid: process id, when it connected.
+    """
+
+    user: str
+    uid: int
+    pid: int
+
+    def __str__(self) -> str:
+        return f"{self.user or 'user without a name'} (uid {self.uid}, pid {self.pid})"
+
+
+_current: ContextVar[Caller | None] = ContextVar("caller", default=None)
+_has_left: ContextVar[Callable[[], bool]] = ContextVar("has_left", default=lambda: False)
+
+
+def current_caller() -> Caller | None:
+    """Return the caller of the command that this thread carries out; None where there is none, as in a replay."""
+    return _current.get()
+
+
+def caller_columns(prefix: str = "") -> dict[str, str | int | None]:
+    """Return the columns `<prefix>caller_user`, `..._uid` and `..._pid` of a row that a command makes or changes."""
+    caller = current_caller()
+    user, uid, pid = (None, None, None) if caller is None else (caller.user, caller.uid, caller.pid)
+    return {f"{prefix}caller_user": user, f"{prefix}caller_uid": uid, f"{prefix}caller_pid": pid}
+
+
+def caller_has_left() -> bool:
+    """Return True if nobody waits any more for the command that this thread carries out (Ctrl-C, a lost terminal)."""
+    return _has_left.get()()
+
+
+@contextlib.contextmanager
+def acting_for(caller: Caller, has_left: Callable[[], bool] = lambda: False) -> Iterator[None]:
+    """Make `caller` the current one of this thread; `has_left` tells when it no longer waits for the answer."""
+    token, left_token = _current.set(caller), _has_left.set(has_left)
+    try:
+        yield
+    finally:
+        _current.reset(token)
+        _has_left.reset(left_token)
+
+
+# ---- arguments -------------------------------------------------------------------------------------------------------
+
+
+def identifier(arguments: Mapping[str, Any], key: str, what: str, default: str = "") -> str:
+    """Return the name that `arguments` gives under `key`; CommandError if it is none."""
+    name = arguments.get(key) or default
+    if not isinstance(name, str) or not _ID.fullmatch(name):
+        raise CommandError(f"{what} is 1 to 64 letters, digits, '.', '_' or '-', not {name!r:.80}")
+    return name
+
+
+def text_argument(arguments: Mapping[str, Any], key: str) -> str:
+    """Return the short text that `arguments` gives under `key`, "" by default; CommandError if it is none."""
+    value = arguments.get(key, "")
+    if not isinstance(value, str) or len(value) > MAX_TEXT_CHARACTERS or not value.isprintable():
+        raise CommandError(
+            f"{key} must be a text of at most {MAX_TEXT_CHARACTERS} printable characters, not {value!r:.80}"
+        )
+    return value
+
+
+def mapping_argument(arguments: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """Return the object that `arguments` gives under `key`, empty by default; CommandError if it is none."""
+    value = arguments.get(key, {})
+    if not isinstance(value, dict) or len(value) > MAX_ENTRIES:
+        raise CommandError(f"{key} must be an object of at most {MAX_ENTRIES} entries, not {value!r:.80}")
+    return value
+
+
+def number_argument(arguments: Mapping[str, Any], key: str, limit: float = 1e6) -> float | None:
+    """Return the number that `arguments` gives under `key`, None by default; CommandError if it is none."""
+    value = arguments.get(key)
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if value is not None and not (is_number and abs(value) <= limit):
+        raise CommandError(f"{key:.80} must be a finite number of at most {limit:g}, not {value!r:.80}")
+    return value

@@ -1,0 +1,214 @@
+"""The protocol of the control socket: one JSON object a line, each way; and the client's side of it.
+
+Request `{"command": "session.start", "arguments": {...}}`; answer `{"ok": true, "result": ...}` or
+`{"ok": false, "status": 2, "error": "one sentence"}`. `status` is the exit status a command line should end with.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import grp
+import json
+import math
+import socket
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, NoReturn
+
+from daemon.commands import FAILED, REFUSED, CommandError, Handler, reading_socket
+
+MAX_LINE_BYTES = 1 << 20
+MAX_ERROR_CHARACTERS = 2000
+MAX_DEPTH = 20  # of lists and objects in a request; those of our commands have four at most
+MAX_WHOLE = 2**63 - 1  # the store keeps whole numbers in 64 bits
+
+# Every command that is not named here changes something.
+READING = frozenset(
+    {
+        "status",
+        "setup.list",
+        "session.list",
+        "session.show",
+        "jobs.list",
+        "model.list",
+        "model.show",
+        "tip",
+        "alarms.list",
+    }
+)
+
+
+# ---- requests and answers --------------------------------------------------------------------------------------------
+
+
+def parse_request(line: bytes) -> tuple[str, dict[str, Any]]:
+    """Return the command and the arguments of a request.
+
+    Raises:
+        CommandError: it is no request, or holds what no command can use: numbers that are not finite or need more than
+            64 bits, text that is no Unicode, deeper nesting than any command has.
+    """
+    if len(line) > MAX_LINE_BYTES:
+        raise CommandError(f"request longer than {MAX_LINE_BYTES} bytes")
+    try:
+        request = json.loads(line, parse_constant=_no_number, parse_float=_finite, parse_int=_whole)
+    except ValueError:
+        request = None
+    except RecursionError:
+        raise _too_deep() from None
+    if not isinstance(request, dict) or not isinstance(request.get("command"), str):
+        raise CommandError('a request is one JSON object a line: {"command": NAME, "arguments": {...}}')
+    _check_values(request)
+    arguments = request.get("arguments", {})
+    if not isinstance(arguments, dict):
+        raise CommandError("arguments must be a JSON object")
+    return request["command"], arguments
+
+
+def answer_line(result: object) -> bytes:
+    """Return the answer of a command that was carried out."""
+    return json.dumps({"ok": True, "result": result}).encode() + b"\n"
+
+
+def refusal_line(message: str, status: int) -> bytes:
+    """Return the answer of a command that was not carried out; a message without end is cut off."""
+    if len(message) > MAX_ERROR_CHARACTERS:
+        message = f"{message[:MAX_ERROR_CHARACTERS]}..."
+    return json.dumps({"ok": False, "status": status, "error": message}).encode() + b"\n"
+
+
+def _no_number(text: str) -> NoReturn:
+    raise CommandError(f"a request holds finite numbers only, not {text}")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    return value if math.isfinite(value) else _no_number(text[:20])
+
+
+def _whole(text: str) -> int:
+    if len(text) <= len(str(-MAX_WHOLE)) and -MAX_WHOLE - 1 <= (value := int(text)) <= MAX_WHOLE:
+        return value
+    raise CommandError(f"a request's whole numbers have 64 bits, which {text:.20} has not")
+
+
+def _check_values(request: object) -> None:
+    """Raise CommandError where JSON values are nested too deep, or a text cannot be encoded."""
+    level = [request]
+    for _ in range(MAX_DEPTH):
+        below: list[object] = []
+        for value in level:
+            if isinstance(value, str):
+                _check_text(value)
+            elif isinstance(value, dict):
+                below += (*value, *value.values())
+            elif isinstance(value, list):
+                below += value
+        if not below:
+            return
+        level = below
+    raise _too_deep()
+
+
+def _check_text(text: str) -> None:
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise CommandError(f"a request's texts are Unicode; {text[error.start]!a} is half a character") from None
+
+
+def _too_deep() -> CommandError:
+    return CommandError(f"a request nests at most {MAX_DEPTH} lists and objects")
+
+
+# ---- the client's side -----------------------------------------------------------------------------------------------
+
+
+def how_to_be_let_in(control_path: Path) -> str:
+    """Say how a user gets access who may not use a daemon's control socket: a clause that names its group."""
+    try:
+        gid = control_path.stat().st_gid
+    except OSError:
+        return "join the group that owns its control socket, or use sudo"
+    try:
+        group = grp.getgrgid(gid).gr_name
+    except (KeyError, OSError):
+        group = str(gid)
+    return f"join the group {group} (`sudo adduser NAME {group}`, then log in anew), or use sudo"
+
+
+def request(path: Path, command: str, arguments: Mapping[str, Any] | None = None, *, timeout_s: float = 120.0) -> Any:
+    """Send one command to the running daemon and return its result.
+
+    Who may not use the control socket is answered by the one for those who may only look, where there is one.
+
+    Raises:
+        CommandError: no daemon is listening, it refused, or it did not answer within `timeout_s`.
+    """
+    message = json.dumps({"command": command, "arguments": dict(arguments or {})}).encode() + b"\n"
+    try:
+        try:
+            line = _exchange(path, message, timeout_s)
+        except PermissionError:
+            line = _exchange_reading(path, message, timeout_s)
+    except TimeoutError:
+        raise CommandError(f"the daemon at {path} did not answer within {timeout_s:g} s", FAILED) from None
+    except OSError as error:
+        raise CommandError(
+            f"no daemon is listening at {path} ({error.strerror or error}); start one with `rigcal run`, "
+            "or name its socket with --socket",
+            FAILED,
+        ) from None
+    if not line.endswith(b"\n"):
+        raise CommandError(f"the daemon at {path} closed the connection without an answer; see its log", FAILED)
+    answer = json.loads(line)
+    if not answer["ok"]:
+        raise CommandError(answer["error"], answer["status"])
+    return answer["result"]
+
+
+def _exchange_reading(control_path: Path, message: bytes, timeout_s: float) -> bytes:
+    """Send a request to the socket for those who may only look."""
+    try:
+        return _exchange(reading_socket(control_path), message, timeout_s)
+    except TimeoutError:
+        raise
+    except OSError:
+        raise CommandError(f"{control_path}: permission denied; {how_to_be_let_in(control_path)}", REFUSED) from None
+
+
+def _exchange(path: Path, message: bytes, timeout_s: float) -> bytes:
+    """Send a line; return the one that comes back, b"" where none does."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        connection.settimeout(timeout_s)
+        connection.connect(str(path))
+        # A daemon that refuses a connection says why and closes it, perhaps before it was sent anything.
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            connection.sendall(message)
+        with connection.makefile("rb") as stream:
+            try:
+                return stream.readline()
+            except ConnectionResetError:
+                return b""
+
+
+# ---- rights ----------------------------------------------------------------------------------------------------------
+
+
+def reading_only(handlers: Mapping[str, Handler], control_path: Path) -> dict[str, Handler]:
+    """Return handlers of the same commands; those that change something are refused.
+
+    Args:
+        handlers: of all commands.
+        control_path: the socket that carries them out, whose group the refusal names.
+    """
+    return {
+        name: handler if name in READING else partial(_refuse, name, control_path) for name, handler in handlers.items()
+    }
+
+
+def _refuse(command: str, control_path: Path, _arguments: Mapping[str, Any]) -> NoReturn:
+    raise CommandError(
+        f"you may look and not change anything, as {command} does: {how_to_be_let_in(control_path)}", REFUSED
+    )

@@ -1,1 +1,0 @@
-"""The benchmark of the gap workflow: blind data from a keeper process, answers from workers, scores after unsealing."""

@@ -1,0 +1,169 @@
+"""systemd: log lines with a priority for its journal, and its readiness and watchdog protocol.
+
+A log line may quote an instrument, a file or a client. So unsafe characters are escaped, a message is one line, and the
+lines of a traceback are indented: nothing that is quoted looks like a line of its own.
+
+Sources: sd-daemon(3), sd_notify(3), systemd.exec(5).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import re
+import socket
+import sys
+import threading
+import weakref
+from collections.abc import Iterator, Mapping
+from typing import TextIO
+
+from daemon.host.safe_output import shown
+from drivers.clock import TimeBudget
+
+_PLAIN = "%(asctime)s %(levelname)s %(name)s: %(message)s"
+_PREFIXED = "%(name)s: %(message)s"  # the journal has the time
+_INDENT = "    "
+_PRIORITIES = {"2": logging.CRITICAL, "3": logging.ERROR, "4": logging.WARNING, "6": logging.INFO, "7": logging.DEBUG}
+_LINE = re.compile(r"<([0-7])>(.*)", re.DOTALL)
+EXTEND_EVERY_S = 20.0
+EXTEND_BY_S = 60
+EXTEND_LIMIT_S = 1800.0  # a start that takes longer hangs
+
+log = logging.getLogger(__name__)
+
+
+class LineFormatter(logging.Formatter):
+    """Formats records as lines that are safe to show.
+
+    Args:
+        is_prefixed: each line begins with its priority, as sd-daemon(3) has it, and has no time stamp.
+    """
+
+    def __init__(self, *, is_prefixed: bool) -> None:
+        super().__init__(_PREFIXED if is_prefixed else _PLAIN)
+        self._is_prefixed = is_prefixed
+
+    def format(self, record: logging.LogRecord) -> str:
+        record.message = record.getMessage().rstrip("\n")
+        if self.usesTime():
+            record.asctime = self.formatTime(record)
+        lines = [shown(self.formatMessage(record))]
+        trace = self.formatException(record.exc_info) if record.exc_info else ""
+        for more in (trace, record.stack_info):
+            if more:
+                lines += (_INDENT + shown(line) for line in more.split("\n"))
+        prefix = priority_prefix(record.levelno) if self._is_prefixed else ""
+        return "\n".join(prefix + line for line in lines)
+
+
+def set_up_logging(*, level: int = logging.INFO, is_prefixed: bool | None = None) -> None:
+    """Send log records, warnings of libraries and exceptions that no one catches to standard error.
+
+    Args:
+        level: the least important that are sent.
+        is_prefixed: each line begins with its priority; None where standard error is to be looked at.
+    """
+    handler = logging.StreamHandler()
+    handler.setFormatter(LineFormatter(is_prefixed=is_journal(sys.stderr) if is_prefixed is None else is_prefixed))
+    logging.basicConfig(level=level, handlers=[handler])
+    logging.captureWarnings(True)
+    threading.excepthook = _log_thread_end
+
+
+def _log_thread_end(end: threading.ExceptHookArgs) -> None:
+    if end.exc_value is not None and not isinstance(end.exc_value, SystemExit):
+        name = end.thread.name if end.thread is not None else "unknown"
+        log.critical("thread %s has ended", name, exc_info=end.exc_value)
+
+
+def is_journal(stream: TextIO, environ: Mapping[str, str] = os.environ) -> bool:
+    """Return whether a stream goes to the journal: it is what JOURNAL_STREAM names (systemd.exec(5))."""
+    try:
+        found = os.fstat(stream.fileno())
+    except (OSError, ValueError, AttributeError):
+        return False
+    return environ.get("JOURNAL_STREAM") == f"{found.st_dev}:{found.st_ino}"
+
+
+def priority_prefix(level: int) -> str:
+    """Return the prefix that tells the journal how important a line is."""
+    priority = next((p for p, least in _PRIORITIES.items() if level >= least), "7")
+    return f"<{priority}>"
+
+
+def parse_line(line: str) -> tuple[int, str]:
+    """Return the level and the text of a line that may begin with a priority; without one it counts as a warning.
+
+    What a library prints on standard error has none, and it is seldom good news.
+    """
+    found = _LINE.match(line)
+    if found is None:
+        return logging.WARNING, line
+    return _PRIORITIES.get(found[1], logging.INFO if found[1] == "5" else logging.CRITICAL), found[2]
+
+
+# ---- readiness and watchdog ----------------------------------------------------------------------------------------
+
+
+class Notifier:
+    """Tells systemd how the service is; does nothing when not started by systemd.
+
+    Args:
+        environ: where NOTIFY_SOCKET and WATCHDOG_USEC are looked up.
+    """
+
+    def __init__(self, environ: os._Environ[str] | dict[str, str] = os.environ) -> None:
+        address = environ.get("NOTIFY_SOCKET", "")
+        self._address = "\0" + address[1:] if address.startswith("@") else address
+        self._is_heard = True
+        if self._address:
+            # Opened once: a beat must not need a descriptor when there are none left.
+            self._channel = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            weakref.finalize(self, self._channel.close)
+        usec = environ.get("WATCHDOG_USEC", "")
+        own = environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+        self.watchdog_s = int(usec) / 1e6 if usec.isdigit() and own else None
+
+    def send(self, *states: str) -> None:
+        """Send states such as `READY=1`, `STOPPING=1`, `WATCHDOG=1`, `STATUS=...`; one that is lost is logged."""
+        if not self._address:
+            return
+        try:
+            self._channel.sendto("\n".join(map(shown, states)).encode(), self._address)
+        except OSError as error:
+            if self._is_heard:
+                log.warning("the service manager is not reached at %s: %s", self._address, error.strerror)
+            self._is_heard = False
+        else:
+            self._is_heard = True
+
+    @contextlib.contextmanager
+    def extending(self, status: str) -> Iterator[None]:
+        """While the block runs, systemd waits for READY beyond its TimeoutStartSec.
+
+        A store that a new version brings up to date, or that a power cut left with a long log, takes its time to open.
+
+        Args:
+            status: what is being done, for `systemctl status`.
+        """
+        if not self._address:
+            yield
+            return
+        done = threading.Event()
+
+        def extend() -> None:
+            limit = TimeBudget(EXTEND_LIMIT_S)
+            while not limit.is_over:
+                self.send(f"EXTEND_TIMEOUT_USEC={EXTEND_BY_S * 1_000_000}", f"STATUS={status}")
+                if done.wait(EXTEND_EVERY_S):
+                    return
+
+        thread = threading.Thread(target=extend, name="start-time", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()

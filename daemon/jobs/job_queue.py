@@ -1,0 +1,365 @@
+"""Every way in which a job changes its state, and the order that a job's process is given.
+
+Each change reads and writes in one transaction, and transactions take turns: an operator's command and the outcome of a
+job's process meet here, and the second of the two finds what the first one did.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from daemon.commands import CHECK, REFUSED, CommandError
+from daemon.config import Config
+from daemon.jobs.order import Order, Outcome, Progress
+from daemon.jobs.scheduler import CHECKS, DueChain, State
+from daemon.models.drift import note_drift, unseen_checks
+from daemon.store.jobs import JobFacts, JobKind, JobTable
+from daemon.store.models import LiveRun, ModelRow, ModelTable, trained_on
+from daemon.store.sessions import SessionTable
+from daemon.store.store import Store
+from drivers.clock import Clock
+
+CANCELLED = Outcome("cancelled", "cancelled by the operator")
+STOPPED = Outcome("interrupted", "the daemon was stopped")
+CANCELLABLE = ("queued", "running", "interrupted")
+RETRIABLE = ("failed", "cancelled", "interrupted")
+
+
+class JobQueue:
+    """The jobs of one rig.
+
+    Args:
+        store: the database.
+        rig_name: whose sessions are worked on.
+        clock: time of the changes.
+
+    Attributes:
+        table: of the jobs.
+    """
+
+    def __init__(self, store: Store, rig_name: str, clock: Clock) -> None:
+        self._store, self._clock = store, clock
+        self.table = JobTable(store, rig_name)
+        self._sessions = SessionTable(store, rig_name)
+        self._models = ModelTable(store, rig_name, clock)
+
+    def state(self) -> State:
+        """The facts that scheduling goes by."""
+        run = self._models.live_run()
+        back_to = {JobKind.GAP: 0, JobKind.REPORT: 0} | ({JobKind.DRIFT: run.after_session} if run else {})
+        covered = {kind: self.table.covered(kind, after) for kind, after in back_to.items()}
+        return State(
+            self.table.newest_sessions(),
+            self.table.pending(),
+            {kind: number for kind, number in covered.items() if number is not None},
+            has_model=self.table.has_done(JobKind.RESIDUAL),
+            live_from=run.after_session if run else None,
+            drifted=self._models.drifted(run) if run else None,
+            stale_candidate=self._stale_candidate(run) if run else None,
+        )
+
+    def _stale_candidate(self, run: LiveRun) -> int | None:
+        """See `State.stale_candidate`; one comparison for each model that goes live, as what fails must not loop."""
+        candidate = self._models.waiting()
+        if candidate is None or candidate.comparison is None or candidate.comparison["live"] == run.model_id:
+            return None
+        return None if self.table.is_comparison_queued(candidate.id, run.since) else candidate.id
+
+    # ---- orders ------------------------------------------------------------------------------------------------------
+
+    def order(self, job: JobFacts, config: Config) -> Order:
+        """The order of a job's process: the sessions were settled when the job was queued."""
+        row = self.table.get(job.id)
+        sessions = self.table.sessions_of(job.id, row["through_session_id"])
+        training = tuple(s["id"] for s in sessions if s["kind"] != CHECK)
+        checks = tuple(s["id"] for s in sessions if s["kind"] == CHECK)
+        if row["model_id"] is not None:
+            return self._comparison(job, config, self._models.get(row["model_id"]), checks)
+        if job.kind is JobKind.GAP:
+            # Drifted checks trigger it to find the reason in them; after a training session they are held out.
+            if job.session_id in checks:
+                return self._order(job, config, tuple(s["id"] for s in sessions))
+            return self._order(job, config, training, held_out_ids=checks)
+        if job.kind is JobKind.DRIFT:
+            return self._drift_order(job, config, [(s["number"], s["id"]) for s in sessions if s["kind"] == CHECK])
+        if row["depends_on"] is None:
+            newest = self.table.newest(JobKind.RESIDUAL, "done")
+            result = newest["result"] if newest else {}
+        else:
+            result = self.table.result(row["depends_on"])
+        if job.kind is JobKind.COMPARISON:
+            return self._comparison(job, config, self._models.at(result["model"]), checks)
+        train_ids = tuple(result.get("sessions", training))
+        return self._order(
+            job,
+            config,
+            tuple(name for name in checks if name not in train_ids) if job.kind is JobKind.REPORT else training,
+            model=result.get("model"),
+            model_sha256=result.get("manifest_sha256"),
+            train_ids=train_ids,
+        )
+
+    def _comparison(self, job: JobFacts, config: Config, model: ModelRow, checks: tuple[str, ...]) -> Order:
+        """Compare a model with the live one, on the check sessions that neither was trained on."""
+        live = self._models.live()
+        if live is not None and live.id == model.id:
+            live = None  # it is live already, and only the nominal model is left to compare it with
+        seen = trained_on([model, live])
+        return self._order(
+            job,
+            config,
+            tuple(name for name in checks if name not in seen),
+            model=str(model.path),
+            model_sha256=model.manifest_sha256,
+            train_ids=model.sessions,
+            live=live,
+        )
+
+    def _drift_order(self, job: JobFacts, config: Config, checks: list[tuple[int, str]]) -> Order:
+        """Hold the live model against the check sessions since it went live that it was not held against yet."""
+        run = self._models.live_run()
+        if run is None:
+            return self._order(job, config, ())
+        live = self._models.get(run.model_id)
+        unseen = unseen_checks(self._models, run, checks, live.sessions)
+        return self._order(job, config, unseen, live=live, live_since=run.since)
+
+    def _order(
+        self,
+        job: JobFacts,
+        config: Config,
+        session_ids: tuple[str, ...],
+        *,
+        live: ModelRow | None = None,
+        **more: Any,
+    ) -> Order:
+        file = self._store.files.database
+        return Order(
+            kind=job.kind.value,
+            job_id=job.id,
+            store=str(config.store_path),
+            models_directory=str(config.models_directory),
+            session_ids=session_ids,
+            seed=config.jobs.seed,
+            live_model=str(live.path) if live else None,
+            live_sha256=live.manifest_sha256 if live else None,
+            live_id=live.id if live else None,
+            store_file=(file.device, file.inode) if file else None,
+            **more,
+        )
+
+    # ---- for the runner ----------------------------------------------------------------------------------------------
+
+    def queue(self, due: DueChain) -> None:
+        """Queue new jobs: training in its order, and those that check a model after the job that makes it.
+
+        A report that fails thus keeps no comparison from running, nor the other way round.
+        """
+        with self._store.transaction():
+            made_by: int | None = None
+            for kind in due.kinds:
+                job_id = self._add(kind, due.session_id, due.through_id, depends_on=made_by)
+                if kind not in CHECKS:
+                    made_by = job_id
+
+    def begin(self, job: JobFacts, time_limit_s: float, host_boot: str | None = None) -> bool:
+        """Start a queued job, which then shows nothing of earlier runs; False if it is queued no more.
+
+        Args:
+            job: which.
+            time_limit_s: how long it may run.
+            host_boot: the computer's boot; None where it is unknown.
+        """
+        with self._store.transaction():
+            if self.table.get(job.id)["state"] != "queued":
+                return False
+            self.table.change(
+                job.id,
+                state="running",
+                attempts=job.attempts + 1,
+                time_limit_s=time_limit_s,
+                host_boot=host_boot,
+                progress=0.0,
+                message="",
+                error=None,
+                result_json=None,
+                **self._store.instant(self._clock.now(), "started_"),
+                ended_utc_ns=None,
+                ended_monotonic_ns=None,
+                ended_boot_id=None,
+            )
+            return True
+
+    def note_process(self, job_id: int, pid: int) -> None:
+        """Note the process of a running job."""
+        self.table.change(job_id, pid=pid)
+
+    def note_progress(self, job_id: int, progress: Progress) -> None:
+        """Note the progress of a running job."""
+        self.table.change(job_id, progress=progress.share, message=progress.message)
+
+    def is_cancelled(self, job_id: int) -> bool:
+        """True if the operator wants a running job to end."""
+        return _is_cancelled(self.table.get(job_id))
+
+    def end(self, job_id: int, outcome: Outcome, *, is_attempt: bool = True) -> Outcome:
+        """End a job; with one that failed or was cancelled end those that wait for it.
+
+        An orderly stop of the daemon is no fault of the job's and no attempt.
+
+        Args:
+            job_id: which.
+            outcome: how.
+            is_attempt: False if something else than the job interrupted it: it is counted as that, and as no attempt.
+
+        Returns:
+            how it ended in the end: what the operator said goes before what the process said.
+        """
+        with self._store.transaction():
+            job = self.table.get(job_id)
+            if _is_cancelled(job):
+                outcome, is_attempt = CANCELLED, True
+            ended = self._store.instant(self._clock.now(), "ended_")
+            is_done = outcome.state == "done"
+            self.table.change(
+                job_id,
+                state=outcome.state,
+                error=outcome.error,
+                attempts=job["attempts"] - 1 if outcome == STOPPED or not is_attempt else job["attempts"],
+                interruptions=job["interruptions"] + (not is_attempt),
+                result_json=outcome.result,
+                progress=1.0 if is_done else 0.0,
+                message="",  # what it was doing is no news any more
+                pid=None,
+                **ended,
+            )
+            if outcome.result is not None and "manifest_sha256" in outcome.result:
+                self._models.add(job_id, outcome.result)
+            if outcome.result is not None and "comparison" in outcome.result:
+                self._models.note_comparison(outcome.result["model"], outcome.result["comparison"])
+            if outcome.result is not None and "drift" in outcome.result:
+                note_drift(self._models, outcome.result["drift"])
+            if outcome.state in {"failed", "cancelled"}:
+                for waiting in self.table.chain(job_id)[1:]:
+                    if waiting["state"] in {"queued", "interrupted"}:
+                        why = "has failed" if outcome.state == "failed" else "was cancelled"
+                        error = f"it needs job {job_id}, which {why}"
+                        self.table.change(waiting["id"], state="cancelled", error=error, **ended)
+            return outcome
+
+    def interrupt_running(self, why: str, *, is_attempt: bool = True) -> None:
+        """Interrupt the jobs that are marked as running and that nobody runs: the scheduler offers them again.
+
+        Args:
+            why: they did not end.
+            is_attempt: as for `end`.
+        """
+        for row in self.table.running():
+            self.end(row["id"], Outcome("interrupted", why), is_attempt=is_attempt)
+
+    def interrupt_left_over(self, host_boot: str) -> None:
+        """Interrupt the jobs that the daemon before this one left running.
+
+        One that a stop had no time to write down was stopped in order. One of another boot was cut off with the
+        computer. Of the rest the daemon was killed, which may have been the job's doing, and is an attempt.
+
+        Args:
+            host_boot: the computer's boot.
+        """
+        for row in self.table.running():
+            if row["host_boot"] not in (host_boot, None):
+                cut = Outcome("interrupted", "the computer was switched off or restarted while it ran")
+                self.end(row["id"], cut, is_attempt=False)
+            elif self._store.ended_in_order:
+                self.end(row["id"], STOPPED)
+            else:
+                self.end(row["id"], Outcome("interrupted", "the daemon ended while it ran"))
+
+    # ---- for the operator --------------------------------------------------------------------------------------------
+
+    def cancel(self, job_id: object) -> str:
+        """Cancel a job that has not ended.
+
+        Returns:
+            a sentence for the operator.
+
+        Raises:
+            CommandError: it has ended.
+            NotInStoreError: there is none.
+        """
+        with self._store.transaction():
+            job = self.table.get(job_id)
+            if job["state"] not in CANCELLABLE:
+                raise CommandError(f"job {job['id']} is {job['state']}; only one that has not ended can be cancelled")
+            if job["state"] == "running":
+                # Whoever runs it, now or after a restart, finds it there.
+                self.table.change(job["id"], error=CANCELLED.error)
+                return f"job {job['id']} ({job['kind']}) is being cancelled"
+            self.end(job["id"], CANCELLED)
+            return f"job {job['id']} ({job['kind']}) is cancelled"
+
+    def retry(self, job_id: object) -> str:
+        """Queue a job that did not end well again, and with it those that waited for it; their attempts count anew.
+
+        Returns:
+            a sentence for the operator.
+
+        Raises:
+            CommandError: it has not ended or ended well, or the one before it did not end well.
+            NotInStoreError: there is none.
+        """
+        with self._store.transaction():
+            job = self.table.get(job_id)
+            if job["state"] not in RETRIABLE:
+                raise CommandError(f"job {job['id']} is {job['state']}; only one that did not end well can be retried")
+            if job["depends_on"] is not None:
+                before = self.table.get(job["depends_on"])
+                if before["state"] in RETRIABLE:
+                    raise CommandError(
+                        f"job {job['id']} waits for job {before['id']}, which is {before['state']}; retry that one: "
+                        "those that wait for it follow"
+                    )
+            for waiting in self.table.chain(job["id"]):
+                self.table.change(
+                    waiting["id"], state="queued", progress=0.0, message="", error=None, attempts=0, interruptions=0
+                )
+            return f"job {job['id']} ({job['kind']}) is queued again"
+
+    def compare(self, model: ModelRow) -> str:
+        """Queue a comparison of a model with the live one, on all check sessions that are closed and used.
+
+        Returns:
+            a sentence for the operator.
+
+        Raises:
+            CommandError: there is none.
+        """
+        closed = self._sessions.used()
+        checks = [session["id"] for session in closed if session["kind"] == CHECK]
+        if not checks:
+            raise CommandError(
+                "no check session is closed and used, so nothing is held out to compare on; hold one with `rigcal "
+                "session start --kind check`",
+                REFUSED,
+            )
+        run = self._models.live_run()
+        through = closed[-1]["id"]
+        job_id = self._add(
+            JobKind.COMPARISON, checks[-1], through, model_id=model.id, live_since=run.since if run else None
+        )
+        return f"job {job_id} will compare model {model.id} with the live one"
+
+    def compare_again(self, model_id: int) -> str:
+        """Queue a comparison of the model of that number, as `compare` does."""
+        return self.compare(self._models.get(model_id))
+
+    def _add(self, kind: JobKind, session_id: str, through_id: str, **columns: int | None) -> int:
+        return self.table.add(
+            self._clock.now(), kind=kind, session_id=session_id, through_session_id=through_id, **columns
+        )
+
+
+def _is_cancelled(job: Mapping[str, Any]) -> bool:
+    """True if the operator wants a running job to end; one that runs has no other error."""
+    return (job["state"], job["error"]) == ("running", CANCELLED.error)

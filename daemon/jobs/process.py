@@ -1,0 +1,282 @@
+"""The process of a job: it reads the store, computes, writes files, tells its parent.
+
+Standard input carries the order, one JSON object, and then stays open: when it closes, the daemon is gone and so goes
+the job. Standard output carries what `daemon.jobs.order` describes, and standard error log lines with their priorities.
+Only the daemon writes to the store.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.errors import CalibrationError, DataError, ModelError, UnsafeError
+from calibration.evaluation.drift import check
+from calibration.evaluation.evaluation import evaluate
+from calibration.evaluation.promotion import compare_held_out
+from calibration.model.model import CalibratedModel
+from calibration.observations import Observations, parse_observations
+from calibration.pipeline.calibrate import train_residual
+from calibration.pipeline.find_gap import find_gap
+from calibration.rig.description import Rig, parse_rig
+from calibration.run import Progress, Run
+from daemon.host.safe_output import write_file
+from daemon.host.systemd import set_up_logging
+from daemon.jobs.checkpoint import FileCheckpoint
+from daemon.jobs.order import Order
+from daemon.models.gap_files import MODEL, gap_answer, write_gap
+from daemon.models.model_files import REPORT, read_model, write_model
+from daemon.report.calibration import calibration_report
+from daemon.report.from_model import provenance, report_input
+from daemon.report.gap import gap_report
+from daemon.report.gap_words import gap_headline
+from daemon.sessions.session_data import sessions_csv, setup_lines
+from daemon.store.errors import StoreError
+from daemon.store.files import FileIdentity
+from daemon.store.reader import Reader
+from daemon.store.sessions import session
+from daemon.warm_up import prepare
+from drivers.clock import NS_PER_S, SystemClock
+
+log = logging.getLogger(__name__)
+
+_LEAST_FIXES = 4  # three place a base and say nothing more
+
+
+def main() -> int:
+    """Entry of the process: exit status 0 when a result was told, 1 when an error was, 2 when the daemon was gone."""
+    line = sys.stdin.readline()
+    if not line:
+        return 2  # the daemon was gone before it could say what to do
+    set_up_logging(is_prefixed=True)  # the daemon reads standard error, and logs it
+    order = Order.from_line(line)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    tell = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # a library that prints must not break the protocol
+
+    def say(message: dict[str, Any]) -> None:
+        tell.write(json.dumps(message) + "\n")
+        tell.flush()
+
+    try:
+        result = perform(order, lambda share, text: say({"progress": share, "message": text}))
+    except Exception as error:
+        if isinstance(error, CalibrationError | StoreError):
+            say({"error": str(error)})
+        else:
+            log.error("%s failed", order.kind, exc_info=error)
+            say({"error": f"{type(error).__name__}: {error}; the daemon's log has the whole story"})
+        return 1
+    say({"result": result})
+    return 0
+
+
+def perform(order: Order, progress: Progress) -> dict[str, Any]:
+    """Carry out an order with the functions that the offline commands use.
+
+    Returns:
+        The result that the store keeps: of a new model `model` (its directory), `manifest_sha256`, `stage`, `metrics`,
+        `sessions`, and for one of the gap workflow `gap` (the object of `rigcal gap`), `sentence` and `report` (the
+        file); for a report `report` (the file) and `evaluation` (the object of `rigcal evaluate`); for a comparison
+        `comparison`; for drift `drift`.
+
+    Raises:
+        CalibrationError: in a sentence, what is wrong with data or result.
+    """
+    prepare()
+    work = {
+        "gap": _find_gap,
+        "residual": _train_residual,
+        "report": _report,
+        "comparison": _compare,
+        "drift": _check_drift,
+    }[order.kind]
+    return work(order, progress)
+
+
+def _find_gap(order: Order, progress: Progress) -> dict[str, Any]:
+    """Identify the kinematics, and what the simulation lacks; of the checks only those it was not found in judge it."""
+    clock = SystemClock()
+    started_ns = clock.monotonic_ns()
+    text = _rig_text(order)
+    rig = parse_rig(text, "the sessions' rig")
+    observations = _placing(_observations(order, rig, order.session_ids))
+    held_out = _held_out(order, rig, observations)
+    models = Path(order.models_directory)
+    # The job keeps its number when it runs again, so it goes on where the daemon was killed.
+    with FileCheckpoint(models / f"{order.job_id:05d}.checkpoint") as checkpoint:
+        found = find_gap(
+            rig,
+            text,
+            observations,
+            holdout=held_out,
+            run=Run(order.seed, progress=progress, checkpoint=checkpoint),
+        )
+        directory = models / f"{order.job_id:05d}-gap"
+        answer = gap_answer(found, (clock.monotonic_ns() - started_ns) / NS_PER_S)
+        checks = ", ".join(np.unique(held_out.session).tolist()) if held_out else "none"
+        sources = {"sessions": ", ".join(order.session_ids), "held-out sessions": checks}
+        sha256 = write_gap(directory, found, answer, gap_report(found, provenance(found.model, None, sources)))
+    made = _made(directory / MODEL, sha256, found.model, "effects" if found.effects else "geometric", observations)
+    return made | {
+        "sessions": list(order.session_ids),
+        "gap": found.as_dict(),
+        "sentence": gap_headline(found),
+        "report": str(directory / REPORT),
+    }
+
+
+def _placing(observations: Observations) -> Observations:
+    """The rows at set-ups with enough fixes to place a base beside what they tell of the machine: checks may have few.
+
+    All rows where no set-up has: what is wrong with them is for the calibration to say.
+    """
+    _, at, fixes = np.unique(observations.setup, return_inverse=True, return_counts=True)
+    enough = fixes[at] >= _LEAST_FIXES
+    return observations.select(enough) if enough.any() else observations
+
+
+def _held_out(order: Order, rig: Rig, training: Observations) -> Observations | None:
+    """The checks' rows at the set-ups of the training; None where there are none."""
+    if not order.held_out_ids:
+        return None
+    try:
+        checks = _observations(order, rig, order.held_out_ids)
+    except DataError as error:
+        log.warning("the check sessions judge nothing: %s", error)
+        return None
+    return checks.select(np.isin(checks.setup, training.setup)) or None
+
+
+def _trained_on(order: Order, model: CalibratedModel) -> Observations:
+    """The training rows of a model: those at the set-ups that it was placed at."""
+    observations = _observations(order, model.rig, order.train_ids)
+    return observations.select(np.isin(observations.setup, list(model.placements)))
+
+
+def _train_residual(order: Order, progress: Progress) -> dict[str, Any]:
+    model = read_model(Path(str(order.model)), order.model_sha256)
+    observations = _trained_on(order, model)
+    model = train_residual(model, observations, run=Run(order.seed, progress=progress))
+    directory = Path(order.models_directory) / f"{order.job_id:05d}-hybrid"
+    made = _made(directory, write_model(directory, model), model, "hybrid", observations)
+    return made | {"sessions": list(order.train_ids)}
+
+
+def _report(order: Order, progress: Progress) -> dict[str, Any]:
+    progress(0.0, "evaluating")
+    directory = Path(str(order.model))
+    model = read_model(directory, order.model_sha256)
+    training = evaluate(model, _trained_on(order, model))
+    held_out = None
+    if order.session_ids:
+        checks = _observations(order, model.rig, order.session_ids)
+        known = bool(np.isin(checks.setup, training.observations.setup).all())
+        held_out = evaluate(model, checks, refit_base=not known)
+    progress(0.3, "drawing")
+    with _store(order) as reader:
+        setups = setup_lines(reader, (*order.train_ids, *order.session_ids))
+    page = calibration_report(report_input(training, held_out, setups=setups))
+    path = directory / REPORT
+    write_file(path, page.encode())
+    judged = held_out or training
+    return {
+        "report": str(path),
+        "model": order.model,
+        "sessions": list(order.train_ids),
+        "held_out": held_out is not None,
+        "evaluation": judged.as_dict(0.0),
+    }
+
+
+def _compare(order: Order, progress: Progress) -> dict[str, Any]:
+    """The candidate beside the live model, on sessions that neither was trained on."""
+    result: dict[str, Any] = {"model": order.model, "sessions": list(order.train_ids)}
+    about = {
+        "manifest_sha256": order.model_sha256,
+        "live": order.live_id,
+        "live_manifest_sha256": order.live_sha256,
+        "sessions": list(order.session_ids),
+    }
+    if not order.session_ids:
+        sentence = "no check session holds fixes that neither model was trained on; nothing can be compared yet"
+        return result | {"comparison": about | {"is_better": False, "sentence": sentence}}
+    progress(0.0, "comparing with the live model")
+    candidate = read_model(Path(str(order.model)), order.model_sha256)
+    live, note = None, ""
+    if order.live_model is not None:
+        try:
+            live = read_model(Path(order.live_model), order.live_sha256)
+        except ModelError as error:
+            # What cannot be used any more must not keep a good model from its place; the operator sees why.
+            note = f"the live model cannot be read ({error}); "
+    compared = compare_held_out(candidate, live, _observations(order, candidate.rig, order.session_ids)).as_dict()
+    return result | {"comparison": about | compared | {"sentence": f"{note}{compared['sentence']}"}}
+
+
+def _check_drift(order: Order, progress: Progress) -> dict[str, Any]:
+    """The live model on check sessions that it was not trained on, one by one."""
+    checks: list[dict[str, Any]] = []
+    if order.session_ids:
+        live = read_model(Path(str(order.live_model)), order.live_sha256)
+        for done, name in enumerate(order.session_ids):
+            progress(done / len(order.session_ids), f"holding check session {name} against the live model")
+            try:
+                found = check(live, _observations(order, live.rig, (name,)))
+            except (DataError, UnsafeError) as error:
+                nothing = {"fixes": 0, "scores": [], "ratio": None, "reason": str(error)}
+                checks.append({"session": name, **nothing})
+                continue
+            fitted = (
+                f"the base at set-up {', '.join(found.refitted)} was fitted on these fixes" if found.refitted else ""
+            )
+            about = {"fixes": found.fixes, "scores": list(found.scores), "ratio": found.ratio, "reason": fitted}
+            checks.append({"session": name, **about})
+    return {"drift": {"live": order.live_id, "live_since": order.live_since, "checks": checks}}
+
+
+def _store(order: Order) -> Reader:
+    return Reader(Path(order.store), FileIdentity(*order.store_file) if order.store_file else None)
+
+
+def _rig_text(order: Order) -> str:
+    """The rig file of the newest session: the sessions carry what they were recorded with."""
+    with _store(order) as reader:
+        newest = session(reader, order.session_ids[-1])
+        assert newest is not None  # no session is ever deleted
+        return str(newest["rig_text"])
+
+
+def _observations(order: Order, rig: Rig, session_ids: tuple[str, ...]) -> Observations:
+    with _store(order) as reader:
+        data = sessions_csv(reader, rig, session_ids)
+    return parse_observations(data, rig, f"sessions {', '.join(session_ids)}")
+
+
+def _made(
+    directory: Path, sha256: str, model: CalibratedModel, stage: str, observations: Observations
+) -> dict[str, Any]:
+    """The result that the store keeps of a model that was trained on these observations."""
+    evaluation = evaluate(model, observations)
+    return {
+        "model": str(directory),
+        "manifest_sha256": sha256,
+        "stage": stage,
+        "metrics": {"training": evaluation.stages(), "noise_mm": model.noise_mm},
+    }
+
+
+def _end_with_parent() -> None:
+    sys.stdin.read()
+    os._exit(2)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Model files, the live model and what it predicts."""

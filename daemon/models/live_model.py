@@ -1,0 +1,162 @@
+"""The live model in memory: loaded beside everything else, again whenever another one goes live."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from calibration.errors import CalibrationError
+from calibration.rig.description import Rig
+from daemon.store.models import ModelRow, ModelTable
+
+if TYPE_CHECKING:
+    from calibration.model.model import CalibratedModel
+
+log = logging.getLogger(__name__)
+
+NO_MODEL = "no model is live; `rigcal model list` shows the candidates"
+LOADING = "the live model is being loaded"
+STOP_TIMEOUT_S = 5.0
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """The live model.
+
+    Attributes:
+        id: its number in the store.
+        model: to predict with.
+        jumped: joints whose readings jumped since it was trained: their zeros are not those that it knows.
+        zero_ns: UTC that `time_s` of its training counts from.
+        newest_ns: UTC of the newest observation that it was trained on; now is later, or the clock is wrong.
+    """
+
+    id: int
+    model: CalibratedModel
+    jumped: tuple[str, ...]
+    zero_ns: int
+    newest_ns: int
+
+
+@dataclass(frozen=True)
+class Missing:
+    """Why there is no live model to predict with.
+
+    Attributes:
+        reason: a sentence.
+        is_defect: a model is live and cannot be used.
+    """
+
+    reason: str
+    is_defect: bool = False
+
+
+@dataclass(frozen=True)
+class LiveModelHealth:
+    """Faults of the live model.
+
+    Attributes:
+        id: its number.
+        jumped: joints whose encoder has jumped since it was trained, their zeros not being checked.
+        defect: why it cannot be used; "" if it can.
+        drifted_with: the check session with which it was found to have drifted; None before.
+    """
+
+    id: int
+    jumped: tuple[str, ...] = ()
+    defect: str = ""
+    drifted_with: str | None = None
+
+
+class LiveModel:
+    """Keeps the live model; asking for it never waits.
+
+    Args:
+        table: the store's models.
+        rig: the machine, as its rig file describes it now.
+    """
+
+    def __init__(self, table: ModelTable, rig: Rig) -> None:
+        self._table, self._rig = table, rig
+        self._state: Loaded | Missing = Missing(LOADING)
+        self._turn = threading.Lock()  # a state and whether it is out of date change together
+        self._changed = threading.Event()
+        self._changed.set()
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name="live-model", daemon=True)
+
+    def start(self) -> None:
+        """Begin to load what is live."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Load no more. A load under way is not waited for beyond `STOP_TIMEOUT_S`."""
+        self._stopping = True
+        self._changed.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=STOP_TIMEOUT_S)
+
+    def now(self) -> Loaded | Missing:
+        """The live model, or why there is none; from any thread."""
+        return self._state
+
+    def health(self) -> LiveModelHealth | None:
+        """Faults of the live model; None where none is live."""
+        run = self._table.live_run()
+        if run is None:
+            return None
+        live, drifted = self.now(), self._table.drifted(run)
+        drifted_with = None if drifted is None else drifted[1]
+        if isinstance(live, Loaded):
+            return LiveModelHealth(run.model_id, live.jumped, "", drifted_with)
+        return LiveModelHealth(run.model_id, (), live.reason if live.is_defect else "", drifted_with)
+
+    def changed(self) -> None:
+        """Another model has gone live, or what is known of the joints' zeros has changed."""
+        with self._turn:
+            self._state = Missing(LOADING)
+            self._changed.set()
+
+    def load(self, row: ModelRow) -> CalibratedModel:
+        """Read a model of the store, which another process has loaded when it was written.
+
+        Raises:
+            CalibrationError: it is damaged, edited, or made for another rig file.
+        """
+        from daemon.warm_up import prepare
+
+        prepare()
+        from daemon.models.model_files import read_model_of_rig  # what the mathematics needs takes a second to import
+
+        return read_model_of_rig(row.path, row.manifest_sha256, self._rig)
+
+    def _run(self) -> None:
+        while True:
+            self._changed.wait()
+            self._changed.clear()
+            if self._stopping:
+                return
+            state = self._look()
+            with self._turn:
+                if not self._changed.is_set():
+                    self._state = state
+
+    def _look(self) -> Loaded | Missing:
+        try:
+            row = self._table.live()
+            if row is None:
+                return Missing(NO_MODEL)
+            jumped = tuple(name for name in self._table.jumped(row) if name in self._rig.joint_names)
+            loaded = Loaded(row.id, self.load(row), jumped, *self._table.training_ns(row))
+        except Exception as error:
+            if self._stopping:
+                return Missing(LOADING)  # store and processes are going away under it: no defect of the model
+            if isinstance(error, CalibrationError):
+                log.error("the live model cannot be used: %s", error)
+                return Missing(f"the live model cannot be used: {error}", is_defect=True)
+            log.exception("the live model could not be loaded")
+            return Missing(f"the live model could not be loaded ({error}); the daemon's log tells", is_defect=True)
+        log.info("model %d is live", row.id)
+        return loaded

@@ -1,0 +1,1 @@
+"""Calibration sessions and station set-ups."""

@@ -1,0 +1,132 @@
+"""Every way in which a calibration session changes its state, and whether calibration may use it.
+
+A session is open, then closed or aborted. When it is closed it is decided whether calibration may use it: where no
+control point shows that the station stood still from its start to its end, it may not, until an operator accepts it.
+Each change is one transaction.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+
+from daemon.commands import CommandError, caller_columns
+from daemon.sessions.open_session import OpenSession
+from daemon.store.jobs import JobTable
+from daemon.store.sessions import SessionTable, preset_jumps
+from daemon.store.store import Store
+from drivers.clock import Clock, Stamp
+from drivers.readings import Fix
+
+log = logging.getLogger(__name__)
+
+NOT_SHOT = "no control point was shot at its start and again at its end, so nothing shows that the station stood still"
+NOT_ENCLOSED = "most of its poses do not lie between a control point's shots at its start and at its end"
+LEAST_ENCLOSED = 0.25  # of its poses; some come before the operator gets to the first shot, or after the last
+
+
+class SessionLifecycle:
+    """The sessions of a rig.
+
+    Args:
+        store: the database.
+        rig_name: whose sessions are opened.
+        clock: time of the changes.
+        tolerance_mm: a control point further off than this says that the station moved.
+
+    Attributes:
+        table: of the sessions.
+    """
+
+    def __init__(self, store: Store, rig_name: str, clock: Clock, tolerance_mm: float) -> None:
+        self._store, self._rig, self._clock, self._tolerance_mm = store, rig_name, clock, tolerance_mm
+        self.table = SessionTable(store, rig_name)
+        self._jobs = JobTable(store, rig_name)
+
+    def unfinished(self) -> tuple[OpenSession | None, list[OpenSession]]:
+        """The rig's open session, and those that have ended and whose last captures were not decoded yet."""
+        opened: OpenSession | None = None
+        ended: list[OpenSession] = []
+        for row in self.table.unfinished():
+            if row["rig"] != self._rig:
+                if row["state"] == "open":
+                    log.warning(
+                        "session %s of rig %s is open; it goes on when rigcal runs that rig", row["id"], row["rig"]
+                    )
+                continue
+            since, until = self._store.stamp(row, "started_"), self._store.stamp_or_none(row, "ended_")
+            order = self._store.order
+            session = OpenSession(row["id"], row["setup_id"], row["prism"], row["kind"], order, since, until)
+            if until is None:
+                opened = session
+            else:
+                ended.append(session)
+        return opened, ended
+
+    def jumped(self, session: OpenSession) -> dict[str, Stamp]:
+        """Devices whose encoders have jumped in a session, since when."""
+        jumped: dict[str, Stamp] = {}
+        for jump in preset_jumps(self._store, session.since):
+            if session.lasted(jump.at):
+                jumped.setdefault(jump.device, jump.at)
+        return jumped
+
+    def end(self, session_id: str, state: str) -> Stamp:
+        """Close or abort a session.
+
+        Returns:
+            When: no fix that was measured later is stored as its observation.
+        """
+        with self._store.transaction():
+            ended = self._clock.now()  # in the transaction: the writer's thread may have held the store for long
+            excluded = self._why_not_used(session_id) if state == "closed" else None
+            self.table.change(session_id, state=state, excluded=excluded, **self._store.instant(ended, "ended_"))
+        return ended
+
+    def judge_again(self, session_id: str) -> None:
+        """Decide anew whether calibration may use a closed session, of which more was decoded after its end."""
+        with self._store.transaction():
+            self.table.exclude_closed(session_id, self._why_not_used(session_id))
+
+    def accept(self, session_id: str, operator: str) -> str:
+        """Let calibration use a closed session from now on, on an operator's word.
+
+        Returns:
+            The reason for which it was not used.
+
+        Raises:
+            CommandError: it is not closed, or it is used anyway.
+            NotInStoreError: there is no such session.
+        """
+        with self._store.transaction():
+            state, despite = self.table.state_and_exclusion(session_id)
+            if state != "closed":
+                why = "open; stop it first" if state == "open" else "aborted, and stays so"
+                raise CommandError(f"session {session_id!r} is {why}")
+            if despite is None:
+                raise CommandError(f"session {session_id!r} is used by calibration; there is nothing to accept")
+            self.table.change(
+                session_id,
+                excluded=None,
+                accepted_despite=despite,
+                accepted_by=operator,
+                accepted_after_job=self._jobs.newest_id(),
+                **caller_columns("accepted_"),
+                **self._store.instant(self._clock.now(), "accepted_"),
+            )
+        return despite
+
+    def add_observation(self, row: Mapping[str, object], fix: Fix, measured: Stamp) -> None:
+        """Add an observation that a fix gives."""
+        self.table.add_observation(self._store.fix_id(fix), measured, **row)
+
+    def _why_not_used(self, session_id: str) -> str | None:
+        """Why calibration must not use a session, a clause; None where a control point shows that it may."""
+        for shot in self.table.shots(session_id):
+            if shot["misclosure_mm"] is not None and shot["misclosure_mm"] > self._tolerance_mm:
+                off = f"control point {shot['point']} was {shot['misclosure_mm']:.1f} mm off at its {shot['phase']}"
+                return f"{off}, so the station had moved"
+        if not self.table.points_shot(session_id, "start") & self.table.points_shot(session_id, "end"):
+            return NOT_SHOT
+        poses, enclosed = self.table.count_poses(session_id)
+        return NOT_ENCLOSED if enclosed < LEAST_ENCLOSED * poses else None

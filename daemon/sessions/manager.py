@@ -1,0 +1,456 @@
+"""Calibration sessions: what the operator says, joined with what the instruments give.
+
+All state lives in the store; this module holds only what an open session needs between two fixes, and changes it after
+the store: what the store has refused has not happened. `on_records` runs in the writer thread; methods named
+`*_command` are called by the control socket's threads.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+import sqlite3
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from calibration.rig.description import Rig
+from daemon.acquisition.joiner import JoinedFix, ObservationJoiner
+from daemon.commands import (
+    CHECK,
+    FAILED,
+    SESSION_KINDS,
+    CommandError,
+    caller_columns,
+    caller_has_left,
+    identifier,
+    text_argument,
+)
+from daemon.config import SessionsSection
+from daemon.sessions.lifecycle import SessionLifecycle
+from daemon.sessions.open_session import OpenSession, Shot
+from daemon.sessions.prism_guard import MotionLimit, Suspicion
+from daemon.sessions.prism_watch import PrismWatch, as_dict
+from daemon.sessions.standstill_places import StandstillPlaces
+from daemon.sessions.station_setups import AXES, Place, SetupBook
+from daemon.store.errors import is_unwritable
+from daemon.store.jobs import JobTable
+from daemon.store.store import Store
+from drivers.clock import NS_PER_S, Clock, lies_within
+from drivers.readings import DeviceEvent, EventKind, Fix, Record, Status
+from drivers.stations.survey import position_mm
+
+log = logging.getLogger(__name__)
+
+STANDING_KINDS = ("static_poses", CHECK)
+CHECK_POSES = (3, 5)
+_LOOK_S = 0.5  # how often a shot looks whether anyone still waits for it
+LATE_NS = 60 * NS_PER_S  # once a fix was joined that was measured so long after a session's end, it has all of its own
+SHOT_SPREAD_MM = 20.0  # fixes of one shot that lie further apart are not of one standing target
+
+
+class SessionKeeper:
+    """Keeps the one open session and turns joined fixes into its observations.
+
+    Args:
+        rig, rig_text: the machine, and the file that describes it.
+        store: where everything is kept.
+        setups: the station set-ups in it.
+        joiner: joins fixes with joints.
+        settings: tolerances and time-outs.
+        clock: time.
+        run_id: of this run of the daemon; poses are numbered within it.
+        aim: turns the station to a prism or control point where something can (a simulated rig); None where the
+            operator does it.
+        limits: station -> what motion can do to its prism.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        rig_text: str,
+        store: Store,
+        setups: SetupBook,
+        joiner: ObservationJoiner,
+        settings: SessionsSection,
+        clock: Clock,
+        *,
+        run_id: int,
+        aim: Callable[[str], None] | None = None,
+        limits: Mapping[str, MotionLimit] | None = None,
+    ) -> None:
+        self._rig, self._rig_text = rig, rig_text
+        self._store, self._joiner, self._settings, self._clock = store, joiner, settings, clock
+        self._setups, self._run_id = setups, run_id
+        self._lifecycle = SessionLifecycle(store, rig.name, clock, settings.control_tolerance_mm)
+        self._table, self._jobs = self._lifecycle.table, JobTable(store, rig.name)
+        self._aim = aim
+        self._commands = threading.Lock()
+        self._shot: Shot | None = None
+        self._places = StandstillPlaces(rig)
+        self._prisms = PrismWatch(store, rig.name, clock, limits or {})
+        self._unstored: list[Callable[[], object]] = []  # observations that the store has yet to take, in their order
+        self._is_waiting = False
+        self._late: set[str] = set()  # sessions that got fixes after their end, and must be judged again
+        # Fixes measured in those that have ended may still come, or wait for their joints
+        self._open: OpenSession | None = None
+        self._ended: list[OpenSession] = []
+        store.unless_damaged(self._go_on, None)
+
+    # ---- the writer thread -------------------------------------------------------------------------------------------
+
+    def on_records(self, records: Sequence[Record]) -> None:
+        """Take records that are stored now: complete a shot, or store observations of the open session."""
+        for record in records:
+            if isinstance(record, Fix):
+                self._feed_shot(record)
+                self._watch_prism(record)
+            elif isinstance(record, DeviceEvent) and record.kind is EventKind.PRESET_JUMP:
+                for session in self._taking():
+                    if session.lasted(record.stamp):
+                        session.jumped.setdefault(record.device, record.stamp)
+        observing = [self._observe(joined) for joined in self._joiner.feed(records)]
+        late = [session.id for session in observing if session is not None and session.until is not None]
+        self._late.update(late)
+        if not late:  # no more of them at present
+            self._unstored += [partial(self._lifecycle.judge_again, session_id) for session_id in self._late]
+            self._late.clear()
+        if self._unstored:
+            self._store_observations()
+
+    def _feed_shot(self, fix: Fix) -> None:
+        shot = self._shot
+        place_mm = position_mm(fix)
+        if shot is None or shot.done.done() or place_mm is None or fix.status is not Status.OK:
+            return
+        if not lies_within(self._store.order, fix.stamp, shot.aimed, None):
+            return
+        if shot.places_mm and math.dist(place_mm, shot.places_mm[0]) > SHOT_SPREAD_MM:
+            shot.fixes.clear()  # the station was still turning to it
+            shot.places_mm.clear()
+        shot.fixes.append(fix)
+        shot.places_mm.append(place_mm)
+        if len(shot.fixes) == shot.wanted:
+            shot.done.set_result(None)
+
+    def _watch_prism(self, fix: Fix) -> None:
+        for session in self._taking():
+            if session.lasted(fix.stamp):
+                event = self._prisms.see(session, fix)
+                if event is not None:
+                    self._unstored.append(partial(self._store.insert_records, [event]))
+
+    def _taking(self) -> list[OpenSession]:
+        """The sessions that may have measured what comes now, oldest first."""
+        opened = self._open
+        return [*self._ended, *([] if opened is None else [opened])]
+
+    def _observe(self, joined: JoinedFix) -> OpenSession | None:
+        """Make an observation of the session in which a fix was measured, if any; that session."""
+        for ended in list(self._ended):
+            if ended.until is not None and lies_within(
+                self._store.order, joined.stamp, ended.until.shifted(LATE_NS), None
+            ):
+                self._ended.remove(ended)
+        session = next((session for session in self._taking() if session.has(joined.stamp)), None)
+        place_mm = position_mm(joined.fix)
+        if session is None or place_mm is None:
+            return None
+        standing = joined.standstill is not None
+        excluded = self._exclusion(session, joined, place_mm)
+        if standing and excluded is None:
+            at_ns = joined.stamp.monotonic_ns
+            standstill = (session.id, joined.standstill)
+            changed = self._places.add(standstill, at_ns, place_mm, joined.values)
+            excluded = changed.pop(at_ns)
+            if changed:
+                self._unstored.append(partial(self._table.exclude, session.id, changed, joined.stamp))
+        row = {
+            "session_id": session.id,
+            "setup_id": session.setup_id,
+            "prism": session.prism,
+            "pose": f"{self._run_id}.{joined.standstill}" if standing else None,
+            **dict(zip(AXES, place_mm, strict=True)),
+            "dwell_s": joined.dwell_s,
+            "moving": not standing,
+            "values_json": joined.values,
+            "excluded": excluded,
+        }
+        self._unstored.append(partial(self._lifecycle.add_observation, row, joined.fix, joined.stamp))
+        return session
+
+    def _store_observations(self) -> None:
+        """Store what was observed; while the disk is full it waits, with what comes after it."""
+        try:
+            with self._store.transaction():
+                for store in self._unstored:
+                    store()
+        except Exception as error:
+            if is_unwritable(error):
+                if not self._is_waiting:
+                    log.error("observations cannot be stored (%s); they wait and are tried again", error)
+                self._is_waiting = True
+                return
+            self._unstored.clear()  # one that can never be stored must not keep out all that follow
+            raise
+        self._unstored.clear()
+        self._is_waiting = False
+
+    def _exclusion(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> str | None:
+        if joined.refused:
+            return joined.refused
+        for joint in self._rig.joint_names:
+            if joint in session.jumped and lies_within(session.order, joined.stamp, session.jumped[joint], None):
+                return f"{joint} jumped: its readings from then on do not fit those before"
+        if session.is_control_point(place_mm):
+            return "a control point, not the prism"
+        doubt = self._prisms.doubt(session, joined.fix)
+        if doubt is not None:
+            return doubt
+        if session.kind in STANDING_KINDS and joined.standstill is None:
+            return "moving"
+        return None
+
+    # ---- sessions ----------------------------------------------------------------------------------------------------
+
+    def start_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Open a session: from now on good fixes become its observations."""
+        with self._commands:
+            if self._open is not None:
+                raise CommandError(f"session {self._open.id!r} is open; stop or abort it first")
+            prism, kind = str(arguments.get("prism", "")), str(arguments.get("kind", "static_poses"))
+            if prism not in self._rig.prism_names:
+                raise CommandError(
+                    f"rig {self._rig.name!r} has no prism {prism!r:.80}; it has {', '.join(self._rig.prism_names)}"
+                )
+            if kind not in SESSION_KINDS:
+                raise CommandError(f"there is no kind {kind!r:.80}; kinds: {', '.join(SESSION_KINDS)}")
+            setup_id = self._setups.usable(arguments.get("setup"))
+            free = self._table.free_id(prism)
+            session_id = identifier(arguments, "id", "a session's id", default=free)
+            if session_id in self._table.ids():
+                raise CommandError(f"session {session_id!r} exists already; choose another --id")
+            points = self._setups.control_points(setup_id)
+            if self._aim is not None:
+                self._aim(prism)
+            now = self._clock.now()
+            row = {
+                "id": session_id,
+                "rig_sha256": hashlib.sha256(self._rig_text.encode()).hexdigest(),
+                "rig_text": self._rig_text,
+                "setup_id": setup_id,
+                "prism": prism,
+                "operator": text_argument(arguments, "operator"),
+                **caller_columns(),
+                "kind": kind,
+                "note": text_argument(arguments, "note"),
+            }
+            self._table.start(now, **row)
+            order = self._store.order
+            self._open = session = OpenSession(session_id, setup_id, prism, kind, order, now, control_points=points)
+            if self._aim is not None:
+                self._prisms.turned(session, now)
+            return {
+                "id": session_id,
+                "setup": setup_id,
+                "prism": prism,
+                "kind": kind,
+                "advice": self._advice(session, "start"),
+            }
+
+    def stop_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Close the open session; its jobs follow by themselves."""
+        with self._commands:
+            session = self._close("closed")
+            return self._table.summary(session.id) | {"advice": self._advice(session, "end")}
+
+    def abort_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Close the open session as unusable: kept, never calibrated with."""
+        with self._commands:
+            return self._table.summary(self._close("aborted").id)
+
+    def accept_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Let calibration use a closed session although nothing shows that the station stood still."""
+        with self._commands:
+            session_id, operator = str(arguments.get("id", "")), text_argument(arguments, "operator")
+            despite = self._lifecycle.accept(session_id, operator)
+            log.warning("session %s is used, by the word of %s: %s", session_id, operator or "an operator", despite)
+            return self._table.summary(session_id)
+
+    def shoot_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Measure a control point: the mean of the next good fixes. The first shot of a point defines its place."""
+        with self._commands:
+            session = self._needs_open()
+            name = identifier(arguments, "point", "a control point's name")
+            if name in self._rig.prism_names:
+                raise CommandError(f"{name!r} is a prism of the rig; a control point stands still beside it")
+            shot = Shot(self._settings.fixes_per_shot, self._clock.now())
+            session.shots.append(shot)
+            try:
+                if self._aim is not None:
+                    self._aim(name)
+                shot.aimed = self._clock.now()
+                self._shot = shot
+                self._await(shot)
+                phase = self._table.phase(session.id, name)
+                result = self._setups.store_shot(session.setup_id, session.id, name, phase, shot.fixes, shot.places_mm)
+                # Before the shot is over: fixes that come late are of the point, and known to be
+                session.control_points = self._setups.control_points(session.setup_id)
+            finally:
+                self._shot = None
+                if self._aim is not None:
+                    self._aim(session.prism)
+                shot.until = self._clock.now()
+                if self._aim is not None:
+                    self._prisms.turned(session, shot.until)
+            return result | {"advice": _after_a_move(session) if result["moved"] else []}
+
+    def confirm_prism_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Take the operator's word that the station is on the session's prism: its fixes count from now on."""
+        with self._commands:
+            return self._prisms.confirm(self._needs_open(), text_argument(arguments, "operator"))
+
+    def turned_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """In a replay: the station was turned to the session's prism at this instant."""
+        with self._commands:
+            session = self._needs_open()
+            self._prisms.turned(session, self._clock.now())
+            return {"session": session.id}
+
+    def list_command(self, _arguments: Mapping[str, Any]) -> list[dict[str, Any]]:
+        """All sessions with what they hold, oldest first."""
+        return self._table.all()
+
+    def show_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """One session: what it holds, what was excluded and why, how its set-up kept its place, and its jobs."""
+        session_id = str(arguments.get("id", ""))
+        return self._table.summary(session_id) | {"jobs": self._jobs.of_session(session_id)}
+
+    def open_session(self) -> dict[str, Any] | None:
+        """What `status` shows of the open session."""
+        session = self._open
+        if session is None:
+            return None
+        suspicions = [as_dict(suspicion) for suspicion in self._prisms.suspicions(session)]
+        return self._table.summary(session.id) | {"prism_suspicions": suspicions}
+
+    def aim_again(self) -> None:
+        """Where something can aim the station, do what an operator would when it may be on another prism."""
+        session = self._open
+        if self._aim is None or session is None or not self._prisms.suspicions(session):
+            return
+        if self._commands.acquire(blocking=False):  # else a command is at work on the session: another time
+            try:
+                if session is self._open:
+                    self._aim(session.prism)
+                    self._prisms.turned(session, self._clock.now())
+            except (CommandError, sqlite3.Error) as error:  # another time: the station, or the disk, is not well
+                log.warning("station not aimed at prism %s again: %s", session.prism, error)
+            finally:
+                self._commands.release()
+
+    def prism_suspicions(self) -> list[Suspicion]:
+        """Stations that may be on another prism than that of the open session; from any thread."""
+        session = self._open
+        return [] if session is None else self._prisms.suspicions(session)
+
+    # ---- parts -------------------------------------------------------------------------------------------------------
+
+    def _await(self, shot: Shot) -> None:
+        """Wait until the shot is complete; the time-out runs on the clock of the rig.
+
+        An operator who gives up turns the station back to the prism: a shot that nobody waits for ends at once.
+        """
+        arrived = threading.Event()
+        shot.done.add_done_callback(lambda _: arrived.set())
+        left_s, is_complete = self._settings.shot_timeout_s, False
+        while left_s > 0 and not is_complete:
+            is_complete = self._clock.wait(arrived, min(left_s, _LOOK_S))
+            left_s -= _LOOK_S
+            if caller_has_left():
+                log.info("a shot of a control point was given up: nobody waits for it any more")
+                raise CommandError("the shot was given up, and nothing was stored", FAILED)
+        if not is_complete:
+            raise CommandError(
+                f"{len(shot.fixes)} of {shot.wanted} good fixes within {self._settings.shot_timeout_s:g} s; is the "
+                "station aimed at the control point, and locked? `rigcal status` shows",
+                FAILED,
+            )
+
+    def _advice(self, session: OpenSession, phase: str) -> list[str]:
+        """What the operator should still do, in sentences."""
+        points = self._setups.control_point_names(session.setup_id)
+        shot = self._table.points_shot(session.id, phase)
+        advice = []
+        missing = [name for name in points if name not in shot]
+        if phase == "start" and (missing or not points):
+            which = f"the control points {', '.join(missing)}" if missing else "a control point"
+            advice.append(
+                f"shoot {which} before the first pose (`rigcal session shoot NAME`), and again before the end"
+            )
+        elif missing or not points:
+            advice.append(
+                f"control points not shot at the session's end: {', '.join(missing) or 'none was shot at all'}"
+            )
+        advice += [
+            f"{joint} jumped during the session, and nothing after that is used: if its encoder was preset, start anew"
+            for joint in self._rig.joint_names
+            if joint in session.jumped
+        ]
+        advice += [
+            f"{suspicion.reason}; its fixes since then do not count: {suspicion.remedy}"
+            for suspicion in self._prisms.suspicions(session)
+        ]
+        if phase == "start":
+            advice.append("stand still at every pose until status counts it; move all joints through their ranges")
+            return advice
+        summary = self._table.summary(session.id)
+        if session.kind == CHECK and not CHECK_POSES[0] <= summary["poses"] <= CHECK_POSES[1]:
+            advice.append(f"a check wants {CHECK_POSES[0]} to {CHECK_POSES[1]} poses; this one has {summary['poses']}")
+        advice += [
+            f"the computer's clock was set back by {-step['step_s']:.1f} s during the session: its rows keep the times "
+            "that it showed, and calibration goes by the monotonic clock"
+            for step in summary["clock_steps"]
+            if step["step_s"] < 0
+        ]
+        return advice
+
+    def _close(self, state: str) -> OpenSession:
+        """End the open session, in the store and then here; what the store refuses leaves it open in both."""
+        session = self._needs_open()
+        session.until = self._lifecycle.end(session.id, state)
+        self._ended.append(session)
+        self._open = None
+        return session
+
+    def _needs_open(self) -> OpenSession:
+        if self._open is None:
+            raise CommandError("no session is open; start one with `rigcal session start`")
+        return self._open
+
+    def _go_on(self) -> None:
+        """Ready the sessions that an earlier run left to take fixes: of those that ended, what it did not decode."""
+        self._open, self._ended = self._lifecycle.unfinished()
+        for session in self._taking():
+            session.control_points = self._setups.control_points(session.setup_id)
+            session.jumped = self._lifecycle.jumped(session)
+            self._prisms.restore(session)
+        opened = self._open
+        if opened is None:
+            return
+        log.warning("session %s (prism %s) was open when rigcal last ended; it goes on", opened.id, opened.prism)
+        if self._aim is not None:  # what aims may have forgotten; an operator's station has kept its lock
+            self._aim(opened.prism)
+            self._prisms.turned(opened, self._clock.now())
+
+
+def _after_a_move(session: OpenSession) -> list[str]:
+    """What to do when a control point shows that the station moved."""
+    return [
+        "the station has moved, and nothing measured from now on fits what was measured before: stop the session, "
+        "describe where the station stands now with `rigcal setup new`, then start the next session",
+        f"session {session.id} is kept and not used; if you know that only the control point was wrong, say so after "
+        f"its end with `rigcal session accept {session.id}`",
+    ]

@@ -1,0 +1,78 @@
+"""An open session, and which fixes are its own: those measured in it while the station was on its prism."""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+
+from daemon.sessions.prism_guard import PrismGuard, Word
+from daemon.sessions.station_setups import Place
+from drivers.clock import Order, Stamp, lies_within
+from drivers.readings import Fix
+
+CONTROL_POINT_RADIUS_MM = 300.0  # a fix this close to a control point is of the control point, not of the boom
+
+
+@dataclass
+class Shot:
+    """A control point being measured: the mean of the next good fixes.
+
+    Attributes:
+        wanted: how many.
+        since, until: fixes measured in between are not of the prism.
+        aimed: fixes measured from then on may be of the point; None until the station was told to turn to it.
+        fixes, places_mm: so far.
+        done: when there are enough.
+    """
+
+    wanted: int
+    since: Stamp
+    until: Stamp | None = None
+    aimed: Stamp | None = None
+    fixes: list[Fix] = field(default_factory=list)
+    places_mm: list[Place] = field(default_factory=list)
+    done: Future[None] = field(default_factory=Future)
+
+
+@dataclass
+class OpenSession:
+    """A session that takes fixes. Each fix's instant tells whose it is: it is joined, and comes, some time later.
+
+    Attributes:
+        order: of instants.
+        since, until: fixes measured in between are of its prism, whichever run of the daemon decodes them; until is
+            None while it is open.
+        shots: when the station was on control points instead.
+        jumped: joints whose encoder jumped in it, since when.
+        control_points: where those of its set-up are, mm.
+        words: who said when that its stations are on its prism.
+        guards: station -> what watches that it stays there; for the writer's thread.
+    """
+
+    id: str
+    setup_id: str
+    prism: str
+    kind: str
+    order: Order
+    since: Stamp
+    until: Stamp | None = None
+    shots: list[Shot] = field(default_factory=list)
+    jumped: dict[str, Stamp] = field(default_factory=dict)
+    control_points: list[Place] = field(default_factory=list)
+    words: list[Word] = field(default_factory=list)
+    guards: dict[str, PrismGuard] = field(default_factory=dict)
+
+    def lasted(self, stamp: Stamp) -> bool:
+        """Whether that instant lies in it."""
+        return lies_within(self.order, stamp, self.since, self.until)
+
+    def has(self, stamp: Stamp) -> bool:
+        """Whether what the station measured then is its prism."""
+        return self.lasted(stamp) and not any(
+            lies_within(self.order, stamp, shot.since, shot.until) for shot in self.shots
+        )
+
+    def is_control_point(self, place_mm: Place) -> bool:
+        """Whether a control point of its set-up is there."""
+        return any(math.dist(place_mm, point) < CONTROL_POINT_RADIUS_MM for point in self.control_points)

@@ -1,0 +1,129 @@
+"""Watches in each session that its stations stay on its prism, and takes an operator's word that they are."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+from daemon.commands import caller_columns
+from daemon.sessions.open_session import OpenSession
+from daemon.sessions.prism_guard import MotionLimit, PrismGuard, Suspicion, Word
+from daemon.store.sessions import SessionTable, fixes_since_used, prism_confirmations
+from daemon.store.store import Store
+from drivers.clock import Clock, Stamp
+from drivers.readings import DeviceEvent, EventKind, Fix, LockState, Status
+from drivers.stations.survey import position_mm
+
+log = logging.getLogger(__name__)
+
+_NUMBERS = ("hz_angle_rad", "zenith_angle_rad", "slope_distance_m", "north_m", "east_m", "up_m")
+
+
+class PrismWatch:
+    """The guards of sessions' prisms.
+
+    Args:
+        store: where operators' words are kept; fixes and observations are there.
+        rig_name: whose sessions are watched.
+        clock: for when they were given.
+        limits: station -> what motion can do to its prism.
+    """
+
+    def __init__(self, store: Store, rig_name: str, clock: Clock, limits: Mapping[str, MotionLimit]) -> None:
+        self._store, self._clock, self._limits = store, clock, limits
+        self._table = SessionTable(store, rig_name)
+
+    def see(self, session: OpenSession, fix: Fix) -> DeviceEvent | None:
+        """Take a fix of the session, in order; what there is to tell an operator."""
+        event = self._take(session, fix)
+        if event is not None:
+            log.warning("station %s: %s", fix.station, event.text)
+        return event
+
+    def doubt(self, session: OpenSession, fix: Fix) -> str | None:
+        """Why a fix that was seen must not be used; None when it may."""
+        guard = session.guards.get(fix.station)
+        suspicion = guard.doubt(fix.stamp) if guard is not None else None
+        return suspicion.reason if suspicion is not None else None
+
+    def suspicions(self, session: OpenSession) -> list[Suspicion]:
+        """Those of the session that last."""
+        return [guard.suspicion for guard in list(session.guards.values()) if guard.suspicion is not None]
+
+    def confirm(self, session: OpenSession, operator: str) -> dict[str, Any]:
+        """Take the word that the session's stations are on its prism: their fixes count from now on."""
+        ended = self.suspicions(session)
+        at = self._clock.now()
+        who = operator or "an operator"
+        text = f"{who} confirms that the station is on prism {session.prism}; its fixes count from now on"
+        stations = [suspicion.station for suspicion in ended] or [*self._limits]
+        events = [DeviceEvent(station, at, EventKind.PRISM_CONFIRMED, text) for station in stations]
+        with self._store.transaction():
+            self._table.add_confirmation(session.id, at, operator=operator, turning=False, **caller_columns())
+            self._store.insert_records(events)
+        session.words.append(Word(at))
+        log.info("session %s: %s", session.id, text)
+        advice = [
+            f"what {suspicion.station} measured before it jumped by {suspicion.distance_m:.2f} m counts too: if it was "
+            "on another prism then, abort the session and hold a new one"
+            for suspicion in ended
+        ]
+        return {
+            "session": session.id,
+            "prism": session.prism,
+            "text": text,
+            "ended": [as_dict(suspicion) for suspicion in ended],
+            "advice": advice,
+        }
+
+    def turned(self, session: OpenSession, at: Stamp) -> None:
+        """The station was turned to the session's prism by something that knows where that is."""
+        self._table.add_confirmation(session.id, at, turning=True)
+        session.words.append(Word(at, is_turning=True))
+
+    def restore(self, session: OpenSession) -> None:
+        """What an earlier run of the daemon knew, from what it stored; where it left off, the next fix is a new lock.
+
+        A restart ends no suspicion, and what happened while nobody listened may begin one.
+        """
+        with self._store.reader() as reader:
+            words = prism_confirmations(reader, session.id)
+            session.words += [Word(reader.stamp(row), bool(row["turning"])) for row in words]
+            for station in self._limits:
+                for row in fixes_since_used(reader, session.id, station):
+                    self._take(session, _fix(station, row, reader.stamp(row)))
+                self._guard(session, station).look_away()
+        for suspicion in self.suspicions(session):
+            log.warning("session %s: %s; %s", session.id, suspicion.reason, suspicion.remedy)
+
+    def _take(self, session: OpenSession, fix: Fix) -> DeviceEvent | None:
+        guard = self._guard(session, fix.station)
+        place_mm = position_mm(fix)
+        if not session.has(fix.stamp) or (place_mm is not None and session.is_control_point(place_mm)):
+            guard.look_away()
+            return None
+        return guard.see(fix)
+
+    def _guard(self, session: OpenSession, station: str) -> PrismGuard:
+        if station not in session.guards:
+            limit = self._limits.get(station, MotionLimit())
+            session.guards[station] = PrismGuard(station, limit, session.words, self._store.order)
+        return session.guards[station]
+
+
+def as_dict(suspicion: Suspicion) -> dict[str, Any]:
+    """A suspicion as `status` shows it."""
+    return {
+        "station": suspicion.station,
+        "since_utc_ns": suspicion.since.utc_ns,
+        "distance_m": suspicion.distance_m,
+        "text": suspicion.reason,
+        "remedy": suspicion.remedy,
+    }
+
+
+def _fix(station: str, row: Mapping[str, Any], stamp: Stamp) -> Fix:
+    """As much of a stored fix as a guard looks at."""
+    numbers = {name: row[name] for name in _NUMBERS}
+    return Fix(station, stamp, stamp, Status(row["status"]), LockState(row["lock"]), **numbers)

@@ -1,0 +1,72 @@
+"""What a stored session holds, for calibration and report.
+
+Observations come as CSV (docs/formats.md): from here on a session is read exactly as an imported file is.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Sequence
+
+from calibration.rig.description import Rig
+from calibration.table import LABEL_COLUMNS, POSITION_COLUMNS, SIGMA_COLUMNS
+from daemon.report.inputs import ControlPoint, SetupLine
+from daemon.sessions.steady_time import SteadyTime
+from daemon.store.reader import Reader
+from daemon.store.sessions import first_observation_ns, observations
+from daemon.store.setups import misclosures, setups_of
+from drivers.clock import NS_PER_S, Stamp
+
+Misclosure = tuple[float, float, float]
+
+
+def sessions_csv(reader: Reader, rig: Rig, session_ids: Sequence[str]) -> bytes:
+    """Observations of the given sessions that calibration may use, oldest first.
+
+    `time_s` counts from the store's first observation that calibration may use, on UTC, steady within a session:
+    sessions may lie boots apart. It is the same whichever sessions are asked for: what a model has learned from some of
+    them depends on time (a jump, a base that settles), and is applied to others.
+    """
+    rows = observations(reader, session_ids)
+    values = [json.loads(row["values_json"]) for row in rows]
+    joints = [joint.column for joint in rig.joints]
+    more = sorted({name for row in values for name in row} - set(joints))
+    steady = {session_id: SteadyTime() for session_id in session_ids}
+    utc_ns = [
+        steady[row["session_id"]].of(Stamp(row["utc_ns"], row["monotonic_ns"], str(row["boot_id"]))).utc_ns
+        for row in rows
+    ]
+    zero_ns = first_observation_ns(reader)
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(["prism", *joints, *POSITION_COLUMNS, *LABEL_COLUMNS, "time_s", *SIGMA_COLUMNS, "dwell_s", *more])
+    for row, measured, at_ns in zip(rows, values, utc_ns, strict=True):
+        cells = [row["prism"], *(measured.get(name) for name in joints)]
+        cells += [row[name] for name in POSITION_COLUMNS]
+        cells += [row["setup_id"], row["session_id"], row["pose"], round((at_ns - zero_ns) / NS_PER_S, 6)]
+        cells += [row[name] for name in SIGMA_COLUMNS] + [row["dwell_s"], *(measured.get(name) for name in more)]
+        writer.writerow("" if cell is None else repr(cell) if isinstance(cell, float) else cell for cell in cells)
+    return out.getvalue().encode()
+
+
+def setup_lines(reader: Reader, session_ids: Sequence[str]) -> list[SetupLine]:
+    """The set-ups of the given sessions with the misclosures of their control points, for the report.
+
+    A point shot in several sessions is shown with the first session's start and the last session's end.
+    """
+    lines = []
+    for setup in setups_of(reader, session_ids):
+        shots = misclosures(reader, setup["id"], session_ids)
+        first: dict[str, Misclosure] = {}
+        last: dict[str, Misclosure] = {}
+        for shot in shots:
+            misclosure = (shot["x"], shot["y"], shot["z"])
+            if shot["phase"] == "start":
+                first.setdefault(shot["name"], misclosure)
+            else:
+                last[shot["name"]] = misclosure
+        points = [ControlPoint(name, first.get(name), last.get(name)) for name in sorted({*first, *last})]
+        lines.append(SetupLine(setup["id"], setup["instrument"], setup["state"] == "moved", points))
+    return lines

@@ -1,0 +1,153 @@
+"""Places of one standstill: the boom does not move, so fixes of its prism lie at one place.
+
+A station that lost its prism may lock on to another one, or to a reflection, and its fixes look as good as before.
+Where the fixes of a standstill lie at several places, the place with the most fixes is taken for the prism's and the
+fixes of the others are excluded; while two places have equally many, both are. More fixes may turn the decision.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, field
+
+from calibration.rig.description import Rig
+from daemon.sessions.station_setups import Place
+
+# Fixes of a standing prism scatter by some mm, in tracking mode by 10 mm, and a long boom that has just stopped sways
+# by some tens of mm. Two prisms, or a prism and a reflection, that are nearer to each other than this look like one.
+SAME_PLACE_MM = 100.0
+MOST_PLACES = 100
+SETTLED_FIXES = 50_000  # hours; what was decided by then stays
+EVERY_FIX = 64  # until a standstill has that many fixes each of them may turn the decision, later one in total / 64
+
+Exclusions = dict[int, str | None]
+"""Instant of a fix, monotonic ns -> why calibration must not use it, None when it may."""
+
+
+@dataclass
+class _Place:
+    """One of the places.
+
+    Attributes:
+        first_mm: where its first fix lies.
+        latest_mm, joints: its latest fix, and the machine's joints then: a boom that sinks slowly counts as standing.
+        count: how many fixes lie there.
+        instants_ns: of those fixes whose exclusion may still change.
+        excluded: why these must not be used.
+    """
+
+    first_mm: Place
+    latest_mm: Place
+    joints: Mapping[str, float]
+    count: int = 0
+    instants_ns: list[int] = field(default_factory=list)
+    excluded: str | None = None
+
+
+class StandstillPlaces:
+    """The places of the present standstill.
+
+    Args:
+        rig: whose joints tell how far a boom that counts as standing has moved.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        self._travel_mm = _travel_mm(rig)
+        self._standstill: Hashable = None
+        self._places: list[_Place] = []
+        self._fixes = 0
+        self._decided_at = 0
+
+    def add(self, standstill: Hashable, at_ns: int, place_mm: Place, values: Mapping[str, float]) -> Exclusions:
+        """Take a fix.
+
+        Args:
+            standstill: which one it is of; with another one all begins anew.
+            at_ns: when it was measured, monotonic within the standstill.
+            place_mm: where the prism was.
+            values: observations CSV column -> number, with the joints at that instant.
+
+        Returns:
+            The exclusion of this fix, and of earlier ones of the standstill for which it has changed.
+        """
+        if standstill != self._standstill:
+            self._standstill, self._places, self._fixes, self._decided_at = standstill, [], 0, 0
+        joints = {column: values[column] for column in self._travel_mm if column in values}
+        place = self._place(place_mm, joints)
+        place.latest_mm, place.joints = place_mm, joints
+        place.count += 1
+        self._fixes += 1
+        changed: Exclusions = {}
+        if self._fixes <= SETTLED_FIXES:
+            place.instants_ns.append(at_ns)
+            if self._fixes - self._decided_at > self._decided_at // EVERY_FIX:
+                changed = self._decide()
+        changed[at_ns] = place.excluded
+        return changed
+
+    def _place(self, place_mm: Place, joints: Mapping[str, float]) -> _Place:
+        """The nearest place that a fix may belong to, or a new one."""
+        near = [place for place in self._places if self._is_near(place, place_mm, joints)]
+        if near:
+            return min(near, key=lambda place: math.dist(place_mm, place.latest_mm))
+        if len(self._places) == MOST_PLACES:
+            self._places.remove(min(self._places, key=lambda p: p.count))  # its fixes stay excluded
+        made = _Place(place_mm, place_mm, joints)
+        if self._places:
+            made.excluded = _another(made, max(self._places, key=lambda p: p.count))
+        self._places.append(made)
+        return made
+
+    def _is_near(self, place: _Place, place_mm: Place, joints: Mapping[str, float]) -> bool:
+        """True if scatter, sway and what the joints have moved since explain the distance from a place's latest fix."""
+        changes = {column: joints[column] - place.joints[column] for column in joints.keys() & place.joints.keys()}
+        moved_mm = sum(_size(column, change) * self._travel_mm[column] for column, change in changes.items())
+        return math.dist(place_mm, place.latest_mm) <= SAME_PLACE_MM + moved_mm
+
+    def _decide(self) -> Exclusions:
+        """Exclude all but the place with the most fixes; the fixes for which that is news."""
+        self._decided_at = self._fixes
+        most = max(place.count for place in self._places)
+        first, *others = [place for place in self._places if place.count == most]
+        changed: Exclusions = {}
+        for place in self._places:
+            excluded = None
+            if place.count < most:
+                excluded = _another(place, first)
+            elif others:
+                excluded = _undecided(place, others[0] if place is first else first)
+            if excluded != place.excluded:
+                place.excluded = excluded
+                changed.update(dict.fromkeys(place.instants_ns, excluded))
+        return changed
+
+
+def _another(place: _Place, prism: _Place) -> str:
+    return f"another prism or a reflection: more fixes of this standstill lie {_metres(place, prism)} m away"
+
+
+def _undecided(place: _Place, other: _Place) -> str:
+    return f"another prism or a reflection: as many fixes of this standstill lie {_metres(place, other)} m away"
+
+
+def _metres(place: _Place, other: _Place) -> str:
+    return f"{math.dist(place.first_mm, other.first_mm) / 1000:.2f}"
+
+
+def _size(column: str, change: float) -> float:
+    """Size of a joint's change; of an angle the short way round."""
+    return abs(math.remainder(change, 360.0) if column.endswith("_deg") else change)
+
+
+def _travel_mm(rig: Rig) -> dict[str, float]:
+    """A joint's column -> how far a change of 1 in it moves any prism at most, mm."""
+    reach_mm = sum(abs(row.a_mm) + abs(row.d_mm) + abs(row.b_mm) for row in rig.rows)
+    reach_mm += sum(math.hypot(b.x_mm, b.y_mm, b.z_mm) for row in rig.rows if (b := row.before) is not None)
+    reach_mm += sum(max(map(abs, joint.limits)) for joint in rig.joints if joint.kind == "prismatic")
+    reach_mm += max(math.hypot(*prism.offset_mm) for prism in rig.prisms)
+    driven: dict[str, float] = {}
+    for _, _, name, coefficient in rig.couplings():
+        driven[name] = driven.get(name, 0.0) + abs(coefficient)
+    lever_mm = {"deg": math.radians(reach_mm), "mm": 1.0}
+    return {joint.column: driven[joint.name] * lever_mm[joint.unit] for joint in rig.joints}

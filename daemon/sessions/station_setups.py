@@ -1,0 +1,180 @@
+"""Station set-ups: where the total station stands, and the control points that tell whether it still does."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from statistics import fmean
+from typing import Any
+
+from calibration.rig.description import Rig
+from daemon.commands import REFUSED, CommandError, identifier, mapping_argument, number_argument, text_argument
+from daemon.store.setups import SetupTable, control_points
+from daemon.store.store import Store
+from drivers.clock import Clock
+from drivers.readings import Fix
+
+log = logging.getLogger(__name__)
+
+Place = tuple[float, float, float]
+MOST_CONSTANT_MM = 500.0
+AXES = ("x_mm", "y_mm", "z_mm")
+
+
+class SetupBook:
+    """The set-ups of a store.
+
+    Args:
+        rig: whose prisms have constants.
+        store: where set-ups are kept.
+        clock: time.
+        tolerance_mm: a control point further off than this says that the set-up moved.
+    """
+
+    def __init__(self, rig: Rig, store: Store, clock: Clock, tolerance_mm: float) -> None:
+        self._rig, self._store, self._clock, self._tolerance_mm = rig, store, clock, tolerance_mm
+        self._table = SetupTable(store)
+
+    def new_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """A station set-up: instrument, tilt, ppm. It replaces none: sessions name theirs."""
+        setup_id = identifier(arguments, "id", "a set-up's id")
+        if setup_id in self._table.states():
+            raise CommandError(f"set-up {setup_id!r} exists already; a station that was moved is a new set-up")
+        constants = mapping_argument(arguments, "prism_constants_mm")
+        for prism in constants:
+            number_argument(constants, prism, limit=MOST_CONSTANT_MM)
+        unknown = sorted(set(constants) - set(self._rig.prism_names))
+        if unknown:
+            raise CommandError(
+                f"rig {self._rig.name!r} has no prism {unknown[0]!r:.80}; it has {', '.join(self._rig.prism_names)}"
+            )
+        points = {str(n): _place(n, place) for n, place in mapping_argument(arguments, "control_points").items()}
+        row: dict[str, object] = {
+            "instrument": text_argument(arguments, "instrument"),
+            "serial": text_argument(arguments, "serial"),
+            "tilt_arcsec": number_argument(arguments, "tilt_arcsec"),
+            "ppm": number_argument(arguments, "ppm"),
+            "prism_constants_json": constants,
+            "note": text_argument(arguments, "note"),
+        }
+        with self._store.transaction():
+            self._table.add(self._clock.now(), id=setup_id, **row)
+            for name, place in points.items():
+                self._table.put_control_point(setup_id, name, place)
+        return {"id": setup_id}
+
+    def list_command(self, _arguments: Mapping[str, Any]) -> list[dict[str, Any]]:
+        """All set-ups with their control points, oldest first."""
+        return self._table.all()
+
+    def usable(self, wanted: object) -> str:
+        """The set-up that is asked for, or the newest: where the station stood before that one it stands no more.
+
+        Raises:
+            CommandError: there is none, or it has moved.
+        """
+        if wanted is None:
+            newest = self._table.newest()
+            if newest is None:
+                raise CommandError("there is no station set-up; describe one with `rigcal setup new`")
+            if newest.state != "ok":
+                raise CommandError(
+                    f"set-up {newest.id!r}, the newest, has {newest.state}; describe a new one (`rigcal setup "
+                    "new`), or name one with --setup if the station stands there again",
+                    REFUSED,
+                )
+            return newest.id
+        states = self._table.states()
+        if not isinstance(wanted, str) or wanted not in states:
+            raise CommandError(f"there is no set-up {wanted!r:.80}; known: {', '.join(states) or 'none'}")
+        if states[wanted] != "ok":
+            raise CommandError(
+                f"set-up {wanted!r} has {states[wanted]}: its control points no longer fit; describe where the "
+                "station stands now with `rigcal setup new`",
+                REFUSED,
+            )
+        return wanted
+
+    def current(self) -> str | None:
+        """The newest set-up; None where there is none, and where it has moved."""
+        newest = self._table.newest()
+        return newest.id if newest is not None and newest.state == "ok" else None
+
+    def store_shot(
+        self, setup_id: str, session_id: str, name: str, phase: str, fixes: Sequence[Fix], places_mm: Sequence[Place]
+    ) -> dict[str, Any]:
+        """Write down that a control point was shot, and whether it still is where it was.
+
+        Args:
+            setup_id: set-up of the station.
+            session_id: session in which it was shot.
+            name: of the point; its first shot defines its place.
+            phase: `start` or `end` of the session.
+            fixes: fixes that are averaged.
+            places_mm: their places in the station's frame.
+
+        Returns:
+            point, phase, x_mm, y_mm, z_mm, misclosure_mm (None if this shot defined the point), moved.
+        """
+        known = self._known_place(setup_id, session_id, name, phase)
+        place = {axis: fmean(p[i] for p in places_mm) for i, axis in enumerate(AXES)}
+        reference = known or place
+        distance_mm = math.dist([*place.values()], [reference[axis] for axis in AXES])
+        misclosure_mm = distance_mm if known else None
+        moved = distance_mm > self._tolerance_mm
+        with self._store.transaction():
+            if known is None:
+                self._table.put_control_point(setup_id, name, place)
+            self._table.add_shot(
+                setup_id,
+                name,
+                fixes[0].stamp,
+                session_id=session_id,
+                phase=phase,
+                **place,
+                fix_ids_json=[self._store.fix_id(fix) for fix in fixes],
+                misclosure_mm=misclosure_mm,
+            )
+            if moved:
+                self._table.mark_moved(setup_id)
+        if moved:
+            log.warning("set-up %s moved: control point %s is %.1f mm off", setup_id, name, distance_mm)
+        return {
+            "point": name,
+            "phase": phase,
+            **place,
+            "misclosure_mm": misclosure_mm,
+            "moved": moved,
+        }
+
+    def _known_place(self, setup_id: str, session_id: str, name: str, phase: str) -> dict[str, float] | None:
+        """Where a control point is known to be; None if this shot defines it.
+
+        A point that only this session's start has shot, and that was not given with the set-up, is defined anew: the
+        operator shoots again because the shot before was no good.
+        """
+        known = next((p for p in control_points(self._store, setup_id) if p["name"] == name), None)
+        shots = self._table.point_shots(setup_id, name)
+        own = all(s["session_id"] == session_id and s["phase"] == "start" for s in shots)
+        if known and phase == "start" and own and any(s["misclosure_mm"] is None for s in shots):
+            return None
+        return None if known is None else {axis: known[axis] for axis in AXES}
+
+    def control_point_names(self, setup_id: str) -> list[str]:
+        """Names of a set-up's control points."""
+        return [point["name"] for point in control_points(self._store, setup_id)]
+
+    def control_points(self, setup_id: str) -> list[Place]:
+        """Places of a set-up's control points, mm in the station's frame."""
+        return [(p["x_mm"], p["y_mm"], p["z_mm"]) for p in control_points(self._store, setup_id)]
+
+
+def _place(name: object, place: object) -> dict[str, float]:
+    identifier({"name": name}, "name", "a control point's name")
+    if isinstance(place, list | tuple) and len(place) == len(AXES):
+        axes = {axis: number_argument({axis: value}, axis, limit=1e7) for axis, value in zip(AXES, place, strict=True)}
+        given = {axis: value for axis, value in axes.items() if value is not None}
+        if len(given) == len(AXES):
+            return given
+    raise CommandError(f"control point {name!r}: give three coordinates in mm, not {place!r:.80}")

@@ -1,0 +1,117 @@
+"""The files of a store: which they are, whatever they are called, and the lock of the one process that writes.
+
+A name can come to mean another file while a program has the first one open.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from daemon.store.errors import StoreBusyError, storage_errors
+
+BESIDE = ("", "-wal", "-shm")  # a database in WAL mode is three files
+
+
+@dataclass(frozen=True)
+class FileIdentity:
+    """A file, whatever it is called.
+
+    Attributes:
+        device, inode: as stat(2) has them.
+    """
+
+    device: int
+    inode: int
+
+    @classmethod
+    def of(cls, path: Path) -> FileIdentity | None:
+        """The file at `path`; None where there is none.
+
+        Raises:
+            OSError: the file system does not tell.
+        """
+        try:
+            status = path.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        return cls(status.st_dev, status.st_ino)
+
+
+@dataclass(frozen=True)
+class StoreFiles:
+    """The files of a store, as they were when it was opened.
+
+    Attributes:
+        path: of the database.
+        identities: of the database, its write-ahead log and that log's index.
+    """
+
+    path: Path
+    identities: tuple[FileIdentity | None, ...]
+
+    @classmethod
+    def of(cls, path: Path) -> StoreFiles:
+        """The files of the store at `path`, which is open."""
+        path = path.absolute()
+        return cls(path, tuple(FileIdentity.of(_beside(path, suffix)) for suffix in BESIDE))
+
+    @property
+    def database(self) -> FileIdentity | None:
+        """The database itself."""
+        return self.identities[0]
+
+    def changed(self) -> tuple[Path, bool] | None:
+        """The first file that is not the one that was opened, and whether another lies in its place.
+
+        Raises:
+            OSError: the file system does not tell.
+        """
+        for suffix, opened in zip(BESIDE, self.identities, strict=True):
+            path = _beside(self.path, suffix)
+            now = FileIdentity.of(path)
+            if opened is not None and now != opened:
+                return path, now is not None
+        return None
+
+
+class WriterLock:
+    """The exclusive right to write to `database`; taken by the constructor.
+
+    A lock file beside the database is held for the life of the process. The kernel drops the lock when the process
+    ends, however it ends, so a stale file never needs to be removed.
+
+    Raises:
+        StoreBusyError: another process (or another store of this one) has it.
+        StoreError: the lock file cannot be made or written.
+    """
+
+    def __init__(self, database: Path) -> None:
+        path = database.with_name(database.name + ".lock")
+        with storage_errors(path):
+            self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            text = os.pread(self._file, 32, 0).strip()
+            os.close(self._file)
+            raise StoreBusyError(str(database), int(text) if text.isdigit() else None) from None
+        # Who holds it is for people; on a full disk the lock holds without.
+        with contextlib.suppress(OSError):
+            os.ftruncate(self._file, 0)
+            os.pwrite(self._file, f"{os.getpid()}\n".encode(), 0)
+
+    def release(self) -> None:
+        """Give the right up; harmless when it was given up before."""
+        if self._file >= 0:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._file, 0)
+            os.close(self._file)
+            self._file = -1
+
+
+def _beside(path: Path, suffix: str) -> Path:
+    return path.with_name(path.name + suffix)

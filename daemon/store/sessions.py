@@ -1,0 +1,367 @@
+"""The tables of calibration sessions: sessions, observations, confirmations of their prism, and encoder jumps."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from daemon.store.connection import Connection
+from daemon.store.errors import NotInStoreError
+from daemon.store.rows import RowSource
+from drivers.clock import NS_PER_S, Stamp
+
+CLOCK_STEP_NS = NS_PER_S // 20  # less may be the time between reading the one clock and the other
+
+# Fixes of these may still come: of the open ones, and of those that ended after the oldest capture that waits to be
+# decoded was made.
+_UNFINISHED = """SELECT * FROM calibration_sessions
+    WHERE state = 'open' OR (ended_boot_id, ended_monotonic_ns) >=
+        (SELECT first_boot_id, first_monotonic_ns FROM raw_chunks
+            WHERE id = (SELECT min(chunk_id) FROM undecoded_chunks))
+    ORDER BY rowid"""
+_SUMMARY = """SELECT id, rig, setup_id AS setup, prism, operator, caller_user AS user, kind, state, note,
+        started_utc_ns, ended_utc_ns, excluded AS not_used, accepted_despite, accepted_by, accepted_utc_ns,
+        accepted_caller_user AS accepted_user,
+        (SELECT state = 'moved' FROM station_setups WHERE station_setups.id = setup_id) AS setup_moved
+    FROM calibration_sessions WHERE id = ?"""
+_COUNTS = """SELECT count(*) FILTER (WHERE excluded IS NULL) AS observations,
+        count(DISTINCT pose) FILTER (WHERE excluded IS NULL) AS poses FROM observations WHERE session_id = ?"""
+_EXCLUDED = """SELECT excluded AS reason, count(*) AS n FROM observations
+    WHERE session_id = ? AND excluded IS NOT NULL GROUP BY excluded ORDER BY n DESC, reason"""
+_SHOTS = "SELECT name AS point, phase, misclosure_mm FROM control_shots WHERE session_id = ? ORDER BY id"
+_INSTANTS = """WITH instants AS (
+        SELECT boot_id, monotonic_ns, utc_ns FROM observations WHERE session_id = ?1
+        UNION ALL SELECT boot_id, monotonic_ns, utc_ns FROM control_shots WHERE session_id = ?1
+        UNION ALL SELECT started_boot_id, started_monotonic_ns, started_utc_ns FROM calibration_sessions WHERE id = ?1
+        UNION ALL SELECT ended_boot_id, ended_monotonic_ns, ended_utc_ns FROM calibration_sessions
+            WHERE id = ?1 AND ended_utc_ns IS NOT NULL)"""
+# Within a boot both clocks run alike, whatever NTP does to their rate: their difference changes only when the clock is
+# set. A later boot must not show an earlier time. The first query is cheap, and nearly always the answer.
+_MAY_HAVE_STEPPED = f"""{_INSTANTS} SELECT min(boot_id) < max(boot_id)
+        OR max(utc_ns - monotonic_ns) - min(utc_ns - monotonic_ns) >= {CLOCK_STEP_NS} AS maybe FROM instants"""
+_CLOCK_STEPS = f"""{_INSTANTS},
+    pairs AS (SELECT utc_ns, utc_ns - lag(utc_ns) OVER earlier AS passed_ns,
+            boot_id = lag(boot_id) OVER earlier AS is_same_boot,
+            monotonic_ns - lag(monotonic_ns) OVER earlier AS true_ns
+        FROM instants WINDOW earlier AS (ORDER BY boot_id, monotonic_ns)),
+    steps AS (SELECT utc_ns, CASE WHEN is_same_boot THEN passed_ns - true_ns ELSE min(passed_ns, 0) END AS step_ns
+        FROM pairs WHERE passed_ns IS NOT NULL)
+    SELECT utc_ns AS at_utc_ns, step_ns FROM steps WHERE abs(step_ns) >= {CLOCK_STEP_NS}"""
+# Poses, and those between two shots of a control point. Where the boom moves, each observation is a pose of its own.
+_ENCLOSED = """SELECT count(DISTINCT coalesce(o.pose, o.id)) AS poses,
+        count(DISTINCT CASE WHEN EXISTS (SELECT 1 FROM control_shots AS a JOIN control_shots AS b
+                ON b.session_id = a.session_id AND b.name = a.name AND b.phase = 'end'
+            WHERE a.session_id = o.session_id AND a.phase = 'start'
+                AND (a.boot_id, a.monotonic_ns) < (o.boot_id, o.monotonic_ns)
+                AND (o.boot_id, o.monotonic_ns) < (b.boot_id, b.monotonic_ns))
+            THEN coalesce(o.pose, o.id) END) AS enclosed
+    FROM observations AS o WHERE o.session_id = ? AND o.excluded IS NULL"""
+_BETWEEN = """SELECT 1 FROM observations AS o JOIN control_shots AS c ON c.session_id = o.session_id AND c.name = ?
+    WHERE o.session_id = ? AND o.excluded IS NULL
+        AND (o.boot_id, o.monotonic_ns) > (c.boot_id, c.monotonic_ns) LIMIT 1"""
+# A boot's number rises from boot to boot, and monotonic_ns within one; utc_ns may step.
+_JUMPS = """SELECT id, device, utc_ns, monotonic_ns, boot_id FROM device_events
+    WHERE kind = 'preset_jump' AND (boot_id, monotonic_ns) >= (?, ?) AND id > ? ORDER BY boot_id, monotonic_ns, id"""
+_EXCLUDE = "UPDATE observations SET excluded = ? WHERE session_id = ? AND boot_id = ? AND monotonic_ns = ?"
+_OBSERVATIONS = """SELECT session_id, setup_id, prism, pose, utc_ns, monotonic_ns, boot_id, x_mm, y_mm, z_mm,
+        sigma_x_mm, sigma_y_mm, sigma_z_mm, dwell_s, values_json
+    FROM observations WHERE excluded IS NULL AND session_id IN ({}) ORDER BY id"""
+# All that a station gave in a session from the last fix that calibration may use, or from the session's start.
+_FIXES = """SELECT fixes.* FROM fixes,
+        (SELECT started_boot_id, started_monotonic_ns FROM calibration_sessions WHERE id = ?1)
+    WHERE station = ?2 AND (boot_id, monotonic_ns) >= (started_boot_id, started_monotonic_ns)
+        AND fixes.id >= coalesce((SELECT max(fix_id) FROM observations JOIN fixes AS used ON used.id = fix_id
+            WHERE session_id = ?1 AND excluded IS NULL AND used.station = ?2), 0)
+    ORDER BY fixes.id"""
+# Those after the newest session that is used: later measurements make up for the earlier ones.
+_UNTRAINED = """SELECT id, excluded FROM calibration_sessions
+    WHERE rig = ?1 AND state = 'closed' AND excluded IS NOT NULL AND rowid >
+        (SELECT coalesce(max(rowid), 0) FROM calibration_sessions
+            WHERE rig = ?1 AND state = 'closed' AND excluded IS NULL)
+    ORDER BY rowid"""
+_OPEN = """SELECT id, started_utc_ns, started_monotonic_ns, started_boot_id FROM calibration_sessions
+    WHERE rig = ? AND state = 'open' ORDER BY rowid DESC LIMIT 1"""
+
+
+@dataclass(frozen=True)
+class OpenSessionRow:
+    """The open session.
+
+    Attributes:
+        id: of the session.
+        started: when it was opened.
+        jumped: devices whose encoders have jumped since, by name.
+    """
+
+    id: str
+    started: Stamp
+    jumped: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A joint's encoder that has jumped by more than the joint can move.
+
+    Attributes:
+        number: of the device event.
+        device: name of the joint.
+        at: when.
+    """
+
+    number: int
+    device: str
+    at: Stamp
+
+
+class SessionTable:
+    """The sessions of a store, and the one of a rig that may be open.
+
+    Args:
+        store: the database.
+        rig_name: whose sessions are opened and used.
+    """
+
+    def __init__(self, store: Connection, rig_name: str) -> None:
+        self._store, self._rig = store, rig_name
+
+    # ---- sessions ----------------------------------------------------------------------------------------------------
+
+    def ids(self) -> set[str]:
+        """All sessions of the store."""
+        return {row["id"] for row in self._store.rows("SELECT id FROM calibration_sessions")}
+
+    def free_id(self, prism: str) -> str:
+        """A name that no session has."""
+        taken = self.ids()
+        return next(name for n in itertools.count(len(taken) + 1) if (name := f"s{n:03d}-{prism}") not in taken)
+
+    def summary(self, session_id: str) -> dict[str, Any]:
+        """One session: its observations, those that were excluded and why, and whether calibration uses it.
+
+        Raises:
+            NotInStoreError: there is none.
+        """
+        with self._store.reader() as reader:
+            return _summary(reader, session_id)
+
+    def all(self) -> list[dict[str, Any]]:
+        """All summaries, oldest first. Read beside the writing connection, which must not wait."""
+        with self._store.reader() as reader:
+            ids = [row["id"] for row in reader.rows("SELECT id FROM calibration_sessions ORDER BY rowid")]
+            return [_summary(reader, session_id) for session_id in ids]
+
+    def unfinished(self) -> list[dict[str, Any]]:
+        """Rows of the sessions that may still get fixes: open ones, and those with captures that wait to be decoded."""
+        return self._store.rows(_UNFINISHED)
+
+    def open_session(self) -> OpenSessionRow | None:
+        """The rig's open session; None without one."""
+        rows = self._store.rows(_OPEN, (self._rig,))
+        if not rows:
+            return None
+        started = self._store.stamp(rows[0], "started_")
+        jumps = preset_jumps(self._store, started)
+        return OpenSessionRow(rows[0]["id"], started, tuple(sorted({jump.device for jump in jumps})))
+
+    def used(self) -> list[dict[str, Any]]:
+        """Id and kind of the rig's closed sessions that calibration may use, oldest first."""
+        return self._store.rows(
+            "SELECT id, kind FROM calibration_sessions WHERE rig = ? AND state = 'closed' AND excluded IS NULL "
+            "ORDER BY rowid",
+            (self._rig,),
+        )
+
+    def untrained(self) -> dict[str, str]:
+        """Closed sessions of the rig that calibration does not use, newer than all that it uses -> why."""
+        return {row["id"]: row["excluded"] for row in self._store.rows(_UNTRAINED, (self._rig,))}
+
+    def newest_number(self) -> int:
+        """Number of the rig's newest session; 0 before the first."""
+        sql = "SELECT coalesce(max(rowid), 0) FROM calibration_sessions WHERE rig = ?"
+        return self._store.number(sql, (self._rig,)) or 0
+
+    def newest_start(self, session_ids: Collection[str]) -> Stamp | None:
+        """When the newest of some sessions was started; None without any of them."""
+        rows = self._store.rows(
+            "SELECT id, started_utc_ns, started_monotonic_ns, started_boot_id FROM calibration_sessions WHERE rig = ? "
+            "ORDER BY rowid DESC",
+            (self._rig,),
+        )
+        return next((self._store.stamp(row, "started_") for row in rows if row["id"] in session_ids), None)
+
+    def state_and_exclusion(self, session_id: str) -> tuple[str, str | None]:
+        """State of a session, and why calibration does not use it, None where it may.
+
+        Raises:
+            NotInStoreError: there is no such session.
+        """
+        found = self._store.rows("SELECT state, excluded FROM calibration_sessions WHERE id = ?", (session_id,))
+        if not found:
+            raise _unknown(session_id)
+        return found[0]["state"], found[0]["excluded"]
+
+    def start(self, started: Stamp, **columns: object) -> None:
+        """Add an open session of the rig."""
+        row = {**columns, "rig": self._rig, "state": "open", **self._store.instant(started, "started_")}
+        self._store.insert("calibration_sessions", row)
+
+    def change(self, session_id: str, **columns: object) -> None:
+        """Change columns of a session."""
+        self._store.update("calibration_sessions", {"id": session_id}, columns)
+
+    def exclude_closed(self, session_id: str, excluded: str | None) -> None:
+        """Change why calibration must not use a session, if it is closed and no operator has accepted it."""
+        closed = {"id": session_id, "state": "closed", "accepted_despite": None}
+        self._store.update("calibration_sessions", closed, {"excluded": excluded})
+
+    # ---- control shots -----------------------------------------------------------------------------------------------
+
+    def phase(self, session_id: str, point: str) -> str:
+        """Return `end` for a control point that was shot before the observations so far, else `start`."""
+        return "end" if self._store.rows(_BETWEEN, (point, session_id)) else "start"
+
+    def points_shot(self, session_id: str, phase: str) -> set[str]:
+        """Control points that were shot in a phase of a session."""
+        return {shot["point"] for shot in self.shots(session_id) if shot["phase"] == phase}
+
+    def shots(self, session_id: str) -> list[dict[str, Any]]:
+        """Point, phase and misclosure_mm of a session's control shots, oldest first."""
+        return self._store.rows(_SHOTS, (session_id,))
+
+    def count_poses(self, session_id: str) -> tuple[int, int]:
+        """Number of poses of a session, and of those that lie between two shots of a control point."""
+        (found,) = self._store.rows(_ENCLOSED, (session_id,))
+        return found["poses"], found["enclosed"]
+
+    # ---- observations ------------------------------------------------------------------------------------------------
+
+    def add_observation(self, fix_id: int | None, measured: Stamp, **columns: object) -> None:
+        """Add an observation that a fix gives."""
+        self._store.insert("observations", {**columns, "fix_id": fix_id, **self._store.instant(measured)})
+
+    def exclude(self, session_id: str, exclusions: Mapping[int, str | None], newest: Stamp) -> None:
+        """Change why observations of a session must not be used.
+
+        Args:
+            session_id: the session.
+            exclusions: instant of a fix, monotonic ns -> why calibration must not use it, None when it may.
+            newest: instant of the newest fix; the others are of its boot.
+        """
+        with self._store.transaction() as db:
+            boot = self._store.boot_row(newest)
+            rows = [(excluded, session_id, boot, at_ns) for at_ns, excluded in exclusions.items()]
+            db.conn.executemany(_EXCLUDE, rows)
+
+    def add_confirmation(self, session_id: str, at: Stamp, **columns: object) -> None:
+        """Add a word that the session's stations are on its prism: `operator` and caller, or `turning`."""
+        row = {"session_id": session_id, **self._store.instant(at), **columns}
+        self._store.insert("prism_confirmations", row)
+
+
+# ---- for the writing connection and for readers ----------------------------------------------------------------------
+
+
+def session(source: RowSource, session_id: str) -> dict[str, Any] | None:
+    """Return a session's row; None where there is none."""
+    return next(iter(source.rows("SELECT * FROM calibration_sessions WHERE id = ?", (session_id,))), None)
+
+
+def observations(source: RowSource, session_ids: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the observations of sessions that calibration may use, oldest first."""
+    return list(source.rows(_OBSERVATIONS.format(_marks(session_ids)), session_ids))
+
+
+def all_sessions(source: RowSource) -> list[dict[str, Any]]:
+    """Return every session without its rig file, oldest first."""
+    return list(
+        source.rows(
+            "SELECT id, rig, setup_id, prism, kind, state, operator, note, started_utc_ns, ended_utc_ns "
+            "FROM calibration_sessions ORDER BY rowid"
+        )
+    )
+
+
+def all_observations(source: RowSource, session_ids: Sequence[str] = ()) -> list[dict[str, Any]]:
+    """Return the observations of sessions, or of all, oldest first, used or excluded; joints and signals as columns."""
+    where = f"WHERE session_id IN ({_marks(session_ids)})" if session_ids else ""
+    rows = source.rows(
+        "SELECT session_id, setup_id, prism, pose, utc_ns, x_mm, y_mm, z_mm, sigma_x_mm, sigma_y_mm, sigma_z_mm, "
+        f"dwell_s, excluded, values_json FROM observations {where} ORDER BY id",
+        session_ids,
+    )
+    return [{**row, **json.loads(row.pop("values_json"))} for row in rows]
+
+
+def first_observation_ns(source: RowSource) -> int:
+    """Return UTC, ns, of the first observation that calibration may use; 0 without one."""
+    rows = source.rows("SELECT utc_ns FROM observations WHERE excluded IS NULL ORDER BY id LIMIT 1")
+    return next((int(row["utc_ns"]) for row in rows), 0)
+
+
+def newest_observation_ns(source: RowSource, session_ids: Sequence[str]) -> int:
+    """Return UTC, ns, of the newest observation of sessions that calibration may use; 0 without one."""
+    sql = "SELECT coalesce(max(utc_ns), 0) AS utc_ns FROM observations WHERE excluded IS NULL AND session_id IN ({})"
+    return next(int(row["utc_ns"]) for row in source.rows(sql.format(_marks(session_ids)), session_ids))
+
+
+def prism_confirmations(source: RowSource, session_id: str) -> list[dict[str, Any]]:
+    """Return the rows of words that a session's stations are on its prism, oldest first."""
+    return list(source.rows("SELECT * FROM prism_confirmations WHERE session_id = ? ORDER BY id", (session_id,)))
+
+
+def fixes_since_used(source: RowSource, session_id: str, station: str) -> Iterator[dict[str, Any]]:
+    """Return a station's fixes in a session, from the last one that calibration may use, or from its start."""
+    return iter(source.rows(_FIXES, (session_id, station)))
+
+
+def preset_jumps(store: Connection, since: Stamp | None, after_number: int = 0) -> list[Jump]:
+    """Return the encoder jumps from an instant on, in their order.
+
+    Args:
+        store: the database.
+        since: the instant; from the first jump on when None.
+        after_number: only those with a greater number.
+    """
+    first = (0, 0) if since is None else store.order(since)
+    rows = store.rows(_JUMPS, (*first, after_number))
+    return [Jump(row["id"], row["device"], store.stamp(row)) for row in rows]
+
+
+def _marks(values: Sequence[object]) -> str:
+    return ",".join("?" * len(values))
+
+
+def _summary(source: RowSource, session_id: str) -> dict[str, Any]:
+    found = list(source.rows(_SUMMARY, (session_id,)))
+    if not found:
+        raise _unknown(session_id)
+    row = found[0]
+    accepted = {key: row.pop(f"accepted_{key}") for key in ("despite", "by", "user", "utc_ns")}
+    (counts,) = source.rows(_COUNTS, (session_id,))
+    steps = _clock_steps(source, session_id)
+    return {
+        **row,
+        **counts,
+        "setup_moved": bool(row["setup_moved"]),
+        "accepted": accepted if accepted["despite"] is not None else None,
+        "excluded": {e["reason"]: e["n"] for e in source.rows(_EXCLUDED, (session_id,))},
+        "control_shots": list(source.rows(_SHOTS, (session_id,))),
+        "clock_steps": steps,
+        "utc_ran_backwards": any(step["step_s"] < 0 for step in steps),
+    }
+
+
+def _clock_steps(source: RowSource, session_id: str) -> list[dict[str, Any]]:
+    """Return the instants at which the computer's clock was set during a session, and by how much."""
+    (found,) = source.rows(_MAY_HAVE_STEPPED, (session_id,))
+    if not found["maybe"]:
+        return []
+    steps = source.rows(_CLOCK_STEPS, (session_id,))
+    return [{"at_utc_ns": step["at_utc_ns"], "step_s": step["step_ns"] / NS_PER_S} for step in steps]
+
+
+def _unknown(session_id: str) -> NotInStoreError:
+    return NotInStoreError(f"there is no session {session_id!r:.80}; `rigcal session list` shows them")

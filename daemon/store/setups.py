@@ -1,0 +1,106 @@
+"""The tables of station set-ups: where a total station stands, its control points, and the shots of these."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from daemon.store.connection import Connection
+from daemon.store.rows import RowSource
+from drivers.clock import Stamp
+
+_OF_SESSIONS = """SELECT id, instrument, state FROM station_setups
+    WHERE id IN (SELECT setup_id FROM calibration_sessions WHERE id IN ({})) ORDER BY rowid"""
+_MISCLOSURES = """SELECT s.name, s.phase, s.x_mm - p.x_mm AS x, s.y_mm - p.y_mm AS y, s.z_mm - p.z_mm AS z
+    FROM control_shots AS s JOIN control_points AS p ON p.setup_id = s.setup_id AND p.name = s.name
+    WHERE s.setup_id = ? AND s.session_id IN ({}) ORDER BY s.id"""
+_POINTS = "SELECT name, x_mm, y_mm, z_mm FROM control_points WHERE setup_id = ? ORDER BY rowid"
+
+
+@dataclass(frozen=True)
+class SetupRow:
+    """A station set-up.
+
+    Attributes:
+        id: of the set-up.
+        state: ok, moved or closed.
+    """
+
+    id: str
+    state: str
+
+
+class SetupTable:
+    """The station set-ups of a store.
+
+    Args:
+        store: the database.
+    """
+
+    def __init__(self, store: Connection) -> None:
+        self._store = store
+
+    def all(self) -> list[dict[str, Any]]:
+        """All set-ups with their control points, oldest first."""
+        setups = self._store.rows(
+            "SELECT id, instrument, serial, tilt_arcsec, ppm, state, note FROM station_setups ORDER BY rowid"
+        )
+        return [setup | {"control_points": control_points(self._store, setup["id"])} for setup in setups]
+
+    def states(self) -> dict[str, str]:
+        """The state of each set-up, oldest first."""
+        rows = self._store.rows("SELECT id, state FROM station_setups ORDER BY rowid")
+        return {row["id"]: row["state"] for row in rows}
+
+    def newest(self) -> SetupRow | None:
+        """The newest set-up; None before the first."""
+        found = self._store.rows("SELECT id, state FROM station_setups ORDER BY rowid DESC LIMIT 1")
+        return SetupRow(**found[0]) if found else None
+
+    def point_shots(self, setup_id: str, name: str) -> list[dict[str, Any]]:
+        """Session, phase and misclosure_mm of a control point's shots."""
+        sql = "SELECT session_id, phase, misclosure_mm FROM control_shots WHERE setup_id = ? AND name = ?"
+        return self._store.rows(sql, (setup_id, name))
+
+    def add(self, created: Stamp, **columns: object) -> None:
+        """Add a set-up."""
+        self._store.insert("station_setups", {**columns, "state": "ok", **self._store.instant(created, "created_")})
+
+    def put_control_point(self, setup_id: str, name: str, place: Mapping[str, float]) -> None:
+        """Add a control point, or change where it is: `x_mm`, `y_mm` and `z_mm`."""
+        key = {"setup_id": setup_id, "name": name}
+        if not self._store.update("control_points", key, place):
+            self._store.insert("control_points", {**key, **place})
+
+    def add_shot(self, setup_id: str, name: str, measured: Stamp, **columns: object) -> None:
+        """Add a shot of a control point."""
+        row = {"setup_id": setup_id, "name": name, **columns, **self._store.instant(measured)}
+        self._store.insert("control_shots", row)
+
+    def mark_moved(self, setup_id: str) -> None:
+        """Note that a set-up has moved: a control point is not where it was."""
+        self._store.update("station_setups", {"id": setup_id}, {"state": "moved"})
+
+
+# ---- for the writing connection and for readers ----------------------------------------------------------------------
+
+
+def control_points(source: RowSource, setup_id: str) -> list[dict[str, Any]]:
+    """Return name, x_mm, y_mm and z_mm of a set-up's control points, in the order they were defined."""
+    return list(source.rows(_POINTS, (setup_id,)))
+
+
+def setups_of(source: RowSource, session_ids: Sequence[str]) -> list[dict[str, Any]]:
+    """Return id, instrument and state of the set-ups of sessions, oldest first."""
+    return list(source.rows(_OF_SESSIONS.format(",".join("?" * len(session_ids))), session_ids))
+
+
+def misclosures(source: RowSource, setup_id: str, session_ids: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the shots of a set-up's control points in some sessions, oldest first.
+
+    Returns:
+        name, phase, and x, y, z: how far off the point's known place it was, mm in the station's frame.
+    """
+    marks = ",".join("?" * len(session_ids))
+    return list(source.rows(_MISCLOSURES.format(marks), (setup_id, *session_ids)))

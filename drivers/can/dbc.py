@@ -1,0 +1,281 @@
+"""DBC files, read by cantools to `SignalChannel`s. See `raw_signal` for the decoding."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cantools.database
+from cantools.database.can import Database, Message, Signal
+from cantools.database.errors import Error as CantoolsError
+
+from drivers.can.frame import DATA_MAX
+from drivers.can.raw_signal import BitField, Multiplexing, SignalChannel
+from drivers.errors import DescriptionError
+from drivers.files import read_whole
+
+_FILE_MAX_BYTES = 2 << 20  # cantools takes more than a second for a megabyte
+
+_COUNTER_NAME = re.compile(r"counter|alive", re.IGNORECASE)
+_NO_VALUE_TEXT = re.compile(r"^(sna|(signal )?not available|invalid)$", re.IGNORECASE)
+
+_MESSAGE_MAX_BYTES = 1785  # of J1939's transport protocol
+# cantools takes a second or two for each of these
+_WORDS_MAX = 600_000
+_MESSAGES_MAX = 20_000
+_NODES_MAX = 10_000
+_BIT_CHECKS_MAX = 500_000_000
+_BRANCH_CHECKS_MAX = 5_000_000
+
+_STRING = re.compile(r'"(?:[^"\\]|\\.)*"', re.DOTALL)
+_WORD = re.compile(r"\w+|[^\s\w]")
+_NODES = re.compile(r"\bBU_\s*:((?:\s+(?!BU_\s*:)\w+)*)")
+_BEYOND = re.compile(r"(?<![\w.])[\d.]+[eE][+-]?\d{4,}")
+_MESSAGE = r"\bBO_\s+(?P<id>\d+)\s+(?P<message>\w+)\s*:\s*(?P<bytes>\w+)"
+_SIGNAL = r"\bSG_\s+(?P<signal>\w+)(?:\s+(?P<mux>\w+))?\s*:\s*(?P<start>\d+)\s*\|\s*(?P<bits>\d+)"
+_RANGES = re.compile(r"\bSG_MUL_VAL_\s+(?P<of>\d+)\s+(?P<multiplexed>\w+)\s+\w+(?P<ranges>[\s\d,-]*)")
+_VALUES = re.compile(r"\bVAL_\s+(?P<of>\d+)\s+\w+(?P<named>[^;]*)")
+_SIZES = re.compile(f"{_MESSAGE}|{_SIGNAL}")
+_RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
+_NESTED = re.compile(r"m\d+M")
+
+
+class DbcFile:
+    """A DBC file.
+
+    Args:
+        path: the file, in Windows' western character set, as DBC files are.
+
+    Raises:
+        DescriptionError: it cannot be read or is malformed; the message gives line and column, or the signal.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._where = str(path)
+        try:
+            text = read_whole(path, _FILE_MAX_BYTES).decode("cp1252", errors="replace")
+            _check_sizes(text, self._where)
+            database = cantools.database.load_string(text, database_format="dbc")
+        except OSError as error:
+            raise DescriptionError(self._where, f"cannot be read: {error.strerror}") from error
+        # Beside its own errors, what cantools lets through from parsing numbers and names
+        except (CantoolsError, ArithmeticError, LookupError, RecursionError, TypeError, ValueError) as error:
+            raise DescriptionError(self._where, f"not a valid DBC file: {' '.join(str(error).split())}") from error
+        assert isinstance(database, Database)  # database_format="dbc" gives no other
+        self._database = database
+
+    def channel(
+        self,
+        name: str,
+        unit: str,
+        message: str,
+        signal: str,
+        *,
+        scale: float = 1.0,
+        offset: float = 0.0,
+        timeout_s: float = 1.0,
+    ) -> SignalChannel:
+        """Return the channel of a signal.
+
+        "No value" is what the file itself names so (SNA, not available, invalid), FEh and FFh in the most significant
+        byte for 29-bit identifiers (J1939-71), and all ones in unsigned signals of 8 bits and more for 11-bit ones.
+        The message counter is the signal with "counter" or "alive" in its name, if there is exactly one.
+
+        Args:
+            name: of the channel.
+            unit: of its values.
+            message: name in the file.
+            signal: name in the file.
+            scale: from the file's physical value to `unit`.
+            offset: added after `scale`, in `unit`.
+            timeout_s: silent for longer than this is a gap.
+
+        Raises:
+            DescriptionError: no such message or signal, or one that no classic CAN frame can carry.
+        """
+        try:
+            declared = self._declared(message, signal)
+        except (ArithmeticError, LookupError, ValueError) as error:
+            raise DescriptionError(self._where, f"signal {signal!r} cannot be read: {error}") from error
+        return dataclasses.replace(declared, name=name, unit=unit, scale=scale, offset=offset, timeout_s=timeout_s)
+
+    def _declared(self, message: str, signal: str) -> SignalChannel:
+        """Return the channel as the file declares it; numbers may be too large to compute with."""
+        found = self._message(message)
+        signals: dict[str, Signal] = {item.name: item for item in found.signals}
+        if signal not in signals:
+            known = ", ".join(sorted(signals)) or "none"
+            raise DescriptionError(self._where, f"message {message!r} has no signal {signal!r}; signals: {known}")
+        wanted = signals[signal]
+        is_extended = bool(found.is_extended_frame)
+        if not (math.isfinite(wanted.scale) and wanted.scale != 0 and math.isfinite(wanted.offset)):
+            raise DescriptionError(
+                self._where, f"signal {signal!r}: factor {wanted.scale} and offset {wanted.offset} make no value"
+            )
+        return SignalChannel(
+            name=signal,
+            unit="",
+            arbitration_id=found.frame_id,
+            is_extended=is_extended,
+            field=_field(wanted),
+            is_float=wanted.is_float,
+            factor=float(wanted.scale),
+            summand=float(wanted.offset),
+            minimum=None if wanted.minimum is None else float(wanted.minimum),
+            maximum=None if wanted.maximum is None else float(wanted.maximum),
+            not_available=frozenset(
+                int(number) for number, text in (wanted.choices or {}).items() if _NO_VALUE_TEXT.match(_plain(text))
+            ),
+            all_ones_is_not_available=not is_extended,
+            is_j1939=is_extended,
+            counter=_counter(signals, signal),
+            multiplexing=self._multiplexing(signals, wanted),
+        )
+
+    def _message(self, name: str) -> Message:
+        try:
+            message = self._database.get_message_by_name(name)
+        except KeyError:
+            known = ", ".join(sorted(item.name for item in self._database.messages)) or "none"
+            raise DescriptionError(self._where, f"has no message {name!r}; messages: {known}") from None
+        if message.is_fd or message.length > DATA_MAX:
+            raise DescriptionError(self._where, f"message {name!r} has {message.length} bytes, a CAN frame has 8")
+        return message
+
+    def _multiplexing(self, signals: dict[str, Signal], signal: Signal) -> Multiplexing | None:
+        if not signal.multiplexer_ids or signal.multiplexer_signal is None:
+            return None
+        selector = signals[signal.multiplexer_signal]
+        if selector.multiplexer_ids:
+            raise DescriptionError(
+                self._where, f"signal {signal.name!r}: a multiplexer behind a multiplexer is not supported"
+            )
+        return Multiplexing(_field(selector), frozenset(signal.multiplexer_ids))
+
+
+def _counter(signals: dict[str, Signal], signal: str) -> BitField | None:
+    counters = [
+        item
+        for item in signals.values()
+        if _COUNTER_NAME.search(item.name) and item.name != signal and not item.multiplexer_ids
+    ]
+    return _field(counters[0]) if len(counters) == 1 else None
+
+
+def _plain(text: object) -> str:
+    return re.sub(r"[_\s]+", " ", str(text)).strip()
+
+
+def _field(signal: Signal) -> BitField:
+    # cantools has made sure that it lies in its message
+    is_signed = signal.is_signed and not signal.is_float
+    if signal.byte_order == "little_endian":
+        return BitField(signal.start, signal.length, "intel", is_signed)
+    return BitField(signal.start, signal.length, "motorola", is_signed)
+
+
+@dataclass
+class _Size:
+    """Amount of work that checking one message is for cantools.
+
+    Attributes:
+        length_bytes: as the file says.
+        signals: how many it has.
+        values: how many values its multiplexers may have.
+        nested: multiplexers behind multiplexers.
+        repeats: how often these are looked at, for the values of those before them.
+    """
+
+    length_bytes: int = 0
+    signals: int = 0
+    values: int = 1
+    nested: set[str] = field(default_factory=set)
+    repeats: int = 1
+
+    @property
+    def bit_checks(self) -> int:
+        """Bits that are written down: the square of the length for each signal."""
+        return self.signals * self.length_bytes**2
+
+    @property
+    def branch_checks(self) -> int:
+        """Signals and bytes that are looked at, over all ways through the multiplexers."""
+        return self.values * self.repeats * (self.signals + self.length_bytes) if self.values > 1 else 0
+
+
+def _check_sizes(text: str, where: str) -> None:
+    """Refuse a file that cantools would need too much time or memory for.
+
+    Args:
+        text: the file's.
+        where: its name, for messages.
+
+    Raises:
+        DescriptionError: it would; the message names the message or signal where it is one.
+    """
+    text = _STRING.sub('""', text)
+    beyond = _BEYOND.search(text)
+    if beyond is not None:
+        raise DescriptionError(where, f"{beyond[0][:40]} is beyond what a number can be")
+    sizes: dict[str, _Size] = {}
+    size = _Size()
+    for found in _SIZES.finditer(text):
+        if found["message"]:
+            size = sizes.setdefault(found["id"], _Size())
+            size.length_bytes = max(size.length_bytes, _message_bytes(found, where))
+        elif found["signal"]:
+            _add_signal(size, found, where)
+    for found in _VALUES.finditer(text):
+        sizes.setdefault(found["of"], _Size()).values += found["named"].count('""')
+    for found in _RANGES.finditer(text):
+        _add_ranges(sizes.setdefault(found["of"], _Size()), found, where)
+    words = sum(1 for _ in _WORD.finditer(text))
+    nodes = sum(len(found[1].split()) for found in _NODES.finditer(text))
+    bit_checks = sum(each.bit_checks for each in sizes.values())
+    branch_checks = sum(each.branch_checks for each in sizes.values())
+    if (
+        words > _WORDS_MAX
+        or len(sizes) > _MESSAGES_MAX
+        or nodes > _NODES_MAX
+        or bit_checks > _BIT_CHECKS_MAX
+        or branch_checks > _BRANCH_CHECKS_MAX
+    ):
+        raise DescriptionError(
+            where,
+            "it describes too much to be read in time; keep the messages that the rig needs in a file of their own",
+        )
+
+
+def _message_bytes(found: re.Match[str], where: str) -> int:
+    length = found["bytes"]
+    if not (length.isdecimal() and len(length) < 6 and int(length) <= _MESSAGE_MAX_BYTES):
+        raise DescriptionError(
+            where,
+            f"message {found['message']!r} has {length[:20]} bytes; the longest has {_MESSAGE_MAX_BYTES}",
+        )
+    return int(length)
+
+
+def _add_signal(size: _Size, found: re.Match[str], where: str) -> None:
+    if max(len(found["start"]), len(found["bits"])) > 5:
+        raise DescriptionError(where, f"signal {found['signal']!r} does not fit in its message")
+    size.signals += 1
+    if found["mux"]:
+        size.values += 1
+        if _NESTED.fullmatch(found["mux"]):
+            size.nested.add(found["signal"])
+
+
+def _add_ranges(size: _Size, found: re.Match[str], where: str) -> None:
+    ranges = _RANGE.findall(found["ranges"])
+    count = sum(max(0, int(high[:20]) - int(low[:20]) + 1) for low, high in ranges)
+    size.values += count
+    if found["multiplexed"] in size.nested:
+        size.repeats *= max(1, count)
+    if size.branch_checks > _BRANCH_CHECKS_MAX:
+        raise DescriptionError(
+            where, f"signal {found['multiplexed']!r}: its multiplexers (SG_MUL_VAL_) have too many values"
+        )

@@ -1,0 +1,139 @@
+"""Decoder of SocketCAN error frames (linux/can/error.h): the controller's state and protocol errors, as events."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from drivers.clock import NS_PER_S, Stamp
+from drivers.readings import DeviceEvent, EventKind
+
+ERROR_REPEAT_NS = 10 * NS_PER_S
+"""Errors that do not change the controller's state are reported at most this often, with their count."""
+
+# Error class, in the identifier
+_TX_TIMEOUT = 0x001
+_LOST_ARBITRATION = 0x002
+_CONTROLLER = 0x004
+_PROTOCOL = 0x008
+_TRANSCEIVER = 0x010
+_NO_ACKNOWLEDGE = 0x020
+_BUS_OFF = 0x040
+_BUS_ERROR = 0x080
+_RESTARTED = 0x100
+
+# data[1], controller
+_RX_OVERFLOW = 0x01
+_TX_OVERFLOW = 0x02
+_WARNING = 0x0C  # receiving or transmitting
+_PASSIVE = 0x30
+_ACTIVE = 0x40
+
+_PROTOCOL_TYPES = {  # data[2]
+    0x01: "single bit error",
+    0x02: "frame format error",
+    0x04: "bit stuffing error",
+    0x08: "dominant bit could not be sent",
+    0x10: "recessive bit could not be sent",
+    0x20: "bus overload",
+    0x40: "active error announcement",
+    0x80: "error while transmitting",
+}
+
+_STATE_TEXTS = {
+    EventKind.BUS_ERROR_ACTIVE: "the controller is error-active again: the bus works",
+    EventKind.BUS_ERROR_WARNING: "the controller counted over 96 errors: check cabling, termination and bit rate",
+    EventKind.BUS_ERROR_PASSIVE: "the controller is error-passive: check cabling, termination and bit rate",
+    EventKind.BUS_OFF: "the controller is bus-off and takes no part any more: check cabling, termination and bit rate;"
+    " restart-ms of the interface restarts it by itself",
+}
+
+
+@dataclass
+class _Kind:
+    count: int = 0
+    unreported: int = 0
+    reported: Stamp | None = None
+
+
+@dataclass
+class BusErrors:
+    """Decoder of the error frames of one link.
+
+    The controller's state is reported when it changes; other errors the first time, and then every ERROR_REPEAT_NS at
+    most, with how many there were since.
+
+    Attributes:
+        link: name of the link.
+        state: the last known state of the controller.
+        count: error frames so far.
+    """
+
+    link: str
+    state: EventKind = EventKind.BUS_ERROR_ACTIVE
+    count: int = 0
+    _errors: _Kind = field(default_factory=_Kind)
+    _overflows: _Kind = field(default_factory=_Kind)
+
+    def feed(self, stamp: Stamp, error_class: int, data: bytes) -> list[DeviceEvent]:
+        """Return the events of one error frame."""
+        self.count += 1
+        data = data.ljust(8, b"\0")
+        events: list[DeviceEvent] = []
+        state = _state(error_class, data[1])
+        if state is not None and state is not self.state:
+            self.state = state
+            counters = f" (error counters: {data[6]} sending, {data[7]} receiving)" if data[6] or data[7] else ""
+            events.append(DeviceEvent(self.link, stamp, state, f"{self.link}: {_STATE_TEXTS[state]}{counters}"))
+        if error_class & _CONTROLLER and data[1] & (_RX_OVERFLOW | _TX_OVERFLOW):
+            what = "received" if data[1] & _RX_OVERFLOW else "transmitted"
+            text = f"the controller's buffer of {what} frames overflowed"
+            self._report(self._overflows, EventKind.FRAMES_DROPPED, stamp, text, events)
+        errors = _errors(error_class, data)
+        if errors:
+            self._report(self._errors, EventKind.BUS_ERROR, stamp, ", ".join(errors), events)
+        return events
+
+    def _report(self, kind: _Kind, event: EventKind, stamp: Stamp, text: str, events: list[DeviceEvent]) -> None:
+        kind.count += 1
+        kind.unreported += 1
+        if kind.reported is not None and stamp.since(kind.reported) < ERROR_REPEAT_NS:
+            return
+        times = "" if kind.unreported == 1 else f"; {kind.unreported} times since the last report"
+        events.append(DeviceEvent(self.link, stamp, event, f"{self.link}: {text}{times}", kind.count))
+        kind.unreported = 0
+        kind.reported = stamp
+
+
+def _state(error_class: int, controller: int) -> EventKind | None:
+    """Return the state that an error frame announces; None if it announces none."""
+    if error_class & _BUS_OFF:
+        return EventKind.BUS_OFF
+    if error_class & _CONTROLLER:
+        for bits, state in (
+            (_PASSIVE, EventKind.BUS_ERROR_PASSIVE),
+            (_WARNING, EventKind.BUS_ERROR_WARNING),
+            (_ACTIVE, EventKind.BUS_ERROR_ACTIVE),
+        ):
+            if controller & bits:
+                return state
+    if error_class & _RESTARTED:
+        return EventKind.BUS_ERROR_ACTIVE
+    return None
+
+
+def _errors(error_class: int, data: bytes) -> list[str]:
+    """Return errors on the wire in words."""
+    words = []
+    if error_class & _TX_TIMEOUT:
+        words.append("transmission timed out")
+    if error_class & _LOST_ARBITRATION:
+        words.append(f"arbitration lost in bit {data[0]}" if data[0] else "arbitration lost")
+    if error_class & _PROTOCOL:
+        words += [text for bit, text in _PROTOCOL_TYPES.items() if data[2] & bit] or ["protocol violation"]
+    if error_class & _TRANSCEIVER:
+        words.append(f"transceiver status {data[4]:02X}h: check the wiring of CAN-H and CAN-L")
+    if error_class & _NO_ACKNOWLEDGE:
+        words.append("no node acknowledged a frame: check that others are powered and at the same bit rate")
+    if error_class & _BUS_ERROR and not words:
+        words.append("bus error")
+    return words

@@ -1,0 +1,158 @@
+"""Classic CAN frames, and how SocketCAN, python-can's `udp_multicast` and slcan adapters encode them."""
+
+from __future__ import annotations
+
+import re
+import struct
+from typing import NamedTuple
+
+import msgpack
+
+STANDARD_ID_MAX = 0x7FF
+EXTENDED_ID_MAX = 0x1FFFFFFF
+DATA_MAX = 8
+
+
+class Frame(NamedTuple):
+    """One classic CAN frame without its instant.
+
+    Attributes:
+        arbitration_id: 11-bit, or 29-bit if `is_extended`; the error class bits of SocketCAN if `is_error`.
+        data: 0 to 8 bytes.
+        is_extended, is_remote, is_error: the frame's flags.
+    """
+
+    arbitration_id: int
+    data: bytes
+    is_extended: bool = False
+    is_remote: bool = False
+    is_error: bool = False
+
+    @property
+    def is_plain(self) -> bool:
+        """True of a data frame with an 11-bit identifier, such as all of CANopen's are."""
+        return not (self.is_extended or self.is_remote or self.is_error)
+
+    def __str__(self) -> str:
+        digits = 8 if self.is_extended else 3
+        return f"{self.arbitration_id:0{digits}X} [{len(self.data)}] {self.data.hex(' ').upper()}".rstrip()
+
+
+_CAN_FRAME = struct.Struct("=IB3x8s")  # struct can_frame, linux/can.h
+_EFF_FLAG, _RTR_FLAG, _ERR_FLAG = 0x80000000, 0x40000000, 0x20000000
+
+
+def parse_can_frame(datagram: bytes) -> Frame | None:
+    """Parse a `struct can_frame`; None if it is none (CAN FD)."""
+    if len(datagram) != _CAN_FRAME.size:
+        return None
+    identifier, length, data = _CAN_FRAME.unpack(datagram)
+    if length > DATA_MAX:
+        return None
+    is_extended = identifier & _EFF_FLAG != 0
+    is_remote = identifier & _RTR_FLAG != 0
+    if identifier & _ERR_FLAG:
+        return Frame(identifier & EXTENDED_ID_MAX, data[:length], is_error=True)
+    return Frame(
+        identifier & (EXTENDED_ID_MAX if is_extended else STANDARD_ID_MAX),
+        b"" if is_remote else data[:length],
+        is_extended,
+        is_remote,
+    )
+
+
+def parse_multicast(datagram: bytes) -> tuple[Frame, float] | None:
+    """Parse a message of `udp_multicast` (a msgpack map) and its timestamp; None if it is no classic CAN frame."""
+    try:
+        fields = msgpack.unpackb(datagram)
+        identifier, data, timestamp = fields["arbitration_id"], fields["data"], float(fields["timestamp"])
+        is_extended, is_remote = fields["is_extended_id"], fields["is_remote_frame"]
+        is_error, is_fd = fields["is_error_frame"], fields["is_fd"]
+    except (ValueError, TypeError, KeyError, msgpack.UnpackException):
+        return None
+    if not isinstance(identifier, int) or not isinstance(data, bytes) or is_fd or len(data) > DATA_MAX:
+        return None
+    if not 0 <= identifier <= (EXTENDED_ID_MAX if is_extended or is_error else STANDARD_ID_MAX):
+        return None
+    return Frame(identifier, data, bool(is_extended and not is_error), bool(is_remote), bool(is_error)), timestamp
+
+
+# Lines in which slcan adapters tell of errors (Linux, drivers/net/can/slcan), as SocketCAN's error frames say the same:
+# linux/can/error.h. The controller's state -> class bits and data[1]; one error -> class bits, index into data, bits.
+_SLCAN_STATES = {b"a": (0x004, 0x40), b"w": (0x004, 0x0C), b"p": (0x004, 0x30), b"b": (0x040, 0x00)}
+_SLCAN_ERRORS = {
+    b"a": (0x020, 0, 0x00),
+    b"b": (0x088, 2, 0x08),
+    b"B": (0x088, 2, 0x10),
+    b"c": (0x088, 3, 0x08),
+    b"f": (0x088, 2, 0x02),
+    b"s": (0x088, 2, 0x04),
+    b"o": (0x004, 1, 0x01),
+    b"O": (0x004, 1, 0x02),
+}
+
+
+class SlcanLines:
+    """Cuts an adapter's bytes into lines and lines into frames. Pure.
+
+    Attributes:
+        malformed: lines that were neither a frame nor an answer to a command.
+    """
+
+    _FRAME = re.compile(rb"(?:t([0-9A-F]{3})|T([0-9A-F]{8})|r([0-9A-F]{3})|R([0-9A-F]{8}))([0-8])([0-9A-F]*)", re.I)
+    _STATE = re.compile(rb"s([awpb])(\d{3})(\d{3})")
+    _ERRORS = re.compile(rb"e(\d)([abBcfsoO]+)")
+    _LINE_MAX = 64  # bytes: more without an end is noise
+
+    def __init__(self) -> None:
+        self._rest = b""
+        self.malformed = 0
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """Return the frames that these bytes complete."""
+        # BEL is the adapter's "error": it ends a line as CR does
+        *lines, self._rest = (self._rest + data).replace(b"\a", b"\r").split(b"\r")
+        if len(self._rest) > self._LINE_MAX:
+            self._rest = b""
+            self.malformed += 1
+        frames = []
+        for line in lines:
+            frame = self._frame(line)
+            if frame is not None:
+                frames.append(frame)
+            elif line and line[:1] not in b"zZVNF":  # sent, version, serial number, status flags
+                self.malformed += 1
+        return frames
+
+    def _frame(self, line: bytes) -> Frame | None:
+        match = self._FRAME.match(line)
+        if match is None:
+            return self._error_frame(line)
+        standard, extended, remote_standard, remote_extended, length, digits = match.groups()
+        identifier = int(standard or extended or remote_standard or remote_extended, 16)
+        is_extended = bool(extended or remote_extended)
+        if identifier > (EXTENDED_ID_MAX if is_extended else STANDARD_ID_MAX):
+            return None
+        if remote_standard or remote_extended:
+            return Frame(identifier, b"", is_extended, is_remote=True)
+        end = 2 * int(length)
+        if len(digits) not in (end, end + 4):  # with the adapter's time stamp switched on, four digits more
+            return None
+        return Frame(identifier, bytes.fromhex(digits[:end].decode("ascii")), is_extended)
+
+    def _error_frame(self, line: bytes) -> Frame | None:
+        """Return the error frame that an adapter's line about errors stands for; None if it is no such line."""
+        data = bytearray(8)
+        if state := self._STATE.fullmatch(line):
+            identifier, data[1] = _SLCAN_STATES[state[1]]
+            data[7], data[6] = (min(int(count), 255) for count in state.groups()[1:])
+            return Frame(identifier, bytes(data), is_error=True)
+        errors = self._ERRORS.fullmatch(line)
+        if errors is None or int(errors[1]) != len(errors[2]):
+            return None
+        identifier = 0
+        for letter in errors[2]:
+            bits, at, value = _SLCAN_ERRORS[bytes([letter])]
+            identifier |= bits
+            data[at] |= value
+        return Frame(identifier, bytes(data), is_error=True)

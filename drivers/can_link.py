@@ -1,0 +1,343 @@
+"""The CAN link: one loop that owns one bus, stamps every frame as it arrives and hands it on undecoded."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from drivers.can.frame import Frame
+from drivers.can.ports import OVERFLOW, Batch, CanLinkConfig, CanPort, open_port
+from drivers.can.stamps import ReceiveStamps
+from drivers.canopen.node_setup import NodeSetup, SetupRunner
+from drivers.canopen.sync import SyncProducer
+from drivers.canopen.transmit import TransmitPermission
+from drivers.clock import NS_PER_S, Clock, Stamp
+from drivers.device_watch import DeviceWatch, no_watch, watch_interface, watch_path
+from drivers.errors import DeviceError, LinkError
+from drivers.outage import Backoff, Outage
+from drivers.readings import CanCapture, Capture, DeviceEvent, EventKind, Gap, GapReason
+from drivers.stall_detector import CLOCK_WAS_SET, NOT_READ_IN_TIME, LateReport, StallDetector
+
+POLL_S = 0.05  # how long a stop or a set-up request may go unnoticed
+LOSS_CHECK_NS = NS_PER_S
+
+Emit = Callable[[Capture | DeviceEvent | Gap], None]
+
+
+class CanLink:
+    """Owns one CAN bus: receives, survives its loss, and sends only what the configuration allows (default: nothing).
+
+    Args:
+        config: see CanLinkConfig.
+        clock: stamps the frames and paces SYNC and repetitions.
+        setups: of the nodes that `request_setup` can set up.
+        configure_at_start: set all of them up when the bus is opened for the first time, and only then. For simulated
+            machines, which are always parked; on a real one an operator has to say so each time.
+
+    Raises:
+        TransmitForbiddenError: SYNC, own identifiers or a set-up at the start are asked for where not allowed.
+    """
+
+    def __init__(
+        self,
+        config: CanLinkConfig,
+        clock: Clock,
+        setups: Iterable[NodeSetup] = (),
+        *,
+        configure_at_start: bool = False,
+    ) -> None:
+        self.name = config.name
+        self._config = config
+        self._clock = clock
+        self._permission = TransmitPermission(
+            config.name, config.allow_transmit, config.transmit_nodes, config.own_identifiers
+        )
+        self._published: deque[Sequence[Frame]] = deque(maxlen=1)
+        if config.sync_period_ms is not None:
+            self._permission.check_link()
+            if config.sync_period_ms <= 0:
+                raise ValueError(f"{config.name}: sync_period_ms must be positive, got {config.sync_period_ms}")
+        self._setups = {setup.node: setup for setup in setups}
+        self._requests_lock = threading.Lock()
+        self._requests: list[NodeSetup] | None = None  # set-ups that were asked for; None while the bus is closed
+        self._last_frame = clock.now()
+        self._at_start: list[NodeSetup] = []
+        if configure_at_start and self._setups:
+            self._at_start = self._permitted(self._setups)
+
+    @property
+    def has_setups(self) -> bool:
+        """True if any CANopen node of this link can be set up."""
+        return bool(self._setups)
+
+    def check_setup(self, nodes: Iterable[int] | None = None) -> None:
+        """Raise what `request_setup` would raise now, and do nothing else."""
+        self._wanted(nodes)
+
+    def request_setup(self, nodes: Iterable[int] | None = None) -> None:
+        """Ask the running loop to identify, check, configure and start nodes; may be called from any thread.
+
+        The outcome is told by DeviceEvents: CONFIGURED, WARNING, ALARM. The caller has made sure that the machine is
+        parked now. A request therefore never waits for the bus to be opened, and what is not done when the bus is lost
+        is given up, with an ALARM for each node.
+
+        Args:
+            nodes: node numbers; None: all that the link knows.
+
+        Raises:
+            TransmitForbiddenError: the link is listen-only, or a node is not listed. Nothing is sent to any node then.
+            DeviceError: no set-up is known for a node, or the bus is not open. Nothing is queued then.
+        """
+        wanted = self._wanted(nodes)
+        with self._requests_lock:
+            if self._requests is None:
+                raise self._not_open()
+            self._requests += wanted
+
+    def publish(self, frames: Sequence[Frame]) -> None:
+        """Send rigcal's own frames soon; may be called from any thread.
+
+        Frames that are still waiting are replaced: what is late is never sent in a burst.
+
+        Raises:
+            TransmitForbiddenError: the link is listen-only, or an identifier is none of its own. Nothing is sent then.
+        """
+        for frame in frames:
+            self._permission.check(frame)
+        self._published.append(tuple(frames))
+
+    def _wanted(self, nodes: Iterable[int] | None) -> list[NodeSetup]:
+        wanted = self._permitted(self._setups if nodes is None else nodes)
+        if self._requests is None:
+            raise self._not_open()
+        return wanted
+
+    def _permitted(self, nodes: Iterable[int]) -> list[NodeSetup]:
+        self._permission.check_link()
+        wanted = []
+        for node in nodes:
+            if node not in self._setups:
+                raise DeviceError(self.name, f"no channel of the rig file is on node {node}")
+            self._permission.check_node(node)
+            wanted.append(self._setups[node])
+        return wanted
+
+    def _not_open(self) -> DeviceError:
+        return DeviceError(self.name, "nothing can be set up: the link is not open; ask again when it is up")
+
+    def run(self, emit: Emit, stop: threading.Event) -> None:
+        """Receive until `stop` is set, opening the bus again whenever it is lost."""
+        backoff = Backoff()
+        outage = Outage(self.name, emit)
+        self._last_frame = self._clock.now()
+        with contextlib.closing(_watch(self._config)) as watch:
+            while not stop.is_set():
+                try:
+                    self._serve(emit, stop, outage, backoff, watch)
+                except LinkError as error:
+                    outage.begin(str(error), self._clock.now(), self._last_frame)
+                    wait_s = backoff.next_s()
+                    # Of real seconds, for devices are plugged in by people; fewer where time is made to run faster
+                    watch.wait(stop, min(wait_s, self._clock.real_seconds(wait_s)))
+
+    def _serve(self, emit: Emit, stop: threading.Event, outage: Outage, backoff: Backoff, watch: DeviceWatch) -> None:
+        """Receive from the opening of the bus to `stop` or a LinkError."""
+        opened = self._clock.host.now()
+        with contextlib.closing(open_port(self._config)) as port:
+            session = _Session(self._config, self._clock, self._permission, port, emit, opened)
+            # An interface that is down opens all the same, and fails at the first read
+            read = session.read(0.0)
+            watch.close()
+            at_start, self._at_start = self._at_start, []
+            self._swap_requests(at_start)
+            try:
+                outage.end(self._clock.now(), f"{self.name}: the bus is open")
+                while True:
+                    session.take(read)
+                    if read.batch.received:
+                        backoff.reset()
+                    session.serve(self._swap_requests([]), self._take_published())
+                    if stop.is_set():
+                        return
+                    read = session.read(session.patience_s())
+            finally:
+                cause = "rigcal was stopped" if stop.is_set() else "the link was lost"
+                session.close(self._swap_requests(None), cause)
+                self._last_frame = session.last_frame
+
+    def _swap_requests(self, requests: list[NodeSetup] | None) -> list[NodeSetup]:
+        """Return the set-ups that were asked for, and put `requests` in their place."""
+        with self._requests_lock:
+            waiting, self._requests = self._requests, requests
+        return waiting or []
+
+    def _take_published(self) -> Sequence[Frame]:
+        try:
+            return self._published.popleft()
+        except IndexError:
+            return ()
+
+
+def _watch(config: CanLinkConfig) -> DeviceWatch:
+    """Return the watch that tells that the link's device is back."""
+    if config.interface == "socketcan":
+        return watch_interface(config.channel)
+    if config.interface == "slcan":
+        return watch_path(config.channel.partition("@")[0])  # python-can's slcan takes PORT@BAUD
+    return no_watch()
+
+
+@dataclass(frozen=True, slots=True)
+class _Read:
+    """Frames of one read, and the host's time just before and just after it."""
+
+    batch: Batch
+    began: Stamp
+    ended: Stamp
+
+
+class _Session:
+    """One life of the bus, from its opening to its loss or a stop."""
+
+    def __init__(
+        self,
+        config: CanLinkConfig,
+        clock: Clock,
+        permission: TransmitPermission,
+        port: CanPort,
+        emit: Emit,
+        opened: Stamp,
+    ) -> None:
+        self._name = config.name
+        self._clock = clock
+        self._permission = permission
+        self._port = port
+        self._emit = emit
+        self._setup = SetupRunner()
+        self._losses: dict[str, int] = {}
+        self._stamps = ReceiveStamps(clock, opened)
+        self._stalls = StallDetector(clock)
+        self._sent: deque[CanCapture] = deque()  # what was received before it may still have to be read
+        now = clock.now()
+        self._late = LateReport(config.name, "frames", now)
+        self._check_losses_ns = now.monotonic_ns + LOSS_CHECK_NS
+        self._checked = self._heard_then = now  # when losses were last looked for, and the last frame before that
+        self._sync: SyncProducer | None = None
+        if config.sync_period_ms is not None:
+            period_ns = round(config.sync_period_ms * 1e6)
+            self._sync = SyncProducer(period_ns, now.monotonic_ns)
+
+    @property
+    def last_frame(self) -> Stamp:
+        """Stamp of the last frame; of the opening of the bus if there was none."""
+        return self._stamps.latest
+
+    def read(self, timeout_s: float) -> _Read:
+        """Wait for frames, at most `timeout_s` real seconds."""
+        host = self._clock.host
+        began = host.now()
+        batch = self._port.receive(timeout_s)
+        return _Read(batch, began, host.now())
+
+    def take(self, read: _Read) -> None:
+        """Stamp and emit the frames of a read; those that may have waited, not stamped before, are marked."""
+        now = self._clock.of_host(read.ended)
+        is_late = self._stalls.is_late(now, POLL_S)
+        stamps = self._stamps.of(read.batch, read.began, read.ended, is_late=is_late)
+        name, emit, sent, doubtful = self._name, self._emit, self._sent, 0
+        for (frame, _), stamp in zip(read.batch.received, stamps, strict=True):
+            while sent and sent[0].stamp.monotonic_ns <= stamp.monotonic_ns:
+                emit(sent.popleft())
+            doubtful += stamp.is_doubtful
+            arbitration_id, data, is_extended, is_remote, is_error = frame
+            emit(CanCapture(name, stamp, arbitration_id, data, is_extended, is_remote, is_error))
+        if sent and read.batch.is_last:
+            self._emit_sent(self._clock.of_host(read.began))
+        if doubtful:
+            self._late.add(doubtful, NOT_READ_IN_TIME if is_late else CLOCK_WAS_SET)
+        elif not is_late:
+            for item in self._late.in_time(now):
+                emit(item)
+        if self._setup.is_active:
+            for (frame, _), stamp in zip(read.batch.received, stamps, strict=True):
+                self._setup.feed(frame, stamp)
+
+    def _emit_sent(self, until: Stamp) -> None:
+        """Emit the frames sent until then; those still to be read were received later."""
+        while self._sent and self._sent[0].stamp.monotonic_ns <= until.monotonic_ns:
+            self._emit(self._sent.popleft())
+
+    def serve(self, requests: Iterable[NodeSetup], published: Iterable[Frame]) -> None:
+        """Send all frames that are due; report lost ones.
+
+        Args:
+            requests: set-ups that were asked for since the last call.
+            published: own frames to send.
+        """
+        monotonic_ns = self._clock.monotonic_ns()
+        if self._sync is not None:
+            sync = self._sync.due(monotonic_ns)
+            if sync is not None:
+                self._send(sync)
+        for frame in published:
+            self._send(frame)
+        for request in requests:
+            self._setup.add(request)
+        if self._setup.is_active:
+            self._setup.advance(self._clock.now())
+        # The last node's start and its event are left when it is done
+        for frame in self._setup.take_frames():
+            self._send(frame)
+        self._emit_setup_events()
+        if monotonic_ns >= self._check_losses_ns:
+            self._check_losses_ns = monotonic_ns + LOSS_CHECK_NS
+            self._report_losses()
+
+    def patience_s(self) -> float:
+        """Return how long the next read may wait, in real seconds."""
+        patience_s = POLL_S
+        for deadline_ns in (self._sync.next_ns if self._sync else None, self._setup.deadline_ns):
+            if deadline_ns is not None:
+                left_s = max(deadline_ns - self._clock.monotonic_ns(), 0) / NS_PER_S
+                patience_s = min(patience_s, self._clock.real_seconds(left_s))
+        return patience_s
+
+    def close(self, requests: Iterable[NodeSetup], cause: str) -> None:
+        """Report all that is left when the bus is given up because of `cause`."""
+        self._emit_sent(self._clock.now())
+        self._report_losses()
+        for item in self._late.end(self._clock.now()):
+            self._emit(item)
+        for request in requests:
+            self._setup.add(request)
+        self._setup.abort(self._clock.now(), cause)
+        self._emit_setup_events()
+
+    def _send(self, frame: Frame) -> None:
+        self._permission.check(frame)
+        stamp = self._clock.now()
+        self._port.send(frame)
+        self._sent.append(CanCapture(self._name, stamp, frame.arbitration_id, frame.data, is_transmitted=True))
+
+    def _emit_setup_events(self) -> None:
+        for event in self._setup.take_events():
+            self._emit(event)
+
+    def _report_losses(self) -> None:
+        now, losses = self._clock.now(), self._port.losses()
+        start, missed = self._checked, 0
+        for reason, total in losses.items():
+            lost = total - self._losses.get(reason, 0)
+            if lost > 0:
+                missed += lost
+                text = f"{self._name}: {lost} frames lost, {reason}"
+                self._emit(DeviceEvent(self._name, now, EventKind.FRAMES_DROPPED, text, lost))
+                if reason == OVERFLOW:
+                    # Told only with the next frame that finds room, so it may lie as far back as the frame before
+                    start = self._heard_then
+        if missed:
+            self._emit(Gap(self._name, GapReason.FRAMES_LOST, start, now, missed))
+        self._losses, self._checked, self._heard_then = losses, now, self._stamps.latest

@@ -1,0 +1,229 @@
+"""PDO mapping (CiA 301) from mapping words or an EDS, and the base of the decoders of a node's channels."""
+
+from __future__ import annotations
+
+import configparser
+import io
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from canopen.objectdictionary import ObjectDictionary, ObjectDictionaryError
+from canopen.objectdictionary.eds import import_eds
+
+from drivers.can.channel import too_short
+from drivers.can.frame import DATA_MAX, EXTENDED_ID_MAX
+from drivers.canopen.cia301 import tpdo_id
+from drivers.clock import Stamp
+from drivers.errors import DescriptionError
+from drivers.files import read_whole
+from drivers.readings import Record
+
+_FILE_MAX_BYTES = 2 << 20
+
+TPDO_COMMUNICATION = 0x1800
+TPDO_MAPPING = 0x1A00
+COB_ID_DISABLED = 1 << 31
+COB_ID_EXTENDED = 1 << 29
+
+
+@dataclass(frozen=True, slots=True)
+class PdoField:
+    """The place of one object in a PDO. Bits count from the least significant of byte 0 (little endian).
+
+    Attributes:
+        index, subindex: the object.
+        first_bit, length_bits: its place.
+    """
+
+    index: int
+    subindex: int
+    first_bit: int
+    length_bits: int
+
+    @property
+    def end_bit(self) -> int:
+        """The first bit behind it: a PDO with fewer bits does not carry it."""
+        return self.first_bit + self.length_bits
+
+    @property
+    def word(self) -> int:
+        """The mapping entry, as object 1A0xh holds it: index, sub-index, length."""
+        return self.index << 16 | self.subindex << 8 | self.length_bits
+
+    def extract(self, bits: int) -> int:
+        """Return the field as an unsigned integer, from the whole PDO read as a little-endian one."""
+        return bits >> self.first_bit & ((1 << self.length_bits) - 1)
+
+    def extract_signed(self, bits: int) -> int:
+        """Return the field as two's complement."""
+        half = 1 << self.length_bits - 1
+        return (self.extract(bits) ^ half) - half
+
+
+@dataclass(frozen=True, slots=True)
+class PdoMapping:
+    """Fields of a PDO, in order."""
+
+    fields: tuple[PdoField, ...]
+
+    @classmethod
+    def from_words(cls, words: Iterable[int], where: str) -> PdoMapping:
+        """Read the 32-bit entries of object 1A0xh, sub-indices 1 and up (`60040020h`: object 6004h.0, 32 bits).
+
+        Raises:
+            DescriptionError: no entry, an entry without bits, or more than 64 bits together.
+        """
+        fields = []
+        first_bit = 0
+        for word in words:
+            field = PdoField(word >> 16 & 0xFFFF, word >> 8 & 0xFF, first_bit, word & 0xFF)
+            if not 0 <= word <= 0xFFFFFFFF or field.length_bits == 0:
+                raise DescriptionError(where, f"PDO mapping entry {word:08X}h is not index, sub-index and length")
+            first_bit = field.end_bit
+            fields.append(field)
+        if not fields:
+            raise DescriptionError(where, "the PDO mapping has no entries")
+        if first_bit > 8 * DATA_MAX:
+            raise DescriptionError(where, f"the PDO mapping has {first_bit} bits, a frame has {8 * DATA_MAX}")
+        return cls(tuple(fields))
+
+    def find(self, index: int) -> PdoField | None:
+        """Return the first field that carries an object, of any sub-index; None if the PDO carries none."""
+        return next((field for field in self.fields if field.index == index), None)
+
+    @property
+    def words(self) -> tuple[int, ...]:
+        """The mapping as object 1A0xh holds it."""
+        return tuple(field.word for field in self.fields)
+
+
+@dataclass(frozen=True, slots=True)
+class TransmitPdo:
+    """A TPDO as it appears on the bus.
+
+    Attributes:
+        arbitration_id, is_extended: its COB-ID.
+        mapping: what it carries.
+    """
+
+    arbitration_id: int
+    is_extended: bool
+    mapping: PdoMapping
+
+    @classmethod
+    def usual(cls, node: int, number: int, words: Iterable[int]) -> TransmitPdo:
+        """Make TPDO `number` (1 to 4) of the pre-defined connection set with a mapping given as words.
+
+        Raises:
+            DescriptionError: see `PdoMapping.from_words`.
+        """
+        where = f"node {node}, TPDO{number}"
+        return cls(tpdo_id(node, number), False, PdoMapping.from_words(words, where))
+
+    @classmethod
+    def from_eds(cls, path: Path, node: int, number: int) -> TransmitPdo:
+        """Read TPDO `number`, counted from 1, of a node from an EDS or DCF.
+
+        Raises:
+            DescriptionError: the file is missing or malformed, or has no such TPDO; the message names the object.
+        """
+        where = str(path)
+        dictionary = _import(path, node)
+        cob_id = _value(dictionary, where, TPDO_COMMUNICATION + number - 1, 1)
+        entries = _value(dictionary, where, TPDO_MAPPING + number - 1, 0)
+        if not 0 <= entries <= 8 * DATA_MAX:
+            raise DescriptionError(where, f"object {TPDO_MAPPING + number - 1:04X}h.0: {entries} mapping entries")
+        words = [_value(dictionary, where, TPDO_MAPPING + number - 1, entry) for entry in range(1, entries + 1)]
+        is_extended = bool(cob_id & COB_ID_EXTENDED)
+        arbitration_id = cob_id & (EXTENDED_ID_MAX if is_extended else 0x7FF)
+        return cls(arbitration_id, is_extended, PdoMapping.from_words(words, f"{where}: TPDO{number}"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PdoChannel:
+    """Settings that all channels in a node's TPDO share.
+
+    Attributes:
+        name: the joint or signal.
+        unit: unit of the value.
+        node: CANopen node number.
+        pdo: the TPDO that carries it.
+        pdo_number: which of the node's TPDOs that is, 1 to 4.
+        is_synchronous: sampled at SYNC, so that its readings carry the instant of the SYNC before.
+        heartbeat_ms: the node's heartbeat producer time; 0: none.
+        timeout_s: silent for longer than this is a gap.
+    """
+
+    name: str
+    unit: str
+    node: int
+    pdo: TransmitPdo
+    pdo_number: int = 1
+    is_synchronous: bool = False
+    heartbeat_ms: int = 1000
+    timeout_s: float = 1.0
+
+    def does_not_carry(self, what: str) -> str:
+        """Return the sentence for a TPDO that lacks the channel's object."""
+        words = " ".join(f"{word:08X}" for word in self.pdo.mapping.words)
+        return f"TPDO{self.pdo_number} of node {self.node} does not carry {what}; its mapping is {words}"
+
+
+class PdoChannelDecoder:
+    """Base of the decoders of CANopen channels.
+
+    Attributes:
+        is_void: the node has an emergency that voids its values (set by the supervision of the node).
+    """
+
+    missed_frames: int | None = None  # PDOs carry no counter
+
+    def __init__(self, channel: PdoChannel) -> None:
+        self.name = channel.name
+        self.node = channel.node
+        self.arbitration_id = channel.pdo.arbitration_id
+        self.is_extended = channel.pdo.is_extended
+        self.is_synchronous = channel.is_synchronous
+        self.heartbeat_ms = channel.heartbeat_ms
+        self.timeout_s = channel.timeout_s
+        self.is_void = False
+        self._unit = channel.unit
+
+    def object_read(self, stamp: Stamp, index: int, value: int) -> list[Record]:  # noqa: ARG002 - profiles use them
+        """Return the records caused by an object of the node that was read over SDO."""
+        return []
+
+    def node_restarted(self) -> None:
+        """Forget the node's last known state, because it has booted."""
+        self.is_void = False
+
+    def _too_short(self, stamp: Stamp, data: bytes, needed_bits: int) -> list[Record]:
+        return too_short(self.name, self._unit, stamp, data, needed_bits)
+
+
+def _import(path: Path, node: int) -> ObjectDictionary:
+    try:
+        # EDS files are ASCII by CiA 306; makers write Latin-1 into names
+        # Whatever the file is called: canopen reads XML from one that is called .epf
+        file = io.StringIO(read_whole(path, _FILE_MAX_BYTES).decode("latin-1"), newline=None)
+        dictionary: ObjectDictionary = import_eds(file, node)  # type: ignore[no-untyped-call]
+        return dictionary
+    except OSError as error:
+        raise DescriptionError(str(path), f"cannot be read: {error.strerror}") from error
+    except configparser.Error as error:
+        raise DescriptionError(str(path), f"not a valid EDS: {' '.join(str(error).split())}") from error
+    # what canopen lets through from its own parsing of numbers, sections and sub-objects
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError, ObjectDictionaryError) as error:
+        raise DescriptionError(str(path), f"not a valid EDS: {error}") from error
+
+
+def _value(dictionary: ObjectDictionary, where: str, index: int, subindex: int) -> int:
+    place = f"object {index:04X}h.{subindex}"
+    variable = dictionary.get_variable(index, subindex)
+    if variable is None:
+        raise DescriptionError(where, f"{place} is not described")
+    value = variable.default if variable.value is None else variable.value
+    if not isinstance(value, int):
+        raise DescriptionError(where, f"{place} has no DefaultValue or ParameterValue that is a number")
+    return value

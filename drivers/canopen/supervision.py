@@ -1,0 +1,113 @@
+"""Supervision of a CANopen node by its frames: boot-up, state, heartbeat, emergencies, objects read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from drivers.canopen.cia301 import NmtState, decode_heartbeat, emcy_id, heartbeat_id, sdo_response_id
+from drivers.canopen.emcy import decode_emergency
+from drivers.canopen.pdo import PdoChannelDecoder
+from drivers.canopen.sdo import UploadResponse, decode_response
+from drivers.clock import NS_PER_S, Stamp
+from drivers.readings import DecodeFailure, DeviceEvent, EventKind, Record
+
+HEARTBEAT_TOLERANCE = 2.5  # producer times without a heartbeat: two may be lost, and the node's clock be slow
+
+_REGISTER_DEVICE_PROFILE = 1 << 5
+_CLASS_HARDWARE = 0x5000
+
+
+class NodeSupervision:
+    """Supervision of one node.
+
+    The heartbeat is supervised from the first that is heard after a boot-up (CiA 301), for a node that has booted may
+    not produce any until it is configured; one that never does is noticed by the silence of its channels.
+
+    An emergency voids the values of the node's channels if it says that the measurement itself has failed: code 5xxxh
+    (device hardware), or error register bit 5 (device profile). Any other, such as communication, voltage or
+    temperature, is reported and leaves the values, which 6503h voids where they are wrong. A code 00xxh without bit 5,
+    or a boot-up, makes them valid again.
+
+    Args:
+        node: node number.
+        channels: decoders of the channels that the node feeds, at least one; the first names the node in events.
+    """
+
+    def __init__(self, node: int, channels: Sequence[PdoChannelDecoder]) -> None:
+        self.node = node
+        self._channels = tuple(channels)
+        self._name = channels[0].name
+        self._state: NmtState | None = None
+        self._heartbeat: Stamp | None = None
+        self._is_lost = False
+        self._timeout_ns = round(max(c.heartbeat_ms for c in channels) * 1e-3 * HEARTBEAT_TOLERANCE * NS_PER_S)
+
+    @property
+    def handlers(self) -> dict[int, Callable[[Stamp, bytes], list[Record]]]:
+        """The handlers of the node's frames, by identifier."""
+        return {
+            heartbeat_id(self.node): self._on_heartbeat,
+            emcy_id(self.node): self._on_emergency,
+            sdo_response_id(self.node): self._on_sdo_response,
+        }
+
+    def tick(self, now: Stamp) -> list[Record]:
+        """Report a heartbeat that is overdue."""
+        heartbeat = self._heartbeat
+        if heartbeat is None or self._is_lost or not self._timeout_ns or now.since(heartbeat) <= self._timeout_ns:
+            return []
+        self._is_lost = True
+        text = f"node {self.node}: no heartbeat for {self._timeout_ns / NS_PER_S:g} s; check its power and cable"
+        # Stamped with the deadline, so that it does not matter when this is called
+        return [DeviceEvent(self._name, heartbeat.shifted(self._timeout_ns), EventKind.HEARTBEAT_LOST, text)]
+
+    def _on_heartbeat(self, stamp: Stamp, data: bytes) -> list[Record]:
+        try:
+            state = decode_heartbeat(data)
+        except ValueError as error:
+            return [DecodeFailure(self._name, stamp, f"node {self.node}: {error}", data)]
+        records = self.tick(stamp)
+        self._heartbeat = None if state is NmtState.BOOT_UP else stamp
+        if self._is_lost:
+            self._is_lost = False
+            text = f"node {self.node}: heartbeat is back, state {state.words}"
+            records.append(DeviceEvent(self._name, stamp, EventKind.HEARTBEAT_RESTORED, text))
+        if state is NmtState.BOOT_UP:
+            text = f"node {self.node} has booted; it sends nothing until it is started"
+            records.append(DeviceEvent(self._name, stamp, EventKind.BOOT_UP, text))
+            for channel in self._channels:
+                channel.node_restarted()
+        elif state is not self._state:
+            before = "" if self._state is None else f", was {self._state.words}"
+            text = f"node {self.node} is {state.words}{before}"
+            records.append(DeviceEvent(self._name, stamp, EventKind.NMT_STATE, text, int(state)))
+        self._state = state
+        return records
+
+    def _on_emergency(self, stamp: Stamp, data: bytes) -> list[Record]:
+        try:
+            emergency = decode_emergency(data)
+        except ValueError as error:
+            return [DecodeFailure(self._name, stamp, f"node {self.node}: {error}", data)]
+        is_void = emergency.code & 0xF000 == _CLASS_HARDWARE or bool(emergency.register & _REGISTER_DEVICE_PROFILE)
+        for channel in self._channels:
+            # A new emergency of another kind does not make values valid that one before it has voided
+            channel.is_void = is_void if emergency.is_reset else channel.is_void or is_void
+        if emergency.is_reset:
+            kind, text = EventKind.EMERGENCY_CLEARED, f"node {self.node}: errors are gone ({emergency.words})"
+        else:
+            kind, text = EventKind.EMERGENCY, f"node {self.node}: {emergency.words}"
+            if is_void:
+                text += "; its values are not used until it takes this back"
+        return [DeviceEvent(self._name, stamp, kind, text, emergency.code)]
+
+    def _on_sdo_response(self, stamp: Stamp, data: bytes) -> list[Record]:
+        """Take the value of an object of the node that anybody on the bus has read."""
+        try:
+            response = decode_response(data)
+        except ValueError:
+            return []  # of block transfers and others; no reading depends on it
+        if not isinstance(response, UploadResponse) or response.data is None:
+            return []
+        value = int.from_bytes(response.data, "little")
+        return [r for channel in self._channels for r in channel.object_read(stamp, response.index, value)]

@@ -1,0 +1,64 @@
+"""Loss of a link: pauses between attempts to open it again, and the records of the outage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from drivers.clock import Stamp
+from drivers.readings import DeviceEvent, EventKind, Gap, GapReason, LinkItem
+
+BACKOFF_FIRST_S = 0.5
+BACKOFF_MAX_S = 2.0  # a device that is back is found within this, even where nothing tells that it is
+
+
+class Backoff:
+    """Pauses between attempts: doubling from BACKOFF_FIRST_S to BACKOFF_MAX_S, the same every time."""
+
+    def __init__(self) -> None:
+        self._next_s = BACKOFF_FIRST_S
+
+    def next_s(self) -> float:
+        """Return the pause before the next attempt in seconds."""
+        wait_s, self._next_s = self._next_s, min(2 * self._next_s, BACKOFF_MAX_S)
+        return wait_s
+
+    def reset(self) -> None:
+        """Begin anew with the shortest pause."""
+        self._next_s = BACKOFF_FIRST_S
+
+
+class Outage:
+    """Reports once that a link is lost, again when the reason changes, and once that it is back.
+
+    Args:
+        link: name of the link.
+        emit: takes the events and gaps.
+    """
+
+    def __init__(self, link: str, emit: Callable[[LinkItem], None]) -> None:
+        self._link = link
+        self._emit = emit
+        self._since: Stamp | None = None
+        self._reason = ""
+
+    def begin(self, reason: str, now: Stamp, since: Stamp) -> None:
+        """Report that the link is down.
+
+        Args:
+            reason: why, for an operator.
+            now: when that was noticed.
+            since: start of the gap, where the link was not down already.
+        """
+        if self._since is None:
+            self._since = since
+            self._emit(Gap(self._link, GapReason.LINK_DOWN, since))
+        if reason != self._reason:  # once a cause, not once an attempt
+            self._emit(DeviceEvent(self._link, now, EventKind.LINK_LOST, reason))
+            self._reason = reason
+
+    def end(self, now: Stamp, text: str) -> None:
+        """Report with `text` that the link is up."""
+        self._emit(DeviceEvent(self._link, now, EventKind.LINK_UP, text))
+        if self._since is not None:
+            self._emit(Gap(self._link, GapReason.LINK_DOWN, self._since, now))
+        self._since, self._reason = None, ""

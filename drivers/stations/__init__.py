@@ -1,0 +1,1 @@
+"""Total stations on serial lines."""

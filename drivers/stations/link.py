@@ -1,0 +1,126 @@
+"""The loop that owns a total station's serial port, polls the station and captures what crosses the wire."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from contextlib import closing
+
+from drivers.clock import NS_PER_S, Clock, Stamp
+from drivers.device_watch import watch_path
+from drivers.errors import LinkError
+from drivers.outage import BACKOFF_MAX_S, Backoff, Outage
+from drivers.readings import DeviceEvent, LinkItem, SerialCapture
+from drivers.stall_detector import NOT_READ_IN_TIME, LateReport, StallDetector
+from drivers.stations.config import StationConfig
+from drivers.stations.poller import Poller
+from drivers.stations.serial_port import SerialPort
+
+_LONGEST_READ_S = 0.5  # how soon a loop with nothing to do notices that it is to stop
+_LONGEST_WRITE_S = 5.0
+
+Emit = Callable[[LinkItem], None]
+
+
+class StationLink:
+    """Owns a station's port, opens it again when it was lost, talks to the station, hands on what crosses the wire.
+
+    Records are decoded elsewhere, from the captures: here replies only tell the poller what to send next.
+
+    Args:
+        config: the station.
+        clock: stamps captures, paces the polling.
+    """
+
+    def __init__(self, config: StationConfig, clock: Clock) -> None:
+        self.name = config.name
+        self._config = config
+        self._clock = clock
+        self._last_read = clock.now()
+
+    def run(self, emit: Emit, stop: threading.Event) -> None:
+        """Listen and talk until `stop` is set.
+
+        Emits captures at once, LINK_UP, LINK_LOST, CONFIGURED and INSTRUMENT_ERROR events, and the LINK_DOWN gap.
+        """
+        backoff, outage = Backoff(), Outage(self.name, emit)
+        with closing(watch_path(self._config.serial.path)) as watch:
+            while not stop.is_set():
+                opened: Stamp | None = None
+                try:
+                    port = SerialPort(self._config.serial, self.name, self._clock.real_seconds(_LONGEST_WRITE_S))
+                    with closing(port):
+                        watch.close()
+                        opened = self._last_read = self._clock.now()
+                        outage.end(opened, f"{self._config.serial.path} opened")
+                        self._serve(port, emit, stop)
+                except LinkError as error:
+                    now = self._clock.now()
+                    # What came since the last read is lost with the device, however long ago that was.
+                    outage.begin(str(error), now, now if opened is None else self._last_read)
+                    is_short_lived = opened is not None and now.since(opened) < BACKOFF_MAX_S * NS_PER_S
+                    if opened is not None and not is_short_lived:
+                        backoff.reset()
+                    pause_s = backoff.next_s()
+                    real_s = min(pause_s, self._clock.real_seconds(pause_s))
+                    if is_short_lived:
+                        stop.wait(real_s)  # it comes and goes by itself: to try whenever it comes would be to spin
+                    else:
+                        watch.wait(stop, real_s)
+
+    def _serve(self, port: SerialPort, emit: Emit, stop: threading.Event) -> None:
+        """Talk to the station from the opening of its port to `stop` or a LinkError."""
+        late = LateReport(self.name, "bytes", self._clock.now())
+        try:
+            self._listen(port, emit, stop, late)
+        finally:
+            for item in late.end(self._clock.now()):
+                emit(item)
+
+    def _listen(self, port: SerialPort, emit: Emit, stop: threading.Event, late: LateReport) -> None:
+        poller = start_poller(self._config)
+        stalls = StallDetector(self._clock)
+        while not stop.is_set():
+            wait_s = _LONGEST_READ_S if poller is None else self._send_due(port, poller, emit)
+            timeout_s = self._clock.real_seconds(wait_s)
+            data = port.read(timeout_s)
+            self._last_read = stamp = self._clock.now()
+            if stalls.is_late(stamp, timeout_s):
+                stamp = stamp.doubted()
+                late.add(len(data), NOT_READ_IN_TIME)
+            else:
+                for item in late.in_time(stamp):
+                    emit(item)
+            if data:
+                capture = SerialCapture(self.name, stamp, data)
+                emit(capture)
+                if poller is not None:
+                    poller.feed(capture)
+        if poller is not None:
+            for command in poller.closing():
+                self._send(port, command, emit)
+
+    def _send_due(self, port: SerialPort, poller: Poller, emit: Emit) -> float:
+        """Send what is due; return for how many seconds there is nothing more to send."""
+        now_ns = self._clock.monotonic_ns()
+        while (command := poller.step(now_ns)) is not None:
+            self._send(port, command, emit)
+        for kind, text in poller.take_notices():
+            emit(DeviceEvent(self.name, self._clock.now(), kind, text))
+        now_ns = self._clock.monotonic_ns()
+        return min(_LONGEST_READ_S, max(0, poller.wake_ns(now_ns) - now_ns) / NS_PER_S)
+
+    def _send(self, port: SerialPort, command: bytes, emit: Emit) -> None:
+        stamp = self._clock.now()
+        port.write(command)
+        emit(SerialCapture(self.name, stamp, command, is_transmitted=True))
+
+
+def start_poller(config: StationConfig) -> Poller | None:
+    """Return a fresh poller of the station; None where its profile sends nothing."""
+    profile, codec = config.station_profile, config.codec
+    if profile.plan is None:
+        return None
+    return Poller(
+        profile.plan(config), lambda command: codec.encode(command, config.crlf), config.reply_reader(), config
+    )

@@ -1,0 +1,7 @@
+"""Profile `passive`: listens to an instrument that another program controls, and sends nothing, ever."""
+
+from __future__ import annotations
+
+from drivers.stations.profile import StationProfile
+
+PROFILE = StationProfile(name="passive", codec=None, plan=None)

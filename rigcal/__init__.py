@@ -1,0 +1,34 @@
+"""The public face of rigcal: what a program or a notebook needs to make a machine's model true.
+
+    import rigcal
+
+    rig = rigcal.Rig.read("ur10")
+    fixes = rigcal.Observations.from_csv("fixes.csv", rig)
+    model = rigcal.calibrate(rig, fixes)
+    model.predict(fixes).position_mm
+
+`docs/api.md` is a worked example. Everything else in the packages `calibration`, `daemon`, `drivers` and `simulators`
+may change without notice; these names follow Semantic Versioning.
+"""
+
+from calibration.errors import CalibrationError, DataError, ModelError, RigError, UnsafeError
+from calibration.observations import Observations
+from calibration.rig.description import Rig
+from rigcal.calibration_api import Model, calibrate, find_gap, plan
+from rigcal.store_api import Store, open_store
+
+__all__ = [
+    "CalibrationError",
+    "DataError",
+    "Model",
+    "ModelError",
+    "Observations",
+    "Rig",
+    "RigError",
+    "Store",
+    "UnsafeError",
+    "calibrate",
+    "find_gap",
+    "open_store",
+    "plan",
+]

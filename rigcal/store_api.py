@@ -1,0 +1,106 @@
+"""A daemon's store, read-only: sessions and observations as data frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Literal
+
+from calibration.errors import DataError
+from calibration.observations import Observations
+from calibration.rig.description import Rig, parse_rig
+from daemon.sessions.session_data import sessions_csv
+from daemon.store.reader import Reader
+from daemon.store.sessions import all_observations, all_sessions, session
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import polars as pl
+
+FrameLibrary = Literal["pandas", "polars"]
+
+
+def open_store(path: str | Path, frames: FrameLibrary = "pandas") -> Store:
+    """Open a store for reading, also while the daemon writes to it.
+
+    Args:
+        path: the daemon's `store.sqlite`.
+        frames: which library's data frames are given; it has to be installed.
+
+    Raises:
+        StoreError: there is no store, or it cannot be read.
+        ValueError: another library.
+    """
+    if frames not in ("pandas", "polars"):
+        raise ValueError(f"{frames!r} is unknown; there are pandas and polars")
+    return Store(Reader(Path(path)), frames)
+
+
+class Store:
+    """A store, read-only; a context manager. Belongs to the thread that opened it.
+
+    Args:
+        reader: the connection.
+        frames: which library's data frames are given.
+    """
+
+    def __init__(self, reader: Reader, frames: FrameLibrary) -> None:
+        self._reader, self._frames = reader, frames
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._reader.close()
+
+    def sessions(self) -> pd.DataFrame | pl.DataFrame:
+        """Return every calibration session, oldest first: id, rig, set-up, prism, kind, state, start and end."""
+        return self._frame(all_sessions(self._reader))
+
+    def observations(self, sessions: Sequence[str] = ()) -> pd.DataFrame | pl.DataFrame:
+        """Return the observations of sessions, oldest first, with the reason why calibration must not use them.
+
+        Args:
+            sessions: ids; all by default.
+
+        Returns:
+            One row a fix: `session_id`, `setup_id`, `prism`, `pose`, `utc_ns`, `x_mm`, `y_mm`, `z_mm` in the station's
+            frame, `sigma_x_mm` and so on, `dwell_s`, `excluded` (None where calibration may use it), and the joints and
+            signals under their column names (`theta1_deg`, `L2_mm`, ...).
+        """
+        return self._frame(all_observations(self._reader, sessions))
+
+    def training_data(self, sessions: Sequence[str]) -> tuple[Rig, Observations]:
+        """Return the rig of sessions and the observations that calibration may use, as the daemon's jobs do.
+
+        Args:
+            sessions: ids, of one rig; the newest one's description counts.
+
+        Raises:
+            DataError: no such session, or no observation that may be used.
+        """
+        found = [session(self._reader, name) for name in sessions]
+        missing = [name for name, row in zip(sessions, found, strict=True) if row is None]
+        if missing or not found:
+            raise DataError(str(self._reader.path), f"there is no session {missing[0]!r}" if missing else "no session")
+        newest = found[-1]
+        assert newest is not None
+        rig = parse_rig(str(newest["rig_text"]), f"the rig of session {sessions[-1]}")
+        return rig, Observations.from_csv(sessions_csv(self._reader, rig, sessions).decode(), rig)
+
+    def _frame(self, rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame | pl.DataFrame:
+        table = [dict(row) for row in rows]
+        if self._frames == "polars":
+            import polars as pl
+
+            return pl.DataFrame(table, infer_schema_length=None)
+        import pandas as pd
+
+        return pd.DataFrame(table)

@@ -1,0 +1,260 @@
+"""Duty cycle of the boom, pose by pose: joint values, directions, rates, and the signals and temperatures meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.rig.description import Rig
+from simulators.hydraulics import CURRENT_DITHER_MA, PRESSURE_NOISE_BAR, motion_columns
+from simulators.rig.dataset import random_poses
+from simulators.rig.screws import Posture, ScrewChain, nominal_constants, pose_chain, screw_chain
+from simulators.rig.truth import RigTruth
+
+Floats = NDArray[np.float64]
+PosePlan = Literal["wide", "face", "sparse"]
+
+_FACE_SHARE = 0.45  # of a revolute joint's range, about its middle, before the feed is set parallel
+_FACE_ROUNDS = 3
+_FACE_JITTER_DEG = 0.5  # an operator sets the feed parallel by eye and by angle display
+_POSES_A_CLUSTER = 6
+_CLUSTER_SHARE = 0.04  # of a joint's range, 1 sigma
+
+_HOURS = 8.0  # length of a duty cycle
+_OVERSHOOT_SHARE = 0.3  # of the motions: past the pose and back
+_CREEP_RATE = 0.045  # of a joint's maximum rate, at most: 0.9 deg/s at 20
+_STILL_SHARE = 0.3  # of the joints, while others creep
+_SHORTEST_GAP = 0.4  # between poses, of the mean one; breaks make the long ones
+_DWELL_SHARES = 0.1, 0.9  # of the time since the pose before
+_RATE_OVER_S = 0.5  # readings that far apart give a rate
+_ROD_KG = 300.0
+_ROD_CHANGES = 2, 6  # in a duty cycle
+_DAY_K, _AIR_DEGC, _GUST_K = 8.0, 15.0, 0.6
+_FOLLOWING_K = 10.0  # a decoy's temperature over the duty cycle
+_THERMOMETER_K = 0.2
+_VISIT_DWELL_S = 20.0
+_DECOY = "spare"
+_DECOYS = 4
+_IDLE_BAR, _SUPPLY_BAR = 40.0, 120.0
+_BAR_PER_NEWTON = 1e-5 / 7.9e-3  # a piston of 100 mm
+
+
+@dataclass(frozen=True)
+class DutyCycle:
+    """n poses in the order of their times.
+
+    Attributes:
+        joints: joint name -> (n,) deg or mm.
+        columns: what effects may depend on, without any sensor's error -> (n,).
+    """
+
+    joints: Mapping[str, Floats]
+    columns: Mapping[str, Floats]
+
+    def recorded(self, rig: Rig, rng: np.random.Generator) -> dict[str, Floats]:
+        """(n,) columns as their sensors give them, but for the readings of the joints."""
+        out: dict[str, Floats] = {}
+        for name, values in self.columns.items():
+            n = len(values)
+            if name.endswith("_rate"):
+                sigma = np.sqrt(2.0) * rig.joint(name.removesuffix("_rate")).sigma / _RATE_OVER_S
+                out[name] = np.where(values == 0.0, 0.0, values + rng.normal(0.0, sigma, n))
+            elif name.endswith("_mA"):
+                out[name] = np.rint(values + (values != 0.0) * rng.normal(0.0, CURRENT_DITHER_MA, n))
+            elif name.endswith("_bar"):
+                out[name] = np.rint(10.0 * (values + rng.normal(0.0, PRESSURE_NOISE_BAR, n))) / 10.0
+            elif name == "temperature_degC":
+                out[name] = np.rint(10.0 * (values + rng.normal(0.0, _THERMOMETER_K, n))) / 10.0
+            else:
+                out[name] = values
+        return out
+
+
+def draw_duty_cycle(
+    truth: RigTruth,
+    n: int,
+    plan: PosePlan,
+    rng: np.random.Generator,
+    *,
+    moving: float,
+    is_decoy: bool,
+) -> DutyCycle:
+    """Draw a duty cycle of n poses.
+
+    Args:
+        truth: the machine; its loads make the pressures.
+        n: number of poses.
+        plan: see `draw_poses`.
+        rng: source.
+        moving: share of the poses that joints creep through.
+        is_decoy: the temperature follows the time, and there are signals that nothing depends on.
+    """
+    rig = truth.rig
+    joints = draw_poses(rig, plan, n, rng)
+    gap = _SHORTEST_GAP + rng.exponential(1.0 - _SHORTEST_GAP, n)
+    gap_s = 3600.0 * _HOURS * gap / gap.sum()
+    time_s = np.cumsum(gap_s)
+    creeps = rng.random(n) < moving
+    columns: dict[str, Floats] = {
+        "time_s": np.rint(time_s * 10.0) / 10.0,
+        "dwell_s": np.where(creeps, 0.0, np.rint(gap_s * rng.uniform(*_DWELL_SHARES, n) * 10.0) / 10.0),
+    }
+    for joint in rig.joints:
+        taking_part = creeps & (rng.random(n) >= _STILL_SHARE)
+        most = _CREEP_RATE * joint.max_rate
+        rate = np.where(taking_part, rng.uniform(-most, most, n), 0.0)
+        came = np.sign(np.diff(joints[joint.name], prepend=joints[joint.name][1 % n]))
+        came = came * np.where(rng.random(n) < _OVERSHOOT_SHARE, -1.0, 1.0)
+        columns[f"{joint.name}_rate"] = rate
+        columns[f"{joint.name}_dir"] = np.where(rate != 0.0, np.sign(rate), came).astype(float)
+    columns["temperature_degC"] = _temperature(time_s / time_s[-1], is_decoy, rng)
+    if any(mass.payload for mass in rig.masses):
+        changes = np.isin(np.arange(n), rng.integers(n // 8, max(n - n // 8, n // 8 + 1), rng.integers(*_ROD_CHANGES)))
+        columns["payload_kg"] = _ROD_KG * ((np.cumsum(changes) + rng.integers(2)) % 2).astype(float)
+    columns |= _machine_signals(truth, joints, columns, rng)
+    return DutyCycle(joints, columns | _decoys(_DECOYS if is_decoy else 0, n, rng))
+
+
+def continue_duty_cycle(
+    truth: RigTruth,
+    poses: Mapping[str, Floats],
+    here: Mapping[str, float],
+    last: Mapping[str, float],
+    given: Mapping[str, Floats],
+    rng: np.random.Generator,
+) -> DutyCycle:
+    """Continue a duty cycle with n further poses.
+
+    Args:
+        truth: the machine.
+        poses: joint name -> (n,) deg or mm.
+        here: joint name -> where the duty cycle ended.
+        last: columns as they were then.
+        given: columns that are asked for -> (n,); the others are those of standstills a minute apart, reached straight
+            from pose to pose, with all else as at its end.
+        rng: source.
+    """
+    rig, n = truth.rig, len(next(iter(poses.values())))
+    columns: dict[str, Floats] = {
+        "time_s": last["time_s"] + 60.0 * np.arange(1.0, n + 1.0),
+        "dwell_s": np.full(n, _VISIT_DWELL_S, dtype=float),
+        "temperature_degC": np.full(n, last["temperature_degC"], dtype=float),
+    }
+    for joint in rig.joints:
+        columns[f"{joint.name}_rate"] = np.zeros(n)
+        columns[f"{joint.name}_dir"] = np.sign(np.diff(poses[joint.name], prepend=here[joint.name])).astype(float)
+    if "payload_kg" in last:
+        columns["payload_kg"] = np.full(n, last["payload_kg"])
+    columns |= {name: np.asarray(values, float) for name, values in given.items() if name in last}
+    columns = _machine_signals(truth, poses, columns, rng) | columns
+    columns |= _decoys(sum(name.startswith(_DECOY) for name in last), n, rng)
+    return DutyCycle(dict(poses), {name: columns[name] for name in last if name in columns})
+
+
+def _machine_signals(
+    truth: RigTruth, joints: Mapping[str, Floats], columns: Mapping[str, Floats], rng: np.random.Generator
+) -> dict[str, Floats]:
+    """Pressures in the cylinders and the machine's own signals, at these joints and rates."""
+    rig, out = truth.rig, dict[str, Floats]()
+    for joint in rig.joints:
+        if joint.kind == "prismatic":
+            load = np.abs(truth.gravity_load(joint.name, joints, columns))
+            supply = _IDLE_BAR + rng.uniform(0.0, _SUPPLY_BAR, len(load))
+            out[f"{joint.name}_bar"] = supply + _BAR_PER_NEWTON * load
+    return out | motion_columns({j.name: columns[f"{j.name}_rate"] / j.max_rate for j in rig.joints})
+
+
+def _decoys(number: int, n: int, rng: np.random.Generator) -> dict[str, Floats]:
+    """Signals that nothing depends on: noise and random walks."""
+    columns: dict[str, Floats] = {}
+    for index in range(number):
+        steps = rng.normal(0.0, 20.0, n)
+        if index % 2:
+            columns[f"{_DECOY}{index + 1}_mA"] = 300.0 + np.cumsum(steps) / 10.0
+        else:
+            columns[f"{_DECOY}{index + 1}_bar"] = 100.0 + steps
+    return columns
+
+
+def _temperature(part: Floats, follows_time: bool, rng: np.random.Generator) -> Floats:
+    """(n,) of the steel, at parts of the duty cycle from 0 to 1."""
+    if follows_time:
+        return _AIR_DEGC + _FOLLOWING_K * part + rng.normal(0.0, _THERMOMETER_K, len(part))
+    day = _DAY_K * np.sin(2.4 * part + rng.uniform(-0.3, 0.9))
+    course: Floats = _AIR_DEGC + day + rng.normal(0.0, _GUST_K, len(part))
+    return course
+
+
+def draw_poses(rig: Rig, plan: PosePlan, n: int, rng: np.random.Generator) -> dict[str, Floats]:
+    """Poses within the joint limits.
+
+    Args:
+        rig: gives joints and limits.
+        plan: `wide`, evenly between the limits; `face`, the last frame's z axis (the feed) held parallel to one
+            direction as a drill plan asks, so that joints move little and make up for one another; `sparse`, a few
+            clusters of poses that are nearly the same.
+        n: number of poses.
+        rng: source.
+
+    Returns:
+        Joint name -> (n,) deg or mm.
+    """
+    if plan == "wide":
+        return random_poses(rig, n, rng)
+    if plan == "face":
+        return _face(rig, n, rng)
+    centres = random_poses(rig, max(4, -(-n // _POSES_A_CLUSTER)), rng)
+    which = rng.integers(len(next(iter(centres.values()))), size=n)
+    spread = {j.name: _CLUSTER_SHARE * (j.limits[1] - j.limits[0]) for j in rig.joints}
+    return _within(rig, {k: v[which] + rng.normal(0.0, spread[k], n) for k, v in centres.items()})
+
+
+def _face(rig: Rig, n: int, rng: np.random.Generator) -> dict[str, Floats]:
+    chain = screw_chain(rig, nominal_constants(rig))
+    turning = [j for j in rig.joints if j.kind == "revolute"]
+    span = np.deg2rad([j.limits[1] - j.limits[0] for j in turning])
+    middle = {j.name: np.array([sum(j.limits) / 2]) for j in rig.joints}
+    feed = pose_chain(chain, _radians(rig, middle)).axes(len(rig.rows))[0, :, 2]
+    poses = random_poses(rig, n, rng)
+    for joint in turning:
+        poses[joint.name] = middle[joint.name] + _FACE_SHARE * (poses[joint.name] - middle[joint.name])
+    for _ in range(_FACE_ROUNDS):
+        posture = pose_chain(chain, _radians(rig, poses))
+        axis = posture.axes(len(rig.rows))[:, :, 2]
+        turns = _turn_axes(chain, posture, [j.name for j in turning], len(rig.rows))
+        across = turns - axis[:, :, None] * (axis[:, None, :] @ turns)
+        missing = np.cross(axis, feed)
+        # Every joint takes a share by its range: least squares in units of the ranges.
+        weighted = across * span**2
+        normal = weighted @ across.transpose(0, 2, 1) + 1e-6 * np.eye(3)
+        step = (weighted.transpose(0, 2, 1) @ np.linalg.solve(normal, missing[:, :, None]))[:, :, 0]
+        for i, joint in enumerate(turning):
+            poses[joint.name] = poses[joint.name] + np.rad2deg(step[:, i])
+        poses = _within(rig, poses)
+    for joint in turning:
+        poses[joint.name] = poses[joint.name] + rng.normal(0.0, _FACE_JITTER_DEG, n)
+    return _within(rig, poses)
+
+
+def _turn_axes(chain: ScrewChain, posture: Posture, joints: list[str], frame: int) -> Floats:
+    """(n, 3, joints) by which rotation vector a frame turns per radian of each joint."""
+    out = np.zeros((len(posture.rotations[0]), 3, len(joints)))
+    for index, screw in enumerate(chain.screws):
+        if screw.turns and chain.carries(index, frame):
+            axis, _ = posture.axis(index)
+            for i, joint in enumerate(joints):
+                if joint in screw.weights:
+                    out[:, :, i] += screw.weights[joint] * axis
+    return out
+
+
+def _radians(rig: Rig, poses: dict[str, Floats]) -> dict[str, Floats]:
+    return {j.name: np.deg2rad(poses[j.name]) if j.kind == "revolute" else poses[j.name] for j in rig.joints}
+
+
+def _within(rig: Rig, poses: dict[str, Floats]) -> dict[str, Floats]:
+    return {j.name: np.clip(poses[j.name], *j.limits) for j in rig.joints}

@@ -1,0 +1,124 @@
+"""Random effects: places on a rig, signs and phases within hard bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.rig.description import Rig
+from simulators.effects.base import Effect
+from simulators.effects.library import FAMILIES
+from simulators.rig.dataset import random_poses
+from simulators.rig.truth import RigTruth, replace_effects
+
+Floats = NDArray[np.float64]
+
+_VOLUME_POSES = 256
+_LEAST_LOAD = 0.05  # of the largest on any joint: less bends nothing
+
+
+@dataclass(frozen=True)
+class Bounded:
+    """An effect at its plausible size, and the factor from there to its hard bound."""
+
+    effect: Effect
+    most: float
+
+    def scaled(self, factor: float) -> Effect:
+        """Return the effect `factor` times as large."""
+        scaled: dict[str, Any] = {name: getattr(self.effect, name) * factor for name in self.effect.amplitudes}
+        return replace(self.effect, **scaled)
+
+
+@dataclass(frozen=True)
+class EffectDraws:
+    """Random effects for data of one machine.
+
+    Attributes:
+        rig: the description; bounds follow from its own weights.
+        prisms: that the data has.
+        first_s, last_s: when it begins and ends.
+        mean_degC: its mean temperature; effects of warmth count from it, as those of time count from `first_s`.
+    """
+
+    rig: Rig
+    prisms: Sequence[str]
+    first_s: float
+    last_s: float
+    mean_degC: float  # noqa: N815 - the unit is degC
+
+    def places(self, family: str) -> tuple[str, ...]:
+        """Places of an effect on the rig, empty if there are none; KeyError if there is no such family."""
+        kind, rig = FAMILIES[family], self.rig
+        found = []
+        for where in (*rig.joint_names, "boom", "base", "clock", "station", *self.prisms):
+            try:
+                kind(where=where).check(rig)
+            except ValueError:
+                continue
+            if not kind.needs_load or self._carries(where):
+                found.append(where)
+        if family == "prism_constant" and len(self.prisms) == 1:
+            found.remove("station")  # the same as that of the only prism
+        return tuple(found)
+
+    def draw(self, family: str, where: str, rng: np.random.Generator) -> Bounded:
+        """Draw an effect of plausible size at a place; KeyError if there is no such family."""
+        effect = FAMILIES[family](where=where).anchored(self.first_s, self.mean_degC).draw_shape(self, rng)
+        size: dict[str, Any] = {name: float(getattr(effect, name)) for name in effect.amplitudes}
+        if effect.has_either_sign and len(size) > 1:
+            direction = rng.normal(size=len(size))
+            scaled = np.array(list(size.values())) * direction / np.linalg.norm(direction)
+            size = dict(zip(size, scaled.tolist(), strict=True))
+        elif effect.has_either_sign:
+            size = {name: float(value * rng.choice([-1.0, 1.0])) for name, value in size.items()}
+        effect = replace(effect, **size)
+        bounds = self.bounds(effect)
+        return Bounded(effect, min(bounds[name] / abs(value) for name, value in size.items() if value != 0.0))
+
+    def largest_load(self, joint: str) -> float:
+        """Largest load of the rig's own weights on a revolute joint in its work volume, N m."""
+        return self._loads[joint]
+
+    def bounds(self, effect: Effect) -> dict[str, float]:
+        """Hard bound of each amplitude of an effect, at its place and in its direction."""
+        bounds = effect.amplitudes
+        if effect.bounded_at == "coefficient":
+            return dict(bounds)
+        if effect.bounded_at == "largest_load":
+            load = max(self._loads.values()) if effect.where == "base" else self._loads[effect.where]
+            return {name: bound / load for name, bound in bounds.items()}
+        size = {name: abs(float(getattr(effect, name))) for name in bounds}
+        small: dict[str, Any] = {name: 1e-3 * value for name, value in size.items()}
+        moved_mm = self._tip_mm([replace(effect, **small)]) - self._tip_mm([])
+        largest_mm = 1e3 * float(np.linalg.norm(moved_mm, axis=1).max())
+        return {name: value * (bounds[name] / largest_mm) for name, value in size.items()}
+
+    def _carries(self, where: str) -> bool:
+        return self._loads.get(where, 0.0) >= _LEAST_LOAD * max(self._loads.values(), default=0.0) > 0.0
+
+    @cached_property
+    def _nominal(self) -> RigTruth:
+        return RigTruth(self.rig, 0, perturbation=0.0)
+
+    @cached_property
+    def _volume(self) -> dict[str, Floats]:
+        return random_poses(self.rig, _VOLUME_POSES, np.random.default_rng([0, 41]))
+
+    @cached_property
+    def _loads(self) -> dict[str, float]:
+        """Largest load on each revolute joint in the work volume, N m."""
+        return {
+            j.name: float(np.abs(self._nominal.gravity_load(j.name, self._volume)).max())
+            for j in self.rig.joints
+            if j.kind == "revolute"
+        }
+
+    def _tip_mm(self, effects: Sequence[Effect]) -> Floats:
+        tip = max(self.rig.prisms, key=lambda prism: prism.frame).name
+        return replace_effects(self._nominal, effects).prism_mm(tip, self._volume)

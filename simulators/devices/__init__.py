@@ -1,0 +1,1 @@
+"""The devices of a simulated rig, speaking their real protocols."""

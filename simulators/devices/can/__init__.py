@@ -1,0 +1,1 @@
+"""CAN devices of a simulated rig."""

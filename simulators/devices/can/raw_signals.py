@@ -1,0 +1,61 @@
+"""Values at a fixed place of a CAN frame, for machines that are described signal by signal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+from calibration.rig.channels import RawSignal
+from simulators.devices.can.bus import Frame
+
+
+def pack(channel: RawSignal, value: float) -> bytes:
+    """Eight bytes with the value at the channel's place and zeros elsewhere; clipped to the place's range."""
+    counts = round((value - channel.offset) / channel.scale)
+    low, high = (-(1 << channel.length_bits - 1), (1 << channel.length_bits - 1) - 1)
+    if not channel.is_signed:
+        low, high = 0, (1 << channel.length_bits) - 1
+    counts = max(low, min(high, counts)) & ((1 << channel.length_bits) - 1)
+    if channel.byte_order == "intel":
+        return (counts << channel.start_bit & (1 << 64) - 1).to_bytes(8, "little")
+    # Motorola: the start bit is the most significant one; bit 7 of byte 0 is the first on the wire.
+    first = channel.start_bit // 8 * 8 + 7 - channel.start_bit % 8
+    return (counts << 64 - first - channel.length_bits & (1 << 64) - 1).to_bytes(8, "big")
+
+
+class RawSignals:
+    """Sends every frame that the channels name, each at the same period.
+
+    Args:
+        channels: the signals; those of one frame share it.
+        sources: channel name -> its value and rate at an instant in simulated seconds.
+        period_s: cycle of all frames.
+    """
+
+    def __init__(
+        self,
+        channels: Sequence[RawSignal],
+        sources: Mapping[str, Callable[[float], tuple[float, float]]],
+        *,
+        period_s: float = 0.02,
+    ) -> None:
+        self._frames: dict[tuple[int, bool], list[RawSignal]] = {}
+        for channel in channels:
+            self._frames.setdefault((channel.arbitration_id, channel.is_extended), []).append(channel)
+        self._sources, self._period_s, self._next_s = sources, period_s, 0.0
+
+    def poll(self, now_s: float) -> list[Frame]:
+        """Return the frames that are due."""
+        if now_s < self._next_s:
+            return []
+        self._next_s = now_s + self._period_s
+        frames = []
+        for (identifier, is_extended), channels in self._frames.items():
+            total = 0
+            for channel in channels:
+                total |= int.from_bytes(pack(channel, self._sources[channel.name](now_s)[0]), "big")
+            frames.append(Frame(identifier, total.to_bytes(8, "big"), is_extended=is_extended))
+        return frames
+
+    def next_deadline(self) -> float:
+        """Instant at which the next frames are due."""
+        return self._next_s

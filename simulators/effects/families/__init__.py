@@ -1,0 +1,1 @@
+"""Effects that a library of physical effects names, one file each."""

@@ -1,0 +1,101 @@
+"""The effects found in their folders, and effects as text: `backlash@theta4:width_rad=2e-3,boom_droop@boom`."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import pkgutil
+from collections.abc import Mapping
+from dataclasses import fields
+from types import ModuleType
+
+from simulators.effects import families, outside, variants
+from simulators.effects.base import Effect
+
+# A seed draws from the families in this order, so that it draws the same cases when a family is added: new ones follow.
+_SEEDED_ORDER = (
+    "joint_compliance",
+    "boom_droop",
+    "pad_play",
+    "backlash",
+    "gravity_flip_play",
+    "load_hysteresis",
+    "encoder_harmonic",
+    "joint_error_map",
+    "angle_scale",
+    "transducer_scale",
+    "transducer_quadratic",
+    "transducer_index_jump",
+    "transducer_cumulative",
+    "thermal_expansion",
+    "solar_bow",
+    "base_settlement",
+    "base_step",
+    "payload_change",
+    "cylinder_compression",
+    "leak_down",
+    "latency",
+    "clock_drift",
+    "station_scale",
+    "prism_constant",
+    "prism_incidence",
+    "linkage_coupling",
+)
+
+
+def _found_in(package: ModuleType) -> dict[str, type[Effect]]:
+    """Effects defined in the modules of a package, in alphabetical order of the modules."""
+    found: dict[str, type[Effect]] = {}
+    for name in sorted(module.name for module in pkgutil.iter_modules(package.__path__)):
+        module = importlib.import_module(f"{package.__name__}.{name}")
+        for kind in vars(module).values():
+            if isinstance(kind, type) and issubclass(kind, Effect) and kind.__module__ == module.__name__:
+                found[kind.family] = kind
+    return found
+
+
+def _in_seeded_order(found: Mapping[str, type[Effect]]) -> dict[str, type[Effect]]:
+    return {name: found[name] for name in (*_SEEDED_ORDER, *(n for n in found if n not in _SEEDED_ORDER))}
+
+
+LIBRARY: Mapping[str, type[Effect]] = _in_seeded_order(_found_in(families))
+"""Effects that a library of physical effects names."""
+
+OUTSIDE: Mapping[str, type[Effect]] = _found_in(outside)
+"""Effects that no library names, in whatever form."""
+
+FAMILIES: Mapping[str, type[Effect]] = {**LIBRARY, **_found_in(variants), **OUTSIDE}
+"""All effects."""
+
+
+def parse_effects(text: str) -> tuple[Effect, ...]:
+    """Parse `FAMILY@WHERE[:NAME=VALUE[:NAME=VALUE...]]`, separated by commas; "" is none.
+
+    Raises:
+        ValueError: unknown family or coefficient, or no finite number; the message names the known ones.
+    """
+    return tuple(_parse_one(part.strip()) for part in text.split(",") if part.strip())
+
+
+def _parse_one(part: str) -> Effect:
+    head, *settings = part.split(":")
+    family, at, where = head.partition("@")
+    kind = FAMILIES.get(family)
+    if kind is None:
+        raise ValueError(f"unknown effect {family!r}; known: {', '.join(sorted(FAMILIES))}")
+    if not at or not where:
+        raise ValueError(f"{part!r}: say where, as in {family}@theta4")
+    known = {f.name: f.type for f in fields(kind) if f.name != "where"}
+    values: dict[str, float | int] = {}
+    for setting in settings:
+        name, _, value = setting.partition("=")
+        if name not in known:
+            raise ValueError(f"{part!r}: {family} has no {name!r}; it has {', '.join(known)}")
+        try:
+            number = float(value)
+        except ValueError:
+            raise ValueError(f"{part!r}: {value!r} is not a number") from None
+        if not math.isfinite(number):
+            raise ValueError(f"{part!r}: {value!r} is not a finite number")
+        values[name] = int(number) if known[name] == "int" else number
+    return kind(where=where, **values)

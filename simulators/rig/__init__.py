@@ -1,0 +1,1 @@
+"""The simulated machine: its true geometry, motion and measurement noise."""

@@ -1,0 +1,173 @@
+"""The machine under load at n instants: positions, weights, and displacements by effects."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.rig.description import Rig
+from simulators.effects.base import Beam, Bend
+from simulators.rig.screws import Posture, RowConstants, Screw, rotation_by_vector
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PointMass:
+    """A weight: a frame, its place there, and whether `payload_kg` overrides it."""
+
+    frame: int
+    place_mm: Floats
+    kg: float
+    is_payload: bool
+
+
+@dataclass(frozen=True)
+class LoadedBody:
+    """The machine at n instants: `simulators.effects.base.Body`.
+
+    Attributes:
+        rig: the description.
+        read, true: joint name -> (n,) as sensed, and as it is, rad or mm.
+        columns: further observation columns -> (n,).
+        gravity: (3,) m/s^2 in the base frame.
+        masses, constants: the true ones.
+        posture: of the true joints.
+        bent: displacements, from the tip towards the base: each moves everything beyond its frame as one, so that the
+            places that it names are those of a machine that is straight up to there.
+        growth: (n,) share by which all lengths are longer.
+    """
+
+    rig: Rig
+    read: Mapping[str, Floats]
+    true: Mapping[str, Floats]
+    columns: Mapping[str, Floats]
+    gravity: Floats
+    masses: tuple[PointMass, ...]
+    constants: tuple[RowConstants, ...]
+    posture: Posture
+    bent: tuple[Bend, ...]
+    growth: Floats
+
+    def column(self, name: str) -> Floats:
+        """(n,) an observation column; ValueError when the caller did not give it."""
+        if name not in self.columns:
+            raise ValueError(f"an effect of this machine needs the column {name!r}")
+        return np.atleast_1d(np.asarray(self.columns[name], dtype=float))
+
+    def has(self, name: str) -> bool:
+        """True if an observation column was given."""
+        return name in self.columns
+
+    def place_mm(self, frame: int, place_mm: Floats) -> Floats:
+        """(n, 3) position in the base frame of a point fixed to a frame, displacements included."""
+        point: Floats = self.posture.point_mm(frame, place_mm) * (1.0 + self.growth)[:, None]
+        for bend in self.bent:
+            if self._follows(frame, bend.frame):
+                point = _bent(bend, point)
+        return point
+
+    def axes(self, frame: int) -> Floats:
+        """(n, 3, 3) axes of a frame as columns, in the base frame."""
+        axes = self.posture.axes(frame)
+        for bend in self.bent:
+            if self._follows(frame, bend.frame):
+                axes = rotation_by_vector(bend.rotation_vector) @ axes
+        return axes
+
+    def origin_mm(self, frame: int) -> Floats:
+        """(n, 3) origin of a frame, in the base frame."""
+        return self.place_mm(frame, np.zeros(3))
+
+    def torque(self, joint: str) -> Floats:
+        """(n,) generalised force of gravity on a joint: N m or N."""
+        return self._torque(joint, self.masses)
+
+    def payload_torque(self, joint: str) -> Floats:
+        """(n,) the part of `torque` that the payload makes."""
+        return self._torque(joint, tuple(mass for mass in self.masses if mass.is_payload))
+
+    def overturning_newton_m(self) -> Floats:
+        """(n, 3) moment of all weights about the base's origin, in the base frame."""
+        total = np.zeros((len(self.growth), 3))
+        for mass in self.masses:
+            total += _cross(self.place_mm(mass.frame, mass.place_mm) / 1e3, self._weight_newton(mass))
+        return total
+
+    def _torque(self, joint: str, masses: tuple[PointMass, ...]) -> Floats:
+        total = np.zeros(len(self.growth))
+        places = [self.place_mm(m.frame, m.place_mm) for m in masses]
+        weights = [self._weight_newton(m) for m in masses]
+        for index, screw in enumerate(self.posture.chain.screws):
+            coefficient = screw.weights.get(joint, 0.0)
+            if coefficient == 0.0:
+                continue
+            if screw.turns != (self.rig.joint(joint).kind == "revolute"):
+                coefficient *= 1e3 if screw.turns else 1e-3  # rad and mm of a motion for each m and rad of its joint
+            axis, point = self._axis(index, screw)
+            for mass, place, weight in zip(masses, places, weights, strict=True):
+                if not self.posture.chain.carries(index, mass.frame):
+                    continue
+                motion = _cross(axis, (place - point) / 1e3) if screw.turns else axis
+                total += coefficient * np.sum(motion * weight, axis=1)
+        return total
+
+    def beam(self, row: int) -> Beam:
+        """Beam of a row's driven length `a`, with the loads on it."""
+        screws = self.posture.chain.screws
+        index = next(i for i, s in enumerate(screws) if s.row == row and not s.turns)
+        axis, root = self.posture.axis(index)
+        before = self.posture.shifts_mm[screws[index].before]
+        carried = self.posture.shifts_mm[index + 1] - before  # pure translation along the axis
+        length_mm = self.constants[row - 1].a + np.sum(carried * axis, axis=1)
+        straight_tip = root + length_mm[:, None] * axis
+        # The bent tip: loads act where the beam has come to rest.
+        tip = straight_tip
+        for bend in self.bent:
+            if self._follows(row, bend.frame):
+                tip = _bent(bend, tip)
+        force, moment, own = np.zeros_like(tip), np.zeros_like(tip), np.zeros_like(tip)
+        for mass in self.masses:
+            weight = self._weight_newton(mass)
+            if self._follows(mass.frame, row):
+                force += weight
+                moment += _cross((self.place_mm(mass.frame, mass.place_mm) - tip) / 1e3, weight)
+            elif mass.frame == row - 1:
+                own += weight
+        return Beam(axis, length_mm / 1e3, straight_tip, force, moment, own)
+
+    def _axis(self, index: int, screw: Screw) -> tuple[Floats, Floats]:
+        axis, point = self.posture.axis(index)
+        point = point * (1.0 + self.growth)[:, None]
+        for bend in self.bent:
+            # A bend comes after its row's driven length and before its row's joint.
+            if self._follows(screw.row, bend.frame) and (screw.row != bend.frame or screw.turns):
+                axis = (rotation_by_vector(bend.rotation_vector) @ axis[:, :, None])[:, :, 0]
+                point = _bent(bend, point)
+        return axis, point
+
+    def _follows(self, frame: int, other: int) -> bool:
+        """True if a frame is another one or beyond it."""
+        return other in (0, *self.rig.path(frame))
+
+    def _weight_newton(self, mass: PointMass) -> Floats:
+        kg = np.full(len(self.growth), mass.kg)
+        if mass.is_payload and "payload_kg" in self.columns:
+            kg = self.column("payload_kg")
+        return kg[:, None] * self.gravity
+
+
+def _bent(bend: Bend, point: Floats) -> Floats:
+    turned = (rotation_by_vector(bend.rotation_vector) @ (point - bend.about_mm)[:, :, None])[:, :, 0]
+    moved: Floats = bend.about_mm + turned + bend.shift_mm
+    return moved
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    """(n, 3) cross products of rows, a few times quicker than NumPy's for three columns."""
+    ax, ay, az = a[:, 0], a[:, 1], a[:, 2]
+    bx, by, bz = b[:, 0], b[:, 1], b[:, 2]
+    return np.column_stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))

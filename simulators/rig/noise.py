@@ -1,0 +1,201 @@
+"""Noise as it occurs: growing with range, shared by a standstill, wandering, with outliers; coarse encoders."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.rig.description import Joint, Rig, Station
+
+Floats = NDArray[np.float64]
+
+ARCSEC = np.pi / 180 / 3600
+_LOG_OUTLIER_SIZES = float(np.log(8.0)), float(np.log(60.0))  # of their size over the noise
+
+
+@dataclass(frozen=True)
+class NoiseSettings:
+    """Settings of the measurement noise.
+
+    Attributes:
+        common_share: of the variance, common to all fixes of a standstill.
+        wander_share, wander_poses: of the variance, in an error that wanders from pose to pose (air, tripod), and over
+            how many poses it forgets.
+        outliers: share of the fixes that are 8 to 60 times the noise off.
+        misjudged: the stated sigma is wrong by a factor from 1 - this to 1 + this.
+        encoder_step_deg: encoders read in steps of this size, whatever the rig file says; 0 as the rig file says.
+        jitter_s: standard deviation of the instant at which joints are read, against that of the fix.
+    """
+
+    common_share: float = 0.2
+    wander_share: float = 0.05
+    wander_poses: float = 3.0
+    outliers: float = 0.015
+    misjudged: float = 0.05
+    encoder_step_deg: float = 0.0
+    jitter_s: float = 0.005
+
+
+@dataclass(frozen=True)
+class FixNoise:
+    """Noise of n fixes.
+
+    Attributes:
+        error_mm: (n, 3) measured minus true.
+        covariance_mm2: (n, 3, 3) of each fix, without outliers.
+        is_outlier: (n,).
+    """
+
+    error_mm: Floats
+    covariance_mm2: Floats
+    is_outlier: NDArray[np.bool_]
+
+    @property
+    def sigma_mm(self) -> Floats:
+        """(n, 3) standard deviation of each coordinate."""
+        return coordinate_sigma_mm(self.covariance_mm2)
+
+
+def draw_noise(
+    station: Station, true_mm: Floats, pose: NDArray[np.intp], settings: NoiseSettings, rng: np.random.Generator
+) -> FixNoise:
+    """Noise of fixes.
+
+    Args:
+        station: its random errors give the noise its shape and size.
+        true_mm: (n, 3) true places in the station's frame.
+        pose: (n,) number of the standstill, rising with the time.
+        settings: see there.
+        rng: source.
+
+    Raises:
+        ValueError: shares that are no shares, or a negative size.
+    """
+    _check(settings)
+    covariance = station_covariance_mm2(station, true_mm)
+    own = station_measured_mm(station, true_mm, rng) - true_mm
+    stands, first, which = np.unique(pose, return_index=True, return_inverse=True)
+    shared = (station_measured_mm(station, true_mm[first], rng) - true_mm[first])[which]
+    fresh = station_measured_mm(station, true_mm[first], rng) - true_mm[first]
+    keep = np.exp(-1.0 / settings.wander_poses)
+    wander = np.empty_like(fresh)
+    state = fresh[0]
+    for i in range(len(stands)):
+        state = fresh[i] if i == 0 else keep * state + np.sqrt(1.0 - keep**2) * fresh[i]
+        wander[i] = state
+    alone = 1.0 - settings.common_share - settings.wander_share
+    shift = np.sqrt(alone) * own + np.sqrt(settings.common_share) * shared
+    shift += np.sqrt(settings.wander_share) * wander[which]
+    is_outlier = rng.random(len(shift)) < settings.outliers
+    direction = rng.normal(size=shift.shape)
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    noise_mm = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+    off = np.exp(rng.uniform(*_LOG_OUTLIER_SIZES, len(shift))) * noise_mm
+    shift = np.where(is_outlier[:, None], direction * off[:, None], shift)
+    return FixNoise(shift, covariance, is_outlier)
+
+
+def read_joints(
+    rig: Rig,
+    joints: Mapping[str, Floats],
+    columns: Mapping[str, Floats],
+    settings: NoiseSettings,
+    rng: np.random.Generator,
+) -> dict[str, Floats]:
+    """Readings of encoders and transducers, taken a little before or after the fix.
+
+    Args:
+        rig: joints' sigma and resolution.
+        joints: joint name -> (n,) at the fix, deg or mm.
+        columns: `<joint>_rate` of each -> (n,).
+        settings: see there.
+        rng: source.
+    """
+    late_s = rng.normal(0.0, settings.jitter_s, len(next(iter(joints.values()))))
+    out = {}
+    for joint in rig.joints:
+        read = read_joint(joint, joints[joint.name] + columns[f"{joint.name}_rate"] * late_s, rng)
+        if joint.kind == "revolute" and settings.encoder_step_deg > 0.0:
+            read = np.rint(read / settings.encoder_step_deg) * settings.encoder_step_deg
+        out[joint.name] = read
+    return out
+
+
+def _check(settings: NoiseSettings) -> None:
+    shares = settings.common_share, settings.wander_share, settings.outliers, settings.misjudged
+    if min(shares) < 0.0 or settings.common_share + settings.wander_share > 1.0 or settings.outliers > 1.0:
+        raise ValueError("shares of noise are from 0 to 1, those of the variance together at most 1")
+    if min(settings.encoder_step_deg, settings.jitter_s) < 0.0 or settings.wander_poses <= 0.0:
+        raise ValueError("sizes of noise are not negative, and a wander lasts more than 0 poses")
+
+
+def read_joint(joint: Joint, values: Floats, rng: np.random.Generator) -> Floats:
+    """(n,) readings of true values by an encoder or transducer, deg or mm: with random error, in whole steps."""
+    noisy = values + rng.normal(0, joint.sigma, len(values))
+    if joint.resolution == 0.0:
+        return noisy
+    return np.rint(noisy / joint.resolution) * joint.resolution
+
+
+@dataclass(frozen=True)
+class _Sighted:
+    """Positions as a total station in the origin measures them, and the spread of each of its measurements."""
+
+    hz: Floats
+    zenith: Floats
+    range_mm: Floats
+    level_mm: Floats
+    sigma_angle: float
+    sigma_range_mm: Floats
+
+
+def _sighted(station: Station, true_mm: Floats) -> _Sighted:
+    x, y, z = true_mm.T
+    level_mm = np.hypot(x, y)
+    range_mm = np.maximum(np.hypot(level_mm, z), 1.0)
+    return _Sighted(
+        hz=np.arctan2(x, y),
+        zenith=np.arctan2(level_mm, z),
+        range_mm=range_mm,
+        level_mm=level_mm,
+        sigma_angle=station.angle_sigma_arcsec * ARCSEC,
+        sigma_range_mm=station.distance_sigma_mm + station.distance_sigma_ppm * 1e-6 * range_mm,
+    )
+
+
+def _position(hz: Floats, zenith: Floats, range_: Floats | float) -> Floats:
+    """(n, 3) positions at a direction and range."""
+    sideways = range_ * np.sin(zenith)
+    return np.column_stack([sideways * np.sin(hz), sideways * np.cos(hz), range_ * np.cos(zenith)])
+
+
+def station_covariance_mm2(station: Station, true_mm: Floats) -> Floats:
+    """(n, 3, 3) of the noise of positions (n, 3): a total station's range errs more than its circles do, or less."""
+    sighted = _sighted(station, true_mm)
+    # Directions of growing range, horizontal circle and zenith angle, each with its own spread.
+    along = _position(sighted.hz, sighted.zenith, 1.0)
+    round_about = np.column_stack([np.cos(sighted.hz), -np.sin(sighted.hz), np.zeros(len(true_mm))])
+    downward = np.cross(round_about, along)
+    across_mm = sighted.sigma_angle * np.stack([sighted.level_mm, sighted.range_mm], axis=1)
+    spread = np.column_stack([sighted.sigma_range_mm, across_mm])
+    root = np.stack([along, round_about, downward], axis=2) * spread[:, None]
+    covariance: Floats = root @ root.transpose(0, 2, 1) + station.target_sigma_mm**2 * np.eye(3)
+    return covariance
+
+
+def coordinate_sigma_mm(covariance_mm2: Floats) -> Floats:
+    """(n, 3) standard deviation of each coordinate, of covariances (n, 3, 3)."""
+    sigma_mm: Floats = np.sqrt(np.diagonal(covariance_mm2, axis1=1, axis2=2))
+    return sigma_mm
+
+
+def station_measured_mm(station: Station, true_mm: Floats, rng: np.random.Generator) -> Floats:
+    """(n, 3) positions (n, 3) as a total station in the origin measures them, with its random errors."""
+    sighted, n = _sighted(station, true_mm), len(true_mm)
+    hz, zenith = (a + rng.normal(0, sighted.sigma_angle, n) for a in (sighted.hz, sighted.zenith))
+    range_mm = sighted.range_mm + rng.normal(0, 1.0, n) * sighted.sigma_range_mm
+    shake_mm = rng.normal(0, 1.0, true_mm.shape) * station.target_sigma_mm
+    return _position(hz, zenith, range_mm) + shake_mm

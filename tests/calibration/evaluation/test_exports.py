@@ -1,0 +1,138 @@
+"""A model for other programs: what it says, and how well its grid stands for it."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration.effects.context import EffectContext
+from calibration.effects.fitted import Choice
+from calibration.effects.library import library, parse_effects
+from calibration.errors import DataError
+from calibration.evaluation import export as folder
+from calibration.evaluation.correction_grid import correction_grid, interpolated
+from calibration.evaluation.export import export_files, formats
+from calibration.evaluation.export.calibration_json import document
+from calibration.evaluation.exports import Export
+from calibration.kinematics.chain import Chain, Placement
+from calibration.model.model import CalibratedModel
+from calibration.model.prediction import Predictor
+from calibration.observations import Observations
+from tests.calibration.conftest import Session, rms
+
+
+def test_the_document_holds_every_parameter_with_its_unit_and_error(session: Session) -> None:
+    told = json.loads(json.dumps(document(session.model), allow_nan=False))
+    parameters = {p["name"]: p for p in told["parameters"]}
+    assert len(parameters) == sum(p.kind != "base" for p in session.model.parameters)
+    length = parameters["row5.a"]
+    assert (length["unit"], length["nominal"]) == ("mm", 5000.0)
+    assert length["value"] == pytest.approx(length["nominal"] + length["correction"])
+    assert 0.0 < length["standard_error"] < 6.0
+    assert told["provenance"]["data_sha256"] == session.model.provenance["data_sha256"]
+    assert told["expected_accuracy"]["rms_mm"] > 0.0
+
+
+def test_the_documents_parameters_and_base_are_the_models_kinematics(session: Session) -> None:
+    """Whoever puts the values of the document into the row convention gets the model's positions."""
+    told = json.loads(json.dumps(document(session.model)))
+    (base,) = told["bases"]
+    chain = Chain(session.rig, {"": Placement(np.array(base["rotation"]), np.array(base["translation_mm"]))})
+    corrections = {p["name"]: p["correction"] for p in told["parameters"]}
+    x = np.array([corrections.get(p.name, 0.0) for p in chain.parameters])
+    rows = session.held_out.select(np.arange(20))
+    np.testing.assert_allclose(
+        chain.positions_mm(x, chain.bind(rows)), Predictor.of(session.model).geometric_mm(rows), rtol=0, atol=1e-6
+    )
+
+
+def test_the_grid_interpolated_linearly_is_close_to_the_model(session: Session) -> None:
+    grid = correction_grid(session.model, ("r",), 20_000, np.random.default_rng(0))
+    assert len(grid.readings) <= 20_000
+    size = rms(grid.corrected_mm["r"] - grid.nominal_mm["r"])
+    assert grid.rms_mm < 0.15 * size, "what is left of the correction by drawings alone"
+    coarse = correction_grid(session.model, ("r",), 2_000, np.random.default_rng(0))
+    assert grid.rms_mm < 0.7 * coarse.rms_mm, "more nodes come closer"
+    correction_mm = grid.corrected_mm["r"] - grid.nominal_mm["r"]
+    at_nodes = interpolated(grid.nodes, correction_mm, grid.readings[::977])
+    np.testing.assert_allclose(at_nodes, correction_mm[::977], atol=1e-9)
+
+
+def model_with(session: Session, effects: str) -> CalibratedModel:
+    """The session's model with effects of their plausible sizes."""
+    model, rows = session.model, session.held_out
+    situation = EffectContext(model.chain, model.values, replace(rows, extra={"time_s": np.arange(len(rows)) * 10.0}))
+    found = []
+    for name, where in parse_effects(effects, session.rig):
+        family = library()[name]
+        settings = family.variants(situation, where)[-1]
+        sigma = np.array([c.sigma for c in family.coefficients(situation, where, settings)])
+        found.append(Choice(name, where, settings).fitted(situation, sigma, 0.1 * sigma))
+    covariance = np.zeros((len(model.values) + sum(len(effect.coefficients) for effect in found),) * 2)
+    return replace(model, effects=tuple(found), covariance=covariance)
+
+
+def test_what_fixes_err_by_and_how_the_base_moved_is_not_in_the_grid(session: Session) -> None:
+    erring = model_with(session, "prism_constant@station,station_scale@station,base_settlement@base")
+    wanted, found = (correction_grid(model, ("r",), 512, np.random.default_rng(0)) for model in (session.model, erring))
+    np.testing.assert_allclose(found.corrected_mm["r"], wanted.corrected_mm["r"], rtol=0.0, atol=1e-6)
+
+
+def test_the_grid_is_of_the_machine_after_all_that_jumped_and_says_what_it_lacks(session: Session) -> None:
+    jumped = model_with(session, "transducer_index_jump@L2")
+    grid = correction_grid(jumped, ("r",), 512, np.random.default_rng(0))
+    jump_mm = jumped.effects[0].coefficients[0].value
+    n = len(grid.readings)
+    joints = dict(zip(session.rig.joint_names, grid.readings.T, strict=True))
+    joints["L2"] = joints["L2"] + jump_mm
+    empty, nothing = np.full(n, ""), np.full((n, 3), np.nan)
+    true = Predictor.of(session.model).base_mm(
+        Observations(np.full(n, "r"), joints, nothing, nothing, empty, empty, empty)
+    )
+    np.testing.assert_allclose(grid.corrected_mm["r"], true, rtol=0.0, atol=1e-6)
+    assert grid.left_out == ()
+    lacking = correction_grid(model_with(session, "backlash@theta4"), ("r",), 512, np.random.default_rng(0))
+    assert lacking.left_out == ("backlash@theta4 is left out: this data lacks the column theta4_dir",)
+
+
+def test_nodes_span_what_the_model_was_trained_on_and_joints_that_matter_get_more(session: Session) -> None:
+    grid = correction_grid(session.model, ("w",), 2_000, np.random.default_rng(0))
+    for name, nodes in grid.nodes.items():
+        assert (nodes[0], nodes[-1]) == session.model.coverage.ranges[name]
+        assert (np.diff(nodes) > 0).all()
+    assert {name for name, nodes in grid.nodes.items() if len(nodes) > 2} == {"theta1", "theta3"}, "all that moves w"
+    assert 0.5 < grid.reachable.mean() <= 1.0
+
+
+def test_a_joint_that_stood_still_in_training_has_nodes_around_its_place(session: Session) -> None:
+    ranges = dict(session.model.coverage.ranges) | {"L2": (700.0, 700.0)}
+    model = replace(session.model, coverage=replace(session.model.coverage, ranges=ranges))
+    assert correction_grid(model, ("r",), 600, np.random.default_rng(0)).nodes["L2"].tolist() == [699.5, 700.5]
+
+
+def test_what_makes_no_grid_is_refused(session: Session) -> None:
+    with pytest.raises(DataError, match="no prism 'x'"):
+        correction_grid(session.model, ("x",), 2_000, np.random.default_rng(0))
+    with pytest.raises(DataError, match="make 512 poses"):
+        correction_grid(session.model, ("r",), 511, np.random.default_rng(0))
+
+
+PARAMETERS_TXT = """
+from calibration.evaluation.exports import Export, Format
+
+FORMAT = Format("parameters.txt", lambda export: "\\n".join(p.name for p in export.model.parameters).encode())
+"""
+
+
+def test_a_new_format_is_one_new_file(session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "parameters_txt.py").write_text(PARAMETERS_TXT)
+    monkeypatch.setattr(folder, "__path__", [*folder.__path__, str(tmp_path)])
+    assert list(formats()) == ["calibration_json", "corrections_csv", "parameters_txt"]
+    files = export_files(Export(session.model, "0" * 64, ("r",), 512))
+    assert list(files) == ["calibration.json", "corrections.csv", "parameters.txt"]
+    assert files["parameters.txt"].decode().split("\n") == [p.name for p in session.model.parameters]
+    assert export_files(Export(session.model, ""), "parameters_txt") == {"parameters.txt": files["parameters.txt"]}
+    with pytest.raises(DataError, match="'parquet' is unknown; there are calibration_json"):
+        export_files(Export(session.model, ""), "parquet")

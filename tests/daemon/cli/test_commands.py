@@ -1,0 +1,62 @@
+"""Commands are found in their folder, and start without what they do not use."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from daemon.cli import commands
+from daemon.cli.main import main
+from tests.daemon.idle_daemon import idle_daemon
+
+HEAVY = ("numpy", "scipy", "pydantic", "rich", "matplotlib", "numba", "lightgbm")
+NEW = '''
+import click
+
+
+@click.command()
+def hello() -> None:
+    """Greet."""
+    click.echo("hello there")
+'''
+
+
+def heavy_modules(*arguments: str) -> list[str]:
+    """Names of heavy packages that are loaded when a command has ended well."""
+    code = (
+        "import sys\n"
+        "from daemon.cli.main import main\n"
+        "try:\n    main()\n"
+        "except SystemExit as end:\n    assert not end.code\n"
+        f"print([name for name in {HEAVY} if name in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True)
+    found: list[str] = ast.literal_eval(done.stderr.splitlines()[-1])
+    return found
+
+
+def test_a_new_file_in_the_folder_is_a_new_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "hello.py").write_text(NEW, encoding="utf-8")
+    monkeypatch.setattr(commands, "__path__", [*commands.__path__, str(tmp_path)])
+    assert "hello      Greet." in CliRunner().invoke(main, ["--help"]).stdout
+    assert CliRunner().invoke(main, ["hello"]).stdout == "hello there\n"
+
+
+def test_no_command_uses_another_commands_module() -> None:
+    for path in Path(commands.__path__[0]).glob("*.py"):
+        assert "daemon.cli.commands" not in path.read_text(encoding="utf-8"), path
+
+
+def test_help_loads_nothing_heavy() -> None:
+    assert heavy_modules("--help") == []
+
+
+def test_the_state_of_a_running_daemon_is_shown_with_nothing_heavy_loaded(tmp_path: Path) -> None:
+    with idle_daemon(tmp_path) as config:
+        for command in (["status", "--frames"], ["alarms"], ["session", "list"]):
+            assert heavy_modules(*command, "--socket", str(config.socket_path)) == []

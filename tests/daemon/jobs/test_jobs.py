@@ -1,0 +1,634 @@
+"""The job runner, on a real store and with real processes."""
+
+import itertools
+import json
+import resource
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from sqlite_utils import Database
+
+from daemon.commands import CommandError
+from daemon.jobs.child import JobChild
+from daemon.jobs.job_queue import JobQueue
+from daemon.jobs.order import Order, Outcome, Progress, parse_message
+from daemon.jobs.process import perform
+from daemon.jobs.scheduler import CHAIN, next_job
+from daemon.models.model_files import model_sha256, read_model
+from daemon.store.errors import NotInStoreError
+from daemon.store.migrations import MIGRATIONS
+from drivers.clock import NS_PER_S, Stamp
+from tests.daemon.job_support import JobRig, is_gone
+
+
+def table(rig: JobRig) -> JobQueue:
+    """The table, with a chain queued for one session, and nobody to run it."""
+    rig.session("a")
+    rig.plan(gap="hang")
+    rig.start()
+    rig.running(1)
+    rig.stop()
+    rig.store.update("jobs", {"id": 1}, {"state": "queued", "attempts": 0})
+    return JobQueue(rig.store, "swdt82", rig.clock)
+
+
+def insert(db: Database, name: str, *rows: dict[str, Any]) -> None:
+    """Rows straight into a table: fast, and into schemas of the past."""
+    marks = ", ".join(f":{column}" for column in rows[0])
+    db.conn.executemany(f"INSERT INTO {name} ({', '.join(rows[0])}) VALUES ({marks})", rows)
+
+
+# ---- with the real work ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_chain_runs_in_order_and_leaves_its_models_and_report(rig: JobRig) -> None:
+    rig.measured("a", 20, prisms=["r", "s"])
+    rig.measured("c", 4, kind="check", prisms=["r", "s"])
+    rig.start(real=True)
+    rig.wait_for("done", "done", "done", "done")
+    jobs = rig.jobs()
+    assert [job["kind"] for job in jobs] == ["gap", "residual", "report", "comparison"]
+    assert all(job["progress"] == 1.0 and job["pid"] is None and job["attempts"] == 1 for job in jobs)
+    assert all(a["ended_monotonic_ns"] <= b["started_monotonic_ns"] for a, b in itertools.pairwise(jobs))
+    models = rig.store.rows("SELECT * FROM models ORDER BY id")
+    assert [(m["job_id"], m["rig"], m["stage"], m["state"]) for m in models] == [
+        (1, "swdt82", "geometric", "candidate"),
+        (2, "swdt82", "hybrid", "candidate"),
+    ]
+    assert [m["manifest_sha256"] for m in models] == [model_sha256(Path(m["path"])) for m in models]
+    assert json.loads(models[0]["metrics_json"])["noise_mm"] > 0
+    assert rig.runner is not None
+    report = rig.runner.list_command({})[2]
+    assert "result_json" not in report
+    assert report["result"]["held_out"]
+    assert report["result"]["sessions"] == ["a"]
+    assert Path(report["result"]["report"]).stat().st_size > 10_000
+    stages = {s["stage"]: s["rms_mm"] for s in report["result"]["evaluation"]["stages"]}
+    assert stages["geometric"] < stages["nominal"] / 2
+    compared = json.loads(models[1]["metrics_json"])["comparison"]
+    assert (compared["live"], compared["sessions"], compared["is_better"]) == (None, ["c"], True)
+
+
+def test_a_job_goes_on_from_the_checkpoint_of_its_number_and_leaves_none(rig: JobRig) -> None:
+    rig.measured("a", 20, prisms=["r", "s"])
+    for row in rig.store.rows("SELECT id, z_mm FROM observations"):  # misfit enough for a global search
+        rig.store.update("observations", {"id": row["id"]}, {"z_mm": row["z_mm"] + (15.0 if row["id"] % 3 else -15.0)})
+    checkpoint = rig.config.models_directory / "00001.checkpoint"
+    checkpoint.parent.mkdir(parents=True)
+    checkpoint.write_bytes(b"no state of a search")
+    order = Order("gap", 1, str(rig.config.store_path), str(checkpoint.parent), ("a",), 0)
+    result = perform(order, lambda share, text: None)
+    assert "the checkpoint cannot be read, so the search began anew" in read_model(Path(result["model"])).warnings
+    assert not checkpoint.exists()
+
+
+def test_data_that_determine_nothing_fail_in_a_sentence_whatever_lies_in_the_current_directory(
+    rig: JobRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "numpy.py").write_text("raise SystemExit('code that is not ours')", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    rig.session("a")
+    rig.start(real=True)
+    rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
+    first, *waiting = rig.jobs()
+    assert "sessions a" in first["error"]
+    assert [job["error"] for job in waiting] == ["it needs job 1, which has failed"] * 3
+    assert first["result_json"] is None
+    assert rig.store.rows("SELECT * FROM models") == []
+
+
+def test_a_fault_inside_a_job_is_its_error(rig: JobRig) -> None:
+    order = Order("no such kind", 1, str(rig.config.store_path), "models", (), 0)
+    with JobChild(order) as child:
+        message = child.next_message(60.0)
+    assert message == Outcome("failed", "KeyError: 'no such kind'; the daemon's log has the whole story")
+    assert is_gone(child.pid)
+
+
+# ---- what becomes of a job -------------------------------------------------------------------------------------------
+
+
+def test_a_failed_job_cancels_those_that_wait_for_it_and_says_why(rig: JobRig) -> None:
+    rig.session("a")
+    rig.plan(residual="fail")
+    rig.start()
+    rig.wait_for("done", "failed", "cancelled", "cancelled")
+    assert [job["error"] for job in rig.jobs()] == [
+        None,
+        "the data are too poor",
+        *["it needs job 2, which has failed"] * 2,
+    ]
+    assert {job["message"] for job in rig.jobs()} == {""}, "what an ended job was doing is no news"
+
+
+@pytest.mark.parametrize(("kind", "other"), [("report", "comparison"), ("comparison", "report")])
+def test_a_report_that_fails_keeps_no_comparison_from_running_nor_the_other_way_round(
+    rig: JobRig, kind: str, other: str
+) -> None:
+    rig.session("a")
+    rig.plan(**{kind: "fail"})
+    rig.start()
+    rig.wait(lambda: len(rig.states()) == 4 and not set(rig.states()) & {"queued", "running"})
+    ended = {job["kind"]: job["state"] for job in rig.jobs()}
+    assert ended == {"gap": "done", "residual": "done", kind: "failed", other: "done"}
+    rig.plan()
+    rig.session("c", kind="check")
+    rig.clock.advance(3.0)
+    rig.wait(lambda: rig.states()[4:] == ["done", "done"], "the checks")
+
+
+@pytest.mark.parametrize(
+    ("what", "error"),
+    [
+        ("garbage", "its process said 'Segmentation fault', which is no message of a job"),
+        ("mute", "its process ended with status 7 and no result"),
+        ("killed", "its process was killed by signal 9 (Killed)"),
+    ],
+)
+def test_a_process_that_breaks_the_protocol_is_a_failed_job(rig: JobRig, what: str, error: str) -> None:
+    rig.session("a")
+    rig.plan(gap=what)
+    rig.start()
+    rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
+    assert rig.job(1)["error"].startswith(error)
+    assert rig.job(1)["pid"] is None
+
+
+def test_a_process_that_closes_its_output_and_lives_on_is_ended(rig: JobRig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("daemon.jobs.child.END_TIMEOUT_S", 0.3)
+    rig.session("a")
+    rig.plan(gap="closed")
+    rig.start()
+    pid = rig.running(1)["pid"]
+    rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
+    assert rig.job(1)["error"] == "its process closed its output without a result"
+    assert is_gone(pid)
+
+
+def test_a_job_that_takes_too_long_is_ended_with_all_that_it_started(tmp_path: Path) -> None:
+    rig = JobRig(tmp_path, time_limit_s=1.5)
+    try:
+        rig.session("a")
+        rig.plan(gap="deaf")
+        rig.start()
+        rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
+        job = rig.job(1)
+        assert job["error"] == "took longer than its limit of 1.5 s ([jobs] time_limit_s)"
+        assert job["time_limit_s"] == 1.5
+        child = int((tmp_path / "child").read_text(encoding="utf-8"))
+        rig.wait(lambda: is_gone(child), "the job's own child to end")
+    finally:
+        rig.close()
+
+
+def test_a_command_that_cannot_be_started_is_tried_as_often_as_allowed(tmp_path: Path) -> None:
+    rig = JobRig(tmp_path, max_attempts=2)
+    try:
+        rig.session("a")
+        runner = rig.start(command=["/nowhere/python"])
+        rig.wait_for("interrupted", "queued", "queued", "queued")
+        assert [job["state"] for job in runner.list_command({})] == ["interrupted", "queued", "queued", "queued"]
+        rig.clock.advance(6.0)
+        rig.wait(lambda: rig.job(1)["attempts"] == 2, "a second attempt")
+        rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
+        assert rig.job(1)["error"].startswith("interrupted 2 times, as often as [jobs] max_attempts allows")
+        assert "queued" not in rig.states()
+    finally:
+        rig.close()
+
+
+# ---- the operator ----------------------------------------------------------------------------------------------------
+
+
+def test_a_running_job_is_cancelled_with_its_process_and_those_that_wait(rig: JobRig) -> None:
+    rig.session("a")
+    rig.plan(gap="hang")
+    runner = rig.start()
+    job = rig.running(1)
+    assert job["progress"] == 0.25
+    assert runner.cancel_command({"id": 1}) == "job 1 (gap) is being cancelled"
+    rig.wait_for("cancelled", "cancelled", "cancelled", "cancelled")
+    assert is_gone(job["pid"])
+    assert [j["error"] for j in rig.jobs()] == [
+        "cancelled by the operator",
+        *["it needs job 1, which was cancelled"] * 3,
+    ]
+
+
+def test_a_queued_job_is_cancelled_and_the_one_before_it_runs_on(rig: JobRig) -> None:
+    rig.session("a")
+    rig.plan(gap="hang")
+    runner = rig.start()
+    rig.running(1)
+    assert runner.cancel_command({"id": 2}) == "job 2 (residual) is cancelled"
+    assert rig.states() == ["running", "cancelled", "cancelled", "cancelled"]
+    assert rig.job(3)["error"] == "it needs job 2, which was cancelled"
+    runner.cancel_command({"id": 1})
+    rig.wait_for("cancelled", "cancelled", "cancelled", "cancelled")
+    assert rig.job(2)["error"] == "cancelled by the operator"
+
+
+def test_a_job_cancelled_between_choice_and_start_does_not_start(rig: JobRig) -> None:
+    jobs = table(rig)
+    chosen = next_job(jobs.state())
+    assert chosen is not None
+    jobs.cancel(1)
+    assert not jobs.begin(chosen, 60.0)
+    assert rig.states() == ["cancelled", "cancelled", "cancelled", "cancelled"]
+
+
+def test_a_cancellation_goes_before_a_result_that_comes_at_the_same_time(rig: JobRig) -> None:
+    jobs = table(rig)
+    chosen = next_job(jobs.state())
+    assert chosen is not None
+    assert jobs.begin(chosen, 60.0)
+    jobs.cancel(1)
+    assert jobs.end(1, Outcome("done", result={"model": "m"})).state == "cancelled"
+    assert rig.states() == ["cancelled", "cancelled", "cancelled", "cancelled"]
+    jobs.retry(1)
+    again = next_job(jobs.state())
+    assert again is not None
+    assert jobs.begin(again, 60.0)
+    assert not jobs.is_cancelled(1)
+
+
+def test_a_cancellation_after_the_end_is_refused_and_forgotten(rig: JobRig) -> None:
+    jobs = table(rig)
+    chosen = next_job(jobs.state())
+    assert chosen is not None
+    jobs.begin(chosen, 60.0)
+    jobs.end(1, Outcome("failed", "the data are too poor"))
+    with pytest.raises(CommandError, match="job 1 is failed; only one that has not ended can be cancelled"):
+        jobs.cancel(1)
+    assert not jobs.is_cancelled(1)
+
+
+def test_a_retried_job_runs_again_with_those_that_waited_and_shows_no_old_error(rig: JobRig) -> None:
+    rig.session("a")
+    rig.plan(gap="fail")
+    runner = rig.start()
+    rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
+    rig.plan(gap="hang")
+    assert runner.retry_command({"id": 1}) == "job 1 (gap) is queued again"
+    job = rig.running(1)
+    assert (job["error"], job["ended_utc_ns"], job["attempts"]) == (None, None, 1)
+    runner.cancel_command({"id": 1})
+    rig.wait_for("cancelled", "cancelled", "cancelled", "cancelled")
+    rig.plan()
+    runner.retry_command({"id": 1})
+    rig.wait_for("done", "done", "done", "done")
+    assert [job["error"] for job in rig.jobs()] == [None] * 4
+
+
+def test_what_makes_no_sense_is_refused_in_a_sentence(rig: JobRig) -> None:
+    rig.session("a")
+    rig.plan(residual="fail")
+    runner = rig.start()
+    rig.wait_for("done", "failed", "cancelled", "cancelled")
+    for command, number, why in (
+        (runner.retry_command, 1, "job 1 is done; only one that did not end well can be retried"),
+        (runner.cancel_command, 1, "job 1 is done"),
+        (runner.retry_command, 3, "job 3 waits for job 2, which is failed; retry that one"),
+        (runner.cancel_command, 99, "there is no job 99"),
+        (runner.retry_command, "1", "there is no job '1'"),
+    ):
+        with pytest.raises((CommandError, NotInStoreError), match=why):
+            command({"id": number})
+
+
+# ---- stops and starts ------------------------------------------------------------------------------------------------
+
+
+def test_a_job_that_stops_interrupt_is_offered_again_however_often_that_was(tmp_path: Path) -> None:
+    rig = JobRig(tmp_path, max_attempts=2)
+    try:
+        rig.session("a")
+        rig.plan(gap="hang")
+        for _ in range(3):
+            rig.start()
+            job = rig.running(1)
+            assert (job["attempts"], job["error"]) == (1, None)
+            rig.stop()
+            assert rig.states() == ["interrupted", "queued", "queued", "queued"]
+            assert (rig.job(1)["attempts"], rig.job(1)["error"]) == (0, "the daemon was stopped")
+            assert is_gone(job["pid"])
+        rig.plan()
+        rig.start()
+        rig.wait_for("done", "done", "done", "done")
+    finally:
+        rig.close()
+
+
+def cut_off(rig: JobRig) -> None:
+    """The job that runs is left running in the store, as a power cut or a kill leaves it."""
+    running = rig.running(1)
+    rig.stop()
+    left = {name: running[name] for name in ("state", "attempts", "host_boot", "interruptions", "pid")}
+    rig.store.update("jobs", {"id": 1}, left)
+
+
+def test_power_cuts_are_no_attempts_of_the_job_that_they_interrupt(tmp_path: Path) -> None:
+    rig = JobRig(tmp_path, max_attempts=2)
+    try:
+        rig.store.begin_run(rig.clock.now())
+        rig.session("a")
+        rig.plan(gap="hang")
+        for cuts in range(5):
+            rig.start(boot=f"boot-{cuts}")
+            rig.clock.advance(200.0)
+            assert rig.running(1)["attempts"] == 1
+            cut_off(rig)
+            rig.store.begin_run(rig.clock.now())  # the run before did not end in order
+        rig.plan()
+        rig.start(boot="the last one")
+        rig.clock.advance(200.0)
+        rig.wait_for("done", "done", "done", "done")
+        assert (rig.job(1)["attempts"], rig.job(1)["interruptions"]) == (1, 5)
+    finally:
+        rig.close()
+
+
+def test_a_job_in_which_the_daemon_was_killed_has_used_an_attempt(tmp_path: Path) -> None:
+    rig = JobRig(tmp_path, max_attempts=2)
+    try:
+        rig.store.begin_run(rig.clock.now())
+        rig.session("a")
+        rig.plan(gap="hang")
+        for attempt in (1, 2):
+            rig.start()
+            rig.clock.advance(200.0)
+            assert rig.running(1)["attempts"] == attempt
+            cut_off(rig)
+            rig.store.begin_run(rig.clock.now())
+        rig.start()
+        rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
+        assert rig.job(1)["error"].startswith("interrupted 2 times")
+    finally:
+        rig.close()
+
+
+def test_a_job_that_an_orderly_stop_had_no_time_to_write_down_has_used_no_attempt(rig: JobRig) -> None:
+    rig.store.begin_run(rig.clock.now())
+    rig.session("a")
+    rig.plan(gap="hang")
+    rig.start()
+    cut_off(rig)
+    rig.store.end_run(rig.clock.now())
+    rig.store.begin_run(rig.clock.now())
+    JobQueue(rig.store, "swdt82", rig.clock).interrupt_left_over("boot-a")
+    assert (rig.states()[0], rig.job(1)["attempts"]) == ("interrupted", 0)
+
+
+def test_a_job_whose_restarts_never_end_is_given_up_and_can_be_retried(rig: JobRig) -> None:
+    jobs = table(rig)
+    rig.store.update("jobs", {"id": 1}, {"state": "interrupted", "interruptions": 20})
+    rig.start()
+    rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
+    assert rig.job(1)["error"].startswith("cut off 20 times by what is not its own fault")
+    rig.stop()
+    jobs.retry(1)
+    assert rig.job(1)["interruptions"] == 0
+
+
+def test_a_result_that_the_store_refuses_is_no_attempt(rig: JobRig) -> None:
+    rig.session("a")
+    with rig.store.transaction() as db:
+        refuse = "BEGIN SELECT RAISE(ABORT, 'database or disk is full'); END"
+        db.execute(f"CREATE TRIGGER full BEFORE UPDATE ON jobs WHEN NEW.state = 'done' {refuse}")
+    rig.start()
+    rig.wait_for("interrupted", "queued", "queued", "queued")
+    assert (rig.job(1)["attempts"], rig.job(1)["interruptions"]) == (0, 1)
+    with rig.store.transaction() as db:
+        db.execute("DROP TRIGGER full")
+    rig.clock.advance(6.0)
+    rig.wait_for("done", "done", "done", "done")
+
+
+def test_an_interrupted_job_waits_before_it_runs_again_and_can_be_cancelled_meanwhile(rig: JobRig) -> None:
+    rig.session("a")
+    rig.plan(gap="hang")
+    rig.start()
+    rig.running(1)
+    rig.stop()
+    ended = rig.store.instant(rig.clock.now().shifted(100 * NS_PER_S), "ended_")
+    rig.store.update("jobs", {"id": 1}, {**ended, "attempts": 1})  # as after a kill
+    runner = rig.start()
+    rig.look_on()
+    assert rig.states() == ["interrupted", "queued", "queued", "queued"]
+    assert runner.cancel_command({"id": 1}) == "job 1 (gap) is cancelled"
+    assert rig.states() == ["cancelled", "cancelled", "cancelled", "cancelled"]
+
+
+def test_nothing_starts_while_a_session_is_open(rig: JobRig) -> None:
+    rig.session("a")
+    rig.session("b", state="open")
+    rig.start()
+    rig.look_on()
+    assert rig.jobs() == []
+    rig.close_session("b")
+    rig.clock.advance(3.0)
+    rig.wait_for("done", "done", "done", "done")
+    assert rig.orders()[0]["session_ids"] == ["a", "b"]
+
+
+def test_queued_jobs_wait_while_a_session_is_open(rig: JobRig) -> None:
+    rig.session("a")
+    rig.plan(gap="hang")
+    runner = rig.start()
+    rig.running(1)
+    rig.session("b", state="open")
+    rig.plan()
+    runner.cancel_command({"id": 1})
+    rig.wait_for("cancelled", "cancelled", "cancelled", "cancelled")
+    runner.retry_command({"id": 1})
+    rig.look_on()
+    assert rig.states() == ["queued", "queued", "queued", "queued"]
+
+
+# ---- which sessions are worked on ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("hours", [-1000, 1000])
+def test_a_wall_clock_that_is_wrong_after_a_reboot_changes_nothing(rig: JobRig, hours: int) -> None:
+    """Neither sessions before nor after it are worked on twice, or not at all."""
+    rig.session("a")
+    rig.start()
+    rig.wait_for("done", "done", "done", "done")
+    rig.stop()
+    rig.clock.set(Stamp(rig.clock.now().utc_ns + hours * 3600 * NS_PER_S, 5 * NS_PER_S, "boot-b"))
+    rig.start()
+    rig.look_on()
+    assert rig.states() == ["done"] * 4
+    rig.session("b")
+    rig.clock.advance(3.0)
+    rig.wait_for(*["done"] * 8)
+    rig.look_on()
+    assert rig.states() == ["done"] * 8
+    assert rig.orders()[4]["session_ids"] == ["a", "b"]
+
+
+def test_a_session_closed_while_a_chain_runs_has_a_chain_of_its_own(rig: JobRig) -> None:
+    rig.session("a")
+    rig.plan(gap="hang")
+    runner = rig.start()
+    rig.running(1)
+    rig.session("c", kind="check")
+    rig.session("b")
+    rig.clock.advance(3.0)
+    rig.plan()
+    runner.cancel_command({"id": 1})
+    rig.wait_for(*["cancelled"] * 4, *["done"] * 4)
+    runner.retry_command({"id": 1})
+    rig.wait_for(*["done"] * 8)
+    told = [(o["job_id"], o["session_ids"], o["train_ids"]) for o in rig.orders() if o["kind"] == "report"]
+    assert told == [(7, ["c"], ["a", "b"]), (3, [], ["a"])], "a job works on the sessions it was queued for"
+
+
+def test_a_check_is_held_against_the_newest_model(rig: JobRig) -> None:
+    rig.session("c1", kind="check")
+    rig.start()
+    rig.look_on()
+    assert rig.jobs() == [], "there is no model yet"
+    rig.session("a")
+    rig.clock.advance(3.0)
+    rig.wait_for("done", "done", "done", "done")
+    rig.session("c2", kind="check")
+    rig.clock.advance(3.0)
+    rig.wait_for(*["done"] * 6)
+    for order, kind in zip(rig.orders()[-2:], ("report", "comparison"), strict=True):
+        assert (order["kind"], order["session_ids"], order["train_ids"]) == (kind, ["c1", "c2"], ["a"])
+        assert order["model"] == str(rig.directory / "2")
+
+
+def test_rigs_that_share_a_store_do_not_share_jobs_or_models(rig: JobRig) -> None:
+    rig.session("a")
+    rig.start()
+    rig.wait_for("done", "done", "done", "done")
+    rig.stop()
+    rig.session("x", kind="check", rig="ur10")
+    rig.start(rig="ur10")
+    rig.look_on()
+    assert len(rig.jobs()) == 4, "the model is another rig's"
+    rig.session("y", rig="ur10")
+    rig.clock.advance(3.0)
+    rig.wait_for(*["done"] * 8)
+    assert rig.orders()[4]["session_ids"] == ["y"]
+
+
+def test_jobs_of_an_older_store_keep_what_they_covered(tmp_path: Path) -> None:
+    """Before m005 a job's own session was all that told what it worked on."""
+    old = Database(tmp_path / "rigcal.sqlite")
+    MIGRATIONS.apply(old, stop_before="m005_jobs_cover_sessions")
+    instants = {
+        f"{prefix}_{name}": 1 for prefix in ("started", "ended") for name in ("utc_ns", "monotonic_ns", "boot_id")
+    }
+    with old.atomic():
+        insert(old, "boots", {"id": 1, "kernel_boot_id": "boot-0", "booted_utc_ns": 0})
+        session = {"id": "a", "rig": "swdt82", "rig_sha256": "", "rig_text": "", "prism": "r", "operator": ""}
+        insert(old, "calibration_sessions", {**session, "kind": "static_poses", "state": "closed", **instants})
+        job = {"kind": "identification", "session_id": "a", "state": "failed"}
+        insert(old, "jobs", {**job, "created_utc_ns": 1, "created_monotonic_ns": 1, "created_boot_id": 1})
+    old.close()
+    rig = JobRig(tmp_path)
+    try:
+        rig.start()
+        rig.look_on()
+        assert rig.states() == ["failed"]
+        assert rig.job(1)["kind"] == "gap", "what identification did is part of that job now"
+    finally:
+        rig.close()
+
+
+# ---- what it costs ---------------------------------------------------------------------------------------------------
+
+
+def test_looking_for_work_stays_cheap_after_years(rig: JobRig) -> None:
+    rig.session("s0")
+    (session,) = rig.store.rows("SELECT * FROM calibration_sessions")
+    job: dict[str, Any] = {
+        "kind": "",
+        "session_id": "",
+        "through_session_id": "",
+        "state": "done",
+        "result_json": json.dumps(["s"] * 500),
+    }
+    job.update(rig.store.instant(rig.clock.now(), "created_"))
+    sessions = [session | {"id": f"s{i}"} for i in range(1, 1000)]
+    jobs_done = [
+        job | {"kind": kind, "session_id": f"s{i}", "through_session_id": f"s{i}"}
+        for i in range(1000)
+        for kind in CHAIN
+    ]
+    with rig.store.transaction() as db:
+        for name, rows in (("calibration_sessions", sessions), ("jobs", jobs_done)):
+            insert(db, name, *rows)
+    jobs = JobQueue(rig.store, "swdt82", rig.clock)
+    jobs.state()
+    statements: list[str] = []
+    steps = 0
+
+    def count() -> int:
+        nonlocal steps
+        steps += 100
+        return 0
+
+    with rig.store.transaction() as db:
+        db.conn.set_trace_callback(statements.append)
+        db.conn.set_progress_handler(count, 100)  # of SQLite's virtual machine; unlike time it is always the same
+        jobs.state()
+        jobs.table.unfinished()
+        db.conn.set_progress_handler(None, 0)
+        db.conn.set_trace_callback(None)
+    assert len(statements) <= 7
+    assert not any("FROM boots" in statement for statement in statements)
+    assert steps < 15_000
+
+
+# ---- messages --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (b'{"progress": 1, "message": "x"}\n', Progress(1.0, "x")),
+        (b'{"progress": 1.0000001, "message": "x"}\n', Progress(1.0, "x")),
+        (b'{"progress": 1%b, "message": "x"}\n' % (b"0" * 400), Progress(1.0, "x")),
+        (b'{"result": {"model": null}}\n', Outcome("done", result={"model": None})),
+        (b'{"error": "too poor"}\n', Outcome("failed", "too poor")),
+    ],
+)
+def test_a_message_is_what_it_says(line: bytes, message: Progress | Outcome) -> None:
+    assert parse_message(line) == message
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.sampled_from(["progress", "message", "result", "error"]), inner),
+)
+
+
+@given(st.binary() | JSON.map(lambda value: json.dumps(value).encode()))
+def test_any_line_is_progress_or_an_end(line: bytes) -> None:
+    message: Any = parse_message(line)
+    if isinstance(message, Progress):
+        assert 0.0 <= message.share <= 1.0
+    else:
+        assert message.state == ("done" if message.result is not None else "failed")
+
+
+def test_a_daemon_without_a_descriptor_left_uses_up_no_attempt(rig: JobRig) -> None:
+    rig.session("a")
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))
+    try:
+        rig.start()
+        rig.wait_for("interrupted", "queued", "queued", "queued")
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    assert (rig.job(1)["attempts"], rig.job(1)["interruptions"]) == (0, 1)
+    rig.clock.advance(6.0)
+    rig.wait_for("done", "done", "done", "done")

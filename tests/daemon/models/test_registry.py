@@ -1,0 +1,439 @@
+"""Which model is live: what an operator may do, what is refused, and what is kept of it."""
+
+import contextlib
+import dataclasses
+import json
+import shutil
+import sqlite3
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NoReturn
+
+import pytest
+from sqlite_utils import Database
+
+from calibration.errors import ModelError
+from daemon.commands import REFUSED, WRONG_USE, CommandError
+from daemon.jobs.process import perform
+from daemon.jobs.runner import JobRunner
+from daemon.models.live_model import LiveModel, Loaded, Missing
+from daemon.store.errors import NotInStoreError
+from daemon.store.migrations import MIGRATIONS
+from daemon.store.models import ModelRow, ModelTable
+from drivers.clock import NS_PER_S, Stamp
+from drivers.readings import DeviceEvent, EventKind
+from tests.daemon.job_support import SOURCE, JobRig
+from tests.daemon.model_support import PRISMS, ModelRig, wait
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[ModelRig]:
+    rig = ModelRig(tmp_path)
+    yield rig
+    rig.close()
+
+
+def states(rig: ModelRig) -> dict[int, str]:
+    return {model.id: model.state for model in rig.models.all()}
+
+
+def refusal(command: object, status: int, **arguments: object) -> str:
+    with pytest.raises((CommandError, NotInStoreError)) as caught:
+        command(arguments)  # type: ignore[operator]  # any of the registry's commands
+    assert getattr(caught.value, "status", WRONG_USE) == status
+    return str(caught.value)
+
+
+def measured(rig: ModelRig, name: str, poses: int, kind: str = "static_poses") -> None:
+    rig.jobs.measured(name, poses, kind, prisms=PRISMS)
+
+
+# ---- from candidate to live ------------------------------------------------------------------------------------------
+
+
+def test_a_candidate_is_compared_on_check_sessions_then_accepted_and_loaded(rig: ModelRig) -> None:
+    measured(rig, "a", 5)
+    measured(rig, "c", 4, "check")
+    model = rig.candidate()
+    assert rig.registry.compare_command({"id": model}) == f"job 2 will compare model {model} with the live one"
+    compared = rig.compare()
+    assert compared["against"] == "nominal"
+    assert (compared["sessions"], compared["fixes"], compared["standstills"]) == (["c"], 8, 4)
+    assert compared["after_mm"] < compared["before_mm"] / 2
+    assert rig.models.get(model).comparison == json.loads(json.dumps(compared))
+    done = rig.registry.accept_command({"id": model, "operator": "Ada"})
+    assert (done["live"], done["retired"]) == (model, None)
+    assert states(rig) == {model: "live"}
+    loaded = rig.settled()
+    assert isinstance(loaded, Loaded)
+    assert loaded.id == model
+    shown = rig.registry.show_command({})
+    assert [(h["state"], h["operator"]) for h in shown["history"]] == [("candidate", ""), ("live", "Ada")]
+    assert shown["history"][-1]["reason"].startswith("accepted: on 8 held-out fixes of 4 standstills its error is")
+
+
+def test_a_candidate_that_is_not_better_than_the_live_model_is_refused(rig: ModelRig) -> None:
+    live = rig.accepted()
+    measured(rig, "c", 4, "check")
+    again = rig.candidate(sessions=("a", "b"))
+    rig.registry.compare_command({"id": again})
+    compared = rig.compare()
+    assert (compared["live"], compared["is_better"], compared["p"]) == (live, False, 1.0), "it is the same model"
+    assert "no gain beyond chance" in refusal(rig.registry.accept_command, REFUSED, id=again)
+    assert states(rig) == {live: "live", again: "candidate"}
+    status = rig.registry.status()
+    assert status["live"]["id"] == live
+    assert (status["candidate"]["id"], status["candidate"]["comparison"]["is_better"]) == (again, False)
+
+
+def test_one_that_is_better_takes_the_live_models_place(rig: ModelRig) -> None:
+    first = rig.accepted(poses=30)
+    second = rig.accepted(poses=40)
+    assert states(rig) == {first: "retired", second: "live"}
+    history = rig.registry.show_command({"id": first})["history"]
+    assert [h["state"] for h in history] == ["candidate", "live", "retired"]
+    loaded = rig.settled()
+    assert isinstance(loaded, Loaded)
+    assert loaded.id == second
+    assert rig.models.get(first).path.is_dir(), "a retired model stays on disk"
+
+
+def test_sessions_that_either_model_was_trained_on_are_no_held_out_data(rig: ModelRig) -> None:
+    for name in ("c1", "c2", "c3"):
+        rig.jobs.session(name, kind="check")
+    live = rig.candidate(sessions=("c1",))
+    rig.compared(live, live=None)
+    rig.registry.accept_command({"id": live})
+    model = rig.candidate(sessions=("a", "c2"))
+    rig.registry.compare_command({"id": model})
+    (job,) = (job for job in rig.job_table.state().jobs if job.kind == "comparison")
+    order = rig.job_table.order(job, rig.config)
+    assert order.session_ids == ("c3",)
+    assert (order.live_id, order.live_model) == (live, str(rig.models.get(live).path))
+
+
+def test_a_live_model_that_is_damaged_does_not_keep_a_good_one_from_its_place(rig: ModelRig) -> None:
+    live = rig.accepted()
+    measured(rig, "c", 4, "check")
+    (rig.models.get(live).path / "model.json").write_text("{}", encoding="utf-8")
+    model = rig.candidate(poses=40)
+    rig.registry.compare_command({"id": model})
+    compared = rig.compare()
+    assert (compared["live"], compared["against"], compared["is_better"]) == (live, "nominal", True)
+    assert compared["sentence"].startswith("the live model cannot be read (")
+    assert rig.registry.accept_command({"id": model})["retired"] == live
+
+
+def test_in_place_of_a_damaged_live_model_nothing_goes_live_on_one_standstill(rig: ModelRig) -> None:
+    live = rig.accepted()
+    measured(rig, "c", 1, "check")
+    (rig.models.get(live).path / "model.json").write_text("{}", encoding="utf-8")
+    model = rig.candidate(poses=40)
+    rig.registry.compare_command({"id": model})
+    compared = rig.compare()
+    assert (compared["against"], compared["standstills"], compared["is_better"]) == ("nominal", 1, False)
+    assert "more check fixes" in refusal(rig.registry.accept_command, REFUSED, id=model)
+    assert states(rig) == {live: "live", model: "candidate"}
+
+
+def test_without_held_out_data_nothing_goes_live(rig: ModelRig) -> None:
+    model = rig.candidate()
+    assert "hold a check session" in refusal(rig.registry.accept_command, REFUSED, id=model)
+    assert "no check session is closed" in refusal(rig.registry.compare_command, REFUSED, id=model)
+    rig.jobs.session("c", kind="check")
+    trained_on_it = rig.candidate(sessions=("c",))
+    rig.registry.compare_command({"id": trained_on_it})
+    assert rig.compare()["is_better"] is False
+    assert "neither model was trained on" in refusal(rig.registry.accept_command, REFUSED, id=trained_on_it)
+    assert rig.settled() == Missing("no model is live; `rigcal model list` shows the candidates")
+
+
+def test_a_comparison_says_which_models_it_compared_and_takes_no_others(rig: ModelRig) -> None:
+    live = rig.accepted(30)
+    measured(rig, "c", 4, "check")
+    model = rig.candidate(40)
+    rig.registry.compare_command({"id": model})
+    (job,) = (job for job in rig.job_table.state().jobs if job.kind == "comparison")
+    order = rig.job_table.order(job, rig.config)
+    rows = rig.models.get(model), rig.models.get(live)
+    assert (order.model_sha256, order.live_sha256) == tuple(row.manifest_sha256 for row in rows)
+    for row, other in (rows, rows[::-1]):  # each other's files, whole in themselves
+        shutil.copytree(other.path, row.path.with_name(f"of-{row.id}"))
+    for row in rows:
+        shutil.rmtree(row.path)
+        row.path.with_name(f"of-{row.id}").rename(row.path)
+    with pytest.raises(ModelError, match="does not hold the model that was written there"):
+        perform(order, lambda share, text: None)
+    shutil.rmtree(rows[0].path)
+    shutil.copytree(rows[1].path, rows[0].path)
+    compared = perform(order, lambda share, text: None)["comparison"]
+    assert compared["manifest_sha256"] == rows[0].manifest_sha256
+    assert (compared["live"], compared["live_manifest_sha256"]) == (live, rows[1].manifest_sha256)
+    assert "the live model cannot be read" in compared["sentence"]
+
+
+def test_a_verdict_that_changes_while_the_model_is_loaded_does_not_count(
+    rig: ModelRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = rig.compared(rig.candidate(), live=None)
+
+    def load(row: ModelRow) -> None:
+        rig.compared(model, live=None, is_better=False)
+
+    monkeypatch.setattr(rig.live, "load", load)
+    told = refusal(rig.registry.accept_command, REFUSED, id=model)
+    assert "another command or comparison changed the models meanwhile" in told
+    assert states(rig) == {model: "candidate"}
+
+
+def test_a_comparison_that_no_job_would_make_is_not_promised(tmp_path: Path) -> None:
+    jobs = JobRig(tmp_path, enabled=False)
+    try:
+        jobs.session("c", kind="check")
+        runner = JobRunner(jobs.store, jobs.config, "swdt82", jobs.clock)
+        row = ModelRow(1, "swdt82", "candidate", "hybrid", tmp_path, "ab", ("a",), 0, {})
+        with pytest.raises(CommandError, match=r"jobs are switched off; set \[jobs\] enabled = true") as caught:
+            runner.compare(row)
+        assert caught.value.status == REFUSED
+        assert jobs.jobs() == []
+    finally:
+        jobs.close()
+
+
+def test_a_comparison_with_a_model_that_is_live_no_more_does_not_count(rig: ModelRig) -> None:
+    early = rig.compared(rig.candidate(), live=None)
+    live = rig.accepted(poses=40)
+    told = refusal(rig.registry.accept_command, REFUSED, id=early)
+    assert f"no model was live, and model {live} is live now; `rigcal model compare {early}`" in told
+
+
+# ---- back ------------------------------------------------------------------------------------------------------------
+
+
+def test_rollback_puts_back_what_the_live_model_replaced_step_by_step(rig: ModelRig) -> None:
+    one, two, three = rig.accepted(30), rig.accepted(40), rig.accepted(30)
+    assert rig.registry.rollback_command({"operator": "Bo"})["live"] == two
+    assert rig.registry.rollback_command({})["live"] == one
+    assert states(rig) == {one: "live", two: "retired", three: "retired"}
+    assert "the first that went live" in refusal(rig.registry.rollback_command, WRONG_USE)
+    assert rig.registry.rollback_command({"id": three})["retired"] == one
+    assert rig.registry.rollback_command({})["live"] == two, "what the third had replaced when it was accepted"
+    loaded = rig.settled()
+    assert isinstance(loaded, Loaded)
+    assert loaded.id == two
+    assert len(rig.store.rows("SELECT id FROM model_states")) == 3 + 2 * 7 - 1, "every change is kept"
+
+
+def test_a_jump_counts_for_models_from_before_it_alone(rig: ModelRig) -> None:
+    before = rig.models.get(rig.candidate(sessions=("a",)))
+    rig.clock.advance(10.0)
+    rig.store.insert_records([DeviceEvent("theta1", rig.clock.now(), EventKind.PRESET_JUMP, "position jumped")])
+    rig.clock.advance(10.0)
+    after = rig.models.get(rig.candidate(sessions=("b",)))
+    assert rig.models.jumped(before) == {"theta1": 1}
+    assert rig.models.jumped(after) == {}
+
+
+@pytest.mark.parametrize("years", [-5, 5])
+def test_a_wall_clock_that_is_wrong_for_a_whole_boot_hides_no_jump_and_makes_none(rig: ModelRig, years: int) -> None:
+    def boot(name: str, years: int) -> None:
+        utc_ns = rig.clock.now().utc_ns + years * 365 * 86_400 * NS_PER_S
+        rig.clock.set(Stamp(utc_ns, NS_PER_S, name))
+
+    def jump() -> None:
+        rig.clock.advance(10.0)
+        rig.store.insert_records([DeviceEvent("theta1", rig.clock.now(), EventKind.PRESET_JUMP, "position jumped")])
+
+    jump()
+    boot("boot-b", years)
+    model = rig.models.get(rig.accepted())
+    assert rig.models.jumped(model) == {}, "it was trained after the jump"
+    boot("boot-c", -years)
+    jump()
+    assert rig.models.jumped(model) == {"theta1": 2}
+    boot("boot-d", years)
+    assert "theta1" in rig.registry.zeros_checked_command({"operator": "Ada"})
+    assert rig.models.jumped(model) == {}
+    boot("boot-e", -years)
+    jump()
+    assert rig.models.jumped(model) == {"theta1": 3}
+
+
+def test_a_jump_that_comes_after_the_operator_looked_counts(rig: ModelRig) -> None:
+    model = rig.models.get(rig.accepted())
+    event = DeviceEvent("theta1", rig.clock.now(), EventKind.PRESET_JUMP, "position jumped")
+    rig.clock.advance(10.0)
+    rig.store.insert_records([event])
+    shown = rig.models.jumped(model)
+    rig.store.insert_records([dataclasses.replace(event, device="theta3")])
+    rig.models.note_zeros_checked(model, max(shown.values()), operator="Ada")
+    assert list(rig.models.jumped(model)) == ["theta3"]
+
+
+def test_what_makes_no_sense_is_refused_in_a_sentence(rig: ModelRig) -> None:
+    assert "no model is live" in refusal(rig.registry.rollback_command, WRONG_USE)
+    assert "no model is live" in refusal(rig.registry.show_command, WRONG_USE)
+    for command in (rig.registry.accept_command, rig.registry.rollback_command, rig.registry.compare_command):
+        assert "there is no model 9" in refusal(command, WRONG_USE, id=9)
+    assert "there is no model None" in refusal(rig.registry.accept_command, WRONG_USE)
+    one, two = rig.accepted(30), rig.accepted(40)
+    waiting = rig.candidate()
+    assert "is live; only a candidate" in refusal(rig.registry.accept_command, WRONG_USE, id=two)
+    assert f"`rigcal model rollback {one}`" in refusal(rig.registry.accept_command, WRONG_USE, id=one)
+    assert "was never live" in refusal(rig.registry.rollback_command, WRONG_USE, id=waiting)
+    assert "operator must be a text" in refusal(rig.registry.rollback_command, WRONG_USE, operator=["x"])
+    assert states(rig) == {one: "retired", two: "live", waiting: "candidate"}
+
+
+# ---- what must not go live -------------------------------------------------------------------------------------------
+
+
+def test_a_damaged_or_exchanged_model_does_not_go_live(rig: ModelRig) -> None:
+    live = rig.accepted(30)
+    damaged = rig.compared(rig.candidate(40), live=live)
+    file = rig.models.get(damaged).path / "model.json"
+    file.write_bytes(file.read_bytes()[:-10])
+    assert "model.json is truncated" in refusal(rig.registry.accept_command, REFUSED, id=damaged)
+    exchanged = rig.compared(rig.candidate(40), live=live)
+    for name in ("manifest.json", "model.json", "covariance.npz"):  # another model, whole in itself
+        (rig.models.get(exchanged).path / name).write_bytes((rig.models.get(live).path / name).read_bytes())
+    assert "does not hold the model that was written" in refusal(rig.registry.accept_command, REFUSED, id=exchanged)
+    gone = rig.compared(rig.candidate(40), live=live)
+    rig.models.get(gone).path.rename(rig.config.models_directory / "elsewhere")
+    assert "is not a directory" in refusal(rig.registry.accept_command, REFUSED, id=gone)
+    assert states(rig)[live] == "live"
+
+
+def test_a_model_of_another_rig_does_not_go_live(rig: ModelRig) -> None:
+    model = rig.compared(rig.candidate(), live=None)
+    rig.store.update("models", {"id": model}, {"rig": "ur10"})
+    for command in (rig.registry.accept_command, rig.registry.rollback_command, rig.registry.compare_command):
+        assert "is of rig 'ur10', and this is rig 'swdt82'" in refusal(command, REFUSED, id=model)
+
+
+def test_a_model_of_another_rig_file_does_not_go_live_and_a_live_one_is_not_used(tmp_path: Path) -> None:
+    before = ModelRig(tmp_path)
+    model = before.accepted()
+    before.close()
+    row = SOURCE.rig.rows[4].model_copy(update={"a_mm": 5001.0})
+    changed = SOURCE.rig.model_copy(update={"rows": (*SOURCE.rig.rows[:4], row, *SOURCE.rig.rows[5:])})
+    after = ModelRig(tmp_path, changed)
+    try:
+        state = after.settled()
+        assert isinstance(state, Missing)
+        assert state.is_defect
+        assert "was made for another rig file" in state.reason
+        other = after.compared(after.candidate(), live=model)
+        assert "another rig file" in refusal(after.registry.accept_command, REFUSED, id=other)
+    finally:
+        after.close()
+
+
+def test_models_of_a_store_from_before_have_a_history_too(tmp_path: Path) -> None:
+    path = tmp_path / "rigcal.sqlite"
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        db = Database(connection)
+        MIGRATIONS.apply(db, stop_before="m006_models_go_live")
+        with db.atomic():
+            db.execute("INSERT INTO boots VALUES (1, 'boot-a', 0)")
+            db.execute(
+                "INSERT INTO models (rig, path, manifest_sha256, stage, state, created_utc_ns, created_monotonic_ns, "
+                "created_boot_id) VALUES ('swdt82', '/models/1', 'ab', 'hybrid', 'candidate', 7, 7, 1)"
+            )
+    rig = ModelRig(tmp_path)
+    try:
+        (change,) = rig.registry.show_command({"id": 1})["history"]
+        assert (change["state"], change["utc_ns"], change["reason"]) == ("candidate", 7, "made")
+    finally:
+        rig.close()
+
+
+def test_the_live_model_is_live_again_after_a_restart(tmp_path: Path) -> None:
+    before = ModelRig(tmp_path)
+    model = before.accepted()
+    before.close()
+    after = ModelRig(tmp_path)
+    try:
+        loaded = after.settled()
+        assert isinstance(loaded, Loaded)
+        assert loaded.id == model
+    finally:
+        after.close()
+
+
+class SlowTable(ModelTable):
+    """Waits for a nod before it says what is live, from the second time on."""
+
+    def __init__(self, jobs: JobRig) -> None:
+        super().__init__(jobs.store, "swdt82", jobs.clock)
+        self.looked = 0
+        self.nod = threading.Event()
+
+    def live(self) -> ModelRow | None:
+        self.looked += 1
+        if self.looked > 1:
+            self.nod.wait(10.0)
+        return super().live()
+
+
+class InTheMidst(threading.Event):
+    """When asked whether it is set, lets another thread call something before the answer can be acted on."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.call = lambda: None
+        self.asked = threading.Event()
+
+    def is_set(self) -> bool:
+        answer = super().is_set()
+        other = threading.Thread(target=self.call)
+        other.start()
+        other.join(timeout=0.2)  # for ever, where what it calls waits its turn
+        self.asked.set()
+        return answer
+
+
+def test_a_change_in_the_midst_of_loading_is_not_overwritten_by_what_was_looked_up_before(tmp_path: Path) -> None:
+    jobs = JobRig(tmp_path)
+    table = SlowTable(jobs)
+    live = LiveModel(table, SOURCE.rig)
+    event = live._changed = InTheMidst()
+    event.call = live.changed
+    event.set()
+    live.start()
+    try:
+        assert event.asked.wait(10.0)
+        wait(lambda: table.looked == 2)
+        assert live.now() == Missing("the live model is being loaded"), "what was looked up is out of date"
+        event.call = lambda: None
+        table.nod.set()
+        wait(lambda: live.now() == Missing("no model is live; `rigcal model list` shows the candidates"))
+    finally:
+        table.nod.set()
+        live.stop()
+        jobs.close()
+
+
+def test_a_load_that_a_stop_cuts_short_is_no_defect_of_the_model(
+    rig: ModelRig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    rig.accepted()
+    live = LiveModel(rig.models, SOURCE.rig)
+    loads, stopped = threading.Event(), threading.Event()
+
+    def cut_short(_row: ModelRow) -> NoReturn:
+        loads.set()
+        assert stopped.wait(60.0)
+        raise ModelError("the process that loads it was ended")
+
+    monkeypatch.setattr(live, "load", cut_short)
+    monkeypatch.setattr("daemon.models.live_model.STOP_TIMEOUT_S", 0.0)
+    live.start()
+    assert loads.wait(60.0)
+    caplog.clear()
+    live.stop()
+    stopped.set()
+    live._thread.join()
+    assert not caplog.records
+    assert live.now() == Missing("the live model is being loaded")

@@ -1,0 +1,152 @@
+"""Fixes that are decoded long after they were measured: whose they are, after stops, restarts and boots."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from daemon.sessions.lifecycle import NOT_ENCLOSED
+from drivers.clock import NS_PER_S, Stamp
+from drivers.readings import CanCapture, DeviceEvent, EventKind, Reading, Record
+from tests.daemon.session_support import SOURCE, STEP_S, Rig
+from tests.daemon.sessions.test_prism_watch import ANOTHER_MM, PRISM_MM, WatchedRig, used
+from tests.daemon.sessions.test_sessions import start
+from tests.daemon.store_support import table
+
+CONTROL_MM = (9000.0, 500.0, 2000.0)
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    made = WatchedRig(tmp_path / "rigcal.sqlite")
+    yield made
+    made.store.close()
+
+
+def captured(rig: Rig, seconds: float) -> list[list[Record]]:
+    """Let time pass that is captured and not decoded yet: what decoding it will give."""
+    rig.store.append_captures([CanCapture("can0", rig.clock.now(), 0x181, b"")])
+    late: list[list[Record]] = []
+    for _ in range(round(seconds / STEP_S)):
+        rig.clock.advance(STEP_S)
+        now = rig.clock.now()
+        readings = [Reading(j.name, now, rig.values[j.name], j.unit) for j in SOURCE.rig.joints]
+        late.append([*readings, rig.fix()])
+    rig.clock.advance(STEP_S)
+    return late
+
+
+def decode(rig: Rig, late: Sequence[Sequence[Record]]) -> None:
+    rig.store.mark_decoded(rig.store.undecoded_chunks())
+    for records in late:
+        rig.store.insert_records(records)
+        rig.keeper.on_records(records)
+
+
+def boot_with_an_earlier_clock(rig: Rig) -> None:
+    rig.clock.set(Stamp(rig.clock.now().utc_ns - 86_400 * NS_PER_S, NS_PER_S, "next boot"))
+
+
+def change_prism(rig: Rig, prism: str, place_mm: tuple[float, float, float]) -> None:
+    rig.say("stop")
+    rig.clock.advance(STEP_S)
+    rig.target_mm = place_mm
+    rig.say("start", prism=prism)
+
+
+def observed(rig: Rig) -> set[tuple[str, str, int]]:
+    """Session, prism and place of what calibration may use."""
+    rows = table(rig.store.path, "observations")
+    return {(r["session_id"], r["prism"], round(r["y_mm"])) for r in rows if r["excluded"] is None}
+
+
+def test_fixes_that_a_killed_run_left_undecoded_never_go_to_a_later_session_on_another_prism(rig: Rig) -> None:
+    start(rig)
+    late = captured(rig, 3)
+    change_prism(rig, "b", ANOTHER_MM)
+    late += captured(rig, 3)
+    rig.keeper = rig.new_keeper()
+    decode(rig, late)
+    rig.live(3)
+    assert observed(rig) == {("s001-r", "r", 8000), ("s002-b", "b", 18000)}
+
+
+def test_fixes_of_a_boot_with_a_later_clock_do_not_go_to_a_session_that_was_started_after_it(rig: Rig) -> None:
+    start(rig)
+    late = captured(rig, 3)
+    rig.say("stop")
+    boot_with_an_earlier_clock(rig)
+    rig.keeper = rig.new_keeper()
+    rig.target_mm = ANOTHER_MM
+    rig.say("start", prism="b")
+    decode(rig, late)
+    rig.live(3)
+    assert observed(rig) == {("s001-r", "r", 8000), ("s002-b", "b", 18000)}
+
+
+def test_sessions_that_end_while_decoding_is_behind_get_their_fixes_each(rig: Rig) -> None:
+    start(rig)
+    late = captured(rig, 3)
+    change_prism(rig, "b", ANOTHER_MM)
+    late += captured(rig, 3)
+    change_prism(rig, "r", PRISM_MM)
+    decode(rig, late)
+    rig.live(3)
+    assert observed(rig) == {("s001-r", "r", 8000), ("s002-b", "b", 18000), ("s003-r", "r", 8000)}
+
+
+def test_a_session_that_ended_before_a_restart_gets_the_fixes_that_were_left_undecoded(rig: Rig) -> None:
+    start(rig)
+    late = captured(rig, 3)
+    rig.say("stop")
+    rig.keeper = rig.new_keeper()
+    decode(rig, late)
+    rig.live(3)
+    assert observed(rig) == {("s001-r", "r", 8000)}
+
+
+def test_a_jump_after_a_session_excludes_nothing_of_it_after_a_restart(rig: Rig) -> None:
+    start(rig)
+    late = captured(rig, 3)
+    rig.say("stop")
+    rig.clock.advance(1)
+    rig.store.insert_records([DeviceEvent("theta1", rig.clock.now(), EventKind.PRESET_JUMP, "from 22 to 33")])
+    rig.keeper = rig.new_keeper()
+    decode(rig, late)
+    rig.live(1)
+    assert observed(rig) == {("s001-r", "r", 8000)}
+
+
+def test_whether_a_session_is_used_is_decided_again_when_its_poses_are_decoded_after_its_end(rig: Rig) -> None:
+    start(rig)
+    rig.shoot("cp1", CONTROL_MM)
+    rig.live(3)
+    rig.shoot("cp1", CONTROL_MM)
+    late = []
+    for _ in range(6):
+        rig.values["theta1"] += 5
+        late += captured(rig, 3)
+    rig.say("stop")
+    assert rig.say("show", id="s001-r")["not_used"] is None
+    decode(rig, late)
+    rig.live(3)
+    shown = rig.say("show", id="s001-r")
+    assert shown["poses"] > 4
+    assert shown["not_used"] == NOT_ENCLOSED
+    rig.say("accept", id="s001-r")
+    rig.live(3)
+    assert rig.say("show", id="s001-r")["not_used"] is None
+
+
+def test_another_prism_stays_suspected_in_a_boot_whose_clock_was_set_back(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    rig.target_mm = ANOTHER_MM
+    rig.live(5)
+    boot_with_an_earlier_clock(rig)
+    rig.keeper = rig.new_keeper()
+    rig.live(5)
+    assert set(used(rig)) == {8000}
+    assert len(rig.keeper.prism_suspicions()) == 1

@@ -1,0 +1,313 @@
+"""Sessions whose station changes to another prism: what counts, what operators are told, what a restart remembers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from calibration.rig.description import shipped_rig
+from daemon.acquisition.joiner import ObservationJoiner, joint_inputs
+from daemon.cli.main import main
+from daemon.commands import CommandError
+from daemon.config import SessionsSection, parse_config
+from daemon.sessions.export import export_session
+from daemon.sessions.manager import SessionKeeper
+from daemon.sessions.prism_guard import MotionLimit
+from daemon.sessions.session_file import SessionFile, read_session_file
+from daemon.store.reader import Reader
+from drivers.clock import ManualClock
+from drivers.logs.can_log import write_can_log
+from drivers.logs.serial_log import SerialLogHeader, SerialLogWriter
+from drivers.readings import CanCapture, EventKind, SerialCapture
+from simulators.devices.stations.total_station import StationSettings
+from simulators.faults import parse_faults
+from simulators.rig.truth import RigTruth
+from simulators.rig_simulator import RigSimulator, SimulatorSettings
+from tests.daemon.session_support import disk_fails
+from tests.daemon.sessions.test_sessions import SOURCE, Rig, start
+from tests.daemon.store_support import table
+from tests.simulated.captures import Step, generate
+from tests.simulated.scripted_host import ScriptedHost
+
+CONFIG = """rig = "swdt82"
+state_directory = "."
+
+[[can]]
+channel = "can0"
+
+[[station]]
+profile = "passive"
+serial.path = "/dev/rigcal-station"
+"""
+PRISM_MM = (3000.0, 8000.0, 1000.0)
+ANOTHER_MM = (3000.0, 18000.0, 1000.0)
+CONTROL_MM = (9000.0, 500.0, 2000.0)
+
+
+class WatchedRig(Rig):
+    """A rig whose configuration names its station."""
+
+    def new_keeper(self, aim: Callable[[str], None] | None = None) -> SessionKeeper:
+        return SessionKeeper(
+            SOURCE.rig,
+            SOURCE.text,
+            self.store,
+            self.setups,
+            ObservationJoiner(joint_inputs(SOURCE.rig), settle_s=0.5),
+            SessionsSection(fixes_per_shot=3),
+            self.clock,
+            run_id=1,
+            aim=aim,
+            limits={"station": MotionLimit()},
+        )
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    made = WatchedRig(tmp_path / "rigcal.sqlite")
+    yield made
+    made.store.close()
+
+
+def used(rig: Rig) -> list[float]:
+    """Where the observations lie that calibration may use: their y, mm."""
+    return [round(row["y_mm"]) for row in table(rig.store.path, "observations") if row["excluded"] is None]
+
+
+def reasons(rig: Rig) -> set[str]:
+    return {row["excluded"] for row in table(rig.store.path, "observations")} - {None}
+
+
+def events(rig: Rig, kind: EventKind) -> list[str]:
+    return [row["text"] for row in table(rig.store.path, "device_events") if row["kind"] == kind]
+
+
+@pytest.mark.slow
+def test_another_prism_s_fixes_never_become_observations_however_long_it_is_followed(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    rig.target_mm = ANOTHER_MM
+    rig.live(40)
+    assert set(used(rig)) == {8000}
+    assert "perhaps another prism: the station's target jumped by 10.00 m" in reasons(rig)
+    assert len(events(rig, EventKind.PRISM_JUMP)) == 1
+    (suspicion,) = rig.keeper.open_session()["prism_suspicions"]  # type: ignore[index]
+    assert suspicion["station"] == "station"
+    assert suspicion["distance_m"] == pytest.approx(10.0)
+    assert "confirm-prism" in suspicion["remedy"]
+    assert [s.station for s in rig.keeper.prism_suspicions()] == ["station"]
+    assert any("perhaps another prism" in sentence for sentence in rig.say("stop")["advice"])
+    assert rig.keeper.prism_suspicions() == []
+
+
+def test_a_prism_that_an_operator_confirms_counts_from_then_on(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    rig.target_mm = ANOTHER_MM
+    rig.live(5)
+    before = len(used(rig))
+    answer = rig.say("confirm_prism", operator="Ada")
+    assert answer["text"] == "Ada confirms that the station is on prism r; its fixes count from now on"
+    assert [s["distance_m"] for s in answer["ended"]] == [pytest.approx(10.0)]
+    (advice,) = answer["advice"]
+    assert "if it was on another prism then, abort the session" in advice
+    assert rig.keeper.prism_suspicions() == []
+    rig.values["theta1"] += 5  # the next standstill: within one, the most fixes decide
+    rig.live(5)
+    assert set(used(rig)[before:]) == {18000}
+    (row,) = table(rig.store.path, "prism_confirmations")
+    assert (row["session_id"], row["operator"]) == (answer["session"], "Ada")
+    assert events(rig, EventKind.PRISM_CONFIRMED) == [answer["text"]]
+
+
+def test_a_prism_is_confirmed_in_a_session_alone(rig: Rig) -> None:
+    with pytest.raises(CommandError, match="no session is open"):
+        rig.say("confirm_prism")
+    start(rig)
+    with pytest.raises(CommandError, match="operator must be a text"):
+        rig.say("confirm_prism", operator="\x1b[2J")
+
+
+def test_a_new_session_on_a_named_prism_is_a_confirmation(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    rig.say("stop")
+    rig.target_mm = ANOTHER_MM
+    rig.live(1)
+    rig.say("start", prism="s")
+    rig.live(2)
+    assert set(used(rig)) == {8000, 18000}
+    assert rig.keeper.prism_suspicions() == []
+
+
+def test_a_control_point_is_shot_in_a_session_without_a_suspicion(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    rig.shoot("cp1", CONTROL_MM)
+    rig.live(2)
+    assert rig.keeper.prism_suspicions() == []
+    assert events(rig, EventKind.PRISM_JUMP) == []
+    assert set(used(rig)) == {8000}
+
+
+def test_a_station_that_comes_back_from_a_control_point_to_another_prism_is_suspected(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    rig.shoot("cp1", CONTROL_MM)
+    rig.target_mm = ANOTHER_MM
+    rig.live(5)
+    assert len(rig.keeper.prism_suspicions()) == 1
+    assert set(used(rig)) == {8000}
+    rig.target_mm = PRISM_MM
+    rig.live(2)
+    assert rig.keeper.prism_suspicions() == []
+
+
+def test_a_control_point_that_is_shot_while_another_prism_is_suspected_is_usable(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    rig.target_mm = CONTROL_MM  # by hand, before the command
+    rig.live(1)
+    assert len(rig.keeper.prism_suspicions()) == 1
+    assert rig.shoot("cp1", CONTROL_MM)["y_mm"] == pytest.approx(500.0)
+    rig.target_mm = PRISM_MM
+    rig.live(2)
+    assert rig.keeper.prism_suspicions() == []
+    assert set(used(rig)) == {8000}
+
+
+def test_a_restart_of_the_daemon_ends_no_suspicion(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    rig.target_mm = ANOTHER_MM
+    rig.live(5)
+    rig.keeper = rig.new_keeper()
+    assert [round(s.distance_m, 3) for s in rig.keeper.prism_suspicions()] == [10.0]
+    rig.live(5)
+    assert set(used(rig)) == {8000}
+    rig.say("confirm_prism")
+    rig.keeper = rig.new_keeper()
+    assert rig.keeper.prism_suspicions() == []
+
+
+def test_another_prism_that_was_found_while_the_daemon_was_away_is_suspected(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    rig.clock.advance(3600)
+    rig.target_mm = ANOTHER_MM
+    rig.keeper = rig.new_keeper()
+    rig.live(5)
+    assert len(rig.keeper.prism_suspicions()) == 1
+    assert set(used(rig)) == {8000}
+
+
+def test_where_something_can_aim_a_station_that_is_suspected_is_aimed_again(rig: Rig) -> None:
+    def aim(target: str) -> None:
+        rig.aimed.append(target)
+        rig.target_mm = PRISM_MM
+
+    rig.keeper = rig.new_keeper(aim)
+    start(rig)
+    rig.live(2)
+    rig.keeper.aim_again()
+    assert rig.aimed == ["r"]
+    rig.target_mm = ANOTHER_MM  # taken for the turn that the start told it to make
+    rig.live(1)
+    rig.target_mm = (3000.0, 28000.0, 1000.0)
+    rig.live(1)
+    assert len(rig.keeper.prism_suspicions()) == 1
+    with disk_fails():
+        rig.keeper.aim_again()  # which cannot be written down, and ends no daemon
+    assert rig.aimed == ["r", "r"]
+    rig.target_mm = (3000.0, 28000.0, 1000.0)
+    rig.live(1)
+    rig.keeper.aim_again()
+    assert rig.aimed == ["r", "r", "r"]
+    rig.values["theta1"] += 5
+    before = len(used(rig))
+    rig.live(2)
+    assert set(used(rig)[before:]) == {8000}
+    assert [row["turning"] for row in table(rig.store.path, "prism_confirmations")] == [1, 1]
+
+
+def test_what_operators_confirmed_is_exported_with_the_session(rig: Rig, tmp_path: Path) -> None:
+    start(rig, id="s1")
+    rig.live(2)
+    rig.say("confirm_prism")
+    confirmed_ns = rig.clock.now().utc_ns
+    rig.live(2)
+    rig.say("stop")
+    config = parse_config(CONFIG, tmp_path / "rigcal.toml")
+    export_session(config, "s1", tmp_path / "out", "log")
+    assert read_session_file(tmp_path / "out" / "s1.json").prism_confirmed_utc_ns == (confirmed_ns,)
+
+
+# ---- a simulated rig -------------------------------------------------------------------------------------------------
+
+JUMP_S, BACK_S, END_S = 12, 60, 70
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Logs of a rig that stands, moves once and stands; prism r is followed, then b for 48 s, then r again."""
+    folder = tmp_path_factory.mktemp("wrong-prism")
+    station = StationSettings(profile="topcon_gts8", push_interval_s=0.5)
+    settings = SimulatorSettings(bus_master="machine", sync_period_s=0.2, signal_period_s=0.5, station=station)
+    faults = parse_faults(f"prism_jump@{JUMP_S}:to=b,prism_jump@{BACK_S}:to=r")
+    simulator = RigSimulator(RigTruth(shipped_rig("swdt82"), 7), 7, settings, faults=faults)
+    plan = [Step(0.0, aim="r"), Step(20.0, pose={"theta4": 24.0}), Step(40.0, pose={"theta4": 22.0})]
+    captures = generate(simulator, ScriptedHost(), END_S, ManualClock(), plan=plan).captures
+    write_can_log(folder / "boom.log", [c for c in captures if isinstance(c, CanCapture)])
+    with (folder / "station.serial").open("w", encoding="utf-8", newline="\n") as stream:
+        writer = SerialLogWriter(stream, SerialLogHeader("station", station.baud, "passive"))
+        for capture in captures:
+            if isinstance(capture, SerialCapture):
+                writer.write(capture)
+    (folder / "rigcal.toml").write_text(CONFIG, encoding="utf-8")
+    return folder
+
+
+def replayed(folder: Path, store: Path, *options: object) -> list[dict[str, Any]]:
+    """The observations that the logs give, with the second of each."""
+    logs = [folder / "boom.log", folder / "station.serial"]
+    arguments = ["replay", *logs, "--config", folder / "rigcal.toml", "--store", store, *options]
+    result = CliRunner().invoke(main, [*map(str, arguments), "--json"], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    with Reader(store) as reader:
+        return [
+            {**row, "second": (row["utc_ns"] - ManualClock().now().utc_ns) / 1e9}
+            for row in reader.rows("SELECT * FROM observations ORDER BY id")
+        ]
+
+
+def test_in_a_simulated_rig_prism_b_never_becomes_prism_r(recorded: Path, tmp_path: Path) -> None:
+    rows = replayed(recorded, tmp_path / "s.sqlite", "--prism", "r", "--kind", "multi_joint")
+    followed_b = [row for row in rows if JUMP_S + 1 < row["second"] < BACK_S]
+    assert len(followed_b) > 80
+    counting = [row["second"] for row in rows if row["excluded"] is None]
+    assert min(counting) < JUMP_S
+    assert max(counting) > BACK_S + 5
+    assert [s for s in counting if JUMP_S + 1 < s < BACK_S] == []
+
+
+def test_a_replay_honours_what_the_operator_confirmed(recorded: Path, tmp_path: Path) -> None:
+    begin_ns = ManualClock().now().utc_ns
+    told = SessionFile(
+        prism="r",
+        kind="multi_joint",
+        since_utc_ns=begin_ns,
+        until_utc_ns=begin_ns + END_S * 10**9,
+        control_points={},
+        prism_confirmed_utc_ns=(begin_ns + 30 * 10**9,),
+    )
+    (tmp_path / "s.json").write_text(told.model_dump_json(), encoding="utf-8")
+    rows = replayed(recorded, tmp_path / "s.sqlite", "--session", tmp_path / "s.json")
+    moving = [row["second"] for row in rows if row["excluded"] is None and row["moving"]]
+    assert [s for s in moving if JUMP_S + 1 < s < 30] == []  # on b, not confirmed
+    assert [s for s in moving if 30 < s < BACK_S] != []  # on b, which the operator said to be r
+    back = [row["excluded"] for row in rows if row["second"] > BACK_S + 1]
+    assert all(reason is not None and "perhaps another prism" in reason for reason in back)

@@ -1,0 +1,175 @@
+"""What the store refuses has not happened: memory never knows more of a session than the store."""
+
+import sqlite3
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlite_utils import Database
+
+from daemon.commands import CommandError
+from daemon.control.protocol import request
+from daemon.control.server import ControlServer
+from daemon.jobs.job_queue import JobQueue
+from daemon.jobs.order import Outcome
+from daemon.jobs.scheduler import CHAIN, DueChain, next_job
+from daemon.store.errors import unwritable_errors
+from daemon.store.migrations import MIGRATIONS
+from daemon.store.store import Store
+from drivers.readings import Reading, Record
+from tests.daemon.session_support import SOURCE, STEP_S, Rig, disk_fails
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    made = Rig(tmp_path / "rigcal.sqlite")
+    made.say("setup_new", id="S1")
+    yield made
+    made.store.close()
+
+
+def open_sessions(rig: Rig) -> list[str]:
+    return [row["id"] for row in rig.store.rows("SELECT id FROM calibration_sessions WHERE state = 'open'")]
+
+
+@pytest.mark.parametrize("command", ["stop", "abort"])
+def test_a_session_whose_end_cannot_be_stored_stays_open_here_and_there(rig: Rig, command: str) -> None:
+    rig.say("start", prism="r")
+    rig.live(2)
+    with disk_fails(), pytest.raises(sqlite3.OperationalError):
+        rig.say(command)
+    with pytest.raises(CommandError, match="session 's001-r' is open; stop or abort it first"):
+        rig.say("start", prism="b")
+    assert open_sessions(rig) == ["s001-r"]
+    before = rig.say("show", id="s001-r")["observations"]
+    rig.live(2)
+    assert rig.say("show", id="s001-r")["observations"] > before + 30, "its fixes are its observations all along"
+    rig.say(command)
+    assert rig.say("start", prism="b")["id"] == "s002-b"
+    rig.keeper = rig.new_keeper()
+    rig.live(2)
+    assert {row["session_id"] for row in rig.store.rows("SELECT * FROM observations WHERE prism = 'b'")} == {"s002-b"}
+    assert open_sessions(rig) == ["s002-b"]
+
+
+def test_a_session_whose_start_finds_the_disk_full_is_not_open(rig: Rig) -> None:
+    (pages,) = rig.store.rows("PRAGMA page_count")
+    rig.store.rows(f"PRAGMA max_page_count = {pages['page_count']}")
+    with pytest.raises(sqlite3.OperationalError, match="database or disk is full"):
+        rig.say("start", prism="r")
+    assert rig.keeper.open_session() is None
+    assert open_sessions(rig) == []
+    rig.store.rows("PRAGMA max_page_count = 1000000")
+    assert rig.say("start", prism="r")["id"] == "s001-r"
+
+
+def test_a_full_disk_is_told_in_a_sentence_that_says_what_to_do(
+    rig: Rig, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def start(arguments: Mapping[str, Any]) -> dict[str, Any]:
+        with unwritable_errors(rig.store.path):  # as the daemon carries commands out
+            return rig.keeper.start_command(arguments)
+
+    server = ControlServer(tmp_path / "s", {"session.start": start})
+    try:
+        (pages,) = rig.store.rows("PRAGMA page_count")
+        rig.store.rows(f"PRAGMA max_page_count = {pages['page_count']}")
+        with pytest.raises(CommandError) as caught:
+            request(tmp_path / "s", "session.start", {"prism": "r"})
+    finally:
+        server.close()
+    assert caught.value.status == 1
+    sentence = str(caught.value)
+    assert f"{rig.store.path}: cannot be written, the disk is full (database or disk is full;" in sentence
+    assert sentence.endswith("nothing was changed, so give the command again")
+    assert "Traceback" not in caplog.text
+
+
+def test_the_store_holds_one_open_session_of_a_rig(rig: Rig) -> None:
+    rig.say("start", prism="r")
+    (row,) = rig.store.rows("SELECT * FROM calibration_sessions")
+    with pytest.raises(sqlite3.IntegrityError, match="UNIQUE"):
+        rig.store.insert("calibration_sessions", row | {"id": "second"})
+    rig.store.insert("calibration_sessions", row | {"id": "another rig's", "rig": "ur10"})
+
+
+def test_of_the_open_sessions_of_an_older_store_the_newest_goes_on_and_the_others_say_why_not(tmp_path: Path) -> None:
+    old = Database(tmp_path / "rigcal.sqlite")
+    MIGRATIONS.apply(old, stop_before="m008_one_open_session")
+    with old.atomic():
+        old["boots"].insert({"id": 1, "kernel_boot_id": "manual", "booted_utc_ns": 0})
+        instant = {"utc_ns": 1, "monotonic_ns": 1, "boot_id": 1}
+        setup = {"id": "S1", "instrument": "", "serial": "", "state": "ok"}
+        old["station_setups"].insert({**setup, **{f"created_{name}": value for name, value in instant.items()}})
+        for number, (name, rig, note) in enumerate([("a", "swdt82", "windy"), ("b", "swdt82", ""), ("x", "ur10", "")]):
+            session: dict[str, Any] = {"id": name, "rig": rig, "rig_sha256": "", "rig_text": "", "setup_id": "S1"}
+            session |= {"prism": "r", "operator": "", "kind": "static_poses", "state": "open", "note": note}
+            session |= {f"started_{key}": value + number * (key != "boot_id") for key, value in instant.items()}
+            old["calibration_sessions"].insert(session)
+    old.close()
+    rig = Rig(tmp_path / "rigcal.sqlite")
+    a, b, x = rig.say("list")
+    assert (a["state"], b["state"], x["state"]) == ("aborted", "open", "open")
+    assert a["note"].startswith("windy; aborted by rigcal: it was still open when session b was started")
+    assert a["ended_utc_ns"] == b["started_utc_ns"]
+    assert b["note"] == ""
+    went_on = rig.keeper.open_session()
+    assert went_on is not None
+    assert went_on["id"] == "b"
+    rig.store.close()
+
+
+def test_what_is_observed_while_the_disk_fails_is_stored_when_it_works_again(rig: Rig) -> None:
+    rig.say("start", prism="r")
+    rig.live(2)
+    for _ in range(20):
+        rig.clock.advance(STEP_S)
+        records: list[Record] = [
+            Reading(j.name, rig.clock.now(), rig.values[j.name], j.unit) for j in SOURCE.rig.joints
+        ]
+        records.append(rig.fix())
+        rig.store.insert_records(records)
+        with disk_fails():
+            rig.keeper.on_records(records)
+    rig.live(2)
+    observed = [row["monotonic_ns"] for row in rig.store.rows("SELECT monotonic_ns FROM observations ORDER BY id")]
+    measured = [row["monotonic_ns"] for row in rig.store.rows("SELECT monotonic_ns FROM fixes ORDER BY id")]
+    assert observed == measured[: len(observed)]
+    assert len(observed) > 80
+
+
+def test_a_cancellation_is_kept_when_the_jobs_end_cannot_be_stored(tmp_path: Path) -> None:
+    rig = Rig(tmp_path / "rigcal.sqlite")
+    rig.say("setup_new", id="S1")
+    name = rig.say("start", prism="r")["id"]
+    rig.say("stop")
+    jobs = JobQueue(rig.store, "swdt82", rig.clock)
+    jobs.queue(DueChain(CHAIN, name, name))
+    job = next_job(jobs.state())
+    assert job is not None
+    assert jobs.begin(job, 60.0)
+    jobs.cancel(job.id)
+    with disk_fails(), pytest.raises(sqlite3.OperationalError):
+        jobs.end(job.id, Outcome("done", result={"model": "m"}))
+    jobs.interrupt_running("the daemon could not see it through", is_attempt=False)
+    assert {row["state"] for row in rig.store.rows("SELECT state FROM jobs")} == {"cancelled"}
+    rig.store.close()
+
+
+def test_a_cancellation_outlives_a_daemon_that_is_killed_before_the_job_has_ended(tmp_path: Path) -> None:
+    rig = Rig(tmp_path / "rigcal.sqlite")
+    rig.say("setup_new", id="S1")
+    name = rig.say("start", prism="r")["id"]
+    rig.say("stop")
+    jobs = JobQueue(rig.store, "swdt82", rig.clock)
+    jobs.queue(DueChain(CHAIN, name, name))
+    job = next_job(jobs.state())
+    assert job is not None
+    assert jobs.begin(job, 60.0)
+    jobs.cancel(job.id)
+    rig.store.close()
+    again = Store(tmp_path / "rigcal.sqlite")
+    JobQueue(again, "swdt82", rig.clock).interrupt_left_over("this boot")
+    assert {row["state"] for row in again.rows("SELECT state FROM jobs")} == {"cancelled"}
+    again.close()

@@ -1,0 +1,404 @@
+import math
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calibration.observations import parse_observations
+from daemon.commands import CommandError
+from daemon.config import SessionsSection
+from daemon.control.server import ControlServer
+from daemon.sessions.session_data import sessions_csv, setup_lines
+from daemon.store.errors import NotInStoreError
+from daemon.store.reader import Reader
+from drivers.clock import NS_PER_S, Stamp
+from drivers.readings import DeviceEvent, EventKind
+from tests.daemon.session_support import SOURCE, STEP_S, Rig
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    made = Rig(tmp_path / "rigcal.sqlite")
+    yield made
+    made.store.close()
+
+
+def start(rig: Rig, **more: Any) -> None:
+    rig.say("setup_new", id="S1", instrument="GTS-905A")
+    rig.say("start", prism="r", operator="Ada", **more)
+
+
+def test_every_standstill_becomes_a_pose(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    for rate in (5.0, -4.0):
+        rig.live(1, theta1=rate)
+        rig.live(2)
+    summary = rig.say("stop")
+    assert summary["poses"] == 3
+    assert summary["state"] == "closed"
+    assert summary["excluded"]["moving"] > 20
+
+
+def test_observations_leave_as_the_contracts_csv_and_can_be_read_as_one(rig: Rig) -> None:
+    start(rig, id="first")
+    rig.live(2)
+    rig.say("stop")
+    with Reader(rig.store.path) as reader:
+        data = sessions_csv(reader, SOURCE.rig, ["first"])
+    observations = parse_observations(data, SOURCE.rig, "stored")
+    assert set(observations.prism) == {"r"}
+    assert set(observations.setup) == {"S1"}
+    assert set(observations.session) == {"first"}
+    assert observations.joints["theta1"] == pytest.approx(22.5)
+    assert observations.position_mm[0] == pytest.approx((3000.0, 8000.0, 1000.0), abs=1e-6)
+    assert (observations.extra["dwell_s"] > 0).all()
+    assert (observations.extra["theta1_rate"] == 0).all()
+
+
+def test_a_clock_that_is_set_in_a_session_does_not_step_its_times(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    now = rig.clock.now()
+    rig.clock.set(Stamp(now.utc_ns - 86_400 * NS_PER_S, now.monotonic_ns, now.boot_id))
+    rig.live(2)
+    rig.say("stop")
+    with Reader(rig.store.path) as reader:
+        table = parse_observations(sessions_csv(reader, SOURCE.rig, ["s001-r"]), SOURCE.rig, "a session")
+    assert np.diff(table.extra["time_s"]) == pytest.approx(STEP_S)
+    assert table.extra["time_s"][-1] > 2.0
+
+
+@pytest.mark.parametrize(("step_s", "backwards"), [(-3600.0, True), (-0.2, True), (3600.0, False)])
+def test_a_session_whose_clock_was_set_is_flagged(rig: Rig, step_s: float, backwards: bool) -> None:
+    start(rig)
+    rig.live(2)
+    now = rig.clock.now()
+    rig.clock.set(Stamp(now.utc_ns + round(step_s * NS_PER_S), now.monotonic_ns, now.boot_id))
+    rig.live(2)
+    stopped = rig.say("stop")
+    for told in (stopped, rig.say("show", id="s001-r"), *rig.say("list")):
+        assert told["utc_ran_backwards"] is backwards
+        (step,) = told["clock_steps"]
+        assert step["step_s"] == pytest.approx(step_s)
+        assert step["at_utc_ns"] == now.utc_ns + round((step_s + STEP_S) * NS_PER_S)
+    advice = [sentence for sentence in stopped["advice"] if "clock was set back" in sentence]
+    assert len(advice) == backwards
+
+
+def test_a_session_that_goes_on_after_a_boot_with_an_earlier_clock_is_flagged(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    now = rig.clock.now()
+    rig.clock.set(Stamp(now.utc_ns - 86_400 * NS_PER_S, 5 * NS_PER_S, "next boot"))
+    rig.keeper = rig.new_keeper()
+    rig.live(2)
+    assert rig.say("stop")["utc_ran_backwards"]
+    rig.clock.set(Stamp(now.utc_ns + 86_400 * NS_PER_S, 5 * NS_PER_S, "a boot with a clock that is right"))
+    rig.say("start", prism="r")
+    rig.live(2)
+    assert rig.say("stop")["clock_steps"] == []
+
+
+def test_a_steady_clock_is_not_flagged(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    summary = rig.say("stop")
+    assert (summary["clock_steps"], summary["utc_ran_backwards"]) == ([], False)
+
+
+def test_a_later_session_by_itself_is_timed_on_the_clock_of_all(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    rig.say("stop")
+    rig.live(30)
+    rig.say("start", prism="r", operator="Ada", kind="check")
+    rig.live(2)
+    rig.say("stop")
+    with Reader(rig.store.path) as reader:
+        both, check = (
+            parse_observations(sessions_csv(reader, SOURCE.rig, sessions), SOURCE.rig, "sessions")
+            for sessions in (["s001-r", "s002-r"], ["s002-r"])
+        )
+    assert both.extra["time_s"][0] == 0.0
+    assert check.extra["time_s"].tolist() == both.extra["time_s"][both.session == "s002-r"].tolist()
+    assert check.extra["time_s"][0] > 30.0
+
+
+def test_every_fix_is_its_session_s_by_when_it_was_measured_not_by_when_it_was_joined(rig: Rig) -> None:
+    start(rig)
+    begun = rig.clock.now().monotonic_ns
+    rig.live(2)
+    shot = rig.clock.now().monotonic_ns
+    rig.shoot("cp1", (1500.0, 9000.0, 2000.0))
+    rig.live(2)
+    rig.say("stop")
+    ended = rig.clock.now().monotonic_ns
+    rig.live(2)
+    observed = {row["monotonic_ns"] for row in rig.store.rows("SELECT monotonic_ns FROM observations")}
+    measured = [row["monotonic_ns"] for row in rig.store.rows("SELECT monotonic_ns FROM fixes")]
+    assert {t for t in measured if begun < t < shot} <= observed
+    assert {t for t in measured if ended - NS_PER_S < t < ended} <= observed
+    assert not {t for t in measured if t < begun or t > ended} & observed
+
+
+def test_a_multi_joint_session_keeps_what_it_measures_while_moving(rig: Rig) -> None:
+    start(rig, kind="multi_joint")
+    rig.live(2)
+    rig.live(1, theta1=5.0)
+    assert "moving" not in rig.say("stop")["excluded"]
+
+
+def test_an_aborted_session_is_kept_and_closed(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    assert rig.say("abort")["state"] == "aborted"
+    assert rig.say("list")[0]["observations"] > 0
+
+
+def test_without_a_session_nothing_is_observed(rig: Rig) -> None:
+    rig.live(2)
+    assert rig.store.rows("SELECT count(*) AS n FROM observations")[0]["n"] == 0
+
+
+def test_a_second_session_is_refused_while_one_is_open(rig: Rig) -> None:
+    start(rig)
+    with pytest.raises(CommandError, match="session 's001-r' is open; stop or abort it first"):
+        rig.say("start", prism="b")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        ({"prism": "x"}, "no prism 'x'; it has w, b, r, s"),
+        ({"prism": "r", "kind": "dance"}, "no kind 'dance'; kinds: single_joint"),
+        ({"prism": "r", "setup": "S9"}, "no set-up 'S9'; known: S1"),
+        ({"prism": "r", "id": "a b"}, "a session's id is 1 to 64 letters"),
+        ({}, "no prism ''"),
+    ],
+)
+def test_a_session_that_cannot_be_is_refused_in_a_sentence(rig: Rig, arguments: dict[str, str], reason: str) -> None:
+    rig.say("setup_new", id="S1")
+    with pytest.raises(CommandError, match=reason):
+        rig.say("start", **arguments)
+    assert rig.keeper.open_session() is None
+
+
+def test_a_session_needs_a_setup(rig: Rig) -> None:
+    with pytest.raises(CommandError, match="there is no station set-up; describe one with `rigcal setup new`"):
+        rig.say("start", prism="r")
+
+
+def test_commands_that_need_an_open_session_say_so(rig: Rig) -> None:
+    for command in ("stop", "abort"):
+        with pytest.raises(CommandError, match="no session is open"):
+            rig.say(command)
+    with pytest.raises(CommandError, match="no session is open"):
+        rig.say("shoot", point="cp1")
+    with pytest.raises(NotInStoreError, match="there is no session 'x'"):
+        rig.say("show", id="x")
+
+
+def test_an_open_session_survives_the_daemon(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    rig.keeper = rig.new_keeper()
+    rig.live(2)
+    assert rig.say("stop")["id"] == "s001-r"
+
+
+def test_control_points_that_hold_say_so(rig: Rig) -> None:
+    start(rig)
+    assert rig.shoot("cp1", (9000.0, 500.0, 2000.0))["misclosure_mm"] is None
+    rig.live(2)
+    again = rig.shoot("cp1", (9000.0, 502.0, 2000.0))
+    assert again["phase"] == "end"
+    assert again["misclosure_mm"] == pytest.approx(2.0, abs=1e-6)
+    assert not again["moved"]
+    assert rig.keeper.open_session() is not None
+    summary = rig.say("stop")
+    assert not summary["setup_moved"]
+    with Reader(rig.store.path) as reader:
+        (line,) = setup_lines(reader, ["s001-r"])
+    assert line.control_points[0].end_mm == pytest.approx((0.0, 2.0, 0.0), abs=1e-6)
+
+
+def test_a_setup_that_moved_is_flagged_and_refused_from_then_on(rig: Rig) -> None:
+    start(rig)
+    rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    rig.live(2)
+    assert rig.shoot("cp1", (9000.0, 520.0, 2000.0))["moved"]
+    assert rig.say("stop")["setup_moved"]
+    assert rig.say("setup_list")[0]["state"] == "moved"
+    with pytest.raises(CommandError, match="set-up 'S1' has moved") as caught:
+        rig.say("start", prism="r", setup="S1")
+    assert caught.value.status == 3
+    with pytest.raises(CommandError, match="set-up 'S1', the newest, has moved; describe a new one"):
+        rig.say("start", prism="r")
+
+
+def test_fixes_on_a_control_point_are_no_observations(rig: Rig) -> None:
+    start(rig)
+    rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    rig.target_mm = (9000.0, 500.0, 2000.0)
+    rig.live(2)
+    summary = rig.say("stop")
+    assert summary["observations"] == 0
+    assert summary["excluded"]["a control point, not the prism"] > 10
+
+
+def test_a_control_point_that_is_not_there_is_told(rig: Rig) -> None:
+    start(rig)
+    rig.keeper._settings = SessionsSection(fixes_per_shot=10_000, shot_timeout_s=1.0)
+    with pytest.raises(CommandError, match="of 10000 good fixes within 1 s; is the station aimed"):
+        rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    with pytest.raises(CommandError, match="'r' is a prism of the rig"):
+        rig.say("shoot", point="r")
+
+
+def test_a_shot_that_the_operator_gave_up_measures_nothing(rig: Rig, tmp_path: Path) -> None:
+    """Who gives up turns the station back to the prism, whose fixes were then taken for the control point."""
+    start(rig)
+    rig.keeper._settings = SessionsSection(fixes_per_shot=40)
+    server = ControlServer(tmp_path / "socket", {"session.shoot": rig.keeper.shoot_command})
+    try:
+        with socket.socket(socket.AF_UNIX) as operator:
+            operator.connect(str(tmp_path / "socket"))
+            operator.sendall(b'{"command": "session.shoot", "arguments": {"point": "cp1"}}\n')
+            while rig.keeper._shot is None:
+                rig.live(STEP_S)
+        while rig.keeper._shot is not None:
+            rig.live(STEP_S)
+    finally:
+        server.close()
+    assert rig.say("setup_list")[0]["control_points"] == []
+    rig.live(2)
+    assert rig.say("stop")["control_shots"] == []
+
+
+def test_where_something_can_aim_it_is_told_to(rig: Rig) -> None:
+    rig.keeper = rig.new_keeper(aim=rig.aimed.append)
+    start(rig)
+    rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    assert rig.aimed == ["r", "cp1", "r"]
+    rig.new_keeper(aim=rig.aimed.append)
+    assert rig.aimed == ["r", "cp1", "r", "r"], "a session that goes on after a restart is aimed for again"
+
+
+def test_the_operator_is_told_what_is_still_to_be_done(rig: Rig) -> None:
+    rig.say("setup_new", id="S1")
+    assert (
+        "shoot a control point before the first pose (`rigcal session shoot NAME`)"
+        in rig.say("start", prism="r", kind="check")["advice"][0]
+    )
+    rig.live(2)
+    advice = rig.say("stop")["advice"]
+    assert "control points not shot at the session's end" in advice[0]
+    assert "a check wants 3 to 5 poses; this one has 1" in advice[1]
+
+
+def test_setups_are_described_once_and_checked(rig: Rig) -> None:
+    rig.say("setup_new", id="S1", tilt_arcsec=3.0, ppm=12.0, prism_constants_mm={"r": -30.0})
+    assert rig.say("setup_list")[0]["ppm"] == 12.0
+    with pytest.raises(CommandError, match="set-up 'S1' exists already"):
+        rig.say("setup_new", id="S1")
+    with pytest.raises(CommandError, match="no prism 'q'"):
+        rig.say("setup_new", id="S2", prism_constants_mm={"q": 1.0})
+
+
+def test_a_shot_repeated_at_the_start_replaces_the_one_before(rig: Rig) -> None:
+    start(rig)
+    rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    again = rig.shoot("cp1", (9000.0, 620.0, 2000.0))
+    assert again["misclosure_mm"] is None
+    assert rig.say("setup_list")[0]["control_points"][0]["y_mm"] == pytest.approx(620.0)
+
+
+def test_a_control_point_of_known_place_is_held_against_it_from_the_first_shot(rig: Rig) -> None:
+    rig.say("setup_new", id="S1", control_points={"cp1": [9000.0, 500.0, 2000.0]})
+    rig.say("start", prism="r")
+    shot = rig.shoot("cp1", (9000.0, 503.0, 2000.0))
+    assert shot["phase"] == "start"
+    assert shot["misclosure_mm"] == pytest.approx(3.0, abs=1e-6)
+
+
+def test_a_fix_of_the_prism_never_becomes_the_control_point(rig: Rig) -> None:
+    """While something aims back at the prism, fixes go on; the shot was complete before."""
+    rig.keeper = rig.new_keeper(aim=lambda target: rig.live(1) if target == "r" else None)
+    start(rig)
+    shot = rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    assert (shot["x_mm"], shot["y_mm"]) == pytest.approx((9000.0, 500.0))
+
+
+def test_after_an_encoder_jumped_nothing_of_the_session_is_used(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    before = rig.keeper.open_session()
+    assert before is not None
+    jump = DeviceEvent("theta1", rig.clock.now(), EventKind.PRESET_JUMP, "from 22 to 33")
+    rig.store.insert_records([jump])
+    rig.keeper.on_records([jump])
+    rig.values["theta1"] += 11.0
+    rig.live(2)
+    rig.keeper = rig.new_keeper()  # a new start of the daemon knows of it too
+    rig.live(2)
+    summary = rig.say("stop")
+    assert summary["observations"] <= before["observations"] + 12  # those that waited for their joints
+    assert sum(n for reason, n in summary["excluded"].items() if reason.startswith("theta1 jumped")) > 60
+    assert any("theta1 jumped" in sentence for sentence in summary["advice"])
+    rig.say("start", prism="r")
+    rig.live(2)
+    assert rig.say("stop")["observations"] > 10
+
+
+def test_a_jump_before_the_session_is_told_of_late_and_excludes_nothing(rig: Rig) -> None:
+    jumped = rig.clock.now()
+    rig.live(1)
+    start(rig)
+    rig.keeper.on_records([DeviceEvent("theta1", jumped, EventKind.PRESET_JUMP, "from 22 to 33")])
+    rig.live(2)
+    assert rig.say("stop")["observations"] > 10
+
+
+@pytest.mark.parametrize("boot_id", ["manual", "next boot"])
+def test_a_wall_clock_that_is_set_back_hides_no_jump_from_the_next_run(rig: Rig, boot_id: str) -> None:
+    start(rig)
+    now = rig.clock.now()
+    rig.store.insert_records([DeviceEvent("theta1", now.shifted(NS_PER_S), EventKind.PRESET_JUMP, "from 22 to 33")])
+    back_ns = 86_400 * NS_PER_S
+    rig.clock.set(Stamp(now.utc_ns - back_ns, now.monotonic_ns + 2 * NS_PER_S, boot_id))
+    if boot_id == "manual":
+        late = rig.clock.now()
+        rig.store.insert_records([DeviceEvent("theta3", late, EventKind.PRESET_JUMP, "from 22 to 33")])
+    rig.keeper = rig.new_keeper()
+    rig.live(2)
+    summary = rig.say("stop")
+    jumped = 2 if boot_id == "manual" else 1
+    assert summary["observations"] == 0
+    assert sum("jumped" in sentence for sentence in summary["advice"]) == jumped
+
+
+def test_numbers_of_a_setup_must_be_numbers(rig: Rig) -> None:
+    with pytest.raises(CommandError, match="tilt_arcsec must be a finite number"):
+        rig.say("setup_new", id="S1", tilt_arcsec=math.nan)
+    with pytest.raises(CommandError, match="give three coordinates in mm"):
+        rig.say("setup_new", id="S1", control_points={"cp1": [1.0, 2.0]})
+    for bad in ("abc", math.nan, [1], 1e300, True):
+        with pytest.raises(CommandError, match="r must be a finite number"):
+            rig.say("setup_new", id="S1", prism_constants_mm={"r": bad})
+    with pytest.raises(CommandError, match="prism_constants_mm must be an object"):
+        rig.say("setup_new", id="S1", prism_constants_mm=[])
+    with pytest.raises(CommandError, match="note must be a text of at most 500"):
+        rig.say("setup_new", id="S1", note="x" * 100_000)
+    with pytest.raises(CommandError, match="a set-up's id is 1 to 64 letters"):
+        rig.say("setup_new", id=10**30)
+    assert rig.say("setup_list") == []
+
+
+def test_automatic_names_avoid_those_that_are_taken(rig: Rig) -> None:
+    start(rig, id="s002-r")
+    rig.say("stop")
+    assert rig.say("start", prism="r")["id"] == "s003-r"
