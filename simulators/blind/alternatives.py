@@ -27,7 +27,7 @@ from simulators.effects.library import LIBRARY
 from simulators.rig.screws import Floats
 
 MARGIN = 5.0  # of ln odds
-_SIGMAS = 2.054  # a normal number is above minus this in 98 % of draws
+SIGMAS = 2.054  # a normal number is above minus this in 98 % of draws
 _PLAIN_SIGMAS = 3.090  # likewise in 99.9 %
 _STEP_TIMES = 9  # at which a alternative may step
 _LINEAR = 1e-2  # of a bound: small enough to be linear
@@ -53,7 +53,7 @@ class Separation:
     @property
     def is_separable(self) -> bool:
         """Beaten in all but 2 % of the draws of the noise."""
-        return self.log_odds - _SIGMAS * self.scatter >= MARGIN
+        return self.log_odds - SIGMAS * self.scatter >= MARGIN
 
     @property
     def is_plain(self) -> bool:
@@ -70,10 +70,10 @@ def nearest_alternative(scene: Scene, visibility: Visibility, effect: Effect) ->
         effect: the hidden one.
     """
     signal = visibility.seen(scene.displacement_mm([effect])[:, :, None])[:, 0]
-    own_evidence, own_fit = _weigh(_columns(scene, visibility, effect), signal)
+    own_evidence, own_fit = weigh(effect_columns(scene, visibility, effect), signal)
     nearest = Separation("", float("inf"), 0.0)
     for alternative in _alternatives(scene, effect.family):
-        evidence, fit = _weigh(_columns(scene, visibility, alternative), signal)
+        evidence, fit = weigh(effect_columns(scene, visibility, alternative), signal)
         if own_evidence - evidence < nearest.log_odds:
             scatter = float(np.linalg.norm(own_fit - fit))
             nearest = Separation(f"{alternative.family}@{alternative.where}", own_evidence - evidence, scatter)
@@ -85,10 +85,10 @@ def _alternatives(scene: Scene, family: str) -> Iterator[Effect]:
     for name, kind in LIBRARY.items():
         if name != family and name not in _NO_ALTERNATIVE:
             for where in draws.places(name):
-                yield from _forms(kind(where=where).anchored(draws.first_s, draws.mean_degC), scene)
+                yield from effect_forms(kind(where=where).anchored(draws.first_s, draws.mean_degC), scene)
 
 
-def _forms(effect: Effect, scene: Scene) -> Iterator[Effect]:
+def effect_forms(effect: Effect, scene: Scene) -> Iterator[Effect]:
     """Yield the variants of an effect: cycles per turn, instants of a step."""
     if effect.family == "encoder_harmonic":
         yield from (_changed(effect, k=k) for k in (1, 2))
@@ -99,7 +99,7 @@ def _forms(effect: Effect, scene: Scene) -> Iterator[Effect]:
         yield effect
 
 
-def _columns(scene: Scene, visibility: Visibility, effect: Effect) -> Floats:
+def effect_columns(scene: Scene, visibility: Visibility, effect: Effect) -> Floats:
     """(3 n, k) visible displacement by each coefficient of an effect at its bound; k is 0 if the data lack a column."""
     bounds = scene.draws.bounds(effect)
     small = [{**dict.fromkeys(bounds, 0.0), name: _LINEAR * bound} for name, bound in bounds.items()]
@@ -114,7 +114,7 @@ def _changed(effect: Effect, **values: Any) -> Effect:
     return replace(effect, **values)
 
 
-def _weigh(columns: Floats, signal: Floats) -> tuple[float, Floats]:
+def weigh(columns: Floats, signal: Floats) -> tuple[float, Floats]:
     """Log evidence, and (3 n,) the fit."""
     A = np.eye(columns.shape[1]) + columns.T @ columns
     b = columns.T @ signal

@@ -98,7 +98,7 @@ def _draw(rig: Rig, cells: Sequence[Cell], directory: Path, pool: ProcessPoolExe
     dropped: Counter[str] = Counter()
     for number, (cell, drawn) in enumerate(zip(cells, pool.map(partial(draw, rig), cells, chunksize=4), strict=True)):
         if drawn is None:
-            dropped[f"{cell.families[0]} {cell.poses} {cell.noise} {cell.size:g}x"] += 1
+            dropped[f"{' '.join(cell.families) or cell.kind} {cell.poses} {cell.noise} {cell.size:g}x"] += 1
             continue
         name = f"case-{number:05d}"
         for suffix, text in (("", drawn.train), ("-held-out", drawn.held_out), ("-twin", drawn.twin)):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,9 @@ from calibration.rig.description import Rig
 from simulators.blind.aliases import alias_scene
 from simulators.blind.alternatives import MARGIN, nearest_alternative
 from simulators.blind.cells import Cell
+from simulators.blind.duty_cycle import PosePlan
 from simulators.blind.hiding import HiddenEffect, UnreachableError, hide
+from simulators.blind.machine import draw_machine, draw_unknown
 from simulators.blind.scene import Scene, SceneSettings, draw_scene
 from simulators.blind.visibility import Visibility, reading_covariance_mm2, timing_covariance_mm2
 from simulators.effects.base import Effect
@@ -20,12 +22,19 @@ from simulators.effects.library import LIBRARY
 from simulators.rig.dataset import SimulatedObservations
 from simulators.rig.noise import NoiseSettings
 
-POSES = {"wide": 250, "face": 250, "sparse": 60}
-HELD_OUT = {"wide": 150, "face": 150, "sparse": 60}
+POSES = {"wide": 250, "face": 250, "sparse": 60, "many": 500, "path": 250}
+HELD_OUT = {"wide": 150, "face": 150, "sparse": 60, "many": 150, "path": 60}
+_PLANS: Mapping[str, PosePlan] = {"wide": "wide", "face": "face", "sparse": "sparse", "many": "wide", "path": "path"}
 ENCODER_STEP_DEG = {"fine": 0.0, "stepped": 0.02, "coarse": 0.1}
-_WITH_TWIN = ("single", "pair", "triple")
+_WITH_TWIN = ("single", "pair", "triple", "machine")
 # An error of a joint's own angle is a curve of it too: where the particular family is missing, the general one is true.
-_GENERAL = {"encoder_harmonic": ("joint_error_map",), "angle_scale": ("joint_error_map",)}
+# A carrier that leans to the side that weighs on it is compliant, whatever its law.
+_GENERAL = {
+    "encoder_harmonic": ("joint_error_map",),
+    "angle_scale": ("joint_error_map",),
+    "base_rocking": ("base_compliance",),
+    "jack_lean": ("base_compliance",),
+}
 _STEP_VARIANCE = 1.0 / 12.0  # of a reading in whole steps
 _POSITION_COLUMNS = ("x_mm", "y_mm", "z_mm")
 # What one case in three lacks, where nothing that is hidden in it depends on it.
@@ -80,12 +89,13 @@ def families(rig: Rig) -> tuple[str, ...]:
 def draw(rig: Rig, cell: Cell) -> Drawn | None:
     """Draw the case of a cell; None where its effects cannot be seen so large."""
     try:
-        scene, hidden, visibility = _hidden(rig, cell)
+        made = _make(rig, cell)
     except UnreachableError:
         return None
-    observed = scene.observe([h.effect for h in hidden])
-    nearest = nearest_alternative(scene, visibility, hidden[0].effect) if cell.kind == "single" else None
-    twin = scene.observe(()) if cell.kind in _WITH_TWIN else None
+    scene, hidden = made.scene, made.hidden
+    observed = scene.observe(made.effects)
+    nearest = nearest_alternative(scene, made.visibility, hidden[0].effect) if cell.kind == "single" else None
+    twin = scene.observe(made.unknown) if cell.kind in _WITH_TWIN else None
     without = cell.families if cell.kind == "left_out" else ()
     label = {
         "kind": cell.kind,
@@ -94,11 +104,12 @@ def draw(rig: Rig, cell: Cell) -> Drawn | None:
         "size": cell.size,
         "seed": cell.seed,
         "effects": [_effect_label(rig, h, without) for h in hidden],
+        "unknown": [asdict(effect) | {"family": effect.family} for effect in made.unknown],
         "separable": nearest is None or nearest.is_separable,
         "plain": nearest is None or nearest.is_plain,
         "alternative": "" if nearest is None else nearest.alternative,
         "aliases": cell.families[0].split("|") if cell.kind == "alias" else [],
-        "general": list(_GENERAL.get(cell.families[0], ())) if cell.kind == "left_out" else [],
+        "general": _general(made, without),
         "noise_rms_mm": scene.noise_rms_mm,
         "lacking": list(scene.settings.missing),
         "truth_mm": observed.held_out.oracle_mm.round(4).tolist(),
@@ -121,8 +132,8 @@ def measured(rig: Rig, cell: Cell, poses: Sequence[Mapping[str, Any]]) -> str:
     """
     if missing := [j.column for j in rig.joints if not poses or any(j.column not in row for row in poses)]:
         raise ValueError(f"no pose, or one without {missing[0]}")
-    scene, hidden, _ = _hidden(rig, cell)
-    effects = [h.effect for h in hidden]
+    made = _make(rig, cell)
+    scene, effects = made.scene, made.effects
     joints = {j.name: np.array([float(row[j.column]) for row in poses]) for j in rig.joints}
     how = [k for k in (*scene.training.columns, "fixes") if all(k in row for row in poses)]
     columns = {k: np.array([float(row[k]) for row in poses]) for k in how}
@@ -131,17 +142,45 @@ def measured(rig: Rig, cell: Cell, poses: Sequence[Mapping[str, Any]]) -> str:
     return replace(before, columns=table).csv_text()
 
 
-def _hidden(rig: Rig, cell: Cell) -> tuple[Scene, tuple[HiddenEffect, ...], Visibility]:
-    """Draw a cell's scene, its hidden effects and their visibility; a seed draws the same each time."""
+@dataclass(frozen=True)
+class _Made:
+    """A case before it is observed.
+
+    Attributes:
+        scene: the data to be.
+        visibility: of displacements in it.
+        hidden: effects to be named or described.
+        unknown: effects that make up structure without a name, as the twin has it too.
+    """
+
+    scene: Scene
+    visibility: Visibility
+    hidden: tuple[HiddenEffect, ...] = ()
+    unknown: tuple[Effect, ...] = ()
+
+    @property
+    def effects(self) -> list[Effect]:
+        return [*(h.effect for h in self.hidden), *self.unknown]
+
+
+def _make(rig: Rig, cell: Cell) -> _Made:
+    """Draw a cell's scene and its hidden effects; a seed draws the same each time."""
     rng = np.random.default_rng([cell.seed, 50])
     settings = SceneSettings(
-        plan=cell.poses,
+        plan=_PLANS[cell.poses],
         poses=POSES[cell.poses],
         held_out=HELD_OUT[cell.poses],
         is_decoy=cell.kind == "decoy",
         sigma_columns=bool(rng.random() < 0.5),
         noise=NoiseSettings(encoder_step_deg=ENCODER_STEP_DEG[cell.noise]),
     )
+    make = _make_machine if cell.kind == "machine" else _make_single
+    made = make(rig, cell, settings, rng)
+    return replace(made, scene=_lacking(made.scene, made.effects, rng))
+
+
+def _make_single(rig: Rig, cell: Cell, settings: SceneSettings, rng: np.random.Generator) -> _Made:
+    """Draw a case with the effects that its cell names."""
     scene = draw_scene(rig, cell.seed, settings)
     wanted, where = cell.families, None
     if cell.kind == "alias":
@@ -149,7 +188,24 @@ def _hidden(rig: Rig, cell: Cell) -> tuple[Scene, tuple[HiddenEffect, ...], Visi
         wanted = (str(rng.choice(cell.families[0].split("|"))),)
     visibility = _visibility(scene)
     hidden = hide(scene, wanted, cell.size, visibility.size, cell.seed, where=(where,)) if wanted else ()
-    return _lacking(scene, [h.effect for h in hidden], rng), hidden, visibility
+    return _Made(scene, visibility, hidden)
+
+
+def _make_machine(rig: Rig, cell: Cell, settings: SceneSettings, rng: np.random.Generator) -> _Made:
+    """Draw a machine with many effects beside unknown structure."""
+    sizes = draw_unknown(rng)
+    noise = replace(settings.noise, excess_wander=sizes.wander, wander_poses=sizes.wander_poses)
+    scene = draw_scene(rig, cell.seed, replace(settings, noise=noise))
+    visibility = _visibility(scene)
+    hidden, unknown = draw_machine(scene, visibility, sizes, cell.seed)
+    return _Made(scene, visibility, hidden, unknown)
+
+
+def _general(made: _Made, without: Sequence[str]) -> list[str]:
+    """Families that are true of what is hidden, although it has another name or none."""
+    nameless = [h.effect.family for h in made.hidden if h.effect.family in without or h.effect.family not in LIBRARY]
+    nameless += [effect.family for effect in made.unknown]
+    return sorted({name for family in nameless for name in _GENERAL.get(family, ())})
 
 
 def _visibility(scene: Scene) -> Visibility:
@@ -195,6 +251,7 @@ def _effect_label(rig: Rig, hidden: HiddenEffect, without: Sequence[str]) -> dic
         "coefficients": {name: float(getattr(effect, name)) for name in effect.amplitudes},
         "scale": {name: abs(float(getattr(plausible, name))) for name in effect.amplitudes},
         "size": hidden.size,
+        "separable": hidden.separable,
     }
 
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Literal
+from typing import Literal, get_args
 
-Kind = Literal["single", "null", "decoy", "pair", "triple", "outside", "left_out", "alias", "beside"]
-Poses = Literal["wide", "face", "sparse"]
+Kind = Literal[
+    "single", "null", "decoy", "pair", "triple", "outside", "left_out", "alias", "beside", "machine", "regime", "path"
+]
+Poses = Literal["wide", "face", "sparse", "many", "path"]
 Noise = Literal["fine", "stepped", "coarse"]
 
 ALIASES = (
@@ -17,13 +19,15 @@ ALIASES = (
     "cylinder_compression|transducer_scale",
     "latency|clock_drift",
 )
-KINDS: tuple[Kind, ...] = ("single", "null", "decoy", "pair", "triple", "outside", "left_out", "alias", "beside")
+KINDS: tuple[Kind, ...] = get_args(Kind)
+LEAST_IN_MACHINE = 3.0  # visible size of each of its effects
 SIZES = (0.25, 0.5, 1.0, 3.0)
-POSES: tuple[Poses, ...] = ("wide", "face", "sparse")
+POSES: tuple[Poses, ...] = get_args(Poses)
 NOISES: tuple[Noise, ...] = ("fine", "stepped", "coarse")
 
 REPORTED_FROM = 1_000_000  # seeds below are for tuning
 _COMMON: tuple[Poses, ...] = ("wide", "face")
+_PLANS: tuple[Poses, ...] = ("wide", "face", "sparse")
 
 
 @dataclass(frozen=True)
@@ -33,9 +37,10 @@ class Cell:
     Attributes:
         kind: purpose of the case.
         families: hidden effects; of an alias, one of `ALIASES`: two families that the data is made to confuse; of
-            `beside`, one that no library has, and one of the library.
-        size: visible RMS of each effect in units of the noise; 0 without effects.
-        poses: `wide`, `face` (feed held parallel to the tunnel axis) or `sparse` (few, in clusters).
+            `beside`, one that no library has, and one of the library; none where the seed draws them too.
+        size: visible RMS of each effect in units of the noise, the least one of a machine; 0 without effects.
+        poses: `wide`, `face` (feed held parallel to the tunnel axis), `sparse` (few, in clusters), `many` (twice as
+            many as `wide`) or `path` (one after another along a continuous path).
         noise: encoders read in steps as the rig file has them (`fine`), of 0.02 deg (`stepped`) or 0.1 deg (`coarse`),
             which it does not tell.
         seed: draws everything else.
@@ -69,10 +74,11 @@ def short_plan(families: Sequence[str], outside: Sequence[str], first: int) -> t
 _Open = tuple[Kind, tuple[str, ...], float, Poses, Noise]
 
 _NULLS, _DECOYS, _PAIRS, _TRIPLES, _CASES_PER_ALIAS, _BESIDE = 600, 60, 60, 30, 10, 80
+_MACHINES = 20
 
 
 def _full(families: Sequence[str], outside: Sequence[str]) -> Iterator[_Open]:
-    for family, size, poses, noise in product(families, SIZES, POSES, NOISES):
+    for family, size, poses, noise in product(families, SIZES, _PLANS, NOISES):
         yield "single", (family,), size, poses, noise
     yield from _without_effect("null", _NULLS)
     yield from _without_effect("decoy", _DECOYS)
@@ -85,6 +91,7 @@ def _full(families: Sequence[str], outside: Sequence[str]) -> Iterator[_Open]:
     for name, _ in product(ALIASES, range(_CASES_PER_ALIAS)):
         yield "alias", (name,), 1.0, "wide", "fine"
     yield from _beside(families, outside, _BESIDE)
+    yield from _machines(_MACHINES)
 
 
 def _short(families: Sequence[str], outside: Sequence[str]) -> Iterator[_Open]:
@@ -101,11 +108,12 @@ def _short(families: Sequence[str], outside: Sequence[str]) -> Iterator[_Open]:
     for name in ALIASES:
         yield "alias", (name,), 1.0, "wide", "fine"
     yield from _beside(families, outside, 4)
+    yield from _machines(1)
 
 
 def _without_effect(kind: Kind, number: int) -> Iterator[_Open]:
     for index in range(number):
-        yield kind, (), 0.0, POSES[index % len(POSES)], NOISES[index // len(POSES) % len(NOISES)]
+        yield kind, (), 0.0, _PLANS[index % len(_PLANS)], NOISES[index // len(_PLANS) % len(NOISES)]
 
 
 def _together(kind: Kind, families: Sequence[str], effects: int, number: int) -> Iterator[_Open]:
@@ -122,6 +130,11 @@ def _beside(families: Sequence[str], outside: Sequence[str], number: int) -> Ite
         turn, at = divmod(index, len(outside))
         family = families[(at * len(families) // len(outside) + turn) % len(families)]
         yield "beside", (outside[at], family), (1.0, 3.0)[turn % 2], _COMMON[turn // 2 % len(_COMMON)], "fine"
+
+
+def _machines(number: int) -> Iterator[_Open]:
+    for index in range(number):
+        yield "machine", (), LEAST_IN_MACHINE, ("wide", "many")[index % 2], "fine"
 
 
 def _numbered(cells: Iterator[_Open], first: int) -> tuple[Cell, ...]:

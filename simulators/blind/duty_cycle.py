@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
 
 from calibration.rig.description import Rig
 from simulators.hydraulics import CURRENT_DITHER_MA, PRESSURE_NOISE_BAR, motion_columns
@@ -16,12 +17,13 @@ from simulators.rig.screws import Posture, ScrewChain, nominal_constants, pose_c
 from simulators.rig.truth import RigTruth
 
 Floats = NDArray[np.float64]
-PosePlan = Literal["wide", "face", "sparse"]
+PosePlan = Literal["wide", "face", "sparse", "path"]
 
 _FACE_SHARE = 0.45  # of a revolute joint's range, about its middle, before the feed is set parallel
 _FACE_ROUNDS = 3
 _FACE_JITTER_DEG = 0.5  # an operator sets the feed parallel by eye and by angle display
 _POSES_A_CLUSTER = 6
+_POSES_A_WAY_POINT = 12
 _CLUSTER_SHARE = 0.04  # of a joint's range, 1 sigma
 
 _HOURS = 8.0  # length of a duty cycle
@@ -196,7 +198,7 @@ def draw_poses(rig: Rig, plan: PosePlan, n: int, rng: np.random.Generator) -> di
         rig: gives joints and limits.
         plan: `wide`, evenly between the limits; `face`, the last frame's z axis (the feed) held parallel to one
             direction as a drill plan asks, so that joints move little and make up for one another; `sparse`, a few
-            clusters of poses that are nearly the same.
+            clusters of poses that are nearly the same; `path`, one after another along a smooth path.
         n: number of poses.
         rng: source.
 
@@ -207,10 +209,19 @@ def draw_poses(rig: Rig, plan: PosePlan, n: int, rng: np.random.Generator) -> di
         return random_poses(rig, n, rng)
     if plan == "face":
         return _face(rig, n, rng)
+    if plan == "path":
+        return _path(rig, n, rng)
     centres = random_poses(rig, max(4, -(-n // _POSES_A_CLUSTER)), rng)
     which = rng.integers(len(next(iter(centres.values()))), size=n)
     spread = {j.name: _CLUSTER_SHARE * (j.limits[1] - j.limits[0]) for j in rig.joints}
     return _within(rig, {k: v[which] + rng.normal(0.0, spread[k], n) for k, v in centres.items()})
+
+
+def _path(rig: Rig, n: int, rng: np.random.Generator) -> dict[str, Floats]:
+    """Poses at even steps along a path through random way points; no joint goes beyond the way points' own values."""
+    way_points = max(3, 1 + -(-n // _POSES_A_WAY_POINT))
+    at, steps = np.arange(float(way_points)), np.linspace(0.0, way_points - 1.0, n)
+    return {k: PchipInterpolator(at, v)(steps) for k, v in random_poses(rig, way_points, rng).items()}
 
 
 def _face(rig: Rig, n: int, rng: np.random.Generator) -> dict[str, Floats]:

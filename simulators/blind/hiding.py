@@ -38,10 +38,12 @@ class HiddenEffect:
     Attributes:
         effect: with its coefficients.
         size: visible size of its displacement, as the caller measures it.
+        separable: False where the data do not tell it from another effect or place that is not hidden.
     """
 
     effect: Effect
     size: float
+    separable: bool = True
 
     def as_dict(self) -> dict[str, Any]:
         """As JSON."""

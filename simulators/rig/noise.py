@@ -24,6 +24,8 @@ class NoiseSettings:
         common_share: of the variance, common to all fixes of a standstill.
         wander_share, wander_poses: of the variance, in an error that wanders from pose to pose (air, tripod), and over
             how many poses it forgets.
+        excess_wander: standard deviation of a further error that wanders likewise, in units of the noise; neither the
+            covariance nor the stated sigma includes it.
         outliers: share of the fixes that are 8 to 60 times the noise off.
         misjudged: the stated sigma is wrong by a factor from 1 - this to 1 + this.
         encoder_step_deg: encoders read in steps of this size, whatever the rig file says; 0 as the rig file says.
@@ -33,6 +35,7 @@ class NoiseSettings:
     common_share: float = 0.2
     wander_share: float = 0.05
     wander_poses: float = 3.0
+    excess_wander: float = 0.0
     outliers: float = 0.015
     misjudged: float = 0.05
     encoder_step_deg: float = 0.0
@@ -77,15 +80,10 @@ def draw_noise(
     _check(settings)
     covariance = station_covariance_mm2(station, true_mm)
     own = station_measured_mm(station, true_mm, rng) - true_mm
-    stands, first, which = np.unique(pose, return_index=True, return_inverse=True)
+    _, first, which = np.unique(pose, return_index=True, return_inverse=True)
     shared = (station_measured_mm(station, true_mm[first], rng) - true_mm[first])[which]
     fresh = station_measured_mm(station, true_mm[first], rng) - true_mm[first]
-    keep = np.exp(-1.0 / settings.wander_poses)
-    wander = np.empty_like(fresh)
-    state = fresh[0]
-    for i in range(len(stands)):
-        state = fresh[i] if i == 0 else keep * state + np.sqrt(1.0 - keep**2) * fresh[i]
-        wander[i] = state
+    wander = _wandering(fresh, settings.wander_poses)
     alone = 1.0 - settings.common_share - settings.wander_share
     shift = np.sqrt(alone) * own + np.sqrt(settings.common_share) * shared
     shift += np.sqrt(settings.wander_share) * wander[which]
@@ -95,7 +93,19 @@ def draw_noise(
     noise_mm = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
     off = np.exp(rng.uniform(*_LOG_OUTLIER_SIZES, len(shift))) * noise_mm
     shift = np.where(is_outlier[:, None], direction * off[:, None], shift)
+    if settings.excess_wander > 0.0:
+        fresh = station_measured_mm(station, true_mm[first], rng) - true_mm[first]
+        shift += settings.excess_wander * _wandering(fresh, settings.wander_poses)[which]
     return FixNoise(shift, covariance, is_outlier)
+
+
+def _wandering(fresh: Floats, poses: float) -> Floats:
+    """(n, 3) errors of the same variance as independent ones (n, 3), forgotten over this many poses."""
+    keep = np.exp(-1.0 / poses)
+    out = np.empty_like(fresh)
+    for i in range(len(fresh)):
+        out[i] = fresh[i] if i == 0 else keep * out[i - 1] + np.sqrt(1.0 - keep**2) * fresh[i]
+    return out
 
 
 def read_joints(
@@ -128,7 +138,7 @@ def _check(settings: NoiseSettings) -> None:
     shares = settings.common_share, settings.wander_share, settings.outliers, settings.misjudged
     if min(shares) < 0.0 or settings.common_share + settings.wander_share > 1.0 or settings.outliers > 1.0:
         raise ValueError("shares of noise are from 0 to 1, those of the variance together at most 1")
-    if min(settings.encoder_step_deg, settings.jitter_s) < 0.0 or settings.wander_poses <= 0.0:
+    if min(settings.encoder_step_deg, settings.jitter_s, settings.excess_wander) < 0.0 or settings.wander_poses <= 0.0:
         raise ValueError("sizes of noise are not negative, and a wander lasts more than 0 poses")
 
 
