@@ -23,6 +23,7 @@ from daemon.host.safe_output import write_file
 
 ANSWERS = "answers.json"
 PROPOSED = 20  # poses that a set may ask for
+MEASURED = ("single", "alias")  # kinds of case of which such poses are measured
 # Shares of a run's time, for its progress.
 _DRAWN, _ANSWERED = 0.05, 0.9
 
@@ -69,10 +70,13 @@ def run(rig: str, options: Sequence[str], directory: Path, *, workers: int, prog
     # Spawned: a worker holds nothing of this process.
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _end_with_parent) as pool:
         told = _answers(pool, [_task(rig, case) for case in cases], progress)
+        labels = read_labels(directory)
         poses = {
-            case.name: rows
-            for case in cases
-            if told[case.name]["verdict"] == "indistinguishable" and (rows := proposed_poses(told[case.name], PROPOSED))
+            label["case"]: rows
+            for label in labels["labels"]
+            if label["kind"] in MEASURED
+            and told[label["case"]]["verdict"] == "indistinguishable"
+            and (rows := proposed_poses(told[label["case"]], PROPOSED))
         }
         if poses:
             measure(rig, poses, directory)
@@ -80,7 +84,6 @@ def run(rig: str, options: Sequence[str], directory: Path, *, workers: int, prog
         measured = {found["case"]: found for found in again}
         answers = json.dumps({"answers": told, "measured": measured}).encode()
         write_file(directory / ANSWERS, answers)
-        labels = read_labels(directory)
         progress(_ANSWERED, "calibrating twins without effects")
         with_twin = {label["case"] for label in labels["labels"] if label["twin_mm"] is not None}
         fitted = pool.map(oracle, [_task(rig, case, "-twin") for case in cases if case.name in with_twin])

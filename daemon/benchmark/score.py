@@ -60,6 +60,9 @@ def scores(trials: Sequence[Trial]) -> tuple[Score, ...]:
         _share("two effects, both exact", [t for t in trials if t.kind == "pair"], lambda t: t.is_right, least=0.90),
         _share("three effects, all exact", [t for t in trials if t.kind == "triple"], lambda t: t.is_right),
         *_coefficients(one),
+        *_machines([t for t in trials if t.kind == "machine"]),
+        *_regimes([t for t in trials if t.kind == "regime"]),
+        *_paths([t for t in trials if t.kind == "path"]),
         _share("cases that ended in an error", trials, lambda t: t.verdict == "failed", most=0.0),
         *_seconds(trials),
     )
@@ -118,7 +121,7 @@ def _closed(words: str, trials: Sequence[Trial], *, with_bar: bool) -> Iterable[
 
 def _strangers(trials: Sequence[Trial]) -> Iterable[Score]:
     outside = [t for t in trials if t.kind == "outside"]
-    yield _share("outside the library: misnamed", outside, lambda t: bool(t.named), most=0.03)
+    yield _share("outside the library: misnamed", outside, lambda t: bool(t.named - t.general), most=0.03)
     yield _share("outside the library: right location", outside, lambda t: t.is_located, least=0.85)
     yield _share("outside the library: unidentified", outside, lambda t: t.verdict == "unidentified")
     left_out = [t for t in trials if t.kind == "left_out"]
@@ -136,6 +139,36 @@ def _coefficients(trials: Sequence[Trial]) -> Iterable[Score]:
     yield _figure("coefficient error at 1x, median of relative errors", errors, np.median, most=0.05)
     inside = [held for _, each in found for held in each]
     yield _share("90 % intervals of coefficients cover", inside, bool, least=0.85, most=0.95)
+
+
+def _machines(trials: Sequence[Trial]) -> Iterable[Score]:
+    told = [one for t in trials for one in t.effects_told]
+    yield _share("machine: effects named with their place", told, lambda one: one[1], least=0.85)
+    yield _share("  of those that the data tell apart", [o for o in told if o[0].separable], lambda one: one[1])
+    for poses in dict.fromkeys(t.poses for t in trials):
+        own = [one for t in trials if t.poses == poses for one in t.effects_told]
+        yield _share(f"  {poses} poses", own, lambda one: one[1])
+    wrong = [is_wrong for t in trials for is_wrong in t.names_told]
+    yield _share("machine: wrong name or place among all named", wrong, bool, most=0.03)
+    yield _share("machine: held-out error raised", trials, lambda t: t.is_held_out_raised, most=0.0)
+    shares = [share for t in trials if (share := t.closed) is not None]
+    closed = "machine: held-out gap closed to the unknown structure"
+    yield _figure(f"{closed}, median", shares, np.median, least=0.90)
+    yield _figure(f"{closed}, 10th percentile", shares, lambda values: np.percentile(values, 10))
+    yield _figure("machine: seconds a case, median", [t.answer["seconds"] for t in trials], np.median)
+
+
+def _regimes(trials: Sequence[Trial]) -> Iterable[Score]:
+    yield _share("regime: effect, part and border named", trials, lambda t: t.is_border_right, least=0.85)
+    yield _share("  effect and part, whatever the border", trials, lambda t: t.is_regime_named)
+    yield _share("  effect, whatever the part", trials, lambda t: all(named for _, named in t.effects_told))
+    wrong = [is_wrong for t in trials for is_wrong in t.names_told]
+    yield _share("regime: wrong name, place or part among all named", wrong, bool, most=0.02)
+
+
+def _paths(trials: Sequence[Trial]) -> Iterable[Score]:
+    yield _share("no effect, noise wanders along a path: named", trials, lambda t: bool(t.named), most=0.0)
+    yield _share("  any alarm", trials, lambda t: t.verdict != "none")
 
 
 def _seconds(trials: Sequence[Trial]) -> Iterable[Score]:

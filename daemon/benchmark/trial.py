@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from daemon.benchmark.regime import TrueRegime, regime_of
+
 Floats = NDArray[np.float64]
 
 HALF_90 = 1.645  # half width of a 90 % interval, standard errors
@@ -26,6 +28,7 @@ class TrueEffect:
         places: that count as where it is.
         coefficients: name -> value, those that the library's family has.
         scale: name -> plausible size, for comparing coefficients of different units.
+        separable: these data tell it from all other effects and places beside the other hidden ones.
     """
 
     family: str
@@ -34,6 +37,7 @@ class TrueEffect:
     places: tuple[str, ...]
     coefficients: Mapping[str, float]
     scale: Mapping[str, float]
+    separable: bool
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,7 @@ class Trial:
     """A case.
 
     Attributes:
-        kind: `single`, `null`, `decoy`, `pair`, `triple`, `outside`, `left_out`, `alias` or `beside`.
+        kind: a kind of case, as in `docs/gap-benchmark.md`.
         poses, noise, size: its cell; size is the visible RMS of an effect in units of the noise.
         seed: draws it again.
         effects: hidden effects.
@@ -50,6 +54,7 @@ class Trial:
         alternative: `family@where` nearest to it.
         general: families that are true of the hidden effect although it has another name.
         aliases: families that this data cannot tell apart by construction; empty where there are none.
+        regime: the part of the data in which the hidden effect acts; None for all rows.
         answer: the workflow's.
         measured: its answer after the poses it proposed; None where it proposed none.
         truth_mm: (m, 3) noise-free held-out positions.
@@ -69,6 +74,7 @@ class Trial:
     alternative: str
     general: frozenset[str]
     aliases: tuple[str, ...]
+    regime: TrueRegime | None
     answer: Mapping[str, Any]
     measured: Mapping[str, Any] | None
     truth_mm: Floats
@@ -89,6 +95,11 @@ class Trial:
         return frozenset(effect["family"] for effect in self.answer.get("effects", ()))
 
     @property
+    def _named_places(self) -> frozenset[tuple[str, str]]:
+        """(family, place) of each effect that was adopted."""
+        return frozenset((effect["family"], effect["where"]) for effect in self.answer.get("effects", ()))
+
+    @property
     def reported_set(self) -> frozenset[str]:
         """Families of the set that is pending."""
         return frozenset(candidate["family"] for candidate in self.answer.get("indistinguishable", ()))
@@ -100,14 +111,52 @@ class Trial:
 
     @property
     def is_in_place(self) -> bool:
-        """True if the right families are named at the right places, and no others."""
-        told = {(effect["family"], effect["where"]) for effect in self.answer.get("effects", ())}
-        return self.is_right and told == {(e.family, e.where) for e in self.effects if e.has_name}
+        """True if the right families are named at the right places, none of them in a false part, and no others."""
+        true = {(e.family, e.where) for e in self.effects if e.has_name}
+        return self.is_right and self._named_places == true and not any(self.names_told)
 
     @property
     def is_wrong(self) -> bool:
-        """True if a family is named that is not hidden."""
-        return bool(self.named - self.families)
+        """True if a family is named that is not hidden, nor true of what is."""
+        return bool(self.named - self.families - self.general)
+
+    @property
+    def effects_told(self) -> list[tuple[TrueEffect, bool]]:
+        """Hidden effects of the library, each with whether it is named at its place."""
+        return [(e, (e.family, e.where) in self._named_places) for e in self.effects if e.has_name]
+
+    @property
+    def names_told(self) -> list[bool]:
+        """True for each name that is wrong: nothing of that family is hidden at that place, nor true of what is."""
+        true = {(e.family, e.where) for e in self.effects}
+        return [
+            family not in self.general and ((family, where) not in true or self._is_in_false_part(family, where))
+            for family, where in self._named_places
+        ]
+
+    @property
+    def told_regime(self) -> Mapping[str, Any] | None:
+        """The part of the data in which the hidden effect acts by the answer; None if it is not named so."""
+        for told in self.answer.get("effects", ()):
+            if any((told["family"], told["where"]) == (e.family, e.where) for e in self.effects):
+                return regime_of(told)
+        return None
+
+    @property
+    def is_regime_named(self) -> bool:
+        """True if the hidden effect is named at its place and in its part, whatever the border."""
+        return self.regime is not None and self.regime.is_part(self.told_regime)
+
+    @property
+    def is_border_right(self) -> bool:
+        """True if the named border is within 10 % of its variable's range."""
+        return self.regime is not None and self.regime.is_border(self.told_regime)
+
+    def _is_in_false_part(self, family: str, where: str) -> bool:
+        """True if an effect is named for a part of the data that is not the one in which it acts."""
+        told = next(e for e in self.answer["effects"] if (e["family"], e["where"]) == (family, where))
+        part = regime_of(told)
+        return part is not None and not (self.regime is not None and self.regime.is_part(part))
 
     @property
     def is_set_true(self) -> bool:
@@ -146,11 +195,26 @@ class Trial:
         return bool(promised) and all(0.5 * sigma**2 >= _TOLD_APART for each in promised for sigma in each.values())
 
     @property
-    def closed(self) -> float | None:
-        """Share of the held-out gap that was closed; None if there is no gap, or no oracle."""
-        if self.oracle_mm2 is None or "after_mm" not in self.answer:
+    def held_out_mm2(self) -> tuple[float, float] | None:
+        """Mean squared 3-D error on held-out poses without and with the effects; None of a case that failed."""
+        if "after_mm" not in self.answer:
             return None
         before, after = (mean_square_mm2(self.answer[name], self.truth_mm) for name in ("before_mm", "after_mm"))
+        return before, after
+
+    @property
+    def is_held_out_raised(self) -> bool:
+        """True if the effects make the held-out error larger."""
+        held_out = self.held_out_mm2
+        return held_out is not None and held_out[1] > held_out[0]
+
+    @property
+    def closed(self) -> float | None:
+        """Share of the held-out gap that was closed; None if there is no gap, or no oracle."""
+        held_out = self.held_out_mm2
+        if self.oracle_mm2 is None or held_out is None:
+            return None
+        before, after = held_out
         if before <= _SHOWS**2 * self.oracle_mm2:
             return None
         return (before - after) / (before - self.oracle_mm2)
@@ -191,7 +255,9 @@ def trial(
 ) -> Trial:
     """A label, as the keeper's JSON has it, joined with the answers of its case and of its twin."""
     effects = tuple(
-        TrueEffect(e["family"], e["where"], e["has_name"], tuple(e["places"]), e["coefficients"], e["scale"])
+        TrueEffect(
+            e["family"], e["where"], e["has_name"], tuple(e["places"]), e["coefficients"], e["scale"], e["separable"]
+        )
         for e in label["effects"]
     )
     return Trial(
@@ -207,6 +273,7 @@ def trial(
         alternative=label["alternative"],
         general=frozenset(label["general"]),
         aliases=tuple(label["aliases"]),
+        regime=None if label["regime"] is None else TrueRegime(**label["regime"]),
         answer=answer,
         measured=measured,
         truth_mm=np.asarray(label["truth_mm"], dtype=float),

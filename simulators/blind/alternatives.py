@@ -101,13 +101,18 @@ def effect_forms(effect: Effect, scene: Scene) -> Iterator[Effect]:
 
 def effect_columns(scene: Scene, visibility: Visibility, effect: Effect) -> Floats:
     """(3 n, k) visible displacement by each coefficient of an effect at its bound; k is 0 if the data lack a column."""
+    return visibility.seen(effect_columns_mm(scene, effect))
+
+
+def effect_columns_mm(scene: Scene, effect: Effect) -> Floats:
+    """(n, 3, k) displacement by each coefficient of an effect at its bound; k is 0 if the data lack a column."""
     bounds = scene.draws.bounds(effect)
     small = [{**dict.fromkeys(bounds, 0.0), name: _LINEAR * bound} for name, bound in bounds.items()]
     try:
         moved = [scene.displacement_mm([_changed(effect, **size)]) for size in small]
     except ValueError:
-        return np.zeros((3 * len(scene.training.prism), 0))
-    return visibility.seen(np.stack(moved, axis=2) / _LINEAR)
+        return np.zeros((len(scene.training.prism), 3, 0))
+    return np.stack(moved, axis=2) / _LINEAR
 
 
 def _changed(effect: Effect, **values: Any) -> Effect:

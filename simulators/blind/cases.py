@@ -15,10 +15,12 @@ from simulators.blind.cells import Cell
 from simulators.blind.duty_cycle import PosePlan
 from simulators.blind.hiding import HiddenEffect, UnreachableError, hide
 from simulators.blind.machine import draw_machine, draw_unknown
+from simulators.blind.regime import draw_regime
 from simulators.blind.scene import Scene, SceneSettings, draw_scene
 from simulators.blind.visibility import Visibility, reading_covariance_mm2, timing_covariance_mm2
 from simulators.effects.base import Effect
 from simulators.effects.library import LIBRARY
+from simulators.effects.part import PartialEffect
 from simulators.rig.dataset import SimulatedObservations
 from simulators.rig.noise import NoiseSettings
 
@@ -40,6 +42,10 @@ _POSITION_COLUMNS = ("x_mm", "y_mm", "z_mm")
 # What one case in three lacks, where nothing that is hidden in it depends on it.
 _MAY_LACK = ("temperature_degC", "dwell_s", "_rate", "_bar", "_mA")
 _LACKING = 1 / 3
+# Of a path: the error that wanders along it in units of the noise, over how many rows it forgets, and the share of the
+# cases that lack these columns.
+_PATH_WANDER, _PATH_ROWS = (0.5, 3.0), (5.0, 60.0)
+_TIMELESS, _TIMES = 0.5, ("time_s", "dwell_s")
 
 RULES = (
     f"{POSES['wide']} poses and one prism where poses are wide or face, {POSES['sparse']} where they are sparse",
@@ -108,6 +114,7 @@ def draw(rig: Rig, cell: Cell) -> Drawn | None:
         "separable": nearest is None or nearest.is_separable,
         "plain": nearest is None or nearest.is_plain,
         "alternative": "" if nearest is None else nearest.alternative,
+        "regime": made.regime,
         "aliases": cell.families[0].split("|") if cell.kind == "alias" else [],
         "general": _general(made, without),
         "noise_rms_mm": scene.noise_rms_mm,
@@ -151,12 +158,14 @@ class _Made:
         visibility: of displacements in it.
         hidden: effects to be named or described.
         unknown: effects that make up structure without a name, as the twin has it too.
+        regime: the part of the data in which the hidden effect acts, for the scorer; None for all.
     """
 
     scene: Scene
     visibility: Visibility
     hidden: tuple[HiddenEffect, ...] = ()
     unknown: tuple[Effect, ...] = ()
+    regime: Mapping[str, Any] | None = None
 
     @property
     def effects(self) -> list[Effect]:
@@ -174,12 +183,12 @@ def _make(rig: Rig, cell: Cell) -> _Made:
         sigma_columns=bool(rng.random() < 0.5),
         noise=NoiseSettings(encoder_step_deg=ENCODER_STEP_DEG[cell.noise]),
     )
-    make = _make_machine if cell.kind == "machine" else _make_single
+    make = {"machine": _make_machine, "regime": _make_regime, "path": _make_path}.get(cell.kind, _make_named)
     made = make(rig, cell, settings, rng)
     return replace(made, scene=_lacking(made.scene, made.effects, rng))
 
 
-def _make_single(rig: Rig, cell: Cell, settings: SceneSettings, rng: np.random.Generator) -> _Made:
+def _make_named(rig: Rig, cell: Cell, settings: SceneSettings, rng: np.random.Generator) -> _Made:
     """Draw a case with the effects that its cell names."""
     scene = draw_scene(rig, cell.seed, settings)
     wanted, where = cell.families, None
@@ -199,6 +208,25 @@ def _make_machine(rig: Rig, cell: Cell, settings: SceneSettings, rng: np.random.
     visibility = _visibility(scene)
     hidden, unknown = draw_machine(scene, visibility, sizes, cell.seed)
     return _Made(scene, visibility, hidden, unknown)
+
+
+def _make_regime(rig: Rig, cell: Cell, settings: SceneSettings, rng: np.random.Generator) -> _Made:
+    """Draw a case with an effect that acts in a part of the data."""
+    scene = draw_scene(rig, cell.seed, settings)
+    visibility = _visibility(scene)
+    regime = draw_regime(scene, visibility, cell.size, rng)
+    if regime.by_row:
+        scene = replace(scene, settings=replace(settings, missing=("time_s",)))
+    return _Made(scene, visibility, (regime.hidden,), regime=regime.label)
+
+
+def _make_path(rig: Rig, cell: Cell, settings: SceneSettings, rng: np.random.Generator) -> _Made:
+    """Draw a case without effects, with an error that wanders along a path."""
+    wander, rows = float(rng.uniform(*_PATH_WANDER)), float(rng.uniform(*_PATH_ROWS))
+    noise = replace(settings.noise, excess_wander=wander, wander_poses=rows)
+    missing = _TIMES if rng.random() < _TIMELESS else ()
+    scene = draw_scene(rig, cell.seed, replace(settings, noise=noise, missing=missing))
+    return _Made(scene, _visibility(scene))
 
 
 def _general(made: _Made, without: Sequence[str]) -> list[str]:
@@ -227,7 +255,7 @@ def _visibility(scene: Scene) -> Visibility:
 def _lacking(scene: Scene, effects: Sequence[Effect], rng: np.random.Generator) -> Scene:
     """Remove a column from one case in three, but none on which a hidden effect depends."""
     name = str(rng.choice(_MAY_LACK))
-    if rng.random() >= _LACKING:
+    if rng.random() >= _LACKING or scene.settings.missing:
         return scene
     fixes = scene.training
     left = {k: v for k, v in fixes.columns.items() if not k.endswith(name)}
@@ -239,7 +267,7 @@ def _lacking(scene: Scene, effects: Sequence[Effect], rng: np.random.Generator) 
 
 
 def _effect_label(rig: Rig, hidden: HiddenEffect, without: Sequence[str]) -> dict[str, Any]:
-    effect = hidden.effect
+    effect = hidden.effect.effect if isinstance(hidden.effect, PartialEffect) else hidden.effect
     plausible = type(effect)(where=effect.where)
     at_the_tip = {name for row in rig.rows if "a" in row.drive for driven in row.drive.values() for name in driven}
     return {

@@ -74,7 +74,8 @@ def short_plan(families: Sequence[str], outside: Sequence[str], first: int) -> t
 _Open = tuple[Kind, tuple[str, ...], float, Poses, Noise]
 
 _NULLS, _DECOYS, _PAIRS, _TRIPLES, _CASES_PER_ALIAS, _BESIDE = 600, 60, 60, 30, 10, 80
-_MACHINES = 20
+_MACHINES, _REGIMES, _PATHS = 20, 36, 20
+_REGIME_SIZES = (3.0, 6.0)
 
 
 def _full(families: Sequence[str], outside: Sequence[str]) -> Iterator[_Open]:
@@ -92,6 +93,8 @@ def _full(families: Sequence[str], outside: Sequence[str]) -> Iterator[_Open]:
         yield "alias", (name,), 1.0, "wide", "fine"
     yield from _beside(families, outside, _BESIDE)
     yield from _machines(_MACHINES)
+    yield from _regimes(_REGIMES)
+    yield from _paths(_PATHS)
 
 
 def _short(families: Sequence[str], outside: Sequence[str]) -> Iterator[_Open]:
@@ -109,6 +112,8 @@ def _short(families: Sequence[str], outside: Sequence[str]) -> Iterator[_Open]:
         yield "alias", (name,), 1.0, "wide", "fine"
     yield from _beside(families, outside, 4)
     yield from _machines(1)
+    yield from _regimes(1)
+    yield from _paths(1)
 
 
 def _without_effect(kind: Kind, number: int) -> Iterator[_Open]:
@@ -135,6 +140,16 @@ def _beside(families: Sequence[str], outside: Sequence[str], number: int) -> Ite
 def _machines(number: int) -> Iterator[_Open]:
     for index in range(number):
         yield "machine", (), LEAST_IN_MACHINE, ("wide", "many")[index % 2], "fine"
+
+
+def _regimes(number: int) -> Iterator[_Open]:
+    for index in range(number):
+        yield "regime", (), _REGIME_SIZES[index % len(_REGIME_SIZES)], "wide", "fine"
+
+
+def _paths(number: int) -> Iterator[_Open]:
+    for index in range(number):
+        yield "path", (), 0.0, "path", NOISES[index % len(NOISES)]
 
 
 def _numbered(cells: Iterator[_Open], first: int) -> tuple[Cell, ...]:

@@ -35,9 +35,10 @@ def bench() -> None:
 @click.option(
     "--cells",
     metavar="KIND,...",
-    help="Only these kinds of case: single, null, decoy, pair, triple, outside, left_out, alias, beside.",
+    help="Only these kinds of case: single, null, decoy, pair, triple, outside, left_out, alias, beside, machine, "
+    "regime, path.",
 )
-@click.option("--poses", metavar="KIND,...", help="Only these poses: wide, face, sparse.")
+@click.option("--poses", metavar="KIND,...", help="Only these poses: wide, face, sparse, many, path.")
 @click.option("--noises", metavar="KIND,...", help="Only these encoders: fine, stepped (0.02 deg), coarse (0.1 deg).")
 @click.option("--effects", metavar="FAMILY,...", help="Only these families among the single effects.")
 @click.option("--sizes", metavar="SIZE,...", help="Only these visible sizes, in units of the noise.")
@@ -133,6 +134,9 @@ def as_dict(found: Run) -> dict[str, object]:
                 "outcome": t.outcome,
                 "named": [f"{e['family']}@{e['where']}" for e in t.answer.get("effects", ())],
                 "set": sorted(t.reported_set),
+                "wrong": sum(t.names_told),
+                "regime": None if t.regime is None else asdict(t.regime),
+                "regime_told": t.told_regime,
                 "resolved": None if t.measured is None else t.is_resolved,
                 "description": t.answer.get("description"),
                 "gap_closed": t.closed,

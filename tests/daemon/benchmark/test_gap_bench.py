@@ -34,6 +34,7 @@ def label(kind: str = "single", *families: str, **more: Any) -> dict[str, Any]:
             "places": ["theta4"],
             "coefficients": {"size": 2.0},
             "scale": {"size": 1.0},
+            "separable": True,
         }
         for family in families
     ]
@@ -44,6 +45,7 @@ def label(kind: str = "single", *families: str, **more: Any) -> dict[str, Any]:
         "alternative": "",
         "general": [],
         "aliases": [],
+        "regime": None,
         "truth_mm": TRUTH_MM.tolist(),
         "twin_mm": TWIN_MM.tolist(),
     }
