@@ -85,10 +85,10 @@ def _alternatives(scene: Scene, family: str) -> Iterator[Effect]:
     for name, kind in LIBRARY.items():
         if name != family and name not in _NO_ALTERNATIVE:
             for where in draws.places(name):
-                yield from effect_forms(kind(where=where).anchored(draws.first_s, draws.mean_degC), scene)
+                yield from _forms(kind(where=where).anchored(draws.first_s, draws.mean_degC), scene)
 
 
-def effect_forms(effect: Effect, scene: Scene) -> Iterator[Effect]:
+def _forms(effect: Effect, scene: Scene) -> Iterator[Effect]:
     """Yield the variants of an effect: cycles per turn, instants of a step."""
     if effect.family == "encoder_harmonic":
         yield from (_changed(effect, k=k) for k in (1, 2))
@@ -113,6 +113,19 @@ def effect_columns_mm(scene: Scene, effect: Effect) -> Floats:
     except ValueError:
         return np.zeros((len(scene.training.prism), 3, 0))
     return np.stack(moved, axis=2) / _LINEAR
+
+
+def library_columns_mm(scene: Scene) -> list[tuple[Effect, Floats]]:
+    """Every form of every effect of the library at all its places, with its columns in mm; free curves apart."""
+    draws = scene.draws
+    return [
+        (form, columns_mm)
+        for name, kind in LIBRARY.items()
+        if name not in _NO_ALTERNATIVE
+        for where in draws.places(name)
+        for form in _forms(kind(where=where).anchored(draws.first_s, draws.mean_degC), scene)
+        if (columns_mm := effect_columns_mm(scene, form)).shape[2]
+    ]
 
 
 def _changed(effect: Effect, **values: Any) -> Effect:

@@ -15,7 +15,7 @@ from simulators.blind.cells import Cell
 from simulators.blind.duty_cycle import PosePlan
 from simulators.blind.hiding import HiddenEffect, UnreachableError, hide
 from simulators.blind.machine import draw_machine, draw_unknown
-from simulators.blind.regime import draw_regime
+from simulators.blind.regime import BORDER_WITHIN, draw_regime
 from simulators.blind.scene import Scene, SceneSettings, draw_scene
 from simulators.blind.visibility import Visibility, reading_covariance_mm2, timing_covariance_mm2
 from simulators.effects.base import Effect
@@ -48,7 +48,8 @@ _PATH_WANDER, _PATH_ROWS = (0.5, 3.0), (5.0, 60.0)
 _TIMELESS, _TIMES = 0.5, ("time_s", "dwell_s")
 
 RULES = (
-    f"{POSES['wide']} poses and one prism where poses are wide or face, {POSES['sparse']} where they are sparse",
+    f"{POSES['wide']} poses and one prism where poses are wide, face or path, {POSES['sparse']} where they are sparse, "
+    f"{POSES['many']} where they are many",
     "Visible size: RMS of the effect's displacement in units of the noise (station and readings), with what constants "
     "within one build tolerance, the prism's offset and a free base can take of it taken out",
     "Amplitudes are capped at the library's hard bounds; a case that cannot reach its size anywhere is dropped",
@@ -64,6 +65,9 @@ RULES = (
     "Gap closed: (before^2 - after^2) / (before^2 - oracle^2) at held-out poses against their noise-free places; "
     "before and after are the workflow's kinematics without and with effects, the oracle kinematics of the twin "
     "without effects; cases in which kinematics alone come within 2 % of the oracle are left out",
+    "Of a machine: a name at a place where it is not hidden is wrong, base_compliance beside a leaning carrier is neither; "
+    "its twin has the unknown structure",
+    f"Of an effect in a part of the data: a border is right within {100 * BORDER_WITHIN:g} % of its variable's range",
 )
 
 

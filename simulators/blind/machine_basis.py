@@ -7,11 +7,10 @@ from functools import cached_property
 
 import numpy as np
 
-from simulators.blind.alternatives import MARGIN, SIGMAS, effect_columns, effect_forms, weigh
+from simulators.blind.alternatives import MARGIN, SIGMAS, effect_columns, library_columns_mm, weigh
 from simulators.blind.scene import Scene
 from simulators.blind.visibility import Visibility
 from simulators.effects.base import Effect
-from simulators.effects.library import LIBRARY
 from simulators.effects.unknown.surface import LENGTH, scaled_reading
 from simulators.rig.screws import Floats
 
@@ -32,6 +31,8 @@ class MachineBasis:
     def __init__(self, scene: Scene, visibility: Visibility) -> None:
         self._scene = scene
         self._visibility = visibility
+        self._signals: dict[Effect, Floats] = {}
+        self._spaces: dict[Effect, Floats] = {}
 
     def beside(self, effects: Sequence[Effect]) -> tuple[float, ...]:
         """Return the visible size of each effect that the others, with any coefficients, do not imitate."""
@@ -58,10 +59,10 @@ class MachineBasis:
             effects: hidden ones.
             unknown: visible size of that structure.
         """
-        root = np.linalg.cholesky(self._covariance(unknown))
-        spaces = [np.linalg.solve(root, self._space(effect)) for effect in effects]
-        signals = [np.linalg.solve(root, self._shown(effect)) for effect in effects]
-        alternatives = [(form, np.linalg.solve(root, columns)) for form, columns in self._library]
+        whiten = np.linalg.inv(np.linalg.cholesky(self._covariance(unknown)))
+        spaces = [whiten @ self._space(effect) for effect in effects]
+        signals = [whiten @ self._shown(effect) for effect in effects]
+        alternatives = [(form, whiten @ columns) for form, columns in self._library]
         hidden = {(effect.family, effect.where) for effect in effects}
         told = []
         for number, signal in enumerate(signals):
@@ -83,13 +84,20 @@ class MachineBasis:
         return tuple(told)
 
     def _shown(self, effect: Effect) -> Floats:
-        return self._visibility.seen(self._scene.displacement_mm([effect])[:, :, None])[:, 0]
+        """(3 n,) visible displacement by an effect."""
+        if effect not in self._signals:
+            moved_mm = self._scene.displacement_mm([effect])
+            self._signals[effect] = self._visibility.seen(moved_mm[:, :, None])[:, 0]
+        return self._signals[effect]
 
     def _space(self, effect: Effect) -> Floats:
         """(3 n, k) columns of all that an effect's coefficients may do."""
-        if effect.family in _CURVES:
-            return self._curves(effect.where)
-        return effect_columns(self._scene, self._visibility, effect)
+        if effect not in self._spaces:
+            if effect.family in _CURVES:
+                self._spaces[effect] = self._curves(effect.where)
+            else:
+                self._spaces[effect] = effect_columns(self._scene, self._visibility, effect)
+        return self._spaces[effect]
 
     def _curves(self, joint: str) -> Floats:
         """(3 n, k) columns of a free curve of a joint's angle, each of 1 mrad."""
@@ -102,20 +110,13 @@ class MachineBasis:
     @cached_property
     def _library(self) -> list[tuple[Effect, Floats]]:
         """Every form of every effect of the library at all its places, with its columns; free curves apart."""
-        draws = self._scene.draws
-        return [
-            (form, effect_columns(self._scene, self._visibility, form))
-            for name, kind in LIBRARY.items()
-            if name not in _CURVES
-            for where in draws.places(name)
-            for form in effect_forms(kind(where=where).anchored(draws.first_s, draws.mean_degC), self._scene)
-        ]
+        return [(form, self._visibility.seen(mm)) for form, mm in library_columns_mm(self._scene)]
 
     @cached_property
     def _orthonormal(self) -> list[Floats]:
         """Orthonormal columns of every effect of the library, free curves of each revolute joint among them."""
         curves = [self._curves(joint) for joint in self._scene.draws.places(_CURVES[0])]
-        return [np.linalg.qr(columns)[0] for columns in (*(c for _, c in self._library if c.shape[1]), *curves)]
+        return [np.linalg.qr(columns)[0] for columns in (*(columns for _, columns in self._library), *curves)]
 
     @property
     def _read(self) -> dict[str, Floats]:

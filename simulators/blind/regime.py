@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from simulators.blind.alternatives import MARGIN, SIGMAS, effect_columns_mm, effect_forms, weigh
+from simulators.blind.alternatives import MARGIN, SIGMAS, effect_columns_mm, library_columns_mm, weigh
 from simulators.blind.hiding import HiddenEffect, UnreachableError
 from simulators.blind.scene import Scene
 from simulators.blind.visibility import Visibility
@@ -139,15 +139,7 @@ class _Alternatives:
     def __init__(self, scene: Scene, visibility: Visibility) -> None:
         self._scene = scene
         self._visibility = visibility
-        draws = scene.draws
-        # (n, 3, k) in mm, of each form of each family at each place.
-        self._library = [
-            (form, effect_columns_mm(scene, form))
-            for name, kind in LIBRARY.items()
-            if name != "joint_error_map"
-            for where in draws.places(name)
-            for form in effect_forms(kind(where=where).anchored(draws.first_s, draws.mean_degC), scene)
-        ]
+        self._library = library_columns_mm(scene)
 
     def are_told_from(self, acting: PartialEffect) -> bool:
         """Return whether the effect in its part beats the rest by `MARGIN` in all but 2 % of draws of the noise."""
@@ -174,7 +166,7 @@ class _Alternatives:
                         holds = Part(variable, above, float(border)).holds(values).astype(float)
                         yield whole_mm * holds[:, None, None]
         for form, columns_mm in self._library:
-            if (form.family, form.where) != (acting.effect.family, acting.effect.where) and columns_mm.shape[2]:
+            if (form.family, form.where) != (acting.effect.family, acting.effect.where):
                 yield columns_mm
                 yield columns_mm * inside[:, None, None]
 

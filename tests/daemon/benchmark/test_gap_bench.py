@@ -332,3 +332,80 @@ def test_cases_that_there_are_not_are_refused(option: str, value: str, said: str
 
     assert result.exit_code == 2
     assert said in json.loads(result.stdout)["error"]
+
+
+def at(*places: str, regime: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """An answer that names `family@where` of each."""
+    effects = [
+        {"family": family, "where": where, "coefficients": {}, "regime": regime}
+        for family, where in (place.split("@") for place in places)
+    ]
+    return {**named(), "effects": effects}
+
+
+def hidden_at(kind: str, *places: str, **more: Any) -> dict[str, Any]:
+    effects = [
+        {**label(kind, family)["effects"][0], "where": where} for family, where in (p.split("@") for p in places)
+    ]
+    return {**label(kind), "effects": effects, **more}
+
+
+def test_effects_of_a_machine_are_counted_one_by_one_with_their_places() -> None:
+    of = hidden_at("machine", "backlash@theta4", "backlash@theta5", "latency@clock", general=["base_compliance"])
+    trials = [
+        judged(of, at("backlash@theta4", "latency@clock", "base_compliance@base")),
+        judged(of, at("backlash@theta4", "backlash@theta6")),
+        judged(of, silent("unidentified")),
+    ]
+
+    assert score(trials, "machine: effects named with their place").value == pytest.approx(3 / 9)
+    wrong = score(trials, "machine: wrong name or place among all named")
+    assert (wrong.value, wrong.n) == (pytest.approx(1 / 5), 5)
+
+
+def test_effects_that_raise_the_held_out_error_of_a_machine_are_a_miss() -> None:
+    of = hidden_at("machine", "backlash@theta4")
+    near, far = (TRUTH_MM + 1.0).tolist(), (TRUTH_MM + 2.0).tolist()
+    trials = [
+        judged(of, {**at("backlash@theta4"), "before_mm": before, "after_mm": after})
+        for before, after in ((near, near), (far, near), (near, far))
+    ]
+
+    found = score(trials, "machine: held-out error raised")
+
+    assert found.value == pytest.approx(1 / 3)
+    assert not found.met
+
+
+PART = {"variable": "theta5", "above": True, "border": 10.0, "low": 4.0, "high": 16.0}
+
+
+@pytest.mark.parametrize(
+    ("told", "border", "part", "wrong"),
+    [
+        pytest.param({"variable": "theta5", "above": True, "border": 15.0}, 1.0, 1.0, 0.0, id="right"),
+        pytest.param({"variable": "theta5_deg", "above": True, "border": 15.0}, 1.0, 1.0, 0.0, id="by its column"),
+        pytest.param({"variable": "theta5", "above": True, "border": 17.0}, 0.0, 1.0, 0.0, id="border"),
+        pytest.param({"variable": "theta5", "above": False, "border": 10.0}, 0.0, 0.0, 1.0, id="side"),
+        pytest.param({"variable": "time_s", "above": True, "border": 10.0}, 0.0, 0.0, 1.0, id="variable"),
+        pytest.param(None, 0.0, 0.0, 0.0, id="all rows"),
+    ],
+)
+def test_an_effect_in_a_part_of_the_data_is_named_with_the_part_and_its_border(
+    told: Mapping[str, Any] | None, border: float, part: float, wrong: float
+) -> None:
+    trials = [judged(hidden_at("regime", "backlash@theta4", regime=PART), at("backlash@theta4", regime=told))]
+
+    assert score(trials, "regime: effect, part and border named").value == border
+    assert score(trials, "  effect and part, whatever the border").value == part
+    assert score(trials, "  effect, whatever the part").value == 1.0
+    assert score(trials, "regime: wrong name, place or part among all named").value == wrong
+
+
+def test_no_name_may_come_of_noise_that_wanders_along_a_path() -> None:
+    trials = [judged(label("path"), told) for told in (silent(), silent("unidentified"), named("backlash"))]
+
+    found = score(trials, "no effect, noise wanders along a path: named")
+
+    assert (found.value, found.met) == (pytest.approx(1 / 3), False)
+    assert score(trials, "  any alarm").value == pytest.approx(2 / 3)
