@@ -65,8 +65,8 @@ RULES = (
     "Gap closed: (before^2 - after^2) / (before^2 - oracle^2) at held-out poses against their noise-free places; "
     "before and after are the workflow's kinematics without and with effects, the oracle kinematics of the twin "
     "without effects; cases in which kinematics alone come within 2 % of the oracle are left out",
-    "Of a machine: a name at a place where it is not hidden is wrong, base_compliance beside a leaning carrier is neither; "
-    "its twin has the unknown structure",
+    "Of a machine: a name at a place where it is not hidden is wrong, base_compliance beside a leaning carrier is "
+    "neither right nor wrong; the twin has the unknown structure",
     f"Of an effect in a part of the data: a border is right within {100 * BORDER_WITHIN:g} % of its variable's range",
 )
 
