@@ -21,7 +21,7 @@ BORDER_WITHIN = 0.1  # of the variable's range
 ROW = "row"  # number of a row, where the data have no time
 
 _QUANTILES = 0.3, 0.7  # of the variable's values, between which the border is
-_TRIALS = 60
+_TRIALS = 8  # of each family, until one is seen and told from all others
 _SCALINGS = 3
 _ELSEWHERE = np.linspace(0.1, 0.9, 17)  # quantiles at which another part may end
 # Families that act from an instant on, by time or by warmth themselves, or in the line of sight, have no part here; nor
@@ -74,8 +74,7 @@ def draw_regime(scene: Scene, visibility: Visibility, size: float, rng: np.rando
     kind = str(rng.choice(KINDS))
     known = [name for name in LIBRARY if name not in _WHOLE and scene.draws.places(name)]
     alternatives = _Alternatives(scene, visibility)
-    for _ in range(_TRIALS):
-        family = str(rng.choice(known))
+    for family in np.repeat(rng.permutation(known), _TRIALS).tolist():
         drawn = scene.draws.draw(family, str(rng.choice(scene.draws.places(family))), rng)
         variables = _variables(scene, kind, drawn.effect.where)
         if not variables:
