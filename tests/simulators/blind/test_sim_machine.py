@@ -38,7 +38,6 @@ def visibility(scene: Scene) -> Visibility:
     return Visibility(scene.truth, fixes.prism, fixes.joints, fixes.noise.covariance_mm2)
 
 
-@pytest.mark.slow
 def test_a_machine_has_ten_effects_of_six_families_that_show_beside_each_other(
     scene: Scene, visibility: Visibility
 ) -> None:
