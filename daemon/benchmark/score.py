@@ -167,7 +167,8 @@ def _regimes(trials: Sequence[Trial]) -> Iterable[Score]:
 
 
 def _paths(trials: Sequence[Trial]) -> Iterable[Score]:
-    yield _share("no effect, noise wanders along a path: named", trials, lambda t: bool(t.named), most=0.0)
+    what = "no effect, noise wanders along a path: named, also in a set"
+    yield _share(what, trials, lambda t: bool(t.named | t.reported_set), most=0.0)
     yield _share("  any alarm", trials, lambda t: t.verdict != "none")
 
 

@@ -106,8 +106,9 @@ class Trial:
 
     @property
     def is_right(self) -> bool:
-        """True if all hidden families of the library are named, and no other."""
-        return self.verdict == "named" and self.named == self.families
+        """True if all hidden families of the library are named, in their part of the data, and no other."""
+        is_whole = self.regime is None or self.is_border_right
+        return self.verdict == "named" and self.named == self.families and is_whole
 
     @property
     def is_in_place(self) -> bool:
