@@ -104,7 +104,8 @@ def _unknown(
         return JackLean(x_rad_per_Nm=x, y_rad_per_Nm=y, softer=float(rng.uniform(-0.8, 0.8)))
 
     joints = rng.permutation(np.array(scene.truth.rig.joint_names))[: int(rng.integers(*_PAIR_ERRORS))].tolist()
-    kinds = [*(joint_error(joint) for joint in joints), lambda: PlacePairError(seed=seed()), lean]
+    kinds = [*(joint_error(joint) for joint in joints), lambda: PlacePairError(seed=seed())]
+    kinds += [lean] if scene.truth.rig.masses else []
     parts = [_undescribed(scene, basis, draw) for draw in kinds]
     shares = rng.dirichlet(np.full(len(parts), 4.0))
     parts = [
@@ -180,6 +181,6 @@ def _of_family(
 
 def _reached(size: float, scene: Scene, drawn: Bounded, visibility: Visibility) -> HiddenEffect:
     """Return an effect of a visible size, or as near to it as its hard bounds allow."""
-    factor = min(size / visibility.size(scene.displacement_mm([drawn.effect])), drawn.most)
-    effect = drawn.scaled(factor)
+    plausible = visibility.size(scene.displacement_mm([drawn.effect]))
+    effect = drawn.scaled(min(size / plausible, drawn.most) if plausible > 0.0 else drawn.most)
     return HiddenEffect(effect, visibility.size(scene.displacement_mm([effect])))

@@ -66,19 +66,13 @@ class MachineBasis:
         hidden = {(effect.family, effect.where) for effect in effects}
         told = []
         for number, signal in enumerate(signals):
-            others = np.hstack([space for other, space in enumerate(spaces) if other != number])
-            Q, _ = np.linalg.qr(others)
-
-            def free(columns: Floats, Q: Floats = Q) -> Floats:
-                left: Floats = columns - Q @ (Q.T @ columns)
-                return left
-
-            own, fit = weigh(free(spaces[number]), free(signal))
+            Q, _ = np.linalg.qr(np.hstack([space for other, space in enumerate(spaces) if other != number]))
+            own, fit = weigh(_free_of(Q, spaces[number]), _free_of(Q, signal))
             worst = np.inf
             for form, columns in alternatives:
                 if (form.family, form.where) in hidden:
                     continue
-                evidence, imitation = weigh(free(columns), free(signal))
+                evidence, imitation = weigh(_free_of(Q, columns), _free_of(Q, signal))
                 worst = min(worst, own - evidence - SIGMAS * float(np.linalg.norm(fit - imitation)))
             told.append(bool(worst >= MARGIN))
         return tuple(told)
@@ -169,6 +163,12 @@ def _centred_kernel(at: Floats) -> Floats:
     mean = kernel(at, even).mean(axis=1)
     centred: Floats = kernel(at, at) - mean[:, None] - mean + kernel(even, even).mean()
     return centred
+
+
+def _free_of(Q: Floats, columns: Floats) -> Floats:
+    """Return columns, or one, without what lies in the space of orthonormal columns Q."""
+    left: Floats = columns - Q @ (Q.T @ columns)
+    return left
 
 
 def _within(columns: Floats, signal: Floats) -> Floats:
