@@ -15,7 +15,7 @@ from tests.calibration.conftest import rig_text, split_by_cells
 
 @pytest.fixture(scope="module")
 def identified(ur10_random_poses: Observations) -> tuple[CalibratedModel, Observations, Observations]:
-    training, held_out = split_by_cells(ur10_random_poses, 0.7, 0)
+    training, held_out = split_by_cells(ur10_random_poses, 0.45, 0)
     return identify(shipped_rig("ur10"), rig_text("ur10"), training), training, held_out
 
 
