@@ -37,7 +37,7 @@ demo: setup ## a simulated rig, from bus traffic to a calibrated model and a rep
 # must be reached by its own tests almost line by line.
 test: ## the whole test suite; needs no hardware
 	@$(BOOTSTRAP) -t systemd-analyze=systemd -t udevadm=udev .venv requirements-dev.lock
-	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder --cov=drivers --cov=daemon.store --cov-report=term-missing:skip-covered --cov-fail-under=95
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder --gates --cov=drivers --cov=daemon.store --cov=calibration --cov-report=term-missing:skip-covered
 
 lint: style types imports ## style, types and import floors
 
