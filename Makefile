@@ -14,7 +14,7 @@ export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 # The tests start a hundred processes: each would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help environment setup demo check test lint blind bench soak fuzz lock clean
+.PHONY: help environment setup demo check test lint style types imports quick blind bench soak fuzz lock clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -37,24 +37,33 @@ demo: setup ## a simulated rig, from bus traffic to a calibrated model and a rep
 # must be reached by its own tests almost line by line.
 test: ## the whole test suite; needs no hardware
 	@$(BOOTSTRAP) -t systemd-analyze=systemd -t udevadm=udev .venv requirements-dev.lock
-	$(BIN)/python -m pytest -n auto --dist loadfile --cov=drivers --cov=daemon.store --cov-report=term-missing:skip-covered --cov-fail-under=95
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder --gates --cov=drivers --cov=daemon.store --cov=calibration --cov-report=term-missing:skip-covered
 
-lint: environment ## style, types and import floors
+lint: style types imports ## style, types and import floors
+
+style: environment
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+
+types: environment
 	$(BIN)/mypy
+
+imports: environment
 	$(BIN)/lint-imports
 
 # Some of every room, and nothing that starts a daemon.
 QUICK := tests/drivers tests/daemon/store tests/daemon/report tests/calibration/numerics tests/calibration/rig tests/simulators/devices
 
-check: lint ## lint and a quick part of the tests, in a minute: before each commit
+quick: environment
 	$(BIN)/python -m pytest -q -n auto --dist loadfile -m "not slow" $(QUICK)
+
+check: ## lint and a quick part of the tests, in a minute: before each commit
+	@$(MAKE) --no-print-directory -j2 --output-sync=target types quick imports style
 
 blind: setup ## a few blind cases of every kind for the gap workflow; two minutes on two cores
 	$(BIN)/rigcal bench gap --short
 
-BENCHES := acquisition socketcan kernels refinement evolution peers far_starts design ur10 table4 zhou2022 prediction gate promotion drift residual gap
+BENCHES := acquisition socketcan kernels refinement evolution peers far_starts design ur10 table4 zhou2022 prediction gate promotion drift residual gap gap_cases
 
 bench: setup ## speed and accuracy beside the peers', as ratios; an hour on two cores
 	@for name in $(BENCHES); do echo "== $$name"; $(BIN)/python -m tests.bench.$$name || exit 1; done

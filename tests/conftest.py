@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import signal
 from collections.abc import Generator
 from pathlib import Path
@@ -11,13 +12,56 @@ from coverage import Coverage
 
 # Where drivers and store are tested for their own sake. Elsewhere their lines do not count: what is reached by the way
 # is not tested, and tracing doubles the time of everything that is written in Python.
-COUNTED = ("tests/drivers/", "tests/golden/", "tests/daemon/store/")
-assert all((Path(__file__).parents[1] / folder).is_dir() for folder in COUNTED)
+COUNTED = (
+    "tests/drivers/",
+    "tests/golden/",
+    "tests/daemon/store/",
+    *(
+        f"tests/calibration/{folder}/"
+        for folder in ("design", "evaluation", "experiments", "identification", "model", "published", "rig")
+    ),
+    "tests/calibration/gap/test_discrimination.py",
+    "tests/calibration/gap/test_detection.py",
+    "tests/calibration/test_observations.py",
+)
+assert all((Path(__file__).parents[1] / place).exists() for place in COUNTED)
 
 # A shell without job control starts what it sends to the background with SIGINT ignored, and so do its children; tests
 # that interrupt a process need it heard.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+GATE_LINES = pytest.StashKey[list[str]]()
+
+# What `make test` asks of each package, in per cent of lines.
+GATES = {("drivers/*", "daemon/store/*"): 95.0, ("calibration/*",): 90.0}
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--gates", action="store_true", help="fail if a package's coverage is below its gate")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Gate each package by itself; pytest-cov knows one gate for all, and pytest's summary stays the last line."""
+    if not session.config.getoption("gates") or hasattr(session.config, "workerinput"):
+        return
+    reader = Coverage()
+    reader.load()
+    lines = []
+    for include, least in GATES.items():
+        reached = reader.report(include=list(include), file=io.StringIO())
+        verdict = "reached" if reached >= least else "FAILED"
+        lines.append(f"coverage of {', '.join(include)}: {reached:.1f} %, gate {least:.0f} % {verdict}")
+        if reached < least:
+            session.exitstatus = pytest.ExitCode.TESTS_FAILED
+    session.config.stash[GATE_LINES] = lines
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    for line in config.stash.get(GATE_LINES, []):
+        terminalreporter.write_line(line)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -18,7 +18,7 @@ from calibration.pipeline.find_gap import find_gap
 from daemon.config import load_rig
 from simulators.blind.aliases import alias_scene
 from simulators.blind.cases import Drawn, draw
-from simulators.blind.cells import Cell, Noise, Poses
+from simulators.blind.cells import Cell, Poses
 from simulators.blind.hiding import hide
 from simulators.blind.scene import SceneSettings, draw_scene
 from simulators.blind.visibility import Visibility
@@ -47,54 +47,6 @@ def test_two_effects_are_both_named_where_they_are_and_the_gap_closes() -> None:
     assert [len(round_.adopted) for round_ in gap.rounds] == [1, 1, 0]
     assert not gap.remaining_significant
     assert gap.rounds[-1].held_out_mm < gap.rounds[0].held_out_mm
-
-
-def test_an_effect_that_shows_in_a_few_fixes_only_is_found_beside_another() -> None:
-    """Beside the first, a fit takes the fixes that show the second, nine of 250, for outliers."""
-    drawn, gap = answered(Cell("pair", ("gravity_flip_play", "joint_error_map"), 1.0, "wide", "fine", 400002))
-    assert {(effect.family, effect.where) for effect in gap.effects} == hidden(drawn)
-
-
-def test_a_few_fixes_that_are_far_off_are_no_curve_of_a_joint() -> None:
-    """Three of 60 fixes are off, by 25 to 160 mm: so many that the search also tries what they were if true."""
-    drawn, gap = answered(Cell("single", ("pad_play",), 1.0, "sparse", "stepped", 650418))
-    assert {(effect.family, effect.where) for effect in gap.effects} == hidden(drawn)
-
-
-def test_a_few_fixes_that_are_off_among_coarse_readings_are_no_effect() -> None:
-    """By what coarse encoders scatter they are not far off; with a step of the base two of them would be in place."""
-    drawn, gap = answered(Cell("null", (), 0.0, "sparse", "coarse", 100314))
-    assert (gap.verdict, hidden(drawn)) == ("none", set())
-
-
-def test_an_effect_is_weighed_with_the_noise_that_it_leaves_and_not_with_itself_as_noise() -> None:
-    drawn, gap = answered(Cell("single", ("transducer_quadratic",), 0.5, "sparse", "coarse", 300062))
-    assert {(effect.family, effect.where) for effect in gap.effects} == hidden(drawn)
-
-
-@pytest.mark.parametrize(
-    ("family", "noise", "seed"), [("leak_down", "fine", 720331), ("joint_error_map", "coarse", 720059)]
-)
-def test_what_sixty_poses_show_plainly_has_its_name(family: str, noise: Noise, seed: int) -> None:
-    """Few of them stood long, and half of them hardly determines the kinematics; a curve is all but as free as they."""
-    drawn, gap = answered(Cell("single", (family,), 0.5, "sparse", noise, seed))
-    assert {(effect.family, effect.where) for effect in gap.effects} == hidden(drawn)
-
-
-@pytest.mark.parametrize("seed", [663007, 650072])
-@pytest.mark.slow
-def test_two_effects_that_are_alike_are_a_set(seed: int) -> None:
-    """In the first case play seems to be beside either, and so is more probable than each; in the second the step fits
-    a little better within a visit than in the hours between two, where it is far more likely beforehand.
-    """
-    drawn, gap = answered(Cell("alias", ("base_settlement|base_step",), 1.0, "wide", "fine", seed))
-    assert {candidate.family for candidate in gap.indistinguishable} == set(drawn.label["aliases"])
-
-
-def test_a_payload_is_no_less_a_payload_where_the_machine_is_lighter_than_its_rig_file() -> None:
-    """Its compliance is just beyond the hard limit, which is as uncertain as the masses that it comes from."""
-    drawn, gap = answered(Cell("pair", ("base_step", "payload_change"), 1.0, "wide", "fine", 400021))
-    assert {(effect.family, effect.where) for effect in gap.effects} == hidden(drawn)
 
 
 def test_scatter_far_beyond_the_instruments_is_no_effect_but_not_passed_over_in_silence() -> None:

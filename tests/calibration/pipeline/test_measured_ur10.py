@@ -15,7 +15,7 @@ from tests.calibration.conftest import rig_text, split_by_cells
 
 @pytest.fixture(scope="module")
 def identified(ur10_random_poses: Observations) -> tuple[CalibratedModel, Observations, Observations]:
-    training, held_out = split_by_cells(ur10_random_poses, 0.7, 0)
+    training, held_out = split_by_cells(ur10_random_poses, 0.45, 0)
     return identify(shipped_rig("ur10"), rig_text("ur10"), training), training, held_out
 
 
@@ -65,5 +65,5 @@ def test_the_residual_learns_what_the_effects_leave_and_knows_what_it_leaves(
     assert found["hybrid"] < found["effects"]
     assert learned.noise_mm == pytest.approx(found["hybrid"], rel=0.15)
     evaluation = evaluate(learned, held_out)
-    # Sixty cells, of which a few decide: over nine divisions the mean is 1.04, from 0.77 to 1.23.
+    # A few cells decide: with 70 % of them for training, nine divisions gave 0.77 to 1.23 and 1.04 in the mean.
     assert 0.75 < float(((evaluation.errors_mm["hybrid"] / evaluation.sigma_mm) ** 2).mean()) < 1.25

@@ -18,9 +18,9 @@ from simulators.rig.truth import RigTruth
 from tests.calibration.conftest import rig_text, rms, simulated
 
 EFFECTS = (
-    "boom_droop@boom,joint_compliance@theta4:compliance_rad_per_Nm=2e-8",
     "encoder_harmonic@theta1:k=2:cosk_rad=4e-3:sink_rad=3e-3,encoder_harmonic@theta4:k=2:cosk_rad=3e-3:sink_rad=3e-3",
-    "backlash@theta1:width_rad=4e-3,backlash@theta4:width_rad=3e-3,boom_droop@boom",
+    "backlash@theta1:width_rad=4e-3,backlash@theta4:width_rad=3e-3,"
+    "boom_droop@boom,joint_compliance@theta4:compliance_rad_per_Nm=2e-8",
 )
 
 
@@ -36,7 +36,7 @@ class Outcome:
 def outcomes() -> list[Outcome]:
     rig = shipped_rig("swdt82")
     found = []
-    for seed, effects in enumerate(EFFECTS, 21):
+    for seed, effects in enumerate(EFFECTS, 22):
         truth = RigTruth(rig, seed, effects=parse_effects(effects))
         training, held_out = simulated(truth, 250, seed), simulated(truth, 600, seed + 100)
         model = train_residual(identify(rig, rig_text("swdt82"), training, effects="none"), training)
@@ -50,7 +50,8 @@ def outcomes() -> list[Outcome]:
 @pytest.mark.slow
 def test_hidden_effects_are_learned(outcomes: list[Outcome]) -> None:
     assert all(o.model.residual is not None for o in outcomes)
-    assert all(o.hybrid_mm < 0.85 * o.geometric_mm for o in outcomes)
+    assert all(o.hybrid_mm < 0.75 * o.geometric_mm for o in outcomes)
+    assert np.mean([o.hybrid_mm / o.geometric_mm for o in outcomes]) < 0.6
 
 
 def test_predicted_sigma_is_the_size_of_held_out_errors(outcomes: list[Outcome]) -> None:

@@ -1,4 +1,4 @@
-"""The accuracy that is promised: twenty machines, held-out poses, close to what noise allows."""
+"""The accuracy that is promised: held-out poses of eight machines, close to what noise allows. A bench has twenty."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tests.calibration.simulated_sessions import Outcome, session
 
 @pytest.fixture(scope="module")
 def outcomes() -> list[Outcome]:
-    return [session(seed) for seed in range(1000, 1020)]
+    return [session(seed) for seed in range(1000, 1008)]
 
 
 @pytest.mark.slow

@@ -47,9 +47,9 @@ def torso(tmp_path: Path) -> list[object]:
     rig = parse_rig(TORSO.read_text(encoding="utf-8"), TORSO.name)
     truth = RigTruth(rig, 3)
     single = simulate_observations(truth, 5 * len(rig.joints), 3, poses=sweeps(rig, 5), setup="east")
-    multi = simulate_observations(truth, 18, 4, setup="east")
+    multi = simulate_observations(truth, 10, 4, setup="east")
     (tmp_path / "train.csv").write_text(table({"single": single, "multi": multi}), encoding="utf-8")
-    held_out = simulate_observations(truth, 20, 5, setup="east")
+    held_out = simulate_observations(truth, 10, 5, setup="east")
     (tmp_path / "test.csv").write_text(held_out.csv_text(), encoding="utf-8")
     data, test = tmp_path / "train.csv", tmp_path / "test.csv"
     return ["--rig", TORSO, "--data", data, "--holdout", test, "--out", tmp_path / "new" / "pages"]
@@ -92,7 +92,7 @@ def test_a_person_gets_a_table_reasons_shared_rows_and_the_page_s_path(torso: li
     assert "*" in best
     assert sum("not applicable" in line for line in lines if "masses" not in line) == 2
     assert sum("masses" in line for line in lines) == 2
-    assert "1 of the 81 rows of test.csv are rows of train.csv as well (the first is row 81)" in result.stdout
+    assert "1 of the 41 rows of test.csv are rows of train.csv as well (the first is row 41)" in result.stdout
     assert "comparison-torso.html" in lines[-1]
 
 
