@@ -20,6 +20,7 @@ COUNTED = (
         f"tests/calibration/{folder}/"
         for folder in ("design", "evaluation", "experiments", "identification", "model", "published", "rig")
     ),
+    "tests/calibration/gap/background/",
     "tests/calibration/gap/test_discrimination.py",
     "tests/calibration/gap/test_detection.py",
     "tests/calibration/test_observations.py",

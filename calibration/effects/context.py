@@ -189,6 +189,15 @@ class EffectContext:
         return greatest if greatest > _LEAST_NM else 0.0
 
     @cached_property
+    def overturning_Nm(self) -> Floats:  # noqa: N802 - the unit is N m
+        """(n, 2) moments of all weights about the level axes through the base's origin; see `level_axes`."""
+        lever_mm, newton = self.loads.places(self.data.readings, self.observations.extra)
+        axes = level_axes(self.rig.gravity)
+        moment = np.cross((newton[:, :, None] * lever_mm).sum(axis=1) / 1e3, -axes[2])
+        out: Floats = moment @ axes[:2].T
+        return out
+
+    @cached_property
     def _torques(self) -> Floats:
         return self.loads(self.data.readings, self.observations.extra, self.down)
 

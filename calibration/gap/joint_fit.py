@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.effects.columns import NO_JOINT, EffectColumns, joined, same_columns
+from calibration.effects.columns import EffectColumns, joined, same_columns
 from calibration.effects.context import EffectContext
 from calibration.effects.fitted import Choice, FittedEffect
-from calibration.gap.formulas.grammar import Formula
 from calibration.gap.projection import Projection
 from calibration.identification.refinement import Fit, Prior, refine
 from calibration.identification.solve import Solution
@@ -146,28 +145,12 @@ class Problem:
         observations: the rows.
         prior: of the solution.
         seed: of everything random.
-        formulas: of effects outside the library, fitted along with the kinematics.
     """
 
     solution: Solution
     observations: Observations
     prior: Prior
     seed: int
-    formulas: tuple[Formula, ...] = ()
-
-    def with_formulas(self, formulas: Sequence[Formula]) -> Problem:
-        """Return the same data with formulas fitted along, the prior sigma of each being its size."""
-        chain, samples, fit = self.solution.chain, self.solution.samples, self.solution.fit
-        additions = EffectColumns(
-            tuple(str(f.term) for f in formulas),
-            np.full(len(formulas), NO_JOINT),
-            np.zeros((len(samples), len(formulas))),
-            np.array([abs(f.coefficient) for f in formulas]),
-            np.stack([f.term.moved_mm for f in formulas], axis=2),
-        )
-        fit = refine(chain, samples, fit.x[: len(chain)], prior=self.prior, additions=additions)
-        solution = replace(self.solution, fit=fit, additions=additions)
-        return replace(self, solution=solution, formulas=tuple(formulas))
 
     def rng(self) -> np.random.Generator:
         """Return the generator of detection's signs, the same every time."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
@@ -57,6 +58,32 @@ class Disagreement:
     def as_dict(self) -> dict[str, object]:
         """Return the JSON object (docs/formats.md, gap)."""
         return {"where": self.where, "variable": self.variable, "p": self.p}
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The evidence of an effect that is named, given all others.
+
+    Attributes:
+        log_bayes_factor: against the model without it.
+        posterior: probability of its family.
+        places: place -> probability that it is there, given the family; those that the data do not exclude.
+        certificate_p: p-value on data that had no part in choosing it; NaN for a map, which no half could choose.
+    """
+
+    log_bayes_factor: float
+    posterior: float
+    places: Mapping[str, float]
+    certificate_p: float
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the members of the JSON object of an effect (docs/formats.md, gap)."""
+        p = self.certificate_p
+        return {
+            "log_bayes_factor": self.log_bayes_factor,
+            "places": dict(self.places),
+            "certificate_p": None if math.isnan(p) else p,
+        }
 
 
 @dataclass(frozen=True)
@@ -131,6 +158,7 @@ class GapResult:
         verdict: one of four.
         effects: all that were adopted, with their coefficients from the joint refit.
         posterior: `family@where` of each adopted one -> probability of its family, when it was adopted.
+        evidence: `family@where` of each adopted one -> its evidence given all others, and where else it may be.
         indistinguishable: the set that is pending, at most three families.
         description: on what the structure depends that no effect of the library explains.
         remaining_significant, remaining_mm: whether structure is left over, and the RMS of what is.
@@ -150,6 +178,7 @@ class GapResult:
     verdict: Verdict
     effects: tuple[FittedEffect, ...]
     posterior: Mapping[str, float]
+    evidence: Mapping[str, Evidence]
     indistinguishable: tuple[Candidate, ...]
     description: str | None
     remaining_significant: bool
@@ -170,11 +199,16 @@ class GapResult:
     error_after_mm: Floats
     warnings: tuple[str, ...] = ()
 
+    def _effect(self, effect: FittedEffect) -> dict[str, object]:
+        """Return the JSON object of one effect, with its evidence."""
+        name = f"{effect.family}@{effect.where}"
+        return {**effect.as_dict(), "posterior": self.posterior[name], **self.evidence[name].as_dict()}
+
     def as_dict(self) -> dict[str, object]:
         """Return the JSON object of `gap` (docs/formats.md), without `seconds`."""
         return {
             "verdict": self.verdict,
-            "effects": [{**e.as_dict(), "posterior": self.posterior[f"{e.family}@{e.where}"]} for e in self.effects],
+            "effects": [self._effect(e) for e in self.effects],
             "indistinguishable": [c.as_dict() for c in self.indistinguishable],
             "description": self.description,
             "remaining": {"significant": self.remaining_significant, "rms_mm": self.remaining_mm},

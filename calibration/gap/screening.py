@@ -11,6 +11,7 @@ import itertools
 import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from scipy.special import chdtrc, logsumexp
@@ -97,27 +98,24 @@ class ScoredEffect:
         return sum(name in listed for name in names) or len(names)
 
 
-class Screen:
-    """Products of the columns of all candidates in the projected space, so that any set of them is scored at once.
+class BlockProducts(Protocol):
+    """Products of blocks of candidates' columns in a projected space."""
 
-    Args:
-        projection: the projected space.
-        candidates: the effects.
-    """
+    def along(self, block: int) -> Floats:
+        """Return (k,) the products of a block's columns with the target."""
 
-    def __init__(self, projection: Projection, candidates: Sequence[CandidateEffect]) -> None:
-        self.projection, self.candidates = projection, tuple(candidates)
-        self._number = {id(candidate): number for number, candidate in enumerate(self.candidates)}
-        self._block: dict[tuple[int, int], int] = {}
-        blocks: list[EffectColumns] = []
-        for number, candidate in enumerate(self.candidates):
-            for option, first in enumerate(candidate.first_equal):
-                self._block[number, option] = len(blocks) if first == option else self._block[number, first]
-                if first == option:
-                    blocks.append(candidate.additions[option])
+    def product(self, a: int, b: int) -> Floats:
+        """Return (k, l) the products of the columns of two blocks."""
+
+
+class _ProjectedProducts:
+    """Products of columns with the kinematics of a projection projected out, each computed when it is asked for."""
+
+    def __init__(self, projection: Projection, blocks: Sequence[EffectColumns]) -> None:
+        self._projection, self._blocks = projection, blocks
         target = projection.target
         removed_target = projection.without_kinematics.removed(target)
-        self._blocks, self._kept = blocks, dict[int, Floats]()
+        self._kept = dict[int, Floats]()
         self._removed: list[Floats] = []
         self._along: list[Floats] = []
         self._gram: dict[tuple[int, int], Floats] = {}
@@ -132,9 +130,53 @@ class Screen:
                 self._gram[number, number] = rows.T @ rows - own.T @ own
                 self._removed.append(own)
 
+    def along(self, block: int) -> Floats:
+        return self._along[block]
+
+    def product(self, a: int, b: int) -> Floats:
+        if (a, b) not in self._gram:
+            product = self._whitened(a).T @ self._whitened(b) - self._removed[a].T @ self._removed[b]
+            self._gram[a, b], self._gram[b, a] = product, product.T
+        return self._gram[a, b]
+
+    def _whitened(self, block: int) -> Floats:
+        """Return (3 m, k) the whitened columns of a block."""
+        if block not in self._kept:
+            if len(self._kept) == _KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[block] = self._projection.whitened(self._projection.moved_mm(self._blocks[block]))
+        return self._kept[block]
+
+
+class Screen:
+    """Products of the columns of all candidates in the projected space, so that any set of them is scored at once.
+
+    Args:
+        projection: the projected space.
+        candidates: the effects.
+        products: of the blocks of their columns, one for each distinct variant in order; those of the projection by
+            default.
+    """
+
+    def __init__(
+        self, projection: Projection, candidates: Sequence[CandidateEffect], products: BlockProducts | None = None
+    ) -> None:
+        self.projection, self.candidates = projection, tuple(candidates)
+        self._number = {id(candidate): number for number, candidate in enumerate(self.candidates)}
+        self._block: dict[tuple[int, int], int] = {}
+        blocks: list[EffectColumns] = []
+        for number, candidate in enumerate(self.candidates):
+            for option, first in enumerate(candidate.first_equal):
+                self._block[number, option] = len(blocks) if first == option else self._block[number, first]
+                if first == option:
+                    blocks.append(candidate.additions[option])
+        self._blocks = blocks
+        self._products = _ProjectedProducts(projection, blocks) if products is None else products
+
     def columns(self, candidate: int, option: int) -> Floats:
         """Return (3 m, k) the projected columns of a variant."""
-        return self.projection.without_kinematics(self._whitened(self._block[candidate, option]))
+        additions = self._blocks[self._block[candidate, option]]
+        return self.projection.columns(self.projection.moved_mm(additions))
 
     def distinct(self, candidate: int) -> tuple[tuple[int, ...], ...]:
         """Return the variants of a candidate, grouped where they differ in their prior alone."""
@@ -151,8 +193,8 @@ class Screen:
             scales: of the plausible sizes of each; 1 by default.
         """
         blocks = [self._block[which] for which in chosen]
-        gram = np.block([[self._product(a, b) for b in blocks] for a in blocks])
-        along = np.concatenate([self._along[block] for block in blocks])
+        gram = np.block([[self._products.product(a, b) for b in blocks] for a in blocks])
+        along = np.concatenate([self._products.along(block) for block in blocks])
         sigma = np.concatenate(
             [
                 self.candidates[candidate].additions[option].prior_sigma * scale
@@ -269,22 +311,8 @@ class Screen:
         """Return eigenvalues (k,) and axes (k, k) of a variant's G'G in prior sigmas, and G'r along these axes."""
         block = self._block[number, option]
         sigma = self.candidates[number].additions[option].prior_sigma
-        size, axes = np.linalg.eigh(self._product(block, block) * sigma * sigma[:, None])
-        return np.maximum(size, 0.0), axes, axes.T @ (self._along[block] * sigma)
-
-    def _product(self, a: int, b: int) -> Floats:
-        if (a, b) not in self._gram:
-            product = self._whitened(a).T @ self._whitened(b) - self._removed[a].T @ self._removed[b]
-            self._gram[a, b], self._gram[b, a] = product, product.T
-        return self._gram[a, b]
-
-    def _whitened(self, block: int) -> Floats:
-        """Return (3 m, k) the whitened columns of a block."""
-        if block not in self._kept:
-            if len(self._kept) == _KEPT:
-                del self._kept[next(iter(self._kept))]
-            self._kept[block] = self.projection.whitened(self.projection.moved_mm(self._blocks[block]))
-        return self._kept[block]
+        size, axes = np.linalg.eigh(self._products.product(block, block) * sigma * sigma[:, None])
+        return np.maximum(size, 0.0), axes, axes.T @ (self._products.along(block) * sigma)
 
 
 def _explained(size: Floats, along: Floats) -> tuple[float, int]:

@@ -11,13 +11,18 @@ import numpy as np
 from calibration.effects.columns import joined
 from calibration.effects.fitted import Choice
 from calibration.gap.adoption import Adopted, adopted
+from calibration.gap.background.blocks import displacement_blocks, smooth_blocks
+from calibration.gap.background.naming import Names, evidence_alone, names_beside
+from calibration.gap.background.outside import formula_block, is_in_library, what_is_left
+from calibration.gap.background.search import background_log_bayes_factor
 from calibration.gap.candidates import CandidateEffect, candidate_at, candidate_effects, variants_at
-from calibration.gap.criteria import best_of_each_family, beyond_doubt, explains, joint_log_bayes_factor
+from calibration.gap.criteria import best_of_each_family, beyond_doubt, joint_log_bayes_factor
+from calibration.gap.detection import detect
 from calibration.gap.formulas.grammar import Formula, Grammar
 from calibration.gap.joint_fit import OUTLIER, JointFit, Problem, joint_fit
 from calibration.gap.projection import Projection
-from calibration.gap.screening import ScoredEffect, Screen
-from calibration.gap.search_result import SearchResult, SelectionStep, conclude
+from calibration.gap.screening import ScoredEffect, Screen, by_family
+from calibration.gap.search_result import STRUCTURE, SearchResult, SelectionStep, conclude
 from calibration.gap.selection import Selection, select_effect
 from calibration.identification.reading_steps import in_true_steps
 from calibration.identification.refinement import Prior
@@ -26,8 +31,8 @@ from calibration.observations import Observations
 
 _MOST_FAMILIES = 4
 _STEPS = 30  # of the loop; every place of every adopted family
+_FORMULAS = 3  # of effects outside the library that may explain all that is left
 _PENDING = 3  # sets that are adopted for the time being
-_FORMULAS = 3  # that are fitted along
 _MANY = 0.02  # share of gross outliers that is more than accidents
 _BETTER = 1.0  # log Bayes factor, to change the form of an adopted effect
 _FORMS = 5  # times that the forms of adopted effects are changed, before all candidates are scored again
@@ -52,7 +57,7 @@ def search(
     """
     seen = in_true_steps(solution, observations, prior)
     problem = Problem(seen, observations, prior, seed)
-    found = _search_with_formulas(problem, families, _Search(problem, families).run())
+    found = _beside_background(problem, families, _Search(problem, families).run())
     if seen is solution:
         return found
     # A model counts the noise of readings as its rig file has it, and what is beyond that as scatter.
@@ -68,21 +73,18 @@ class _Search:
     def __init__(self, problem: Problem, families: Collection[str]) -> None:
         self.problem, self.families = problem, tuple(families)
 
-    def run(self, before: SearchResult | None = None) -> SearchResult:
+    def run(self) -> SearchResult:
         """Search without gross outliers, and with all samples where there are many such.
 
         To kinematics alone a fix that shows an effect may look like an outlier, as such fixes are often the rare ones:
         those after a step, or where a load has changed its side. The search whose effects leave fewer outliers counts.
-
-        Args:
-            before: a result from which to go on.
         """
         counted = self.problem.with_mild_outliers(self.problem.kinematics_only())
         weight = counted.fit.weight
-        found = self._run(counted, before)
+        found = self._run(counted)
         if (weight < OUTLIER).mean() < _MANY:
             return found
-        with_all = self._run(replace(counted, fit=replace(counted.fit, weight=np.ones_like(weight))), before)
+        with_all = self._run(replace(counted, fit=replace(counted.fit, weight=np.ones_like(weight))))
         return with_all if with_all.joint.choices and self._outliers(with_all) < self._outliers(found) else found
 
     def _outliers(self, found: SearchResult) -> int:
@@ -90,7 +92,7 @@ class _Search:
         fit = found.joint.fit if found.joint.choices else self.problem.solution.fit
         return int((fit.weight < OUTLIER).sum())
 
-    def _run(self, joint: JointFit, before: SearchResult | None) -> SearchResult:
+    def _run(self, joint: JointFit) -> SearchResult:
         """Search from a fit of the kinematics alone, whose weights are those of the first step."""
         projection = self.problem.project(joint)
         alone = SelectionStep(joint, projection, (), {}, ())
@@ -99,10 +101,6 @@ class _Search:
         posterior: dict[str, float] = {}
         pending: list[str] = []
         candidates, count = initial.candidates, 0
-        if before is not None and before.joint.choices:
-            steps, posterior = list(before.steps[:-1]), dict(before.posterior)
-            joint = self.problem.fit(before.joint.choices, joint.fit.x)
-            projection, candidates = self._candidates(joint)
         while True:
             selection = select_effect(self.problem, joint, projection, candidates)
             count += 1
@@ -211,52 +209,80 @@ def _step(joint: JointFit, projection: Projection, selection: Selection, taken: 
     return SelectionStep(joint, projection, selection.scored, selection.posterior, taken, selection.reasons)
 
 
-def _search_with_formulas(problem: Problem, families: Collection[str], found: SearchResult) -> SearchResult:
-    """Return a result with the effects that are beyond doubt in addition to formulas of effects outside the library.
-
-    On a machine there is always something that no library has, and clear effects besides. The search goes on with a
-    formula fitted along, one more each time: of several that are found together others may be an effect in words. The
-    model that comes of it has the effects alone; what they leave is told as ever.
+def _beside_background(problem: Problem, families: Collection[str], found: SearchResult) -> SearchResult:
+    """Return a result with the effects that are beyond doubt beside structure that no library has, if there are any.
 
     Args:
         problem: the data.
         families: of effects that may be named.
-        found: without formulas fitted along. It stays as it is where nothing more is named, or a set stays open.
+        found: without a background; it stays as it is where it leaves nothing but noise, or nothing more is certain.
     """
-    further, formulas = found, list[Formula]()
-    for _ in range(_FORMULAS):
-        new = next((f for f in further.outside_library if not _has_name(f, further)), None)
-        if new is None:
-            break
-        formulas.append(new)
-        further = _Search(problem.with_formulas(formulas), families).run(further)
-    named, pending = {str(c) for c in further.joint.choices}, {str(w.candidate) for w in found.alternatives}
-    if not {str(c) for c in found.joint.choices} < named or (pending and not pending & named):
-        return found
-    fits = [problem.fit(step.fit.choices, problem.solution.fit.x) for step in further.steps]
-    steps = [replace(s, fit=fit, projection=problem.project(fit)) for s, fit in zip(further.steps, fits, strict=True)]
-    joint, final = fits[-1], Grammar(steps[-1].projection)
-    return replace(
-        found,
-        adopted=adopted(problem.solution, joint, further.adopted.reason),
-        joint=joint,
-        steps=tuple(steps),
-        alternatives=(),
-        formulas=final.find() or tuple(formulas),
-        posterior=further.posterior,
-        final=final,
+    names, formulas = _names(problem, families, found)
+    if names is None or not names.joint.choices:
+        smooth = None if formulas else names
+        return replace(found, evidence=evidence_alone(problem, found.joint, families), beside=smooth)
+    joint, first = names.joint, found.steps[0]
+    last = problem.project(joint)
+    posterior = {name: own.posterior for name, own in names.evidence.items()}
+    of_family = by_family(names.left) | {c.family: posterior[str(c)] for c in joint.choices}
+    listed = ", ".join(map(str, joint.choices))
+    return SearchResult(
+        adopted(problem.solution, joint, f"the data ask for {listed}, whatever else is there"),
+        joint,
+        (
+            replace(first, adopted=joint.choices, posterior=of_family),
+            replace(first, fit=joint, projection=last, scored=names.left, posterior=of_family, adopted=(), reasons={}),
+        ),
+        names.open_set,
+        formulas,
+        formulas,
+        posterior,
+        found.candidates,
+        found.initial,
+        Grammar(last),
+        names.evidence,
+        names,
     )
 
 
-def _has_name(formula: Formula, found: SearchResult) -> bool:
-    """True if an effect that was scored in the last step explains what a formula does.
+def _names(
+    problem: Problem, families: Collection[str], found: SearchResult
+) -> tuple[Names | None, tuple[Formula, ...]]:
+    """Return the names beside structure that no library has, None where a search has left nothing but noise.
 
-    A formula that does not show by itself, for all that hides it, has no name.
+    One effect outside the library is a formula, or two, that leave nothing; names are sought beside these, which are
+    returned as well. Where formulas do not explain all that is left they may stand for anything, and names are sought
+    beside a smooth unknown.
     """
-    over = found.final.projection
-    shows = formula.adds_to(np.empty((len(over.residual), 0)), over.residual)
-    scored = found.steps[-1].scored if shows else ()
-    return any(w.log_bayes_factor > 0.0 and explains(w, formula, over) for w in scored)
+    known, context, average = found.joint.choices, found.joint.situation, problem.solution.samples.average
+    smooth = smooth_blocks(context, average)
+    if not found.outside_library and not detect(found.final, problem.rng()).significant:
+        wide = [*smooth, *displacement_blocks(context, average)]
+        if background_log_bayes_factor(problem, found.joint, wide) < STRUCTURE:
+            return None, ()
+        names = names_beside(problem, smooth, families, known)
+        left = background_log_bayes_factor(problem, names.joint, wide)
+        return replace(names, background_log_bayes_factor=left), ()
+    first = (found.outside_library or found.final.find())[:1]
+    if _formulas_suffice(problem, found.joint, first):
+        further, formulas = first, tuple[Formula, ...]()
+        for _ in range(_FORMULAS):
+            formulas += tuple(f for f in further if not is_in_library(f, found.candidates.candidates, found.initial))
+            names = names_beside(problem, [formula_block(f, n) for n, f in enumerate(formulas)], families, known)
+            further = what_is_left(problem, names.joint, formulas)
+            if not further:
+                return names, formulas
+    return names_beside(problem, smooth, families, known), ()
+
+
+def _formulas_suffice(problem: Problem, joint: JointFit, formulas: Sequence[Formula]) -> bool:
+    """True if a few formulas explain all that effects leave, be they effects of the library in words or not."""
+    for _ in range(_FORMULAS):
+        further = what_is_left(problem, joint, formulas)
+        if not further:
+            return True
+        formulas = (*formulas, *further)
+    return False
 
 
 def reselect(problem: Problem, joint: JointFit, again: Sequence[Choice]) -> JointFit:

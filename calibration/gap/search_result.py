@@ -15,6 +15,7 @@ import numpy as np
 
 from calibration.effects.fitted import Choice
 from calibration.gap.adoption import Adopted, adopted
+from calibration.gap.background.naming import Names
 from calibration.gap.candidates import CandidateEffects
 from calibration.gap.criteria import beyond, explains, stands_for
 from calibration.gap.detection import Detection, detect
@@ -23,6 +24,7 @@ from calibration.gap.formulas.terms import modulations
 from calibration.gap.formulas.variables import ErrorSource
 from calibration.gap.joint_fit import OUTLIER, JointFit, Problem
 from calibration.gap.projection import Projection
+from calibration.gap.result import Evidence
 from calibration.gap.screening import ScoredEffect, Screen
 from calibration.observations import Floats
 
@@ -33,6 +35,9 @@ _MISJUDGED = 0.1  # share by which a sigma may be off
 _FAR_MISJUDGED = 1.0  # the same where nothing says that it is anything but noise
 _COMPARED = 12  # effects that are held against a formula
 _ANY_SIZE = 1e3  # of the plausible sizes of an effect
+STRUCTURE = 12.0  # log Bayes factor of a background that is more than chance
+_LISTED = 4  # parts of a background
+_WORTH_TELLING = 0.3  # of the largest part
 
 
 @dataclass(frozen=True)
@@ -72,6 +77,8 @@ class SearchResult:
         candidates: all candidates at the beginning, and what the data lack for others.
         initial: the projection about the kinematics alone.
         final: all terms on which the remaining errors may depend.
+        evidence: `family@where` of each adopted effect -> its evidence given all others.
+        beside: what is certain beside a background; None where no background was needed.
     """
 
     adopted: Adopted
@@ -84,6 +91,8 @@ class SearchResult:
     candidates: CandidateEffects
     initial: Projection
     final: Grammar
+    evidence: Mapping[str, Evidence] = field(default_factory=dict)
+    beside: Names | None = None
 
 
 def conclude(
@@ -291,7 +300,9 @@ class Remaining:
     @property
     def significant(self) -> bool:
         """True if anything is there that has no name."""
-        return bool(self.detection.significant or self.found.alternatives or self.found.formulas)
+        beside = self.found.beside
+        is_smooth = beside is not None and beside.background_log_bayes_factor > STRUCTURE
+        return bool(self.detection.significant or self.found.alternatives or self.found.formulas or is_smooth)
 
     @property
     def adopted(self) -> Adopted:
@@ -299,7 +310,8 @@ class Remaining:
         return replace(self.found.adopted, structured=self.significant)
 
     def warnings(self) -> Iterator[str]:
-        """Yield a sentence about effects that are there and that the model lacks."""
+        """Yield sentences about effects that are there and that the model lacks, or may have at the wrong place."""
+        yield from self.open_places()
         if self.found.alternatives:
             names = " or ".join(str(scored.candidate) for scored in self.found.alternatives)
             yield (
@@ -311,6 +323,15 @@ class Remaining:
             said = f": {self.description}" if self.description else ""
             yield f"{what} leave more than noise, so the model lacks what could not be named{said}"
 
+    def open_places(self) -> Iterator[str]:
+        """Yield sentences about places that are open, and about effects that held-out groups do not bear out."""
+        for name, own in self.found.evidence.items():
+            others = [f"{where} ({p:.0%})" for where, p in own.places.items() if not name.endswith(f"@{where}")]
+            if others:
+                yield f"{name}: these data do not exclude that it is at {' or '.join(others)} instead"
+        for name in self.found.beside.harmful if self.found.beside else ():
+            yield f"{name} seems to be there, but raises the errors of held-out groups, so the model lacks it"
+
 
 def remaining(found: SearchResult, rng: np.random.Generator) -> Remaining:
     """Test and describe the errors that a search has left.
@@ -320,12 +341,31 @@ def remaining(found: SearchResult, rng: np.random.Generator) -> Remaining:
         rng: draws the signs of detection.
     """
     final, detection = found.final, detect(found.final, rng)
+    if found.beside is not None and found.beside.background and not found.formulas:
+        rest = Remaining(found, detection, _background_text(found.beside))
+        return rest if rest.significant else replace(rest, description=None)
     formulas = found.formulas or (final.find() if detection.significant and not found.alternatives else ())
     description = describe(formulas, _library_says(found, formulas[0])) if formulas else None
     if detection.significant and not (formulas or found.alternatives or found.adopted.effects):
         on = [f"{d.variable} ({d.where})" for d in detection.disagreements[:1]] or ["something"]
         description = f"the errors depend on {on[0]} in a way that no formula of the grammar says"
     return Remaining(found, detection, description)
+
+
+def _background_text(names: Names) -> str:
+    """Return a clause: on what the rest depends smoothly, and the nearest effect of the library with its evidence."""
+    most = names.background[0][2]
+    parts = [
+        f"{text if where == 'station' else f'{where} error by {text}'} ({rms_mm:.2g} mm RMS)"
+        for where, text, rms_mm in names.background[:_LISTED]
+        if rms_mm > _WORTH_TELLING * most
+    ]
+    nearest = [w for w in names.left if w.log_bayes_factor > 0.0][:1]
+    said = [
+        f"{w.candidate} comes nearest, with too little evidence (log Bayes factor {w.log_bayes_factor:.1f})"
+        for w in nearest
+    ]
+    return "; ".join([f"smooth in {', '.join(parts)}", *(said or ["nothing in the library is like it"])])
 
 
 def _library_says(found: SearchResult, formula: Formula) -> str:

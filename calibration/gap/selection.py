@@ -14,7 +14,6 @@ from calibration.gap.criteria import (
     as_simple,
     best_of_each_family,
     beyond,
-    beyond_doubt,
     cross_validation_p,
     further_places,
     half_sample_wins,
@@ -80,7 +79,7 @@ def select_effect(
         candidates: effects that may be missing.
     """
     reasons: dict[str, str] = {}
-    screen, is_further = Screen(projection, candidates), bool(joint.choices or problem.formulas)
+    screen, is_further = Screen(projection, candidates), bool(joint.choices)
     while True:
         scored = screen.score(without=reasons)
         if not scored or not may_stand_out(scored):
@@ -155,7 +154,7 @@ def _judged(
             tried = problem.fit([*joint.choices, *(w.choice for w in taken)], start)
         return Selection("adopt", scored, posterior, tried, reasons=reasons)
     reasons |= {str(w.candidate): objection for w in alternatives}
-    if len(alternatives) < 2 or problem.formulas:
+    if len(alternatives) < 2:
         return Selection("nothing", scored, posterior, reasons=reasons)
     members = tuple(with_same_family(w, screen, scored) for w in alternatives[:_MOST_OF_A_SET])
     return Selection("set", scored, posterior, tried, members, reasons=reasons)
@@ -176,10 +175,6 @@ def _objection(
     """
     leading, best = scored[0], best_of_each_family(scored)
     has_equal = not is_known and any(as_simple(leading, w) for w in near[1:])
-    if problem.formulas and not beyond_doubt(best):
-        return "beside what is not in the library it is not beyond all doubt", near
-    if any(f.term.source.where == leading.candidate.where for f in problem.formulas):
-        return "what is not in the library is at the same place", near
     if posterior[leading.candidate.family] < _CERTAIN or has_equal:
         return "another family is nearly as likely", near
     elsewhere = [w for w in scored[1:] if w.candidate.family == leading.candidate.family and is_near(leading, w)]

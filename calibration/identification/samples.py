@@ -211,17 +211,17 @@ def _group_repeats(
 def _standstills(rig: Rig, turns: Floats, observations: Observations, means: ChainData, count: Integers) -> Integers:
     """(m,) number of each sample's standstill, from one observation of each, mean readings and how many it averages.
 
-    A standstill takes a prism in once: a second sample of it is one that disagreed.
+    A standstill takes a prism in once: a second sample of it is one that disagreed. Where poses have no names, rows
+    with the very same readings of all joints are one standstill.
     """
     spread = standing_spread(rig)
     found = np.arange(len(means), dtype=np.intp)
     begun: dict[tuple[str, str, str], list[tuple[int, Floats, set[int]]]] = {}
     # Most repeats first, so that the odd one out joins no others.
     for sample in np.argsort(-count, kind="stable").tolist():
-        key = str(observations.session[sample]), str(observations.setup[sample]), str(observations.pose[sample])
-        if not key[2]:
-            continue
         prism, readings = int(means.prism[sample]), means.readings[sample]
+        pose = str(observations.pose[sample]) or readings.tobytes().hex()
+        key = str(observations.session[sample]), str(observations.setup[sample]), pose
         for number, first, prisms in begun.setdefault(key, []):
             if prism not in prisms and (np.abs(_differences(turns, readings - first)) <= spread).all():
                 prisms.add(prism)

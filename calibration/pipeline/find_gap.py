@@ -122,6 +122,7 @@ def _answer(
         verdict=verdict,
         effects=effects,
         posterior=found.posterior,
+        evidence=found.evidence,
         indistinguishable=candidates,
         description=rest.description,
         remaining_significant=rest.significant,
@@ -140,7 +141,7 @@ def _answer(
         observations=observations,
         error_before_mm=error_before,
         error_after_mm=error_after,
-        warnings=tuple(_warnings(found, model, holdout)),
+        warnings=tuple(_warnings(rest, model, holdout)),
     )
 
 
@@ -217,8 +218,10 @@ def _noise(
     return float(np.sqrt(known + excess)), source
 
 
-def _warnings(found: SearchResult, model: CalibratedModel, holdout: Observations | None) -> Iterator[str]:
+def _warnings(rest: Remaining, model: CalibratedModel, holdout: Observations | None) -> Iterator[str]:
+    found = rest.found
     yield from model.warnings
+    yield from rest.open_places()
     if holdout is not None:
         yield from (f"in the held-out rows: {warning}" for warning in model_warnings(model, holdout))
     if found.formulas and found.adopted.effects:

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.effects.boom import boom_in
-from calibration.effects.context import level_axes
 from calibration.gap.projection import Projection
 from calibration.observations import Floats
 from calibration.rig.description import Joint
@@ -175,10 +174,7 @@ class Variables:
             yield ErrorSource("base", f"base tilt about {axis}", {"rad": 1}, average(moved[:, :, number]))
         yield ErrorSource("base", "base height error", {"mm": 1}, average(moved[:, :, 2]))
         if situation.rig.masses:
-            lever_mm, newton = situation.loads.places(situation.data.readings, situation.observations.extra)
-            axes = level_axes(situation.rig.gravity)
-            moment = np.cross((newton[:, :, None] * lever_mm).sum(axis=1) / 1e3, -axes[2])
-            leaning = (moved[:, :, :2] @ (moment @ axes[:2].T)[:, :, None])[:, :, 0]
+            leaning = (moved[:, :, :2] @ situation.overturning_Nm[:, :, None])[:, :, 0]
             soft: Unit = {"rad": 1, "N": -1, "m": -1}
             yield ErrorSource("base", "base tilt", soft, average(leaning), constant=("moment of all weights", "torque"))
         grown = situation.to_station(situation.located.prism_mm[:, :, None])[:, :, 0]

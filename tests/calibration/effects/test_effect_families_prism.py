@@ -42,6 +42,7 @@ ALIKE: Mapping[str, tuple[str, str, tuple[float, ...]]] = {
         "base",
         (3e-4, -1e-4, -2.0),
     ),
+    "base_compliance@base:x_rad_per_Nm=6e-9:y_rad_per_Nm=3e-9": ("base_compliance", "base", (6e-9, 3e-9)),
     "latency@clock:seconds=0.02": ("latency", "clock", (0.02,)),
     "clock_drift@clock:ppm=5": ("clock_drift", "clock", (5.0,)),
     "station_scale@station:ppm=50": ("station_scale", "station", (50.0,)),

@@ -41,6 +41,7 @@ REPORTED = {
     "solar_bow": ("rad_per_K",),
     "base_settlement": ("tilt_x_rad_per_h", "tilt_y_rad_per_h", "z_mm_per_h"),
     "base_step": ("tilt_x_rad", "tilt_y_rad", "z_mm", "time_s"),
+    "base_compliance": ("x_rad_per_Nm", "y_rad_per_Nm"),
     "payload_change": ("compliance_rad_per_Nm",),
     "cylinder_compression": ("mm_per_bar",),
     "leak_down": ("rad_per_s",),
@@ -59,6 +60,7 @@ BESIDE_THE_MACHINE = {
     "prism_incidence",
     "base_settlement",
     "base_step",
+    "base_compliance",
 }
 FAMILIES = sorted(library().items())
 ROWS = 40

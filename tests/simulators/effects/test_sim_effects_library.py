@@ -420,7 +420,7 @@ def test_library_and_outside_are_apart_and_the_library_is_the_contracts() -> Non
     contract = """joint_compliance boom_droop pad_play backlash gravity_flip_play load_hysteresis encoder_harmonic
     joint_error_map angle_scale transducer_scale transducer_quadratic transducer_index_jump transducer_cumulative
     thermal_expansion solar_bow base_settlement base_step payload_change cylinder_compression leak_down latency
-    clock_drift station_scale prism_constant prism_incidence linkage_coupling"""
+    clock_drift station_scale prism_constant prism_incidence linkage_coupling base_compliance"""
     assert list(LIBRARY) == contract.split()
 
 

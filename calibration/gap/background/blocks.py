@@ -1,0 +1,176 @@
+"""Columns of a smooth unknown: joint errors that depend on angles, and displacements over the work volume and time.
+
+A machine has more than a library has names for. What is left of it is smooth: an error of a joint that depends on its
+own angle or on those of two neighbours, a displacement that changes slowly over the work volume or with time. Each of
+these is a block of cosines whose amounts are normal with a standard deviation of their own, smaller for finer waves: a
+Gaussian process of few columns (Solin and Särkkä, Statistics and Computing 30, 2020).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibration.effects.columns import NO_JOINT, EffectColumns
+from calibration.effects.context import EffectContext
+from calibration.observations import Floats
+
+_CURVE_WAVES = 10  # half waves of a joint's own reading
+_SURFACE_WAVES = 3  # of each of two angles
+_PAIR_WAVES = 2  # of each of two readings
+_PLACE_WAVES = 2  # of each coordinate
+_TIME_WAVES = 8
+_LEAST_TURN_DEG, _LEAST_STROKE_MM = 0.5, 2.0  # a joint that moves less has no curve
+_ROWS_PER_WAVE = 8
+_WHOLE_TURN_DEG = 300.0  # who covers more meets himself at the other end, or nearly
+_JOINT_SIGMA = {"revolute": 1e-3, "prismatic": 1.0}  # rad or mm
+
+
+@dataclass(frozen=True)
+class Block:
+    """One part of the background.
+
+    Attributes:
+        name: of the block.
+        kind: `curve` of a joint's own reading, `surface` of two; `pair`, `place`, `time` for displacements; `formula`.
+        where: the joint that errs, else `station`.
+        text: on what it depends, for people.
+        columns: of the samples; prior sigmas are those of amounts of plausible size.
+    """
+
+    name: str
+    kind: str
+    where: str
+    text: str
+    columns: EffectColumns
+
+
+def smooth_blocks(context: EffectContext, average: Callable[[Floats], Floats]) -> tuple[Block, ...]:
+    """Return the blocks beside which names are sought: errors of joints, and what wanders over place and time.
+
+    Args:
+        context: of n observations.
+        average: makes values (m, ...) of samples from values (n, ...) of rows.
+    """
+    moving = _moving(context)
+    found = [_curve(context, name) for name in moving]
+    for pair in itertools.pairwise(moving):
+        found += [_surface(context, pair, at) for at in pair]
+    found += [_place(context), *_time(context)]
+    return tuple(replace(b, columns=b.columns.over(average)) for b in found)
+
+
+def displacement_blocks(context: EffectContext, average: Callable[[Floats], Floats]) -> tuple[Block, ...]:
+    """Return blocks of displacements by pairs of joints: together with the smooth ones they see any structure.
+
+    Arguments are those of `smooth_blocks`.
+    """
+    found = [_pair(context, pair) for pair in itertools.pairwise(_moving(context))]
+    return tuple(replace(b, columns=b.columns.over(average)) for b in found)
+
+
+def _moving(context: EffectContext) -> list[str]:
+    return [name for name in context.rig.joint_names if _moves(context, name)]
+
+
+def _moves(context: EffectContext, joint: str) -> bool:
+    least = _LEAST_TURN_DEG if _kind(context, joint) == "revolute" else _LEAST_STROKE_MM
+    return float(np.ptp(context.reading(joint))) > least
+
+
+def _curve(context: EffectContext, joint: str) -> Block:
+    most = min(_CURVE_WAVES, max(len(context) // _ROWS_PER_WAVE, 2))
+    values, number = _waves(context, joint, most)
+    name = f"curve({joint})"
+    return Block(name, "curve", joint, joint, _at_joint(context, joint, name, values, 1.0 / number))
+
+
+def _surface(context: EffectContext, pair: Sequence[str], joint: str) -> Block:
+    (a, of_a), (b, of_b) = (_waves(context, name, _SURFACE_WAVES) for name in pair)
+    values = (a[:, :, None] * b[:, None, :]).reshape(len(context), -1)
+    sizes = 1.0 / np.hypot(of_a[:, None], of_b).ravel()
+    text = " and ".join(pair)
+    name = f"surface({text})@{joint}"
+    return Block(name, "surface", joint, text, _at_joint(context, joint, name, values, sizes))
+
+
+def _pair(context: EffectContext, pair: Sequence[str]) -> Block:
+    """Return displacements along the station's axes that depend on two joints."""
+    (a, of_a), (b, of_b) = (_waves(context, name, _PAIR_WAVES) for name in pair)
+    both = (a[:, :, None] * b[:, None, :]).reshape(len(context), -1)
+    sizes = np.concatenate([1.0 / of_a, 1.0 / of_b, 1.0 / np.hypot(of_a[:, None], of_b).ravel()])
+    text = " and ".join(pair)
+    columns = _shifts(f"pair({text})", np.hstack([a, b, both]), sizes)
+    return Block(f"pair({text})", "pair", "station", text, columns)
+
+
+def _waves(context: EffectContext, joint: str, most: int) -> tuple[Floats, Floats]:
+    """Return waves (n, k) of a joint's reading and their numbers (k,): half waves of its range, or whole ones."""
+    reading = context.reading(joint)
+    if _kind(context, joint) == "revolute" and np.ptp(reading) > _WHOLE_TURN_DEG:
+        number = np.arange(1, most // 2 + 2 if most % 2 else most // 2 + 1)
+        angle = np.deg2rad(reading)[:, None] * number
+        return np.hstack([np.cos(angle), np.sin(angle)]), np.tile(number, 2).astype(np.float64)
+    number = np.arange(1, most + 1)
+    return np.cos(np.pi * number * _unit(reading)[:, None]), number.astype(np.float64)
+
+
+def _kind(context: EffectContext, joint: str) -> str:
+    return context.rig.joint(joint).kind
+
+
+def _place(context: EffectContext) -> Block:
+    """Return displacements that depend on the place of the prism in the work volume, along three axes."""
+    u = [_unit(axis) for axis in context.located.prism_mm.T]
+    orders = [order for order in itertools.product(range(_PLACE_WAVES + 1), repeat=3) if any(order)]
+    waves = np.stack(
+        [np.prod([np.cos(np.pi * k * v) for k, v in zip(order, u, strict=True)], axis=0) for order in orders], axis=1
+    )
+    sizes = np.array([1.0 / np.linalg.norm(order) for order in orders])
+    return Block("place", "place", "station", "place", _shifts("place", waves, sizes))
+
+
+def _time(context: EffectContext) -> Iterator[Block]:
+    """Yield displacements that wander with time, or with the order of rows where no time is known."""
+    time_s = context.extra("time_s")
+    at = time_s if np.isfinite(time_s).all() and np.ptp(time_s) > 0.0 else np.arange(float(len(context)))
+    if len(at) < 4 * _ROWS_PER_WAVE:
+        return
+    number = np.arange(1, _TIME_WAVES + 1)
+    waves = np.cos(np.pi * number * _unit(at)[:, None])
+    yield Block("time", "time", "station", "time", _shifts("time", waves, 1.0 / number))
+
+
+def _unit(values: Floats) -> Floats:
+    """Return values (n,) scaled to the range from 0 to 1."""
+    low, high = float(values.min()), float(values.max())
+    return (values - low) / max(high - low, 1e-12)
+
+
+def _at_joint(context: EffectContext, joint: str, name: str, values: Floats, sizes: Floats) -> EffectColumns:
+    kind = _kind(context, joint)
+    unit = math.degrees(1.0) if kind == "revolute" else 1.0
+    index = context.chain.joint_index[joint]
+    return EffectColumns(
+        tuple(f"{name}:{i}" for i in range(len(sizes))),
+        np.full(len(sizes), index),
+        values * unit,
+        sizes * _JOINT_SIGMA[kind],
+    )
+
+
+def _shifts(name: str, waves: Floats, sizes: Floats) -> EffectColumns:
+    """Return (n, 3, 3 k) displacements along the station's axes, mm, by waves (n, k) of sizes (k,)."""
+    shift = np.concatenate([waves[:, None, :] * axis[None, :, None] for axis in np.eye(3)], axis=2)
+    count = shift.shape[2]
+    return EffectColumns(
+        tuple(f"{name}:{i}" for i in range(count)),
+        np.full(count, NO_JOINT),
+        np.zeros((len(waves), count)),
+        np.tile(sizes, 3),
+        shift,
+    )

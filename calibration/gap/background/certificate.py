@@ -1,0 +1,58 @@
+"""Certificates: an effect that one half of the groups chooses is tested on the other half.
+
+The search looks at all data, so its evidence is not a test. Here the data are split by groups: one half chooses the
+effect of greatest evidence given all others, and where that is the named one, the other half gives the F-test of it,
+exact for normal errors and whatever the number of rows, with kinematics and background at their priors as part of the
+error. Both halves take both roles; the p-value is corrected for that, and over all names for false discoveries
+(Benjamini and Hochberg 1995). Sample splitting: Cox, Biometrika 62, 1975.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.special import fdtrc
+
+from calibration.gap.background.system import Chosen, Model, System
+from calibration.gap.projection import rows_of
+from calibration.observations import Floats
+
+
+def certificates(system: System, model: Model, places: Sequence[set[str]], seed: int) -> Floats:
+    """Return (e,) the p-value of every effect of a model; 1 where no half chooses it.
+
+    Args:
+        system: the linear model.
+        model: with e effects.
+        places: where each may be: which of these a half chooses is all the same.
+        seed: of the halves.
+    """
+    labels, group = np.unique(system.projection.groups, return_inverse=True)
+    first = np.isin(group, np.random.default_rng([seed, 3]).permutation(len(labels))[: len(labels) // 2])
+    halves = [system.of_rows(rows_of(np.flatnonzero(own))) for own in (first, ~first)]
+    p = np.ones(len(model.effects))
+    for number, effect in enumerate(model.effects):
+        without = system.fit(model.without(number), model.scales)
+        family = system.candidates[effect[0]].family
+        for choosing, testing in (halves, halves[::-1]):
+            best = max(choosing.screen(without).score(), key=lambda w: w.log_bayes_factor)
+            if best.candidate.family == family and best.candidate.where in places[number]:
+                p[number] = min(p[number], 2.0 * _f_test(testing, without, system.choice(best)))
+    return _adjusted(p)
+
+
+def _f_test(system: System, model: Model, effect: Chosen) -> float:
+    """Return the p-value of an effect in addition to a model, for rows that had no part in choosing it."""
+    squares, columns, total = system.explained(model, effect)
+    rest = system.products.rows - columns
+    return float(fdtrc(columns, rest, (squares / columns) / ((total - squares) / rest)))
+
+
+def _adjusted(p: Floats) -> Floats:
+    """Return p-values (e,) adjusted for the rate of false discoveries among all of them."""
+    order = np.argsort(p)
+    ranked = p[order] * len(p) / np.arange(1, len(p) + 1)
+    out = np.empty_like(p)
+    out[order] = np.minimum(np.minimum.accumulate(ranked[::-1])[::-1], 1.0)
+    return out

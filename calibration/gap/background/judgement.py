@@ -1,0 +1,177 @@
+"""Judgement of every effect of a model given all others: its evidence, its alternatives, and where it may be.
+
+The order in which effects are found matters to none of this: each is left out in turn, the background takes what it
+can, and everything in the library competes for what is missing then.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from scipy.special import softmax
+
+from calibration.gap.background.search import ODDS, Gain, gains, is_curve, needed
+from calibration.gap.background.system import Chosen, Model, System
+from calibration.gap.criteria import beyond
+from calibration.gap.screening import ScoredEffect
+
+_CERTAIN = 0.95  # posterior of a family
+_OPEN = 0.02  # posterior of another family
+_ROUNDS = 5
+_BETTER = 1.0  # log odds, to take one effect for another
+_COMPARED = 8
+NEAR = 5.0  # log Bayes factor: places and families this near are not told apart
+_NOT_TOLD = math.exp(-NEAR)
+_TRUE_TO = 25.0  # log Bayes factor beyond which it is true to a share of itself
+_DOMINATES = 4.0  # squares of a curve, of those of surfaces at its joint
+
+
+@dataclass(frozen=True)
+class Judged:
+    """An effect of a model, judged given all others.
+
+    Attributes:
+        effect: the effect.
+        scored: the same, beside the model without it.
+        log_bayes_factor: against the model without it.
+        log_odds: the same with prior odds.
+        posterior: probability of its family.
+        places: place -> probability that it is there, given the family; those that are possible.
+        alternatives: of other families, where these are possible.
+    """
+
+    effect: Chosen
+    scored: ScoredEffect
+    log_bayes_factor: float
+    log_odds: float
+    posterior: float
+    places: Mapping[str, float]
+    alternatives: tuple[ScoredEffect, ...] = ()
+
+    @property
+    def is_certain(self) -> bool:
+        """True if the family is beyond doubt."""
+        return self.posterior >= _CERTAIN
+
+
+def judged(system: System, model: Model) -> tuple[Model, list[Judged]]:
+    """Return a model in which every effect is the most probable given all others, and the judgement of each."""
+    for _ in range(_ROUNDS):
+        before = model
+        found: list[Judged] = []
+        for effect in before.effects:
+            if effect not in model.effects:
+                continue
+            rivals = _Rivals(system, model, model.effects.index(effect))
+            changed = rivals.changed()
+            model = model if changed is None else changed
+            found += [] if changed is not None else [rivals.judgement()]
+        if model is before:
+            break
+    return model, found
+
+
+def judgements(system: System, model: Model) -> list[Judged]:
+    """Return the judgement of every effect of a model that stays as it is."""
+    return [_Rivals(system, model, number).judgement() for number in range(len(model.effects))]
+
+
+class _Rivals:
+    """An effect of a model, and all that could be in its place."""
+
+    def __init__(self, system: System, model: Model, number: int) -> None:
+        self.system, self.model = system, model
+        self.effect, self.rest = model.effects[number], model.without(number)
+        self.candidate = system.candidates[self.effect[0]]
+        self.without = system.fit(self.rest, model.scales)
+        found = gains(system, self.without, _COMPARED, always=self.effect[0])
+        own = next(g for g in found if g.scored.candidate is self.candidate)
+        gain = model.log_evidence - self.without.log_evidence
+        if gain > own.log_likelihood_gain:
+            more = gain - own.log_likelihood_gain
+            own = replace(
+                own,
+                log_bayes_factor=own.log_bayes_factor + more,
+                log_likelihood_gain=gain,
+                log_odds=own.log_odds + more,
+            )
+        self.gains = [own, *(g for g in found if g.scored.candidate is not self.candidate)]
+        # Where the background fits the machine imperfectly, evidence of any size is true to a share of it only.
+        self.temper = max(1.0, own.log_bayes_factor / _TRUE_TO)
+        # A prior probability counts between a candidate and nothing; between families it is that of their places.
+        self.odds = [(g.log_bayes_factor - math.log(_places(system, g))) / self.temper for g in self.gains]
+
+    def changed(self) -> Model | None:
+        """Return the model without the effect where it is not needed, with a better one where there is one, or None."""
+        best = max(range(len(self.gains)), key=self.odds.__getitem__)
+        if not self._is_needed() or beyond(self.system.projection.situation, self.gains[0].scored):
+            return self.system.fit(self.rest, self.without.scales)
+        if self.odds[best] > self.odds[0] + _BETTER:
+            better = self.gains[best]
+            return self.system.fit([*self.rest, self.system.choice(better.scored)], better.model.scales)
+        return None
+
+    def _is_needed(self) -> bool:
+        """True if the effect is beyond doubt: beside all others, and where a curve can imitate it against nothing."""
+        own = self.gains[0]
+        if own.log_odds < needed(self.system, self.without, self.candidate):
+            return False
+        if not is_curve(self.system, self.candidate):
+            return True
+        bare = self.system.fit(self.rest, self.model.scales, without={f"curve({self.candidate.where})"})
+        return own.model.log_evidence - bare.log_evidence - math.log(len(self.system.candidates)) > ODDS
+
+    def judgement(self) -> Judged:
+        """Return the judgement of the effect."""
+        share = softmax([*self.odds, 0.0])
+        same = [n for n, g in enumerate(self.gains) if g.scored.candidate.family == self.candidate.family]
+        # How large an effect would be at another place is no evidence against that place.
+        at_best = softmax([self.gains[n].log_likelihood_gain / self.temper for n in same])
+        places = {self.gains[n].scored.candidate.where: float(p) for n, p in zip(same, at_best, strict=True)}
+        least = places[self.candidate.where] * _NOT_TOLD
+        return Judged(
+            self.effect,
+            self.gains[0].scored,
+            self.gains[0].log_bayes_factor,
+            self.gains[0].log_odds,
+            float(share[same].sum()),
+            {where: p for where, p in places.items() if p > least},
+            tuple(g.scored for n, g in enumerate(self.gains) if n not in same and share[n] > _OPEN),
+        )
+
+
+def _places(system: System, gain: Gain) -> int:
+    return sum(c.family == gain.scored.candidate.family for c in system.candidates)
+
+
+def curves(system: System, model: Model) -> dict[str, float]:
+    """Return the joints whose curve is beyond doubt and no part of a surface, the largest first, with its log odds.
+
+    A smooth error that depends on several angles has a part that depends on each alone: a curve is a joint's own where
+    it is much larger than the surfaces at this joint. And another effect at the joint may be what a curve imitates.
+    """
+    amounts = system.amounts(model)
+    size = {
+        name: float(((system.columns[:, own] @ amounts[own]) ** 2).sum())
+        for name in system.blocks
+        for own in [system.of_block(name)]
+    }
+    every = [block for block in system.blocks.values() if block.kind == "curve"]
+    prior = -math.log(len({c.family for c in system.candidates}) * max(len(every), 1))
+    found = {}
+    for block in every:
+        surfaces = [b.name for b in system.blocks.values() if b.kind == "surface" and b.where == block.where]
+        if size[block.name] < _DOMINATES * sum(size[name] for name in surfaces):
+            continue
+        without = system.fit(model.effects, model.scales, without={block.name})
+        gain = model.log_evidence - without.log_evidence
+        near = gain - max(NEAR, gain * NEAR / _TRUE_TO)
+        imitated = any(
+            g.scored.candidate.where == block.where and g.log_bayes_factor > near
+            for g in gains(system, without, _COMPARED)
+        )
+        if gain + prior > ODDS and not imitated:
+            found[block.where] = gain + prior
+    return dict(sorted(found.items(), key=lambda item: -item[1]))

@@ -1,0 +1,74 @@
+"""Formulas of effects outside the library: parts of a background where they do not explain everything."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from calibration.effects.columns import NO_JOINT, EffectColumns
+from calibration.gap.background.blocks import Block
+from calibration.gap.candidates import CandidateEffect
+from calibration.gap.detection import detect
+from calibration.gap.formulas.grammar import Formula, Grammar
+from calibration.gap.joint_fit import JointFit, Problem
+from calibration.gap.projection import Projection
+from calibration.identification.refinement import refine
+from calibration.observations import Floats
+
+_SAME = 0.995  # share of a formula's squares that an effect which is the same explains
+
+
+def formula_block(formula: Formula, number: int) -> Block:
+    """Return the block of a formula; its prior sigma is its size."""
+    return Block(f"formula{number}", "formula", formula.term.source.where, str(formula.term), _columns([formula]))
+
+
+def is_in_library(formula: Formula, candidates: Sequence[CandidateEffect], over: Projection) -> bool:
+    """True if a formula is an effect of the library in other words.
+
+    Args:
+        formula: of the grammar.
+        candidates: effects of the library.
+        over: the projection in which they are compared.
+    """
+    target = over.columns(formula.term.moved_mm[:, :, None])[:, 0]
+    for candidate in candidates:
+        if candidate.where != formula.term.source.where:
+            continue
+        for option in sorted(set(candidate.first_equal)):
+            columns = over.columns(over.moved_mm(candidate.additions[option]))
+            left = target - columns @ np.linalg.lstsq(columns, target)[0]
+            if float(left @ left) < (1.0 - _SAME) * float(target @ target):
+                return True
+    return False
+
+
+def what_is_left(problem: Problem, joint: JointFit, formulas: Sequence[Formula]) -> tuple[Formula, ...]:
+    """Return the formula of what is left when formulas are fitted along with kinematics and effects, if anything is.
+
+    Args:
+        problem: the data.
+        joint: kinematics and effects.
+        formulas: any number.
+    """
+    solution = problem.solution
+    along = problem
+    if formulas:
+        chain, additions = solution.chain, _columns(formulas)
+        fit = refine(chain, solution.samples, solution.fit.x[: len(chain)], prior=problem.prior, additions=additions)
+        along = replace(problem, solution=replace(solution, fit=fit, additions=additions))
+    grammar = Grammar(along.project(along.fit(joint.choices, along.solution.fit.x)))
+    return grammar.find(1) if detect(grammar, problem.rng()).significant else ()
+
+
+def _columns(formulas: Sequence[Formula]) -> EffectColumns:
+    moved: Floats = np.stack([f.term.moved_mm for f in formulas], axis=2)
+    return EffectColumns(
+        tuple(str(f.term) for f in formulas),
+        np.full(len(formulas), NO_JOINT),
+        np.zeros((len(moved), len(formulas))),
+        np.array([abs(f.coefficient) for f in formulas]),
+        moved,
+    )

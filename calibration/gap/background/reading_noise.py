@@ -1,0 +1,76 @@
+"""Random errors of readings, as several prisms of one standstill show them: these errors they share.
+
+A rig file that has encoders better than they are, or readings taken before the machine stood still, make errors that
+differ from pose to pose and go together at all prisms of a pose. Taken for noise of the fixes they count as evidence
+once for every prism.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import nnls
+
+from calibration.gap.background.system import Model, System
+from calibration.gap.joint_fit import Problem
+from calibration.observations import Floats
+
+_LEAST_PAIRS = 60
+_LARGER = 1.5  # times the rig file's variance
+
+
+def with_reading_noise(problem: Problem, system: System, model: Model) -> Problem:
+    """Return the data with the reading errors that samples of one standstill share, where these exceed the rig file's.
+
+    Args:
+        problem: the data.
+        system: a linear model of them.
+        model: what is known to be there.
+    """
+    rig, solution = problem.solution.chain.rig, problem.solution
+    shared = _shared_variance(system, model)
+    known = solution.samples.shared_variance(rig)
+    if not (shared > (_LARGER - 1.0) * known).any():
+        return problem
+    joints = [
+        joint.model_copy(update={"sigma": math.hypot(joint.sigma, math.sqrt(more))})
+        for joint, more in zip(rig.joints, shared.tolist(), strict=True)
+    ]
+    chain = solution.chain.of(rig.model_copy(update={"joints": tuple(joints)}))
+    return replace(problem, solution=replace(solution, chain=chain))
+
+
+def _shared_variance(system: System, model: Model) -> Floats:
+    """Return (joints,) variances of reading errors that samples of one standstill share, deg^2 or mm^2.
+
+    The products of errors of two samples are, in the mean, the sum over joints of the variance times both samples'
+    displacements; least squares finds variances that are not negative.
+    """
+    projection = system.projection
+    samples = projection.samples
+    pairs = [
+        pair
+        for own in np.split(np.argsort(samples.standstill, kind="stable"), _ends(samples.standstill))
+        for pair in itertools.combinations(own[projection.fit.weight[own] > 0.5].tolist(), 2)
+    ]
+    count = projection.joint_jacobian.shape[2]
+    if len(pairs) < _LEAST_PAIRS:
+        return np.zeros(count)
+    first, second = np.array(pairs).T
+    left = system.residual(model).reshape(-1, 3)
+    moved = projection.whitened(projection.joint_jacobian).reshape(len(left), 3, count)
+    of_first = np.einsum("pcj,pck->pjk", moved[first], moved[first])
+    of_second = np.einsum("pcj,pck->pjk", moved[second], moved[second])
+    along = np.einsum("pcj,pc->pj", moved[first], left[first]) * np.einsum("pcj,pc->pj", moved[second], left[second])
+    unit = np.maximum(np.sqrt(np.einsum("pjj,pjj->j", of_first, of_second)), 1e-300)
+    matrix = np.einsum("pjk,pjk->jk", of_first, of_second) / (unit * unit[:, None])
+    variance: Floats = nnls(matrix, along.sum(axis=0) / unit)[0] / unit
+    return variance
+
+
+def _ends(labels: np.ndarray) -> np.ndarray:
+    """Return where the sorted labels (m,) change."""
+    return np.flatnonzero(np.diff(np.sort(labels))) + 1

@@ -1,0 +1,202 @@
+"""The search for effects beside a background: the one of greatest gain is added until none is beyond doubt."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibration.effects.fitted import Choice
+from calibration.gap.background.blocks import Block
+from calibration.gap.background.evidence import Scales
+from calibration.gap.background.system import Effect, Model, System
+from calibration.gap.background.weights import reweighted
+from calibration.gap.candidates import CandidateEffect, candidate_at, candidate_effects
+from calibration.gap.criteria import beyond
+from calibration.gap.joint_fit import JointFit, Problem
+from calibration.gap.screening import ScoredEffect
+
+MAP = "joint_error_map"  # the curves of the background are this effect
+ODDS = math.log(999.0)  # of an effect against none
+ODDS_OF_TWO = math.log(19.0)  # of one effect against another that is as likely beforehand
+_LIKE_A_CURVE = 0.02  # share of the variance that a curve may leave
+_TRIED = 6  # candidates whose gain is found with scales of their own
+_MOST = 60  # effects
+_PASSES = 4
+
+
+@dataclass(frozen=True)
+class Gain:
+    """A candidate, and what a model gains by it.
+
+    Attributes:
+        scored: the candidate.
+        log_bayes_factor: against the model without it, all scales of the background found again.
+        log_likelihood_gain: the same of its best form and size, as if these had been known beforehand.
+        log_odds: `log_bayes_factor` with prior odds.
+        model: with it.
+    """
+
+    scored: ScoredEffect
+    log_bayes_factor: float
+    log_likelihood_gain: float
+    log_odds: float
+    model: Model
+
+
+def search_beside(
+    problem: Problem, joint: JointFit, blocks: Sequence[Block], families: Collection[str], known: Sequence[Choice]
+) -> tuple[System, Model]:
+    """Return the linear model with all effects that are beyond doubt beside a background.
+
+    Outliers and scatter are judged again beside what was found, and the search goes on from there.
+
+    Args:
+        problem: the data.
+        joint: the kinematics alone, with weights to begin with.
+        blocks: of the background.
+        families: of effects that may be named.
+        known: effects to begin with.
+    """
+    scales: Scales | None = None
+    found: tuple[Effect, ...] = ()
+    for number in range(_PASSES):
+        fit, scales = reweighted(problem, joint, blocks, found, scales)
+        joint = replace(joint, fit=fit)
+        system, begun = linear_system(problem, joint, blocks, families, known)
+        effects = found if number else begun
+        model = _grown(system, system.fit(system.chosen(effects), scales))
+        found = tuple((system.candidates[n], option, scale) for n, option, scale in model.effects)
+        scales = model.scales
+        if number and len(found) == len(effects):
+            break
+    return system, model
+
+
+def background_log_bayes_factor(problem: Problem, joint: JointFit, blocks: Sequence[Block]) -> float:
+    """Return the log Bayes factor of a background beside kinematics and effects, against noise alone.
+
+    Args:
+        problem: the data.
+        joint: kinematics and effects.
+        blocks: of the background.
+    """
+    kinematics = problem.with_mild_outliers(problem.kinematics_only())
+    _, known = linear_system(problem, kinematics, (), (), joint.choices)
+    fit, scales = reweighted(problem, kinematics, blocks, known, None)
+    system, known = linear_system(problem, replace(kinematics, fit=fit), blocks, (), joint.choices)
+    return system.background_log_bayes_factor(system.fit(system.chosen(known), scales))
+
+
+def linear_system(
+    problem: Problem, joint: JointFit, blocks: Sequence[Block], families: Collection[str], known: Sequence[Choice]
+) -> tuple[System, tuple[Effect, ...]]:
+    """Return the linear model about a fit, and the known effects in it.
+
+    Args:
+        problem: the data.
+        joint: the kinematics alone, with weights and scatter that count.
+        blocks: of a background.
+        families: of the candidates; new maps of joints are the background's.
+        known: effects that are candidates in any case, in the form that they are known in.
+    """
+    projection, context = problem.project(joint), joint.situation
+    begun = [candidate_at(context, projection, c.family, c.where, [replace(c, scale=1.0)]) for c in known]
+    every = candidate_effects(context, projection, [name for name in families if name != MAP]).candidates
+    taken = {block.where for block in blocks if block.kind == "formula"}  # what is outside the library is there
+    possible = [candidate for candidate in every if candidate.where not in taken]
+    noise = projection.samples.variance(context.rig, projection.joint_jacobian)
+    system = System(projection, blocks, _joined(possible, begun), noise / (noise + joint.fit.excess_variance))
+    return system, tuple((own, 0, c.scale) for own, c in zip(begun, known, strict=True))
+
+
+def _joined(possible: Sequence[CandidateEffect], known: Sequence[CandidateEffect]) -> list[CandidateEffect]:
+    """Return the possible candidates, those that are known with the form that they are known in as their first."""
+    by_name = {str(c): c for c in known}
+    out = []
+    for candidate in possible:
+        own = by_name.pop(str(candidate), None)
+        if own is not None:
+            options, additions = (*own.options, *candidate.options), (*own.additions, *candidate.additions)
+            odds = np.append(candidate.log_odds.max(), candidate.log_odds)
+            own = replace(candidate, options=options, additions=additions, log_odds=odds)
+        out.append(candidate if own is None else own)
+    return [*out, *by_name.values()]
+
+
+def gains(system: System, model: Model, most: int = _TRIED, always: int | None = None) -> list[Gain]:
+    """Return what a model gains by the candidates that promise most, the greatest first.
+
+    Args:
+        system: the linear model.
+        model: what is there.
+        most: candidates.
+        always: number of a candidate that is among them whatever it promises.
+    """
+    every, context = system.screen(model).score(), system.projection.situation
+    scored = sorted(
+        (w for w in every if w.log_bayes_factor > 0.0 and not beyond(context, w)),
+        key=lambda w: -w.log_bayes_factor - log_prior(system, model, w.candidate),
+    )[:most]
+    scored += [
+        w
+        for w in every
+        if always is not None and w.candidate is system.candidates[always] and all(w is not v for v in scored)
+    ]
+    found = []
+    for w in scored:
+        tried = system.fit([*model.effects, system.choice(w)], model.scales, quick=True)
+        best = tried.log_evidence - model.log_evidence
+        gain = best + w.form_averaging
+        found.append(Gain(w, gain, best, gain + log_prior(system, model, w.candidate), tried))
+    return sorted(found, key=lambda g: -g.log_odds)
+
+
+def log_prior(system: System, model: Model, candidate: CandidateEffect) -> float:
+    """Return the log prior probability of a candidate; families that a model has share half of it all.
+
+    One that the curve of its own joint can imitate has that curve for its alternative, and not nothing.
+    """
+    if is_curve(system, candidate):
+        return -math.log(sum(c.where == candidate.where and is_curve(system, c) for c in system.candidates))
+    families = {c.family for c in system.candidates}
+    places = sum(c.family == candidate.family for c in system.candidates)
+    there = {system.candidates[number].family for number, _, _ in model.effects}
+    if not there or there == families:
+        return -math.log(len(families) * places)
+    share = 0.5 / len(there) if candidate.family in there else 0.5 / (len(families) - len(there))
+    return math.log(share / places)
+
+
+def is_curve(system: System, candidate: CandidateEffect) -> bool:
+    """True if the background's curve of the same joint can do what a candidate does in these data."""
+    curve = next((b for b in system.blocks.values() if b.kind == "curve" and b.where == candidate.where), None)
+    own = candidate.additions[0]
+    if curve is None or own.shift_mm is not None or candidate.family == MAP:
+        return False
+    basis = np.column_stack([np.ones(len(own.column)), curve.columns.column])
+    left = own.column - basis @ np.linalg.lstsq(basis, own.column)[0]
+    around = own.column - own.column.mean(axis=0)
+    return bool((left**2).sum() < _LIKE_A_CURVE * (around**2).sum())
+
+
+def needed(system: System, model: Model, candidate: CandidateEffect) -> float:
+    """Return the log odds that a candidate needs in addition to a model.
+
+    They are those against nothing for a new family; less is enough for a further place of a family that is there, and
+    against an anonymous curve of the joint.
+    """
+    there = any(system.candidates[number].family == candidate.family for number, _, _ in model.effects)
+    return ODDS_OF_TWO if there or is_curve(system, candidate) else ODDS
+
+
+def _grown(system: System, model: Model) -> Model:
+    """Return a model with the effect of the greatest gain added until none is beyond doubt."""
+    while len(model.effects) < _MOST:
+        found = [g for g in gains(system, model) if g.log_odds > needed(system, model, g.scored.candidate)]
+        if not found:
+            break
+        model = system.fit(found[0].model.effects, found[0].model.scales)
+    return model

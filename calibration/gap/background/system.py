@@ -1,0 +1,249 @@
+"""Kinematics, background and candidate effects as one linear model about a fit, judged by products of its columns."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Collection, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
+
+from calibration.effects.columns import EffectColumns
+from calibration.gap.background.blocks import Block
+from calibration.gap.background.evidence import Products, Scales, greatest
+from calibration.gap.candidates import CandidateEffect
+from calibration.gap.projection import Projection
+from calibration.gap.screening import ScoredEffect, Screen
+from calibration.observations import Floats
+
+Integers = NDArray[np.intp]
+
+Chosen = tuple[int, int, float]  # number of a candidate, its variant, scale of plausible sizes
+Effect = tuple[CandidateEffect, int, float]
+
+_ITERATIONS, _FEW = 60, 10
+_START, _AGAIN = -1.0, -3.0  # log scale of a block at the beginning, and of one that had vanished
+_GONE = -5.0  # log scale of a block that has vanished
+_SEEN = 1e-10  # least eigenvalue of products of columns, of their largest
+
+
+@dataclass(frozen=True)
+class Model:
+    """A model of the system: which effects it has, and how large its background is.
+
+    Attributes:
+        effects: (candidate, variant, scale) of each.
+        scales: of background and noise.
+    """
+
+    effects: tuple[Chosen, ...]
+    scales: Scales
+
+    @property
+    def log_evidence(self) -> float:
+        """Log evidence, up to a constant of the rows."""
+        return self.scales.log_evidence
+
+    def without(self, number: int) -> tuple[Chosen, ...]:
+        """Return the effects without one of them."""
+        return self.effects[:number] + self.effects[number + 1 :]
+
+
+class System:
+    """A linear model about a fit.
+
+    Args:
+        projection: about the fit; its kinematics are those of the model.
+        blocks: of the background.
+        candidates: effects that may be part of the model.
+        least_noise: least variance of the noise, of the one that the projection whitens with.
+
+    Attributes:
+        projection, candidates: as above.
+        blocks: name -> block of the background.
+        products: of all whitened columns, in prior sigmas.
+    """
+
+    def __init__(
+        self, projection: Projection, blocks: Sequence[Block], candidates: Sequence[CandidateEffect], least_noise: float
+    ) -> None:
+        self.projection, self.candidates = projection, tuple(candidates)
+        self.blocks = {block.name: block for block in blocks}
+        self._number = {str(candidate): number for number, candidate in enumerate(self.candidates)}
+        parts, count = [projection.kinematics], projection.kinematics.shape[1]
+        self._kinematics: Integers = np.arange(count)
+        self._of_block: dict[str, Integers] = {}
+        self._of_option: dict[tuple[int, int], Integers] = {}
+        for name, block in self.blocks.items():
+            parts.append(self._whitened(block.columns))
+            self._of_block[name] = np.arange(count, count := count + parts[-1].shape[1])
+        for number, candidate in enumerate(self.candidates):
+            for option, first in enumerate(candidate.first_equal):
+                if first == option:
+                    parts.append(self._whitened(candidate.additions[option]))
+                    self._of_option[number, option] = np.arange(count, count := count + parts[-1].shape[1])
+                self._of_option[number, option] = self._of_option[number, first]
+        self.columns, target = np.hstack(parts), projection.target
+        self.products = Products(
+            self.columns.T @ self.columns,
+            self.columns.T @ target,
+            float(target @ target),
+            len(target),
+            least_noise,
+        )
+
+    def _whitened(self, additions: EffectColumns) -> Floats:
+        return self.projection.whitened(self.projection.moved_mm(additions)) * additions.prior_sigma
+
+    def of_rows(self, rows: Integers) -> System:
+        """Return the same system of some of the whitened rows (r,) alone."""
+        out = copy(self)
+        out.columns, target = self.columns[rows], self.projection.target[rows]
+        out.products = Products(
+            out.columns.T @ out.columns,
+            out.columns.T @ target,
+            float(target @ target),
+            len(rows),
+            self.products.least_noise,
+        )
+        return out
+
+    def chosen(self, effects: Sequence[Effect]) -> list[Chosen]:
+        """Return effects by the numbers of their candidates."""
+        return [(self._number[str(candidate)], option, scale) for candidate, option, scale in effects]
+
+    def choice(self, scored: ScoredEffect) -> Chosen:
+        """Return a scored candidate in its best variant."""
+        return self._number[str(scored.candidate)], scored.option, scored.scale
+
+    def fit(
+        self,
+        effects: Sequence[Chosen],
+        start: Scales | None,
+        *,
+        without: Collection[str] = (),
+        quick: bool = False,
+    ) -> Model:
+        """Return the model with the given effects and the background of greatest evidence.
+
+        Args:
+            effects: (candidate, variant, scale) of each.
+            start: scales to start from; plausible ones by default.
+            without: names of blocks that are left out.
+            quick: near enough to compare models, without blocks that have vanished.
+        """
+        log_scale = dict.fromkeys(self._of_block, _START if start is None else _AGAIN)
+        log_scale |= {} if start is None else start.log_scale
+        blocks = {
+            name: own
+            for name, own in self._of_block.items()
+            if name not in without and (not quick or log_scale[name] > _GONE)
+        }
+        fixed, sigma = self._fixed(effects)
+        noise = 1.0 if start is None else start.noise
+        scales = greatest(self.products, fixed, sigma, blocks, log_scale, noise, _FEW if quick else _ITERATIONS)
+        return Model(tuple(effects), scales)
+
+    def background_log_bayes_factor(self, model: Model) -> float:
+        """Return the log Bayes factor of a model's background against noise alone.
+
+        Its scales are those of greatest evidence, so that it is a few above zero where there is nothing.
+        """
+        return model.log_evidence - self.fit(model.effects, None, without=self.blocks).log_evidence
+
+    def at(self, effects: Sequence[Chosen], scales: Scales) -> Model:
+        """Return the model with the given effects at scales as they are."""
+        fixed, sigma = self._fixed(effects)
+        return Model(tuple(effects), replace(scales, fixed=fixed, fixed_sigma=sigma))
+
+    def _fixed(self, effects: Sequence[Chosen]) -> tuple[Integers, Floats]:
+        """Return the columns (f,) of kinematics and effects, and the factors (f,) on their sigmas."""
+        index, sigma = [self._kinematics], [np.ones(len(self._kinematics))]
+        for number, option, scale in effects:
+            own = self.candidates[number]
+            unit = own.additions[own.first_equal[option]].prior_sigma
+            index.append(self._of_option[number, option])
+            sigma.append(own.additions[option].prior_sigma / unit * scale)
+        return np.concatenate(index).astype(np.intp), np.concatenate(sigma)
+
+    def amounts(self, model: Model) -> Floats:
+        """Return (t,) the posterior means of all columns' amounts, in prior sigmas; 0 of what a model lacks."""
+        index, sigma, noise = model.scales.index, model.scales.sigma, model.scales.noise
+        matrix = self.products.gram[np.ix_(index, index)] * (sigma * sigma[:, None] / noise)
+        matrix[np.diag_indices_from(matrix)] += 1.0
+        mean = cho_solve(cho_factor(matrix, lower=True), self.products.along[index] * sigma / noise)
+        out = np.zeros(len(self.products.along))
+        out[index] = mean * sigma
+        return out
+
+    def residual(self, model: Model) -> Floats:
+        """Return (3 m,) what a model's posterior mean leaves of the whitened target."""
+        left: Floats = self.projection.target - self.columns @ self.amounts(model)
+        return left
+
+    def of_block(self, name: str) -> Integers:
+        """Return the columns of a block."""
+        return self._of_block[name]
+
+    def of_effect(self, effect: Chosen) -> Integers:
+        """Return the columns of an effect."""
+        return self._of_option[effect[0], effect[1]]
+
+    def screen(self, model: Model) -> Screen:
+        """Return a screen of the candidates that a model lacks, beside the model."""
+        there = {number for number, _, _ in model.effects}
+        numbers = [number for number in range(len(self.candidates)) if number not in there]
+        candidates = [self.candidates[number] for number in numbers]
+        distinct = [
+            (number, option)
+            for number in numbers
+            for option, first in enumerate(self.candidates[number].first_equal)
+            if first == option
+        ]
+        return Screen(self.projection, candidates, _BesideModel(self, model, distinct))
+
+    def explained(self, model: Model, effect: Chosen) -> tuple[float, int, float]:
+        """Return the squares of what a model leaves that an effect explains at most, its columns, and all squares.
+
+        Where the model is true these are chi-square distributed times the noise that the model has wrong.
+        """
+        own = _BesideModel(self, model, [effect[:2]])
+        size, axes = np.linalg.eigh(own.product(0, 0))
+        seen = size > _SEEN * max(float(size[-1]), _SEEN)
+        squares = float(((axes.T @ own.along(0))[seen] ** 2 / size[seen]).sum())
+        return squares, int(seen.sum()), own.squares
+
+
+class _BesideModel:
+    """Products of the columns of variants with everything in a model projected out, as `Screen` takes them."""
+
+    def __init__(self, system: System, model: Model, variants: Sequence[tuple[int, int]]) -> None:
+        index, root = model.scales.index, math.sqrt(model.scales.noise)
+        sigma = model.scales.sigma / root
+        gram, along = system.products.gram, system.products.along
+        matrix = gram[np.ix_(index, index)] * (sigma * sigma[:, None])
+        matrix[np.diag_indices_from(matrix)] += 1.0
+        factor = cholesky(matrix, lower=True)
+        of_variant = [system.of_effect((number, option, 1.0)) for number, option in variants]
+        columns = np.concatenate([np.empty(0, dtype=np.intp), *of_variant])
+        prior = [system.candidates[number].additions[option].prior_sigma for number, option in variants]
+        unit = np.concatenate([np.empty(0), *prior]) * root
+        removed = solve_triangular(factor, sigma[:, None] * gram[np.ix_(index, columns)], lower=True) / unit
+        left = solve_triangular(factor, sigma * along[index], lower=True)
+        self._gram = gram[np.ix_(columns, columns)] / (unit * unit[:, None]) - removed.T @ removed
+        self._along = along[columns] / (unit * root) - removed.T @ left / root
+        self.squares = (system.products.squares - float(left @ left)) / model.scales.noise
+        ends = np.cumsum([0, *map(len, of_variant)]).tolist()
+        self._slices = [slice(a, b) for a, b in itertools.pairwise(ends)]
+
+    def along(self, block: int) -> Floats:
+        own: Floats = self._along[self._slices[block]]
+        return own
+
+    def product(self, a: int, b: int) -> Floats:
+        own: Floats = self._gram[self._slices[a], self._slices[b]]
+        return own

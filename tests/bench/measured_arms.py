@@ -1,0 +1,171 @@
+"""Two measured arms from public repositories: what is named, and errors of held-out rows stage by stage.
+
+    python -m tests.bench.measured_arms --iiwa DIR --irb120 DIR
+
+DIR is a checkout of github.com/Zhangzhongqiu/robot-calibration (KUKA iiwa 7 with joint torques, two runs without a load
+and two with one) and of github.com/icelinker/Robot-Calibration-LaserTracker (ABB IRB 120, three reflectors). Neither
+has a licence, so none of their data is here; an arm whose checkout is not given is skipped. A random half of the poses
+trains, the other half is held out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.model.prediction import Predictor
+from calibration.observations import Observations, parse_observations
+from calibration.pipeline.calibrate import calibrate
+from calibration.rig.description import Rig, parse_rig
+
+Floats = NDArray[np.float64]
+
+_IRB120 = [(0, -90, 290, 0), (270, 0, 0, -90), (70, -90, 0, 0), (0, 90, 302, 0), (0, -90, 0, 0), (0, 0, 72, 180)]
+_IRB120_MASSES = [(1, 3.909), (2, 2.944), (3, 1.328), (4, 0.546), (5, 0.4)]
+_IIWA = [
+    (0, -90, 340, 0),
+    (0, 90, 0, 0),
+    (0, 90, 400, 0),
+    (0, -90, 0, 0),
+    (0, -90, 400, 0),
+    (0, 90, 0, 0),
+    (0, 0, 126, 0),
+]
+_IIWA_MASSES = [(2, 7.54), (4, 5.65), (6, 3.13)]
+_IIWA_RUNS = {
+    "0 kg": ("0kg/20161216_run1_0kg.csv", 1),
+    "1.25 kg": ("1.25kg/20161216_run2_1.25kg.csv", 1),
+    "2.5 kg": ("2.5kg/20161216_run3_2.5kg.csv", 1),
+    "all joints": ("20161118_run_1.csv", 20),
+}
+_COVERAGE = 1.6448536269514722  # sigmas of a two-sided 90 % interval
+
+
+@dataclass(frozen=True)
+class Case:
+    """One data set, split."""
+
+    title: str
+    rig: Rig
+    rig_text: str
+    train: Observations
+    held_out: Observations
+
+
+def rig_text(
+    name: str, rows: Sequence[tuple[float, ...]], masses: Sequence[tuple[float, ...]], prisms: Sequence[str]
+) -> str:
+    """Return a rig file: a tracker, DH rows of (a, alpha, d, theta), masses midway between frames."""
+    parts = [
+        f'name = "{name}"\nconvention = "dh"\ngravity = [0, 0, -1]',
+        "[tolerances]\nlength_mm = 1.0\nangle_deg = 0.2\nbeta_deg = 0.1\nprism_mm = 100.0",
+        "[station]\nangle_sigma_arcsec = 1.0\ndistance_sigma_mm = 0.01\ndistance_sigma_ppm = 0.5",
+    ]
+    parts += [
+        f'[[joint]]\nname = "q{n}"\nkind = "revolute"\nlimits = [-360, 360]\nsigma = 0.0005\nmax_rate = 180.0'
+        for n in range(1, len(rows) + 1)
+    ]
+    parts += [
+        f"[[row]]\na_mm = {a}\nalpha_deg = {alpha}\nd_mm = {d}\ntheta_deg = {theta}\n"
+        f"drive = {{ theta = {{ q{n} = 1.0 }} }}"
+        for n, (a, alpha, d, theta) in enumerate(rows, 1)
+    ]
+    parts += [
+        f'[[prism]]\nname = "{p}"\nframe = {len(rows)}\noffset_mm = [0, 0, 0]\noffset_known = false' for p in prisms
+    ]
+    parts += [f'[[mass]]\nname = "link {frame}"\nframe = {frame}\nkg = {kg}\nmidway = true' for frame, kg in masses]
+    return "\n\n".join(parts) + "\n"
+
+
+def iiwa(folder: Path) -> Iterator[Case]:
+    """Yield the runs of the 7-joint arm, with measured torques and with those that follow from its masses."""
+    text = rig_text("iiwa7", _IIWA, _IIWA_MASSES, ["tool"])
+    for title, (path, first) in _IIWA_RUNS.items():
+        lines = list(csv.reader((folder / path).read_text().splitlines()))[1:]
+        values = np.array([[float(v) for v in line] for line in lines if len(line) > 20][first:])
+        angles, torques, position = np.rad2deg(values[:, 1:8]), values[:, 8:15], values[:, [18, 22, 26]]
+        for measured in (True, False):
+            columns = {f"q{n}_deg": angles[:, n - 1] for n in range(1, 8)}
+            columns |= {f"q{n}_Nm": torques[:, n - 1] for n in range(1, 8)} if measured else {}
+            loads = "torques" if measured else "masses"
+            yield _case(f"iiwa 7, {title}, {loads}", text, [("tool", columns, position)])
+
+
+def irb120(folder: Path) -> Iterator[Case]:
+    """Yield the small arm with its joints as commanded and as read back."""
+    text = rig_text("irb120", _IRB120, _IRB120_MASSES, ["smr1", "smr2", "smr3"])
+    measured = folder / "3-Full Measurement/Output/Backup"
+    positions = [np.loadtxt(measured / f"measured_SMR_{n}.txt") for n in (1, 2, 3)]
+    joints = {
+        "commanded": np.loadtxt(folder / "3-Full Measurement/Input/generated_joints.txt"),
+        "read back": np.loadtxt(measured / "measured_joints.txt"),
+    }
+    for title, angles in joints.items():
+        columns = {f"q{n}_deg": angles[:, n - 1] for n in range(1, 7)}
+        yield _case(f"IRB 120, {title}", text, [(f"smr{n}", columns, at) for n, at in enumerate(positions, 1)])
+
+
+def _case(title: str, text: str, prisms: Sequence[tuple[str, dict[str, Floats], Floats]]) -> Case:
+    """Return a data set of (prism, columns, positions) of the same poses, split by poses."""
+    rig = parse_rig(text, title)
+    count = len(prisms[0][2])
+    is_train = np.isin(np.arange(count), np.random.default_rng(1).permutation(count)[: count // 2])
+    halves = []
+    for chosen in (is_train, ~is_train):
+        out = io.StringIO()
+        out.write(",".join(["prism", *prisms[0][1], "x_mm", "y_mm", "z_mm"]) + "\n")
+        for row in np.flatnonzero(chosen):
+            for prism, columns, position in prisms:
+                fields = [*(values[row] for values in columns.values()), *position[row]]
+                out.write(f"{prism}," + ",".join(f"{value:.7f}" for value in fields) + "\n")
+        halves.append(parse_observations(out.getvalue().encode(), rig, title))
+    return Case(title, rig, text, *halves)
+
+
+def main() -> None:
+    """Print one line for every data set."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--iiwa", type=Path, metavar="DIR")
+    parser.add_argument("--irb120", type=Path, metavar="DIR")
+    parser.add_argument("--only", default="", help="data sets whose title has this")
+    given = parser.parse_args()
+    cases = [*(iiwa(given.iiwa) if given.iiwa else ()), *(irb120(given.irb120) if given.irb120 else ())]
+    if not cases:
+        print("skipped: no checkout is given (--iiwa DIR, --irb120 DIR)")
+    print("held-out RMS in mm: n as designed, g geometry, e with effects, h with the residual; share in 90 % intervals")
+    for case in cases:
+        if given.only in case.title:
+            print(_line(case), flush=True)
+
+
+def _line(case: Case) -> str:
+    began = time.process_time()
+    model, _ = calibrate(case.rig, case.rig_text, case.train)
+    cpu_s = time.process_time() - began
+    held_out, predictor = case.held_out, Predictor.of(model)
+    predicted = predictor.predict(replace(held_out, position_mm=np.full_like(held_out.position_mm, np.nan)))
+    stages = {
+        "n": predictor.nominal_mm(held_out),
+        "g": predictor.geometric_mm(held_out),
+        "e": predictor.effects_mm(held_out),
+        "h": predicted.position_mm,
+    }
+    errors = {
+        name: float(np.sqrt(((held_out.position_mm - at) ** 2).sum(axis=1).mean())) for name, at in stages.items()
+    }
+    inside = np.abs(held_out.position_mm - predicted.position_mm) <= _COVERAGE * predicted.sigma_mm
+    named = ", ".join(f"{e.family}@{e.where}" for e in model.effects) or "nothing"
+    numbers = "  ".join(f"{name} {value:.3f}" for name, value in errors.items())
+    return f"{case.title:32}  {numbers}  {inside.mean():.0%}  {cpu_s:.0f} s of CPU  {named}"
+
+
+if __name__ == "__main__":
+    main()
