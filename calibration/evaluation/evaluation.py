@@ -98,7 +98,7 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
         UnsafeError: a set-up that the model does not know, or whose base cannot be placed with these rows.
     """
     require_positions(observations)
-    effects = model
+    effects, learned = model, model.residual is not None
     if refit_base:
         effects = with_refitted_base(replace(model, residual=None), observations)
         model = effects if model.residual is None else with_refitted_base(model, observations)
@@ -108,6 +108,8 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
         names = ", ".join(repr(s) for s in model.placements)
         fixes = len(np.unique(originals(observations)))
         warnings.append(f"the base transform of set-up {names} was fitted on these {fixes} fixes")
+        if learned and model.residual is None:
+            warnings.append(f"the residual is left out here, in all rows: {model.residual_reason}")
     warnings += [w for w in model_warnings(model, observations) if w not in warnings]
     errors = {
         "nominal": observations.position_mm - Predictor.of(effects).nominal_mm(observations),

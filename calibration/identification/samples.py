@@ -265,11 +265,12 @@ def left_out_errors(
     joint_jacobian: Floats,
     covariance: Floats,
     excess_variance: float,
+    groups: Integers | None = None,
 ) -> Floats:
-    """Estimate the errors that samples would have, had the fit not seen their standstill.
+    """Estimate the errors that samples would have, had the fit not seen their group.
 
     A fit follows each of its samples a little. In the fit linearised where it came to rest, sample errors e of a
-    standstill become V (V - J C J')^-1 e when it is left out (leave-one-out residuals, Cook & Weisberg 1982, extended
+    group become V (V - J C J')^-1 e when it is left out (leave-one-out residuals, Cook & Weisberg 1982, extended
     to blocks and a prior), with their noise V, their derivatives J and the posterior covariance C.
 
     Args:
@@ -280,6 +281,7 @@ def left_out_errors(
         joint_jacobian: (m, 3, joints) mm per deg or mm.
         covariance: (p, p) posterior.
         excess_variance: mm^2 per axis that the samples scatter beyond station and readings.
+        groups: (m,) samples that are left out together; by default those of one standstill.
 
     Returns:
         (m, 3), mm.
@@ -287,13 +289,16 @@ def left_out_errors(
     own = samples.own_covariance(rig, joint_jacobian) + excess_variance * np.eye(3)
     by_reading = joint_jacobian * np.sqrt(samples.shared_variance(rig))
     out = np.empty_like(error_mm)
-    order = np.argsort(samples.standstill, kind="stable")
-    first, size = np.unique(samples.standstill[order], return_index=True, return_counts=True)[1:]
+    block = samples.standstill if groups is None else groups
+    order = np.argsort(block, kind="stable")
+    first, size = np.unique(block[order], return_index=True, return_counts=True)[1:]
     for k in np.unique(size):
         rows = order[first[size == k][:, None] + np.arange(k)]  # (blocks, k)
         flat = (len(rows), 3 * k, -1)
         shared = by_reading[rows].reshape(flat)
-        noise = shared @ shared.transpose(0, 2, 1)
+        still = samples.standstill[rows]
+        together = np.repeat(np.repeat(still[:, :, None] == still[:, None, :], 3, axis=1), 3, axis=2)
+        noise = shared @ shared.transpose(0, 2, 1) * together
         for i in range(k):
             noise[:, 3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += own[rows[:, i]]
         factor = np.linalg.cholesky(noise)

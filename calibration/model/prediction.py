@@ -188,6 +188,10 @@ class Predictor:
         excess = (1.0 - weight)[:, None] * without + weight[:, None] * learned
         return _turned(rotation, estimate), (rotation * excess[:, None, :]) @ rotation.transpose(0, 2, 1)
 
+    def residual_weights(self, observations: Observations) -> Floats:
+        """(n,) weight of the residual learner in each row, 0 to 1; where it is 0 the model is its stage before."""
+        return self._located(self._rows(observations))[2]
+
     def features(self, observations: Observations, signals: Sequence[str]) -> Features:
         """Features of a residual learner with these signal columns, effects taken into account."""
         rows = self._rows(observations)

@@ -19,6 +19,7 @@ from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor
 from calibration.observations import Floats, Observations
 
+_REACHED = 0.5  # weight of the residual in a row, beyond which the row lies in its region
 _ROUNDS = 2  # the residual turns with the base: after the first by a few mrad, then by nothing that is seen
 
 
@@ -26,14 +27,17 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
     """Refit the base transform of a model at the set-ups of some observations.
 
     A base is fitted to the errors of the whole model, its residual included: one fitted without would take up the
-    residual's estimate at these few places, and a prediction would add that a second time.
+    residual's estimate at these few places, and a prediction would add that a second time. The residual is left out of
+    the model where at most half of these fixes lie in the region it was trained on, or where they fit better without
+    it: what was learned at home is then not true here, and the few rows that it reaches would bend the base for all.
 
     Args:
         model: the model.
         observations: n rows with positions, at one or more set-ups.
 
     Returns:
-        The model with these set-ups in place of its own.
+        The model with these set-ups in place of its own; without its residual, and with the reason, where that is left
+        out.
 
     Raises:
         DataError: a prism that the rig lacks.
@@ -59,7 +63,7 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
     fit = refine(chain, samples, near.x, free=moves, excess_variance=model.excess_sigma_mm**2, additions=additions)
     effects_values = fit.x[: len(chain)]
     refuse_turning(chain, samples, effects_values)
-    left = samples
+    left, without = samples, fit
     for _ in range(_ROUNDS if model.residual is not None else 0):
         here = replace(model, placements=start.placements, values=fit.x[: len(chain)], covariance=fit.covariance)
         correction, lacking = Predictor.of(here).correction(observations)
@@ -69,6 +73,15 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
             station_covariance=samples.station_covariance + samples.average(lacking),
         )
         fit = refine(chain, left, fit.x, free=moves, excess_variance=0.0, additions=additions)
+    if model.residual is not None:
+        placed = replace(model, placements=start.placements)
+        reason = _why_left_out(
+            replace(placed, values=without.x[: len(chain)], residual=None, covariance=without.covariance),
+            replace(placed, values=fit.x[: len(chain)], covariance=fit.covariance),
+            observations,
+        )
+        if reason:
+            return replace(with_refitted_base(replace(model, residual=None), observations), residual_reason=reason)
     geometric = effects_values
     if model.effects:
         geometric = refine(chain, samples, extended(model.geometric_values), free=free).x
@@ -85,6 +98,26 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
         nominal_values=nominal.x,
         intervals=model.intervals.at_other_setups(),
     )
+
+
+def _why_left_out(without: CalibratedModel, whole: CalibratedModel, observations: Observations) -> str:
+    """Return why the residual is left out at these set-ups; empty where it is of use."""
+    assert whole.residual is not None
+    reached = Predictor.of(whole).residual_weights(observations) > _REACHED
+    if 2 * int(reached.sum()) <= len(reached):
+        return (
+            f"{int((~reached).sum())} of {len(reached)} fixes lie outside the region that the residual was trained on"
+        )
+    before, after = (
+        float(np.median(np.linalg.norm(observations.position_mm - position_mm, axis=1)))
+        for position_mm in (
+            Predictor.of(without).effects_mm(observations),
+            Predictor.of(whole).parts(observations).position_mm,
+        )
+    )
+    if after > before:
+        return f"the fixes are {after:.3g} mm off with the residual and {before:.3g} mm without, in the median"
+    return ""
 
 
 def _covariance(chain: Chain, samples: Samples, fit: Fit, additions: EffectColumns, known_covariance: Floats) -> Floats:

@@ -141,7 +141,7 @@ def _answer(
         observations=observations,
         error_before_mm=error_before,
         error_after_mm=error_after,
-        warnings=tuple(_warnings(rest, model, holdout)),
+        warnings=tuple(_warnings(rest, model, holdout, held_out)),
     )
 
 
@@ -218,10 +218,18 @@ def _noise(
     return float(np.sqrt(known + excess)), source
 
 
-def _warnings(rest: Remaining, model: CalibratedModel, holdout: Observations | None) -> Iterator[str]:
+def _warnings(
+    rest: Remaining,
+    model: CalibratedModel,
+    holdout: Observations | None,
+    held_out_mm: tuple[float, float] | None,
+) -> Iterator[str]:
     found = rest.found
     yield from model.warnings
     yield from rest.open_places()
+    if held_out_mm is not None and held_out_mm[1] > held_out_mm[0]:
+        before, after = held_out_mm
+        yield f"the effects raise the error of the held-out rows from {before:.3g} to {after:.3g} mm RMS"
     if holdout is not None:
         yield from (f"in the held-out rows: {warning}" for warning in model_warnings(model, holdout))
     if found.formulas and found.adopted.effects:

@@ -5,41 +5,105 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.observations import Observations, cell_mm
+from calibration.numerics.groups import path_stretches, same_readings
+from calibration.observations import Floats, Observations, cell_mm
 
 Integers = NDArray[np.intp]
 
 
 def group_labels(observations: Observations) -> NDArray[np.str_]:
-    """(n,) `Observations.groups`, with all fixes of one standstill in a single group.
+    """(n,) labels that follow how the data were taken, with all fixes of one standstill in a single group.
 
-    They share the random errors of the readings: a learner that sees one of them "predicts" the others. Among the
-    groups of a standstill's fixes it is the one that fewest standstills have: the cell of a prism that stands still
-    while the joints beyond it are swept would tie the whole sweep together.
+    Groups are sessions or set-ups where there are several, else stretches of the path that the poses follow, else cells
+    of the workspace. Fixes of a standstill share the random errors of the readings: a learner that sees one of them
+    "predicts" the others. Among the groups of a standstill's fixes it is the one that fewest standstills have: the cell
+    of a prism that stands still while the joints beyond it are swept would tie the whole sweep together.
     """
-    labels = observations.groups()
-    rows = np.flatnonzero(observations.pose != "")
-    names = [part[rows] for part in (observations.session, observations.setup, observations.pose)]
-    standstill = np.unique(np.column_stack(names), axis=0, return_inverse=True)[1].reshape(-1)
-    known, group = np.unique(labels[rows], return_inverse=True)
+    if len(observations) == 0:
+        return np.zeros(0, dtype=np.str_)
+    return _by_standstill(_as_taken(observations), observations)
+
+
+def neighbour_labels(observations: Observations) -> NDArray[np.str_]:
+    """(n,) labels of stretches of a path or of cells, as `group_labels` has them within each session and set-up.
+
+    What a fit leaves out together to see how it does on new poses; without all fixes of a set-up it has no base there.
+    """
+    if len(observations) == 0:
+        return np.zeros(0, dtype=np.str_)
+    track = np.char.add(_tracks(observations).astype(np.str_), "|")
+    return _by_standstill(np.char.add(track, _places(observations)), observations)
+
+
+def _by_standstill(labels: NDArray[np.str_], observations: Observations) -> NDArray[np.str_]:
+    """(n,) labels with one for all fixes of a standstill: the one that fewest standstills have."""
+    standstill = _standstills(observations)
+    known, group = np.unique(labels, return_inverse=True)
     pairs = np.unique(np.column_stack([standstill, group]), axis=0)
     standstills_of = np.bincount(pairs[:, 1], minlength=len(known))
     rarest_first = pairs[np.lexsort((standstills_of[pairs[:, 1]], pairs[:, 0]))]
     rarest = rarest_first[np.unique(rarest_first[:, 0], return_index=True)[1], 1]
-    out = labels.copy()
-    out[rows] = known[rarest[standstill]]
-    return out
+    return np.asarray(known[rarest[standstill]], dtype=np.str_)
 
 
 def standstill_labels(observations: Observations) -> NDArray[np.str_]:
-    """(n,) labels of fixes whose errors hang together: of one standstill, or while moving of one workspace cell.
+    """(n,) labels of fixes whose errors hang together: of one standstill, or of one stretch or cell while moving.
 
     What a test over fixes may take for one draw, whatever the number of prisms at a standstill.
     """
-    cells = np.char.add("cell ", observations.cells(cell_mm(observations.position_mm, observations.setup)))
-    place = np.where(observations.pose != "", np.char.add("pose ", observations.pose), cells)
+    place = np.where(observations.pose != "", np.char.add("pose ", observations.pose), _places(observations))
     within = np.char.add(np.char.add(observations.setup, "|"), np.char.add(observations.session, "|"))
     return np.char.add(within, place)
+
+
+def _places(observations: Observations) -> NDArray[np.str_]:
+    """(n,) stretches of a path, else cells of the workspace."""
+    stretch = _stretches(observations)
+    if stretch is None:
+        return np.char.add("cell ", observations.cells(cell_mm(observations.position_mm, observations.setup)))
+    return np.char.add("stretch ", stretch.astype(np.str_))
+
+
+def _as_taken(observations: Observations) -> NDArray[np.str_]:
+    """(n,) sessions or set-ups where there are several, else stretches of a path, else cells of the workspace."""
+    stretch = None
+    if not any(len(np.unique(labels)) > 1 for labels in (observations.session, observations.setup)):
+        stretch = _stretches(observations)
+    return observations.groups() if stretch is None else np.char.add("stretch ", stretch.astype(np.str_))
+
+
+def _stretches(observations: Observations) -> Integers | None:
+    """(n,) `path_stretches` of rows in the order of their times, or as they stand where a time is missing."""
+    order = np.arange(len(observations))
+    time_s = observations.extra.get("time_s")
+    if time_s is not None and np.isfinite(time_s).all():
+        order = np.argsort(time_s, kind="stable")
+    found = path_stretches(_readings(observations)[order], _tracks(observations)[order])
+    if found is None:
+        return None
+    out = np.empty_like(found)
+    out[order] = found
+    return out
+
+
+def _standstills(observations: Observations) -> Integers:
+    """(n,) numbers of standstills: fixes of one pose, or without a name of the pose those with the same readings."""
+    track, named = _tracks(observations), observations.pose != ""
+    out = same_readings(_readings(observations), track)
+    pose = np.unique(observations.pose, return_inverse=True)[1].reshape(-1)
+    by_name = np.unique(np.column_stack([track, pose]), axis=0, return_inverse=True)[1].reshape(-1)
+    either = np.where(named, len(out) + by_name, out)
+    return np.asarray(np.unique(either, return_inverse=True)[1].reshape(-1), dtype=np.intp)
+
+
+def _readings(observations: Observations) -> Floats:
+    return np.column_stack(list(observations.joints.values()))
+
+
+def _tracks(observations: Observations) -> Integers:
+    """(n,) number of each row's session and set-up."""
+    labels = np.column_stack([observations.session, observations.setup])
+    return np.asarray(np.unique(labels, axis=0, return_inverse=True)[1].reshape(-1), dtype=np.intp)
 
 
 def folds(groups: NDArray[np.str_], count: int, seed: int) -> Integers:

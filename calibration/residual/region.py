@@ -1,10 +1,10 @@
 """The region that a residual was trained on: outside it the estimate fades to zero, and the model says so.
 
 Three things make a row strange. A joint beyond the readings it was trained with; a pose that is farther from all
-trained poses than those on which cross-validation has shown that the learner helps; and a signal that is missing or
-that reads what it never read, as a shifted sensor or another unit does. In the first two cases the estimate fades. A
-strange signal is replaced by its usual value, and the estimate counts for less by as much as it gained from that
-signal. All weights are smooth: a rig that moves out of the region sees no step.
+trained poses than those on which cross-validation has shown that the learner helps; and a signal that reads what it
+never read, as at another site, under another load, or where a sensor has shifted. In all three the estimate fades to
+zero. A missing signal is replaced by its usual value, and the estimate counts for less by as much as it gained from
+that signal. All weights are smooth: a rig that moves out of the region sees no step.
 """
 
 from __future__ import annotations
@@ -80,20 +80,20 @@ class Region:
         """Warn of rows outside the region, and of signals that are not what they were in training."""
         if len(features) == 0:
             return
-        for name, values, (low, high, room, _, loss, _) in self._notable(features):
+        for name, values, (low, high, room, _, _, _) in self._notable(features):
             outside = int(((values < low - room) | (values > high + room)).sum())
             if outside:
                 yield (
                     f"{name}: {outside} of {len(values)} readings are outside the {low:.4g} .. {high:.4g} of the "
-                    f"training data (a shifted sensor, or another unit?); there the residual does without it, which "
-                    f"costs {loss:.0%} of what it gains"
+                    f"training data (another site, a shifted sensor, or another unit?); there the residual fades"
                 )
         _, weight = self.confine(features)
         faded = int((weight < _FADED).sum())
         if faded:
             yield (
                 f"the residual fades: {faded} of {len(weight)} rows lie outside the region it was trained on "
-                f"({', '.join(self._reasons(features, joints))}); {int((weight == 0.0).sum())} rows get none of it"
+                f"({', '.join(self._reasons(features, joints))}); {int((weight == 0.0).sum())} rows "
+                f"({(weight == 0.0).mean():.0%}) get none of it"
             )
 
     def _notable(self, features: Features) -> Iterator[tuple[str, Floats, Floats]]:
@@ -296,21 +296,25 @@ def _nearness(joints: Floats, poses: Floats, near: float, row: int, readings: Fl
 
 @part()
 def _signal_weight(table: Floats, row: int, signals: Floats) -> float:
-    """Weight by the signals; what is missing or out of range is drawn to its usual value."""
-    lost = 0.0
+    """Weight by the signals; what is missing or out of range is drawn to its usual value.
+
+    A missing signal costs the share of the gain that goes with it. A strange one that matters leaves nothing: what made
+    it strange, another site or load, has not been seen to leave the rest of the estimate right.
+    """
+    lost, trusted = 0.0, 1.0
     for k in range(table.shape[1]):
-        value, trust = signals[row, k], 0.0
+        value = signals[row, k]
         if math.isfinite(value):
             away = max(table[_LOW, k] - value, value - table[_HIGH, k])
             trust = _falling((away - table[_ROOM, k]) / (_FADE * table[_ROOM, k]))
             if trust < 1.0:
                 signals[row, k] = table[_USUAL, k] + trust * (value - table[_USUAL, k])
-        elif table[_GAPS, k] > 0.0:
-            trust = 1.0
-        else:
+                if table[_LOSS, k] >= _NOTABLE:
+                    trusted *= trust
+        elif table[_GAPS, k] == 0.0:
             signals[row, k] = table[_USUAL, k]
-        lost += (1.0 - trust) * table[_LOSS, k]
-    return max(0.0, 1.0 - lost)
+            lost += table[_LOSS, k]
+    return trusted * max(0.0, 1.0 - lost)
 
 
 @compiled

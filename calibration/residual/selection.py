@@ -30,10 +30,13 @@ Labels = NDArray[np.str_]
 _T = TypeVar("_T")
 
 _FOLDS = 5
+_FEW_ROWS, _MORE_FOLDS = 600, 10  # where folds' learners have too few rows to tell what all of them will leave
 _LEAST_ROWS = 50
 _LEAST_UNITS = 10
-_ALL_ROWS = (0.5, 1.0)  # limits of what rows that the folds leave out may be hoped to gain
+_MOST_GAIN = 2.0  # of the squared error that may be hoped to go, for each part of the rows that folds leave out
 _REACH = 1.5  # in error; the chain of Zhou et al. 2022 gains a quarter on the better of its parts
+_OUT_OF_REACH = 1.6  # in error on two folds: a learner so far behind the best is not tried on the others
+_PROBED_FOLDS = 2
 _MOST_PROGRESS = 0.95
 
 
@@ -121,6 +124,13 @@ def select_residual(
     for name in ("gp", "rbfn", "lightgbm", "chain") if kind == "default" else (kind,):
         if kind == "default" and name == "chain" and not _may_win(trials):
             continue
+        if kind == "default" and estimates and name != "chain":
+            best_mm = min((found for found, _ in estimates.values()), key=lambda found: _squares(target_mm - found))
+            probed, probe_mm = validation.probe(name)
+            if _squares(target_mm[probed] - probe_mm) > _OUT_OF_REACH**2 * _squares((target_mm - best_mm)[probed]):
+                trial = _trial(name, target_mm[probed], probe_mm, units[probed])
+                trials[name] = replace(trial, kept=False)
+                continue
         estimate_mm, tuned = estimates[name] = validation.estimate(name, tuned.settings if tuned else None)
         trials[name] = _trial(name, target_mm, estimate_mm, units)
     compared = tuple(trials.values())
@@ -129,6 +139,9 @@ def select_residual(
         reason = "in cross-validation of the training data no learner lowers the error beyond chance"
         return _nothing(target_mm, compared, reason)
     estimate_mm, tuned = estimates[best.kind]
+    if len(features) < _FEW_ROWS:
+        validation = CrossValidation(data, _MORE_FOLDS, seed, executor)
+        estimate_mm, _ = validation.estimate(best.kind, tuned.settings if tuned else None)
     left_mm = target_mm - estimate_mm
     gain = _gain_of_all_rows(validation, best.kind, left_mm, tuned, executor)
     residual = _fit(best.kind, data, tuned, seed, executor)
@@ -180,6 +193,10 @@ def _nothing(target_mm: Floats, trials: tuple[Trial, ...], reason: str) -> Selec
     return Selection(None, trials, reason, target_mm, np.zeros(len(target_mm), dtype=np.intp))
 
 
+def _squares(error_mm: Floats) -> float:
+    return float((error_mm**2).sum())
+
+
 def _units(groups: Labels, standstills: Labels) -> Labels:
     """(n,) labels to test by: groups, or the standstills in them where the groups are too few for a test."""
     return groups if len(np.unique(groups)) >= _LEAST_UNITS else np.char.add(np.char.add(groups, "|"), standstills)
@@ -219,7 +236,7 @@ def _gain_of_all_rows(
     with_most, with_half = float((left_mm**2).sum()), float(((data.target_mm - half_mm) ** 2).sum())
     used = 1.0 - 1.0 / validation.count
     gain = (with_half / with_most - 1.0) * (1.0 / used - 1.0) / (2.0 - 1.0 / used)
-    return float(np.clip(1.0 - gain, *_ALL_ROWS))
+    return float(np.clip(1.0 - gain, 1.0 - min(0.5, _MOST_GAIN * (1.0 / used - 1.0)), 1.0))
 
 
 def _fit(kind: str, data: Data, tuned: Tuned | None, seed: int, executor: Executor) -> Residual | None:
@@ -290,6 +307,7 @@ class CrossValidation:
         self._training = [data.select(self.split != fold) for fold in range(self.count)]
         self._held = [data.features.select(self.split == fold) for fold in range(self.count)]
         self._shapes: list[Shape] = []
+        self._probed_shapes: list[Shape] = []
 
     def estimate(self, kind: str, settings: Settings | None = None) -> tuple[Floats, Tuned | None]:
         """Estimate each row by a learner that was trained without its fold.
@@ -307,11 +325,33 @@ class CrossValidation:
             seen = [training.features for training in self._training]
             return self._trees(list(zip(seen, self._held, strict=True)), settings, None)
         if not self._shapes:
-            self._shapes = self._map(_best_shape, self._training)
+            known = self._probed_shapes
+            self._shapes = [*known, *self._map(_best_shape, self._training[len(known) :])]
         if kind == "rbfn":
             return self._joined(self._map(_network_estimate, self._training, self._held, self._shapes)), None
         parts = self._map(_chain_features, self._training, self._held, self._shapes)
         return self._trees(parts, settings, parts[0][0].names)
+
+    def probe(self, kind: str) -> tuple[NDArray[np.bool_], Floats]:
+        """Estimate the rows of two folds alone, which tells whether a learner is worth the work of all of them.
+
+        Args:
+            kind: `rbfn` or `lightgbm`, the latter without tuning.
+
+        Returns:
+            (n,) rows of these folds; their estimates, mm.
+        """
+        rows = self.split < _PROBED_FOLDS
+        training, held = self._training[:_PROBED_FOLDS], self._held[:_PROBED_FOLDS]
+        if kind == "lightgbm":
+            parts = [(inside.features, outside) for inside, outside in zip(training, held, strict=True)]
+            return rows, self._trees(parts, Settings(), None)[0][rows]
+        shapes = self._map(_best_shape, training)
+        estimate_mm = np.empty_like(self.data.target_mm)
+        for fold, found in enumerate(self._map(_network_estimate, training, held, shapes)):
+            estimate_mm[self.split == fold] = found
+        self._probed_shapes = shapes
+        return rows, estimate_mm[rows]
 
     def _map(self, work: Callable[..., _T], *of_folds: Sequence[object]) -> list[_T]:
         found = []

@@ -89,6 +89,22 @@ def test_the_stages_without_a_residual_have_a_base_of_their_own(moved: Moved) ->
     assert found.outliers == plain.outliers
 
 
+def test_a_residual_that_reaches_few_fixes_of_a_site_is_left_out_there(moved: Moved) -> None:
+    residual = moved.model.residual
+    assert residual is not None
+    region = residual.region
+    near = moved.many.select(np.arange(100))
+    # Trained on a part of theta1's range alone: what was learned there says nothing of the other rows.
+    narrow = region.joints.copy()
+    narrow[:2, 0] = np.quantile(near.joints["theta1"], 0.1), 1.0
+    narrow[2, 0] = 0.5
+    home = replace(moved.model, residual=replace(residual, region=replace(region, joints=narrow)))
+    found = evaluate(home, near, refit_base=True)
+    np.testing.assert_array_equal(found.errors_mm["hybrid"], found.errors_mm["effects"])
+    assert found.model.residual is None
+    assert any("the residual is left out here, in all rows" in warning for warning in found.warnings)
+
+
 def test_a_model_with_a_refitted_base_is_stored_whole(moved: Moved, refitted: list[CalibratedModel]) -> None:
     again, prediction = model_from_files(model_to_files(refitted[0])), Predictor.of(refitted[0]).predict(moved.held_out)
     np.testing.assert_array_equal(Predictor.of(again).predict(moved.held_out).sigma_mm, prediction.sigma_mm)

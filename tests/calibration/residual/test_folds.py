@@ -48,10 +48,25 @@ def test_poses_of_the_same_name_in_two_sessions_are_two_standstills(sweeps: Obse
 
 
 def test_without_standstills_groups_are_the_cells(sweeps: Observations) -> None:
-    bare = replace(sweeps, pose=np.full(len(sweeps), ""))
+    bare = replace(sweeps, pose=np.full(len(sweeps), "")).select(sweeps.prism == "r")
     np.testing.assert_array_equal(group_labels(bare), bare.cells())
-    some = replace(sweeps, pose=np.where(np.arange(len(sweeps)) < 8, sweeps.pose, ""))
-    np.testing.assert_array_equal(group_labels(some)[8:], some.cells()[8:])
+
+
+def test_fixes_with_the_same_readings_are_a_standstill_without_a_name(sweeps: Observations) -> None:
+    bare = replace(sweeps, pose=np.full(len(sweeps), ""))
+    np.testing.assert_array_equal(group_labels(bare), group_labels(sweeps))
+
+
+def test_along_a_path_groups_are_stretches_of_it_in_the_order_of_time(sweeps: Observations) -> None:
+    turn = np.linspace(0.0, 2.0 * np.pi, len(sweeps))
+    middle = {name: values.mean() for name, values in sweeps.joints.items()}
+    joints = {name: middle[name] + 10.0 * np.sin((1 + k) * turn + k) for k, name in enumerate(sweeps.joints)}
+    path = replace(sweeps, joints=joints, pose=np.full(len(sweeps), ""), extra={"time_s": turn})
+    labels = group_labels(path)
+    assert 15 <= len(np.unique(labels)) <= 60
+    assert (labels[1:] == labels[:-1]).mean() > 0.85
+    shuffled = np.random.default_rng(0).permutation(len(path))
+    np.testing.assert_array_equal(group_labels(path.select(shuffled)), labels[shuffled])
 
 
 def test_a_machine_of_a_few_millimetres_has_groups_as_a_large_one_has(sweeps: Observations) -> None:

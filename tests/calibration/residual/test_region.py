@@ -144,18 +144,16 @@ def test_a_missing_signal_costs_what_it_gave(region: Region) -> None:
     assert np.isnan(settled.signals[1, 1])  # as in every fifth row of training
 
 
-def test_a_shifted_or_misread_signal_is_left_out_smoothly(region: Region) -> None:
+def test_beyond_what_a_signal_read_in_training_nothing_is_estimated(region: Region) -> None:
     pressure = np.linspace(100.0, 250.0, 301)
     middle = np.tile([0.0, 200.0, 500.0], (301, 1))
     settled, weight = region.confine(seen(middle, np.column_stack([pressure, np.full(301, 12.0)])))
     estimate = predict(settled)[:, 1]
     assert np.abs(np.diff(estimate)).max() < 0.06
-    assert np.abs(np.diff(weight)).max() < 0.02
+    assert np.abs(np.diff(weight)).max() < 0.06
     assert estimate[pressure < 155.0] == pytest.approx((pressure[pressure < 155.0] - 100.0) / 50.0)
     far = pressure > 185.0
-    assert np.abs(estimate[far]).max() < 0.2
-    assert weight[far] == pytest.approx(weight[-1])
-    assert 0.5 < weight[-1] < 0.8
+    np.testing.assert_array_equal(weight[far], 0.0)
 
 
 def test_a_valve_current_that_matters_nothing_is_not_spoken_of(region: Region, training: Features) -> None:
@@ -171,9 +169,15 @@ def test_what_is_outside_is_named(region: Region) -> None:
     signals = np.array([[100.0, 12.0], [100.0, 12.0], [np.nan, 12.0], [1e7, 12.0]])
     shifted, fades = region.warnings(seen(readings, signals), JOINTS)
     assert shifted.startswith("oil_bar: 1 of 4 readings are outside the 5")
-    assert "a shifted sensor, or another unit?" in shifted
+    assert "(another site, a shifted sensor, or another unit?)" in shifted
     assert fades.startswith("the residual fades: 4 of 4 rows lie outside the region it was trained on (a above 4")
-    for reason in ("b below 15", "deg in 1", "oil_bar missing in 1", "oil_bar strange in 1", "2 rows get none of it"):
+    for reason in (
+        "b below 15",
+        "deg in 1",
+        "oil_bar missing in 1",
+        "oil_bar strange in 1",
+        "3 rows (75%) get none of it",
+    ):
         assert reason in fades
 
 

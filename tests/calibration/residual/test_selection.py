@@ -74,7 +74,7 @@ def test_a_learner_that_helps_is_kept_and_predicts_rows_it_never_saw(kind: Kind)
     assert rms(left) < 0.5 * trial.before_mm
     noisy = left + np.random.default_rng(5).normal(0, 0.1, left.shape)
     assert 0.7 < (noisy**2).sum() / (300 * decision.variance_mm2.sum()) < 1.3
-    assert 0.5 * trial.after_mm**2 <= decision.variance_mm2.sum() <= trial.after_mm**2
+    assert 0.5 * trial.after_mm**2 <= decision.variance_mm2.sum() <= 1.05 * trial.after_mm**2
 
 
 def test_the_default_is_the_best_of_all_on_held_out_groups() -> None:
