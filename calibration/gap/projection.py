@@ -22,6 +22,7 @@ from calibration.effects.context import EffectContext
 from calibration.identification.refinement import Fit, whitened_rows
 from calibration.identification.samples import Samples
 from calibration.identification.solve import Solution
+from calibration.numerics.groups import path_stretches
 from calibration.numerics.matrices import gram
 from calibration.observations import Floats, cell_mm
 
@@ -69,7 +70,7 @@ class Projection:
 
     Attributes:
         samples, situation: as above.
-        groups: (m,) workspace cells, a standstill in that of its first sample; no fold separates them.
+        groups: (m,) stretches of a path or workspace cells, a standstill in one of them; no fold separates them.
         joint_jacobian: (m, 3, joints) by reading, station's frame, mm per deg or mm.
         jacobian: (m, 3, p) by the chain's parameters, mm per mm or rad.
         error_mm: (m, 3) measured minus fitted positions, outliers included, station's frame.
@@ -146,14 +147,22 @@ class Projection:
         return additions.moved_mm(self.joint_jacobian)
 
 
+def follows_path(samples: Samples) -> bool:
+    """True if the poses follow one path, and are not taken one independently of the other."""
+    return path_stretches(samples.data.readings, samples.data.setup) is not None
+
+
 def cells(samples: Samples) -> Labels:
-    """Return (m,) workspace cells for grouped splits; a standstill is in the cell of its first sample.
+    """Return (m,) labels for grouped splits: stretches of a path, else workspace cells; a standstill is in one of them.
 
     Set-ups and sessions are no groups here: without a set-up's fixes its base, a part of the fit, is undetermined.
     """
     setup = samples.data.setup
-    cell = np.rint(samples.position_mm / cell_mm(samples.position_mm, setup)).astype(int)
     first = np.arange(len(samples)) if samples.standstill is None else samples.standstill
+    stretch = path_stretches(samples.data.readings, setup)
+    if stretch is not None:
+        return np.array([f"{s}|stretch {n}" for s, n in zip(setup[first], stretch[first], strict=True)])
+    cell = np.rint(samples.position_mm / cell_mm(samples.position_mm, setup)).astype(int)
     return np.array([f"{s}|{x},{y},{z}" for s, (x, y, z) in zip(setup[first], cell[first], strict=True)])
 
 

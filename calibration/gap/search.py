@@ -11,7 +11,7 @@ import numpy as np
 from calibration.effects.columns import joined
 from calibration.effects.fitted import Choice
 from calibration.gap.adoption import Adopted, adopted
-from calibration.gap.background.blocks import displacement_blocks, smooth_blocks
+from calibration.gap.background.blocks import displacement_blocks, smooth_blocks, time_blocks
 from calibration.gap.background.naming import Names, evidence_alone, names_beside
 from calibration.gap.background.outside import formula_block, is_in_library, what_is_left
 from calibration.gap.background.search import background_log_bayes_factor
@@ -20,7 +20,7 @@ from calibration.gap.criteria import best_of_each_family, beyond_doubt, joint_lo
 from calibration.gap.detection import detect
 from calibration.gap.formulas.grammar import Formula, Grammar
 from calibration.gap.joint_fit import OUTLIER, JointFit, Problem, joint_fit
-from calibration.gap.projection import Projection
+from calibration.gap.projection import Projection, follows_path
 from calibration.gap.screening import ScoredEffect, Screen, by_family
 from calibration.gap.search_result import STRUCTURE, SearchResult, SelectionStep, conclude
 from calibration.gap.selection import Selection, select_effect
@@ -218,7 +218,8 @@ def _beside_background(problem: Problem, families: Collection[str], found: Searc
         found: without a background; it stays as it is where it leaves nothing but noise, or nothing more is certain.
     """
     names, formulas = _names(problem, families, found)
-    if names is None or not names.joint.choices:
+    is_doubted = names is not None and follows_path(problem.solution.samples)
+    if names is None or not (names.joint.choices or is_doubted):
         smooth = None if formulas else names
         return replace(found, evidence=evidence_alone(problem, found.joint, families), beside=smooth)
     joint, first = names.joint, found.steps[0]
@@ -226,8 +227,11 @@ def _beside_background(problem: Problem, families: Collection[str], found: Searc
     posterior = {name: own.posterior for name, own in names.evidence.items()}
     of_family = by_family(names.left) | {c.family: posterior[str(c)] for c in joint.choices}
     listed = ", ".join(map(str, joint.choices))
+    reason = (
+        f"the data ask for {listed}, whatever else is there" if listed else "nothing is certain beside what wanders"
+    )
     return SearchResult(
-        adopted(problem.solution, joint, f"the data ask for {listed}, whatever else is there"),
+        adopted(problem.solution, joint, reason),
         joint,
         (
             replace(first, adopted=joint.choices, posterior=of_family),
@@ -256,7 +260,17 @@ def _names(
     """
     known, context, average = found.joint.choices, found.joint.situation, problem.solution.samples.average
     smooth = smooth_blocks(context, average)
-    if not found.outside_library and not detect(found.final, problem.rng()).significant:
+    if follows_path(problem.solution.samples):
+        # Errors that wander with time look like any effect whose pattern changes slowly along a path.
+        wandering = [*(block for block in smooth if block.kind != "time"), *time_blocks(context, average, fine=True)]
+        return names_beside(problem, wandering, families, known), ()
+    final = found.final
+    if found.alternatives:  # one of them is there, which explains what it explains
+        tried = problem.fit([*known, found.alternatives[0].choice], found.joint.fit.x)
+        final = Grammar(problem.project(tried))
+    if not found.outside_library and not detect(final, problem.rng()).significant:
+        if found.alternatives:
+            return None, ()
         wide = [*smooth, *displacement_blocks(context, average)]
         if background_log_bayes_factor(problem, found.joint, wide) < STRUCTURE:
             return None, ()

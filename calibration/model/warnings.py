@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
@@ -13,7 +14,7 @@ from calibration.effects.library import library
 from calibration.kinematics.torques import torque_columns
 from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor
-from calibration.observations import Observations
+from calibration.observations import Floats, Observations
 from calibration.residual.features import DEFLECTION, missing_signals
 from calibration.rig.limits import turns_deg
 
@@ -27,6 +28,8 @@ _ALIKE = 0.7  # correlation about zero; less says nothing of a factor
 _FAR = 5.0  # times: masses are not wrong by so much
 _NEAR = 2.0  # times a unit: that unit
 _LEAST_ROWS = 10
+_LEAST_LOAD = 0.01  # of the largest load of any joint: less is nothing to compare with
+_SIGMAS = 3.0  # standard errors that a factor must have
 
 
 def model_warnings(model: CalibratedModel, observations: Observations) -> tuple[str, ...]:
@@ -155,12 +158,15 @@ def times_computed(context: EffectContext) -> Mapping[str, float]:
     """Compare measured torques with the loads that the rig file's masses make.
 
     Returns:
-        Joint -> factor from its load to its column `<name>_Nm`, for joints where the two are correlated.
+        Joint -> factor from its load to its column `<name>_Nm`, for joints that have a load to compare with and where
+        the factor is beyond three standard errors.
     """
     rows = context.observations
     extra = {name: values for name, values in rows.extra.items() if not name.endswith("_Nm")}
     computed = replace(context, observations=replace(rows, extra=extra))
     out = {}
+    turning = [joint.name for joint in context.rig.joints if joint.kind == "revolute"]
+    most = max((_rms(computed.torque(name)) for name in turning if context.rig.masses), default=0.0)
     for joint in context.rig.joints if context.rig.masses else ():
         if joint.kind != "revolute" or f"{joint.name}_Nm" not in rows.extra:
             continue
@@ -168,9 +174,18 @@ def times_computed(context: EffectContext) -> Mapping[str, float]:
         known = np.isfinite(measured)
         size = float(np.linalg.norm(measured[known]) * np.linalg.norm(load[known]))
         product = float(measured[known] @ load[known])
-        if known.sum() >= _LEAST_ROWS and abs(product) > _ALIKE * size and computed.greatest_torque(joint.name) > 0.0:
-            out[joint.name] = product / float(load[known] @ load[known])
+        if known.sum() < _LEAST_ROWS or abs(product) <= _ALIKE * size or _rms(load[known]) <= _LEAST_LOAD * most:
+            continue
+        squares = float(load[known] @ load[known])
+        factor = product / squares
+        error = _rms(measured[known] - factor * load[known]) / math.sqrt(squares)
+        if computed.greatest_torque(joint.name) > 0.0 and abs(factor) > _SIGMAS * error:
+            out[joint.name] = factor
     return out
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values[np.isfinite(values)] ** 2))) if np.isfinite(values).any() else 0.0
 
 
 def torque_unit_warnings(times_computed: Mapping[str, float]) -> Iterator[str]:

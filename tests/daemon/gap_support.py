@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.effects.base import FittedCoefficient
-from calibration.gap.result import Candidate, Disagreement, Experiment, Forecast, GapResult, Round
+from calibration.gap.result import Candidate, Disagreement, Evidence, Experiment, Forecast, GapResult, Round
 from calibration.model.prediction import Predictor
 from calibration.observations import Floats, Observations, parse_observations
 from calibration.pipeline.calibrate import identify
@@ -45,6 +45,7 @@ def named() -> GapResult:
         verdict="named",
         effects=model.effects,
         posterior={EFFECT: 0.9997},
+        evidence={EFFECT: Evidence(412.0, 0.9997, {"theta4": 1.0}, 1e-9)},
         indistinguishable=(),
         description=None,
         remaining_significant=False,
@@ -85,6 +86,7 @@ def nothing() -> GapResult:
         verdict="none",
         effects=(),
         posterior={},
+        evidence={},
         model=replace(gap.model, effects=(), covariance=_of_kinematics(gap)),
         before_mm=gap.after_mm,
         error_before_mm=left,
@@ -103,6 +105,7 @@ def pending() -> GapResult:
         verdict="indistinguishable",
         effects=(),
         posterior={},
+        evidence={},
         model=replace(gap.model, effects=(), covariance=_of_kinematics(gap)),
         indistinguishable=rivals()[:2],
         remaining_significant=True,

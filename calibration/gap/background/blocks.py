@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +23,7 @@ _CURVE_WAVES = 10  # half waves of a joint's own reading
 _SURFACE_WAVES = 3  # of each of two angles
 _PAIR_WAVES = 2  # of each of two readings
 _PLACE_WAVES = 2  # of each coordinate
-_TIME_WAVES = 8
+_TIME_WAVES, _MOST_WAVES = 8, 60
 _LEAST_TURN_DEG, _LEAST_STROKE_MM = 0.5, 2.0  # a joint that moves less has no curve
 _ROWS_PER_WAVE = 8
 _WHOLE_TURN_DEG = 300.0  # who covers more meets himself at the other end, or nearly
@@ -60,8 +60,8 @@ def smooth_blocks(context: EffectContext, average: Callable[[Floats], Floats]) -
     found = [_curve(context, name) for name in moving]
     for pair in itertools.pairwise(moving):
         found += [_surface(context, pair, at) for at in pair]
-    found += [_place(context), *_time(context)]
-    return tuple(replace(b, columns=b.columns.over(average)) for b in found)
+    found.append(_place(context))
+    return (*(replace(b, columns=b.columns.over(average)) for b in found), *time_blocks(context, average))
 
 
 def displacement_blocks(context: EffectContext, average: Callable[[Floats], Floats]) -> tuple[Block, ...]:
@@ -71,6 +71,28 @@ def displacement_blocks(context: EffectContext, average: Callable[[Floats], Floa
     """
     found = [_pair(context, pair) for pair in itertools.pairwise(_moving(context))]
     return tuple(replace(b, columns=b.columns.over(average)) for b in found)
+
+
+def time_blocks(
+    context: EffectContext, average: Callable[[Floats], Floats], *, fine: bool = False
+) -> tuple[Block, ...]:
+    """Return displacements that wander with time, or with the order of rows where no time is known.
+
+    Args:
+        context: of n observations.
+        average: as of `smooth_blocks`.
+        fine: with as short waves as so many rows can show.
+    """
+    time_s = context.extra("time_s")
+    at = time_s if np.isfinite(time_s).all() and np.ptp(time_s) > 0.0 else np.arange(float(len(context)))
+    if len(at) < 4 * _ROWS_PER_WAVE:
+        return ()
+    number = np.arange(1, (min(len(at) // _ROWS_PER_WAVE, _MOST_WAVES) if fine else _TIME_WAVES) + 1)
+    waves = np.cos(np.pi * number * _unit(at)[:, None])
+    block = Block(
+        "time", "time", "station", "time", _shifts("time", waves, 1.0 / np.sqrt(number) if fine else 1.0 / number)
+    )
+    return (replace(block, columns=block.columns.over(average)),)
 
 
 def _moving(context: EffectContext) -> list[str]:
@@ -132,17 +154,6 @@ def _place(context: EffectContext) -> Block:
     )
     sizes = np.array([1.0 / np.linalg.norm(order) for order in orders])
     return Block("place", "place", "station", "place", _shifts("place", waves, sizes))
-
-
-def _time(context: EffectContext) -> Iterator[Block]:
-    """Yield displacements that wander with time, or with the order of rows where no time is known."""
-    time_s = context.extra("time_s")
-    at = time_s if np.isfinite(time_s).all() and np.ptp(time_s) > 0.0 else np.arange(float(len(context)))
-    if len(at) < 4 * _ROWS_PER_WAVE:
-        return
-    number = np.arange(1, _TIME_WAVES + 1)
-    waves = np.cos(np.pi * number * _unit(at)[:, None])
-    yield Block("time", "time", "station", "time", _shifts("time", waves, 1.0 / number))
 
 
 def _unit(values: Floats) -> Floats:

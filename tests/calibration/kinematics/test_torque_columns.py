@@ -7,14 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calibration.effects.context import EffectContext
 from calibration.errors import CalibrationError
 from calibration.evaluation.evaluation import evaluate
-from calibration.kinematics.chain import Chain
+from calibration.kinematics.chain import Chain, Placement
 from calibration.kinematics.torques import gravity_torques
 from calibration.model.files import model_from_files, model_to_files
 from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor
-from calibration.model.warnings import model_warnings
+from calibration.model.warnings import model_warnings, times_computed
 from calibration.observations import Floats, Observations, parse_observations
 from calibration.pipeline.calibrate import identify
 from calibration.rig.description import Rig, shipped_rig
@@ -83,6 +84,20 @@ def test_torques_of_another_unit_are_named_in_training_and_after() -> None:
     assert of_load(trained, fixes(rig, truth, 40, 6, 1.0)) == []
     (said,) = of_load(trained, in_kilo)
     assert "as if in kN m" in said
+
+
+def test_a_joint_that_hardly_carries_anything_in_these_rows_is_compared_with_nothing() -> None:
+    """With a straight wrist the forearm's roll carries next to nothing, and its sensor shows friction."""
+    rig, rng = shipped_rig("ys100"), np.random.default_rng(0)
+    chain, rows, blank = Chain(rig, {"": Placement.identity()}), 60, np.full(60, "")
+    joints = {joint.name: 0.5 * rng.uniform(*joint.limits, rows) for joint in rig.joints}
+    joints |= {name: rng.normal(0.0, 0.01, rows) for name in ("theta4", "theta5", "theta6")}
+    still = Observations(np.full(rows, rig.prism_names[0]), joints, *np.zeros((2, rows, 3)), blank, blank, blank)
+    context = EffectContext(chain, np.zeros(len(chain)), still)
+    measured = {f"{name}_Nm": 1e3 * context.torque(name) for name in ("theta2", "theta4")}
+    compared = times_computed(replace(context, observations=replace(still, extra=measured)))
+    assert set(compared) == {"theta2"}
+    assert compared["theta2"] == pytest.approx(1e3)
 
 
 def test_torques_whose_sign_has_changed_since_training_are_named() -> None:
