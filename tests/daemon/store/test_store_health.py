@@ -125,8 +125,8 @@ def test_a_long_check_ends_at_a_stop(path: Path) -> None:
     with watched(path, ends_in_order=False) as (store, _), store.transaction() as db:
         db.execute("CREATE TABLE long (n INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE) STRICT")
         db.execute(
-            "WITH RECURSIVE c(n) AS (VALUES (1) UNION ALL SELECT n + 1 FROM c WHERE n < 200000) "
-            "INSERT INTO long SELECT n, printf('%032d', (n * 7919) % 200003) FROM c"
+            "WITH RECURSIVE c(n) AS (VALUES (1) UNION ALL SELECT n + 1 FROM c WHERE n < 500000) "
+            "INSERT INTO long SELECT n, printf('%032d', (n * 7919) % 500009) FROM c"
         )
     with contextlib.closing(Store(path)) as store:
         store.begin_run(at(0))
