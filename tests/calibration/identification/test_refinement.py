@@ -82,7 +82,10 @@ def test_prisms_of_one_pose_share_their_standstill_and_poses_do_not(noisy_joints
     assert len(set(shared.tolist())) == 10
     unlabelled = averaged(chain, replace(table, pose=np.full(len(table), "", dtype=np.str_))).standstill
     assert unlabelled is not None
-    assert len(set(unlabelled.tolist())) == 40
+    assert unlabelled.tolist() == shared.tolist()  # the very same readings of all joints are one standstill
+    theta4 = table.joints["theta4"] + np.arange(len(table)) * 1e-6
+    apart = replace(table, pose=np.full(len(table), "", dtype=np.str_), joints=dict(table.joints) | {"theta4": theta4})
+    assert len(set(averaged(chain, apart).standstill.tolist())) == 40
 
 
 def test_a_fix_with_other_readings_than_its_pose_is_a_standstill_of_its_own(noisy_joints: Rig) -> None:
