@@ -32,6 +32,7 @@ from calibration.observations import Observations
 _MOST_FAMILIES = 4
 _STEPS = 30  # of the loop; every place of every adopted family
 _FORMULAS = 3  # of effects outside the library that may explain all that is left
+_LEAST_SAMPLES = 60  # for the evidence of a background to be more than that of a few fixes
 _PENDING = 3  # sets that are adopted for the time being
 _MANY = 0.02  # share of gross outliers that is more than accidents
 _BETTER = 1.0  # log Bayes factor, to change the form of an adopted effect
@@ -269,7 +270,7 @@ def _names(
         tried = problem.fit([*known, found.alternatives[0].choice], found.joint.fit.x)
         final = Grammar(problem.project(tried))
     if not found.outside_library and not detect(final, problem.rng()).significant:
-        if found.alternatives:
+        if found.alternatives or len(problem.solution.samples) < _LEAST_SAMPLES:
             return None, ()
         wide = [*smooth, *displacement_blocks(context, average)]
         if background_log_bayes_factor(problem, found.joint, wide) < STRUCTURE:

@@ -139,6 +139,9 @@ def test_prisms_of_a_standstill_are_no_further_evidence_of_what_the_model_lacks(
     table = simulate_observations(RigTruth(rig, 1001), 50, 1001, noise_mm=3.0).csv_text()
     training = parse_observations(table.encode(), rig, "simulated.csv")
     model = identify(rig, rig_text("swdt82"), training, effects="none")
-    alone = replace(training, pose=np.full(len(training), ""))
+    # Without a name of their pose, and with readings that are not the very same.
+    theta4 = training.joints["theta4"] + np.arange(len(training)) * 1e-6
+    joints = dict(training.joints) | {"theta4": theta4}
+    alone = replace(training, pose=np.full(len(training), ""), joints=joints)
     assert joint_error_scale(model, alone) > 0.0  # what they would say were each a standstill of its own
     assert joint_error_scale(model, training) == 0.0
