@@ -30,6 +30,7 @@ from calibration.table import (
 Floats = NDArray[np.float64]
 Strings = NDArray[np.str_]
 
+ROW = "row"  # an optional column that no file has: the number of the row, from 0, where no time is known
 DIRECTIONS = (-1.0, 0.0, 1.0)
 CELL_MM = 100.0
 _CELL_SHARE = 0.4  # of the spread of all places: no cell is larger
@@ -135,6 +136,12 @@ class Observations:
             extra={k: v[rows] for k, v in self.extra.items()},
         )
 
+    def numbered(self) -> Observations:
+        """Return the observations with the number of each row as a further column, where they have no time."""
+        if ROW in self.extra or np.isfinite(self.extra.get("time_s", np.full(1, np.nan))).any():
+            return self
+        return replace(self, extra={**self.extra, ROW: np.arange(len(self), dtype=np.float64)})
+
     def groups(self) -> Strings:
         """Return (n,) labels for grouped splits: sessions or set-ups where there are several, else workspace cells.
 
@@ -207,7 +214,7 @@ def format_observations(observations: Observations, rig: Rig) -> str:
             columns[name] = labels
     if np.isfinite(observations.sigma_mm).any():
         columns |= {name: observations.sigma_mm[:, i] for i, name in enumerate(SIGMA_COLUMNS)}
-    columns |= observations.extra
+    columns |= {name: values for name, values in observations.extra.items() if name != ROW}
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(columns)

@@ -143,7 +143,7 @@ def alternative_of(
     """
     context = knowledge.context(readings, conditions)
     if isinstance(effect, FittedEffect):
-        choice = Choice(effect.family, effect.where, effect.settings)
+        choice = Choice(effect.family, effect.where, effect.settings, regime=effect.regime)
         return Alternative.of(name_of(effect), (choice,), context, np.array([c.value for c in effect.coefficients]))
     name, _, where = effect.partition("@")
     variants = library()[name].variants(context, where)

@@ -8,11 +8,13 @@ from dataclasses import dataclass, field, replace
 from itertools import accumulate
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.effects.base import Family, FittedCoefficient, JointFamily, PrismFamily, Settings
 from calibration.effects.columns import NO_JOINT, EffectColumns
 from calibration.effects.context import EffectContext
 from calibration.effects.library import library
+from calibration.effects.regime import Regime
 from calibration.kinematics.chain import Chain
 from calibration.observations import Floats, Observations
 
@@ -27,12 +29,14 @@ class FittedEffect:
         family, where: which effect it is and the place it is at.
         coefficients: in the family's order.
         settings: the numbers of its variant.
+        regime: the rows in which it acts; None for all.
     """
 
     family: str
     where: str
     coefficients: tuple[FittedCoefficient, ...]
     settings: Settings = field(default_factory=dict)
+    regime: Regime | None = None
 
     def as_dict(self) -> dict[str, object]:
         """Return the JSON object (docs/formats.md, gap), with the form and the numbers of the variant."""
@@ -44,6 +48,7 @@ class FittedEffect:
             },
             "form": self.form,
             "settings": dict(self.settings),
+            "regime": None if self.regime is None else self.regime.as_dict(),
         }
 
     @property
@@ -65,12 +70,14 @@ class Choice:
         family, where: which effect, and the place it is at.
         settings: the numbers of its variant.
         scale: factor on the plausible sizes of its coefficients, where the data say that they are larger or smaller.
+        regime: the rows in which it acts; None for all.
     """
 
     family: str
     where: str
     settings: Settings
     scale: float = 1.0
+    regime: Regime | None = None
 
     def __str__(self) -> str:
         return f"{self.family}@{self.where}"
@@ -79,7 +86,7 @@ class Choice:
         """Return its coefficients for the observations of a context."""
         family = library()[self.family]
         found = family.coefficients(context, self.where, self.settings)
-        column, shift = _moves(family, context, self.where, self.settings)
+        column, shift = _moves(family, context, self)
         return EffectColumns(
             tuple(f"{self}:{c.name}" for c in found),
             np.full(len(found), _joint(family, context.chain, self.where)),
@@ -95,7 +102,7 @@ class Choice:
             FittedCoefficient(c.name, c.unit, float(value), float(error), c.sigma)
             for c, value, error in zip(found, values, standard_errors, strict=True)
         )
-        return FittedEffect(self.family, self.where, coefficients, dict(self.settings))
+        return FittedEffect(self.family, self.where, coefficients, dict(self.settings), self.regime)
 
     def beyond(self, context: EffectContext, values: Floats, standard_errors: Floats) -> tuple[str, ...]:
         """Return the names of the coefficients (k,) that are beyond their hard limits by more than chance.
@@ -151,9 +158,9 @@ class AppliedEffects:
         self._shifts = bool((self.joint == NO_JOINT).any())
         # Most effects lack nothing ever; the variance that the others leave does not depend on the rows.
         self._unknown = [
-            (family, effect.where, joint, _unknown_variance(effect))
+            (effect, joint, _unknown_variance(effect))
             for (family, effect, _), joint in zip(self._parts, at, strict=True)
-            if family.needs(effect.where)
+            if family.needs(effect.where) or effect.regime is not None
         ]
 
     def columns(self, context: EffectContext) -> EffectColumns:
@@ -161,7 +168,7 @@ class AppliedEffects:
         column = np.zeros((len(context), len(self.joint)))
         shift_mm = np.zeros((len(context), 3, len(self.joint))) if self._shifts else None
         for family, effect, own in self._parts:
-            moved, shifted = _moves(family, context, effect.where, effect.settings)
+            moved, shifted = _moves(family, context, effect)
             column[:, own] = moved
             if shift_mm is not None and shifted is not None:
                 shift_mm[:, :, own] = shifted
@@ -170,8 +177,8 @@ class AppliedEffects:
     def unknown_variance(self, context: EffectContext) -> Floats:
         """Return the variance (n, joints) of joint values in rows that lack what an effect needs, deg^2 or mm^2."""
         out = np.zeros((len(context), self._joints))
-        for family, where, joint, variance in self._unknown:
-            known = family.known(context, where)
+        for effect, joint, variance in self._unknown:
+            known = _known(effect, context)
             if joint != NO_JOINT and not known.all():
                 out[~known, joint] += variance
         return out
@@ -179,9 +186,9 @@ class AppliedEffects:
     def unknown_mm2(self, context: EffectContext) -> Floats:
         """Return the variance (n,) of each coordinate in rows that lack what an effect on the prism needs, mm^2."""
         out = np.zeros(len(context))
-        for family, where, joint, variance in self._unknown:
+        for effect, joint, variance in self._unknown:
             if joint == NO_JOINT:
-                out[~family.known(context, where)] += variance
+                out[~_known(effect, context)] += variance
         return out
 
 
@@ -205,13 +212,11 @@ def left_out(effects: Sequence[FittedEffect], context: EffectContext) -> tuple[s
     """Return a sentence for every effect that lacks an input in some of these observations."""
     sentences = []
     for effect in effects:
-        family = library()[effect.family]
-        lacking = int((~family.known(context, effect.where)).sum())
+        needs = library()[effect.family].needs(effect.where) or (effect.regime.variable if effect.regime else "")
+        lacking = int((~_known(effect, context)).sum())
         if lacking:
             rows = "" if lacking == len(context) else f" in {lacking} of {len(context)} rows"
-            sentences.append(
-                f"{effect.family}@{effect.where} is left out{rows}: this data lacks {family.needs(effect.where)}"
-            )
+            sentences.append(f"{effect.family}@{effect.where} is left out{rows}: this data lacks {needs}")
     return tuple(sentences)
 
 
@@ -226,10 +231,17 @@ def _joint(family: Family, chain: Chain, where: str) -> int:
     return chain.joint_index[where] if isinstance(family, JointFamily) else NO_JOINT
 
 
-def _moves(family: Family, context: EffectContext, where: str, settings: Settings) -> tuple[Floats, Floats | None]:
+def _known(effect: FittedEffect, context: EffectContext) -> NDArray[np.bool_]:
+    """Return an (n,) mask of the rows that have what an effect needs."""
+    known = library()[effect.family].known(context, effect.where)
+    return known if effect.regime is None else known & effect.regime.known(context)
+
+
+def _moves(family: Family, context: EffectContext, effect: Choice | FittedEffect) -> tuple[Floats, Floats | None]:
     """Return (n, k) columns at the joint; (n, 3, k) displacements of the prism, None for effects at a joint."""
+    acts = np.ones(len(context)) if effect.regime is None else effect.regime.holds(context).astype(np.float64)
     if isinstance(family, JointFamily):
-        return family.columns(context, where, settings), None
+        return family.columns(context, effect.where, effect.settings) * acts[:, None], None
     assert isinstance(family, PrismFamily)  # there are these two
-    shift = family.shift_mm(context, where, settings)
+    shift = family.shift_mm(context, effect.where, effect.settings) * acts[:, None, None]
     return np.zeros((len(context), shift.shape[2])), shift

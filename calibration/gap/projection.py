@@ -54,7 +54,11 @@ class SoftProjection:
 
         a'b less the product of both removed parts is the product of the projected a and b.
         """
-        removed: Floats = self._half.T @ (self._kinematics.T @ whitened)
+        return self.removed_by(self._kinematics.T @ whitened)
+
+    def removed_by(self, products: Floats) -> Floats:
+        """Return `removed` (..., q, k) of rows whose products with the kinematics (..., q, k) are given."""
+        removed: Floats = self._half.T @ products
         return removed
 
 

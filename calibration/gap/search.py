@@ -21,6 +21,7 @@ from calibration.gap.detection import detect
 from calibration.gap.formulas.grammar import Formula, Grammar
 from calibration.gap.joint_fit import OUTLIER, JointFit, Problem, joint_fit
 from calibration.gap.projection import Projection, follows_path
+from calibration.gap.regimes import EffectInRegime, effect_in_regime
 from calibration.gap.screening import ScoredEffect, Screen, by_family
 from calibration.gap.search_result import STRUCTURE, SearchResult, SelectionStep, conclude
 from calibration.gap.selection import Selection, select_effect
@@ -58,7 +59,7 @@ def search(
     """
     seen = in_true_steps(solution, observations, prior)
     problem = Problem(seen, observations, prior, seed)
-    found = _beside_background(problem, families, _Search(problem, families).run())
+    found = _beside_background(problem, families, _in_regimes(problem, families, _Search(problem, families).run()))
     if seen is solution:
         return found
     # A model counts the noise of readings as its rig file has it, and what is beyond that as scatter.
@@ -69,10 +70,16 @@ def search(
 
 
 class _Search:
-    """A search over the given families."""
+    """A search over the given families.
 
-    def __init__(self, problem: Problem, families: Collection[str]) -> None:
-        self.problem, self.families = problem, tuple(families)
+    Args:
+        problem: the data.
+        families: of effects that may be named.
+        known: an effect to begin with, which stays.
+    """
+
+    def __init__(self, problem: Problem, families: Collection[str], known: EffectInRegime | None = None) -> None:
+        self.problem, self.families, self.known = problem, tuple(families), known
 
     def run(self) -> SearchResult:
         """Search without gross outliers, and with all samples where there are many such.
@@ -80,7 +87,10 @@ class _Search:
         To kinematics alone a fix that shows an effect may look like an outlier, as such fixes are often the rare ones:
         those after a step, or where a load has changed its side. The search whose effects leave fewer outliers counts.
         """
-        counted = self.problem.with_mild_outliers(self.problem.kinematics_only())
+        start = self.problem.kinematics_only()
+        if self.known:
+            start = self.problem.fit([self.known.choice], start.fit.x)
+        counted = self.problem.with_mild_outliers(start)
         weight = counted.fit.weight
         found = self._run(counted)
         if (weight < OUTLIER).mean() < _MANY:
@@ -94,14 +104,19 @@ class _Search:
         return int((fit.weight < OUTLIER).sum())
 
     def _run(self, joint: JointFit) -> SearchResult:
-        """Search from a fit of the kinematics alone, whose weights are those of the first step."""
-        projection = self.problem.project(joint)
-        alone = SelectionStep(joint, projection, (), {}, ())
-        initial = candidate_effects(joint.situation, projection, self.families)
+        """Search from a fit of kinematics and known effects, whose weights are those of the first step."""
+        first = self.problem.with_mild_outliers(self.problem.kinematics_only()) if self.known else joint
+        alone = SelectionStep(first, self.problem.project(first), (), {}, ())
+        initial = candidate_effects(first.situation, alone.projection, self.families)
         steps: list[SelectionStep] = []
         posterior: dict[str, float] = {}
+        projection, candidates = alone.projection, initial.candidates
+        if self.known:
+            choice, posterior[str(self.known.choice)] = self.known.choice, self.known.posterior
+            steps.append(replace(alone, adopted=(choice,), posterior={choice.family: self.known.posterior}))
+            projection, candidates = self._candidates(joint)
         pending: list[str] = []
-        candidates, count = initial.candidates, 0
+        count = 0
         while True:
             selection = select_effect(self.problem, joint, projection, candidates)
             count += 1
@@ -130,7 +145,8 @@ class _Search:
                 posterior |= {str(c): step.posterior[c.family] for c in step.adopted}
             elif step is not None and members and not alternatives:
                 steps[-1], alternatives = step, members
-        joint, renamed = self._renamed(joint, [str(c) for c in joint.choices if str(c) not in pending])
+        certain = [str(c) for c in joint.choices if str(c) not in pending and c.regime is None]
+        joint, renamed = self._renamed(joint, certain)
         for step in renamed:
             steps.insert(-1, step)
             posterior |= {str(c): step.posterior[c.family] for c in step.adopted}
@@ -208,6 +224,27 @@ class _Search:
 
 def _step(joint: JointFit, projection: Projection, selection: Selection, taken: tuple[Choice, ...]) -> SelectionStep:
     return SelectionStep(joint, projection, selection.scored, selection.posterior, taken, selection.reasons)
+
+
+def _in_regimes(problem: Problem, families: Collection[str], found: SearchResult) -> SearchResult:
+    """Return a result with an effect that acts in a part of the data, where this leaves noise and nothing less does."""
+    if _leaves_noise(problem, found):
+        return found
+    starts = [problem.kinematics_only(), *([found.joint] if found.joint.choices else [])]
+    for start in starts:
+        one = effect_in_regime(problem, start, families)
+        if one is None:
+            continue
+        tried = _Search(problem, families, one).run()
+        if tried.joint.choices and _leaves_noise(problem, tried):
+            return tried
+    return found
+
+
+def _leaves_noise(problem: Problem, found: SearchResult) -> bool:
+    """True if nothing is left that has no name."""
+    is_open = found.alternatives or found.formulas or found.outside_library
+    return not is_open and not detect(found.final, problem.rng()).significant
 
 
 def _beside_background(problem: Problem, families: Collection[str], found: SearchResult) -> SearchResult:
@@ -371,5 +408,5 @@ def _with_variants(joint: JointFit, over: Projection, choice: Choice, *, is_open
     options = [replace(choice, scale=1.0)]
     if is_open:
         variants = variants_at(joint.situation, choice.family, choice.where)
-        options += [v for v in variants if v.settings != choice.settings]
+        options += [replace(v, regime=choice.regime) for v in variants if v.settings != choice.settings]
     return candidate_at(joint.situation, over, choice.family, choice.where, options)

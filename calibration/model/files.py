@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from calibration.effects.base import FittedCoefficient
 from calibration.effects.fitted import FittedEffect
 from calibration.effects.library import library
+from calibration.effects.regime import Regime
 from calibration.errors import ModelError, RigError
 from calibration.identification.identifiability import Identifiability
 from calibration.identification.refinement import Prior
@@ -95,11 +96,18 @@ class _Coefficient(_Part):
     prior_sigma: Plausible
 
 
+class _Regime(_Part):
+    variable: str
+    above: bool
+    border: Finite
+
+
 class _Effect(_Part):
     family: str
     where: str
     settings: dict[str, Setting]
     coefficients: tuple[_Coefficient, ...]
+    regime: _Regime | None = None
 
 
 class _Outlier(_Part):
@@ -351,7 +359,12 @@ def _read_effect(part: _Effect, chain: Chain) -> FittedEffect:
         raise ModelError(f"model.json has effect {part.family}@{part.where} in no form it takes: {error}") from error
     if tuple(c.name for c in coefficients) != names:
         raise ModelError(f"effect {part.family}@{part.where} of model.json needs the coefficients {', '.join(names)}")
-    return FittedEffect(part.family, part.where, coefficients, part.settings)
+    regime = None if part.regime is None else Regime(**dict(part.regime))
+    if regime is not None and not regime.is_possible(chain.rig):
+        raise ModelError(
+            f"effect {part.family}@{part.where} of model.json depends on {regime.variable}, which is not there"
+        )
+    return FittedEffect(part.family, part.where, coefficients, part.settings, regime)
 
 
 def _first(error: ValidationError) -> str:

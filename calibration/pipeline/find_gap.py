@@ -73,6 +73,7 @@ def find_gap(
         require_positions(holdout)
         remedy = "hold out rows of those, or judge the model on these afterwards with evaluate --refit-base"
         require_known_setups(observations, holdout, remedy)
+    observations = observations.numbered()
     with run.workers() as pool:
         run = replace(run, executor=pool)
         rng = effects_rng(run.seed)

@@ -15,10 +15,10 @@ from calibration.kinematics.chain import Chain
 from calibration.kinematics.compiled_chain import Located
 from calibration.kinematics.torques import GravityModel, gravity_torques, torque_columns
 from calibration.numerics.jit import compiled, part
-from calibration.observations import Floats, Observations
+from calibration.observations import ROW, Floats, Observations
 from calibration.rig.description import Rig
 
-_NOT_FEATURES = frozenset({"time_s"})  # a tree that splits on time knows the past alone
+_NOT_FEATURES = frozenset({"time_s", ROW})  # a tree that splits on time knows the past alone
 _LEAST_MEASURED = 0.5
 _VARYING = 1e-6  # of the largest load
 DEFLECTION = ("deflection_x_mm", "deflection_y_mm", "deflection_z_mm")
