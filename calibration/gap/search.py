@@ -33,6 +33,7 @@ from calibration.observations import Observations
 _MOST_FAMILIES = 4
 _STEPS = 30  # of the loop; every place of every adopted family
 _FORMULAS = 3  # of effects outside the library that may explain all that is left
+_REGIME = 15.0  # log Bayes factor, for an effect in a part of the data: its variable and its border are chosen
 _LEAST_SAMPLES = 60  # for the evidence of a background to be more than that of a few fixes
 _PENDING = 3  # sets that are adopted for the time being
 _MANY = 0.02  # share of gross outliers that is more than accidents
@@ -227,16 +228,22 @@ def _step(joint: JointFit, projection: Projection, selection: Selection, taken: 
 
 
 def _in_regimes(problem: Problem, families: Collection[str], found: SearchResult) -> SearchResult:
-    """Return a result with an effect that acts in a part of the data, where this leaves noise and nothing less does."""
-    if _leaves_noise(problem, found):
-        return found
-    starts = [problem.kinematics_only(), *([found.joint] if found.joint.choices else [])]
+    """Return a result with an effect that acts in a part of the data, where that leaves noise and is the likelier one.
+
+    Rows in which it acts may seem to be outliers to anything else, so that all rows count where there are many such.
+    """
+    alone = problem.with_mild_outliers(problem.kinematics_only())
+    starts = [alone, *([found.joint] if found.joint.choices else [])]
+    if (alone.fit.weight < OUTLIER).mean() >= _MANY:
+        starts.append(replace(alone, fit=replace(alone.fit, weight=np.ones_like(alone.fit.weight))))
+    is_open = not _leaves_noise(problem, found)
     for start in starts:
         one = effect_in_regime(problem, start, families)
         if one is None:
             continue
         tried = _Search(problem, families, one).run()
-        if tried.joint.choices and _leaves_noise(problem, tried):
+        is_likelier = found.joint.fit.cost - tried.joint.fit.cost > _REGIME
+        if tried.joint.choices and (is_open or is_likelier) and _leaves_noise(problem, tried):
             return tried
     return found
 

@@ -69,8 +69,8 @@ def judged(system: System, model: Model) -> tuple[Model, list[Judged]]:
             model = model if changed is None else changed
             found += [] if changed is not None else [rivals.judgement()]
         if model is before:
-            break
-    return model, found
+            return model, found
+    return model, judgements(system, model)
 
 
 def judgements(system: System, model: Model) -> list[Judged]:
@@ -170,7 +170,7 @@ def curves(system: System, model: Model) -> dict[str, float]:
         near = gain - max(NEAR, gain * NEAR / _TRUE_TO)
         imitated = any(
             g.scored.candidate.where == block.where and g.log_bayes_factor > near
-            for g in gains(system, without, _COMPARED)
+            for g in gains(system, without, _COMPARED, without={block.name})
         )
         if gain + prior > ODDS and not imitated:
             found[block.where] = gain + prior

@@ -126,7 +126,9 @@ def _joined(possible: Sequence[CandidateEffect], known: Sequence[CandidateEffect
     return [*out, *by_name.values()]
 
 
-def gains(system: System, model: Model, most: int = _TRIED, always: int | None = None) -> list[Gain]:
+def gains(
+    system: System, model: Model, most: int = _TRIED, always: int | None = None, without: Collection[str] = ()
+) -> list[Gain]:
     """Return what a model gains by the candidates that promise most, the greatest first.
 
     Args:
@@ -134,6 +136,7 @@ def gains(system: System, model: Model, most: int = _TRIED, always: int | None =
         model: what is there.
         most: candidates.
         always: number of a candidate that is among them whatever it promises.
+        without: names of blocks that the model is to do without.
     """
     every, context = system.screen(model).score(), system.projection.situation
     scored = sorted(
@@ -147,7 +150,7 @@ def gains(system: System, model: Model, most: int = _TRIED, always: int | None =
     ]
     found = []
     for w in scored:
-        tried = system.fit([*model.effects, system.choice(w)], model.scales, quick=True)
+        tried = system.fit([*model.effects, system.choice(w)], model.scales, without=without, quick=True)
         best = tried.log_evidence - model.log_evidence
         gain = best + w.form_averaging
         found.append(Gain(w, gain, best, gain + log_prior(system, model, w.candidate), tried))
