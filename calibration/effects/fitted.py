@@ -54,7 +54,8 @@ class FittedEffect:
     @property
     def form(self) -> str:
         """A phrase that names its form; empty where there is nothing to tell."""
-        return library()[self.family].form(self.settings)
+        form = library()[self.family].form(self.settings)
+        return ", ".join(text for text in (form, self.regime.text if self.regime else "") if text)
 
     @property
     def reported(self) -> tuple[FittedCoefficient, ...]:

@@ -22,8 +22,8 @@ class Regime:
     """The rows in which a variable is above a border, or all others.
 
     Attributes:
-        variable: a joint (its reading, deg or mm), `torque(JOINT)` (N m, or N of a prismatic joint), an optional column
-            of the observations, or `row` (from 0) where the data have no time.
+        variable: the column of a joint's reading, deg or mm; `torque(JOINT)`, its load in N m, or N where it is
+            prismatic; an optional column of the observations; or `row`, from 0, where the data have no time.
         above: in the rows above the border; else in those at or below it.
         border: in the variable's unit.
     """
@@ -36,19 +36,14 @@ class Regime:
         """Return the JSON object `regime` of an effect (docs/formats.md, gap)."""
         return {"variable": self.variable, "above": self.above, "border": self.border}
 
-    def text(self, rig: Rig) -> str:
-        """Return a phrase: in which rows."""
-        joint = next((j for j in rig.joints if j.name == self.variable), None)
-        value = f"{self.border:.4g}"
-        if joint is not None:
-            value += f" {joint.unit}"
-        elif self.variable.startswith("torque("):
-            value += " N m"
-        elif self.variable == ROW:
-            return f"only in rows {'after' if self.above else 'up to'} row {math.floor(self.border)}"
-        elif self.variable == "time_s":
+    @property
+    def text(self) -> str:
+        """A phrase: in which rows."""
+        if self.variable == ROW:
+            return f"only in rows {'after' if self.above else 'up to'} {math.floor(self.border)}"
+        if self.variable == "time_s":
             return f"only {'after' if self.above else 'until'} time_s = {self.border:.6g}"
-        return f"only where {self.variable} is {'above' if self.above else 'at most'} {value}"
+        return f"only where {self.variable} is {'above' if self.above else 'at most'} {self.border:.4g}"
 
     def known(self, context: EffectContext) -> NDArray[np.bool_]:
         """Return an (n,) mask of the rows of which it is known whether they are in the part."""
@@ -72,8 +67,9 @@ class Regime:
 
 def variable_values(context: EffectContext, variable: str) -> Floats:
     """Return the (n,) values of a part's variable, NaN where they are not known."""
-    if variable in context.chain.joint_index:
-        return context.reading(variable)
+    by_column = {joint.column: joint.name for joint in context.rig.joints}
+    if variable in by_column:
+        return context.reading(by_column[variable])
     if variable.startswith("torque("):
         return context.torque(variable.removeprefix("torque(").removesuffix(")"))
     return context.extra(variable)
@@ -88,5 +84,5 @@ def variables(context: EffectContext) -> dict[str, Floats]:
     rig, columns = context.rig, context.observations.extra
     loads = [_TORQUE.format(j.name) for j in rig.joints if context.greatest_torque(j.name) > 0.0]
     own = [name for name in sorted(columns) if not name.endswith(("_rate", "_Nm", "_dir"))]
-    found = {name: variable_values(context, name) for name in (*rig.joint_names, *loads, *own)}
+    found = {name: variable_values(context, name) for name in (*(j.column for j in rig.joints), *loads, *own)}
     return {name: v for name, v in found.items() if np.isfinite(v).mean() > _LEAST_KNOWN and np.nanstd(v) > 0.0}

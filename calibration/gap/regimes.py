@@ -7,47 +7,31 @@ the variable, so that all borders of it cost little more than one.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import logsumexp
 
 from calibration.effects.fitted import Choice
 from calibration.effects.regime import Regime, variables
-from calibration.gap.candidates import CandidateEffect, candidate_effects
+from calibration.gap.candidates import CandidateEffect, candidate_at, candidate_effects, variants_at
 from calibration.gap.joint_fit import JointFit, Problem
 from calibration.gap.projection import Integers, Projection, rows_of
-from calibration.gap.screening import LOG_SCALE_ODDS, SCALES
+from calibration.gap.screening import Screen
 from calibration.observations import Floats
 
-_COARSE, _FINE, _FINEST = 6, 24, 200  # borders of a variable: for all hypotheses, for the best, and at the end
-_COMPARED = 30  # hypotheses, and effects
-_LIKELY = (3.0,)  # scale at which all hypotheses are compared
+_BORDERS = 6  # of a variable, at first
 _LEAST = 0.05  # share of the samples on either side of a border
 _MOST_FORMS = 40  # of a candidate: one with more is a step at any time
-_FITTED = 8  # hypotheses that are fitted
+_FITTED = 8  # effects that are fitted at a time
+_ROUNDS = 2
 _PASSES = 3  # of a border and the fit that it depends on
-_HALF = 0.5
 _OUTLIER = 6.0  # median errors: more is no worse
+_HALF = 0.5
 _REGIME = math.log(0.1)  # prior probability that an effect acts in a part only
-_POSTERIOR = 0.95  # of an effect and its variable, among all
-_BETTER = math.log(999.0)  # log odds against all rows
-
-
-@dataclass(frozen=True)
-class _Hypothesis:
-    """An effect in one part of the data, or in all.
-
-    Attributes:
-        choice: in its best form, at the best border.
-        log_bayes_factor: against nothing, averaged over forms and borders.
-        log_odds: that with the prior odds.
-    """
-
-    choice: Choice
-    log_bayes_factor: float
-    log_odds: float
+_LIKELY = 3.0  # factor on plausible sizes: only an effect that is large shows in a part
+_BETTER = math.log(999.0)  # log odds against nothing
+_POSTERIOR = 0.95  # of an effect among all that are fitted, and of its variable among all
 
 
 @dataclass(frozen=True)
@@ -74,24 +58,24 @@ def effect_in_regime(problem: Problem, joint: JointFit, families: Collection[str
     Returns:
         The effect; None where nothing is certain.
     """
-    ranked = _ranked(problem.project(joint), families)
-    names = list(dict.fromkeys(str(h.choice) for h in ranked))[:_COMPARED]
-    best = _fitted(problem, joint, ranked)
-    if best is None:
-        return None
-    ranked = _ranked(problem.project(best.joint, without_last=True), families, names)
-    own = str(best.joint.choices[-1])
-    if str(ranked[0].choice) != own:
-        best = _fitted(problem, joint, ranked)
-        if best is None or str(best.joint.choices[-1]) != own:
+    fitted: dict[str, _Fitted] = {}
+    about = problem.project(joint)
+    for _ in range(_ROUNDS):
+        promising = [choice for choice, log_odds in _screened(about, families) if log_odds > _BETTER]
+        for choice in promising[:_FITTED]:
+            if str(choice) not in fitted:
+                fitted[str(choice)] = _fitted(problem, joint, choice)
+        if not fitted:
             return None
-    posterior = sum(
-        math.exp(h.log_odds - logsumexp([h.log_odds for h in ranked])) for h in ranked if str(h.choice) == own
-    )
-    without = max([0.0, *(h.log_odds for h in ranked if h.choice.regime is None)])
-    is_certain = min(posterior, best.posterior) > _POSTERIOR and ranked[0].log_odds - without > _BETTER
-    is_physical = not best.joint.beyond(len(best.joint.choices) - 1)
-    return EffectInRegime(best.joint.choices[-1], posterior) if is_certain and is_physical else None
+        best = min(fitted.values(), key=lambda own: own.joint.fit.cost)
+        # What is near in the noise that kinematics leave may be far apart in the noise that the true effect leaves.
+        about = problem.project(best.joint, without_last=True)
+    cost = [own.joint.fit.cost for own in fitted.values() if not own.joint.beyond(len(own.joint.choices) - 1)]
+    if best.joint.fit.cost not in cost:  # beyond what is physical
+        return None
+    posterior = 1.0 / sum(math.exp(best.joint.fit.cost - own) for own in cost)
+    is_certain = min(posterior, best.posterior) > _POSTERIOR
+    return EffectInRegime(best.joint.choices[-1], posterior) if is_certain else None
 
 
 @dataclass(frozen=True)
@@ -107,36 +91,28 @@ class _Fitted:
     posterior: float
 
 
-def _fitted(problem: Problem, joint: JointFit, ranked: Sequence[_Hypothesis]) -> _Fitted | None:
-    """Return the best fit with one of the effects that promise most in addition; None if none has a regime.
-
-    What is near in the noise that the kinematics alone leave may be far apart in the noise that the true effect leaves.
-    """
-    by_name: dict[str, _Hypothesis] = {}
-    for h in ranked:
-        if h.choice.regime is not None and h.log_odds > _BETTER:
-            by_name.setdefault(str(h.choice), h)
-    found = None
-    for h in list(by_name.values())[:_FITTED]:
-        others = [c for c in joint.choices if str(c) != str(h.choice)]
-        tried = _in_best_part(problem, problem.fit([*others, h.choice], joint.start(others)))
-        if found is None or tried.joint.fit.cost < found.joint.fit.cost:
-            found = tried
-    return found
-
-
-def _in_best_part(problem: Problem, joint: JointFit) -> _Fitted:
-    """Return a fit with the part of its last effect in which the errors are least, of those by any variable.
+def _fitted(problem: Problem, joint: JointFit, choice: Choice) -> _Fitted:
+    """Return the fit of a further effect in the part of the data in which the errors are least, by any variable.
 
     A row on the wrong side of a border looks like an outlier, which has no say in a fit.
     """
+    others = [c for c in joint.choices if str(c) != str(choice)]
+    found = problem.fit([*others, choice], joint.start(others))
     for _ in range(_PASSES):
-        part, posterior = _best_part(problem, joint)
-        choice = joint.choices[-1]
-        if part == choice.regime:
+        part, posterior = _best_part(problem, found)
+        choice = _best_form(problem, found, part)
+        if choice == found.choices[-1]:
             break
-        joint = problem.fit([*joint.choices[:-1], replace(choice, regime=part)], joint.fit.x)
-    return _Fitted(joint, posterior)
+        found = problem.fit([*others, choice], joint.start(others))
+    return _Fitted(found, posterior)
+
+
+def _best_form(problem: Problem, joint: JointFit, part: Regime) -> Choice:
+    """Return the last effect of a fit in its best form in a part of the data."""
+    last, projection = joint.choices[-1], problem.project(joint, without_last=True)
+    forms = [replace(form, regime=part) for form in variants_at(joint.situation, last.family, last.where)]
+    own = candidate_at(joint.situation, projection, last.family, last.where, forms)
+    return Screen(projection, [own]).score()[0].choice
 
 
 def _best_part(problem: Problem, joint: JointFit) -> tuple[Regime, float]:
@@ -154,7 +130,7 @@ def _best_part(problem: Problem, joint: JointFit) -> tuple[Regime, float]:
     found: list[tuple[float, Regime]] = []
     for variable, of_row in variables(context).items():
         values = samples.average(of_row[:, None])[:, 0]
-        border, order = _borders(values, len(values)), np.argsort(values)
+        border, order = borders(values, len(values)), np.argsort(values)
         count = np.searchsorted(values[order], border)
         gain = np.concatenate([[0.0], np.cumsum((outside - within)[order])])
         for above, cost in ((True, gain[count]), (False, -gain[count])):
@@ -166,60 +142,33 @@ def _best_part(problem: Problem, joint: JointFit) -> tuple[Regime, float]:
     return part, 1.0 / float(np.exp([least - total for total, _ in found]).sum())
 
 
-def _ranked(projection: Projection, families: Collection[str], names: Collection[str] = ()) -> list[_Hypothesis]:
-    """Return the hypotheses that promise most, the most probable first, and every candidate in all rows.
+def _screened(projection: Projection, families: Collection[str]) -> list[tuple[Choice, float]]:
+    """Return every candidate in its best part about a fit with its log odds, the most probable first.
 
-    Args:
-        projection: about a fit.
-        families: of the candidates.
-        names: `family@where` of those that are compared; all of the families by default, with fewer borders.
+    The odds are against nothing and averaged over forms, sides and borders.
     """
     every = candidate_effects(projection.situation, projection, families).candidates
-    few = [c for c in every if len(set(c.first_equal)) <= _MOST_FORMS and (not names or str(c) in names)]
-    everywhere = np.zeros(len(projection.samples), dtype=np.intp)
-    whole = [
-        _best(candidate, values[:, :, 0], [None], candidate.log_prior)
-        for candidate, values in zip(few, _Columns(projection, few).evidence(0, everywhere), strict=True)
-    ]
+    candidates = [c for c in every if len(set(c.first_equal)) <= _MOST_FORMS]
     values = {name: projection.samples.average(v[:, None])[:, 0] for name, v in variables(projection.situation).items()}
     log_prior = _REGIME - math.log(2.0 * max(len(values), 1))
-    columns = _Columns(projection, few, _LIKELY)
-    coarse = sorted(_in_parts(columns, values, _COARSE, log_prior), key=lambda h: -h.log_odds)
-    # Those that promise most, and the best of every candidate.
-    coarse = [*coarse[:_COMPARED], *{str(h.choice): h for h in reversed(coarse)}.values()]
-    fine = []
-    for variable in {h.choice.regime.variable for h in coarse if h.choice.regime}:
-        own = {str(h.choice) for h in coarse if h.choice.regime and h.choice.regime.variable == variable}
-        columns = _Columns(projection, [c for c in few if str(c) in own])
-        fine += list(_in_parts(columns, {variable: values[variable]}, _FINEST if names else _FINE, log_prior))
-    return sorted([*whole, *fine], key=lambda h: -h.log_odds)
-
-
-def _in_parts(columns: _Columns, values: Mapping[str, Floats], borders: int, log_prior: float) -> Iterator[_Hypothesis]:
-    """Yield every candidate on either side of each variable (m,), its border averaged over so many."""
+    columns, found = _Columns(projection, candidates), dict[int, tuple[Choice, float]]()
     for variable, own in values.items():
-        border = _borders(own, borders)
+        border = borders(own, _BORDERS)
         if not len(border):
             continue
         slice_of = np.searchsorted(border, np.where(np.isfinite(own), own, -math.inf))
-        for candidate, evidence in zip(columns.candidates, columns.evidence(len(border), slice_of), strict=True):
-            for above in (False, True):
-                regimes: list[Regime | None] = [Regime(variable, above, float(value)) for value in border]
-                yield _best(candidate, evidence[:, :, int(above)], regimes, candidate.log_prior + log_prior)
+        for number, evidence in enumerate(columns.evidence(len(border), slice_of)):
+            most, candidate = float(evidence.max()), candidates[number]
+            together = most + math.log(float(np.exp(evidence - most).sum()) / len(border))
+            log_odds = together + candidate.log_prior + log_prior
+            if number not in found or log_odds > found[number][1]:
+                option, at, above = np.unravel_index(int(evidence.argmax()), evidence.shape)
+                regime = Regime(variable, bool(above), float(border[at]))
+                found[number] = replace(candidate.options[option], scale=_LIKELY, regime=regime), log_odds
+    return sorted(found.values(), key=lambda own: -own[1])
 
 
-def _best(
-    candidate: CandidateEffect, values: Floats, regimes: Sequence[Regime | None], log_prior: float
-) -> _Hypothesis:
-    """Return a candidate by its log evidence (options, borders, scales), averaged over borders that are as likely."""
-    most = float(values.max())
-    together = most + math.log(float(np.exp(values - most).sum()) / len(regimes))
-    option, at, scale = np.unravel_index(int(values.argmax()), values.shape)
-    choice = replace(candidate.options[option], scale=SCALES[scale], regime=regimes[at])
-    return _Hypothesis(choice, together, together + log_prior)
-
-
-def _borders(values: Floats, count: int) -> Floats:
+def borders(values: Floats, count: int) -> Floats:
     """Return at most so many borders between values (m,), halfway between neighbours and evenly in their order."""
     known = np.sort(values[np.isfinite(values)])
     at = np.unique((np.linspace(_LEAST, 1.0 - _LEAST, count) * len(known)).astype(int))
@@ -232,18 +181,15 @@ def _borders(values: Floats, count: int) -> Floats:
 
 
 class _Columns:
-    """Whitened columns of candidates, and their evidence in all samples of a projection and in parts of them.
+    """Whitened columns of candidates, and their evidence in parts of the samples of a projection.
 
     Args:
         projection: about a fit.
         candidates: effects.
-        scales: of plausible sizes that are compared.
     """
 
-    def __init__(
-        self, projection: Projection, candidates: Sequence[CandidateEffect], scales: Sequence[float] = SCALES
-    ) -> None:
-        self._projection, self.candidates, self._scales = projection, candidates, scales
+    def __init__(self, projection: Projection, candidates: Sequence[CandidateEffect]) -> None:
+        self._projection, self._candidates = projection, candidates
         self._of: dict[int, list[tuple[int, int]]] = {}  # number of columns -> candidates with their options
         for number, candidate in enumerate(candidates):
             for option, additions in enumerate(candidate.additions):
@@ -255,7 +201,7 @@ class _Columns:
         self._removed_target = projection.without_kinematics.removed(projection.target)
 
     def evidence(self, borders: int, slice_of: Integers) -> list[Floats]:
-        """Return for each candidate (options, borders, 2, scales) log evidence with the prior odds of form and size.
+        """Return for each candidate (options, borders, 2) log evidence with the prior odds of its forms.
 
         Args:
             borders: number of borders, of which samples of slice i are above the first i.
@@ -265,14 +211,12 @@ class _Columns:
             For the samples that are not above a border, and for those that are.
         """
         index = [rows_of(np.flatnonzero(slice_of == number)) for number in range(borders + 1)]
-        log_scale_odds = np.array([LOG_SCALE_ODDS[scale] for scale in self._scales])
-        found: list[list[Floats]] = [[] for _ in self.candidates]
+        found: list[list[Floats]] = [[] for _ in self._candidates]
         for width, options in self._of.items():
-            sigma = np.array([self.candidates[n].additions[o].prior_sigma for n, o in options])
-            gram, along = self._products(self._rows[width], width, index)
-            values = _log_bayes_factors(gram, along, sigma[:, None, None], self._scales) + log_scale_odds
+            sigma = _LIKELY * np.array([self._candidates[n].additions[o].prior_sigma for n, o in options])
+            values = _log_bayes_factors(*self._products(self._rows[width], width, index), sigma[:, None, None])
             for (number, option), own in zip(options, values, strict=True):
-                found[number].append(own + self.candidates[number].log_odds[option])
+                found[number].append(own + self._candidates[number].log_odds[option])
         return [np.array(own) for own in found]
 
     def _products(self, columns: Floats, width: int, index: Sequence[Integers]) -> tuple[Floats, Floats]:
@@ -299,23 +243,15 @@ class _Columns:
 
 
 def _on_both_sides(slices: Sequence[Floats]) -> Floats:
-    """Return (b, 2, ...) sums below and above each of b borders, from those of the b + 1 slices between them.
-
-    Without a border they are those of all samples, and of none.
-    """
-    sums = np.array(slices)
-    total = sums.sum(axis=0)
-    below = np.cumsum(sums, axis=0)[:-1] if len(sums) > 1 else total[None]
-    return np.stack([below, total - below], axis=1)
+    """Return (b, 2, ...) sums below and above each of b borders, from those of the b + 1 slices between them."""
+    below = np.cumsum(slices, axis=0)
+    return np.stack([below[:-1], below[-1] - below[:-1]], axis=1)
 
 
-def _log_bayes_factors(gram: Floats, along: Floats, sigma: Floats, scales: Sequence[float]) -> Floats:
-    """Return (..., s) log Bayes factors at s scales, as `from_products`, of (..., k, k), (..., k) and (..., k)."""
-    out = []
-    for scale in scales:
-        unit = sigma * scale
-        factor = np.linalg.cholesky(gram * unit[..., None] * unit[..., None, :] + np.eye(gram.shape[-1]))
-        solved = np.linalg.solve(factor, (along * unit)[..., None])[..., 0]
-        log_root = np.log(np.diagonal(factor, axis1=-2, axis2=-1)).sum(axis=-1)
-        out.append(0.5 * (solved**2).sum(axis=-1) - log_root)
-    return np.stack(out, axis=-1)
+def _log_bayes_factors(gram: Floats, along: Floats, sigma: Floats) -> Floats:
+    """Return (...) log Bayes factors, as `from_products`, of (..., k, k), (..., k) and (..., k)."""
+    factor = np.linalg.cholesky(gram * sigma[..., None] * sigma[..., None, :] + np.eye(gram.shape[-1]))
+    solved = np.linalg.solve(factor, (along * sigma)[..., None])[..., 0]
+    log_root = np.log(np.diagonal(factor, axis1=-2, axis2=-1)).sum(axis=-1)
+    out: Floats = 0.5 * (solved**2).sum(axis=-1) - log_root
+    return out

@@ -10,7 +10,7 @@ from typing import Literal
 from calibration.effects.base import FittedCoefficient
 from calibration.effects.fitted import FittedEffect
 from calibration.model.model import CalibratedModel
-from calibration.observations import Floats, Observations
+from calibration.observations import ROW, Floats, Observations
 
 Verdict = Literal["named", "none", "indistinguishable", "unidentified"]
 
@@ -84,6 +84,45 @@ class Evidence:
             "places": dict(self.places),
             "certificate_p": None if math.isnan(p) else p,
         }
+
+
+@dataclass(frozen=True)
+class Break:
+    """An instant after which the machine is another.
+
+    Attributes:
+        variable: `time_s`, or `row` where the data have no time.
+        border: the last instant or row of the machine as it was is at or below it.
+        before, after: number of samples.
+        log_bayes_factor: of two machines against one, the instant chosen among all.
+    """
+
+    variable: str
+    border: float
+    before: int
+    after: int
+    log_bayes_factor: float
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the JSON object `break` (docs/formats.md, gap)."""
+        return {
+            "variable": self.variable,
+            "border": self.border,
+            "samples_before": self.before,
+            "samples_after": self.after,
+            "log_bayes_factor": self.log_bayes_factor,
+        }
+
+    @property
+    def text(self) -> str:
+        """A sentence: when, and what to do."""
+        when = f"row {math.floor(self.border)}" if self.variable == ROW else f"time_s = {self.border:.6g}"
+        fewer = "before" if self.before < self.after else "after"
+        return (
+            f"after {when} the machine is another than before ({self.before} samples before, {self.after} after): give "
+            f"the rows {fewer} it a name of their own in the column setup if the station or the base moved, or leave "
+            f"them out if the machine was repaired"
+        )
 
 
 @dataclass(frozen=True)
@@ -166,6 +205,7 @@ class GapResult:
         before_mm, after_mm: RMS over the rows of calibrated kinematics, and with the effects.
         noise_mm: the noise floor; `noise_source` says where it is from, a clause.
         held_out: RMS before and after on held-out rows, mm; None where none were given.
+        machine_break: an instant after which the machine is another; None for none.
         disagreements: most significant first.
         experiments: what would tell more.
         rounds: in their order.
@@ -189,6 +229,7 @@ class GapResult:
     noise_mm: float
     noise_source: str
     held_out: tuple[float, float] | None
+    machine_break: Break | None
     disagreements: tuple[Disagreement, ...]
     experiments: tuple[Experiment, ...]
     rounds: tuple[Round, ...]
@@ -220,6 +261,7 @@ class GapResult:
             "holdout": None
             if self.held_out is None
             else {"rms_before_mm": self.held_out[0], "rms_after_mm": self.held_out[1]},
+            "break": None if self.machine_break is None else self.machine_break.as_dict(),
             "disagreements": [d.as_dict() for d in self.disagreements],
             "experiments": [e.as_dict() for e in self.experiments],
             "warnings": list(self.warnings),

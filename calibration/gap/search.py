@@ -15,6 +15,7 @@ from calibration.gap.background.blocks import displacement_blocks, smooth_blocks
 from calibration.gap.background.naming import Names, evidence_alone, names_beside
 from calibration.gap.background.outside import formula_block, is_in_library, what_is_left
 from calibration.gap.background.search import background_log_bayes_factor
+from calibration.gap.breaks import find_break
 from calibration.gap.candidates import CandidateEffect, candidate_at, candidate_effects, variants_at
 from calibration.gap.criteria import best_of_each_family, beyond_doubt, joint_log_bayes_factor
 from calibration.gap.detection import detect
@@ -61,6 +62,7 @@ def search(
     seen = in_true_steps(solution, observations, prior)
     problem = Problem(seen, observations, prior, seed)
     found = _beside_background(problem, families, _in_regimes(problem, families, _Search(problem, families).run()))
+    found = replace(found, machine_break=find_break(problem, found.joint))
     if seen is solution:
         return found
     # A model counts the noise of readings as its rig file has it, and what is beyond that as scatter.

@@ -24,7 +24,7 @@ from calibration.gap.formulas.terms import modulations
 from calibration.gap.formulas.variables import ErrorSource
 from calibration.gap.joint_fit import OUTLIER, JointFit, Problem
 from calibration.gap.projection import Projection
-from calibration.gap.result import Evidence
+from calibration.gap.result import Break, Evidence
 from calibration.gap.screening import ScoredEffect, Screen
 from calibration.observations import Floats
 
@@ -79,6 +79,7 @@ class SearchResult:
         final: all terms on which the remaining errors may depend.
         evidence: `family@where` of each adopted effect -> its evidence given all others.
         beside: what is certain beside a background; None where no background was needed.
+        machine_break: an instant after which the machine is another; None for none.
     """
 
     adopted: Adopted
@@ -93,6 +94,7 @@ class SearchResult:
     final: Grammar
     evidence: Mapping[str, Evidence] = field(default_factory=dict)
     beside: Names | None = None
+    machine_break: Break | None = None
 
 
 def conclude(
@@ -302,7 +304,10 @@ class Remaining:
         """True if anything is there that has no name."""
         beside = self.found.beside
         is_smooth = beside is not None and beside.background_log_bayes_factor > STRUCTURE
-        return bool(self.detection.significant or self.found.alternatives or self.found.formulas or is_smooth)
+        has_break = self.found.machine_break is not None
+        return bool(
+            self.detection.significant or self.found.alternatives or self.found.formulas or is_smooth or has_break
+        )
 
     @property
     def adopted(self) -> Adopted:
@@ -341,6 +346,8 @@ def remaining(found: SearchResult, rng: np.random.Generator) -> Remaining:
         rng: draws the signs of detection.
     """
     final, detection = found.final, detect(found.final, rng)
+    if found.machine_break is not None:
+        return Remaining(found, detection, found.machine_break.text)
     if found.beside is not None and found.beside.background and not found.formulas:
         rest = Remaining(found, detection, _background_text(found.beside))
         return rest if rest.significant else replace(rest, description=None)

@@ -134,6 +134,7 @@ def _answer(
         noise_mm=noise_mm,
         noise_source=source,
         held_out=held_out,
+        machine_break=found.machine_break,
         disagreements=before.disagreements,
         experiments=proposed,
         rounds=tuple(_rounds(found, observations, holdout, seed)),

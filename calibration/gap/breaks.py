@@ -1,0 +1,75 @@
+"""Breaks: an instant after which the machine is another, as after a repair, a knock or another set-up of the data.
+
+All parameters of the kinematics may differ after it. An effect of the library that is a step has fewer coefficients and
+is named where it suffices; a break is what none of these explains.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from calibration.gap.background.blocks import time_blocks
+from calibration.gap.background.search import ODDS, background_log_bayes_factor
+from calibration.gap.joint_fit import JointFit, Problem
+from calibration.gap.projection import Projection, from_products, rows_of
+from calibration.gap.regimes import borders
+from calibration.gap.result import Break
+from calibration.observations import ROW, Floats
+
+_BORDERS = 100
+_LEAST_SAMPLES = 60
+_SCALES = (0.1, 0.3, 1.0)  # of build tolerances, by which a machine may have changed
+_GROSS = 8.0  # times the median error, beyond which a sample counts less
+
+
+def find_break(problem: Problem, joint: JointFit) -> Break | None:
+    """Return the instant after which another machine is beyond doubt, in addition to the effects of a fit; or None.
+
+    Errors that wander with time are no break: these are as likely as two machines only where nothing changes at once.
+
+    Args:
+        problem: the data.
+        joint: kinematics and effects.
+    """
+    samples, columns = problem.solution.samples, joint.situation.observations.extra
+    if len(samples) < _LEAST_SAMPLES:
+        return None
+    variable = ROW if ROW in columns else "time_s"
+    of_row = joint.situation.extra(variable)
+    if not np.isfinite(of_row).all():
+        return None
+    size = np.linalg.norm(joint.error_mm(problem.solution), axis=1)
+    weight = np.minimum(1.0, (_GROSS * np.median(size) / np.maximum(size, 1e-9)) ** 2)
+    counted = replace(joint, fit=replace(joint.fit, weight=weight))
+    projection, values = problem.project(counted), samples.average(of_row[:, None])[:, 0]
+    found = max(_two_machines(projection, values), default=None)
+    if found is None or found[0] < ODDS:
+        return None
+    wandering = time_blocks(joint.situation, samples.average, fine=True)
+    if found[0] < background_log_bayes_factor(problem, joint, wandering) + ODDS:
+        return None
+    before = int((values <= found[1]).sum())
+    return Break(variable, found[1], before, len(values) - before, found[0])
+
+
+def _two_machines(projection: Projection, values: Floats) -> list[tuple[float, float]]:
+    """Return log Bayes factor and border of two machines for every border between values (m,)."""
+    each = borders(values, _BORDERS)
+    slice_of = np.searchsorted(each, values)
+    kinematics = projection.kinematics[:, : projection.jacobian.shape[2]]
+    index = [rows_of(np.flatnonzero(slice_of == number)) for number in range(len(each) + 1)]
+    along = np.cumsum([kinematics[rows].T @ projection.target[rows] for rows in index][::-1], axis=0)[::-1]
+    own = np.cumsum([kinematics[rows].T @ kinematics[rows] for rows in index][::-1], axis=0)[::-1]
+    other = np.cumsum([projection.kinematics[rows].T @ kinematics[rows] for rows in index][::-1], axis=0)[::-1]
+    soft, found = projection.without_kinematics, []
+    removed_target = soft.removed(projection.target)
+    prior = math.log(max(len(each), 1) * len(_SCALES))
+    for number, border in enumerate(each, 1):
+        removed = soft.removed_by(other[number])
+        gram, right = own[number] - removed.T @ removed, along[number] - removed.T @ removed_target
+        best = max(from_products(gram, right, np.full(len(right), scale)) for scale in _SCALES)
+        found.append((best - prior, float(border)))
+    return found
