@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,7 +72,10 @@ class EffectColumns:
         """
         moved, shift_mm = self.apply(data, coefficients)
         lin = kinematics(moved)
-        jacobian = np.concatenate([lin.jacobian, self.moved_mm(lin.joint_jacobian)], axis=2)
+        p = lin.jacobian.shape[2]
+        jacobian = np.empty((*lin.jacobian.shape[:2], p + len(self)))
+        jacobian[:, :, :p] = lin.jacobian
+        self._move(lin.joint_jacobian, jacobian[:, :, p:])
         return Linearisation(lin.position_mm + shift_mm, jacobian, lin.joint_jacobian)
 
     def change(self, coefficients: Floats, joints: int) -> Floats:
@@ -89,7 +92,7 @@ class EffectColumns:
         """Return the displacement of the prisms beside that, (m, 3) in the station's frame, by coefficients (k,)."""
         if self.shift_mm is None:
             return np.zeros((len(self.column), 3))
-        shifted: Floats = self.shift_mm @ coefficients
+        shifted: Floats = self.shift_mm[:, :, self._shifting] @ coefficients[self._shifting]
         return shifted
 
     def moved_mm(self, joint_jacobian: Floats) -> Floats:
@@ -99,11 +102,21 @@ class EffectColumns:
             joint_jacobian: (m, 3, joints) by readings, mm per deg or mm.
         """
         moved = np.empty((len(self.column), 3, len(self)))
-        for joint, own in _runs(self.joint.tobytes()):
-            np.multiply(joint_jacobian[:, :, joint, None], self.column[:, None, own], out=moved[:, :, own])
-        if self.shift_mm is not None:
-            moved += self.shift_mm
+        self._move(joint_jacobian, moved)
         return moved
+
+    def _move(self, joint_jacobian: Floats, out: Floats) -> None:
+        """Write `moved_mm` into `out` (m, 3, k)."""
+        for joint, own in _runs(self.joint.tobytes()):
+            np.multiply(joint_jacobian[:, :, joint, None], self.column[:, None, own], out=out[:, :, own])
+        if self.shift_mm is not None:
+            out[:, :, self._shifting] += self.shift_mm[:, :, self._shifting]
+
+    @cached_property
+    def _shifting(self) -> slice:
+        """Coefficients from the first to the last one that moves a prism itself."""
+        found = np.flatnonzero([] if self.shift_mm is None else self.shift_mm.any(axis=(0, 1)))
+        return slice(int(found[0]), int(found[-1]) + 1) if len(found) else slice(0, 0)
 
     def over(self, rows: Callable[[Floats], Floats]) -> EffectColumns:
         """Return the same coefficients for other rows.

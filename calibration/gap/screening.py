@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.special import chdtrc, logsumexp
 
 from calibration.effects.base import FittedCoefficient
@@ -203,6 +204,22 @@ class Screen:
         )
         return from_products(gram, along, sigma)
 
+    def beside(self, chosen: Mapping[int, tuple[int, float]]) -> Beside:
+        """Return the log Bayes factors of candidates in addition to others.
+
+        Args:
+            chosen: number of each of the others -> its variant and scale.
+        """
+        own = [
+            (self._block[number, option], self._sigma(number, option, scale))
+            for number, (option, scale) in chosen.items()
+        ]
+        return Beside(self, [block for block, _ in own], np.concatenate([np.empty(0), *(sigma for _, sigma in own)]))
+
+    def _sigma(self, candidate: int, option: int, scale: float) -> Floats:
+        sigma: Floats = self.candidates[candidate].additions[option].prior_sigma * scale
+        return sigma
+
     def together(self, scored: Sequence[ScoredEffect]) -> float:
         """Return the log Bayes factor of several effects together, in their best variants."""
         chosen = [(self._number[id(w.candidate)], w.option) for w in scored]
@@ -313,6 +330,44 @@ class Screen:
         sigma = self.candidates[number].additions[option].prior_sigma
         size, axes = np.linalg.eigh(self._products.product(block, block) * sigma * sigma[:, None])
         return np.maximum(size, 0.0), axes, axes.T @ (self._products.along(block) * sigma)
+
+
+class Beside:
+    """Log Bayes factors of candidates in addition to others: these are factored once, by `Screen.beside`.
+
+    Attributes:
+        log_bayes_factor: of the others together against no effect; 0 for none.
+    """
+
+    def __init__(self, screen: Screen, blocks: Sequence[int], sigma: Floats) -> None:
+        self._screen, self._others, self._sigma = screen, blocks, sigma
+        self._factor = np.linalg.cholesky(np.eye(len(sigma)) + self._across(blocks) * sigma)
+        self._along = self._solved(np.concatenate([np.empty(0), *map(screen._products.along, blocks)]) * sigma)
+        self.log_bayes_factor = 0.5 * float(self._along @ self._along) - float(np.log(np.diag(self._factor)).sum())
+        self._left: dict[int, tuple[Floats, Floats]] = {}
+
+    def together(self, candidate: int, option: int, scale: float) -> float:
+        """Return the log Bayes factor of a variant and the others against no effect."""
+        block = self._screen._block[candidate, option]
+        if block not in self._left:
+            removed = self._solved(self._across([block]))
+            own, along = self._screen._products.product(block, block), self._screen._products.along(block)
+            self._left[block] = own - removed.T @ removed, along - removed.T @ self._along
+        return self.log_bayes_factor + from_products(*self._left[block], self._screen._sigma(candidate, option, scale))
+
+    def _across(self, blocks: Sequence[int]) -> Floats:
+        """Return (q, k) products of the others' columns, in prior sigmas, with those of some blocks."""
+        rows = [np.hstack([self._screen._products.product(a, b) for b in blocks]) for a in self._others]
+        if not rows:
+            return np.empty((0, sum(len(self._screen._products.along(b)) for b in blocks)))
+        stacked: Floats = np.vstack(rows) * self._sigma[:, None]
+        return stacked
+
+    def _solved(self, right: Floats) -> Floats:
+        """Return the factor's inverse times a right-hand side (q,) or (q, k)."""
+        if not len(right):
+            return right
+        return np.asarray(solve_triangular(self._factor, right, lower=True, check_finite=False))
 
 
 def _explained(size: Floats, along: Floats) -> tuple[float, int]:

@@ -16,7 +16,7 @@ from calibration.gap.background.naming import Names, evidence_alone, names_besid
 from calibration.gap.background.outside import formula_block, is_in_library, what_is_left
 from calibration.gap.background.search import background_log_bayes_factor
 from calibration.gap.candidates import CandidateEffect, candidate_at, candidate_effects, variants_at
-from calibration.gap.criteria import best_of_each_family, beyond_doubt, joint_log_bayes_factor
+from calibration.gap.criteria import best_of_each_family, beyond_doubt
 from calibration.gap.detection import detect
 from calibration.gap.formulas.grammar import Formula, Grammar
 from calibration.gap.joint_fit import OUTLIER, JointFit, Problem, joint_fit
@@ -345,13 +345,13 @@ def _reselect_once(problem: Problem, joint: JointFit, again: Sequence[Choice]) -
         if choice not in again:
             continue
         others = {k: v for k, v in chosen.items() if k != number}
-        without = joint_log_bayes_factor(screen, others)
+        beside = screen.beside(others)
         values = {
-            one: joint_log_bayes_factor(screen, {**others, number: one}) + float(candidates[number].log_odds[one[0]])
+            one: beside.together(number, *one) + float(candidates[number].log_odds[one[0]])
             for one in itertools.product(range(len(candidates[number].options)), {1.0, choice.scale})
         }
         best = max(values, key=values.__getitem__)
-        if values[best] < without:
+        if values[best] < beside.log_bayes_factor:
             chosen = others
         elif values[best] > values[chosen[number]] + _BETTER:
             chosen[number] = best
