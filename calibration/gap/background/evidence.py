@@ -109,8 +109,15 @@ def greatest(
     theta = np.append([np.clip(start[name], *_LOG_SCALE) for name in names], max(float(np.log(noise)), least))
     bounds = [_LOG_SCALE] * len(names) + [(least, _MOST_NOISE)]
     # SciPy's tolerance is relative to a value of many thousands; differences of a few are what counts.
-    options = {"maxiter": iterations, "ftol": _ENOUGH / max(abs(negative(theta)[0]), 1.0)}
-    found = minimize(negative, theta, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    enough = _ENOUGH / max(abs(negative(theta)[0]), 1.0)
+    found = minimize(
+        negative,
+        theta,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"maxiter": iterations, "ftol": enough},
+    )
     scale = dict(zip(names, found.x[:-1].tolist(), strict=True))
     return Scales(fixed, fixed_sigma, dict(blocks), scale, float(np.exp(found.x[-1])), -float(found.fun))
 

@@ -10,10 +10,11 @@ import pytest
 
 from calibration.observations import Floats
 from calibration.pipeline.calibrate import train_residual
+from calibration.residual.cross_validation import CrossValidation, Data
 from calibration.residual.features import Features, usable_signals
 from calibration.residual.folds import folds, group_labels
 from calibration.residual.learners import LOADERS
-from calibration.residual.selection import CrossValidation, Data, Kind, Selection, select_residual
+from calibration.residual.selection import Kind, Selection, select_residual
 from tests.calibration.conftest import Session, features, rms, simulated
 
 
