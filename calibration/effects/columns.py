@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -149,11 +149,40 @@ def joined(parts: Sequence[EffectColumns], rows: int) -> EffectColumns:
 
 def same_columns(a: EffectColumns, b: EffectColumns) -> bool:
     """Return True if two sets of coefficients differ in their names and priors alone."""
-    if not (np.array_equal(a.joint, b.joint) and np.array_equal(a.column, b.column)):
+    if not np.array_equal(a.joint, b.joint):
+        return False
+    if a.column is b.column and a.shift_mm is b.shift_mm:
+        return True
+    if not np.array_equal(a.column, b.column):
         return False
     if a.shift_mm is None or b.shift_mm is None:
         return a.shift_mm is b.shift_mm
     return np.array_equal(a.shift_mm, b.shift_mm)
+
+
+def sharing(parts: Iterable[EffectColumns], known: Iterable[EffectColumns] = ()) -> tuple[EffectColumns, ...]:
+    """Return the same coefficients, with equal columns in memory once: those of thousands of rows are many megabytes.
+
+    Args:
+        parts: any number, one after the other.
+        known: further ones whose columns may be among them.
+    """
+    kept: dict[tuple[int, float, float], list[EffectColumns]] = {}
+    for part in known:
+        kept.setdefault(_sums(part), []).append(part)
+    out = []
+    for part in parts:
+        alike = kept.setdefault(_sums(part), [])
+        same = next((other for other in alike if same_columns(other, part)), None)
+        if same is None:
+            alike.append(part)
+        out.append(part if same is None else replace(part, column=same.column, shift_mm=same.shift_mm))
+    return tuple(out)
+
+
+def _sums(part: EffectColumns) -> tuple[int, float, float]:
+    """Return what tells columns of different sums apart without comparing them."""
+    return len(part), float(part.column.sum()), 0.0 if part.shift_mm is None else float(part.shift_mm.sum())
 
 
 @lru_cache

@@ -29,7 +29,7 @@ from calibration.observations import Floats
 _PAIRED = 10
 _SECOND = math.log(0.05)  # prior probability that a second effect is there
 _AT_ONCE = 128  # columns
-_KEPT = 16  # variants whose rows are cached; all of them are gigabytes where there are thousands of fixes
+_KEPT = 20_000_000  # values of variants' rows that are cached; all are gigabytes where there are thousands of fixes
 _SEEN = 1e-10  # least eigenvalue of products of columns, of their largest
 _TINY = float(np.finfo(np.float64).tiny)
 _EQUAL = 5.0  # log Bayes factor; less is no difference
@@ -143,9 +143,10 @@ class _ProjectedProducts:
     def _whitened(self, block: int) -> Floats:
         """Return (3 m, k) the whitened columns of a block."""
         if block not in self._kept:
-            if len(self._kept) == _KEPT:
+            rows = self._projection.whitened(self._projection.moved_mm(self._blocks[block]))
+            while self._kept and sum(kept.size for kept in self._kept.values()) + rows.size > _KEPT:
                 del self._kept[next(iter(self._kept))]
-            self._kept[block] = self._projection.whitened(self._projection.moved_mm(self._blocks[block]))
+            self._kept[block] = rows
         return self._kept[block]
 
 
@@ -377,13 +378,15 @@ def _explained(size: Floats, along: Floats) -> tuple[float, int]:
 
 
 def _batches(blocks: Sequence[EffectColumns]) -> Iterator[Sequence[EffectColumns]]:
-    """Yield the blocks in batches of some columns: one pass over the rows serves a batch."""
+    """Yield the blocks in batches of some columns, wider ones alone: one pass over the rows serves a batch."""
     first, width = 0, 0
-    for number, additions in enumerate(blocks, 1):
-        width += len(additions)
-        if width >= _AT_ONCE or number == len(blocks):
+    for number, additions in enumerate(blocks):
+        if width and width + len(additions) > _AT_ONCE:
             yield blocks[first:number]
             first, width = number, 0
+        width += len(additions)
+    if width:
+        yield blocks[first:]
 
 
 def by_family(scored: Iterable[ScoredEffect]) -> dict[str, float]:

@@ -73,6 +73,7 @@ class _Search:
 
     def __init__(self, problem: Problem, families: Collection[str]) -> None:
         self.problem, self.families = problem, tuple(families)
+        self._initial: tuple[CandidateEffect, ...] = ()
 
     def run(self) -> SearchResult:
         """Search without gross outliers, and with all samples where there are many such.
@@ -98,6 +99,7 @@ class _Search:
         projection = self.problem.project(joint)
         alone = SelectionStep(joint, projection, (), {}, ())
         initial = candidate_effects(joint.situation, projection, self.families)
+        self._initial = initial.candidates
         steps: list[SelectionStep] = []
         posterior: dict[str, float] = {}
         pending: list[str] = []
@@ -146,7 +148,8 @@ class _Search:
         """Return the candidates that may be added: of no other families once a model has its most."""
         taken = {c.family for c in there}
         allowed = [f for f in self.families if f in taken] if len(taken) >= _MOST_FAMILIES else self.families
-        return candidate_effects(projection.situation, projection, allowed, [str(c) for c in there]).candidates
+        names = [str(c) for c in there]
+        return candidate_effects(projection.situation, projection, allowed, names, self._initial).candidates
 
     def _reselected(self, joint: JointFit, taken: Sequence[Choice]) -> JointFit:
         """Return the fit with its effects in their best forms, before those `taken` are added.

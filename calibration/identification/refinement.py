@@ -17,7 +17,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from scipy.linalg import LinAlgError, lapack
+from scipy.linalg import LinAlgError, cho_solve, lapack
 from scipy.special import expit
 
 from calibration.effects.columns import EffectColumns
@@ -160,8 +160,8 @@ def whitened_rows(
         value=fit.x * root,
         precision_root=root,
         joint_jacobian=model.by_sample(state.by_joint),
-        parameter_jacobian=model.by_sample(state.jacobian[:, :, : len(chain)]),
-        whiten=lambda moved_mm: whitened(moved_mm[model.order]),
+        parameter_jacobian=model.by_sample(state.jacobian[:, :, : len(chain)].copy()),
+        whiten=lambda moved_mm: whitened(model.by_row(moved_mm)),
     )
 
 
@@ -346,7 +346,7 @@ class _Factor:
 
     def solve(self, right: Floats) -> Floats:
         """Solution of the linear system for a right-hand side (q,)."""
-        solved: Floats = self._scale * lapack.dpotrs(self._lower, self._scale * right, lower=1)[0]
+        solved: Floats = self._scale * cho_solve((self._lower, True), self._scale * right)
         return solved
 
     def inverse(self) -> Floats:

@@ -110,7 +110,7 @@ def select_residual(
         return _nothing(target_mm, (), "switched off")
     units = _units(groups, standstills)
     if len(features) < _LEAST_ROWS or len(np.unique(groups)) < 2 or len(np.unique(units)) < _LEAST_UNITS:
-        return _nothing(target_mm, (), _too_few(groups))
+        return _nothing(target_mm, (), _left_out(kind, _too_few(groups)))
     data = Data(features, target_mm, groups, units)
     steps = itertools.count(1)
     validation = CrossValidation(
@@ -136,8 +136,7 @@ def select_residual(
     compared = tuple(trials.values())
     best = min((t for t in compared if t.kept), key=lambda t: t.after_mm, default=None)
     if best is None:
-        reason = "in cross-validation of the training data no learner lowers the error beyond chance"
-        return _nothing(target_mm, compared, reason)
+        return _nothing(target_mm, compared, _left_out(kind, _no_gain(compared)))
     estimate_mm, tuned = estimates[best.kind]
     if len(features) < _FEW_ROWS:
         validation = CrossValidation(data, _MORE_FOLDS, seed, executor)
@@ -147,7 +146,7 @@ def select_residual(
     residual = _fit(best.kind, data, tuned, validation.shared, seed, executor)
     progress(1.0)
     if residual is None:
-        return _nothing(target_mm, compared, "all rows together show nothing to learn")
+        return _nothing(target_mm, compared, _left_out(kind, "all rows together show nothing to learn"))
     return Selection(
         residual,
         compared,
@@ -200,6 +199,21 @@ def _squares(error_mm: Floats) -> float:
 def _units(groups: Labels, standstills: Labels) -> Labels:
     """(n,) labels to test by: groups, or the standstills in them where the groups are too few for a test."""
     return groups if len(np.unique(groups)) >= _LEAST_UNITS else np.char.add(np.char.add(groups, "|"), standstills)
+
+
+def _left_out(kind: Kind, reason: str) -> str:
+    """Return the reason why there is no residual, which a learner that was asked for is told by its name."""
+    return reason if kind == "default" else f"{kind} was asked for and is left out: {reason}"
+
+
+def _no_gain(compared: Sequence[Trial]) -> str:
+    if len(compared) > 1:
+        return "in cross-validation of the training data no learner lowers the error beyond chance"
+    (only,) = compared
+    return (
+        f"in cross-validation of the training data the error is {only.before_mm:.3g} mm RMS without it and "
+        f"{only.after_mm:.3g} with it, no gain beyond chance (p {only.p:.2g})"
+    )
 
 
 def _too_few(groups: Labels) -> str:

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import lapack, solve_triangular
+from scipy.linalg import cho_solve, lapack, solve_triangular
 from scipy.optimize import minimize
 
 from calibration.observations import Floats
@@ -376,4 +376,4 @@ def _factor(gram: Floats, sd: Floats, variance: float) -> Floats:
 
 def _solve(factor: Floats, right: Floats) -> Floats:
     """Solution by a lower Cholesky factor."""
-    return np.asarray(lapack.dpotrs(factor, right, lower=1)[0])
+    return np.asarray(cho_solve((factor, True), right, check_finite=False))
