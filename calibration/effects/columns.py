@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,7 +72,10 @@ class EffectColumns:
         """
         moved, shift_mm = self.apply(data, coefficients)
         lin = kinematics(moved)
-        jacobian = np.concatenate([lin.jacobian, self.moved_mm(lin.joint_jacobian)], axis=2)
+        p = lin.jacobian.shape[2]
+        jacobian = np.empty((*lin.jacobian.shape[:2], p + len(self)))
+        jacobian[:, :, :p] = lin.jacobian
+        self._move(lin.joint_jacobian, jacobian[:, :, p:])
         return Linearisation(lin.position_mm + shift_mm, jacobian, lin.joint_jacobian)
 
     def change(self, coefficients: Floats, joints: int) -> Floats:
@@ -89,7 +92,7 @@ class EffectColumns:
         """Return the displacement of the prisms beside that, (m, 3) in the station's frame, by coefficients (k,)."""
         if self.shift_mm is None:
             return np.zeros((len(self.column), 3))
-        shifted: Floats = self.shift_mm @ coefficients
+        shifted: Floats = self.shift_mm[:, :, self._shifting] @ coefficients[self._shifting]
         return shifted
 
     def moved_mm(self, joint_jacobian: Floats) -> Floats:
@@ -99,11 +102,21 @@ class EffectColumns:
             joint_jacobian: (m, 3, joints) by readings, mm per deg or mm.
         """
         moved = np.empty((len(self.column), 3, len(self)))
-        for joint, own in _runs(self.joint.tobytes()):
-            np.multiply(joint_jacobian[:, :, joint, None], self.column[:, None, own], out=moved[:, :, own])
-        if self.shift_mm is not None:
-            moved += self.shift_mm
+        self._move(joint_jacobian, moved)
         return moved
+
+    def _move(self, joint_jacobian: Floats, out: Floats) -> None:
+        """Write `moved_mm` into `out` (m, 3, k)."""
+        for joint, own in _runs(self.joint.tobytes()):
+            np.multiply(joint_jacobian[:, :, joint, None], self.column[:, None, own], out=out[:, :, own])
+        if self.shift_mm is not None:
+            out[:, :, self._shifting] += self.shift_mm[:, :, self._shifting]
+
+    @cached_property
+    def _shifting(self) -> slice:
+        """Coefficients from the first to the last one that moves a prism itself."""
+        found = np.flatnonzero([] if self.shift_mm is None else self.shift_mm.any(axis=(0, 1)))
+        return slice(int(found[0]), int(found[-1]) + 1) if len(found) else slice(0, 0)
 
     def over(self, rows: Callable[[Floats], Floats]) -> EffectColumns:
         """Return the same coefficients for other rows.
@@ -136,11 +149,40 @@ def joined(parts: Sequence[EffectColumns], rows: int) -> EffectColumns:
 
 def same_columns(a: EffectColumns, b: EffectColumns) -> bool:
     """Return True if two sets of coefficients differ in their names and priors alone."""
-    if not (np.array_equal(a.joint, b.joint) and np.array_equal(a.column, b.column)):
+    if not np.array_equal(a.joint, b.joint):
+        return False
+    if a.column is b.column and a.shift_mm is b.shift_mm:
+        return True
+    if not np.array_equal(a.column, b.column):
         return False
     if a.shift_mm is None or b.shift_mm is None:
         return a.shift_mm is b.shift_mm
     return np.array_equal(a.shift_mm, b.shift_mm)
+
+
+def sharing(parts: Iterable[EffectColumns], known: Iterable[EffectColumns] = ()) -> tuple[EffectColumns, ...]:
+    """Return the same coefficients, with equal columns in memory once: those of thousands of rows are many megabytes.
+
+    Args:
+        parts: any number, one after the other.
+        known: further ones whose columns may be among them.
+    """
+    kept: dict[tuple[int, float, float], list[EffectColumns]] = {}
+    for part in known:
+        kept.setdefault(_sums(part), []).append(part)
+    out = []
+    for part in parts:
+        alike = kept.setdefault(_sums(part), [])
+        same = next((other for other in alike if same_columns(other, part)), None)
+        if same is None:
+            alike.append(part)
+        out.append(part if same is None else replace(part, column=same.column, shift_mm=same.shift_mm))
+    return tuple(out)
+
+
+def _sums(part: EffectColumns) -> tuple[int, float, float]:
+    """Return what tells columns of different sums apart without comparing them."""
+    return len(part), float(part.column.sum()), 0.0 if part.shift_mm is None else float(part.shift_mm.sum())
 
 
 @lru_cache

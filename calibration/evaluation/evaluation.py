@@ -70,6 +70,7 @@ class Evaluation:
             "per_prism": {prism: self.stages(prism) for prism in np.unique(self.observations.prism).tolist()},
             "effects": [effect.as_dict() for effect in self.model.effects],
             "residual": self.model.residual.learner.kind if self.model.residual else None,
+            "residual_reason": self.model.residual_reason,
             "noise_mm": self.model.noise_mm,
             "identifiability": self.model.identifiability.as_dict(),
             "warnings": list(self.warnings),

@@ -137,12 +137,13 @@ def _best_variants(
         for _ in range(_CHOICES):
             start = list(chosen)
             for number, candidate in enumerate(candidates):
-                values = {}
-                for one in itertools.product(range(len(candidate.options)), SCALES):
-                    together = [*chosen[:number], one, *chosen[number + 1 :]]
-                    which = [(at, option) for at, (option, _) in enumerate(together)]
-                    values[one] = screen.log_bayes_factor(which, [scale for _, scale in together])
-                    values[one] += float(candidate.log_odds[one[0]]) + LOG_SCALE_ODDS[one[1]]
+                beside = screen.beside({at: one for at, one in enumerate(chosen) if at != number})
+                values = {
+                    (option, scale): beside.together(number, option, scale)
+                    + float(candidate.log_odds[option])
+                    + LOG_SCALE_ODDS[scale]
+                    for option, scale in itertools.product(range(len(candidate.options)), SCALES)
+                }
                 chosen[number] = max(values, key=values.__getitem__)
             if chosen == start:
                 break

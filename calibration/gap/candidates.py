@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from calibration.effects.columns import EffectColumns, same_columns
+from calibration.effects.columns import EffectColumns, same_columns, sharing
 from calibration.effects.context import EffectContext
 from calibration.effects.fitted import Choice
 from calibration.effects.library import library
@@ -48,10 +48,8 @@ class CandidateEffect:
     @cached_property
     def first_equal(self) -> tuple[int, ...]:
         """(o,) for each variant the first one with the same columns; the two differ in their prior alone."""
-        # Columns of different sums are told apart without comparing them.
-        sums = [(len(a), a.column.sum(), 0.0 if a.shift_mm is None else a.shift_mm.sum()) for a in self.additions]
         return tuple(
-            next((k for k in range(n) if sums[k] == sums[n] and same_columns(self.additions[k], own)), n)
+            next((k for k in range(n) if same_columns(self.additions[k], own)), n)
             for n, own in enumerate(self.additions)
         )
 
@@ -70,7 +68,11 @@ class CandidateEffects:
 
 
 def candidate_effects(
-    situation: EffectContext, over: Projection, families: Collection[str], without: Collection[str] = ()
+    situation: EffectContext,
+    over: Projection,
+    families: Collection[str],
+    without: Collection[str] = (),
+    like: Sequence[CandidateEffect] = (),
 ) -> CandidateEffects:
     """Return the candidates of the given families.
 
@@ -79,6 +81,7 @@ def candidate_effects(
         over: the projection to whose samples the columns belong.
         families: names in the library.
         without: `family@where` of the effects that are in the model already.
+        like: candidates about another fit, most of whose columns are the same.
     """
     found: list[tuple[str, str, tuple[Choice, ...]]] = []
     disabled: dict[str, str] = {}
@@ -96,9 +99,13 @@ def candidate_effects(
         elif here and not any(choices for _, _, choices in here):
             disabled[name] = "these poses show nothing of it"
         found += [one for one in here if one[2]]
+    alike = {(c.family, c.where): c.additions for c in like}
     log_prior = _log_priors([name for name, _, _ in found], {name.partition("@")[0] for name in without})
     return CandidateEffects(
-        tuple(candidate_at(situation, over, name, where, choices, log_prior[name]) for name, where, choices in found),
+        tuple(
+            candidate_at(situation, over, name, where, choices, log_prior[name], alike.get((name, where), ()))
+            for name, where, choices in found
+        ),
         disabled,
     )
 
@@ -126,14 +133,15 @@ def candidate_at(
     where: str,
     choices: Sequence[Choice],
     log_prior: float = 0.0,
+    known: Sequence[EffectColumns] = (),
 ) -> CandidateEffect:
-    """Return the candidate with the given variants."""
+    """Return the candidate with the given variants; columns that are equal to `known` ones are these."""
     odds = np.array([library()[family].odds(choice.settings) for choice in choices])
     return CandidateEffect(
         family,
         where,
         tuple(choices),
-        tuple(choice.columns(situation).over(over.samples.average) for choice in choices),
+        sharing((choice.columns(situation).over(over.samples.average) for choice in choices), known),
         np.log(odds / odds.sum()),
         log_prior,
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -62,19 +62,6 @@ def further_places(screen: Screen, scored: Sequence[ScoredEffect]) -> list[Score
         if gain > max(_PLAIN, alternative + 2 * NEAR):
             found.append(w)
     return found
-
-
-def joint_log_bayes_factor(screen: Screen, chosen: Mapping[int, tuple[int, float]]) -> float:
-    """Return the log Bayes factor of several effects together; 0 for none.
-
-    Args:
-        screen: the candidates.
-        chosen: number of the candidate -> its variant and scale.
-    """
-    if not chosen:
-        return 0.0
-    options = [(number, option) for number, (option, _) in chosen.items()]
-    return screen.log_bayes_factor(options, [scale for _, scale in chosen.values()])
 
 
 def may_stand_out(scored: Sequence[ScoredEffect]) -> bool:

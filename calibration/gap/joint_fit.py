@@ -109,7 +109,7 @@ def joint_fit(
     again = _parts(solution, observations, choices, fit.x)
     if not all(same_columns(a, b) for a, b in zip(parts, again[1], strict=True)):
         situation, parts = again
-        fit = refine(chain, samples, fit.x, prior=prior, additions=along(solution, parts))
+        fit = refine(chain, samples, fit.x, prior=prior, additions=along(solution, parts), like=fit)
     return JointFit(situation, tuple(choices), parts, fit)
 
 

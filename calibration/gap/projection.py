@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from calibration.effects.columns import EffectColumns, joined
 from calibration.effects.context import EffectContext
@@ -198,7 +198,7 @@ def from_products(gram: Floats, along: Floats, sigma: Floats) -> float:
     """
     matrix = np.eye(len(sigma)) + gram * sigma * sigma[:, None]
     factor = np.linalg.cholesky(matrix)
-    solved = np.linalg.solve(factor, along * sigma)
+    solved = solve_triangular(factor, along * sigma, lower=True, check_finite=False)
     return 0.5 * float(solved @ solved) - float(np.log(np.diag(factor)).sum())
 
 

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.special import chdtrc, logsumexp
 
 from calibration.effects.base import FittedCoefficient
@@ -28,7 +29,7 @@ from calibration.observations import Floats
 _PAIRED = 10
 _SECOND = math.log(0.05)  # prior probability that a second effect is there
 _AT_ONCE = 128  # columns
-_KEPT = 16  # variants whose rows are cached; all of them are gigabytes where there are thousands of fixes
+_KEPT = 20_000_000  # values of variants' rows that are cached; all are gigabytes where there are thousands of fixes
 _SEEN = 1e-10  # least eigenvalue of products of columns, of their largest
 _TINY = float(np.finfo(np.float64).tiny)
 _EQUAL = 5.0  # log Bayes factor; less is no difference
@@ -142,9 +143,10 @@ class _ProjectedProducts:
     def _whitened(self, block: int) -> Floats:
         """Return (3 m, k) the whitened columns of a block."""
         if block not in self._kept:
-            if len(self._kept) == _KEPT:
+            rows = self._projection.whitened(self._projection.moved_mm(self._blocks[block]))
+            while self._kept and sum(kept.size for kept in self._kept.values()) + rows.size > _KEPT:
                 del self._kept[next(iter(self._kept))]
-            self._kept[block] = self._projection.whitened(self._projection.moved_mm(self._blocks[block]))
+            self._kept[block] = rows
         return self._kept[block]
 
 
@@ -202,6 +204,22 @@ class Screen:
             ]
         )
         return from_products(gram, along, sigma)
+
+    def beside(self, chosen: Mapping[int, tuple[int, float]]) -> Beside:
+        """Return the log Bayes factors of candidates in addition to others.
+
+        Args:
+            chosen: number of each of the others -> its variant and scale.
+        """
+        own = [
+            (self._block[number, option], self._sigma(number, option, scale))
+            for number, (option, scale) in chosen.items()
+        ]
+        return Beside(self, [block for block, _ in own], np.concatenate([np.empty(0), *(sigma for _, sigma in own)]))
+
+    def _sigma(self, candidate: int, option: int, scale: float) -> Floats:
+        sigma: Floats = self.candidates[candidate].additions[option].prior_sigma * scale
+        return sigma
 
     def together(self, scored: Sequence[ScoredEffect]) -> float:
         """Return the log Bayes factor of several effects together, in their best variants."""
@@ -315,6 +333,44 @@ class Screen:
         return np.maximum(size, 0.0), axes, axes.T @ (self._products.along(block) * sigma)
 
 
+class Beside:
+    """Log Bayes factors of candidates in addition to others: these are factored once, by `Screen.beside`.
+
+    Attributes:
+        log_bayes_factor: of the others together against no effect; 0 for none.
+    """
+
+    def __init__(self, screen: Screen, blocks: Sequence[int], sigma: Floats) -> None:
+        self._screen, self._others, self._sigma = screen, blocks, sigma
+        self._factor = np.linalg.cholesky(np.eye(len(sigma)) + self._across(blocks) * sigma)
+        self._along = self._solved(np.concatenate([np.empty(0), *map(screen._products.along, blocks)]) * sigma)
+        self.log_bayes_factor = 0.5 * float(self._along @ self._along) - float(np.log(np.diag(self._factor)).sum())
+        self._left: dict[int, tuple[Floats, Floats]] = {}
+
+    def together(self, candidate: int, option: int, scale: float) -> float:
+        """Return the log Bayes factor of a variant and the others against no effect."""
+        block = self._screen._block[candidate, option]
+        if block not in self._left:
+            removed = self._solved(self._across([block]))
+            own, along = self._screen._products.product(block, block), self._screen._products.along(block)
+            self._left[block] = own - removed.T @ removed, along - removed.T @ self._along
+        return self.log_bayes_factor + from_products(*self._left[block], self._screen._sigma(candidate, option, scale))
+
+    def _across(self, blocks: Sequence[int]) -> Floats:
+        """Return (q, k) products of the others' columns, in prior sigmas, with those of some blocks."""
+        rows = [np.hstack([self._screen._products.product(a, b) for b in blocks]) for a in self._others]
+        if not rows:
+            return np.empty((0, sum(len(self._screen._products.along(b)) for b in blocks)))
+        stacked: Floats = np.vstack(rows) * self._sigma[:, None]
+        return stacked
+
+    def _solved(self, right: Floats) -> Floats:
+        """Return the factor's inverse times a right-hand side (q,) or (q, k)."""
+        if not len(right):
+            return right
+        return np.asarray(solve_triangular(self._factor, right, lower=True, check_finite=False))
+
+
 def _explained(size: Floats, along: Floats) -> tuple[float, int]:
     """Return the squares that columns explain and their rank, from the eigenvalues (k,) of G'G and G'r along these."""
     seen = size > _SEEN * max(float(size[-1]), _TINY)
@@ -322,13 +378,15 @@ def _explained(size: Floats, along: Floats) -> tuple[float, int]:
 
 
 def _batches(blocks: Sequence[EffectColumns]) -> Iterator[Sequence[EffectColumns]]:
-    """Yield the blocks in batches of some columns: one pass over the rows serves a batch."""
+    """Yield the blocks in batches of some columns, wider ones alone: one pass over the rows serves a batch."""
     first, width = 0, 0
-    for number, additions in enumerate(blocks, 1):
-        width += len(additions)
-        if width >= _AT_ONCE or number == len(blocks):
+    for number, additions in enumerate(blocks):
+        if width and width + len(additions) > _AT_ONCE:
             yield blocks[first:number]
             first, width = number, 0
+        width += len(additions)
+    if width:
+        yield blocks[first:]
 
 
 def by_family(scored: Iterable[ScoredEffect]) -> dict[str, float]:

@@ -17,7 +17,7 @@ from calibration.gap.background.outside import formula_block, is_in_library, wha
 from calibration.gap.background.search import background_log_bayes_factor
 from calibration.gap.breaks import find_break
 from calibration.gap.candidates import CandidateEffect, candidate_at, candidate_effects, variants_at
-from calibration.gap.criteria import best_of_each_family, beyond_doubt, joint_log_bayes_factor
+from calibration.gap.criteria import best_of_each_family, beyond_doubt
 from calibration.gap.detection import detect
 from calibration.gap.formulas.grammar import Formula, Grammar
 from calibration.gap.joint_fit import OUTLIER, JointFit, Problem, joint_fit
@@ -83,6 +83,7 @@ class _Search:
 
     def __init__(self, problem: Problem, families: Collection[str], known: EffectInRegime | None = None) -> None:
         self.problem, self.families, self.known = problem, tuple(families), known
+        self._initial: tuple[CandidateEffect, ...] = ()
 
     def run(self) -> SearchResult:
         """Search without gross outliers, and with all samples where there are many such.
@@ -111,6 +112,7 @@ class _Search:
         first = self.problem.with_mild_outliers(self.problem.kinematics_only()) if self.known else joint
         alone = SelectionStep(first, self.problem.project(first), (), {}, ())
         initial = candidate_effects(first.situation, alone.projection, self.families)
+        self._initial = initial.candidates
         steps: list[SelectionStep] = []
         posterior: dict[str, float] = {}
         projection, candidates = alone.projection, initial.candidates
@@ -165,7 +167,8 @@ class _Search:
         """Return the candidates that may be added: of no other families once a model has its most."""
         taken = {c.family for c in there}
         allowed = [f for f in self.families if f in taken] if len(taken) >= _MOST_FAMILIES else self.families
-        return candidate_effects(projection.situation, projection, allowed, [str(c) for c in there]).candidates
+        names = [str(c) for c in there]
+        return candidate_effects(projection.situation, projection, allowed, names, self._initial).candidates
 
     def _reselected(self, joint: JointFit, taken: Sequence[Choice]) -> JointFit:
         """Return the fit with its effects in their best forms, before those `taken` are added.
@@ -391,13 +394,13 @@ def _reselect_once(problem: Problem, joint: JointFit, again: Sequence[Choice]) -
         if choice not in again:
             continue
         others = {k: v for k, v in chosen.items() if k != number}
-        without = joint_log_bayes_factor(screen, others)
+        beside = screen.beside(others)
         values = {
-            one: joint_log_bayes_factor(screen, {**others, number: one}) + float(candidates[number].log_odds[one[0]])
+            one: beside.together(number, *one) + float(candidates[number].log_odds[one[0]])
             for one in itertools.product(range(len(candidates[number].options)), {1.0, choice.scale})
         }
         best = max(values, key=values.__getitem__)
-        if values[best] < without:
+        if values[best] < beside.log_bayes_factor:
             chosen = others
         elif values[best] > values[chosen[number]] + _BETTER:
             chosen[number] = best

@@ -76,6 +76,7 @@ class LinearModel:
         if additions is not None and len(additions.column) != len(samples):
             raise ValueError(f"additions have {len(additions.column)} rows where there are {len(samples)} samples")
         self.order = np.argsort(samples.standstill, kind="stable")
+        self._is_in_order = bool((np.diff(self.order) > 0).all())
         following = np.flatnonzero(np.diff(samples.standstill[self.order])) + 1
         self._start = np.concatenate([[0], following, [len(samples)]]).astype(np.intp)
         self.chain = chain
@@ -120,8 +121,14 @@ class LinearModel:
         """Covariance of all rows with weights (m,)."""
         return factorise(self._start, of_rows, state.by_joint, self._shared, weight)
 
+    def by_row(self, values: Floats) -> Floats:
+        """Inverse of `by_sample`."""
+        return values if self._is_in_order else values[self.order]
+
     def by_sample(self, values: Floats) -> Floats:
-        """Sort values (m, ...) of the rows into the order of the samples."""
+        """Sort values (m, ...) of the rows into the order of the samples; no copy where it is the same."""
+        if self._is_in_order:
+            return values
         out = np.empty_like(values)
         out[self.order] = values
         return out

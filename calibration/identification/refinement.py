@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg import LinAlgError, cho_solve, lapack
 from scipy.special import expit
 
 from calibration.effects.columns import EffectColumns
@@ -25,7 +25,7 @@ from calibration.errors import CalibrationError
 from calibration.identification.linear_model import Flags, Linearised, LinearModel
 from calibration.identification.samples import Samples
 from calibration.kinematics.chain import Chain
-from calibration.numerics.matrices import gram
+from calibration.numerics.matrices import gram, inverse_by
 from calibration.observations import Floats
 
 Prior = Literal["recalibration", "as-built"]
@@ -76,6 +76,7 @@ def refine(
     prior: Prior = "recalibration",
     excess_variance: float | None = None,
     additions: EffectColumns | None = None,
+    like: Fit | None = None,
 ) -> Fit:
     """Find the maximum of the posterior near `start`.
 
@@ -87,12 +88,13 @@ def refine(
         prior: trust the build tolerances, or estimate one factor on all of them.
         excess_variance: hold s^2 at this value instead of estimating it.
         additions: coefficients to estimate along, with columns for the m rows.
+        like: a fit of nearly the same model, whose noise is where to begin; by default what `start` leaves tells it.
 
     Raises:
         CalibrationError: the numbers left the range of floating point.
         ValueError: additions for another number of rows.
     """
-    return _fit(LinearModel(chain, samples, free, additions), start, prior, excess_variance, moves=True)
+    return _fit(LinearModel(chain, samples, free, additions), start, prior, excess_variance, moves=True, like=like)
 
 
 def posterior(chain: Chain, samples: Samples, x: Floats, *, prior: Prior = "recalibration") -> Fit:
@@ -158,8 +160,8 @@ def whitened_rows(
         value=fit.x * root,
         precision_root=root,
         joint_jacobian=model.by_sample(state.by_joint),
-        parameter_jacobian=model.by_sample(state.jacobian[:, :, : len(chain)]),
-        whiten=lambda moved_mm: whitened(moved_mm[model.order]),
+        parameter_jacobian=model.by_sample(state.jacobian[:, :, : len(chain)].copy()),
+        whiten=lambda moved_mm: whitened(model.by_row(moved_mm)),
     )
 
 
@@ -189,8 +191,13 @@ class _Posterior:
         self.gradient = self.jacobian.T @ self.error - self.precision * state.x[free]
 
     @cached_property
+    def factor(self) -> _Factor:
+        """LinAlgError where the normal equations cannot be factored."""
+        return _Factor(self.normal)
+
+    @cached_property
     def covariance(self) -> Floats:
-        return _inverse(self.normal)
+        return self.factor.inverse()
 
     def squares(self, at: Linearised) -> float:
         """Weighted squares plus the prior's at another state, noise and weights as they are here."""
@@ -234,7 +241,7 @@ class _Posterior:
         """
         inside = self.model.tolerated[self.model.free]
         mean = 1.0 + 2.0 / max(self.determined - 2.0, 1.0)
-        return _inverse(self.normal - np.diag(np.where(inside, self.precision * (1.0 - 1.0 / mean), 0.0)))
+        return _Factor(self.normal - np.diag(np.where(inside, self.precision * (1.0 - 1.0 / mean), 0.0))).inverse()
 
     def cost(self) -> float:
         """Negative log evidence (Laplace), up to a constant: fits of one data set from different starts compare by it.
@@ -250,18 +257,23 @@ class _Posterior:
         together = float(self.error @ self.error) + self.whitening.log_det
         correlation = 0.5 * (float(self.weight @ rows.square) + float(rows.log_det.sum()) - together)
         prior = 0.5 * (np.log(self.precision) - self.precision * self.state.x[self.model.free] ** 2).sum()
-        scale = 1.0 / np.sqrt(np.diag(self.normal))
-        determinant = np.linalg.slogdet(self.normal * scale[:, None] * scale)[1] - 2.0 * np.log(scale).sum()
-        return -float(likelihood + correlation + prior - 0.5 * determinant)
+        return -float(likelihood + correlation + prior - 0.5 * self.factor.log_det)
 
 
-def _fit(model: LinearModel, start: Floats, prior: Prior, excess_variance: float | None, *, moves: bool) -> Fit:
+def _fit(
+    model: LinearModel,
+    start: Floats,
+    prior: Prior,
+    excess_variance: float | None,
+    *,
+    moves: bool,
+    like: Fit | None = None,
+) -> Fit:
     """Alternate between the parameters (if it `moves`) and what is estimated beside them until all are at rest."""
     state = model.at(model.extended(start))
     _require_finite(state.error)
-    robust = float(np.median(np.linalg.norm(state.error, axis=1))) / 1.54  # median of a 3-D normal's norm
-    excess = max(robust**2, _LEAST_EXCESS) if excess_variance is None else excess_variance
-    noise = _Noise(excess, 0.05, _AS_BUILT_SCALE if prior == "as-built" else 1.0)
+    noise = _first_noise(state, prior) if like is None else _noise_of(like)
+    noise = noise if excess_variance is None else replace(noise, excess=excess_variance)
     damping, settled, rounds, weight = 0.0, False, 0, np.ones(len(model.order))
     while not settled and rounds < _ROUNDS:
         rounds += 1
@@ -290,6 +302,18 @@ def _fit(model: LinearModel, start: Floats, prior: Prior, excess_variance: float
     return Fit(state.x, covariance, noise.excess, noise.scale, weight, view.cost(), settled, rounds)
 
 
+def _first_noise(state: Linearised, prior: Prior) -> _Noise:
+    """Noise by what a state leaves, whatever outliers there are."""
+    robust = float(np.median(np.linalg.norm(state.error, axis=1))) / 1.54  # median of a 3-D normal's norm
+    return _Noise(max(robust**2, _LEAST_EXCESS), 0.05, _AS_BUILT_SCALE if prior == "as-built" else 1.0)
+
+
+def _noise_of(fit: Fit) -> _Noise:
+    """Noise as a fit has found it."""
+    share = float(np.clip(1.0 - fit.weight.mean(), *_OUTLIER_SHARE))
+    return _Noise(max(fit.excess_variance, _LEAST_EXCESS), share, fit.prior_scale)
+
+
 def _require_finite(values: Floats) -> None:
     if not np.isfinite(values).all():
         raise CalibrationError("identification: the fit left the range of numbers; check units of the observations")
@@ -303,21 +327,32 @@ def _inlier_probability(square: Floats, share: float) -> Floats:
 
 def damped_step(normal: Floats, gradient: Floats, damping: float) -> Floats:
     """Levenberg-Marquardt step; LinAlgError where the matrix cannot be factored."""
-    scale, factor = _factor(normal + damping * np.diag(np.diag(normal)))
-    step: Floats = scale * cho_solve(factor, scale * gradient)
-    return step
+    return _Factor(normal + damping * np.diag(np.diag(normal))).solve(gradient)
 
 
-def _factor(matrix: Floats) -> tuple[Floats, tuple[Floats, bool]]:
-    """Scale that gives the matrix a unit diagonal, and the Cholesky factor of that."""
-    scale = 1.0 / np.sqrt(np.diag(matrix))
-    return scale, cho_factor(matrix * scale[:, None] * scale, lower=True)
+class _Factor:
+    """Cholesky factor of a matrix (q, q), scaled to a unit diagonal; LinAlgError where there is none."""
 
+    def __init__(self, matrix: Floats) -> None:
+        self._scale = 1.0 / np.sqrt(np.diag(matrix))
+        self._lower, failed = lapack.dpotrf(matrix * self._scale[:, None] * self._scale, lower=1)
+        if failed:
+            raise LinAlgError("the normal equations are not positive definite")
 
-def _inverse(matrix: Floats) -> Floats:
-    scale, factor = _factor(matrix)
-    inverse: Floats = cho_solve(factor, np.eye(len(matrix))) * scale[:, None] * scale
-    return inverse
+    @property
+    def log_det(self) -> float:
+        """Logarithm of the matrix's determinant."""
+        return 2.0 * float(np.log(np.diag(self._lower)).sum() - np.log(self._scale).sum())
+
+    def solve(self, right: Floats) -> Floats:
+        """Solution of the linear system for a right-hand side (q,)."""
+        solved: Floats = self._scale * cho_solve((self._lower, True), self._scale * right)
+        return solved
+
+    def inverse(self) -> Floats:
+        """Inverse of the matrix."""
+        whole: Floats = inverse_by(self._lower) * self._scale[:, None] * self._scale
+        return whole
 
 
 def _step(view: _Posterior, damping: float) -> tuple[Linearised, float, Floats, float]:
@@ -326,7 +361,8 @@ def _step(view: _Posterior, damping: float) -> tuple[Linearised, float, Floats, 
     here = float(view.error @ view.error + view.precision @ state.x[free] ** 2)
     while damping < _DAMPING[2]:
         try:
-            step = damped_step(view.normal, view.gradient, damping)
+            undamped = damping == 0.0
+            step = view.factor.solve(view.gradient) if undamped else damped_step(view.normal, view.gradient, damping)
         except LinAlgError:
             damping = max(10.0 * damping, _DAMPING[1])
             continue

@@ -1,4 +1,4 @@
-"""Products of columns that are mostly zero, and roots of covariances.
+"""Products of columns that are mostly zero, inverses by Cholesky factors, and roots of covariances.
 
 A curve of a joint's angle has dozens of splines, and a fix touches four of them: of the hundreds of coefficients of
 several curves a row has a few. What each row has it adds, so zeros cost no more than a look.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import lapack
 
 from calibration.numerics.jit import compiled
 from calibration.observations import Floats
@@ -20,7 +21,7 @@ _WORTHWHILE = 50  # rare columns: with fewer, products of all columns are as fas
 
 def gram(rows: Floats) -> Floats:
     """Return the (q, q) products of all columns of `rows` (r, q) with each other: rows' rows."""
-    rare = (rows != 0.0).mean(axis=0) <= _RARE
+    rare = _filled(np.ascontiguousarray(rows)) <= _RARE * len(rows)
     if rare.sum() < _WORTHWHILE:
         product: Floats = rows.T @ rows
         return product
@@ -32,6 +33,16 @@ def gram(rows: Floats) -> Floats:
     out[np.ix_(seldom, often)] = beside
     out[np.ix_(often, seldom)] = beside.T
     out[np.ix_(seldom, seldom)] = own + np.tril(own, -1).T
+    return out
+
+
+@compiled
+def _filled(rows: Floats) -> Integers:
+    """(q,) number of values of each column of rows (r, q) that are not zero."""
+    out = np.zeros(rows.shape[1], dtype=np.intp)
+    for r in range(len(rows)):
+        for k in range(rows.shape[1]):
+            out[k] += rows[r, k] != 0.0
     return out
 
 
@@ -55,6 +66,15 @@ def _add(rows: Floats, seldom: Integers, often: Integers, beside: Floats, own: F
                 with_usual[k] += value[a] * usual[k]
             for b in range(a + 1):
                 with_rare[at[b]] += value[a] * value[b]
+
+
+def inverse_by(factor: Floats) -> Floats:
+    """Return the inverse (q, q) of the matrix whose lower Cholesky factor is given, whatever stands above."""
+    if not len(factor):
+        return factor
+    lower = np.tril(lapack.dpotri(factor, lower=1)[0])
+    inverse: Floats = lower + np.tril(lower, -1).T
+    return inverse
 
 
 def root_of(covariance: Floats) -> Floats:

@@ -9,25 +9,24 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.numerics.statistics import paired_test
 from calibration.observations import Floats
+from calibration.residual.cross_validation import MANY_ROWS, CrossValidation, Data, Shared, best_shape
 from calibration.residual.features import Features
 from calibration.residual.folds import folds
 from calibration.residual.gaussian.process import fit_gaussian_process
-from calibration.residual.learners import Chained, Residual, with_estimate, with_out_of_fold_estimate
-from calibration.residual.rbf.rbfn import Shape, choose_shape, fit_shape
+from calibration.residual.learners import Chained, Residual, with_out_of_fold_estimate
+from calibration.residual.rbf.rbfn import fit_shape
 from calibration.residual.rbf.torque_network import TorqueNetwork, fit_torque_network
-from calibration.residual.trees.boosting import Settings, Tuned, cross_validate, fit_boosting
+from calibration.residual.trees.boosting import Settings, Tuned, fit_boosting
 
 Kind = Literal["default", "none", "rbfn", "lightgbm", "chain", "gp"]
 Labels = NDArray[np.str_]
-_T = TypeVar("_T")
 
 _FOLDS = 5
 _FEW_ROWS, _MORE_FOLDS = 600, 10  # where folds' learners have too few rows to tell what all of them will leave
@@ -35,8 +34,7 @@ _LEAST_ROWS = 50
 _LEAST_UNITS = 10
 _MOST_GAIN = 2.0  # of the squared error that may be hoped to go, for each part of the rows that folds leave out
 _REACH = 1.5  # in error; the chain of Zhou et al. 2022 gains a quarter on the better of its parts
-_OUT_OF_REACH = 1.6  # in error on two folds: a learner so far behind the best is not tried on the others
-_PROBED_FOLDS = 2
+_OUT_OF_REACH, _BEHIND = 1.6, 1.02  # in error on two folds of few and of many rows: who is so far behind has lost
 _MOST_PROGRESS = 0.95
 
 
@@ -112,7 +110,7 @@ def select_residual(
         return _nothing(target_mm, (), "switched off")
     units = _units(groups, standstills)
     if len(features) < _LEAST_ROWS or len(np.unique(groups)) < 2 or len(np.unique(units)) < _LEAST_UNITS:
-        return _nothing(target_mm, (), _too_few(groups))
+        return _nothing(target_mm, (), _left_out(kind, _too_few(groups)))
     data = Data(features, target_mm, groups, units)
     steps = itertools.count(1)
     validation = CrossValidation(
@@ -124,10 +122,12 @@ def select_residual(
     for name in ("gp", "rbfn", "lightgbm", "chain") if kind == "default" else (kind,):
         if kind == "default" and name == "chain" and not _may_win(trials):
             continue
-        if kind == "default" and estimates and name != "chain":
+        if estimates and (name != "chain" or len(features) >= MANY_ROWS):
             best_mm = min((found for found, _ in estimates.values()), key=lambda found: _squares(target_mm - found))
-            probed, probe_mm = validation.probe(name)
-            if _squares(target_mm[probed] - probe_mm) > _OUT_OF_REACH**2 * _squares((target_mm - best_mm)[probed]):
+            probed, probe_mm = validation.probe(name, tuned.settings if tuned else Settings())
+            if _squares(target_mm[probed] - probe_mm) > _reach(name, len(features)) ** 2 * _squares(
+                (target_mm - best_mm)[probed]
+            ):
                 trial = _trial(name, target_mm[probed], probe_mm, units[probed])
                 trials[name] = replace(trial, kept=False)
                 continue
@@ -136,18 +136,17 @@ def select_residual(
     compared = tuple(trials.values())
     best = min((t for t in compared if t.kept), key=lambda t: t.after_mm, default=None)
     if best is None:
-        reason = "in cross-validation of the training data no learner lowers the error beyond chance"
-        return _nothing(target_mm, compared, reason)
+        return _nothing(target_mm, compared, _left_out(kind, _no_gain(compared)))
     estimate_mm, tuned = estimates[best.kind]
     if len(features) < _FEW_ROWS:
         validation = CrossValidation(data, _MORE_FOLDS, seed, executor)
         estimate_mm, _ = validation.estimate(best.kind, tuned.settings if tuned else None)
     left_mm = target_mm - estimate_mm
     gain = _gain_of_all_rows(validation, best.kind, left_mm, tuned, executor)
-    residual = _fit(best.kind, data, tuned, seed, executor)
+    residual = _fit(best.kind, data, tuned, validation.shared, seed, executor)
     progress(1.0)
     if residual is None:
-        return _nothing(target_mm, compared, "all rows together show nothing to learn")
+        return _nothing(target_mm, compared, _left_out(kind, "all rows together show nothing to learn"))
     return Selection(
         residual,
         compared,
@@ -202,6 +201,21 @@ def _units(groups: Labels, standstills: Labels) -> Labels:
     return groups if len(np.unique(groups)) >= _LEAST_UNITS else np.char.add(np.char.add(groups, "|"), standstills)
 
 
+def _left_out(kind: Kind, reason: str) -> str:
+    """Return the reason why there is no residual, which a learner that was asked for is told by its name."""
+    return reason if kind == "default" else f"{kind} was asked for and is left out: {reason}"
+
+
+def _no_gain(compared: Sequence[Trial]) -> str:
+    if len(compared) > 1:
+        return "in cross-validation of the training data no learner lowers the error beyond chance"
+    (only,) = compared
+    return (
+        f"in cross-validation of the training data the error is {only.before_mm:.3g} mm RMS without it and "
+        f"{only.after_mm:.3g} with it, no gain beyond chance (p {only.p:.2g})"
+    )
+
+
 def _too_few(groups: Labels) -> str:
     return f"{len(groups)} fixes in {len(np.unique(groups))} groups are too few to learn a residual from"
 
@@ -220,6 +234,16 @@ def _may_win(trials: Mapping[str, Trial]) -> bool:
     return trials["rbfn"].kept and trials["lightgbm"].after_mm < _REACH * best
 
 
+def _reach(kind: str, rows: int) -> float:
+    """Error on two folds, of that of the best learner so far, up to which another one is tried on all of them.
+
+    Tuning may still gain much with few rows, where trying costs little. The chain, the most work, must be ahead.
+    """
+    if rows < MANY_ROWS:
+        return _OUT_OF_REACH
+    return 1.0 if kind == "chain" else _BEHIND
+
+
 def _gain_of_all_rows(
     validation: CrossValidation, kind: str, left_mm: Floats, tuned: Tuned | None, executor: Executor
 ) -> float:
@@ -231,7 +255,7 @@ def _gain_of_all_rows(
     if validation.count == 2:
         return 1.0
     data = validation.data
-    halves = CrossValidation(data, 2, validation.seed, executor)
+    halves = CrossValidation(data, 2, validation.seed, executor, shared=validation.shared)
     half_mm, _ = halves.estimate(kind, tuned.settings if tuned else None)
     with_most, with_half = float((left_mm**2).sum()), float(((data.target_mm - half_mm) ** 2).sum())
     used = 1.0 - 1.0 / validation.count
@@ -239,157 +263,14 @@ def _gain_of_all_rows(
     return float(np.clip(1.0 - gain, 1.0 - min(0.5, _MOST_GAIN * (1.0 / used - 1.0)), 1.0))
 
 
-def _fit(kind: str, data: Data, tuned: Tuned | None, seed: int, executor: Executor) -> Residual | None:
+def _fit(kind: str, data: Data, tuned: Tuned | None, shared: Shared, seed: int, executor: Executor) -> Residual | None:
     if kind == "gp":
-        return fit_gaussian_process(data.features, data.target_mm, seed)
+        return fit_gaussian_process(data.features, data.target_mm, seed, shared.terms)
     if kind == "lightgbm" and tuned is not None:
         return fit_boosting(data.features, data.target_mm, tuned, seed, executor)
-    shape = _best_shape(data, seed)
+    shape = shared.shape or best_shape(data, seed)
     network = fit_shape(data.features, data.target_mm, shape, seed)
     if tuned is None:
         return network
     seen = with_out_of_fold_estimate(data.features, data.target_mm, data.labels, shape, seed)
     return Chained(network, fit_boosting(seen, data.target_mm, tuned, seed, executor))
-
-
-# -- cross-validation --------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Data:
-    """Rows to learn a residual from.
-
-    Attributes:
-        features: n rows.
-        target_mm: (n, 3) residuals in the base frame.
-        groups: (n,) labels that no fold separates.
-        units: (n,) labels that are no coarser, for splits inside a single group.
-    """
-
-    features: Features
-    target_mm: Floats
-    groups: Labels
-    units: Labels
-
-    def select(self, rows: NDArray[np.bool_]) -> Data:
-        """Rows by mask."""
-        return Data(self.features.select(rows), self.target_mm[rows], self.groups[rows], self.units[rows])
-
-    @property
-    def labels(self) -> Labels:
-        """(n,) labels to split by: groups, or the units of the only one, or the rows of the only unit."""
-        for labels in (self.groups, self.units):
-            if len(np.unique(labels)) > 1:
-                return labels
-        return np.arange(len(self.features)).astype(np.str_)
-
-
-class CrossValidation:
-    """Out-of-fold estimates of the learners for one division into folds.
-
-    Args:
-        data: all rows.
-        count: number of folds; fewer where there are fewer groups.
-        seed: of folds and learners.
-        executor: runs what is independent; results do not depend on it.
-        advance: told after each piece of work.
-    """
-
-    def __init__(
-        self, data: Data, count: int, seed: int, executor: Executor, advance: Callable[[], None] = lambda: None
-    ) -> None:
-        self.data = data
-        self.seed = seed
-        self.split = folds(data.labels, count, seed)
-        self.count = int(self.split.max()) + 1
-        self._executor = executor
-        self._advance = advance
-        self._training = [data.select(self.split != fold) for fold in range(self.count)]
-        self._held = [data.features.select(self.split == fold) for fold in range(self.count)]
-        self._shapes: list[Shape] = []
-        self._probed_shapes: list[Shape] = []
-
-    def estimate(self, kind: str, settings: Settings | None = None) -> tuple[Floats, Tuned | None]:
-        """Estimate each row by a learner that was trained without its fold.
-
-        Args:
-            kind: `rbfn`, `lightgbm`, `chain` or `gp`.
-            settings: of the trees; tuned if left out.
-
-        Returns:
-            (n, 3) estimates, mm; settings and number of the trees, None without trees.
-        """
-        if kind == "gp":
-            return self._joined(self._map(_process_estimate, self._training, self._held)), None
-        if kind == "lightgbm":
-            seen = [training.features for training in self._training]
-            return self._trees(list(zip(seen, self._held, strict=True)), settings, None)
-        if not self._shapes:
-            known = self._probed_shapes
-            self._shapes = [*known, *self._map(_best_shape, self._training[len(known) :])]
-        if kind == "rbfn":
-            return self._joined(self._map(_network_estimate, self._training, self._held, self._shapes)), None
-        parts = self._map(_chain_features, self._training, self._held, self._shapes)
-        return self._trees(parts, settings, parts[0][0].names)
-
-    def probe(self, kind: str) -> tuple[NDArray[np.bool_], Floats]:
-        """Estimate the rows of two folds alone, which tells whether a learner is worth the work of all of them.
-
-        Args:
-            kind: `rbfn` or `lightgbm`, the latter without tuning.
-
-        Returns:
-            (n,) rows of these folds; their estimates, mm.
-        """
-        rows = self.split < _PROBED_FOLDS
-        training, held = self._training[:_PROBED_FOLDS], self._held[:_PROBED_FOLDS]
-        if kind == "lightgbm":
-            parts = [(inside.features, outside) for inside, outside in zip(training, held, strict=True)]
-            return rows, self._trees(parts, Settings(), None)[0][rows]
-        shapes = self._map(_best_shape, training)
-        estimate_mm = np.empty_like(self.data.target_mm)
-        for fold, found in enumerate(self._map(_network_estimate, training, held, shapes)):
-            estimate_mm[self.split == fold] = found
-        self._probed_shapes = shapes
-        return rows, estimate_mm[rows]
-
-    def _map(self, work: Callable[..., _T], *of_folds: Sequence[object]) -> list[_T]:
-        found = []
-        for result in self._executor.map(partial(work, seed=self.seed), *of_folds):
-            found.append(result)
-            self._advance()
-        return found
-
-    def _joined(self, estimates: Sequence[Floats]) -> Floats:
-        out = np.empty_like(self.data.target_mm)
-        for fold, estimate in enumerate(estimates):
-            out[self.split == fold] = estimate
-        return out
-
-    def _trees(
-        self, parts: Sequence[tuple[Features, Features]], settings: Settings | None, names: Sequence[str] | None
-    ) -> tuple[Floats, Tuned]:
-        target, split = self.data.target_mm, self.split
-        found = cross_validate(parts, target, split, self.seed, self._executor, settings=settings, names=names)
-        self._advance()
-        return found
-
-
-def _best_shape(data: Data, seed: int) -> Shape:
-    return choose_shape(data.features, data.target_mm, data.labels, seed)
-
-
-def _network_estimate(training: Data, held: Features, shape: Shape, *, seed: int) -> Floats:
-    return fit_shape(training.features, training.target_mm, shape, seed).predict(held)
-
-
-def _process_estimate(training: Data, held: Features, *, seed: int) -> Floats:
-    process = fit_gaussian_process(training.features, training.target_mm, seed)
-    return np.zeros((len(held), 3)) if process is None else process.predict(held)
-
-
-def _chain_features(training: Data, held: Features, shape: Shape, *, seed: int) -> tuple[Features, Features]:
-    """Features of training rows and of held-out rows as the chain's trees see them."""
-    estimate = _network_estimate(training, held, shape, seed=seed)
-    seen = with_out_of_fold_estimate(training.features, training.target_mm, training.labels, shape, seed)
-    return seen, with_estimate(held, estimate)

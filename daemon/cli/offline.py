@@ -179,6 +179,8 @@ def show_evaluation(result: Mapping[str, Any], rows: str) -> None:
         f"learned residual: {result['residual'] or 'none'}; "
         f"{seen['rank']} of {seen['parameters']} parameters determined by the data"
     )
+    if result["residual"] is None:
+        echo(f"no residual: {result['residual_reason']}")
     covered = result["intervals"]
     axes = ", ".join(f"{share:.0%}" for share in covered["axis_coverage"])
     echo(

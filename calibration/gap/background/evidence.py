@@ -12,14 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cholesky, lapack, solve_triangular
+from scipy.linalg import lapack
 from scipy.optimize import minimize
 
+from calibration.numerics.matrices import inverse_by
 from calibration.observations import Floats
 
 Integers = NDArray[np.intp]
 
 _LOG_SCALE = (-9.0, 5.0)  # of plausible sizes
+_ENOUGH = 1e-3  # of a log evidence, which is compared with others that differ by one at least
 _MOST_NOISE = 12.0  # log of its variance, of the one that rows are whitened with
 
 
@@ -95,46 +97,84 @@ def greatest(
         iterations: at most.
     """
     names = list(blocks)
-    index = np.concatenate([fixed, *blocks.values()]).astype(np.intp)
-    number = np.repeat(np.arange(-1, len(names)), [len(fixed), *map(len, blocks.values())])
-    gram, along = products.gram[np.ix_(index, index)], products.along[index]
+    index = np.concatenate([np.empty(0, dtype=np.intp), *blocks.values()]).astype(np.intp)
+    number = np.repeat(np.arange(len(names)), [*map(len, blocks.values())])
+    model = FixedAndScaled(products, fixed, fixed_sigma, index)
 
     def negative(theta: Floats) -> tuple[float, Floats]:
-        sigma = np.exp(np.append(theta[:-1], 0.0)[number])
-        sigma[: len(fixed)] = fixed_sigma
-        value, slope, by_noise = _evidence(products, gram, along, sigma, float(np.exp(theta[-1])))
-        return -value, -np.append(np.bincount(number + 1, slope, minlength=len(names) + 1)[1:], by_noise)
+        value, slope, by_noise = model.evidence(np.exp(theta[number]), float(np.exp(theta[-1])))
+        return -value, -np.append(np.bincount(number, slope, minlength=len(names)), by_noise)
 
     least = float(np.log(products.least_noise))
     theta = np.append([np.clip(start[name], *_LOG_SCALE) for name in names], max(float(np.log(noise)), least))
     bounds = [_LOG_SCALE] * len(names) + [(least, _MOST_NOISE)]
-    found = minimize(negative, theta, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations})
+    # SciPy's tolerance is relative to a value of many thousands; differences of a few are what counts.
+    enough = _ENOUGH / max(abs(negative(theta)[0]), 1.0)
+    found = minimize(
+        negative,
+        theta,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"maxiter": iterations, "ftol": enough},
+    )
     scale = dict(zip(names, found.x[:-1].tolist(), strict=True))
     return Scales(fixed, fixed_sigma, dict(blocks), scale, float(np.exp(found.x[-1])), -float(found.fun))
 
 
-def _evidence(
-    products: Products, gram: Floats, along: Floats, sigma: Floats, noise: float
-) -> tuple[float, Floats, float]:
-    """Return the log evidence of a model, its derivatives by the log of every sigma (q,), and by that of the noise.
+class FixedAndScaled:
+    """Log evidence as a function of the scales of some columns, beside others whose scales stay.
+
+    In the axes of their own products the columns that stay are independent of each other at any noise: they are
+    eliminated once and for all, and what is factored again and again has the columns with scales alone.
 
     Args:
         products: of the whole.
-        gram: (q, q) of the model's columns.
-        along: (q,) of the same with the target.
-        sigma: (q,) of their amounts.
-        noise: variance.
+        fixed: (f,) columns whose scales stay.
+        fixed_sigma: (f,) those scales.
+        index: (b,) columns with scales.
     """
-    matrix = gram * (sigma * sigma[:, None] / noise)
-    matrix[np.diag_indices_from(matrix)] += 1.0
-    factor = cholesky(matrix, lower=True, overwrite_a=True, check_finite=False)
-    half = solve_triangular(factor, along * sigma / noise, lower=True, check_finite=False)
-    explained = float(half @ half)
-    value = 0.5 * (explained - products.squares / noise - products.rows * np.log(noise))
-    value -= float(np.log(np.diag(factor)).sum())
-    mean = solve_triangular(factor, half, lower=True, trans=1, check_finite=False)
-    variance = (lapack.dtrtri(factor, lower=1)[0] ** 2).sum(axis=0)
-    slope: Floats = mean**2 + variance - 1.0
-    # The squares that the posterior mean leaves, over the noise.
-    left = products.squares / noise - explained - float(mean @ mean)
-    return value, slope, 0.5 * (left + len(sigma) - float(variance.sum()) - products.rows)
+
+    def __init__(self, products: Products, fixed: Integers, fixed_sigma: Floats, index: Integers) -> None:
+        own = products.gram[np.ix_(fixed, fixed)] * (fixed_sigma * fixed_sigma[:, None])
+        size, axes = np.linalg.eigh(own)
+        turned = fixed_sigma[:, None] * axes
+        self._size = np.maximum(size, 0.0)
+        self._across: Floats = turned.T @ products.gram[np.ix_(fixed, index)]
+        self._along_fixed, self._along = turned.T @ products.along[fixed], products.along[index]
+        self._gram = products.gram[np.ix_(index, index)]
+        self._products = products
+
+    def evidence(self, sigma: Floats, noise: float) -> tuple[float, Floats, float]:
+        """Return the log evidence, its derivatives by the log of every scale (b,), and by that of the noise.
+
+        Args:
+            sigma: (b,) scales.
+            noise: variance.
+        """
+        products, size = self._products, self._size
+        left = noise / (noise + size)  # share of the prior variance that is left, along the axes of what stays
+        across = self._across * np.sqrt(left / noise)[:, None]
+        fixed = self._along_fixed * np.sqrt(left / noise)
+        outer = sigma * sigma[:, None] / noise
+        matrix = (self._gram - across.T @ across) * outer
+        matrix[np.diag_indices_from(matrix)] += 1.0
+        factor, failed = lapack.dpotrf(matrix, lower=1, overwrite_a=1)
+        if failed:
+            raise np.linalg.LinAlgError("the products of a background's columns are not those of any columns")
+        score = sigma * (self._along - across.T @ fixed) / noise
+        inverse = inverse_by(factor)
+        mean = inverse @ score
+        explained = float(fixed @ fixed) / noise + float(score @ mean)
+        value = 0.5 * (explained - products.squares / noise - products.rows * np.log(noise))
+        value -= float(np.log(np.diag(factor)).sum()) - 0.5 * float(np.log(left).sum())
+        variance = np.diag(inverse)
+        slope: Floats = mean**2 + variance - 1.0
+        # Of what stays: posterior means in prior sigmas, and variances with what the others leave open.
+        mean_fixed = np.sqrt(left / noise) * (fixed - across @ (sigma * mean))
+        faded = across * np.sqrt(left)[:, None]
+        of_fixed = float(left.sum()) + float(np.vdot(inverse, (faded.T @ faded) * outer))
+        # The squares that the posterior mean leaves, over the noise.
+        squares = products.squares / noise - explained - float(mean @ mean) - float(mean_fixed @ mean_fixed)
+        count = len(size) + len(sigma)
+        return value, slope, 0.5 * (squares + count - float(variance.sum()) - of_fixed - products.rows)

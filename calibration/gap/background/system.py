@@ -74,20 +74,24 @@ class System:
         self.projection, self.candidates = projection, tuple(candidates)
         self.blocks = {block.name: block for block in blocks}
         self._number = {str(candidate): number for number, candidate in enumerate(self.candidates)}
-        parts, count = [projection.kinematics], projection.kinematics.shape[1]
+        parts, count = list[EffectColumns](), projection.kinematics.shape[1]
         self._kinematics: Integers = np.arange(count)
         self._of_block: dict[str, Integers] = {}
         self._of_option: dict[tuple[int, int], Integers] = {}
         for name, block in self.blocks.items():
-            parts.append(self._whitened(block.columns))
-            self._of_block[name] = np.arange(count, count := count + parts[-1].shape[1])
+            parts.append(block.columns)
+            self._of_block[name] = np.arange(count, count := count + len(parts[-1]))
         for number, candidate in enumerate(self.candidates):
             for option, first in enumerate(candidate.first_equal):
                 if first == option:
-                    parts.append(self._whitened(candidate.additions[option]))
-                    self._of_option[number, option] = np.arange(count, count := count + parts[-1].shape[1])
+                    parts.append(candidate.additions[option])
+                    self._of_option[number, option] = np.arange(count, count := count + len(parts[-1]))
                 self._of_option[number, option] = self._of_option[number, first]
-        self.columns, target = np.hstack(parts), projection.target
+        self.columns, target = np.empty((len(projection.target), count)), projection.target
+        self.columns[:, : len(self._kinematics)] = projection.kinematics
+        first = len(self._kinematics)
+        for part in parts:
+            self.columns[:, first : (first := first + len(part))] = self._whitened(part)
         self.products = Products(
             self.columns.T @ self.columns,
             self.columns.T @ target,

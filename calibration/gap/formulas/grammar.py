@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from calibration.gap.formulas.terms import Term, all_terms, chunks, columns_of
@@ -23,7 +24,7 @@ from calibration.observations import Floats
 
 _LEAST_SEEN = 1e-3  # visible share of a term's displacement, of the largest such share; less is rounding
 _SIZES = 4.0 ** np.arange(1, 13)  # prior sigma^2 in standard errors^2
-_KEPT = 2e7  # numbers that are kept for the next question
+_KEPT = 1e7  # numbers that are kept for the next question
 _BLOCKS = 1000  # of groups, for the sums by group
 _MOST = 3  # terms of a description
 _BEGINNINGS = 12
@@ -112,21 +113,23 @@ class Grammar:
         order = np.argsort(block, kind="stable")
         first = np.flatnonzero(np.diff(block[order], prepend=-1))
         residual = projection.residual.reshape(-1, 3)
-        kept, seen, by_group = [], [], []
-        small = 3 * len(residual) * len(possible) <= _KEPT
+        seen, by_group = [], []
+        shape = 3 * len(residual), len(possible)
+        kept = np.empty(shape, order="F") if math.prod(shape) <= _KEPT else None
         for part in chunks(possible, len(residual)):
             moved, columns, length = columns_of(projection, part)
             seen.append(length / np.maximum(np.sqrt((moved**2).sum(axis=(0, 1))), _TINY))
             by_sample = np.einsum("mck,mc->mk", columns.reshape(len(residual), 3, -1), residual)
             by_group.append(np.add.reduceat(by_sample[order], first, axis=0))
-            if small:
-                kept.append(columns)
+            if kept is not None:
+                first_of_part = sum(map(len, seen[:-1]))
+                kept[:, first_of_part : first_of_part + len(part)] = columns
         visible = np.concatenate(seen)
         shown = visible > _LEAST_SEEN * visible.max(initial=0.0)
         self.terms = tuple(term for term, is_shown in zip(possible, shown, strict=True) if is_shown)
         self.by_group = np.hstack(by_group)[:, shown]
         self.score: Floats = self.by_group.sum(axis=0)
-        self._kept = np.hstack(kept)[:, shown] if kept else None
+        self._kept = None if kept is None else _of_shown(kept, shown)
         self._prior = np.array([term.log_prior for term in self.terms])
 
     def find(self, most: int = _MOST) -> tuple[Formula, ...]:
@@ -219,6 +222,14 @@ class Grammar:
             return directions.T @ self._kept
         parts = chunks(self.terms, len(self.projection.samples))
         return np.hstack([directions.T @ columns_of(self.projection, part)[1] for part in parts])
+
+
+def _of_shown(columns: Floats, shown: NDArray[np.bool_]) -> Floats:
+    """Return the columns (r, k) that are shown, moved to the front in place: a copy would double hundreds of MB."""
+    for to, at in enumerate(np.flatnonzero(shown).tolist()):
+        if to != at:
+            columns[:, to] = columns[:, at]
+    return columns[:, : int(shown.sum())]
 
 
 def describe(found: Sequence[Formula], library: str = "not in the library") -> str:

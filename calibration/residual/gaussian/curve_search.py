@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import lapack, solve_triangular
+from scipy.linalg import cho_solve, lapack, solve_triangular
 from scipy.optimize import minimize
 
 from calibration.observations import Floats
@@ -35,6 +35,7 @@ _USUAL_LOG_LENGTH, _LOG_LENGTH_SPREAD = math.log(0.3), 1.5
 _LENGTH_LIMITS = (math.log(0.005), math.log(5.0))
 _FREEDOM, _WIDEST = 7.0, 3.0  # logarithms of amplitudes and noise below and above the residual's spread
 _ITERATIONS, _LAST_ITERATIONS = 10, 40
+_ENOUGH = 0.01  # nats, by which a step must raise the evidence for another one
 _LEAST = 1e-12
 _ROUNDING = 1e-12
 
@@ -100,18 +101,30 @@ class _Guess:
     log_length: float
 
 
+@dataclass(frozen=True)
+class Terms:
+    """Curves with their logarithms of amplitude and length, and those of noise and size of the corrections."""
+
+    curves: tuple[Curve, ...]
+    log_amplitude: tuple[float, ...]
+    log_length: tuple[float, ...]
+    log_correction: float
+    log_sigma: float
+
+
 class CurveSearch:
     """Curves for the residual of some rows.
 
     Args:
         rows: what is to be explained.
         own: joint -> axis of its own value.
+        start: terms of similar rows; those that these rows do not ask for end with no amplitude to speak of.
 
     Attributes:
         curves: found so far.
     """
 
-    def __init__(self, rows: Rows, own: Mapping[int, int]) -> None:
+    def __init__(self, rows: Rows, own: Mapping[int, int], start: Terms | None = None) -> None:
         self.curves: list[Curve] = []
         self._rows = rows
         self._y = rows.target_mm.ravel()
@@ -128,13 +141,27 @@ class CurveSearch:
         self._log_correction, self._log_sigma = self._log_spread - 1.0, self._log_spread
         self._log_amplitude: list[float] = []
         self._log_length: list[float] = []
+        self._information: dict[_Candidates, Floats] = {}
+        if start is not None:
+            for curve, amplitude, length in zip(start.curves, start.log_amplitude, start.log_length, strict=True):
+                self._take(_Guess(0.0, curve, amplitude, length))
+            self._log_correction, self._log_sigma = start.log_correction, start.log_sigma
 
     def run(self) -> None:
         """Take terms until none is likely."""
-        while self._take_some():
-            self._optimise(_ITERATIONS)
         if self.curves:
             self._optimise(_LAST_ITERATIONS)
+        begun = len(self.curves)
+        while self._take_some():
+            self._optimise(_ITERATIONS)
+        if len(self.curves) > begun:
+            self._optimise(_LAST_ITERATIONS)
+
+    @property
+    def terms(self) -> Terms:
+        """What was found."""
+        amplitude, length = tuple(self._log_amplitude), tuple(self._log_length)
+        return Terms(tuple(self.curves), amplitude, length, self._log_correction, self._log_sigma)
 
     def weights(self, gram: Floats, moment: Floats) -> Floats:
         """(p + m,) corrections of the parameters, then the curves' weights, for other rows.
@@ -210,7 +237,7 @@ class CurveSearch:
                 continue
             values, square = self._rows.waves(candidates.axes, candidates.counts)
             score = values.T @ by_lever[:, levers] / variance
-            information = (values**2).T @ self._lever_square[:, levers] / variance
+            information = self._squares(candidates)[:, levers] / variance
             best = np.full(len(levers), -np.inf)
             amplitude, length = np.zeros(len(levers)), np.zeros(len(levers))
             for log_length in candidates.log_lengths:
@@ -228,6 +255,13 @@ class CurveSearch:
                 for g, lever, a, k in zip(best, levers, amplitude, length, strict=True)
             ]
         return found
+
+    def _squares(self, candidates: _Candidates) -> Floats:
+        """(m, l) summed squares of each wave at each lever, which stay the same from term to term."""
+        if candidates not in self._information:
+            values, _ = self._rows.waves(candidates.axes, candidates.counts)
+            self._information[candidates] = (values**2).T @ self._lever_square
+        return self._information[candidates]
 
     def _weigh(self, guess: _Guess, left: Floats, sd: Floats, factor: Floats, variance: float) -> _Guess:
         """Compute the gain in log evidence beside the terms so far, at the best amplitude and length near the guess."""
@@ -293,8 +327,7 @@ class CurveSearch:
             sd, variance = self._prior(theta), math.exp(2.0 * theta[-1])
             factor = _factor(self._gram, sd, variance)
             mean = _solve(factor, sd * self._moment / variance)
-            inverse, _ = lapack.dpotri(factor, lower=1)
-            spread = np.diag(inverse)
+            spread = np.diag(lapack.dpotri(factor, lower=1)[0])
             explained = float(mean @ (sd * self._moment)) / variance
             length = theta[1 + terms : 1 + 2 * terms]
             off = (length - _USUAL_LOG_LENGTH) / _LOG_LENGTH_SPREAD
@@ -320,7 +353,11 @@ class CurveSearch:
             (self._log_spread - _FREEDOM, self._log_spread + _WIDEST),
         ]
         start = np.clip(start, *np.transpose(bounds))
-        found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations}).x
+        # SciPy's tolerance is relative to a value of many thousands.
+        enough = _ENOUGH / max(abs(cost(start)[0]), 1.0)
+        found = minimize(
+            cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations, "ftol": enough}
+        ).x
         self._log_correction, self._log_sigma = float(found[0]), float(found[-1])
         self._log_amplitude = found[1 : 1 + terms].tolist()
         self._log_length = found[1 + terms : 1 + 2 * terms].tolist()
@@ -328,12 +365,15 @@ class CurveSearch:
 
 def _factor(gram: Floats, sd: Floats, variance: float) -> Floats:
     """Lower Cholesky factor of 1 + S M'M S / variance."""
-    inside = gram * np.outer(sd, sd / variance)
+    inside = np.multiply(gram, sd[:, None], order="F")
+    inside *= sd / variance
     inside[np.diag_indices_from(inside)] += 1.0 + _ROUNDING * float(np.diag(inside).max(initial=0.0))
-    return np.asarray(np.linalg.cholesky(inside), dtype=np.float64)
+    factor, failed = lapack.dpotrf(inside, lower=1, overwrite_a=1)
+    if failed:
+        raise np.linalg.LinAlgError("the products of curves are not those of any columns")
+    return np.asarray(factor, dtype=np.float64)
 
 
 def _solve(factor: Floats, right: Floats) -> Floats:
     """Solution by a lower Cholesky factor."""
-    forward = solve_triangular(factor, right, lower=True)
-    return np.asarray(solve_triangular(factor, forward, lower=True, trans=1))
+    return np.asarray(cho_solve((factor, True), right, check_finite=False))

@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from calibration.numerics.stored_arrays import read_npz, write_npz
 from calibration.observations import Floats
 from calibration.residual.features import Features, is_place
-from calibration.residual.gaussian.curve_search import CurveSearch, Rows
+from calibration.residual.gaussian.curve_search import CurveSearch, Rows, Terms
 from calibration.residual.gaussian.curves import Axis, Curve, CurveSum
 
 _FILE = "gaussian_process.npz"
@@ -33,6 +33,14 @@ _META = "gaussian_process.json"
 
 _WHOLE_TURN_DEG = 300.0  # an angle that covers more than this goes round
 _MOST_ROWS = 1500  # to find the terms by, and of a block of the sums over all rows
+
+
+@dataclass(frozen=True)
+class Found:
+    """Terms over all variables of some rows, by name and whether they go round."""
+
+    variables: tuple[tuple[str, bool], ...]
+    terms: Terms
 
 
 @dataclass(frozen=True)
@@ -44,6 +52,7 @@ class GaussianProcess:
         axes, curves: terms; the columns of the axes are those of `names`.
         weights: of the curves' waves, deg, mm.
         parameters: (p,) corrections of what `Features.parameter_jacobian` has, mm or rad.
+        found: the terms that it was fitted with; not stored.
     """
 
     kind: ClassVar[str] = "gp"
@@ -53,6 +62,7 @@ class GaussianProcess:
     curves: tuple[Curve, ...]
     weights: Floats
     parameters: Floats
+    found: Found | None = field(default=None, compare=False)
 
     @cached_property
     def _sum(self) -> CurveSum:
@@ -105,13 +115,16 @@ class GaussianProcess:
         return cls(tuple(str(a["feature"]) for a in document["axes"]), axes, curves, weights, parameters)
 
 
-def fit_gaussian_process(features: Features, target_mm: Floats, seed: int) -> GaussianProcess | None:
+def fit_gaussian_process(
+    features: Features, target_mm: Floats, seed: int, start: Found | None = None
+) -> GaussianProcess | None:
     """Find terms, their amplitudes and smoothness, and their weights.
 
     Args:
         features: n rows.
         target_mm: (n, 3) residuals in the base frame.
         seed: of the rows that terms are found by, where there are more than 1,500.
+        start: what was found for most of these rows, which saves much of the search.
 
     Returns:
         None where no term is likely, or nothing varies.
@@ -132,7 +145,9 @@ def fit_gaussian_process(features: Features, target_mm: Floats, seed: int) -> Ga
         levers = np.concatenate([features.joint_jacobian[of], along_base], axis=2)
         return Rows(axes, scaled[of], levers, features.parameter_jacobian[of] * unit, target_mm[of])
 
-    search = CurveSearch(rows(some), own)
+    variables = tuple((name, axis.is_periodic) for name, axis in zip(names, axes, strict=True))
+    known = start.terms if start is not None and start.variables == variables else None
+    search = CurveSearch(rows(some), own, known)
     search.run()
     if not search.curves:
         return None
@@ -147,7 +162,12 @@ def fit_gaussian_process(features: Features, target_mm: Floats, seed: int) -> Ga
     used = sorted({axis for curve in search.curves for axis in curve.axes})
     curves = tuple(replace(c, axes=tuple(used.index(a) for a in c.axes)) for c in search.curves)
     return GaussianProcess(
-        tuple(names[a] for a in used), tuple(axes[a] for a in used), curves, weights[p:], weights[:p] * unit
+        tuple(names[a] for a in used),
+        tuple(axes[a] for a in used),
+        curves,
+        weights[p:],
+        weights[:p] * unit,
+        Found(variables, search.terms),
     )
 
 

@@ -158,3 +158,25 @@ def test_noise_chooses_no_neighbours_of_a_prism_that_stands_still() -> None:
     rig = RIG.model_copy(update={"prisms": (*RIG.prisms, foot)})
     table = simulate_observations(RigTruth(rig, 1), 75, 1, noise_mm=3.0, prisms=("s", "foot"))
     assert heard(fitted(rig, parse_observations(table.csv_text().encode(), rig, "simulated.csv"))) == set()
+
+
+def test_an_effect_beside_others_is_weighed_as_all_together_are(bare: Projection) -> None:
+    """The others are factored once; their products with an effect are what is left to do for each of its forms."""
+    names = [("leak_down", "theta6"), ("encoder_harmonic", "theta7"), ("base_settlement", "base")]
+    places = [candidate_at(bare.situation, bare, *name, variants_at(bare.situation, *name)) for name in names]
+    screen = Screen(bare, places)
+    chosen = {0: (0, 1.0), 2: (1, 3.0)}
+    beside = screen.beside(chosen)
+    assert beside.log_bayes_factor == pytest.approx(screen.log_bayes_factor([(0, 0), (2, 1)], [1.0, 3.0]))
+    for option in range(2):
+        together = screen.log_bayes_factor([(0, 0), (2, 1), (1, option)], [1.0, 3.0, 10.0])
+        assert beside.together(1, option, 10.0) == pytest.approx(together)
+    assert screen.beside({}).log_bayes_factor == 0.0
+    assert screen.beside({}).together(1, 0, 1.0) == pytest.approx(screen.log_bayes_factor([(1, 0)]))
+
+
+def test_forms_that_differ_in_their_prior_alone_share_their_columns(bare: Projection) -> None:
+    forms = variants_at(bare.situation, "joint_error_map", "theta7")
+    first, second = candidate_at(bare.situation, bare, "joint_error_map", "theta7", forms).additions[:2]
+    assert first.column is second.column
+    assert (first.prior_sigma < second.prior_sigma).all()

@@ -51,6 +51,7 @@ def test_the_report_is_the_contracts_json_object(session: Session) -> None:
         "per_prism",
         "effects",
         "residual",
+        "residual_reason",
         "noise_mm",
         "identifiability",
         "warnings",

@@ -61,6 +61,19 @@ def test_it_finds_which_joint_errs_with_what_and_nothing_else() -> None:
     assert rms(left) < 0.1 * rms(truth(arm(1000, 1001)))
 
 
+def test_a_start_at_what_similar_rows_showed_comes_to_the_same_and_keeps_nothing_else() -> None:
+    process, _ = learned()
+    seen, unseen = arm(500, 7), arm(1000, 1007)
+    target = truth(seen) + np.random.default_rng(7).normal(0, 1.0, (500, 3))
+    alone, begun = (fit_gaussian_process(seen, target, 0, start) for start in (None, process.found))
+    assert alone is not None
+    assert begun is not None
+    assert rms(alone.predict(unseen) - begun.predict(unseen)) < 0.02 * rms(truth(unseen))
+    of_noise = fit_gaussian_process(seen, np.random.default_rng(8).normal(0, 1.0, (500, 3)), 0, process.found)
+    assert of_noise is not None
+    assert rms(of_noise.predict(unseen)) < 0.15  # of noise of 1 mm
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_it_finds_nothing_in_noise(seed: int) -> None:
     seen = arm(300, seed)

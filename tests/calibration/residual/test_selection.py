@@ -10,10 +10,11 @@ import pytest
 
 from calibration.observations import Floats
 from calibration.pipeline.calibrate import train_residual
+from calibration.residual.cross_validation import CrossValidation, Data
 from calibration.residual.features import Features, usable_signals
 from calibration.residual.folds import folds, group_labels
 from calibration.residual.learners import LOADERS
-from calibration.residual.selection import CrossValidation, Data, Kind, Selection, select_residual
+from calibration.residual.selection import Kind, Selection, select_residual
 from tests.calibration.conftest import Session, features, rms, simulated
 
 
@@ -92,6 +93,13 @@ def test_nothing_is_learned_from_noise(seed: int) -> None:
     assert decision.reason == "in cross-validation of the training data no learner lowers the error beyond chance"
 
 
+def test_one_learner_that_does_not_help_is_left_out_by_its_name() -> None:
+    decision = choose("gp", noise=1.0, signal=0.0, n=250)
+    assert decision.residual is None
+    assert decision.reason.startswith("gp was asked for and is left out: in cross-validation of the training data")
+    assert "no gain beyond chance" in decision.reason
+
+
 def test_too_few_groups_are_a_reason_to_learn_nothing() -> None:
     seen, _ = made_up(60)
     one = np.full(60, "s")
@@ -155,6 +163,31 @@ def test_what_all_rows_gain_is_told_from_the_rows_that_the_folds_really_had(grou
     expected = 2.0 * most - ((target - half) ** 2).sum() if groups == 3 else most
     assert 0.5 * most < expected < 1.02 * most
     assert 120 * found.variance_mm2.sum() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("kind", ["gp", "rbfn"])
+def test_what_folds_of_many_rows_share_flatters_no_learner(kind: str) -> None:
+    """The error on folds is that on rows which no learner has seen, though terms and shape are found once."""
+    rng = np.random.default_rng(3)
+    seen, cells = made_up(3000)
+    target = curve(seen.geometry) + rng.normal(0.0, 0.5, (3000, 3))
+    rows = np.arange(3000) < 1500
+    with ThreadPoolExecutor(2) as pool:
+        data = Data(seen.select(rows), target[rows], cells[rows], cells[rows])
+        left = target[rows] - CrossValidation(data, 5, 0, pool).estimate(kind)[0]
+        found = select_residual(
+            data.features,
+            data.target_mm,
+            data.groups,
+            data.groups,
+            kind=kind,  # type: ignore[arg-type]
+            seed=0,
+            executor=pool,
+            progress=lambda share: None,
+        )
+    assert found.residual is not None
+    unseen = target[~rows] - found.residual.predict(seen.select(~rows))
+    assert (left**2).mean() > 0.97 * (unseen**2).mean()
 
 
 def test_a_chain_that_cannot_win_is_not_trained() -> None:

@@ -24,8 +24,8 @@ from daemon.models.model_files import write_model
 from tests.daemon.offline_support import held_out_csv, small_calibration, train_csv
 
 KEYS = [
-    "rig", "n", "seconds", "stages", "per_prism", "effects", "residual", "noise_mm", "identifiability", "warnings",
-    "ignored_columns", "expected_accuracy", "axes", "importance", "intervals",
+    "rig", "n", "seconds", "stages", "per_prism", "effects", "residual", "residual_reason", "noise_mm",
+    "identifiability", "warnings", "ignored_columns", "expected_accuracy", "axes", "importance", "intervals",
 ]  # fmt: skip
 STAGES = ["nominal", "geometric", "effects", "hybrid"]
 STAGE_KEYS = ["stage", "mean_mm", "rms_mm", "max_mm", "std_mm"]
@@ -88,12 +88,25 @@ def test_calibrate_then_evaluate_as_programs(work: Path, tmp_path: Path) -> None
     rms = {stage["stage"]: stage["rms_mm"] for stage in answer["stages"]}
     assert rms["geometric"] == rms["effects"] == rms["hybrid"] < 0.6 < rms["nominal"]
     assert answer["residual"] is None
+    assert answer["residual_reason"] == "switched off"
     assert "On the 240 fixes it was fitted to" in (out / "report.html").read_text(encoding="utf-8")
     assert "report.html" not in (out / "manifest.json").read_text()
 
     done = command("evaluate", "--model", out, "--data", work / "test.csv", "--json")
     assert done.returncode == 0, done.stderr
     assert_contract(json.loads(done.stdout), 60)
+
+
+def test_a_residual_that_was_asked_for_and_is_left_out_says_why(work: Path, tmp_path: Path) -> None:
+    few = tmp_path / "few.csv"
+    few.write_text("".join((work / "train.csv").read_text().splitlines(keepends=True)[:41]))
+    asked = ("calibrate", "--rig", "ur10", "--data", few, "--out", tmp_path / "model", "--effects", "none")
+    why = "gp was asked for and is left out:"
+    told = run(*asked, "--residual", "gp")
+    assert (told.exit_code, why in " ".join(told.stdout.split())) == (0, True)
+    answer = json.loads(run(*asked, "--residual", "gp", "--json").stdout)
+    assert answer["residual"] is None
+    assert answer["residual_reason"].startswith(why)
 
 
 def test_evaluate_prints_every_stage_for_people(work: Path) -> None:

@@ -1,0 +1,218 @@
+"""Cross-validation of the learners of the residual: estimates of rows by learners that were trained without them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.observations import Floats
+from calibration.residual.features import Features
+from calibration.residual.folds import folds
+from calibration.residual.gaussian.process import Found, fit_gaussian_process
+from calibration.residual.learners import with_estimate, with_out_of_fold_estimate
+from calibration.residual.rbf.rbfn import Shape, choose_shape, fit_shape
+from calibration.residual.trees.boosting import Settings, Tuned, cross_validate
+
+Labels = NDArray[np.str_]
+_T = TypeVar("_T")
+
+MANY_ROWS = 1000  # of which a fold's hardly change what suits them
+_PROBED_FOLDS = 2
+
+
+@dataclass(frozen=True)
+class Data:
+    """Rows to learn a residual from.
+
+    Attributes:
+        features: n rows.
+        target_mm: (n, 3) residuals in the base frame.
+        groups: (n,) labels that no fold separates.
+        units: (n,) labels that are no coarser, for splits inside a single group.
+    """
+
+    features: Features
+    target_mm: Floats
+    groups: Labels
+    units: Labels
+
+    def select(self, rows: NDArray[np.bool_]) -> Data:
+        """Rows by mask."""
+        return Data(self.features.select(rows), self.target_mm[rows], self.groups[rows], self.units[rows])
+
+    @property
+    def labels(self) -> Labels:
+        """(n,) labels to split by: groups, or the units of the only one, or the rows of the only unit."""
+        for labels in (self.groups, self.units):
+            if len(np.unique(labels)) > 1:
+                return labels
+        return np.arange(len(self.features)).astype(np.str_)
+
+
+@dataclass(frozen=True)
+class Shared:
+    """What learners of many rows share, whichever fold is left out; None for what each finds for itself.
+
+    Attributes:
+        shape: of networks.
+        terms: to begin with in the search for a Gaussian process.
+    """
+
+    shape: Shape | None = None
+    terms: Found | None = None
+
+
+class CrossValidation:
+    """Out-of-fold estimates of the learners for one division into folds.
+
+    A fold's learner finds by itself what suits the rows of the other folds. Where rows are many that hardly depends on
+    the fold: what is found without the first one serves all, networks as it is, and terms as a start, of which the
+    evidence of its own rows leaves each fold what it needs.
+
+    Args:
+        data: all rows.
+        count: number of folds; fewer where there are fewer groups.
+        seed: of folds and learners.
+        executor: runs what is independent; results do not depend on it.
+        advance: told after each piece of work.
+        shared: what is known of these rows.
+
+    Attributes:
+        shared: the same, and what was found since.
+    """
+
+    def __init__(
+        self,
+        data: Data,
+        count: int,
+        seed: int,
+        executor: Executor,
+        advance: Callable[[], None] = lambda: None,
+        shared: Shared | None = None,
+    ) -> None:
+        self.data = data
+        self.seed = seed
+        self.split = folds(data.labels, count, seed)
+        self.count = int(self.split.max()) + 1
+        self._executor = executor
+        self._advance = advance
+        self._training = [data.select(self.split != fold) for fold in range(self.count)]
+        self._held = [data.features.select(self.split == fold) for fold in range(self.count)]
+        self.shared = Shared() if shared is None else shared
+        self._has_many = len(data.features) >= MANY_ROWS
+        self._own_shapes: list[Shape] = []
+
+    def estimate(self, kind: str, settings: Settings | None = None) -> tuple[Floats, Tuned | None]:
+        """Estimate each row by a learner that was trained without its fold.
+
+        Args:
+            kind: `rbfn`, `lightgbm`, `chain` or `gp`.
+            settings: of the trees; tuned if left out.
+
+        Returns:
+            (n, 3) estimates, mm; settings and number of the trees, None without trees.
+        """
+        if kind == "gp":
+            return self._joined(self._processes()), None
+        if kind == "lightgbm":
+            seen = [training.features for training in self._training]
+            return self._trees(list(zip(seen, self._held, strict=True)), settings, None)
+        shapes = self._shapes(self.count)
+        if kind == "rbfn":
+            return self._joined(self._map(_network_estimate, self._training, self._held, shapes)), None
+        parts = self._map(_chain_features, self._training, self._held, shapes)
+        return self._trees(parts, settings, parts[0][0].names)
+
+    def probe(self, kind: str, settings: Settings) -> tuple[NDArray[np.bool_], Floats]:
+        """Estimate the rows of two folds alone, which tells whether a learner is worth the work of all of them.
+
+        Args:
+            kind: `rbfn`, `lightgbm` or `chain`.
+            settings: of the trees.
+
+        Returns:
+            (n,) rows of these folds; their estimates, mm.
+        """
+        rows = self.split < _PROBED_FOLDS
+        training, held = self._training[:_PROBED_FOLDS], self._held[:_PROBED_FOLDS]
+        if kind == "lightgbm":
+            parts = [(inside.features, outside) for inside, outside in zip(training, held, strict=True)]
+            return rows, self._trees(parts, settings, None)[0][rows]
+        shapes = self._shapes(_PROBED_FOLDS)
+        if kind == "chain":
+            parts = self._map(_chain_features, training, held, shapes)
+            return rows, self._trees(parts, settings, parts[0][0].names)[0][rows]
+        estimate_mm = np.empty_like(self.data.target_mm)
+        for fold, found in enumerate(self._map(_network_estimate, training, held, shapes)):
+            estimate_mm[self.split == fold] = found
+        return rows, estimate_mm[rows]
+
+    def _shapes(self, count: int) -> list[Shape]:
+        """Shapes of the networks of the first folds."""
+        if self._has_many:
+            shape = self.shared.shape or self._map(best_shape, self._training[:1])[0]
+            self.shared = replace(self.shared, shape=shape)
+            return count * [shape]
+        self._own_shapes += self._map(best_shape, self._training[len(self._own_shapes) : count])
+        return self._own_shapes[:count]
+
+    def _processes(self) -> list[Floats]:
+        """Estimates of each fold's rows by a Gaussian process."""
+        found: list[tuple[Floats, Found | None]] = []
+        if self._has_many and self.shared.terms is None:
+            found = self._map(_process_estimate, self._training[:1], self._held[:1])
+            self.shared = replace(self.shared, terms=found[0][1])
+        rest = slice(len(found), None)
+        work = partial(_process_estimate, start=self.shared.terms)
+        return [estimate for estimate, _ in [*found, *self._map(work, self._training[rest], self._held[rest])]]
+
+    def _map(self, work: Callable[..., _T], *of_folds: Sequence[object]) -> list[_T]:
+        found = []
+        for result in self._executor.map(partial(work, seed=self.seed), *of_folds):
+            found.append(result)
+            self._advance()
+        return found
+
+    def _joined(self, estimates: Sequence[Floats]) -> Floats:
+        out = np.empty_like(self.data.target_mm)
+        for fold, estimate in enumerate(estimates):
+            out[self.split == fold] = estimate
+        return out
+
+    def _trees(
+        self, parts: Sequence[tuple[Features, Features]], settings: Settings | None, names: Sequence[str] | None
+    ) -> tuple[Floats, Tuned]:
+        target, split = self.data.target_mm, self.split
+        found = cross_validate(parts, target, split, self.seed, self._executor, settings=settings, names=names)
+        self._advance()
+        return found
+
+
+def best_shape(data: Data, seed: int) -> Shape:
+    """Shape of the network that suits some rows best."""
+    return choose_shape(data.features, data.target_mm, data.labels, seed)
+
+
+def _network_estimate(training: Data, held: Features, shape: Shape, *, seed: int) -> Floats:
+    return fit_shape(training.features, training.target_mm, shape, seed).predict(held)
+
+
+def _process_estimate(
+    training: Data, held: Features, *, seed: int, start: Found | None = None
+) -> tuple[Floats, Found | None]:
+    """Estimates of held-out rows, and the terms that they rest on."""
+    process = fit_gaussian_process(training.features, training.target_mm, seed, start)
+    return (np.zeros((len(held), 3)), None) if process is None else (process.predict(held), process.found)
+
+
+def _chain_features(training: Data, held: Features, shape: Shape, *, seed: int) -> tuple[Features, Features]:
+    """Features of training rows and of held-out rows as the chain's trees see them."""
+    estimate = _network_estimate(training, held, shape, seed=seed)
+    seen = with_out_of_fold_estimate(training.features, training.target_mm, training.labels, shape, seed)
+    return seen, with_estimate(held, estimate)
