@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from calibration.effects.columns import joined
 from calibration.effects.fitted import Choice
 from calibration.gap.adoption import Adopted, adopted
 from calibration.gap.background.blocks import displacement_blocks, smooth_blocks, time_blocks
@@ -16,13 +14,14 @@ from calibration.gap.background.naming import Names, evidence_alone, names_besid
 from calibration.gap.background.outside import formula_block, is_in_library, what_is_left
 from calibration.gap.background.search import background_log_bayes_factor
 from calibration.gap.breaks import find_break
-from calibration.gap.candidates import CandidateEffect, candidate_at, candidate_effects, variants_at
+from calibration.gap.candidates import CandidateEffect, candidate_effects
 from calibration.gap.criteria import best_of_each_family, beyond_doubt
 from calibration.gap.detection import detect
 from calibration.gap.formulas.grammar import Formula, Grammar
 from calibration.gap.joint_fit import OUTLIER, JointFit, Problem, joint_fit
 from calibration.gap.projection import Projection, follows_path
 from calibration.gap.regimes import EffectInRegime, effect_in_regime
+from calibration.gap.reselection import explain_outliers, reselect
 from calibration.gap.screening import ScoredEffect, Screen, by_family
 from calibration.gap.search_result import STRUCTURE, SearchResult, SelectionStep, conclude
 from calibration.gap.selection import Selection, select_effect
@@ -38,8 +37,6 @@ _REGIME = 15.0  # log Bayes factor, for an effect in a part of the data: its var
 _LEAST_SAMPLES = 60  # for the evidence of a background to be more than that of a few fixes
 _PENDING = 3  # sets that are adopted for the time being
 _MANY = 0.02  # share of gross outliers that is more than accidents
-_BETTER = 1.0  # log Bayes factor, to change the form of an adopted effect
-_FORMS = 5  # times that the forms of adopted effects are changed, before all candidates are scored again
 
 
 def search(
@@ -347,78 +344,3 @@ def _formulas_suffice(problem: Problem, joint: JointFit, formulas: Sequence[Form
             return True
         formulas = (*formulas, *further)
     return False
-
-
-def reselect(problem: Problem, joint: JointFit, again: Sequence[Choice]) -> JointFit:
-    """Return the fit without effects that others make superfluous, and with the best forms of the rest.
-
-    Args:
-        problem: the data.
-        joint: kinematics and effects; returned itself where nothing changes.
-        again: those of its effects to look at.
-    """
-    names = {str(c) for c in again}
-    for _ in range(_FORMS):
-        before = joint
-        joint = _reselect_once(problem, before, [c for c in before.choices if str(c) in names])
-        if joint is before:
-            break
-    return joint
-
-
-def explain_outliers(problem: Problem, joint: JointFit) -> JointFit:
-    """Return the fit with its effects in forms that explain its outliers too, or itself where these are less likely.
-
-    The few fixes beyond the loads of all others are outliers to a straight line, and the only ones that show a curve.
-
-    Args:
-        problem: the data.
-        joint: kinematics and effects.
-    """
-    if (joint.fit.weight >= OUTLIER).all():
-        return joint
-    every = replace(joint, fit=replace(joint.fit, weight=np.ones_like(joint.fit.weight)))
-    tried = reselect(problem, every, joint.choices)
-    return tried if tried is not every and tried.fit.cost < joint.fit.cost else joint
-
-
-def _reselect_once(problem: Problem, joint: JointFit, again: Sequence[Choice]) -> JointFit:
-    """Reselect each effect once, by the linear model about the fit."""
-    if len(joint.choices) < 2 or not again:
-        return joint
-    over = Projection(problem.solution, joint.situation, joint.fit, joint.additions)
-    candidates = [_with_variants(joint, over, choice, is_open=choice in again) for choice in joint.choices]
-    screen = Screen(over, candidates)
-    chosen = {number: (0, choice.scale) for number, choice in enumerate(joint.choices)}
-    for number, choice in enumerate(joint.choices):
-        if choice not in again:
-            continue
-        others = {k: v for k, v in chosen.items() if k != number}
-        beside = screen.beside(others)
-        values = {
-            one: beside.together(number, *one) + float(candidates[number].log_odds[one[0]])
-            for one in itertools.product(range(len(candidates[number].options)), {1.0, choice.scale})
-        }
-        best = max(values, key=values.__getitem__)
-        if values[best] < beside.log_bayes_factor:
-            chosen = others
-        elif values[best] > values[chosen[number]] + _BETTER:
-            chosen[number] = best
-    kept = [replace(candidates[n].options[option], scale=scale) for n, (option, scale) in chosen.items()]
-    if kept == list(joint.choices):
-        return joint
-    parts = [
-        replace(part, prior_sigma=part.prior_sigma * scale)
-        for n, (option, scale) in chosen.items()
-        for part in [candidates[n].additions[option]]
-    ]
-    return problem.fit(kept, over.solved(joined(parts, len(over.samples))))
-
-
-def _with_variants(joint: JointFit, over: Projection, choice: Choice, *, is_open: bool) -> CandidateEffect:
-    """Return the candidate of an effect in its present form, and in its other variants where that is open."""
-    options = [replace(choice, scale=1.0)]
-    if is_open:
-        variants = variants_at(joint.situation, choice.family, choice.where)
-        options += [replace(v, regime=choice.regime) for v in variants if v.settings != choice.settings]
-    return candidate_at(joint.situation, over, choice.family, choice.where, options)

@@ -62,6 +62,7 @@ def calibrate(
         CalibrationError: LightGBM's system library is missing.
         ValueError: an unknown method or effect.
     """
+    observations = observations.numbered()
     model = identify(rig, rig_text, observations, prior=prior, method=method, effects=effects, run=run.part(0.0, 0.4))
     kind = METHODS[method].residual if residual == "default" else residual
     if kind == "torque network":
@@ -94,6 +95,7 @@ def identify(
         DataError, UnsafeError, ValueError: as `calibrate`.
     """
     require_positions(observations)
+    observations = observations.numbered()
     with run.workers() as pool:
         adopted = identify_by(method, Task(rig, observations, prior, effects, replace(run, executor=pool)))
         return build_model(rig, rig_text, observations, adopted, prior, {"seed": run.seed, "method": method})

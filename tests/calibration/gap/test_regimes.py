@@ -1,0 +1,104 @@
+"""Effects that act in a part of the data are named with the part, and machines that break are two machines."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from calibration.gap.result import GapResult
+from calibration.model.files import model_from_files, model_to_files
+from calibration.model.prediction import Predictor
+from calibration.observations import Observations, parse_observations
+from calibration.pipeline.find_gap import find_gap
+from daemon.config import load_rig
+from simulators.blind.cases import draw
+from simulators.blind.cells import Cell
+
+pytestmark = pytest.mark.slow
+
+SOURCE = load_rig("swdt82")
+
+
+def drawn(kind: Literal["regime", "null"], size: float, seed: int) -> Observations:
+    case = draw(SOURCE.rig, Cell(kind, (), size, "wide", "fine", seed))
+    assert case is not None
+    return parse_observations(case.train.encode(), SOURCE.rig, "case.csv")
+
+
+@pytest.fixture(scope="module")
+def coupled() -> tuple[GapResult, Observations]:
+    """A linkage coupling beyond 35 deg of theta1 alone."""
+    rows = drawn("regime", 3.0, 2069)
+    return find_gap(SOURCE.rig, SOURCE.text, rows), rows
+
+
+def test_an_effect_beyond_an_angle_is_named_with_the_angle(coupled: tuple[GapResult, Observations]) -> None:
+    (effect,) = coupled[0].effects
+    assert (effect.family, effect.where) == ("linkage_coupling", "theta1")
+    assert effect.regime is not None
+    assert (effect.regime.variable, effect.regime.above) == ("theta1_deg", True)
+    assert effect.regime.border == pytest.approx(35.1, abs=7.5)
+    assert "only where theta1_deg is above 35" in effect.form
+
+
+def test_it_does_nothing_in_the_other_rows_also_in_a_model_that_was_read_again(
+    coupled: tuple[GapResult, Observations],
+) -> None:
+    gap, rows = coupled
+    model = model_from_files(model_to_files(gap.model))
+    without = Predictor.of(replace(model, effects=()))
+    moved = np.linalg.norm(Predictor.of(model).effects_mm(rows) - without.effects_mm(rows), axis=1)
+    assert model.effects[0].regime is not None
+    inside = rows.joints["theta1"] > model.effects[0].regime.border
+    assert (moved[~inside] < 1e-9).all()
+    assert (moved[inside] > 1e-3).mean() > 0.9
+
+
+def test_without_times_the_border_is_a_row_and_later_rows_are_as_the_last() -> None:
+    rows = drawn("regime", 3.0, 2071)
+    gap = find_gap(SOURCE.rig, SOURCE.text, rows)
+    (effect,) = gap.effects
+    assert effect.regime is not None
+    assert (effect.family, effect.regime.variable, effect.regime.above) == ("joint_compliance", "row", True)
+    assert effect.regime.border == pytest.approx(155.5, abs=25.0)
+    later = Predictor.of(gap.model).effects_mm(rows)  # rows of another file: the machine as it is now
+    now = Predictor.of(gap.model).effects_mm(rows.numbered())
+    assert np.abs(later - now)[156:].max() < 1e-9
+    assert np.abs(later - now)[:150].max() > 1.0
+
+
+def test_a_machine_that_is_another_from_an_instant_on_is_found_and_told() -> None:
+    first, second = (drawn("null", 0.0, seed) for seed in (1945, 1963))
+    rows = joined(first.select(np.arange(100)), second)
+    gap = find_gap(SOURCE.rig, SOURCE.text, rows)
+    assert gap.machine_break is not None
+    assert (gap.verdict, gap.effects) == ("unidentified", ())
+    assert gap.machine_break.before == 100
+    assert "after time_s = " in (gap.description or "")
+    assert gap.as_dict()["break"] == gap.machine_break.as_dict()
+
+
+def test_one_machine_has_no_break() -> None:
+    gap = find_gap(SOURCE.rig, SOURCE.text, drawn("null", 0.0, 1945))
+    assert (gap.verdict, gap.machine_break) == ("none", None)
+
+
+def joined(a: Observations, b: Observations) -> Observations:
+    """One file of two machines, the second ten minutes after the first."""
+    extra = {name: np.concatenate([a.extra[name], b.extra[name]]) for name in a.extra if name in b.extra}
+    later = a.extra["time_s"].max() + 600.0 - b.extra["time_s"].min()
+    extra["time_s"] = np.concatenate([a.extra["time_s"], b.extra["time_s"] + later])
+    return replace(
+        a,
+        prism=np.concatenate([a.prism, b.prism]),
+        joints={name: np.concatenate([a.joints[name], b.joints[name]]) for name in a.joints},
+        position_mm=np.concatenate([a.position_mm, b.position_mm]),
+        sigma_mm=np.concatenate([a.sigma_mm, b.sigma_mm]),
+        setup=np.concatenate([a.setup, b.setup]),
+        session=np.concatenate([a.session, b.session]),
+        pose=np.array([str(number) for number in range(len(a) + len(b))]),
+        extra=extra,
+    )
