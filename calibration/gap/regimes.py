@@ -16,11 +16,12 @@ from calibration.effects.fitted import Choice
 from calibration.effects.regime import Regime, variables
 from calibration.gap.candidates import CandidateEffect, candidate_at, candidate_effects, variants_at
 from calibration.gap.joint_fit import JointFit, Problem
-from calibration.gap.projection import Integers, Projection, rows_of
+from calibration.gap.projection import Integers, Projection, SoftProjection, rows_of
 from calibration.gap.screening import Screen
 from calibration.observations import Floats
 
 _BORDERS = 6  # of a variable, at first
+_SCREENED = 500  # samples that choose which effects are fitted
 _LEAST = 0.05  # share of the samples on either side of a border
 _MOST_FORMS = 40  # of a candidate: one with more is a step at any time
 _FITTED = 8  # effects that are fitted at a time
@@ -39,12 +40,17 @@ class EffectInRegime:
     """An effect that acts in a part of the data.
 
     Attributes:
-        choice: the effect, with its regime.
+        joint: the fit with it, as its last effect.
         posterior: probability of the effect in this part among all effects and parts.
     """
 
-    choice: Choice
+    joint: JointFit
     posterior: float
+
+    @property
+    def choice(self) -> Choice:
+        """The effect, with its regime."""
+        return self.joint.choices[-1]
 
 
 def effect_in_regime(problem: Problem, joint: JointFit, families: Collection[str]) -> EffectInRegime | None:
@@ -75,7 +81,7 @@ def effect_in_regime(problem: Problem, joint: JointFit, families: Collection[str
         return None
     posterior = 1.0 / sum(math.exp(best.joint.fit.cost - own) for own in cost)
     is_certain = min(posterior, best.posterior) > _POSTERIOR
-    return EffectInRegime(best.joint.choices[-1], posterior) if is_certain else None
+    return EffectInRegime(best.joint, posterior) if is_certain else None
 
 
 @dataclass(frozen=True)
@@ -151,12 +157,13 @@ def _screened(projection: Projection, families: Collection[str]) -> list[tuple[C
     candidates = [c for c in every if len(set(c.first_equal)) <= _MOST_FORMS]
     values = {name: projection.samples.average(v[:, None])[:, 0] for name, v in variables(projection.situation).items()}
     log_prior = _REGIME - math.log(2.0 * max(len(values), 1))
-    columns, found = _Columns(projection, candidates), dict[int, tuple[Choice, float]]()
+    some = np.unique(np.linspace(0, len(projection.samples) - 1, _SCREENED).astype(np.intp))
+    columns, found = _Columns(projection, candidates, some), dict[int, tuple[Choice, float]]()
     for variable, own in values.items():
         border = borders(own, _BORDERS)
         if not len(border):
             continue
-        slice_of = np.searchsorted(border, np.where(np.isfinite(own), own, -math.inf))
+        slice_of = np.searchsorted(border, np.where(np.isfinite(own), own, -math.inf))[some]
         for number, evidence in enumerate(columns.evidence(len(border), slice_of)):
             most, candidate = float(evidence.max()), candidates[number]
             together = most + math.log(float(np.exp(evidence - most).sum()) / len(border))
@@ -181,15 +188,19 @@ def borders(values: Floats, count: int) -> Floats:
 
 
 class _Columns:
-    """Whitened columns of candidates, and their evidence in parts of the samples of a projection.
+    """Whitened columns of candidates, and their evidence in parts of some samples of a projection.
 
     Args:
         projection: about a fit.
         candidates: effects.
+        some: (s,) index of the samples.
     """
 
-    def __init__(self, projection: Projection, candidates: Sequence[CandidateEffect]) -> None:
-        self._projection, self._candidates = projection, candidates
+    def __init__(self, projection: Projection, candidates: Sequence[CandidateEffect], some: Integers) -> None:
+        rows = rows_of(some)
+        self._candidates = candidates
+        self._kinematics, self._target = projection.kinematics[rows], projection.target[rows]
+        self._without = SoftProjection(self._kinematics)
         self._of: dict[int, list[tuple[int, int]]] = {}  # number of columns -> candidates with their options
         for number, candidate in enumerate(candidates):
             for option, additions in enumerate(candidate.additions):
@@ -197,15 +208,15 @@ class _Columns:
         self._rows = {}
         for width, options in self._of.items():
             moved = (projection.moved_mm(candidates[n].additions[o]) for n, o in options)
-            self._rows[width] = np.hstack([projection.whitened(own) for own in moved])
-        self._removed_target = projection.without_kinematics.removed(projection.target)
+            self._rows[width] = np.hstack([projection.whitened(own)[rows] for own in moved])
+        self._removed_target = self._without.removed(self._target)
 
     def evidence(self, borders: int, slice_of: Integers) -> list[Floats]:
         """Return for each candidate (options, borders, 2) log evidence with the prior odds of its forms.
 
         Args:
             borders: number of borders, of which samples of slice i are above the first i.
-            slice_of: (m,) of each sample.
+            slice_of: (s,) of each sample.
 
         Returns:
             For the samples that are not above a border, and for those that are.
@@ -227,15 +238,14 @@ class _Columns:
             width: k.
             index: rows of each of b + 1 slices.
         """
-        over = self._projection
         with_kinematics, with_target, grams = [], [], []
         for rows in index:
             own = columns[rows]
-            with_kinematics.append(over.kinematics[rows].T @ own)
-            with_target.append(over.target[rows] @ own)
+            with_kinematics.append(self._kinematics[rows].T @ own)
+            with_target.append(self._target[rows] @ own)
             blocks = np.ascontiguousarray(own.reshape(len(own), -1, width).swapaxes(0, 1))
             grams.append(blocks.swapaxes(1, 2) @ blocks)
-        removed = over.without_kinematics.removed_by(_on_both_sides(with_kinematics))
+        removed = self._without.removed_by(_on_both_sides(with_kinematics))
         along = _on_both_sides(with_target) - np.einsum("...qk,q->...k", removed, self._removed_target)
         removed = np.moveaxis(removed.reshape(*removed.shape[:3], -1, width), 3, 0)
         gram = np.moveaxis(_on_both_sides(grams), 2, 0) - removed.swapaxes(-1, -2) @ removed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
@@ -58,7 +59,9 @@ def search(
     """
     seen = in_true_steps(solution, observations, prior)
     problem = Problem(seen, observations, prior, seed)
-    found = _beside_background(problem, families, _in_regimes(problem, families, _Search(problem, families).run()))
+    whole = _Search(problem, families)
+    found = _in_regimes(problem, families, whole.run(), whole.least_cost)
+    found = _beside_background(problem, families, found)
     found = replace(found, machine_break=find_break(problem, found.joint))
     if seen is solution:
         return found
@@ -76,11 +79,15 @@ class _Search:
         problem: the data.
         families: of effects that may be named.
         known: an effect to begin with, which stays.
+
+    Attributes:
+        least_cost: of all fits on the way, in nats.
     """
 
     def __init__(self, problem: Problem, families: Collection[str], known: EffectInRegime | None = None) -> None:
         self.problem, self.families, self.known = problem, tuple(families), known
         self._initial: tuple[CandidateEffect, ...] = ()
+        self.least_cost = math.inf
 
     def run(self) -> SearchResult:
         """Search without gross outliers, and with all samples where there are many such.
@@ -153,6 +160,7 @@ class _Search:
             steps.insert(-1, step)
             posterior |= {str(c): step.posterior[c.family] for c in step.adopted}
         joint = explain_outliers(self.problem, joint)
+        self.least_cost = min(self.least_cost, joint.fit.cost)
         return conclude(self.problem, joint, alone, steps, alternatives, selection.formulas, posterior, initial)
 
     def _candidates(self, joint: JointFit) -> tuple[Projection, tuple[CandidateEffect, ...]]:
@@ -229,23 +237,29 @@ def _step(joint: JointFit, projection: Projection, selection: Selection, taken: 
     return SelectionStep(joint, projection, selection.scored, selection.posterior, taken, selection.reasons)
 
 
-def _in_regimes(problem: Problem, families: Collection[str], found: SearchResult) -> SearchResult:
+def _in_regimes(problem: Problem, families: Collection[str], found: SearchResult, least_cost: float) -> SearchResult:
     """Return a result with an effect that acts in a part of the data, where that leaves noise and is the likelier one.
 
     Rows in which it acts may seem to be outliers to anything else, so that all rows count where there are many such.
+
+    Args:
+        problem: the data.
+        families: of effects that may be named.
+        found: with effects that act in all rows.
+        least_cost: of the fits that led to it, also of those with effects that it was not sure of.
     """
     alone = problem.with_mild_outliers(problem.kinematics_only())
     starts = [alone, *([found.joint] if found.joint.choices else [])]
     if (alone.fit.weight < OUTLIER).mean() >= _MANY:
         starts.append(replace(alone, fit=replace(alone.fit, weight=np.ones_like(alone.fit.weight))))
-    is_open = not _leaves_noise(problem, found)
     for start in starts:
         one = effect_in_regime(problem, start, families)
-        if one is None:
+        if one is None or least_cost - one.joint.fit.cost < _REGIME:
             continue
+        if start is found.joint and detect(Grammar(problem.project(one.joint)), problem.rng()).significant:
+            continue  # all others are there already
         tried = _Search(problem, families, one).run()
-        is_likelier = found.joint.fit.cost - tried.joint.fit.cost > _REGIME
-        if tried.joint.choices and (is_open or is_likelier) and _leaves_noise(problem, tried):
+        if tried.joint.choices and _leaves_noise(problem, tried):
             return tried
     return found
 
