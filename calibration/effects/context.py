@@ -136,6 +136,16 @@ class EffectContext:
         moved = np.stack([*tilts, np.tile(axes[2], (len(self), 1))], axis=2)
         return self.to_station(moved * amount[:, None, None])
 
+    def base_shift_mm(self, amount: Floats) -> Floats:
+        """Return (n, 3, 3) displacements in the station's frame as the base moves over the ground by `amount` (n,).
+
+        The columns are shifts along the level axes x and y, mm per mm, and a turn about the upright axis through the
+        base frame's origin, mm per rad; see `level_axes`.
+        """
+        x, y, up = level_axes(self.rig.gravity)
+        moved = np.stack(np.broadcast_arrays(x, y, np.cross(up, self.located.prism_mm)), axis=2)
+        return self.to_station(moved * amount[:, None, None])
+
     # -- loads ---------------------------------------------------------------------------------------------------------
 
     @cached_property

@@ -187,11 +187,11 @@ def _by_place(rig: Rig, alternatives: Sequence[FittedEffect]) -> Iterator[Experi
 
 
 def _row(rig: Rig, where: str) -> int | None:
-    """Return the first row that an effect at a joint value or the boom moves; None for all others."""
+    """Return the first row that an effect at a joint value, a passive row or the boom moves; None for all others."""
     if where == "boom":
         boom = boom_of(rig)
         return None if boom is None else boom[0]
-    return next((number for number, _, name, _ in rig.couplings() if name == where), None)
+    return next((number for number, _, name, _ in rig.couplings() if where in (name, f"row{number}")), None)
 
 
 def _as_the_library_says(alternatives: Sequence[FittedEffect]) -> Iterator[Experiment]:

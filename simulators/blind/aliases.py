@@ -78,6 +78,22 @@ def _lowered(scene: Scene, rng: np.random.Generator) -> tuple[Scene, str]:
     return _changed(scene, change), where
 
 
+def _from_the_other_side(scene: Scene, rng: np.random.Generator) -> tuple[Scene, str]:
+    """Two short visits, and a joint that comes from below in the first and from above in the second.
+
+    Its play is then as a zero that stepped in between.
+    """
+    where = _one_of([p for p in scene.draws.places("backlash") if p in scene.draws.places("zero_step")], rng)
+
+    def change(fixes: Fixes) -> dict[str, Floats]:
+        time_s, visit = _visits(scene, fixes)
+        side = 1.0 - 2.0 * visit
+        rate = np.abs(fixes.columns[f"{where}_rate"]) * side
+        return {"time_s": time_s, f"{where}_dir": side, f"{where}_rate": rate}
+
+    return _at_other_times(scene, change), where
+
+
 def _pressed(scene: Scene, rng: np.random.Generator) -> tuple[Scene, str]:
     """A pressure that follows the stroke: its compression of the cylinder is as a wrong scale."""
     where = _one_of(list(scene.draws.places("cylinder_compression")), rng)
@@ -94,6 +110,7 @@ _MADE: Mapping[str, Callable[[Scene, np.random.Generator], tuple[Scene, str]]] =
     "load_hysteresis|joint_compliance": _lowered,
     "cylinder_compression|transducer_scale": _pressed,
     "latency|clock_drift": _creeping_later,
+    "backlash|zero_step": _from_the_other_side,
 }
 
 

@@ -18,6 +18,7 @@ ALIASES = (
     "load_hysteresis|joint_compliance",
     "cylinder_compression|transducer_scale",
     "latency|clock_drift",
+    "backlash|zero_step",
 )
 KINDS: tuple[Kind, ...] = get_args(Kind)
 LEAST_IN_MACHINE = 3.0  # visible size of each of its effects

@@ -56,7 +56,8 @@ class EffectDraws:
         """Places of an effect on the rig, empty if there are none; KeyError if there is no such family."""
         kind, rig = FAMILIES[family], self.rig
         found = []
-        for where in (*rig.joint_names, "boom", "base", "clock", "station", *self.prisms):
+        rows = (f"row{number}" for number in range(1, len(rig.rows) + 1))
+        for where in (*rig.joint_names, "boom", "base", "clock", "station", *self.prisms, *rows):
             try:
                 kind(where=where).check(rig)
             except ValueError:
@@ -93,6 +94,9 @@ class EffectDraws:
         if effect.bounded_at == "largest_load":
             load = max(self._loads.values()) if effect.where == "base" else self._loads[effect.where]
             return {name: bound / load for name, bound in bounds.items()}
+        if effect.bounded_at == "largest_moment":
+            moment = self._largest_moment(effect.moment_row(self.rig))
+            return {name: bound / moment for name, bound in bounds.items()}
         size = {name: abs(float(getattr(effect, name))) for name in bounds}
         small: dict[str, Any] = {name: 1e-3 * value for name, value in size.items()}
         moved_mm = self._tip_mm([replace(effect, **small)]) - self._tip_mm([])
@@ -118,6 +122,18 @@ class EffectDraws:
             for j in self.rig.joints
             if j.kind == "revolute"
         }
+
+    def _largest_moment(self, row: int) -> float:
+        """Largest moment of the weights that a row carries in the work volume, N m."""
+        if row not in self._moments:
+            moments = self._nominal.row_moment(row, self._volume)
+            self._moments[row] = float(np.linalg.norm(moments, axis=1).max())
+        return self._moments[row]
+
+    @cached_property
+    def _moments(self) -> dict[int, float]:
+        """Row -> largest moment, of those that were asked for."""
+        return {}
 
     def _tip_mm(self, effects: Sequence[Effect]) -> Floats:
         tip = max(self.rig.prisms, key=lambda prism: prism.frame).name

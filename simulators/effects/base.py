@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, Protocol
 
@@ -54,6 +54,9 @@ class Body(Protocol):
     def beam(self, row: int) -> Beam:
         """Beam of a row's driven length `a`, with the loads on it."""
 
+    def turning(self, row: int) -> Turning:
+        """Axis of a row's driven angle `theta`, with the moment on it."""
+
 
 @dataclass(frozen=True)
 class Beam:
@@ -74,6 +77,21 @@ class Beam:
     force_newton: Floats
     moment_newton_m: Floats
     own_weight_newton: Floats
+
+
+@dataclass(frozen=True)
+class Turning:
+    """A row where it turns, at n instants, in the base frame.
+
+    Attributes:
+        axis: (n, 3) unit vector.
+        straight_mm: (n, 3) the place on it where the row turns, of a machine without bends.
+        moment_newton_m: (n, 3) moment about that place, bends included, of all weights that turn with the row.
+    """
+
+    axis: Floats
+    straight_mm: Floats
+    moment_newton_m: Floats
 
 
 @dataclass(frozen=True)
@@ -101,11 +119,13 @@ class Sight:
         prism: its name.
         place_mm: (n, 3) where it is.
         axes: (n, 3, 3) the axes of the frame that it is fixed to, as columns.
+        column: (n,) of an observation column, by its name; ValueError when the caller did not give it.
     """
 
     prism: str
     place_mm: Floats
     axes: Floats
+    column: Callable[[str], Floats]
 
 
 class DrawContext(Protocol):
@@ -139,7 +159,8 @@ class Effect:
         amplitudes: coefficients that scale the effect (twice of each is twice the effect) -> hard bound of
             plausible values.
         bounded_at: the quantity that the bounds limit: the coefficient itself, the angle (rad) at the largest load of
-            the rig's own weights on the joint, or the displacement (mm) of the last prism in the work volume.
+            the rig's own weights on the joint, or at their largest moment where the row `moment_row` turns, or the
+            displacement (mm) of the last prism in the work volume.
         has_either_sign: drawn amplitudes are positive or negative.
         needs_load: it acts only on joints that carry a noticeable part of the rig's weight.
         acts_at: kinds of places: `joint`, `revolute`, `prismatic`, `prism`, or `boom`, `base`, `clock`, `station`.
@@ -149,7 +170,7 @@ class Effect:
 
     family: ClassVar[str]
     amplitudes: ClassVar[Mapping[str, float]]
-    bounded_at: ClassVar[Literal["coefficient", "largest_load", "full_reach"]] = "coefficient"
+    bounded_at: ClassVar[Literal["coefficient", "largest_load", "largest_moment", "full_reach"]] = "coefficient"
     has_either_sign: ClassVar[bool] = False
     needs_load: ClassVar[bool] = False
     acts_at: ClassVar[tuple[str, ...]] = ("joint",)
@@ -169,6 +190,10 @@ class Effect:
         for name in self.positive:
             if getattr(self, name) <= 0.0:
                 raise ValueError(f"{self.family}@{self.where}: {name} must be positive, not {getattr(self, name):g}")
+
+    def moment_row(self, rig: Rig) -> int:
+        """Number of the row whose moment bounds it; ValueError where another quantity does."""
+        raise ValueError(f"{self.family}: no moment bounds it on rig {rig.name!r}")
 
     def draw_shape(self, data: DrawContext, rng: np.random.Generator) -> Effect:
         """Return the effect with random values of its coefficients other than the amplitudes."""
@@ -241,6 +266,13 @@ def boom_stroke(rig: Rig) -> str:
     if stroke is None:
         raise ValueError(f"rig {rig.name!r} has no prismatic joint")
     return stroke
+
+
+def first_turned(rig: Rig) -> dict[str, int]:
+    """Revolute joint -> number of the first row that it turns; joints that turn none are left out."""
+    rows = {(number, joint) for number, what, joint, _ in rig.couplings() if what == "theta"}
+    of_joint = {joint.name: [n for n, name in rows if name == joint.name] for joint in rig.joints}
+    return {j.name: min(of_joint[j.name]) for j in rig.joints if j.kind == "revolute" and of_joint[j.name]}
 
 
 def step_time_s(data: DrawContext, rng: np.random.Generator) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.rig.description import Rig
-from simulators.effects.base import Beam, Bend
+from simulators.effects.base import Beam, Bend, Turning
 from simulators.rig.screws import Posture, RowConstants, Screw, rotation_by_vector
 
 Floats = NDArray[np.float64]
@@ -138,6 +138,17 @@ class LoadedBody:
             elif mass.frame == row - 1:
                 own += weight
         return Beam(axis, length_mm / 1e3, straight_tip, force, moment, own)
+
+    def turning(self, row: int) -> Turning:
+        """Axis of a row's driven angle `theta`, with the moment on it."""
+        index, screw = next((i, s) for i, s in enumerate(self.posture.chain.screws) if s.row == row and s.turns)
+        axis, place = self._axis(index, screw)
+        moment = np.zeros_like(place)
+        for mass in self.masses:
+            if self.posture.chain.carries(index, mass.frame):
+                arm_m = (self.place_mm(mass.frame, mass.place_mm) - place) / 1e3
+                moment += _cross(arm_m, self._weight_newton(mass))
+        return Turning(axis, self.posture.axis(index)[1] * (1.0 + self.growth)[:, None], moment)
 
     def _axis(self, index: int, screw: Screw) -> tuple[Floats, Floats]:
         axis, point = self.posture.axis(index)

@@ -163,7 +163,7 @@ class RigTruth:
         station_mm = placement.to_station_mm(body.place_mm(frame, place))
         if not self.effects:
             return station_mm
-        sight = Sight(name, station_mm, placement.rotation @ body.axes(frame))
+        sight = Sight(name, station_mm, placement.rotation @ body.axes(frame), body.column)
         shifts = [shift for effect in self.effects if (shift := effect.fix_shift_mm(sight)) is not None]
         return station_mm + np.sum(shifts, axis=0) if shifts else station_mm
 
@@ -180,6 +180,20 @@ class RigTruth:
         """
         loose = replace_effects(self, ()) if self.effects else self
         return loose._solve(joints, columns or {}, setup).torque(joint)
+
+    def row_moment(
+        self, row: int, joints: Mapping[str, Floats], columns: Mapping[str, Floats] | None = None, *, setup: str = ""
+    ) -> Floats:
+        """(n, 3) moment of all weights that turn with a row about the place where it turns, N m, in the base frame.
+
+        Args:
+            row: its number; `theta` of it is driven.
+            joints: as for `gravity_load`.
+            columns: as for `gravity_load`.
+            setup: as for `gravity_load`.
+        """
+        loose = replace_effects(self, ()) if self.effects else self
+        return loose._solve(joints, columns or {}, setup).turning(row).moment_newton_m
 
     def _solve(self, joints: Mapping[str, Floats], columns: Mapping[str, Floats], setup: str | None) -> LoadedBody:
         read = {}

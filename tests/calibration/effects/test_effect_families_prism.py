@@ -43,6 +43,9 @@ ALIKE: Mapping[str, tuple[str, str, tuple[float, ...]]] = {
         (3e-4, -1e-4, -2.0),
     ),
     "base_compliance@base:x_rad_per_Nm=6e-9:y_rad_per_Nm=3e-9": ("base_compliance", "base", (6e-9, 3e-9)),
+    "lateral_compliance@theta3:compliance_rad_per_Nm=6e-9": ("lateral_compliance", "theta3", (6e-9,)),
+    "lateral_compliance@theta7:compliance_rad_per_Nm=3e-8": ("lateral_compliance", "theta7", (3e-8,)),
+    "passive_compliance@row2:compliance_rad_per_Nm=6e-9": ("passive_compliance", "row2", (6e-9,)),
     "latency@clock:seconds=0.02": ("latency", "clock", (0.02,)),
     "clock_drift@clock:ppm=5": ("clock_drift", "clock", (5.0,)),
     "station_scale@station:ppm=50": ("station_scale", "station", (50.0,)),
@@ -51,7 +54,7 @@ ALIKE: Mapping[str, tuple[str, str, tuple[float, ...]]] = {
     "prism_incidence@r:cos1_mm=2:sin1_mm=-1": ("prism_incidence", "r", (2.0, -1.0)),
     "linkage_coupling@theta1:coupling=-2e-3": ("linkage_coupling", "theta1", (-2e-3,)),
 }
-MINE = sorted({family for family, _, _ in ALIKE.values()} | {"base_step"})
+MINE = sorted({family for family, _, _ in ALIKE.values()} | {"base_step", "base_shift", "prism_seat_step"})
 
 
 def shift_columns(rig: Rig, n: int, rng: np.random.Generator) -> dict[str, Floats]:
@@ -145,21 +148,82 @@ def test_a_coupled_row_follows_every_joint_that_drives_it() -> None:
         assert rms(additions.shifted_mm(np.array([2e-3])) - shift) < 0.005 * rms(shift)
 
 
-def test_a_step_of_the_base_acts_after_its_instant(machine: RigTruth, still: Observations) -> None:
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("base_step@base:tilt_x_rad=1e-3:tilt_y_rad=-2e-3:z_mm=5", (1e-3, -2e-3, 5.0)),
+        ("base_shift@base:x_mm=6:y_mm=-9:heading_rad=1e-3", (6.0, -9.0, 1e-3)),
+        ("prism_seat_step@r:x_mm=9:y_mm=-12:z_mm=15", (9.0, -12.0, 15.0)),
+    ],
+)
+def test_a_step_acts_after_its_instant(
+    text: str, values: tuple[float, ...], machine: RigTruth, still: Observations
+) -> None:
     after = float(np.sort(still.extra["time_s"])[70]) - 1.0
-    text = f"base_step@base:tilt_x_rad=1e-3:tilt_y_rad=-2e-3:z_mm=5:time_s={after}"
-    hidden = measured(replace_effects(machine, parse_effects(text)), 120, 2)
+    (simulated,) = parse_effects(f"{text}:time_s={after}")
+    hidden = measured(replace_effects(machine, [simulated]), 120, 2)
     situation = placed(machine, hidden)
-    family = moving_prisms("base_step")
-    grid = family.variants(situation, "base")
+    family, where = moving_prisms(simulated.family), simulated.where
+    grid = family.variants(situation, where)
     near = min(grid, key=lambda settings: abs(settings["time_s"] - after))
-    fine = family.refined(situation, "base", near)
-    exact = min(fine, key=lambda settings: abs(settings["time_s"] - after))
+    finer = family.refined(situation, where, near)  # none where the grid has every instant
+    exact = min(finer or grid, key=lambda settings: abs(settings["time_s"] - after))
     assert abs(exact["time_s"] - after) < 2.0 * np.sqrt(3.0) * exact["time_error_s"]
-    additions = Choice("base_step", "base", exact).columns(situation)
+    additions = Choice(simulated.family, where, exact).columns(situation)
     shift = hidden.position_mm - still.position_mm
     assert rms(shift) > 5.0
-    assert rms(additions.shifted_mm(np.array([1e-3, -2e-3, 5.0])) - shift) < 0.01 * rms(shift)
+    assert rms(additions.shifted_mm(np.array(values)) - shift) < 0.01 * rms(shift)
+
+
+def test_a_carrier_that_turns_on_the_spot_has_a_form_with_its_heading_alone(
+    machine: RigTruth, still: Observations
+) -> None:
+    family, situation = moving_prisms("base_shift"), placed(machine, still)
+    moved, turned = (
+        next(s for s in family.variants(situation, "base") if bool(family.form(s)) is on_the_spot)
+        for on_the_spot in (False, True)
+    )
+    assert (family.form(turned), family.names(turned)) == ("turned on the spot", ("heading_rad",))
+    np.testing.assert_array_equal(
+        family.shift_mm(situation, "base", turned), family.shift_mm(situation, "base", moved)[:, :, 2:]
+    )
+    assert all(family.form(form) for form in family.refined(situation, "base", turned))
+    (effect,) = (Choice("base_shift", "base", turned).fitted(situation, np.array([1e-3]), np.array([1e-4])),)
+    assert [c.name for c in effect.reported] == ["x_mm", "y_mm", "heading_rad", "time_s"]
+    assert [c.value for c in effect.reported[:3]] == [0.0, 0.0, 1e-3]
+
+
+@pytest.mark.parametrize(("name", "where"), [("ur10", "q4"), ("ys100", "theta4")])
+def test_a_link_of_any_convention_gives_way_where_its_joint_is(name: str, where: str) -> None:
+    rig = shipped_rig(name)
+    known = tuple(prism.model_copy(update={"offset_known": True}) for prism in rig.prisms)
+    truth = RigTruth(rig.model_copy(update={"prisms": known}), 4, perturbation=0.0)
+    still = measured(truth, 40, 2)
+    situation = placed(truth, still)
+    settings = library()["lateral_compliance"].variants(situation, where)[0]
+    (own,) = library()["lateral_compliance"].coefficients(situation, where, settings)
+    value = 5.0 * own.sigma
+    soft = replace_effects(truth, parse_effects(f"lateral_compliance@{where}:compliance_rad_per_Nm={value}"))
+    prism = rig.prism_names[0]
+    shift = soft.prism_mm(prism, still.joints) - truth.prism_mm(prism, still.joints)
+    found = Choice("lateral_compliance", where, settings).columns(situation).shifted_mm(np.array([value]))
+    assert rms(shift) > 0.2
+    assert rms(found - shift) < 0.01 * rms(shift)
+
+
+def test_whatever_the_weights_are_a_links_turn_has_few_shapes(machine: RigTruth, still: Observations) -> None:
+    situation, rng = placed(machine, still), np.random.default_rng(1)
+    for name, where in (("lateral_compliance", "theta3"), ("passive_compliance", "row2")):
+        family = moving_prisms(name)
+        plain, shaped = family.variants(situation, where)
+        columns = family.shift_mm(situation, where, shaped).reshape(-1, len(family.names(shaped)))
+        np.testing.assert_allclose(family.shift_mm(situation, where, plain).ravel(), columns[:, 0], rtol=1e-12)
+        for _ in range(5):
+            masses = tuple(m.model_copy(update={"kg": m.kg * (1.0 + rng.uniform(-0.15, 0.15))}) for m in BOOM.masses)
+            other = Chain(BOOM.model_copy(update={"masses": masses}), situation.chain.placements)
+            turned = family.shift_mm(EffectContext(other, situation.x, still), where, plain).ravel()
+            found, *_ = np.linalg.lstsq(columns, turned)
+            assert rms((turned - columns @ found).reshape(-1, 3)) < 3e-3 * rms(turned.reshape(-1, 3))
 
 
 def test_a_droop_grows_as_a_cantilever_does() -> None:
@@ -343,6 +407,14 @@ def test_machines_without_a_telescope_or_a_linkage_have_no_place_for_what_needs_
     assert families["linkage_coupling"].places(robot) == ()
     assert families["linkage_coupling"].places(BOOM) == ("theta1",)
     assert families["linkage_coupling"].places(torso) == ("q1", "q2")
+    assert families["passive_compliance"].places(robot) == ()
+    assert families["passive_compliance"].places(BOOM) == ("row2",)
+    levers = parse_rig((RIGS / "levers.toml").read_text(encoding="utf-8"), "levers.toml")
+    assert families["passive_compliance"].places(levers) == ("row2",)  # a cylinder turns it
+    assert families["lateral_compliance"].places(robot) == tuple(f"theta{number}" for number in range(2, 7))
+    assert families["lateral_compliance"].places(BOOM) == tuple(f"theta{number}" for number in range(3, 9))
+    assert families["zero_step"].places(BOOM) == tuple(n for n in BOOM.joint_names if n.startswith("theta"))
+    assert families["prism_seat_step"].places(BOOM) == BOOM.prism_names
     assert families["prism_constant"].places(robot) == ("tool",)
     assert families["prism_constant"].places(BOOM) == ("w", "b", "r", "s", "station")
 
@@ -350,14 +422,14 @@ def test_machines_without_a_telescope_or_a_linkage_have_no_place_for_what_needs_
 def test_effects_that_the_rows_cannot_show_take_no_form(machine: RigTruth, still: Observations) -> None:
     families = library()
     bare = placed(machine, replace(still, extra={}))
-    for name in ("thermal_expansion", "base_settlement", "base_step", "latency", "clock_drift"):
+    for name in ("thermal_expansion", "base_settlement", "base_step", "base_shift", "latency", "clock_drift"):
         (where,) = families[name].places(BOOM)
         assert families[name].needs(where)
         assert not families[name].known(bare, where).any()
         assert families[name].variants(bare, where) == ()
     constant = {name: np.full(len(still), values[0]) for name, values in still.extra.items()}
     constant |= {f"{name}_rate": np.zeros(len(still)) for name in BOOM.joint_names}
-    for name in ("thermal_expansion", "base_settlement", "base_step", "latency", "clock_drift"):
+    for name in ("thermal_expansion", "base_settlement", "base_step", "base_shift", "latency", "clock_drift"):
         (where,) = families[name].places(BOOM)
         assert families[name].variants(placed(machine, replace(still, extra=constant)), where) == ()
     first = placed(machine, still.select(still.prism == "w"))
@@ -376,7 +448,9 @@ def test_effects_that_the_rows_cannot_show_take_no_form(machine: RigTruth, still
         np.testing.assert_array_equal(moving_prisms(name).shift_mm(without, "boom", settings), 0.0)
 
 
-@pytest.mark.parametrize("name", ["thermal_expansion", "base_settlement", "base_step", "latency", "clock_drift"])
+@pytest.mark.parametrize(
+    "name", ["thermal_expansion", "base_settlement", "base_step", "base_shift", "latency", "clock_drift"]
+)
 def test_rows_that_lack_a_column_are_left_alone_and_made_as_uncertain_as_the_effect_was(
     name: str, machine: RigTruth, still: Observations
 ) -> None:

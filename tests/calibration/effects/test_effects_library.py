@@ -42,6 +42,11 @@ REPORTED = {
     "base_settlement": ("tilt_x_rad_per_h", "tilt_y_rad_per_h", "z_mm_per_h"),
     "base_step": ("tilt_x_rad", "tilt_y_rad", "z_mm", "time_s"),
     "base_compliance": ("x_rad_per_Nm", "y_rad_per_Nm"),
+    "base_shift": ("x_mm", "y_mm", "heading_rad", "time_s"),
+    "zero_step": ("jump_rad", "time_s"),
+    "prism_seat_step": ("x_mm", "y_mm", "z_mm", "time_s"),
+    "lateral_compliance": ("compliance_rad_per_Nm",),
+    "passive_compliance": ("compliance_rad_per_Nm",),
     "payload_change": ("compliance_rad_per_Nm",),
     "cylinder_compression": ("mm_per_bar",),
     "leak_down": ("rad_per_s",),
@@ -61,6 +66,7 @@ BESIDE_THE_MACHINE = {
     "base_settlement",
     "base_step",
     "base_compliance",
+    "base_shift",
 }
 FAMILIES = sorted(library().items())
 ROWS = 40

@@ -67,6 +67,10 @@ AT_JOINTS: dict[str, tuple[dict[str, Matrix], Change]] = {
         {"time_s": TIME_S},
         lambda truth, q: np.where(TIME_S > 2000.0, 7.0, 0.0),
     ),
+    "zero_step@theta4:jump_rad=4e-3:time_s=2000": (
+        {"time_s": TIME_S},
+        lambda truth, q: np.where(TIME_S > 2000.0, 4e-3, 0.0),
+    ),
     "transducer_cumulative@L2:mm_per_m=0.2": (
         {},
         lambda truth, q: 0.2 * np.append(0.0, np.cumsum(np.abs(np.diff(q["L2"])))) / 1e3,
@@ -203,6 +207,59 @@ def test_a_base_step_turns_and_lifts_the_whole_machine_after_its_time(truth, joi
     assert np.allclose(got[~late], before[~late], atol=1e-9)
 
 
+def test_a_base_shift_moves_and_turns_the_whole_machine_over_the_ground_after_its_time(truth, joints) -> None:
+    text = "base_shift@base:x_mm=30:y_mm=-10:heading_rad=5e-3:time_s=2000"
+    got = in_base(truth, place(truth, text, joints, time_s=TIME_S))
+    before = in_base(truth, truth.prism_mm("r", joints))
+    c, s = np.cos(5e-3), np.sin(5e-3)
+    turned = before @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T + [30.0, -10.0, 0.0]
+    late = TIME_S > 2000.0
+    assert np.allclose(got[late], turned[late], atol=1e-6)
+    assert np.allclose(got[~late], before[~late], atol=1e-9)
+
+
+def test_a_prism_that_slips_in_its_seat_is_elsewhere_in_its_frame_and_no_other_is(truth, joints) -> None:
+    text = "prism_seat_step@r:x_mm=5:y_mm=-3:z_mm=8:time_s=2000"
+    moved = place(truth, text, joints, time_s=TIME_S) - truth.prism_mm("r", joints)
+    for i, T in enumerate(frames(truth, joints)):
+        slipped = truth.placement().rotation @ T[9][:3, :3] @ [5.0, -3.0, 8.0]
+        assert np.allclose(moved[i], slipped if TIME_S[i] > 2000.0 else 0.0, atol=1e-8)
+    assert np.array_equal(place(truth, text, joints, prism="s", time_s=TIME_S), truth.prism_mm("s", joints))
+
+
+def test_a_link_that_gives_way_to_the_side_turns_about_its_bearing_across_its_axis(truth, joints) -> None:
+    """The slewing column's bearing, at the origin of frame 3, under all weights beyond: moments from matrices."""
+    soft = 5e-9
+    moved = in_base(truth, place(truth, f"lateral_compliance@theta3:compliance_rad_per_Nm={soft}", joints))
+    moved = moved - in_base(truth, truth.prism_mm("r", joints))
+    down = truth.placement().rotation.T @ [0.0, 0.0, -9.80665]
+    masses = truth._build_masses(np.random.default_rng([truth.seed, 2]), 1.0)
+    for i, T in enumerate(frames(truth, joints)):
+        bearing, axis = T[3][:3, 3], T[3][:3, 2]
+        moment = np.zeros(3)
+        for mass in masses:
+            if mass.frame >= 3:
+                place_mm = T[mass.frame][:3, :3] @ mass.place_mm + T[mass.frame][:3, 3]
+                moment += np.cross((place_mm - bearing) / 1e3, mass.kg * down)
+        tilt = soft * (moment - (moment @ axis) * axis)
+        arm = in_base(truth, truth.prism_mm("r", joints))[i] - bearing
+        assert np.allclose(moved[i], np.cross(tilt, arm), atol=0.01 * np.linalg.norm(moved[i]))
+    assert np.abs(moved).max() > 2.0
+
+
+def test_a_coupled_row_gives_way_and_the_joints_own_row_does_not(truth, joints) -> None:
+    """Row 2 of the boom keeps its bracket upright: it turns about its own axis, in a direction that is level."""
+    text = "passive_compliance@row2:compliance_rad_per_Nm=5e-9"
+    moved = in_base(truth, place(truth, text, joints)) - in_base(truth, truth.prism_mm("r", joints))
+    for i, T in enumerate(frames(truth, joints)):
+        arm = in_base(truth, truth.prism_mm("r", joints))[i] - T[2][:3, 3]
+        # Small turns about the axis are across arm and axis both.
+        size = np.linalg.norm(moved[i]) * np.linalg.norm(arm)
+        assert abs(moved[i] @ arm) < 0.01 * size
+        assert abs(moved[i] @ T[2][:3, 2]) < 0.01 * size
+    assert np.abs(moved).max() > 2.0
+
+
 def test_settlement_grows_by_the_hour_from_the_first_row(truth, joints) -> None:
     text = "base_settlement@base:tilt_x_rad_per_h=0:tilt_y_rad_per_h=5e-4:z_mm_per_h=-1.5"
     got = in_base(truth, place(truth, text, joints, time_s=TIME_S))
@@ -332,6 +389,9 @@ NEEDS = {
     "solar_bow@theta4": "temperature_degC",
     "base_settlement@base": "time_s",
     "base_step@base": "time_s",
+    "base_shift@base": "time_s",
+    "zero_step@theta4": "time_s",
+    "prism_seat_step@r": "time_s",
     "payload_change@theta4": "payload_kg",
     "cylinder_compression@L3": "L3_bar",
     "leak_down@theta4": "dwell_s",
@@ -359,6 +419,8 @@ def test_what_an_effect_needs_and_the_caller_lacks_is_said(truth, joints, text: 
         *("prism_incidence@station", "linkage_coupling@theta4", "linkage_coupling@L2", "pad_play@L2"),
         *("payload_change@L2", "joint_error_map@theta4:length_deg=0", "joint_error_map@theta4:highest=2"),
         *("cross_law@theta1", "gear_mesh@L3", "thermal_cross@L2", "stick_slip_rate@theta4:deg_per_s=0"),
+        *("zero_step@L2", "prism_seat_step@theta4", "prism_seat_step@station", "base_shift@boom"),
+        *("lateral_compliance@theta1", "lateral_compliance@L2", "passive_compliance@row1", "passive_compliance@theta1"),
         *("creep@theta4:tau_s=0", "twist_by_reach@theta4", "base_rocking@boom", "prism_mast_bend@station"),
     ],
 )
@@ -368,7 +430,15 @@ def test_an_effect_at_an_impossible_place_or_of_an_impossible_shape_is_refused(s
 
 
 @pytest.mark.parametrize(
-    "text", ["pad_play@boom", "payload_change@q2", "linkage_coupling@q2", "twist_by_reach@boom", "thermal_cross@q2"]
+    "text",
+    [
+        "pad_play@boom",
+        "passive_compliance@row2",
+        "payload_change@q2",
+        "linkage_coupling@q2",
+        "twist_by_reach@boom",
+        "thermal_cross@q2",
+    ],
 )
 def test_a_rig_without_the_part_has_no_such_effect(text: str) -> None:
     with pytest.raises(ValueError, match="ur10"):
@@ -383,7 +453,7 @@ def columns_for(rig: Rig) -> dict[str, Matrix]:
     return columns
 
 
-DEFAULT_PLACES = ("L2", "theta1", "theta4", "boom", "base", "clock", "station", "r")
+DEFAULT_PLACES = ("L2", "theta1", "theta4", "boom", "base", "clock", "station", "r", "row2")
 
 
 def anywhere(family: str, rig: Rig) -> Effect:
@@ -420,7 +490,8 @@ def test_library_and_outside_are_apart_and_the_library_is_the_contracts() -> Non
     contract = """joint_compliance boom_droop pad_play backlash gravity_flip_play load_hysteresis encoder_harmonic
     joint_error_map angle_scale transducer_scale transducer_quadratic transducer_index_jump transducer_cumulative
     thermal_expansion solar_bow base_settlement base_step payload_change cylinder_compression leak_down latency
-    clock_drift station_scale prism_constant prism_incidence linkage_coupling base_compliance"""
+    clock_drift station_scale prism_constant prism_incidence linkage_coupling base_compliance base_shift
+    lateral_compliance passive_compliance prism_seat_step zero_step"""
     assert list(LIBRARY) == contract.split()
 
 

@@ -1,0 +1,87 @@
+"""A carrier that moved over the ground at once: it slid, was pushed, or was set down a little further on."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calibration.effects.base import Coefficient, FittedCoefficient, Settings, SizedFamily, check_sizes, sizes
+from calibration.effects.context import EffectContext
+from calibration.effects.timing import STEP_SETTINGS, StepFamily, check_step, refined_steps, step_grid
+from calibration.observations import Floats
+
+_ON_THE_SPOT = "on_the_spot"
+_ON_THE_SPOT_ODDS = 0.25
+_HEADING = Coefficient("heading_rad", "rad", 1e-3, -10e-3, 10e-3)
+
+
+class BaseShift(StepFamily, SizedFamily):
+    """The base stands elsewhere on the ground, and points elsewhere, in all rows after one instant.
+
+    Tilts and the rise are `base_step`'s: a carrier that slips off a jack does both. A pedestal that turns in its foot
+    turns on the spot, about the upright axis through the base's origin: a form with the heading alone.
+    """
+
+    name = "base_shift"
+    equation = "shifts along the base's level x and y axes and turn about its upright axis, for t > time_s"
+    source = "rigid motion of the set-up over the ground at one instant: a carrier that slides or is moved"
+    confused_with = ("base_step", "zero_step", "prism_seat_step")
+    revealed_by = "a prism on the carrier, or one pose again and again all through the session"
+    fixed = (Coefficient("x_mm", "mm", 5.0, -50.0, 50.0), Coefficient("y_mm", "mm", 5.0, -50.0, 50.0), _HEADING)
+    place = "base"
+    moves_machine = False
+
+    def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
+        steps = step_grid(context.extra("time_s"))
+        turns = tuple({**step, _ON_THE_SPOT: 1.0} for step in steps)
+        return self._sized(context, where, (*steps, *turns))
+
+    def refined(self, context: EffectContext, where: str, settings: Settings) -> tuple[Settings, ...]:
+        form = {_ON_THE_SPOT: 1.0} if _ON_THE_SPOT in settings else {}
+        finer = refined_steps(context.extra("time_s"), settings)
+        return self._sized(context, where, tuple({**step, **form} for step in finer))
+
+    def odds(self, settings: Settings) -> float:
+        return super().odds(settings) * (_ON_THE_SPOT_ODDS if _ON_THE_SPOT in settings else 1.0)
+
+    def form(self, settings: Settings) -> str:
+        return "turned on the spot" if _ON_THE_SPOT in settings else ""
+
+    def check_settings(self, settings: Settings) -> None:
+        form = (_ON_THE_SPOT,) if _ON_THE_SPOT in settings else ()
+        check_sizes(settings, (*STEP_SETTINGS, *form), 1 if form else len(self.fixed))
+        check_step(settings)
+
+    def names(self, settings: Settings) -> tuple[str, ...]:
+        self.check_settings(settings)
+        return tuple(c.name for c in _coefficients(settings))
+
+    def coefficients(self, context: EffectContext, where: str, settings: Settings) -> tuple[Coefficient, ...]:
+        del context, where
+        return _coefficients(settings)
+
+    def reported(
+        self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
+    ) -> tuple[FittedCoefficient, ...]:
+        """Return shifts, heading and instant; shifts of a carrier that turns on the spot are zero."""
+        listed = super().reported(settings, coefficients)
+        if _ON_THE_SPOT in settings:
+            listed = (*(FittedCoefficient(c.name, c.unit, 0.0, 0.0, c.sigma) for c in self.fixed[:2]), *listed)
+        return listed
+
+    def shift_mm(self, context: EffectContext, where: str, settings: Settings) -> Floats:
+        del where
+        # A comparison with NaN is false: rows without a time stand as before.
+        after = context.extra("time_s") > settings["time_s"]
+        moved = context.base_shift_mm(after.astype(np.float64))
+        return moved[:, :, 2:] if _ON_THE_SPOT in settings else moved
+
+    def _sized(self, context: EffectContext, where: str, steps: tuple[Settings, ...]) -> tuple[Settings, ...]:
+        known = self.known(context, where)
+        return tuple({**step, **sizes(self.shift_mm(context, where, step)[known])} for step in steps)
+
+
+def _coefficients(settings: Settings) -> tuple[Coefficient, ...]:
+    return (_HEADING,) if _ON_THE_SPOT in settings else BaseShift.fixed
+
+
+FAMILY = BaseShift()

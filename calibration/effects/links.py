@@ -1,0 +1,220 @@
+"""Links that bend under what they carry: where a row turns, the weights' moment there, and effects of that."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.effects.base import Coefficient, PrismFamily, Settings
+from calibration.effects.context import EffectContext
+from calibration.effects.load_shapes import (
+    UNIT,
+    LoadShapes,
+    OfUncertainLoad,
+    load_columns,
+    load_variants,
+    part_coefficients,
+    part_names,
+    shapes_by_design,
+)
+from calibration.kinematics.chain import Op
+from calibration.kinematics.torques import MASS_SIGMA
+from calibration.observations import Floats
+from calibration.rig.description import Rig
+
+_LINEAR = "compliance_rad_per_Nm"
+_SIGMA_RAD = 1e-3  # at the largest moment of the weights beyond
+_BOUND_RAD = 20e-3
+_LEAST_NM = 1e-6
+_LEAST_SHARE = 0.01  # of the largest moment; a link that gives way to less of it shows nothing
+
+
+@dataclass(frozen=True)
+class Link:
+    """What a turning row carries, in n rows of observations; vectors are of the base frame.
+
+    Attributes:
+        context: the rows of observations.
+        row: number of the row of the kinematic table, whose `theta` is driven.
+    """
+
+    context: EffectContext
+    row: int
+
+    @property
+    def axis(self) -> Floats:
+        """(n, 3) unit vectors of the axis about which the row turns."""
+        return self._turning[0]
+
+    @property
+    def place_mm(self) -> Floats:
+        """(n, 3) where it turns: the origin of the frame in which the rotation is made."""
+        return self._turning[1]
+
+    @cached_property
+    def carries_prism(self) -> NDArray[np.bool_]:
+        """(n,) mask of the rows of observations whose prism turns with it."""
+        carried: NDArray[np.bool_] = self._beyond[self.context.prism_frame]
+        return carried
+
+    @cached_property
+    def moment_newton_m(self) -> Floats:
+        """(n, 3) moment about its place of all weights beyond."""
+        moment: Floats = self._by_point.sum(axis=1)
+        return moment
+
+    @cached_property
+    def parts_newton_m(self) -> Floats:
+        """(n, 3, parts) changes of that moment as a mass, or its centre's distance, is `MASS_SIGMA` larger."""
+        loads, rig = self.context.loads, self.context.rig
+        origins_mm = self.context.located.frames_mm[:, loads.point_frame]
+        at_origins = self._moments(origins_mm)
+        parts = []
+        for index, mass in enumerate(rig.masses):
+            own = self._carried & (loads.point_mass == index)
+            if mass.kg > 0.0 and own.any():
+                parts.append(MASS_SIGMA * self._by_point[:, own].sum(axis=1))
+                if mass.centre_mm is not None and any(mass.centre_mm):
+                    parts.append(parts[-1] - MASS_SIGMA * at_origins[:, own].sum(axis=1))
+        return np.stack(parts, axis=2) if parts else np.zeros((len(self.context), 3, 0))
+
+    @cached_property
+    def _beyond(self) -> NDArray[np.bool_]:
+        """(rows + 1,) mask of the frames that turn with it."""
+        rig = self.context.rig
+        return np.array([self.row in rig.path(frame) for frame in range(len(rig.rows) + 1)])
+
+    @cached_property
+    def _carried(self) -> NDArray[np.bool_]:
+        """(points,) mask of the weights beyond."""
+        return self._beyond[self.context.loads.point_frame]
+
+    @cached_property
+    def _weights(self) -> tuple[Floats, Floats]:
+        return self.context.loads.places(self.context.data.readings, self.context.observations.extra)
+
+    @cached_property
+    def _by_point(self) -> Floats:
+        return self._moments(self._weights[0])
+
+    def _moments(self, places_mm: Floats) -> Floats:
+        """Return the moments (n, points, 3) of the weights beyond, hung at these places (n, points, 3)."""
+        newton = self._weights[1] * self._carried
+        arm_mm = places_mm - self.place_mm[:, None]
+        moments: Floats = np.cross(arm_mm * (newton[:, :, None] / 1e3), self.context.down[:, None])
+        return moments
+
+    @cached_property
+    def _turning(self) -> tuple[Floats, Floats]:
+        """The axis and the place: a walk along the chain up to the row's rotation."""
+        chain, x, readings = self.context.chain, self.context.x, self.context.data.readings
+        axes = np.tile(np.eye(3), (len(readings), 1, 1))
+        place_mm = np.zeros((len(readings), 3))
+        *before, own = chain.rig.path(self.row)
+        for op in [op for number in before for op in chain.row_ops[number - 1]] + _up_to_turn(chain.row_ops[own - 1]):
+            size = op.driven(readings) + (x[op.parameter] if op.parameter >= 0 else 0.0)
+            if op.rotates:
+                first, second = (op.axis + 1) % 3, (op.axis + 2) % 3
+                u, v = axes[:, :, first].copy(), axes[:, :, second].copy()
+                c, s = np.cos(size)[:, None], np.sin(size)[:, None]
+                axes[:, :, first], axes[:, :, second] = c * u + s * v, c * v - s * u
+            else:
+                place_mm += size[:, None] * axes[:, :, op.axis]
+        return axes[:, :, _turn(chain.row_ops[own - 1]).axis], place_mm
+
+
+def _turn(ops: list[Op]) -> Op:
+    """Return the rotation of a row that joints drive."""
+    return next(op for op in ops if op.rotates and op.drive)
+
+
+def _up_to_turn(ops: list[Op]) -> list[Op]:
+    return ops[: ops.index(_turn(ops))]
+
+
+class LinkFamily(OfUncertainLoad, PrismFamily):
+    """A link that turns a little, about the place where its row turns, in proportion to a part of the weights' moment.
+
+    All that is beyond moves with it as one. How stiff a link may be goes by the largest moment of all weights beyond,
+    whatever part of that the link gives way to.
+    """
+
+    goes_with = "weights"
+
+    @abstractmethod
+    def row(self, rig: Rig, where: str) -> int:
+        """Return the number of the row that turns."""
+
+    @abstractmethod
+    def given_way_to(self, axis: Floats, moments: Floats) -> Floats:
+        """Return the part (n, 3, k) of moments (n, 3, k) to which a link gives way that turns about an axis (n, 3)."""
+
+    def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
+        link = Link(context, self.row(context.rig, where))
+        most, volume = _greatest(context, link.row), Link(context.work_volume, link.row)
+        if most == 0.0 or not link.carries_prism.any() or np.abs(self._loads(volume)).max() < _LEAST_SHARE * most:
+            return ()
+        return load_variants(self._shapes(context, where), _SIGMA_RAD / most)
+
+    def names(self, settings: Settings) -> tuple[str, ...]:
+        return (_LINEAR, *part_names(settings))
+
+    def coefficients(self, context: EffectContext, where: str, settings: Settings) -> tuple[Coefficient, ...]:
+        most = max(_greatest(context, self.row(context.rig, where)), _LEAST_NM)
+        bound = _BOUND_RAD / most
+        return (Coefficient(_LINEAR, UNIT, _SIGMA_RAD / most, 0.0, bound), *part_coefficients(settings, bound))
+
+    def shift_mm(self, context: EffectContext, where: str, settings: Settings) -> Floats:
+        link, n = Link(context, self.row(context.rig, where)), len(context)
+        if not context.rig.masses:
+            return np.zeros((n, 3, len(self.names(settings))))
+        loads = load_columns(
+            self._loads(link), settings, lambda: self._shapes(context, where), lambda: self._parts(link)
+        )
+        turns = loads.reshape(n, 3, -1).transpose(0, 2, 1)
+        arm_mm = (context.located.prism_mm - link.place_mm) * link.carries_prism[:, None]
+        return context.to_station(np.cross(turns, arm_mm[:, None]).transpose(0, 2, 1))
+
+    def _loads(self, link: Link) -> Floats:
+        """Return the moment (3 n,) to which a link gives way, N m, by rows and coordinates."""
+        return self.given_way_to(link.axis, link.moment_newton_m[:, :, None]).reshape(-1)
+
+    def _parts(self, link: Link) -> Floats:
+        """Return the changes (3 n, parts) of that by the uncertain parts of the weights."""
+        parts = self.given_way_to(link.axis, link.parts_newton_m)
+        return parts.reshape(-1, parts.shape[2])
+
+    def _shapes(self, context: EffectContext, where: str) -> LoadShapes:
+        """Return the shapes by which uncertain weights change that over the poses."""
+
+        def in_volume(volume: EffectContext) -> tuple[Floats, Floats]:
+            link = Link(volume, self.row(volume.rig, where))
+            return self._loads(link), self._parts(link)
+
+        return shapes_by_design(context, f"{self.name} {where}", in_volume, constant=True)
+
+
+def _greatest(context: EffectContext, row: int) -> float:
+    """Return the largest moment of the weights beyond a row in the work volume, N m; 0 where there is none."""
+    if not context.rig.masses:
+        return 0.0
+    most = float(np.linalg.norm(Link(context.work_volume, row).moment_newton_m, axis=1).max(initial=0.0))
+    return most if most > _LEAST_NM else 0.0
+
+
+def own_rows(rig: Rig) -> dict[str, int]:
+    """Return the row that each revolute joint turns first, by the joint's name; those that turn none have none."""
+    found: dict[str, int] = {}
+    for number, driven, name, _ in rig.couplings():
+        if driven == "theta" and rig.joint(name).kind == "revolute":
+            found.setdefault(name, number)
+    return found
+
+
+def turning_rows(rig: Rig) -> tuple[int, ...]:
+    """Return the numbers of the rows that joints turn."""
+    return tuple(number for number, row in enumerate(rig.rows, 1) if "theta" in row.drive)
