@@ -137,6 +137,8 @@ def _best_part(problem: Problem, joint: JointFit) -> tuple[Regime, float]:
     for variable, of_row in variables(context).items():
         values = samples.average(of_row[:, None])[:, 0]
         border, order = borders(values, len(values)), np.argsort(values)
+        if not len(border):
+            continue
         count = np.searchsorted(values[order], border)
         gain = np.concatenate([[0.0], np.cumsum((outside - within)[order])])
         for above, cost in ((True, gain[count]), (False, -gain[count])):

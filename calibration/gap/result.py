@@ -205,7 +205,6 @@ class GapResult:
         before_mm, after_mm: RMS over the rows of calibrated kinematics, and with the effects.
         noise_mm: the noise floor; `noise_source` says where it is from, a clause.
         held_out: RMS before and after on held-out rows, mm; None where none were given.
-        machine_break: an instant after which the machine is another; None for none.
         disagreements: most significant first.
         experiments: what would tell more.
         rounds: in their order.
@@ -213,6 +212,7 @@ class GapResult:
         model: kinematics and adopted effects, no residual.
         observations, error_before_mm, error_after_mm: the rows with (n, 3) errors, station's frame.
         warnings: sentences.
+        machine_break: an instant after which the machine is another; None for none.
     """
 
     verdict: Verdict
@@ -229,7 +229,6 @@ class GapResult:
     noise_mm: float
     noise_source: str
     held_out: tuple[float, float] | None
-    machine_break: Break | None
     disagreements: tuple[Disagreement, ...]
     experiments: tuple[Experiment, ...]
     rounds: tuple[Round, ...]
@@ -239,6 +238,7 @@ class GapResult:
     error_before_mm: Floats
     error_after_mm: Floats
     warnings: tuple[str, ...] = ()
+    machine_break: Break | None = None
 
     def _effect(self, effect: FittedEffect) -> dict[str, object]:
         """Return the JSON object of one effect, with its evidence."""

@@ -19,7 +19,7 @@ from calibration.gap.candidates import CandidateEffect, candidate_effects
 from calibration.gap.criteria import best_of_each_family, beyond_doubt
 from calibration.gap.detection import detect
 from calibration.gap.formulas.grammar import Formula, Grammar
-from calibration.gap.joint_fit import OUTLIER, JointFit, Problem, joint_fit
+from calibration.gap.joint_fit import OUTLIER, JointFit, Problem, along, joint_fit
 from calibration.gap.projection import Projection, follows_path
 from calibration.gap.regimes import EffectInRegime, effect_in_regime
 from calibration.gap.reselection import explain_outliers, reselect
@@ -27,7 +27,7 @@ from calibration.gap.screening import ScoredEffect, Screen, by_family
 from calibration.gap.search_result import STRUCTURE, SearchResult, SelectionStep, conclude
 from calibration.gap.selection import Selection, select_effect
 from calibration.identification.reading_steps import in_true_steps
-from calibration.identification.refinement import Prior
+from calibration.identification.refinement import Prior, refine
 from calibration.identification.solve import Solution
 from calibration.observations import Observations
 
@@ -62,7 +62,10 @@ def search(
     whole = _Search(problem, families)
     found = _in_regimes(problem, families, whole.run(), whole.least_cost)
     found = _beside_background(problem, families, found)
-    found = replace(found, machine_break=find_break(problem, found.joint))
+    broken = find_break(problem, found.joint)
+    if broken is not None:
+        by_formulas = found.joint.fit.cost - _cost_with_formulas(problem, found)
+        found = replace(found, machine_break=broken if broken.log_bayes_factor > by_formulas else None)
     if seen is solution:
         return found
     # A model counts the noise of readings as its rig file has it, and what is beyond that as scatter.
@@ -252,6 +255,7 @@ def _in_regimes(problem: Problem, families: Collection[str], found: SearchResult
     starts = [alone, *([found.joint] if found.joint.choices else [])]
     if (alone.fit.weight < OUTLIER).mean() >= _MANY:
         starts.append(replace(alone, fit=replace(alone.fit, weight=np.ones_like(alone.fit.weight))))
+    least_cost = min(least_cost, _cost_with_formulas(problem, found))
     for start in starts:
         one = effect_in_regime(problem, start, families)
         if one is None or least_cost - one.joint.fit.cost < _REGIME:
@@ -262,6 +266,18 @@ def _in_regimes(problem: Problem, families: Collection[str], found: SearchResult
         if tried.joint.choices and _leaves_noise(problem, tried):
             return tried
     return found
+
+
+def _cost_with_formulas(problem: Problem, found: SearchResult) -> float:
+    """Return the cost of a result's effects with the formulas that explain what they leave, nats."""
+    formulas = (found.outside_library or found.final.find())[:1]
+    for _ in range(_FORMULAS):
+        formulas += what_is_left(problem, found.joint, formulas)
+    solution, joint = problem.solution, found.joint
+    columns = [formula_block(formula, number).columns for number, formula in enumerate(formulas)]
+    start = np.append(joint.fit.x, np.zeros(sum(map(len, columns))))
+    additions = along(solution, [*joint.parts, *columns])
+    return refine(solution.chain, solution.samples, start, prior=problem.prior, additions=additions).cost
 
 
 def _leaves_noise(problem: Problem, found: SearchResult) -> bool:
