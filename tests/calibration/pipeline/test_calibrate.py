@@ -37,6 +37,8 @@ def joined(*parts: Observations) -> Observations:
         session=np.concatenate([p.session for p in parts]),
         pose=np.concatenate([p.pose for p in parts]),
         extra={k: np.concatenate([p.extra[k] for p in parts]) for k in first.extra},
+        row_numbers=None,
+        place="row",
     )
 
 
