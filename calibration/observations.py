@@ -21,6 +21,7 @@ from calibration.table import (
     POSITION_COLUMNS,
     SIGMA_COLUMNS,
     DataFrame,
+    Place,
     Table,
     extra_columns,
     read_csv,
@@ -66,7 +67,10 @@ class Observations:
         pose: (n,) standstill; "" where not given. A pose is unique within its session and set-up.
         extra: optional columns by their CSV name (`time_s`, `theta1_dir`, `boom_valve_mA`, ...) -> (n,), NaN where
             not measured.
-        ignored_columns: columns of the file that docs/formats.md does not name.
+        ignored_columns: columns of the file that docs/reference.md does not name.
+        ignored_numbers: those of them that hold numbers, which a signal of the rig file could use.
+        row_numbers: (n,) where each row was read (`row_name`); None for rows that were made in a program.
+        place: what numbers them: the lines of a file, its header is line 1, or the rows of a data frame, from 0.
     """
 
     prism: Strings
@@ -78,6 +82,9 @@ class Observations:
     pose: Strings
     extra: Mapping[str, Floats] = field(default_factory=dict)
     ignored_columns: tuple[str, ...] = ()
+    ignored_numbers: tuple[str, ...] = ()
+    row_numbers: NDArray[np.intp] | None = None
+    place: Place = "row"
 
     @classmethod
     def from_csv(cls, path_or_text: str | Path, rig: Rig, *, positions_required: bool = True) -> Observations:
@@ -134,6 +141,7 @@ class Observations:
             session=self.session[rows],
             pose=self.pose[rows],
             extra={k: v[rows] for k, v in self.extra.items()},
+            row_numbers=None if self.row_numbers is None else self.row_numbers[rows],
         )
 
     def numbered(self) -> Observations:
@@ -141,6 +149,15 @@ class Observations:
         if ROW in self.extra or np.isfinite(self.extra.get("time_s", np.full(1, np.nan))).any():
             return self
         return replace(self, extra={**self.extra, ROW: np.arange(len(self), dtype=np.float64)})
+
+    def row_number(self, row: int) -> int:
+        """Return the number of a row, from 0, where it was read."""
+        return row if self.row_numbers is None else int(self.row_numbers[row])
+
+    def row_name(self, *rows: int) -> str:
+        """Return what a sentence calls rows, from 0: `line 17`, `lines 17, 43`, `row 16 (from 0)` of a data frame."""
+        numbers = ", ".join(str(self.row_number(row)) for row in rows)
+        return f"{self.place}{'s' if len(rows) > 1 else ''} {numbers}{' (from 0)' if self.place == 'row' else ''}"
 
     def groups(self) -> Strings:
         """Return (n,) labels for grouped splits: sessions or set-ups where there are several, else workspace cells.
@@ -284,8 +301,9 @@ def _build(table: Table, rig: Rig, positions_required: bool) -> Observations:
         table.refuse_where(values > _MOST_MM, name, values, f"is no standard deviation of a fix ({_MOST_MM:g} mm)")
     extra_names = extra_columns(table.header, rig)
     extra = {name: table.numbers(name, required=False) for name in extra_names}
+    directions = {f"{name}_dir" for name in rig.joint_names}
     for name, values in extra.items():
-        if name.endswith("_dir"):
+        if name in directions:
             bad = np.isfinite(values) & ~np.isin(values, DIRECTIONS)
             table.refuse_where(bad, name, values, "is not a direction; allowed: -1, 0, 1")
         low, high = next(ends for ending, ends in _POSSIBLE.items() if name.endswith(ending))
@@ -300,5 +318,8 @@ def _build(table: Table, rig: Rig, positions_required: bool) -> Observations:
         session=table.labels("session"),
         pose=table.labels("pose"),
         extra=extra,
-        ignored_columns=tuple(name for name in table.header if name not in table.wanted),
+        ignored_columns=table.ignored,
+        ignored_numbers=table.ignored_numbers,
+        row_numbers=table.row_numbers,
+        place=table.place,
     )

@@ -15,14 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import DataError
+from calibration.rig.columns import CONDITIONS, LABELS, OF_JOINT, POSITION, PRISM, SIGMA, WRITTEN, names, names_of_joint
 from calibration.rig.description import Rig
+from calibration.rig.signals import is_read_anyway
 
 Floats = NDArray[np.float64]
 Strings = NDArray[np.str_]
 
-POSITION_COLUMNS = ("x_mm", "y_mm", "z_mm")
-SIGMA_COLUMNS = ("sigma_x_mm", "sigma_y_mm", "sigma_z_mm")
-LABEL_COLUMNS = ("setup", "session", "pose")
+Place = Literal["line", "row"]
+"""What numbers the rows: the lines of a file, the first is 1, or the rows of a data frame, the first is 0."""
+
+POSITION_COLUMNS = names(POSITION)
+SIGMA_COLUMNS = names(SIGMA)
+LABEL_COLUMNS = names(LABELS)
 
 _LONGEST = 200  # characters of a label or a number; every row's label takes as much memory as the longest
 _LONGEST_ROW = 1 << 20
@@ -31,7 +36,6 @@ _MOST_LABEL_BYTES = 64 << 20
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _NO_NUMBERS = {"nan", "na", "n/a", "null", "none", "inf", "-inf", "+inf", "infinity", "-"}
 _NOT_MEASURED = {"nan", "None", "<NA>", "NaT"}  # cells of data frames, as text
-_SIGNAL = re.compile(r"[A-Za-z][A-Za-z0-9_]*_(bar|mA)")
 
 
 class DataFrame(Protocol):
@@ -51,12 +55,13 @@ class Table:
     Args:
         source: name of the table for messages.
         header: names of its columns.
-        rig: whose joints, prisms and channels are wanted.
+        rig: whose joints, prisms, channels and signals are wanted.
         positions_required: False where the columns of positions may be missing.
-        place: `line` of a file, from 1, or `row` of a data frame, from 0: what numbers the rows in messages.
+        place: what numbers the rows.
 
     Attributes:
         header: names of its columns.
+        place: what numbers the rows.
 
     Raises:
         DataError: a column is missing, appears twice or has no name.
@@ -69,16 +74,18 @@ class Table:
         rig: Rig,
         *,
         positions_required: bool,
-        place: Literal["line", "row"] = "line",
+        place: Place = "line",
     ) -> None:
-        self.header = header
-        self._source, self._place = source, place
+        self.header, self.place = header, place
+        self._source = source
         self._check_header(rig, positions_required)
         self._lines = array("q")
         self._numbers = {name: _Numbers() for name in header if name in _number_columns(header, rig)}
-        self._labels: dict[str, list[str]] = {name: [] for name in header if name in ("prism", *LABEL_COLUMNS)}
+        self._labels: dict[str, list[str]] = {name: [] for name in header if name in (PRISM.name, *LABEL_COLUMNS)}
+        self._ignored = {name: _Ignored() for name in header if name not in self.wanted}
         self._number_places = [(header.index(name), column) for name, column in self._numbers.items()]
         self._label_places = [(header.index(name), cells) for name, cells in self._labels.items()]
+        self._ignored_places = [(header.index(name), column) for name, column in self._ignored.items()]
         self._alike: dict[str, str] = {}
 
     def __len__(self) -> int:
@@ -88,6 +95,22 @@ class Table:
     def wanted(self) -> set[str]:
         """Names of the columns that are read; all others are passed over."""
         return {*self._numbers, *self._labels}
+
+    @property
+    def ignored(self) -> tuple[str, ...]:
+        """Names of the columns that are passed over."""
+        return tuple(self._ignored)
+
+    @property
+    def ignored_numbers(self) -> tuple[str, ...]:
+        """Names of those that hold numbers, not all the same, and that rigcal has not written itself."""
+        own = names(WRITTEN)
+        return tuple(name for name, column in self._ignored.items() if column.varies and name not in own)
+
+    @property
+    def row_numbers(self) -> NDArray[np.intp]:
+        """(n,) number of each row, as messages name it."""
+        return np.array(self._lines, dtype=np.intp)
 
     def append(self, row: Sequence[str], line: int) -> None:
         """Take a row.
@@ -103,6 +126,8 @@ class Table:
         for place, cells in self._label_places:
             cell = row[place].strip()
             cells.append(self._alike.setdefault(cell, cell))
+        for place, ignored in self._ignored_places:
+            ignored.append(row[place].strip())
 
     def numbers(self, column: str, *, required: bool) -> Floats:
         """Return a column (n,) of numbers, NaN where a cell is empty.
@@ -163,17 +188,17 @@ class Table:
         raise DataError(self._source, reason, column=column)
 
     def _refuse_line(self, line: int, column: str, reason: str) -> NoReturn:
-        if self._place == "row":
+        if self.place == "row":
             raise DataError(f"{self._source}, row {line} (from 0)", reason, column=column)
         raise DataError(self._source, reason, line, column)
 
     def _refuse_header(self, reason: str, column: str | None = None) -> NoReturn:
-        raise DataError(self._source, reason, 1 if self._place == "line" else None, column)
+        raise DataError(self._source, reason, 1 if self.place == "line" else None, column)
 
     def _check_header(self, rig: Rig, positions_required: bool) -> None:
         header = self.header
         if not header or header == [""]:
-            self._refuse_header("the file is empty; a header is needed" if self._place == "line" else "no columns")
+            self._refuse_header("the file is empty; a header is needed" if self.place == "line" else "no columns")
         if len(header) > _MOST_COLUMNS:
             self._refuse_header(f"{len(header)} columns; at most {_MOST_COLUMNS}")
         doubled = sorted({name for name in header if header.count(name) > 1})
@@ -181,7 +206,7 @@ class Table:
             self._refuse_header(f"{header.count('')} columns have no name; name them, or leave them out")
         if doubled:
             self._refuse_header("column appears twice", doubled[0])
-        needed = ["prism", *(j.column for j in rig.joints), *(POSITION_COLUMNS if positions_required else ())]
+        needed = [PRISM.name, *(j.column for j in rig.joints), *(POSITION_COLUMNS if positions_required else ())]
         missing = [name for name in needed if name not in header]
         if len(header) == 1 and len(missing) == len(needed):
             self._refuse_header("one column only: separate columns by commas, and write decimals with a point")
@@ -239,34 +264,32 @@ def read_frame(frame: DataFrame, rig: Rig, source: str, *, positions_required: b
     Raises:
         DataError: with row, column and reason.
     """
-    header = [str(name) for name in frame.columns]
+    keys = list(frame.columns)
+    header = [str(key) for key in keys]
     table = Table(source, header, rig, positions_required=positions_required, place="row")
-    wanted = table.wanted
-    columns = {name: [_cell(v) for v in frame[name].to_numpy().tolist()] for name in header if name in wanted}
-    rows = len(columns["prism"])
+    columns = {name: [_cell(v) for v in frame[key].to_numpy().tolist()] for name, key in zip(header, keys, strict=True)}
+    rows = len(columns[PRISM.name])
     if not rows:
         raise DataError(source, "no observations")
     for name, cells in columns.items():
         if len(cells) != rows:
             table.refuse_column(name, f"{len(cells)} cells where the column prism has {rows}")
-    nothing = [""] * rows
-    for number, row in enumerate(zip(*(columns.get(name, nothing) for name in header), strict=True)):
+    for number, row in enumerate(zip(*columns.values(), strict=True)):
         table.append(row, number)
     return table
 
 
 def optional_columns(rig: Rig) -> set[str]:
-    """Return the names of all optional columns of numbers but signals, `<signal>_bar` and `<signal>_mA`."""
-    columns = {"time_s", "dwell_s", "temperature_degC", "payload_kg"}
-    for joint in rig.joints:
-        columns |= {f"{joint.name}_dir", f"{joint.name}_rate", f"{joint.name}_Nm"}
-    return columns | {c.column for c in rig.channels if c.name not in rig.joint_names}
+    """Return the names of all optional columns of numbers but pressures and currents, which no rig needs to name."""
+    of_joints = {name for joint in rig.joint_names for name in names_of_joint(OF_JOINT, joint)}
+    of_channels = {c.column for c in rig.channels if c.name not in rig.joint_names}
+    return {*names(CONDITIONS), *of_joints, *of_channels, *(signal.column for signal in rig.signals)}
 
 
 def extra_columns(header: Sequence[str], rig: Rig) -> list[str]:
     """Return those of a table's columns that are optional columns of numbers, in their order."""
     known = optional_columns(rig)
-    return [name for name in header if name in known or (_SIGNAL.fullmatch(name) and name not in SIGMA_COLUMNS)]
+    return [name for name in header if name in known or is_read_anyway(name)]
 
 
 def _number_columns(header: Sequence[str], rig: Rig) -> set[str]:
@@ -292,6 +315,26 @@ class _Numbers:
         self.values.append(value)
         if self.bad is None and not math.isfinite(value):
             self.bad = line, cell
+
+
+class _Ignored:
+    """A column that is passed over."""
+
+    def __init__(self) -> None:
+        self._numbers: set[float] | None = set()  # two at most; None as soon as a cell is no number
+
+    @property
+    def varies(self) -> bool:
+        """True if it holds numbers alone, and two that differ."""
+        return self._numbers is not None and len(self._numbers) > 1
+
+    def append(self, cell: str) -> None:
+        if not cell or self._numbers is None:
+            return
+        if len(cell) > _LONGEST or not _NUMBER.fullmatch(cell):
+            self._numbers = None
+        elif len(self._numbers) < 2:
+            self._numbers.add(float(cell))
 
 
 class _Lines:

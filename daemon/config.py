@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import reprlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -298,8 +299,12 @@ class RigSource:
     directory: Path
 
 
-def load_rig(name_or_path: str) -> RigSource:
+def load_rig(name_or_path: str, signals: Sequence[str] = ()) -> RigSource:
     """Load a shipped rig by its name, or any rig by the path of its file.
+
+    Args:
+        name_or_path: of the rig.
+        signals: columns of further signals, as `Rig.with_signals` takes them.
 
     Raises:
         RigError: no such rig or file, or the file is malformed.
@@ -318,4 +323,7 @@ def load_rig(name_or_path: str) -> RigSource:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise RigError(str(path), "", f"cannot be read: {reason}") from error
-    return RigSource(parse_rig(text, path.name), text, directory)
+    rig = parse_rig(text, path.name)
+    if signals:
+        rig = rig.with_signals(*signals)
+    return RigSource(rig, rig.text, directory)

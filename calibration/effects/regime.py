@@ -40,7 +40,7 @@ class Regime:
     def text(self) -> str:
         """A phrase: in which rows."""
         if self.variable == ROW:
-            return f"only in rows {'after' if self.above else 'up to'} {math.floor(self.border)}"
+            return f"only in rows {'after' if self.above else 'up to'} {math.floor(self.border)} (from 0)"
         if self.variable == "time_s":
             return f"only {'after' if self.above else 'until'} time_s = {self.border:.6g}"
         return f"only where {self.variable} is {'above' if self.above else 'at most'} {self.border:.4g}"

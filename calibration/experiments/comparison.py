@@ -188,15 +188,16 @@ def shared_rows(training: Observations, held_out: Observations, names: tuple[str
     same = np.isin(rows[1], rows[0])
     pose = np.isin(readings[1], readings[0]) & ~same
     found = []
+    first_same, first_pose = (held_out.row_name(int(np.argmax(rows))) for rows in (same, pose))
     if same.any():
         found.append(
-            f"{same.sum()} of the {len(held_out)} rows of {names[1]} are rows of {names[0]} as well (the first is row "
-            f"{int(np.argmax(same)) + 1}): the held-out figures are too good by these"
+            f"{same.sum()} of the {len(held_out)} rows of {names[1]} are rows of {names[0]} as well, the first in "
+            f"{first_same}: the held-out figures are too good by these"
         )
     if pose.any():
         found.append(
             f"{pose.sum()} of the {len(held_out)} rows of {names[1]} were measured in poses of {names[0]}, all joints "
-            f"reading the same (the first is row {int(np.argmax(pose)) + 1}): they share the errors of those readings"
+            f"reading the same, the first in {first_pose}: they share the errors of those readings"
         )
     return tuple(found)
 

@@ -116,7 +116,7 @@ class Break:
     @property
     def text(self) -> str:
         """A sentence: when, and what to do."""
-        when = f"row {math.floor(self.border)}" if self.variable == ROW else f"time_s = {self.border:.6g}"
+        when = f"row {math.floor(self.border)} (from 0)" if self.variable == ROW else f"time_s = {self.border:.6g}"
         fewer = "before" if self.before < self.after else "after"
         return (
             f"after {when} the machine is another than before ({self.before} samples before, {self.after} after): give "

@@ -16,12 +16,14 @@ from calibration.kinematics.chain import ROW_ORDER, Chain
 from calibration.observations import Floats, Observations, originals
 from calibration.rig.description import Rig
 from calibration.rig.limits import never_moved
+from calibration.rig.signals import how_to_use
 
 # Of observations.
 _GOOD = 2  # fixes a parameter, from which on build tolerances matter little
 _FAR_MM = 5e5  # from the instrument: nobody measures a boom from there
 _LIGHT, _HEAVY = 1e-3, 10.0  # of the machine, between which its payload is
 _TOO_FAST = 3.0  # times the fastest motion of a joint
+_LISTED = 5  # columns
 _UNORDERED = 0.25  # of the rows; a clock is not set as often
 
 # Of a fit.
@@ -88,10 +90,11 @@ def data_warnings(observations: Observations, chain: Chain, different: int) -> I
     copied = np.flatnonzero(originals(observations) != np.arange(len(observations)))
     if len(copied):
         yield (
-            f"{len(copied)} of {len(observations)} rows are copies of earlier ones in every digit, the first in row "
-            f"{copied[0] + 1}, and count once"
+            f"{len(copied)} of {len(observations)} rows are copies of earlier ones in every digit, the first in "
+            f"{observations.row_name(copied[0])}, and count once"
         )
     yield from row_warnings(chain.rig, observations)
+    yield from _warn_of_ignored(chain.rig, observations)
     if different < len(chain):
         yield (
             f"{different} different fixes are few for {len(chain)} parameters: much of the model rests on build "
@@ -126,13 +129,23 @@ def row_warnings(rig: Rig, observations: Observations) -> Iterator[str]:
             )
 
 
+def _warn_of_ignored(rig: Rig, observations: Observations) -> Iterator[str]:
+    columns = observations.ignored_numbers
+    for column in columns[:_LISTED]:
+        yield how_to_use(column, rig)
+    more = columns[_LISTED:]
+    if more:
+        yield f"{len(more)} more columns hold numbers and are not used: {', '.join(ascii(name) for name in more)}"
+
+
 def _warn_of_setups(observations: Observations) -> Iterator[str]:
     blank = observations.setup == ""
     if blank.any() and not blank.all():
         named = ", ".join(repr(setup) for setup in np.unique(observations.setup[~blank]).tolist())
         yield (
-            f"{blank.sum()} of {len(blank)} rows have no setup, the first in row {blank.argmax() + 1}, beside those of "
-            f"{named}: they are taken for another set-up with a base of its own; fill in the column"
+            f"{blank.sum()} of {len(blank)} rows have no setup, the first in "
+            f"{observations.row_name(int(blank.argmax()))}, beside those of {named}: they are taken for another set-up "
+            f"with a base of its own; fill in the column"
         )
 
 
@@ -148,8 +161,8 @@ def _warn_of_clock(observations: Observations) -> Iterator[str]:
     back = order[1:][same & (np.diff(time_s[order]) < 0.0)]
     if 0 < len(back) <= _UNORDERED * len(known):
         yield (
-            f"time_s runs backward, first in row {back.min() + 1}: what depends on time takes the rows in the order of "
-            f"time_s; was the clock set, or does every session count from zero? correct the column"
+            f"time_s runs backward, first in {observations.row_name(int(back.min()))}: what depends on time takes the "
+            f"rows in the order of time_s; was the clock set, or does every session count from zero? correct the column"
         )
 
 

@@ -332,7 +332,8 @@ class Chain:
         if not np.isfinite(readings).all():
             joint, row = np.argwhere(~np.isfinite(readings))[0]
             column = self.rig.joints[joint].column
-            raise DataError("observations", f"the reading of row {row} (from 0) is not a finite number", column=column)
+            place = observations.row_name(row)
+            raise DataError("observations", f"the reading of {place} is not a finite number", column=column)
         return ChainData(
             np.ascontiguousarray(readings.T),
             _indices(observations.prism.tolist(), self._prism_index, "prism"),

@@ -381,7 +381,7 @@ def _out_of_reach(
         asked = f"; {most} prisms of one pose ask for {3 * most} coordinates of {joints} joints"
         yield (
             f"{int(missed.sum())} of {len(missed)} targets are out of reach from their nominal commands, within the "
-            f"limits of the joints: they are missed by up to {closure_mm[worst]:.3g} mm (row {worst + 1})"
+            f"limits of the joints: they are missed by up to {closure_mm[worst]:.3g} mm, in {commanded.row_name(worst)}"
             f"{asked if 3 * most > joints else ''}"
         )
     position = None

@@ -133,7 +133,7 @@ class CalibratedModel:
         effects: named physics on top of the kinematics.
         effects_reason: why these, or why none, a clause.
         joint_error_scale: error that kinematics and effects leave, as `joint_errors.joint_error_scale` finds it.
-        outliers: fixes of the training data that were weighted out.
+        outliers: fixes of the training data that were weighted out, by the numbers that warnings name their rows by.
         residual: the learner that was kept, if any.
         trials: learners that were compared.
         residual_reason: why there is a learner or none.

@@ -118,7 +118,7 @@ class Predictor:
             executor: threads among which many rows are divided; the result does not depend on it.
         """
         found = self._in_pieces(observations, executor)
-        _refuse_infinite(found.position_mm, found.sigma_mm)
+        _refuse_infinite(observations, found.position_mm, found.sigma_mm)
         return found
 
     def nominal_mm(self, observations: Observations) -> Floats:
@@ -133,7 +133,7 @@ class Predictor:
         """(n, 3) positions by kinematics and effects, in the station's frame."""
         rows = self._rows(observations)
         position_mm = self._machine.locate(rows.data).position_mm + rows.shift_mm
-        _refuse_infinite(position_mm)
+        _refuse_infinite(observations, position_mm)
         return position_mm
 
     def parts(self, observations: Observations) -> Parts:
@@ -142,7 +142,7 @@ class Predictor:
         located, estimate, _ = self._located(rows)
         rotation = self._machine.rotations(rows.data)
         correction, by_joint = _turned(rotation, estimate), rotation @ located.joint_jacobian
-        _refuse_infinite(located.position_mm, correction)
+        _refuse_infinite(observations, located.position_mm, correction)
         return Parts(located.position_mm + rows.shift_mm + correction, rows.data.readings, by_joint, correction)
 
     def base_mm(self, observations: Observations) -> Floats:
@@ -156,7 +156,7 @@ class Predictor:
         if rows.columns.shift_mm is not None:
             shift_mm = rows.columns.shifted_mm(self._effects.machine_values)
             place_mm += _turned(self._machine.rotations(rows.data).transpose(0, 2, 1), shift_mm)
-        _refuse_infinite(place_mm)
+        _refuse_infinite(observations, place_mm)
         return place_mm
 
     def to_station(self, observations: Observations, vector_mm: Floats) -> Floats:
@@ -380,15 +380,15 @@ def check_setups(model: CalibratedModel, observations: Observations) -> None:
         )
 
 
-def _refuse_infinite(*numbers: Floats) -> None:
+def _refuse_infinite(observations: Observations, *numbers: Floats) -> None:
     """Raise CalibrationError where one of the arrays (n, 3) of predictions is not finite."""
     for predicted in numbers:
         # One sum costs less than a look at each, and hides neither infinity nor NaN.
         if not math.isfinite(predicted.sum()):
             row = int(np.argmin(np.isfinite(predicted).all(axis=1)))
             raise CalibrationError(
-                f"the prediction of row {row} (from 0) is not a finite number; look for a reading or signal of that "
-                f"row that no machine can have, else calibrate again"
+                f"the prediction of {observations.row_name(row)} is not a finite number; look for a reading or signal "
+                f"of that row that no machine can have, else calibrate again"
             )
 
 

@@ -84,9 +84,8 @@ def build_model(
         },
     )
     model = with_effects(model, adopted)
-    model = replace(
-        model, outliers=tuple(o for o in Predictor.of(model).find_outliers(observations) if original[o.row])
-    )
+    outliers = (o for o in Predictor.of(model).find_outliers(observations) if original[o.row])
+    model = replace(model, outliers=tuple(replace(o, row=observations.row_number(o.row)) for o in outliers))
     lacking = joint_error_scale(model, distinct, structured=adopted.structured)
     model = replace(model, joint_error_scale=lacking)
     model = with_intervals(model, distinct)

@@ -118,17 +118,17 @@ def _seen_mm(model: CalibratedModel, observations: Observations, setup: str) -> 
 
 
 def _of_outliers(model: CalibratedModel, observations: Observations, solution: Solution) -> Iterator[str]:
-    if model.outliers:
-        worst = sorted(model.outliers, key=lambda o: -o.sigma)
-        rows = ", ".join(str(o.row + 1) for o in worst[:_LISTED])
+    outliers = Predictor.of(model).find_outliers(observations)
+    if outliers:
+        worst = sorted(outliers, key=lambda o: -o.sigma)
+        rows = observations.row_name(*(o.row for o in worst[:_LISTED]))
         more = f" and {len(worst) - _LISTED} more" if len(worst) > _LISTED else ""
         share = (
             "were weighted out" if (solution.fit.weight < 1.0).any() else "count as much as all others in this method"
         )
-        outliers = Predictor.of(model).find_outliers(observations)
         yield (
-            f"{len(worst)} of {len(observations)} training fixes are outliers and {share} (row {rows}{more}; "
-            f"up to {worst[0].sigma:.0f} sigma){_where_together(observations, outliers)}"
+            f"{len(worst)} of {len(observations)} training fixes are outliers and {share}, up to {worst[0].sigma:.0f} "
+            f"sigma off, in {rows}{more}{_where_together(observations, outliers)}"
         )
 
 

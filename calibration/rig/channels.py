@@ -1,4 +1,7 @@
-"""Channels of a rig: the devices that its readings and signals come from. Drivers read them; this only describes."""
+"""Channels of a rig, the devices that its readings and signals come from, and signals that come from none.
+
+Drivers read them; this only describes.
+"""
 
 from __future__ import annotations
 
@@ -9,30 +12,44 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 Unit = Literal["deg", "mm", "deg/s", "mm/s", "bar", "mA", "degC", "Nm", "kg", "V", "%", ""]
 
 
-class _Channel(BaseModel):
-    """Fields of every channel.
+class _Quantity(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
+    unit: Unit
+
+    @property
+    def column(self) -> str:
+        """Name of its column in an observations CSV: `theta1_deg`, `boom_valve_mA`."""
+        return f"{self.name}_{self.unit.replace('/', '_per_')}" if self.unit else self.name
+
+
+class Signal(_Quantity):
+    """A column of observations files beside joints and channels: a tilt, a temperature, a pressure.
+
+    No device on the machine's buses is read for it: rows that the daemon stores have none.
+
+    Attributes:
+        name: as in the column, `<name>_<unit>` (`deg/s` is written `deg_per_s`), or `<name>` alone without a unit.
+        unit: of its numbers; "" where they have none, or another one.
+    """
+
+
+class AnyChannel(_Quantity):
+    """What a joint's reading, or a signal, comes from on the machine's buses; `device` says how it is read.
 
     Attributes:
         name: the joint it reads, or the name of a signal (`boom_valve`).
         link: name of the CAN link in the daemon's configuration.
-        unit: unit of the value that the channel yields.
+        unit: of the value that the channel yields.
         timeout_s: silent for longer than this is a gap.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
     link: str = "boom"
-    unit: Unit
     timeout_s: float = Field(default=1.0, gt=0)
 
-    @property
-    def column(self) -> str:
-        """Name of the channel's column in an observations CSV: `theta1_deg`, `boom_valve_mA`."""
-        return f"{self.name}_{self.unit.replace('/', '_per_')}" if self.unit else self.name
 
-
-class _CanopenChannel(_Channel):
+class CanopenChannel(AnyChannel):
     """A CANopen slave.
 
     Attributes:
@@ -52,7 +69,7 @@ class _CanopenChannel(_Channel):
     heartbeat_ms: int = Field(default=1000, ge=0, le=65535)
 
 
-class Cia406Encoder(_CanopenChannel):
+class Cia406Encoder(CanopenChannel):
     """A CiA 406 rotary encoder: value_deg = sign * (counts - zero_counts) * 360 / units_per_revolution, wrapped.
 
     Attributes:
@@ -76,13 +93,13 @@ class Cia406Encoder(_CanopenChannel):
         return self
 
 
-class Cia406Linear(_CanopenChannel):
+class Cia406Linear(CanopenChannel):
     """A CiA 406 linear transducer: value_mm = sign * (counts - zero_counts) * step_nm / 1e6.
 
     Attributes:
         object: `6004` or `6020` (multi-sensor devices, sub-index 1).
         step_nm: measuring step, object 6005h.1 or 6501h.
-        sign, zero_counts: as for encoders.
+        sign, zero_counts: as of encoders.
         range_mm: measuring range; a value beyond it is refused.
     """
 
@@ -95,7 +112,7 @@ class Cia406Linear(_CanopenChannel):
     range_mm: tuple[float, float] = (-1e5, 1e5)
 
 
-class Cia404Analogue(_CanopenChannel):
+class Cia404Analogue(CanopenChannel):
     """A CiA 404 analogue input (pressure, length, temperature).
 
     Attributes:
@@ -111,7 +128,7 @@ class Cia404Analogue(_CanopenChannel):
     offset: float = 0.0
 
 
-class DbcSignal(_Channel):
+class DbcSignal(AnyChannel):
     """A signal of a DBC file.
 
     Attributes:
@@ -128,7 +145,7 @@ class DbcSignal(_Channel):
     offset: float = 0.0
 
 
-class RawSignal(_Channel):
+class RawSignal(AnyChannel):
     """A value at a fixed place of a CAN frame, for machines without a DBC.
 
     Attributes:

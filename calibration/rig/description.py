@@ -7,7 +7,6 @@ after row i. Files keep degrees and mm, and so does this description.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Sequence
 from importlib import resources
 from pathlib import Path
@@ -26,7 +25,9 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 from calibration.errors import RigError
-from calibration.rig.channels import Channel
+from calibration.rig.channels import Channel, Signal
+from calibration.rig.columns import POSITION, SIGMA, WRITTEN, names
+from calibration.rig.signals import signal_faults, signal_lines, signal_of, taken_names
 from calibration.rig.toml import parse_toml
 
 Vector = tuple[float, float, float]
@@ -36,9 +37,9 @@ Convention = Literal["mdh_beta_after", "mdh_beta_before", "dh"]
 
 BEYOND_BUILDING = 4.0  # build tolerances: no correction by building alone is larger
 ANOTHER_VALUE = 10.0  # build tolerances: so far off, the file's value is another machine's and tells nothing
-_MOST = 300  # joints, rows, prisms, masses or channels
+_MOST = 300  # joints, rows, prisms, masses, channels or signals
 _NEARLY_PARALLEL = math.cos(math.radians(15.0))  # beyond it the other constants turn an axis within their tolerances
-_COORDINATE = re.compile(r"(sigma_)?[xyz](_pred)?_mm")  # columns of a fix and of its prediction
+_OF_FIXES = frozenset(names((*POSITION, *SIGMA, *WRITTEN)))  # columns of a fix and of its prediction
 
 
 class _Part(BaseModel):
@@ -84,13 +85,18 @@ class Joint(_Part):
 
     @model_validator(mode="after")
     def _column_of_its_own(self) -> Joint:
-        if _COORDINATE.fullmatch(self.column):
+        if self.column in _OF_FIXES:
             raise ValueError(f"no joint can be called {self.name!r}: its column {self.column} is one of the fix's")
         return self
 
 
 class FixedTransform(_Part):
-    """A constant transform before a row: Trans(x,y,z) Rot(z) Rot(y) Rot(x), applied in that order."""
+    """A constant transform before a row: Trans(x,y,z) Rot(z) Rot(y) Rot(x), applied in that order.
+
+    Attributes:
+        x_mm, y_mm, z_mm: shift.
+        rz_deg, ry_deg, rx_deg: turns.
+    """
 
     x_mm: float = 0.0
     y_mm: float = 0.0
@@ -110,8 +116,8 @@ class Row(_Part):
             Denavit-Hartenberg, with Hayati's beta for a next axis that is nearly parallel)
 
     Attributes:
-        alpha_deg, a_mm, d_mm, theta_deg, beta_deg, b_mm: constants of the row.
-        drive: for `theta`, `d` or `a`: which joints move it, as a linear combination {joint: coefficient}.
+        alpha_deg, a_mm, d_mm, theta_deg, beta_deg, b_mm: constant of the row, as its convention has it.
+        drive: for `theta`, `d` or `a`: which joints move it, as a linear combination `{ joint = coefficient }`.
         identify: which of the row's constants calibration may correct; in a rig, a row that says nothing also has beta
             where it alone can tilt an axis: where that is nearly parallel to the next, or the next row slides along `a`
             before it turns.
@@ -138,7 +144,7 @@ class Prism(_Part):
         name: as in the observations CSV.
         frame: fixed to the frame after this row (0: the base).
         offset_mm: place in that frame.
-        offset_known: False for a target whose mounting is unknown: it is fitted even at stage nominal.
+        offset_known: false for a target whose mounting is unknown: it is fitted even at stage nominal.
     """
 
     name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
@@ -154,7 +160,7 @@ class Mass(_Part):
         name: which part of the machine.
         frame: fixed to the frame after this row.
         kg: mass; a payload's is what is carried unless `payload_kg` is measured.
-        centre_mm: centre of gravity in that frame; None for `midway`.
+        centre_mm: centre of gravity in that frame; none with `midway`.
         midway: the centre is midway between the origins of frames `frame` and `frame` + 1.
         payload: this is the payload that `payload_kg` replaces.
         assumed: not measured and not from the maker.
@@ -176,7 +182,14 @@ class Mass(_Part):
 
 
 class Tolerances(_Part):
-    """Build tolerances, 1 sigma: how far the machine may be from its nominal model."""
+    """Build tolerances, 1 sigma: how far the machine may be from its nominal model.
+
+    Attributes:
+        length_mm: of a length, `a`, `d` and `b`.
+        angle_deg: of an angle, `alpha` and `theta`.
+        beta_deg: of `beta`.
+        prism_mm: of each coordinate of a prism's offset.
+    """
 
     length_mm: float = Field(gt=0)
     angle_deg: float = Field(gt=0)
@@ -208,13 +221,14 @@ class Rig(_Part):
 
     Attributes:
         name: of the machine.
-        convention: order of the transforms in a row (`Row`).
+        convention: order of the transforms in a row.
         gravity: its direction in the base frame, of any length.
         joints: the joint values, `[[joint]]` in the file.
         rows: the kinematic table, `[[row]]`.
         prisms: reflectors, `[[prism]]`.
         masses: lumped masses, `[[mass]]`.
         channels: where readings and signals come from, `[[channel]]`.
+        signals: further columns of observations files, `[[signal]]`.
         tolerances: build tolerances.
         station: random error of a fix.
     """
@@ -227,6 +241,7 @@ class Rig(_Part):
     prisms: tuple[Prism, ...] = Field(alias="prism", min_length=1, max_length=_MOST)
     masses: tuple[Mass, ...] = Field(alias="mass", default=(), max_length=_MOST)
     channels: tuple[Channel, ...] = Field(alias="channel", default=(), max_length=_MOST)
+    signals: tuple[Signal, ...] = Field(alias="signal", default=(), max_length=_MOST)
     tolerances: Tolerances
     station: Station = Station()
 
@@ -252,14 +267,18 @@ class Rig(_Part):
 
     @model_validator(mode="after")
     def _names_differ(self) -> Rig:
-        for what, names in (
+        for what, called in (
             ("joint", [j.name for j in self.joints]),
             ("prism", [p.name for p in self.prisms]),
             ("channel", [c.name for c in self.channels]),
+            ("signal", [s.name for s in self.signals]),
+            ("signal", [s.column for s in self.signals]),
         ):
-            doubled = sorted({n for n in names if names.count(n) > 1})
+            doubled = sorted({n for n in called if called.count(n) > 1})
             if doubled:
                 raise ValueError(f"two {what}s are called {doubled[0]!r}")
+        for fault in signal_faults(self):
+            raise ValueError(fault)
         return self
 
     @model_validator(mode="after")
@@ -331,6 +350,34 @@ class Rig(_Part):
             raise RigError(str(path), "", f"cannot be read: {reason}") from error
         return parse_rig(text, path.name)
 
+    def with_signals(self, *columns: str) -> Rig:
+        """Return the rig with further signals, as if its file had a `[[signal]]` for each; models of it keep them.
+
+        Args:
+            columns: columns of observations tables, `<name>_<unit>` or `<name>`: `tilt_x_deg`.
+
+        Raises:
+            RigError: a column that cannot be a signal's, or that the rig has already.
+            ValueError: the rig was not read from a text.
+        """
+        if not self.text:
+            raise ValueError("the rig was not read from a text, to which the signals could be added; use Rig.read")
+        lines = [self.text.rstrip("\n")]
+        for column in columns:
+            try:
+                lines += ["", *signal_lines(signal_of(column, taken_names(self)))]
+            except ValueError as error:
+                raise RigError(f"rig {self.name!r}", "signal", str(error)) from error
+        return parse_rig("\n".join((*lines, "")), f"rig {self.name!r}")
+
+    def differences(self, other: Rig) -> tuple[str, ...]:
+        """Return the attributes in which another rig is another machine: neither its text nor its signals."""
+        return tuple(
+            name
+            for name in type(self).model_fields
+            if name != "signals" and getattr(self, name) != getattr(other, name)
+        )
+
     def couplings(self) -> Iterator[tuple[int, Driven, str, float]]:
         """Iterate over every (row number from 1, driven constant, joint name, coefficient)."""
         for number, row in enumerate(self.rows, 1):
@@ -372,6 +419,7 @@ _SECTIONS: dict[str, type[BaseModel]] = {
     "row.before": FixedTransform,
     "prism": Prism,
     "mass": Mass,
+    "signal": Signal,
     "tolerances": Tolerances,
     "station": Station,
 }

@@ -26,6 +26,14 @@ DIRECTORY = click.Path(path_type=Path)
 
 rig_option = click.option("--rig", required=True, metavar="RIG", help="Name of a shipped rig, or path of a rig file.")
 data_option = click.option("--data", type=FILE, required=True, metavar="CSV", help="Observations, one row per fix.")
+signal_option = click.option(
+    "--signal",
+    "signals",
+    multiple=True,
+    metavar="COLUMN",
+    help="Use a further column of numbers, as a [[signal]] of the rig file does: NAME_UNIT, or NAME without a unit "
+    "(tilt_x_deg, oil_degC). May be given again; the model remembers it.",
+)
 model_option = click.option(
     "--model", "directory", type=DIRECTORY, required=True, metavar="DIR", help="The directory calibrate wrote."
 )
@@ -86,6 +94,15 @@ def read_observations(path: Path, rig: Rig, *, positions_required: bool = True) 
     except OSError as error:
         raise DataError(str(path), f"cannot be read: {error.strerror}") from error
     return parse_observations(data, rig, path.name, positions_required=positions_required), data
+
+
+def require_columns(observations: Observations, columns: Sequence[str], path: Path) -> None:
+    """DataError unless the observations have all of these optional columns, which were asked for by name."""
+    from calibration.errors import DataError
+
+    for column in columns:
+        if column not in observations.extra:
+            raise DataError(path.name, "the file has no such column, which --signal names", column=column)
 
 
 def source_line(path: Path, data: bytes) -> str:

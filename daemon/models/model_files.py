@@ -162,10 +162,11 @@ def read_model_of_rig(directory: Path, manifest_sha256: str, rig: Rig) -> Calibr
 
     Raises:
         CalibrationError: as `read_model`.
-        UnsafeError: it was made for another rig file: names, joints, rows, limits or channels differ. Comments may.
+        UnsafeError: it was made for another rig file: names, joints, rows, limits or channels differ.
+            Comments and signals may.
     """
     model = read_model(directory, manifest_sha256)
-    if model.rig != rig:
+    if model.rig.differences(rig):
         raise UnsafeError(
             f"{directory} was made for another rig file (of {model.rig.name!r}) than the one in use (of {rig.name!r}), "
             "and they differ in what they describe; calibrate with this one, or go back to that one"

@@ -334,7 +334,7 @@ def _outliers(report: ReportInput) -> str:
         f"{len(report.outliers)} of {len(report.training)} fixes ({number(share, 2)} %) did not fit with the others "
         "and had little or no say in the fit. They still count in every figure of this report."
     )
-    rows = [[str(o.row), o.prism, number(o.error_mm), number(o.sigmas, 2)] for o in worst]
+    rows = [[o.row, o.prism, number(o.error_mm), number(o.sigmas, 2)] for o in worst]
     columns = ["row of the data", "prism", "error, mm", "in standard deviations"]
     caption = f"The {len(worst)} worst" if len(worst) < len(report.outliers) else ""
     return markup.section(

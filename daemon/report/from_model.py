@@ -159,7 +159,7 @@ def _readable(coefficient: FittedCoefficient) -> tuple[str, float, float, str]:
 def _outliers(training: Evaluation) -> Iterator[OutlierLine]:
     for outlier in training.outliers:
         yield OutlierLine(
-            row=outlier.row + 1,
+            row=training.observations.row_name(outlier.row),
             prism=str(training.observations.prism[outlier.row]),
             error_mm=float(np.linalg.norm(training.errors_mm["effects"][outlier.row])),
             sigmas=outlier.sigma,

@@ -132,9 +132,9 @@ class EffectLine:
 
 @dataclass(frozen=True)
 class OutlierLine:
-    """A fix that the fit set aside: its row of the training data from 1, its prism, how far off it is."""
+    """A fix that the fit set aside: its row as warnings name it, its prism, how far off it is."""
 
-    row: int
+    row: str
     prism: str
     error_mm: float
     sigmas: float

@@ -189,6 +189,24 @@ def test_a_bad_data_frame_is_refused_with_its_place(changes: dict[str, list[obje
         Observations.from_frame(frame(**changes), RIG)
 
 
+def test_rows_keep_the_numbers_of_the_file_whatever_is_left_out() -> None:
+    rows = "\n".join(ROW if number % 5 else "" for number in range(1, 20))  # some lines are empty
+    found = parse(f"{HEADER}\n{rows}\n")
+    assert [found.row_name(row) for row in (0, 3, 4)] == ["line 2", "line 5", "line 7"]
+    kept = found.select(np.arange(16) % 3 == 1).select(np.array([3, 1]))
+    assert kept.row_name(0, 1) == "lines 14, 7"
+    assert kept.row_number(0) == 14
+    of_frame = Observations.from_frame(frame(), RIG).select(np.array([1]))
+    assert of_frame.row_name(0) == "row 1 (from 0)"
+
+
+def test_columns_of_a_data_frame_that_nothing_uses_are_told_apart() -> None:
+    made = frame(tilt_deg=[1.0, 2.5], remark=["fine", None], still=[3, 3])
+    assert Observations.from_frame(made, RIG).ignored_numbers == ("tilt_deg",)
+    rig = RIG.with_signals("tilt_deg")
+    assert Observations.from_frame(made, rig).extra["tilt_deg"].tolist() == [1.0, 2.5]
+
+
 def test_a_data_frame_must_have_the_columns_and_a_row() -> None:
     whole = frame()
     with pytest.raises(DataError, match="data frame, column z_mm: column missing for rig"):

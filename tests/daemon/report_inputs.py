@@ -56,7 +56,7 @@ def report_input(
         "n_parameters": 56,
         "rank": 54,
         "unidentifiable": ["row9.theta with prism.s.x"],
-        "outliers": [OutlierLine(7, rig.prism_names[0], 55.5, 12.0)],
+        "outliers": [OutlierLine("line 7", rig.prism_names[0], 55.5, 12.0)],
         "warnings": ["Joint L2 moved over less than a tenth of its range."],
         "ignored_columns": ["operator_note"],
         "provenance": {"made": "2026-11-21 14:03 UTC", "seed": "17"},

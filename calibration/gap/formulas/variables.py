@@ -12,7 +12,9 @@ import numpy as np
 from calibration.effects.boom import boom_in
 from calibration.gap.projection import Projection
 from calibration.observations import Floats
+from calibration.rig.columns import own_columns
 from calibration.rig.description import Joint
+from calibration.rig.signals import is_read_anyway
 
 Unit = Mapping[str, int]  # symbol -> power
 
@@ -24,7 +26,6 @@ _STEPS = 16
 _LEAST_KNOWN = 0.5  # share of the rows that have a column
 _INCIDENCE = (1, 2, 3, 6)  # harmonics; six reflectors make a prism that is seen from all round
 _FEW_SIGNALS = 4  # that products take in; each more would add a hundred terms
-_SIGNALS = ("_bar", "_mA")
 _NOTHING: Unit = {}
 
 
@@ -313,11 +314,15 @@ class Variables:
             yield from self._measured(text, "time", _NOTHING, np.where(time_s > instant_s, 1.0, 0.0))
 
     def _machine_signals(self) -> Iterator[Variable]:
-        """Pressures, currents and whatever else was recorded."""
+        """Pressures, currents and the signals of the rig file."""
+        rig = self._situation.rig
+        own = own_columns(rig.joint_names)
+        units = {signal.column: signal.unit for signal in (*rig.channels, *rig.signals) if signal.column not in own}
         for column in sorted(self._situation.observations.extra):
-            ending = next((e for e in _SIGNALS if column.endswith(e)), None)
-            if ending is not None:
-                yield from self._measured(column, column, {ending[1:]: 1}, self._situation.extra(column))
+            unit = units.get(column, column.rpartition("_")[2] if is_read_anyway(column) else None)
+            if unit is not None:
+                powers = {symbol: power for symbol, power in zip(unit.split("/"), (1, -1), strict=False) if symbol}
+                yield from self._measured(column, column, powers, self._situation.extra(column))
 
     def _measured(self, text: str, topic: str, unit: Unit, values: Floats) -> Iterator[Variable]:
         """The variable of (n,) values, if most rows have it and it varies; a row without it says nothing."""

@@ -49,6 +49,7 @@ CONNECT_TIMEOUT_S = 5
     show_default=True,
     help="Learner of what is left; `default` takes the one that helps on data it has not seen, or none.",
 )
+@offline.signal_option
 @offline.prior_option
 @offline.seed_option
 @offline.time_limit_option
@@ -65,6 +66,7 @@ def calibrate(
     method: str,
     effects: str,
     residual: Kind,
+    signals: tuple[str, ...],
     prior: Prior,
     seed: int,
     time_limit: float | None,
@@ -87,10 +89,11 @@ def calibrate(
     from daemon.report.calibration import calibration_report
     from daemon.report.from_model import report_input
 
-    source = load_rig(rig)
+    source = load_rig(rig, signals)
     _check_effects(effects, method, source.rig)
     model_files.check_target(out)
     observations, raw = offline.read_observations(data, source.rig)
+    offline.require_columns(observations, signals, data)
     with (
         FileCheckpoint(out.resolve().with_name(f"{out.resolve().name}.checkpoint")) as checkpoint,
         progress_display(as_json=as_json) as progress,

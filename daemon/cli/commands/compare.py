@@ -44,6 +44,7 @@ _MOST = 1000  # sentences: all of them
     metavar="DIR",
     help="Where the page with the plots goes, as comparison-RIG.html; the current directory by default.",
 )
+@offline.signal_option
 @offline.prior_option
 @click.option(
     "--refit-base",
@@ -59,6 +60,7 @@ def compare(
     holdout: Path,
     protocol: str | None,
     out: Path,
+    signals: tuple[str, ...],
     prior: Prior,
     seed: int,
     time_limit: float | None,
@@ -88,8 +90,9 @@ def compare(
     from daemon.report.zhou2022 import protocol_page
 
     watch = offline.Stopwatch()
-    source = load_rig(rig)
+    source = load_rig(rig, signals)
     training, raw = offline.read_observations(data, source.rig)
+    offline.require_columns(training, signals, data)
     held_out, held_out_raw = offline.read_observations(holdout, source.rig)
     page = out / f"comparison-{re.sub(r'[^A-Za-z0-9._-]+', '-', source.rig.name)}.html"
     out.mkdir(parents=True, exist_ok=True)

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     help="Where model/, report.html and gap.json go, and plan.csv and plan.json where poses are asked for; "
     "replaces an earlier answer.",
 )
+@offline.signal_option
 @offline.prior_option
 @offline.seed_option
 @json_option
@@ -42,6 +43,7 @@ def gap(
     data: Path,
     holdout: Path | None,
     out: Path,
+    signals: tuple[str, ...],
     prior: Prior,
     seed: int,
     *,
@@ -64,9 +66,10 @@ def gap(
     from daemon.report.from_model import provenance
     from daemon.report.gap import gap_report
 
-    source = load_rig(rig)
+    source = load_rig(rig, signals)
     check_gap_target(out)
     observations, raw = offline.read_observations(data, source.rig)
+    offline.require_columns(observations, signals, data)
     files = {"data": offline.source_line(data, raw)}
     held_out = None
     overlap: tuple[str, ...] = ()

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import click
 
+from calibration.rig.columns import CLOSURE
 from daemon.cli import offline
 from daemon.cli.command import REFUSED, Command, Delivered, json_option
 from daemon.warm_up import prepare
-
-CLOSURE_COLUMN = "closure_mm"
 
 
 @click.command(cls=Command)
@@ -47,16 +46,16 @@ def inverse(directory: Path, data: Path, out: Path | None, *, as_json: bool) -> 
     with one_blas_thread():
         found = solve(model, targets)
     commands = {joint.column: found.observations.joints[joint.name] for joint in model.rig.joints}
-    table = offline.with_columns(raw, {**commands, CLOSURE_COLUMN: found.closure_mm})
-    unreached = (~found.reached).nonzero()[0] + 1
+    table = offline.with_columns(raw, {**commands, CLOSURE.name: found.closure_mm})
+    unreached = (~found.reached).nonzero()[0].tolist()
     result: dict[str, object] = {
         "rig": model.rig.name,
         "n": len(targets),
         "seconds": watch.seconds,
         "worst_closure_mm": float(found.closure_mm.max()),
-        "unreached_rows": unreached.tolist(),
+        "unreached_lines": [targets.row_number(row) for row in unreached],
         "warnings": list(found.warnings),
         "ignored_columns": list(targets.ignored_columns),
     }
     offline.deliver(table, result, found.warnings, out, as_json=as_json)
-    return Delivered(result, REFUSED) if len(unreached) else result
+    return Delivered(result, REFUSED) if unreached else result

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from calibration.rig.columns import INTERVALS, PREDICTED, names
 from daemon.cli import offline
 from daemon.cli.command import Command, json_option
 from daemon.warm_up import prepare
@@ -17,8 +18,8 @@ if TYPE_CHECKING:
     from calibration.observations import Floats
     from calibration.residual.conformal import Intervals
 
-PREDICTED_COLUMNS = tuple(f"{name}_pred_mm" for name in ("x", "y", "z", "sigma_x", "sigma_y", "sigma_z"))
-INTERVAL_COLUMNS = tuple(f"{name}_pred_mm" for name in ("half90_x", "half90_y", "half90_z", "radius90"))
+PREDICTED_COLUMNS = names(PREDICTED)
+INTERVAL_COLUMNS = names(INTERVALS)
 
 
 @click.command(cls=Command)

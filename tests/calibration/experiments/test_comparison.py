@@ -198,9 +198,9 @@ def test_rows_and_poses_that_training_and_held_out_data_share_are_named() -> Non
     assert shared_rows(data.select(np.arange(20)), data.select(np.arange(20, 40)), ("a.csv", "b.csv")) == ()
     same, pose = shared_rows(data.select(np.arange(22)), data.select(np.arange(19, 40)), ("a.csv", "b.csv"))
     assert "3 of the 21 rows of b.csv are rows of a.csv" in same
-    assert "the first is row 1)" in same
+    assert "the first in line 21: " in same
     assert "2 of the 21 rows of b.csv were measured in poses of a.csv" in pose
-    assert "the first is row 4)" in pose
+    assert "the first in line 24: " in pose
     moved = replace(data, position_mm=data.position_mm + 0.1)
     assert len(shared_rows(data, moved, ("a.csv", "b.csv"))) == 1
 

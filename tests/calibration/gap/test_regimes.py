@@ -101,4 +101,6 @@ def joined(a: Observations, b: Observations) -> Observations:
         session=np.concatenate([a.session, b.session]),
         pose=np.array([str(number) for number in range(len(a) + len(b))]),
         extra=extra,
+        row_numbers=None,
+        place="row",
     )

@@ -202,6 +202,8 @@ def joined_observations(parts: list[Observations]) -> Observations:
             session=np.concatenate([joined.session, part.session]),
             pose=np.concatenate([joined.pose, pose]),
             extra={},
+            row_numbers=None,
+            place="row",
         )
     return joined
 

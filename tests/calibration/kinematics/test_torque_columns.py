@@ -206,9 +206,9 @@ def test_a_prediction_that_is_not_finite_is_refused(carrying: CalibratedModel) -
     rows = fixes(rig, RigTruth(rig, 5), 40, 8, 1.0)
     strange = np.arange(40) == 17
     endless = replace(rows, extra={**rows.extra, "theta2_rate": np.where(strange, 1e200, 0.0)})
-    with np.errstate(over="ignore", invalid="ignore"), pytest.raises(CalibrationError, match="prediction of row 17"):
+    with np.errstate(over="ignore", invalid="ignore"), pytest.raises(CalibrationError, match="prediction of line 19 "):
         Predictor.of(carrying).predict(endless)
     heavy = replace(rows, extra={**rows.extra, "theta2_Nm": np.where(strange, 1.7e308, 0.0)})
     for use in (Predictor.of(carrying).predict, Predictor.of(carrying).effects_mm, Predictor.of(carrying).parts):
-        with np.errstate(all="ignore"), pytest.raises(CalibrationError, match="prediction of row 17"):
+        with np.errstate(all="ignore"), pytest.raises(CalibrationError, match="prediction of line 19 "):
             use(heavy)

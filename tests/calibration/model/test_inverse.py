@@ -168,7 +168,7 @@ def test_a_target_out_of_reach_is_named_and_approached(boom: CalibratedModel) ->
     before = np.linalg.norm(Predictor.of(boom).predict(targets).position_mm[2] - far[2])
     assert 10_000.0 < found.closure_mm[2] < before
     assert found.warnings[0].startswith("1 of 5 targets are out of reach from their nominal commands")
-    assert "(row 3)" in found.warnings[0]
+    assert "mm, in row 2 (from 0)" in found.warnings[0]
     low, high = np.array([joint.limits for joint in boom.rig.joints]).T
     joints = table(boom, found.observations)
     assert ((joints >= low) & (joints <= high)).all()

@@ -86,7 +86,7 @@ def test_rows_without_a_setup_beside_others_are_told(session: Session) -> None:
     with pytest.raises(UnsafeError, match=r"set-up '' \(no setup in the row\) is unknown to the model"):
         evaluate(model, mixed)
     (warning,) = calibrated(session, mixed).warnings
-    assert warning.startswith("50 of 250 rows have no setup, the first in row 201, beside those of 'S1'")
+    assert warning.startswith("50 of 250 rows have no setup, the first in line 202, beside those of 'S1'")
 
 
 def test_a_clock_that_was_set_back_is_told_and_a_sorted_table_is_not(session: Session) -> None:
@@ -94,7 +94,7 @@ def test_a_clock_that_was_set_back_is_told_and_a_sorted_table_is_not(session: Se
     time_s = rows.extra["time_s"].copy()
     time_s[120:] -= 600.0
     (warning,) = calibrated(session, at_times(time_s)(rows)).warnings
-    assert warning.startswith("time_s runs backward, first in row 121")
+    assert warning.startswith("time_s runs backward, first in line 122")
     assert warning in evaluate(session.model, at_times(time_s)(rows)).warnings
     by_prism = rows.select(np.argsort(rows.prism, kind="stable"))
     shuffled = rows.select(np.random.default_rng(1).permutation(len(rows)))

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 from calibration.errors import UnsafeError
 from calibration.evaluation.evaluation import evaluate
-from calibration.observations import Observations, format_observations
+from calibration.observations import Observations, format_observations, parse_observations
 from calibration.pipeline.calibrate import identify
 from calibration.rig.description import parse_rig, shipped_rig
 from calibration.run import Run
@@ -146,10 +146,13 @@ def test_copied_rows_count_once_and_are_named(session: Session) -> None:
     position[7] += [0.0, 0.0, 3000.0]
     training = replace(session.training, position_mm=position, pose=np.full(250, ""))
     copied = training.select(np.concatenate([np.arange(250), np.arange(100)]))
+    copied = parse_observations(format_observations(copied, session.rig).encode(), session.rig, "copied.csv")
     model = identify(session.rig, rig_text("swdt82"), copied)
     once = identify(session.rig, rig_text("swdt82"), training)
-    assert any(w.startswith("100 of 350 rows are copies of earlier ones") and "row 251" in w for w in model.warnings)
-    assert any(w.startswith("1 of 250 training fixes are outliers") and "(row 8;" in w for w in model.warnings)
+    assert any(
+        w.startswith("100 of 350 rows are copies of earlier ones") and "in line 252, " in w for w in model.warnings
+    )
+    assert any(w.startswith("1 of 250 training fixes are outliers") and w.endswith("in line 9") for w in model.warnings)
     np.testing.assert_array_equal(model.values, once.values)
     np.testing.assert_array_equal(model.covariance, once.covariance)
     assert (model.outliers, model.noise_mm) == (once.outliers, once.noise_mm)

@@ -142,7 +142,7 @@ def test_what_is_no_number_is_refused_in_training_and_prediction(model: Calibrat
         lambda rows: evaluate(model, rows),
         lambda rows: train_residual(model, rows),
     ):
-        with pytest.raises(DataError, match=r"theta5_deg: the reading of row 17 \(from 0\) is not a finite number"):
+        with pytest.raises(DataError, match=r"theta5_deg: the reading of line 19 is not a finite number"):
             use(broken)
     with pytest.raises(DataError, match="theta5_deg"):
         identify(TRUTH.rig, rig_text("swdt82"), broken)

@@ -75,7 +75,7 @@ def test_a_target_out_of_reach_is_delivered_with_status_3(model: Path, targets: 
     done = run("inverse", "--model", model, "--data", far, "--out", out, "--json")
     answer = json.loads(done.stdout)
     assert done.exit_code == 3
-    assert (answer["n"], answer["unreached_rows"], answer["out"]) == (12, [5], str(out))
+    assert (answer["n"], answer["unreached_lines"], answer["out"]) == (12, [6], str(out))
     closures = numbers(parsed(out.read_text()), ["closure_mm"])[:, 0]
     assert closures[4] == pytest.approx(answer["worst_closure_mm"])
     assert closures[4] > 1000.0

@@ -14,6 +14,7 @@ import pytest
 from sqlite_utils import Database
 
 from calibration.errors import ModelError
+from calibration.rig.description import parse_rig
 from daemon.commands import REFUSED, WRONG_USE, CommandError
 from daemon.jobs.process import perform
 from daemon.jobs.runner import JobRunner
@@ -310,6 +311,17 @@ def test_a_model_of_another_rig_does_not_go_live(rig: ModelRig) -> None:
     rig.store.update("models", {"id": model}, {"rig": "ur10"})
     for command in (rig.registry.accept_command, rig.registry.rollback_command, rig.registry.compare_command):
         assert "is of rig 'ur10', and this is rig 'swdt82'" in refusal(command, REFUSED, id=model)
+
+
+def test_a_model_stays_live_where_the_rig_file_has_another_comment_or_signal(tmp_path: Path) -> None:
+    before = ModelRig(tmp_path)
+    before.accepted()
+    before.close()
+    after = ModelRig(tmp_path, parse_rig(f"# mine\n{SOURCE.rig.with_signals('tilt_x_deg').text}", "boom.toml"))
+    try:
+        assert isinstance(after.settled(), Loaded)
+    finally:
+        after.close()
 
 
 def test_a_model_of_another_rig_file_does_not_go_live_and_a_live_one_is_not_used(tmp_path: Path) -> None:

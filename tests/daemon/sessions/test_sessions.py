@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 
 from calibration.observations import parse_observations
+from daemon.acquisition.present_state import expected_of
 from daemon.commands import CommandError
-from daemon.config import SessionsSection
+from daemon.config import Config, SessionsSection, load_rig
 from daemon.control.server import ControlServer
 from daemon.sessions.session_data import sessions_csv, setup_lines
 from daemon.store.errors import NotInStoreError
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import DeviceEvent, EventKind
+from tests.daemon import session_support
 from tests.daemon.session_support import SOURCE, STEP_S, Rig
 
 
@@ -57,6 +59,25 @@ def test_observations_leave_as_the_contracts_csv_and_can_be_read_as_one(rig: Rig
     assert observations.position_mm[0] == pytest.approx((3000.0, 8000.0, 1000.0), abs=1e-6)
     assert (observations.extra["dwell_s"] > 0).all()
     assert (observations.extra["theta1_rate"] == 0).all()
+
+
+def test_a_signal_without_a_device_stands_in_the_way_of_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "boom.toml"
+    path.write_text(SOURCE.rig.with_signals("tilt_x_deg").text, encoding="utf-8")
+    source = load_rig(str(path))
+    monkeypatch.setattr(session_support, "SOURCE", source)
+    assert expected_of(Config(rig=str(path)), source.rig) == expected_of(Config(rig="swdt82"), SOURCE.rig)
+    rig = Rig(tmp_path / "rigcal.sqlite")
+    start(rig, id="first")
+    rig.live(2)
+    assert rig.say("stop")["poses"] == 1
+    with Reader(rig.store.path) as reader:
+        data = sessions_csv(reader, source.rig, ["first"])
+    rig.store.close()
+    assert b"tilt" not in data
+    assert "tilt_x_deg" not in parse_observations(data, source.rig, "stored").extra
 
 
 def test_a_clock_that_is_set_in_a_session_does_not_step_its_times(rig: Rig) -> None:

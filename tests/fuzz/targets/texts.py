@@ -25,6 +25,7 @@ _TOML = (
         b"[[prism]]\n",
         b"[[mass]]\n",
         b"[[channel]]\n",
+        b"[[signal]]\n",
         b"[station]\n",
         b'name = "theta1"\n',
     ),
