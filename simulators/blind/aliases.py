@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from simulators.blind.hiding import UnreachableError
 from simulators.blind.scene import Fixes, Scene
+from simulators.effects.families.zero_step import ZeroStep
 from simulators.rig.screws import Floats
 
 _VISIT_H, _NEXT_VISIT_H = 0.2, 5.0
@@ -83,7 +84,9 @@ def _from_the_other_side(scene: Scene, rng: np.random.Generator) -> tuple[Scene,
 
     Its play is then as a zero that stepped in between.
     """
-    where = _one_of([p for p in scene.draws.places("backlash") if p in scene.draws.places("zero_step")], rng)
+    where = _one_of(
+        _far_reaching(scene, set(scene.draws.places("backlash")) & set(scene.draws.places("zero_step"))), rng
+    )
 
     def change(fixes: Fixes) -> dict[str, Floats]:
         time_s, visit = _visits(scene, fixes)
@@ -126,6 +129,13 @@ def _changed(scene: Scene, change: Change) -> Scene:
         training=replace(training, columns={**training.columns, **new}, recorded={**training.recorded, **recorded}),
         held_out=replace(held_out, columns={**held_out.columns, **change(held_out)}),
     )
+
+
+def _far_reaching(scene: Scene, joints: Collection[str]) -> list[str]:
+    """Return the joints that move the prism by as much as the median one, or more: play of others hardly shows."""
+    moved = {p: scene.displacement_mm([ZeroStep(p, time_s=-np.inf)]) for p in sorted(joints)}
+    size = {p: float(np.sqrt(np.mean(mm**2))) for p, mm in moved.items()}
+    return [p for p in size if size[p] >= np.median(list(size.values()))]
 
 
 def _one_of(places: list[str], rng: np.random.Generator) -> str:

@@ -25,7 +25,7 @@ class BaseShift(StepFamily, SizedFamily):
     equation = "shifts along the base's level x and y axes and turn about its upright axis, for t > time_s"
     source = "rigid motion of the set-up over the ground at one instant: a carrier that slides or is moved"
     confused_with = ("base_step", "zero_step", "prism_seat_step")
-    revealed_by = "a prism on the carrier, or one pose again and again all through the session"
+    revealed_by = "a prism on the carrier, and control points on the ground, before and after"
     fixed = (Coefficient("x_mm", "mm", 5.0, -50.0, 50.0), Coefficient("y_mm", "mm", 5.0, -50.0, 50.0), _HEADING)
     place = "base"
     moves_machine = False

@@ -99,6 +99,28 @@ def test_effects_that_would_explain_next_to_nothing_of_a_gap_are_no_set() -> Non
     assert (gap.verdict, gap.effects, gap.indistinguishable) == ("unidentified", (), ())
 
 
+@pytest.mark.parametrize(
+    ("hidden", "named", "undecided"),
+    [
+        ("zero_step@theta1:jump_rad=3e-4", [], [("base_shift", "base"), ("zero_step", "theta1")]),
+        ("base_shift@base:x_mm=0:y_mm=0:heading_rad=3e-4", [], [("base_shift", "base"), ("zero_step", "theta1")]),
+        ("base_shift@base:x_mm=0.3:y_mm=-0.4:heading_rad=2e-4", [("base_shift", "base")], []),
+        ("zero_step@theta3:jump_rad=3e-4", [("zero_step", "theta3")], []),
+        ("prism_seat_step@tool:x_mm=0.3:y_mm=0.4:z_mm=-0.3", [("prism_seat_step", "tool")], []),
+    ],
+)
+def test_a_robot_that_turned_in_its_foot_is_as_one_whose_first_encoder_slipped_and_as_no_other(
+    hidden: str, named: list[tuple[str, str]], undecided: list[tuple[str, str]]
+) -> None:
+    robot, n = load_rig("ys100"), 120
+    moved = RigTruth(robot.rig, 3, effects=parse_effects(f"{hidden}:time_s=3000"))
+    columns = {"time_s": np.linspace(0.0, 7200.0, n)}
+    data = simulate_observations(moved, n, 3, noise_mm=0.05, columns=columns).csv_text().encode()
+    gap = find_gap(robot.rig, robot.text, parse_observations(data, robot.rig, "session.csv"))
+    assert [(effect.family, effect.where) for effect in gap.effects] == named
+    assert sorted((candidate.family, candidate.where) for candidate in gap.indistinguishable) == undecided
+
+
 @pytest.mark.slow
 def test_a_set_beside_a_named_effect_leaves_the_errors_of_every_round_as_they_are_without_it() -> None:
     rng = np.random.default_rng(42)
