@@ -29,45 +29,45 @@ def drawn(kind: Literal["regime", "null"], size: float, seed: int) -> Observatio
 
 
 @pytest.fixture(scope="module")
-def coupled() -> tuple[GapResult, Observations]:
-    """A linkage coupling beyond 35 deg of theta1 alone."""
-    rows = drawn("regime", 3.0, 2069)
+def soft() -> tuple[GapResult, Observations]:
+    """A joint that gives way beyond 32 deg of its own angle alone."""
+    rows = drawn("regime", 6.0, 2092)
     return find_gap(SOURCE.rig, SOURCE.text, rows), rows
 
 
-def test_an_effect_beyond_an_angle_is_named_with_the_angle(coupled: tuple[GapResult, Observations]) -> None:
-    (effect,) = coupled[0].effects
-    assert (effect.family, effect.where) == ("linkage_coupling", "theta1")
+def test_an_effect_beyond_an_angle_is_named_with_the_angle(soft: tuple[GapResult, Observations]) -> None:
+    (effect,) = soft[0].effects
+    assert (effect.family, effect.where) == ("joint_compliance", "theta4")
     assert effect.regime is not None
-    assert (effect.regime.variable, effect.regime.above) == ("theta1_deg", True)
-    assert effect.regime.border == pytest.approx(35.1, abs=7.5)
-    assert "only where theta1_deg is above 35" in effect.form
+    assert (effect.regime.variable, effect.regime.above) == ("theta4_deg", True)
+    assert effect.regime.border == pytest.approx(32.1, abs=7.4)
+    assert "only where theta4_deg is above 3" in effect.form
 
 
 def test_it_does_nothing_in_the_other_rows_also_in_a_model_that_was_read_again(
-    coupled: tuple[GapResult, Observations],
+    soft: tuple[GapResult, Observations],
 ) -> None:
-    gap, rows = coupled
+    gap, rows = soft
     model = model_from_files(model_to_files(gap.model))
     without = Predictor.of(replace(model, effects=()))
     moved = np.linalg.norm(Predictor.of(model).effects_mm(rows) - without.effects_mm(rows), axis=1)
     assert model.effects[0].regime is not None
-    inside = rows.joints["theta1"] > model.effects[0].regime.border
+    inside = rows.joints["theta4"] > model.effects[0].regime.border
     assert (moved[~inside] < 1e-9).all()
     assert (moved[inside] > 1e-3).mean() > 0.9
 
 
 def test_without_times_the_border_is_a_row_and_later_rows_are_as_the_last() -> None:
-    rows = drawn("regime", 3.0, 2071)
+    rows = drawn("regime", 6.0, 2082)
     gap = find_gap(SOURCE.rig, SOURCE.text, rows)
     (effect,) = gap.effects
     assert effect.regime is not None
     assert (effect.family, effect.regime.variable, effect.regime.above) == ("joint_compliance", "row", True)
-    assert effect.regime.border == pytest.approx(155.5, abs=25.0)
+    assert effect.regime.border == pytest.approx(172.5, abs=25.0)
     later = Predictor.of(gap.model).effects_mm(rows)  # rows of another file: the machine as it is now
     now = Predictor.of(gap.model).effects_mm(rows.numbered())
-    assert np.abs(later - now)[156:].max() < 1e-9
-    assert np.abs(later - now)[:150].max() > 1.0
+    assert np.abs(later - now)[198:].max() < 1e-9
+    assert np.abs(later - now)[:147].max() > 1.0
 
 
 def test_a_machine_that_is_another_from_an_instant_on_is_found_and_told() -> None:
