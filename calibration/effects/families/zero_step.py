@@ -36,7 +36,8 @@ class ZeroStep(StepFamily, JointFamily):
 
     def columns(self, context: EffectContext, where: str, settings: Settings) -> Floats:
         del where
-        return np.degrees(context.extra("time_s") > settings["time_s"])[:, None]
+        after = context.extra("time_s") > settings["time_s"]
+        return np.degrees(after.astype(np.float64))[:, None]
 
     def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
         """Return the mean square for rows as likely before the step as after it."""

@@ -139,6 +139,7 @@ def test_a_family_has_sane_numbers_wherever_it_may_be_on_the_boom(
         sigma = np.array([c.sigma for c in coefficients])
         variance = family.unknown_variance(sigma, sigma, settings)
         assert 0.0 <= variance < np.inf
+        assert Choice(name, where, settings).columns(situation).column.dtype == np.float64
         # Plausible sizes are seen by an instrument of 0.01 mm, and no accident.
         moved = moved_mm(situation, Choice(name, where, settings)) * sigma
         assert moved.shape == (ROWS, 3, len(coefficients))
@@ -242,6 +243,7 @@ def test_every_family_copes_with_every_rig_and_with_a_single_row(rig_name: str) 
         for name, family in FAMILIES:
             for where, settings in forms(family, situation):
                 additions = Choice(name, where, settings).columns(situation)
+                assert additions.column.dtype == np.float64
                 assert np.isfinite(additions.column).all()
                 assert additions.shift_mm is None or np.isfinite(additions.shift_mm).all()
 
