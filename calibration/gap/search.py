@@ -148,6 +148,7 @@ class _Search:
                 pending += [str(c) for c in taken]
             posterior |= {str(c): selection.posterior[c.family] for c in taken}
             joint = selection.joint
+            self.least_cost = min(self.least_cost, joint.fit.cost)
             projection, candidates = self._candidates(joint)
         alternatives = selection.alternatives
         for name in pending:
