@@ -215,10 +215,10 @@ def _errors_in_sigma(directory: Path, session: str, tips: list[dict[str, Any]]) 
             (session,),
         ).fetchall()
     store.close()
+    fixes = [(json.loads(values), place) for values, *place in rows]
     found = []
     for tip in tips:
-        for values, *place in rows:
-            joints = json.loads(values)
+        for joints, place in fixes:
             if tip["station_mm"] and all(abs(joints[name] - value) < 0.05 for name, value in tip["joints"].items()):
                 sigma = math.hypot(tip["sigma_mm"], 5.0)  # of tip and fix
                 found.append(math.dist(tip["station_mm"], place) / sigma)
