@@ -14,7 +14,7 @@ export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 # The tests start a hundred processes: each would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help environment setup demo check test lint style types imports quick blind bench soak fuzz lock clean
+.PHONY: help environment setup demo check test long lint style types imports quick blind bench soak fuzz lock clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -35,9 +35,12 @@ demo: setup ## a simulated rig, from bus traffic to a calibrated model and a rep
 
 # The deployment tests ask systemd's own tools about the files in deploy/. What reads devices and what keeps their data
 # must be reached by its own tests almost line by line.
-test: ## the whole test suite; needs no hardware
+test: ## the test suite; needs no hardware
 	@$(BOOTSTRAP) -t systemd-analyze=systemd -t udevadm=udev .venv requirements-dev.lock
-	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder --gates --cov=drivers --cov=daemon.store --cov=calibration --cov-report=term-missing:skip-covered
+	$(BIN)/python -m pytest -m "not long" -n auto --dist loadfile --no-loadscope-reorder --gates --cov=drivers --cov=daemon.store --cov=calibration --cov-report=term-missing:skip-covered
+
+long: setup ## tests that take a quarter of an hour, if what they test has changed since they passed
+	$(BIN)/python -m tests.long
 
 lint: style types imports ## style, types and import floors
 
@@ -55,7 +58,7 @@ imports: environment
 QUICK := tests/drivers tests/daemon/store tests/daemon/report tests/calibration/numerics tests/calibration/rig tests/simulators/devices
 
 quick: environment
-	$(BIN)/python -m pytest -q -n auto --dist loadfile -m "not slow" $(QUICK)
+	$(BIN)/python -m pytest -q -n auto --dist loadfile -m "not slow and not long" $(QUICK)
 
 check: ## lint and a quick part of the tests, in a minute: before each commit
 	@$(MAKE) --no-print-directory -j2 --output-sync=target types quick imports style

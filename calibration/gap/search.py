@@ -246,12 +246,16 @@ def _in_regimes(problem: Problem, families: Collection[str], found: SearchResult
 
     Rows in which it acts may seem to be outliers to anything else, so that all rows count where there are many such.
 
+    Where one effect or none leaves nothing but noise, no part of the data is sought.
+
     Args:
         problem: the data.
         families: of effects that may be named.
         found: with effects that act in all rows.
         least_cost: of the fits that led to it, also of those with effects that it was not sure of.
     """
+    if len(found.joint.choices) <= 1 and _leaves_noise(problem, found):
+        return found
     alone = problem.with_mild_outliers(problem.kinematics_only())
     starts = [alone, *([found.joint] if found.joint.choices else [])]
     if (alone.fit.weight < OUTLIER).mean() >= _MANY:

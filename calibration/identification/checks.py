@@ -34,6 +34,7 @@ _FAR_RAD = math.radians(75.0)  # from the rig file: no assembly is off so much, 
 _FAR_TOLERANCES = 100.0  # likewise of lengths
 _TILTED_DEG = 30.0  # no carrier works on such a slope
 _TURNING_DEG = 3.0  # standard error of a base's attitude beneath a known machine; 2 mm over a metre leave a tenth
+_LEFT_OUT = "the fit had to leave out"
 _DISCARDED = 1.0 / 3.0  # share of the fixes
 _DISCARDED_OF_ONE = 0.8  # of a set-up or a prism
 _LEAST_DISCARDED = 5
@@ -305,30 +306,35 @@ def refuse_turning(chain: Chain, samples: Samples, x: Floats) -> None:
 
 
 def refuse_discarded(chain: Chain, samples: Samples, fit: Fit, prior: Prior) -> None:
-    """UnsafeError for a fit that left out much of the data, or nearly all of a set-up or a prism."""
+    """UnsafeError for a fit that left out nearly all of a set-up or a prism."""
     discarded = fit.weight < 0.5
     still = _encoders_that_stood_still(chain.rig, samples)
-    left_out = "the fit had to leave out"
     for setup, name in enumerate(chain.setups):
         own = discarded[samples.data.setup == setup]
         if len(chain.setups) > 1 and own.sum() >= _LEAST_DISCARDED and own.mean() > _DISCARDED_OF_ONE:
             raise UnsafeError(
-                f"{left_out} {own.sum()} of the {len(own)} fixes of set-up {name!r}: check unit, order and sign of its "
-                f"x, y, z, whether the station stood still, and whether the joints were read as at the other set-ups"
+                f"{_LEFT_OUT} {own.sum()} of the {len(own)} fixes of set-up {name!r}: check unit, order and sign of "
+                f"its x, y, z, whether the station stood still, and whether the joints were read as elsewhere"
             )
     for prism, name in enumerate(chain.rig.prism_names):
         own = discarded[samples.data.prism == prism]
         if own.sum() >= _LEAST_DISCARDED and own.mean() > _DISCARDED_OF_ONE:
             hint = "" if prior == "as-built" else "; --prior as-built also tries joints that are mounted turned"
             raise UnsafeError(
-                f"{left_out} {own.sum()} of the {len(own)} fixes of prism {name!r}, so it would be wrong "
+                f"{_LEFT_OUT} {own.sum()} of the {len(own)} fixes of prism {name!r}, so it would be wrong "
                 f"there: check which prism was measured, its offset, and zero and sign of the joints before it{hint}"
                 f"{still}"
             )
+
+
+def refuse_much_discarded(chain: Chain, samples: Samples, fit: Fit) -> None:
+    """UnsafeError for a fit, with effects where there are any, that left out much of the data."""
+    discarded = fit.weight < 0.5
     if discarded.mean() > _DISCARDED:
         raise UnsafeError(
-            f"{left_out} {discarded.sum()} of {len(discarded)} fixes, so it describes a part of the data "
-            f"only: check columns, units and zeros of the joints, and the station's set-up{still}"
+            f"{_LEFT_OUT} {discarded.sum()} of {len(discarded)} fixes, so it describes a part of the data only: check "
+            f"columns, units and zeros of the joints, and the station's set-up"
+            f"{_encoders_that_stood_still(chain.rig, samples)}"
         )
 
 

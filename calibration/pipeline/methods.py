@@ -12,6 +12,7 @@ from calibration.effects.library import library
 from calibration.gap.adoption import Adopted, adopt
 from calibration.gap.search import search
 from calibration.gap.search_result import Remaining, remaining
+from calibration.identification.checks import refuse_much_discarded
 from calibration.identification.refinement import Prior
 from calibration.identification.solve import Solution, solve
 from calibration.observations import Observations
@@ -75,11 +76,12 @@ def find_effects(
         rng: draws the signs of the last test.
 
     Raises:
-        DataError, UnsafeError: as `solve`.
+        DataError, UnsafeError: as `solve`; much of the data is left out by kinematics with effects.
     """
     solution = solve(rig, observations, prior=prior, run=run.part(0.0, 0.4))
     run.progress(0.4, "looking for missing effects")
     found = search(solution, observations, families, prior=prior, seed=run.seed)
+    refuse_much_discarded(solution.chain, solution.samples, found.adopted.solution.fit)
     run.progress(0.9, "testing the remaining errors")
     return remaining(found, rng)
 
@@ -111,7 +113,9 @@ def _default(task: Task) -> Adopted:
         rest = find_effects(rig, observations, library(), prior, run, effects_rng(run.seed))
         return replace(rest.adopted, warnings=(*rest.adopted.warnings, *rest.warnings()))
     solution = solve(rig, observations, prior=prior, run=run.part(0.0, 0.8))
-    return adopt(solution, observations, task.effects, prior=prior)
+    found = adopt(solution, observations, task.effects, prior=prior)
+    refuse_much_discarded(solution.chain, solution.samples, found.solution.fit)
+    return found
 
 
 def _pde_paper(task: Task) -> Adopted:

@@ -44,7 +44,7 @@ print(status, len(before) > 20, sorted(name for name in after if after[name] != 
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_calibration_after_the_warm_up_waits_for_no_compiler() -> None:
     command = [sys.executable, "-c", COMPILED_LATER, str(DATA)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)

@@ -32,6 +32,7 @@ def actual_mm(model: CalibratedModel, truth: RigTruth, readings: Floats) -> Floa
     return np.linalg.norm(lin.position_mm.reshape(true_mm.shape) - true_mm, axis=2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("hidden", "lacks"),
     [("", False), ("boom_droop@boom", True), ("encoder_harmonic@theta4:k=2:cosk_rad=2e-3:sink_rad=1e-3", True)],
@@ -63,6 +64,7 @@ def test_on_measured_data_the_expected_error_is_the_held_out_one(ur10_random_pos
     assert found.rms_mm == pytest.approx(left_mm, rel=0.15)
 
 
+@pytest.mark.long
 def test_statistics_are_those_of_the_errors(session: Session) -> None:
     found = expected_accuracy(session.model, np.random.default_rng(1), poses=200)
     answer = found.as_dict()

@@ -114,6 +114,7 @@ def test_stiffening_reducers_are_found_and_held_out_errors_fall_to_the_noise(sti
     assert "joint_compliance@theta2" in stiff.model.effects_reason
 
 
+@pytest.mark.long
 def test_springs_of_all_joints_together_are_no_formula_of_the_base() -> None:
     """Beside the first of five, one moment about the base explains nearly as much as the next two together."""
     rig, training, _ = robot(2019, stiffening(2019))
@@ -121,6 +122,7 @@ def test_springs_of_all_joints_together_are_no_formula_of_the_base() -> None:
     assert {(e.family, e.where) for e in adopted.effects} == {("joint_compliance", f"theta{n}") for n in range(2, 7)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [2012, 3007, 3018])
 def test_the_few_poses_under_loads_that_no_other_has_show_the_curve_and_are_no_outliers(seed: int) -> None:
     """Joint 2 is pulled one way in all poses but one to three."""
@@ -151,6 +153,7 @@ def test_a_boom_without_effects_gets_none(session: Session) -> None:
     assert search(solved(session.rig, session.training), session.training, library()).adopted.effects == ()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["swdt82", "ys100"])
 def test_data_without_any_noise_get_no_effect_and_no_failure(name: str) -> None:
     rig = shipped_rig(name)
@@ -160,6 +163,7 @@ def test_data_without_any_noise_get_no_effect_and_no_failure(name: str) -> None:
         assert search(solved(rig, table), table, library()).adopted.effects == ()
 
 
+@pytest.mark.long
 def test_a_few_gross_outliers_do_not_hide_a_compliance(stiff: Fitted) -> None:
     moved = stiff.training.position_mm.copy()
     moved[[5, 25]] += [80.0, -50.0, 60.0]

@@ -132,6 +132,7 @@ def test_a_model_of_play_with_other_shapes_of_the_load_is_refused() -> None:
         library()["gravity_flip_play"].columns(situation, "theta6", {"spread": 1.0, "other_Nm": 30.0, **shapes})
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("poses", "seed"), [("wide", 10001), ("face", 10006)])
 def test_play_is_named_where_masses_and_the_carriers_lean_move_the_flip(poses: Poses, seed: int) -> None:
     """Cases that a compliance with a curve explained better than the sign of the rig file's load."""

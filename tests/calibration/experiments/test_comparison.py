@@ -32,6 +32,8 @@ from tests.calibration.conftest import rig_text
 from tests.calibration.simulated_ys100 import robot, stiffening
 from tests.simulated.observations import simulate_observations
 
+pytestmark = pytest.mark.long
+
 TORSO = Path(__file__).parents[2] / "rigs" / "torso.toml"
 SMALL = PaperSettings(population=60, generations=10)
 
@@ -228,7 +230,6 @@ def boom() -> tuple[Observations, Observations, Protocol]:
     return training, held_out, found
 
 
-@pytest.mark.slow
 def test_sweeps_are_told_from_motion_of_several_joints(boom: tuple[Observations, Observations, Protocol]) -> None:
     training, held_out, found = boom
     single = single_joint_rows(shipped_rig("swdt82"), training)
@@ -286,7 +287,6 @@ def test_the_answer_is_json_and_has_the_paper_s_figures_beside(
     assert len(found["trajectory"]["errors"]["hybrid"]["error_mm"]) == PATH_POINTS
 
 
-@pytest.mark.slow
 def test_without_sweeps_or_times_the_protocol_does_the_rest_and_says_so() -> None:
     rig, text, training, _ = torso()
     multi = training.select(np.char.startswith(training.pose, "multi"))

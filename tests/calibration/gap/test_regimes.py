@@ -17,7 +17,8 @@ from daemon.config import load_rig
 from simulators.blind.cases import draw
 from simulators.blind.cells import Cell
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
+
 
 SOURCE = load_rig("swdt82")
 

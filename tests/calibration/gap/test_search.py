@@ -49,6 +49,7 @@ def test_two_effects_are_both_named_where_they_are_and_the_gap_closes() -> None:
     assert gap.rounds[-1].held_out_mm < gap.rounds[0].held_out_mm
 
 
+@pytest.mark.long
 def test_scatter_far_beyond_the_instruments_is_no_effect_but_not_passed_over_in_silence() -> None:
     drawn = draw(SOURCE.rig, Cell("null", (), 0.0, "wide", "fine", 42))
     assert drawn is not None
@@ -80,6 +81,7 @@ def test_a_disc_that_is_off_its_axis_and_oval_is_an_encoder_error_and_no_curve()
     np.testing.assert_allclose(values, (2e-4, 1e-4, -1e-4, 8e-5), atol=2e-5)
 
 
+@pytest.mark.long
 def test_what_is_too_large_for_its_name_is_not_said_to_be_outside_of_the_library() -> None:
     data = session_csv(60, hidden="transducer_scale@L2:scale=0.03")
     gap = find_gap(SOURCE.rig, SOURCE.text, parse_observations(data, SOURCE.rig, "session.csv"))
@@ -88,6 +90,7 @@ def test_what_is_too_large_for_its_name_is_not_said_to_be_outside_of_the_library
     assert gap.description.endswith("transducer_scale@L2 would do this, but scale would be beyond what is physical")
 
 
+@pytest.mark.long
 def test_effects_that_would_explain_next_to_nothing_of_a_gap_are_no_set() -> None:
     """A distance meter's cyclic error, as a stranger's station may have it, leaves four times the noise."""
     drawn = draw(SOURCE.rig, Cell("null", (), 0.0, "wide", "fine", 49))
@@ -99,6 +102,7 @@ def test_effects_that_would_explain_next_to_nothing_of_a_gap_are_no_set() -> Non
     assert (gap.verdict, gap.effects, gap.indistinguishable) == ("unidentified", (), ())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("hidden", "named", "undecided"),
     [
@@ -121,7 +125,7 @@ def test_a_robot_that_turned_in_its_foot_is_as_one_whose_first_encoder_slipped_a
     assert sorted((candidate.family, candidate.where) for candidate in gap.indistinguishable) == undecided
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_set_beside_a_named_effect_leaves_the_errors_of_every_round_as_they_are_without_it() -> None:
     rng = np.random.default_rng(42)
     scene = draw_scene(SOURCE.rig, 42, SceneSettings())
@@ -145,6 +149,7 @@ def test_a_set_beside_a_named_effect_leaves_the_errors_of_every_round_as_they_ar
     assert all(f.visible > 0.1 for f in gap.forecasts if f.family in ("base_settlement", "base_step"))
 
 
+@pytest.mark.long
 def test_an_effect_that_no_library_has_is_described_and_gets_no_name() -> None:
     drawn, gap = answered(Cell("outside", ("thermal_cross",), 1.0, "wide", "fine", 52))
     assert gap.verdict == "unidentified"
@@ -168,6 +173,7 @@ def test_an_effect_is_named_beside_one_that_no_library_has() -> None:
     assert coefficient.value == pytest.approx(true, abs=4.0 * coefficient.standard_error)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("family", "poses", "seed", "lookalike", "formula"),
     [
@@ -241,6 +247,7 @@ def test_the_step_of_an_encoder_is_seen_in_its_readings() -> None:
     assert step_of(np.repeat([1.0, 2.0, 3.0], 10)) == 0.0
 
 
+@pytest.mark.long
 def test_an_encoder_that_reads_in_coarser_steps_than_its_file_says_hides_less_when_its_steps_are_known() -> None:
     """As noise of one size along all axes, 0.1 deg at eight metres would drown an error along the boom."""
     drawn = draw(SOURCE.rig, Cell("single", ("transducer_scale",), 0.5, "wide", "coarse", 370009))

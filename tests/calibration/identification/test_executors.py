@@ -69,6 +69,7 @@ def test_spawned_processes(search: str, reference: Evolved, processes: Executor)
     assert_same(SEARCHES[search](processes), reference)
 
 
+@pytest.mark.long
 def test_a_dask_cluster(search: str, reference: Evolved, cluster: Client) -> None:
     assert_same(SEARCHES[search](cluster.get_executor()), reference)
 

@@ -41,6 +41,7 @@ def fixes(rig: Rig, truth: RigTruth, poses: int, seed: int, sign: float) -> Obse
     return replace(observations, extra=dict(observations.extra) | columns)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_torques_that_hold_the_load_serve_as_well_as_the_load(sign: float) -> None:
     rig = shipped_rig("ys100")
@@ -52,6 +53,7 @@ def test_torques_that_hold_the_load_serve_as_well_as_the_load(sign: float) -> No
     assert any("holds the load" in warning for warning in model.warnings) == (sign < 0.0)
 
 
+@pytest.mark.long
 def test_a_torque_that_was_measured_in_training_is_missed() -> None:
     rig = shipped_rig("ys100")
     truth = RigTruth(rig, 5, perturbation=0.6, effects=parse_effects(EFFECTS))

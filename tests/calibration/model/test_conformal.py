@@ -107,7 +107,7 @@ def test_at_another_set_up_x_and_y_are_alike(session: Session) -> None:
     assert intervals.axes[2] == session.model.intervals.axes[2]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_outliers_are_covered_like_other_fixes() -> None:
     rig = shipped_rig("swdt82")
     truth = RigTruth(rig, 12)

@@ -42,6 +42,7 @@ def test_the_last_to_leave_restores_what_the_first_found() -> None:
         assert blas_threads() == {2}
 
 
+@pytest.mark.long
 def test_threads_and_spawned_processes_calibrate_the_same_model(session: Session, processes: Executor) -> None:
     few = session.training.select(np.arange(0, 250, 3))
 

@@ -130,6 +130,7 @@ def test_a_turned_joint_is_made_good_as_built_and_named(session: Session) -> Non
     assert rms(evaluate(model, turned(session.held_out)).errors_mm["geometric"]) < 6.0
 
 
+@pytest.mark.long
 def test_a_fifth_of_gross_outliers_with_a_reversed_joint_is_still_named(session: Session) -> None:
     position = session.training.position_mm.copy()
     bad = np.random.default_rng(3).permutation(250)[:50]
@@ -141,6 +142,7 @@ def test_a_fifth_of_gross_outliers_with_a_reversed_joint_is_still_named(session:
     assert any("of 250 training fixes are outliers" in w for w in model.warnings)
 
 
+@pytest.mark.long
 def test_copied_rows_count_once_and_are_named(session: Session) -> None:
     position = session.training.position_mm.copy()
     position[7] += [0.0, 0.0, 3000.0]

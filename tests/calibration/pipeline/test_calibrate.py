@@ -137,6 +137,7 @@ def test_identification_and_evaluation_need_positions(session: Session) -> None:
         evaluate(session.model, session.held_out.select(np.array([], dtype=int)))
 
 
+@pytest.mark.long
 def test_several_set_ups_share_one_machine(session: Session) -> None:
     parts = [simulated(session.truth, 125, 20 + i, setup=name) for i, name in enumerate(("north", "south"))]
     model = identify(session.rig, TEXT, joined(*parts))
@@ -261,6 +262,7 @@ def test_a_residual_is_not_used_for_a_prism_it_never_saw(session: Session) -> No
     assert any("not trained on prism r" in w for w in model_warnings(model, session.held_out))
 
 
+@pytest.mark.long
 def test_readings_beyond_limits_and_corrections_beyond_tolerances_are_named(session: Session) -> None:
     joints = session.training.joints
     shifted = {**joints, "theta5": joints["theta5"] + 1.5, "theta8": joints["theta8"] + 3.0}
@@ -283,6 +285,7 @@ def test_an_encoder_mounted_the_other_way_round_is_found_as_built_and_refused_ot
     assert any(w.startswith("row7.theta came out ") and "deg from the rig file" in w for w in model.warnings)
 
 
+@pytest.mark.long
 def test_two_encoders_mounted_turned_are_found_as_built(session: Session) -> None:
     training, held_out = (
         turned(turned(o, "theta5", 90.0), "theta7", -180.0) for o in (session.training, session.held_out)
@@ -304,6 +307,7 @@ def test_a_fit_that_leaves_out_a_whole_prism_is_refused(session: Session) -> Non
         identify(session.rig, TEXT, replace(session.training, position_mm=position))
 
 
+@pytest.mark.long
 def test_a_fit_of_half_of_the_data_is_refused(session: Session) -> None:
     position = session.training.position_mm.copy()
     wrong = np.random.default_rng(6).permutation(len(position))[:100]

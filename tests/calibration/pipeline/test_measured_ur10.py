@@ -12,6 +12,8 @@ from calibration.pipeline.calibrate import identify, train_residual
 from calibration.rig.description import shipped_rig
 from tests.calibration.conftest import rig_text, split_by_cells
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def identified(ur10_random_poses: Observations) -> tuple[CalibratedModel, Observations, Observations]:
@@ -23,7 +25,6 @@ def stages(model: CalibratedModel, held_out: Observations) -> dict[str, float]:
     return {str(s["stage"]): float(s["rms_mm"]) for s in evaluate(model, held_out).stages()}
 
 
-@pytest.mark.slow
 def test_kinematics_reach_half_a_millimetre_on_held_out_cells(
     identified: tuple[CalibratedModel, Observations, Observations],
 ) -> None:
@@ -53,7 +54,6 @@ def test_a_hundred_poses_are_enough_for_six_tenths(
     assert stages(model, held_out)["geometric"] <= 0.60
 
 
-@pytest.mark.slow
 def test_the_residual_learns_what_the_effects_leave_and_knows_what_it_leaves(
     identified: tuple[CalibratedModel, Observations, Observations],
 ) -> None:

@@ -17,6 +17,8 @@ from simulators.effects.library import parse_effects
 from simulators.rig.truth import RigTruth
 from tests.calibration.conftest import rig_text, rms, simulated
 
+pytestmark = pytest.mark.long
+
 EFFECTS = (
     "encoder_harmonic@theta1:k=2:cosk_rad=4e-3:sink_rad=3e-3,encoder_harmonic@theta4:k=2:cosk_rad=3e-3:sink_rad=3e-3",
     "backlash@theta1:width_rad=4e-3,backlash@theta4:width_rad=3e-3,"
@@ -47,7 +49,6 @@ def outcomes() -> list[Outcome]:
     return found
 
 
-@pytest.mark.slow
 def test_hidden_effects_are_learned(outcomes: list[Outcome]) -> None:
     assert all(o.model.residual is not None for o in outcomes)
     assert all(o.hybrid_mm < 0.75 * o.geometric_mm for o in outcomes)

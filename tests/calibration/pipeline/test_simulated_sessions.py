@@ -7,13 +7,14 @@ import pytest
 
 from tests.calibration.simulated_sessions import Outcome, session
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def outcomes() -> list[Outcome]:
     return [session(seed) for seed in range(1000, 1008)]
 
 
-@pytest.mark.slow
 def test_held_out_error_is_close_to_the_noise_floor(outcomes: list[Outcome]) -> None:
     ratios = np.array([o.ratio for o in outcomes])
     assert ratios.mean() <= 1.04

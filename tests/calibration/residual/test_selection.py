@@ -63,6 +63,7 @@ def test_rows_of_a_group_and_of_a_standstill_are_never_on_both_sides(session: Se
     assert np.bincount(split).min() > 20
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["rbfn", "lightgbm", "chain", "gp"])
 def test_a_learner_that_helps_is_kept_and_predicts_rows_it_never_saw(kind: Kind) -> None:
     decision = choose(kind, noise=0.1, signal=1.0)
@@ -119,6 +120,7 @@ def test_a_learner_survives_being_written_and_read(kind: Kind) -> None:
     assert not again.fits(replace(unseen, names=("other", *unseen.names[1:])))
 
 
+@pytest.mark.long
 def test_the_decision_does_not_depend_on_the_number_of_workers() -> None:
     one, three = (choose("chain", noise=0.1, signal=1.0, n=150, workers=workers) for workers in (1, 3))
     assert one.residual is not None
@@ -190,6 +192,7 @@ def test_what_folds_of_many_rows_share_flatters_no_learner(kind: str) -> None:
     assert (left**2).mean() > 0.97 * (unseen**2).mean()
 
 
+@pytest.mark.long
 def test_a_chain_that_cannot_win_is_not_trained() -> None:
     decision = choose("default", noise=0.01, signal=5.0)
     assert [t.kind for t in decision.trials] == ["gp", "rbfn", "lightgbm"]
@@ -207,6 +210,7 @@ def test_time_and_constant_columns_are_no_features(session: Session) -> None:
     assert seen.geometry.shape[1] == 9 + 27 + 3
 
 
+@pytest.mark.long
 def test_one_group_that_holds_most_rows_is_no_obstacle() -> None:
     """As in single-joint sweeps: a prism that stands still while others move ties all of a sweep together."""
     seen, _ = made_up(400)

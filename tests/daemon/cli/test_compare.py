@@ -77,7 +77,7 @@ def test_the_answer_has_a_row_for_every_method_and_a_page(ys100: list[object]) -
     assert "default has the lowest mean error" in page
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_person_gets_a_table_reasons_shared_rows_and_the_page_s_path(torso: list[object], tmp_path: Path) -> None:
     train, test = tmp_path / "train.csv", tmp_path / "test.csv"
     shared = train.read_text(encoding="utf-8").splitlines()[1]
@@ -96,7 +96,7 @@ def test_a_person_gets_a_table_reasons_shared_rows_and_the_page_s_path(torso: li
     assert "comparison-torso.html" in lines[-1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_protocol_prints_its_tables_and_draws_its_plots(torso: list[object], tmp_path: Path) -> None:
     result = run(*torso, "--protocol", "zhou2022", "--time-limit", 0.1)
     assert result.exit_code == 0, result.stderr

@@ -115,6 +115,7 @@ def test_a_place_where_nothing_can_be_written_is_refused_before_any_work(tmp_pat
         assert "notes.txt is a file; name another directory" in " ".join(result.stderr.split())
 
 
+@pytest.mark.long
 def test_useless_columns_change_nothing_and_the_answer_stays_sound(tmp_path: Path) -> None:
     data = table(20)
     rows = len(data["prism"])

@@ -79,7 +79,7 @@ def test_a_model_uses_and_remembers_the_signal_that_it_was_trained_with(work: Pa
     assert any("the residual was trained with tilt_x_deg, which this data lacks" in w for w in told["warnings"])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_flag_and_the_lines_that_a_warning_says_make_the_same_model(work: Path) -> None:
     plain = calibrated(work, "plain")
     assert plain["warnings"].count(SAID) == 1
@@ -91,7 +91,7 @@ def test_the_flag_and_the_lines_that_a_warning_says_make_the_same_model(work: Pa
     assert by_file["stages"] == by_flag["stages"] != plain["stages"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_gap_finds_that_the_error_goes_with_the_signal(work: Path) -> None:
     common = ("--rig", "ur10", "--data", work / "train.csv", "--out", work / "gap", "--json")
     answer = json.loads(run("gap", *common, "--signal", "tilt_x_deg").stdout)

@@ -60,6 +60,7 @@ def soft_machine() -> GapResult:
 COMPLIANCE = "joint_compliance@q2:compliance_rad_per_Nm=6e-6,joint_compliance@q3:compliance_rad_per_Nm=9e-6"
 
 
+@pytest.mark.long
 def test_effects_are_named_beside_structure_that_no_library_has() -> None:
     gap = soft_machine()
     assert {(e.family, e.where) for e in gap.effects} == {("joint_compliance", "q2"), ("joint_compliance", "q3")}
