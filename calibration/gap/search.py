@@ -246,7 +246,7 @@ def _in_regimes(problem: Problem, families: Collection[str], found: SearchResult
 
     Rows in which it acts may seem to be outliers to anything else, so that all rows count where there are many such.
 
-    Where one effect or none leaves nothing but noise, no part of the data is sought.
+    Where one effect or none leaves nothing but noise, only that one may be better off in a part of the data.
 
     Args:
         problem: the data.
@@ -254,9 +254,11 @@ def _in_regimes(problem: Problem, families: Collection[str], found: SearchResult
         found: with effects that act in all rows.
         least_cost: of the fits that led to it, also of those with effects that it was not sure of.
     """
-    if len(found.joint.choices) <= 1 and _leaves_noise(problem, found):
-        return found
     alone = problem.with_mild_outliers(problem.kinematics_only())
+    if len(found.joint.choices) <= 1 and _leaves_noise(problem, found):
+        one = effect_in_regime(problem, alone, [choice.family for choice in found.joint.choices])
+        if one is None or found.joint.fit.cost - one.joint.fit.cost < _REGIME:
+            return found
     starts = [alone, *([found.joint] if found.joint.choices else [])]
     if (alone.fit.weight < OUTLIER).mean() >= _MANY:
         starts.append(replace(alone, fit=replace(alone.fit, weight=np.ones_like(alone.fit.weight))))
