@@ -16,6 +16,7 @@ from calibration.rig.description import Rig
 from daemon.acquisition.acquisition import Acquisition
 from daemon.acquisition.clock_watch import ClockWatch
 from daemon.acquisition.present_state import expected_of
+from daemon.acquisition.thinning import Thinning
 from daemon.alarms.board import AlarmBoard
 from daemon.alarms.evidence import Gatherer
 from daemon.commands import FAILED, REFUSED, CommandError, Handler, reading_socket
@@ -37,6 +38,7 @@ from daemon.store.errors import StoreError, storage_errors, storage_sentence, un
 from daemon.store.health import StoreHealth, StoreWatch
 from daemon.store.jobs import JobTable
 from daemon.store.models import ModelTable
+from daemon.store.packing import Packing
 from daemon.store.sessions import SessionTable
 from daemon.store.setups import SetupTable
 from daemon.store.store import Store
@@ -81,6 +83,7 @@ class Daemon:
     def _compose(self, config: Config, store: Store, parts: Parts) -> None:
         declare_channels(store, parts.rig)
         self._watch = StoreWatch(store, parts.clock)
+        self._packing = Packing(store)
         self._setups = SetupBook(parts.rig, store, parts.clock, config.sessions.control_tolerance_mm)
         self._sessions = SessionKeeper(
             parts.rig,
@@ -116,6 +119,7 @@ class Daemon:
             on_records=self._on_records,
             expected=expected_of(config, parts.rig),
             clock_watch=ClockWatch(before) if parts.mode == "live" else None,
+            thinning=Thinning(self._sessions.is_of_session),
         )
         self._jobs = JobRunner(store, config, parts.rig.name, parts.clock, is_held=self._are_jobs_held)
         self._job_table, self._model_table = JobTable(store, parts.rig.name), models
@@ -171,6 +175,7 @@ class Daemon:
             self._live_model.start()
             self._acquisition.start()
             self._watch.start()
+            self._packing.start()
             if self._sender is not None:
                 self._sender.start()
             if self._config.jobs.enabled:
@@ -199,7 +204,7 @@ class Daemon:
         """Stop all parts within `STOP_S`, side by side, so that no one's stop delays what was captured."""
         budget = TimeBudget(STOP_S)
         stops = [server.close for server in self._servers]
-        stops += [self._live_model.stop, self._jobs.stop, self._watch.stop]
+        stops += [self._live_model.stop, self._jobs.stop, self._watch.stop, self._packing.stop]
         if self._sender is not None:
             stops.append(self._sender.stop)
         others = [threading.Thread(target=_stop_part, args=(stop,), daemon=True) for stop in stops]

@@ -25,6 +25,7 @@ from daemon.acquisition.link_intake import LinkIntake
 from daemon.acquisition.present_state import NOTHING_EXPECTED, Expected
 from daemon.acquisition.status import AcquisitionStatus
 from daemon.acquisition.status_board import StatusBoard
+from daemon.acquisition.thinning import Thinning
 from daemon.store import Store
 from daemon.store.errors import storage_sentence
 from drivers.clock import NS_PER_S, Clock, Stamp, TimeBudget
@@ -80,6 +81,7 @@ class Acquisition:
             passed (ten times a second). What it stores it commits itself.
         expected: what should be heard, for `status`.
         clock_watch: looks after the computer's clock, live; none where the clock is another one.
+        thinning: chooses the readings and fixes to store; all of them by default.
     """
 
     def __init__(
@@ -94,8 +96,10 @@ class Acquisition:
         on_records: Callable[[Sequence[Record]], None],
         expected: Expected = NOTHING_EXPECTED,
         clock_watch: ClockWatch | None = None,
+        thinning: Thinning | None = None,
     ) -> None:
         self._store, self._clock, self._on_records = store, clock, on_records
+        self._thinning = thinning
         self._batch_seconds = batch_seconds
         self._intakes = [LinkIntake(link, clock, queue_captures, store.begun or clock.now()) for link in links]
         self._factories = decoders
@@ -329,8 +333,9 @@ class Acquisition:
         return batches
 
     def _commit_records(self, records: Sequence[Record], chunk_ids: Sequence[int]) -> None:
+        kept = records if self._thinning is None else self._thinning.kept(records)
         with self._store.transaction():
-            self._insert(records)
+            self._insert(kept)
             self._store.mark_decoded(chunk_ids)
 
     def _insert(self, records: Sequence[Record]) -> None:

@@ -38,7 +38,7 @@ from daemon.sessions.station_setups import AXES, Place, SetupBook
 from daemon.store.errors import is_unwritable
 from daemon.store.jobs import JobTable
 from daemon.store.store import Store
-from drivers.clock import NS_PER_S, Clock, lies_within
+from drivers.clock import NS_PER_S, Clock, Stamp, lies_within
 from drivers.readings import DeviceEvent, EventKind, Fix, Record, Status
 from drivers.stations.survey import position_mm
 
@@ -119,6 +119,10 @@ class SessionKeeper:
             self._late.clear()
         if self._unstored:
             self._store_observations()
+
+    def is_of_session(self, stamp: Stamp) -> bool:
+        """Return True if an instant lies in the open session, or in one that ended and may still get fixes."""
+        return any(session.lasted(stamp) for session in self._taking())
 
     def _feed_shot(self, fix: Fix) -> None:
         shot = self._shot

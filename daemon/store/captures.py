@@ -2,7 +2,7 @@
 
 A chunk holds captures of one link and one boot. Layout, little endian:
 
-    magic "RCAP", version u8 = 1 or 2, kind u8 (1 CAN, 2 serial), packing u8 (0 plain, 1 zlib), u8 = 0,
+    magic "RCAP", version u8 = 1 to 3, kind u8 (1 CAN, 2 serial), packing u8 (0 plain, 1 zlib, 2 LZMA2), u8 = 0,
     count u32, body length u32 (before packing), link length u16, boot length u16, link UTF-8, boot UTF-8,
     body (packed), CRC-32 of all that precedes u32
 
@@ -10,32 +10,35 @@ The body is columns, not rows, and each column of integers is stored byte plane 
 neighbours resemble each other, which is what makes a fast compressor effective. Columns: differences of monotonic_ns
 i64 (the first from zero), differences of utc_ns - monotonic_ns i64 (the first from zero), CAN only: arbitration_id
 u32; flags u8; data length u32; then the data of all captures. Version 2 is that of chunks in which a capture has the
-flag 16, its time is doubtful: a program that does not know the flag must not take the time for known.
+flag 16, its time is doubtful: a program that does not know the flag must not take the time for known. Version 3 is that
+of large chunks, which many small ones were put together to; packed_captures.py has their body.
 """
 
 from __future__ import annotations
 
+import lzma
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from daemon.store.errors import StoreError
+from daemon.store.packed_captures import CaptureColumns, Planes, packed, planes, unpacked
 from drivers.clock import Stamp
 from drivers.readings import CanCapture, Capture, SerialCapture
 
 _MAGIC = b"RCAP"
-_VERSION, _VERSION_WITH_DOUBTS = 1, 2
+_VERSION, _VERSION_WITH_DOUBTS, _VERSION_LARGE = 1, 2, 3
 _CAN, _SERIAL = 1, 2
-_PLAIN, _ZLIB = 0, 1
+_PLAIN, _ZLIB, _LZMA2 = 0, 1, 2
 _HEADER = struct.Struct("<4sBBBxIIHH")
 _CRC = struct.Struct("<I")
 _EXTENDED, _REMOTE, _ERROR, _TRANSMITTED, _TIME_DOUBTFUL = 1, 2, 4, 8, 16
 _FASTEST = 1  # zlib level: three quarters of what level 6 gains, in a fifth of its time
+_FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6}]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +63,23 @@ class Chunk:
     blob: bytes
 
 
+@dataclass(frozen=True)
+class CaptureRun:
+    """Captures of one link and one boot.
+
+    Attributes:
+        link: the link they crossed.
+        boot_id: the boot of their stamps.
+        is_serial: a serial link's, not those of a CAN bus.
+        columns: the captures.
+    """
+
+    link: str
+    boot_id: str
+    is_serial: bool
+    columns: CaptureColumns
+
+
 def encode_captures(captures: Sequence[Capture]) -> list[Chunk]:
     """Chunks of `captures` (any links, any order): one per link and boot, each in order; links as they first appear.
 
@@ -80,32 +100,55 @@ def encode_captures(captures: Sequence[Capture]) -> list[Chunk]:
 
 
 def _encode(link: str, captures: list[Capture]) -> Chunk:
-    first, last = captures[0].stamp, captures[-1].stamp
-    stamps = [c.stamp for c in captures]
+    columns = _columns_of(link, captures)
+    monotonic, utc = columns.monotonic_ns, columns.utc_ns
+    is_serial = isinstance(captures[0], SerialCapture)
+    parts = [np.diff(monotonic, prepend=np.int64(0)), np.diff(utc - monotonic, prepend=np.int64(0))]
+    parts += [columns.flags, columns.length] if is_serial else [columns.identifier, columns.flags, columns.length]
+    body = b"".join([*map(planes, parts), columns.payload.tobytes()])
+    packing, shorter = _ZLIB, zlib.compress(body, _FASTEST)
+    if len(shorter) >= len(body):
+        packing, shorter = _PLAIN, body
+    version = _VERSION_WITH_DOUBTS if (columns.flags & _TIME_DOUBTFUL).any() else _VERSION
+    run = CaptureRun(link, captures[0].stamp.boot_id, is_serial, columns)
+    return _chunk(run, version, packing, shorter, len(body))
+
+
+def encode_large(run: CaptureRun) -> Chunk:
+    """One large chunk: smaller than those of `encode_captures`, and slower to make."""
+    body = packed(run.columns, is_serial=run.is_serial)
+    shorter = lzma.compress(body, lzma.FORMAT_RAW, filters=_FILTERS)
+    return _chunk(run, _VERSION_LARGE, _LZMA2, shorter, len(body))
+
+
+def _columns_of(link: str, captures: Sequence[Capture]) -> CaptureColumns:
     data = [c.data for c in captures]
-    is_can = isinstance(captures[0], CanCapture)
     try:
-        monotonic = np.array([s.monotonic_ns for s in stamps], dtype=np.int64)
-        utc = np.array([s.utc_ns for s in stamps], dtype=np.int64)
-        columns = [np.diff(monotonic, prepend=np.int64(0)), np.diff(utc - monotonic, prepend=np.int64(0))]
-        if is_can:
-            columns.append(np.array([c.arbitration_id for c in captures if isinstance(c, CanCapture)], dtype="<u4"))
-        columns.append(np.fromiter(map(_flags, captures), dtype=np.uint8, count=len(captures)))
-        columns.append(np.fromiter(map(len, data), dtype="<u4", count=len(data)))
+        return CaptureColumns(
+            np.array([c.stamp.monotonic_ns for c in captures], dtype=np.int64),
+            np.array([c.stamp.utc_ns for c in captures], dtype=np.int64),
+            np.array([c.arbitration_id if isinstance(c, CanCapture) else 0 for c in captures], dtype=np.uint32),
+            np.fromiter(map(_flags, captures), dtype=np.uint8, count=len(captures)),
+            np.fromiter(map(len, data), dtype=np.uint32, count=len(data)),
+            np.frombuffer(b"".join(data), dtype=np.uint8),
+        )
     except OverflowError as error:
         raise StoreError(f"link {link!r}: a captured frame cannot be stored: {error}") from error
-    payload = b"".join(data)
-    body = b"".join(map(_planes, columns)) + payload
-    packing, packed = _ZLIB, zlib.compress(body, _FASTEST)
-    if len(packed) >= len(body):
-        packing, packed = _PLAIN, body
-    names = link.encode(), first.boot_id.encode()
-    kind = _CAN if is_can else _SERIAL
-    version = _VERSION_WITH_DOUBTS if any(s.is_doubtful for s in stamps) else _VERSION
-    head = _HEADER.pack(_MAGIC, version, kind, packing, len(captures), len(body), *map(len, names)) + b"".join(names)
-    blob = head + packed
+
+
+def _chunk(run: CaptureRun, version: int, packing: int, body: bytes, length: int) -> Chunk:
+    columns, names = run.columns, (run.link.encode(), run.boot_id.encode())
+    kind = _SERIAL if run.is_serial else _CAN
+    head = _HEADER.pack(_MAGIC, version, kind, packing, len(columns), length, *map(len, names)) + b"".join(names)
+    blob = head + body
     blob += _CRC.pack(zlib.crc32(blob))
-    return Chunk(link, "can" if is_can else "serial", first, last, len(captures), len(payload), blob)
+    first, last = (
+        Stamp(
+            int(columns.utc_ns[n]), int(columns.monotonic_ns[n]), run.boot_id, bool(columns.flags[n] & _TIME_DOUBTFUL)
+        )
+        for n in (0, -1)
+    )
+    return Chunk(run.link, "serial" if run.is_serial else "can", first, last, len(columns), len(columns.payload), blob)
 
 
 def _flags(capture: Capture) -> int:
@@ -122,34 +165,52 @@ def _flags(capture: Capture) -> int:
     return flags
 
 
-def _planes(column: NDArray[np.generic]) -> bytes:
-    size = column.dtype.itemsize
-    little = column.astype(column.dtype.newbyteorder("<"), copy=False)
-    return np.ascontiguousarray(little.view(np.uint8).reshape(-1, size).T).tobytes()
-
-
 def decode_captures(blob: bytes) -> list[Capture]:
     """The captures of a chunk, equal to those that were encoded.
+
+    Raises:
+        StoreError: as `decode_run`.
+    """
+    run = decode_run(blob)
+    columns, flags = run.columns, run.columns.flags.tolist()
+    stamps = [
+        Stamp(u, m, run.boot_id, bool(f & _TIME_DOUBTFUL))
+        for u, m, f in zip(columns.utc_ns.tolist(), columns.monotonic_ns.tolist(), flags, strict=True)
+    ]
+    payload, ends = columns.payload.tobytes(), np.cumsum(columns.length, dtype=np.int64).tolist()
+    data = [payload[start:end] for start, end in pairwise([0, *ends])]
+    if run.is_serial:
+        return [
+            SerialCapture(run.link, s, d, bool(f & _TRANSMITTED)) for s, d, f in zip(stamps, data, flags, strict=True)
+        ]
+    return [
+        CanCapture(run.link, s, i, d, bool(f & _EXTENDED), bool(f & _REMOTE), bool(f & _ERROR), bool(f & _TRANSMITTED))
+        for s, i, d, f in zip(stamps, columns.identifier.tolist(), data, flags, strict=True)
+    ]
+
+
+def decode_run(blob: bytes) -> CaptureRun:
+    """The captures of a chunk as columns.
 
     Raises:
         StoreError: the chunk is truncated, damaged, or of a version that this program does not know.
     """
     if len(blob) < _HEADER.size + _CRC.size or blob[:4] != _MAGIC:
         raise StoreError(f"not a chunk of captures ({len(blob)} bytes)")
-    if blob[4] not in (_VERSION, _VERSION_WITH_DOUBTS):
-        known = f"{_VERSION} and {_VERSION_WITH_DOUBTS}"
+    if not _VERSION <= blob[4] <= _VERSION_LARGE:
+        known = f"{_VERSION} to {_VERSION_LARGE}"
         raise StoreError(f"chunk of captures has version {blob[4]}, this program reads {known}; use a newer one")
     if _CRC.unpack_from(blob, len(blob) - _CRC.size)[0] != zlib.crc32(blob[: -_CRC.size]):
         raise StoreError("chunk of captures is damaged (its CRC-32 does not match); restore the store from a backup")
     try:
         return _decode(blob)
-    except (ArithmeticError, LookupError, TypeError, ValueError, zlib.error) as error:
+    except (ArithmeticError, LookupError, TypeError, ValueError, lzma.LZMAError, zlib.error) as error:
         # Its CRC-32 is right, so it was written so: not by this program, or on a broken computer.
         raise StoreError(f"chunk of captures makes no sense ({error}); restore the store from a backup") from error
 
 
-def _decode(blob: bytes) -> list[Capture]:
-    _, _, kind, packing, count, body_length, link_length, boot_length = _HEADER.unpack_from(blob)
+def _decode(blob: bytes) -> CaptureRun:
+    _, version, kind, packing, count, body_length, link_length, boot_length = _HEADER.unpack_from(blob)
     link_end = _HEADER.size + link_length
     boot_end = link_end + boot_length
     link = blob[_HEADER.size : link_end].decode()
@@ -157,38 +218,22 @@ def _decode(blob: bytes) -> list[Capture]:
     body = blob[boot_end : -_CRC.size]
     if packing == _ZLIB:
         body = zlib.decompressobj().decompress(body, body_length + 1)
+    elif packing == _LZMA2:
+        body = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=_FILTERS).decompress(body, body_length + 1)
     if len(body) != body_length:
         raise ValueError(f"{len(body)} bytes or more where its header says {body_length}")
-    columns = _Columns(body, count)
-    monotonic = np.cumsum(columns.take("<i8"))
-    utc = np.cumsum(columns.take("<i8")) + monotonic
-    identifiers = columns.take("<u4").tolist() if kind == _CAN else []
-    flags = columns.take("u1").tolist()
-    stamps = [
-        Stamp(u, m, boot_id, bool(f & _TIME_DOUBTFUL))
-        for u, m, f in zip(utc.tolist(), monotonic.tolist(), flags, strict=True)
-    ]
-    data = list(columns.slices(columns.take("<u4")))
-    if kind == _CAN:
-        return [
-            CanCapture(link, s, i, d, bool(f & _EXTENDED), bool(f & _REMOTE), bool(f & _ERROR), bool(f & _TRANSMITTED))
-            for s, i, d, f in zip(stamps, identifiers, data, flags, strict=True)
-        ]
-    return [SerialCapture(link, s, d, bool(f & _TRANSMITTED)) for s, d, f in zip(stamps, data, flags, strict=True)]
+    read = unpacked if version == _VERSION_LARGE else _small
+    return CaptureRun(link, boot_id, kind != _CAN, read(body, count, is_serial=kind != _CAN))
 
 
-class _Columns:
-    """Reads a body column by column."""
-
-    def __init__(self, body: bytes, count: int) -> None:
-        self._body, self._count, self._at = body, count, 0
-
-    def take(self, dtype: str) -> NDArray[np.generic]:
-        size = np.dtype(dtype).itemsize
-        planes = np.frombuffer(self._body, dtype=np.uint8, count=size * self._count, offset=self._at)
-        self._at += size * self._count
-        return np.ascontiguousarray(planes.reshape(size, -1).T).view(dtype)[:, 0]
-
-    def slices(self, lengths: NDArray[np.generic]) -> Iterator[bytes]:
-        ends = [self._at, *(np.cumsum(lengths.astype(np.int64)) + self._at).tolist()]
-        return (self._body[start:end] for start, end in pairwise(ends))
+def _small(body: bytes, count: int, *, is_serial: bool) -> CaptureColumns:
+    """Return the columns of a small chunk's body."""
+    source = Planes(body)
+    monotonic = np.cumsum(source.column("<i8", count), dtype=np.int64)
+    utc = np.cumsum(source.column("<i8", count), dtype=np.int64) + monotonic
+    identifier = np.zeros(count, dtype=np.uint32) if is_serial else source.column("<u4", count).astype(np.uint32)
+    flags = source.column("u1", count).astype(np.uint8)
+    length = source.column("<u4", count).astype(np.uint32)
+    payload = np.frombuffer(source.take(int(length.sum(dtype=np.int64))), dtype=np.uint8)
+    source.end()
+    return CaptureColumns(monotonic, utc, identifier, flags, length, payload)

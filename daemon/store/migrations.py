@@ -324,6 +324,25 @@ def m014_who_said_so(db: Database) -> None:
     )
 
 
+@MIGRATIONS()
+def m015_large_chunks(db: Database) -> None:
+    """Captures are found by their time, and small chunks that large ones may be made of are known."""
+    _create(
+        db,
+        # Chunks as acquisition has committed them. A table of its own, for the reason that undecoded_chunks is one.
+        "CREATE TABLE small_chunks (chunk_id INTEGER PRIMARY KEY REFERENCES raw_chunks(id)) STRICT",
+        "INSERT INTO small_chunks SELECT id FROM raw_chunks",
+        # All that the query of a time asks before it reads a chunk.
+        "DROP INDEX raw_chunks_by_time",
+        """CREATE INDEX raw_chunks_by_end
+            ON raw_chunks(last_boot_id, last_monotonic_ns, first_boot_id, first_monotonic_ns, link_id)""",
+        # No query uses these.
+        "DROP INDEX joint_samples_by_time",
+        "DROP INDEX signals_by_time",
+        "DROP INDEX fixes_by_time",
+    )
+
+
 def unknown_migrations(db: Database) -> list[str]:
     """Migrations that `db` has and this program does not know: it was made by a newer one."""
     empty = Database(memory=True)

@@ -162,7 +162,8 @@ class Store(Connection):
                     *(last.utc_ns, last.monotonic_ns, boot, chunk.captures, chunk.payload_bytes, chunk.blob),
                 )
                 ids.append(db.execute(_CHUNKS, values).lastrowid or 0)
-            db.conn.executemany("INSERT INTO undecoded_chunks (chunk_id) VALUES (?)", [(i,) for i in ids])
+            for table in ("undecoded_chunks", "small_chunks"):
+                db.conn.executemany(f"INSERT INTO {table} (chunk_id) VALUES (?)", [(i,) for i in ids])
         return ids
 
     def _link_row(self, link: str, kind: str) -> int:

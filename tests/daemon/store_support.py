@@ -26,8 +26,8 @@ def frame(number: int, seconds: float | None = None, link: str = "boom", boot_id
     return CanCapture(link, at(when, boot_id), 0x181, number.to_bytes(8, "little"))
 
 
-def serial_bytes(data: bytes, seconds: float, link: str = "station") -> SerialCapture:
-    return SerialCapture(link, at(seconds), data)
+def serial_bytes(data: bytes, seconds: float, link: str = "station", boot_id: str = BOOT) -> SerialCapture:
+    return SerialCapture(link, at(seconds, boot_id), data)
 
 
 def reading(

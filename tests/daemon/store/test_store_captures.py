@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 import zlib
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.store.captures import decode_captures, encode_captures
+from daemon.store.captures import decode_captures, decode_run, encode_captures, encode_large
 from daemon.store.errors import StoreError
+from daemon.store.packed_captures import packed, unpacked
+from daemon.store.packing import packed_run
 from drivers.clock import Stamp
 from drivers.readings import CanCapture, Capture, SerialCapture
 from tests.daemon.store_support import at, frame, serial_bytes
@@ -43,6 +47,41 @@ def test_every_field_of_every_capture_comes_back_in_order(captures: list[Capture
     assert len(back) == len(captures)
 
 
+CYCLES = st.lists(st.tuples(INT64, st.integers(0, 3), st.binary(max_size=9), st.booleans()), min_size=1, max_size=60)
+
+
+@given(CYCLES, st.booleans())
+def test_a_large_chunk_gives_back_what_small_ones_held(cycle: list[tuple[int, int, bytes, bool]], serial: bool) -> None:
+    """Stamps that jump anywhere, and few kinds of frames that come again and again, of any length."""
+    captures: list[Capture] = [
+        SerialCapture("station", Stamp(-ns, ns, "boot-a", doubt), data, doubt)
+        if serial
+        else CanCapture("boom", Stamp(ns // 3, ns, "boot-a"), number, data, is_error=doubt)
+        for ns, number, data, doubt in cycle
+    ]
+    small = [chunk for start in range(0, len(captures), 7) for chunk in encode_captures(captures[start : start + 7])]
+    large = packed_run([decode_run(chunk.blob) for chunk in small])
+    assert decode_captures(large.blob) == captures
+    assert (large.first, large.last) == (captures[0].stamp, captures[-1].stamp)
+
+
+def test_a_minute_of_a_bus_in_one_chunk_takes_half_the_room_of_small_ones() -> None:
+    """A SYNC cycle of nine encoders with noise in the last bits, and stamps that scatter as a kernel's do."""
+    rng = np.random.default_rng(5)
+    counts = np.cumsum(rng.normal(40.0, 3.0, (3000, 9)), axis=0) + rng.normal(0.0, 2.0, (3000, 9))
+    late_ns = np.cumsum(230_000 + rng.exponential(15_000.0, (3000, 9)), axis=1) + 20_000_000 * np.arange(3000)[:, None]
+    captures: list[Capture] = [
+        CanCapture("boom", Stamp(10**18 + int(ns), int(ns), "boot-a"), 0x181 + node, struct.pack("<i", int(count)))
+        for cycle, times in zip(counts, late_ns, strict=True)
+        for node, (count, ns) in enumerate(zip(cycle, times, strict=True))
+    ]
+    small = [chunk for start in range(0, len(captures), 40) for chunk in encode_captures(captures[start : start + 40])]
+    large = packed_run([decode_run(chunk.blob) for chunk in small])
+    assert decode_captures(large.blob) == captures
+    assert len(large.blob) < 4.0 * len(captures)  # of 16 bits of noise in a stamp and 5 in a count
+    assert len(large.blob) < 0.5 * sum(len(chunk.blob) for chunk in small)
+
+
 def test_a_chunk_says_what_it_holds() -> None:
     can, serial = encode_captures([frame(1), serial_bytes(b"Q+1", 0.0015), frame(2)])
     assert (can.link, can.kind, can.captures, can.payload_bytes) == ("boom", "can", 2, 16)
@@ -65,9 +104,10 @@ def test_a_frame_that_no_bus_can_carry_is_refused_by_name() -> None:
         encode_captures([CanCapture("boom", at(0), 2**32, b"")])
 
 
-@given(st.data())
-def test_any_change_of_a_chunk_is_noticed(data: st.DataObject) -> None:
+@given(st.data(), st.booleans())
+def test_any_change_of_a_chunk_is_noticed(data: st.DataObject, is_large: bool) -> None:
     (chunk,) = encode_captures([frame(n) for n in range(5)])
+    chunk = encode_large(decode_run(chunk.blob)) if is_large else chunk
     place = data.draw(st.integers(0, len(chunk.blob) - 1))
     change = data.draw(st.integers(1, 255))
     damaged = bytearray(chunk.blob)
@@ -81,9 +121,9 @@ def test_any_change_of_a_chunk_is_noticed(data: st.DataObject) -> None:
 def test_a_chunk_of_a_later_version_asks_for_a_newer_program() -> None:
     (chunk,) = encode_captures([frame(1)])
     later = bytearray(chunk.blob[:-4])
-    later[4] = 3
+    later[4] = 4
     later += zlib.crc32(later).to_bytes(4, "little")
-    with pytest.raises(StoreError, match="version 3"):
+    with pytest.raises(StoreError, match="version 4"):
         decode_captures(bytes(later))
 
 
@@ -129,3 +169,14 @@ def test_a_doubtful_time_survives_and_earlier_programs_refuse_it() -> None:
     assert decode_captures(chunk.blob) == captures
     assert [capture.stamp.is_doubtful for capture in decode_captures(chunk.blob)] == [False, True, False]
     assert chunk.blob[4] == 2
+
+
+@given(st.data())
+def test_a_large_chunk_that_was_written_wrongly_is_refused_or_is_some_captures(data: st.DataObject) -> None:
+    """Its checksum is right: whatever the body says, nothing but a sentence or captures may come of it."""
+    columns = decode_run(encode_captures([frame(n) for n in range(30)])[0].blob).columns
+    body = bytearray(packed(columns, is_serial=False))
+    for _ in range(data.draw(st.integers(1, 8))):
+        body[data.draw(st.integers(0, len(body) - 1))] = data.draw(st.integers(0, 255))
+    with contextlib.suppress(ValueError, IndexError):
+        assert len(unpacked(bytes(body), 30, is_serial=False)) == 30

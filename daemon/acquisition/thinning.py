@@ -1,0 +1,47 @@
+"""Readings and fixes of no session are thinned: they are there to be looked at, and raw captures have them all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from drivers.clock import NS_PER_S, Stamp
+from drivers.readings import Fix, Reading, Record
+
+INTERVAL_NS = NS_PER_S
+
+
+class Thinning:
+    """Keeps one reading a channel and one fix a station a second, and every change of a status.
+
+    Events, gaps and failures are all kept, and so is everything of a session.
+
+    Args:
+        is_of_session: whether an instant lies in a session.
+    """
+
+    def __init__(self, is_of_session: Callable[[Stamp], bool]) -> None:
+        self._is_of_session = is_of_session
+        self._kept: dict[tuple[type[Record], str], Reading | Fix] = {}
+
+    def kept(self, records: Sequence[Record]) -> list[Record]:
+        """Return the records to store, in order."""
+        return [record for record in records if self._is_kept(record)]
+
+    def _is_kept(self, record: Record) -> bool:
+        if isinstance(record, Reading):
+            key: tuple[type[Record], str] = Reading, record.channel
+        elif isinstance(record, Fix):
+            key = Fix, record.station
+        else:
+            return True
+        last = self._kept.get(key)
+        is_new = (
+            last is None
+            or last.status is not record.status
+            or last.stamp.boot_id != record.stamp.boot_id
+            or not 0 <= record.stamp.monotonic_ns - last.stamp.monotonic_ns < INTERVAL_NS
+        )
+        if not is_new and not self._is_of_session(record.stamp):
+            return False
+        self._kept[key] = record
+        return True

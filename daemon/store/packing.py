@@ -1,0 +1,150 @@
+"""Small chunks of captures, as acquisition commits them, are put together to large ones, which take far less room."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import sqlite3
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+from daemon.store.captures import CaptureRun, Chunk, decode_run, encode_large
+from daemon.store.errors import StoreError, storage_sentence
+from daemon.store.packed_captures import joined
+from daemon.store.store import Store
+
+log = logging.getLogger(__name__)
+
+SPAN_NS = 60_000_000_000  # of a large chunk: what is newer lies in small ones
+MOST_CAPTURES = 100_000
+LOOK_S = 10.0  # real seconds between looks
+PAUSE_S = 0.2  # between one chunk and the next: acquisition comes first
+STOP_S = 5.0
+_NICE = 15
+_LOOKED_AT = 10_000  # small chunks
+
+_SMALL = """SELECT raw_chunks.id, link_id, captures, first_boot_id AS boot, first_monotonic_ns AS first_ns,
+        last_monotonic_ns AS last_ns, undecoded_chunks.chunk_id IS NOT NULL AS waits
+    FROM small_chunks JOIN raw_chunks ON raw_chunks.id = small_chunks.chunk_id
+    LEFT JOIN undecoded_chunks ON undecoded_chunks.chunk_id = small_chunks.chunk_id
+    ORDER BY small_chunks.chunk_id LIMIT ?"""
+_NEWEST = """SELECT last_boot_id AS boot, last_monotonic_ns AS last_ns FROM raw_chunks ORDER BY id DESC LIMIT 1"""
+_LARGE = """UPDATE raw_chunks SET last_utc_ns = ?, last_monotonic_ns = ?, captures = ?, bytes = ?, chunk = ?
+    WHERE id = ?"""
+
+Row = dict[str, Any]
+
+
+class Packing:
+    """Packs the chunks of a store, in a thread of its own.
+
+    A large chunk is read again and compared, byte for byte and stamp for stamp, with the small ones before these go. It
+    comes and they go in one transaction: a kill or a power cut leaves the one or the others.
+
+    Args:
+        store: open for writing.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Begin to pack."""
+        self._thread = threading.Thread(target=self._run, name="packing", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End after the chunk in work. Harmless when not started."""
+        self._stopping.set()
+        if self._thread is not None:
+            self._thread.join(STOP_S)
+
+    def _run(self) -> None:
+        with contextlib.suppress(OSError):  # this thread alone: acquisition comes first
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+        pause_s = LOOK_S
+        while not self._stopping.wait(pause_s):
+            try:
+                pause_s = PAUSE_S if self.pack_next() else LOOK_S
+            except sqlite3.Error as error:
+                pause_s = LOOK_S
+                log.warning("captures stay in small chunks for now: %s", storage_sentence(self._store.path, error))
+
+    def pack_next(self) -> bool:
+        """Make one large chunk, if there are small ones for it.
+
+        Returns:
+            whether there may be more.
+
+        Raises:
+            sqlite3.Error: the store cannot be read or written; it is as it was.
+        """
+        run = self._due()
+        if not run:
+            return False
+        ids = [row["id"] for row in run]
+        blobs = [self._chunk(number) for number in ids]
+        try:
+            large = packed_run([decode_run(blob) for blob in blobs]) if len(blobs) > 1 else None
+        except StoreError as error:
+            log.error("%s: raw chunks %d to %d stay as they are: %s", self._store.path, ids[0], ids[-1], error)
+            large = None
+        if large is not None and len(large.blob) >= sum(map(len, blobs)):
+            large = None
+        with self._store.transaction() as db:
+            marks = [(number,) for number in ids]
+            db.conn.executemany("DELETE FROM small_chunks WHERE chunk_id = ?", marks)
+            if large is not None:
+                last = large.last
+                values = last.utc_ns, last.monotonic_ns, large.captures, large.payload_bytes, large.blob, ids[0]
+                db.execute(_LARGE, values)
+                db.conn.executemany("DELETE FROM raw_chunks WHERE id = ?", marks[1:])
+        return True
+
+    def _chunk(self, number: int) -> bytes:
+        (row,) = self._store.rows("SELECT chunk FROM raw_chunks WHERE id = ?", [number])
+        return bytes(row["chunk"])
+
+    def _due(self) -> Sequence[Row]:
+        """Return the small chunks of one link and one boot that make the next large chunk; none where all is new."""
+        newest = self._store.rows(_NEWEST)
+        runs: dict[int, list[Row]] = {}  # by link
+        for row in self._store.rows(_SMALL, [_LOOKED_AT]):
+            run = runs.setdefault(row["link_id"], [])
+            if run and (row["boot"] != run[0]["boot"] or _is_full(run)):
+                return run
+            if row["waits"]:
+                break  # as all that came later
+            run.append(row)
+        for run in filter(None, runs.values()):
+            age_ns = newest[0]["last_ns"] - run[-1]["last_ns"]
+            if _is_full(run) or newest[0]["boot"] != run[0]["boot"] or age_ns > SPAN_NS:
+                return run
+        return []
+
+
+def packed_run(small: Sequence[CaptureRun]) -> Chunk:
+    """Return one large chunk of the captures of small ones, which are of one link and one boot.
+
+    Raises:
+        StoreError: the chunk would not give back what it was made of.
+    """
+    run = CaptureRun(small[0].link, small[0].boot_id, small[0].is_serial, joined([own.columns for own in small]))
+    if any((own.link, own.boot_id, own.is_serial) != (run.link, run.boot_id, run.is_serial) for own in small):
+        raise StoreError("they are of different links or boots than their rows say")
+    chunk = encode_large(run)
+    again = decode_run(chunk.blob)
+    if (again.link, again.boot_id, again.is_serial) != (run.link, run.boot_id, run.is_serial) or not (
+        again.columns.equals(run.columns)
+    ):
+        raise StoreError("packed, they do not read as they were; this is a fault of rigcal: please report it")
+    return chunk
+
+
+def _is_full(run: Sequence[Row]) -> bool:
+    span_ns: int = run[-1]["last_ns"] - run[0]["first_ns"]
+    return span_ns >= SPAN_NS or sum(row["captures"] for row in run) >= MOST_CAPTURES
