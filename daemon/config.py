@@ -142,6 +142,16 @@ class TipSection(_Section):
     can: TipCanSection | None = None
 
 
+class MetricsSection(_Section):
+    """Metrics for Prometheus, on the loopback interface alone.
+
+    Attributes:
+        port: where they are served, as docs/metrics.md says; 0 for any that is free, which the log names.
+    """
+
+    port: int = Field(ge=0, le=65535)
+
+
 class Config(_Section):
     """Everything `rigcal run` needs to know.
 
@@ -151,6 +161,7 @@ class Config(_Section):
         socket: the control socket; `control.sock` in the runtime or state directory when absent.
         read_group: whose members may look at the daemon's state and not change it, by a socket `status.sock` beside the
             control socket; no one when absent.
+        metrics: where metrics are served; nowhere when absent.
     """
 
     rig: str
@@ -162,6 +173,7 @@ class Config(_Section):
     sessions: SessionsSection = SessionsSection()
     jobs: JobsSection = JobsSection()
     tip: TipSection | None = None
+    metrics: MetricsSection | None = None
 
     @model_validator(mode="after")
     def _names_differ(self) -> Config:

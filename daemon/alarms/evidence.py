@@ -34,6 +34,7 @@ class Evidence:
         is_store_new: the store has never seen a job, and yet models lie beside it.
         previous_run: when the daemon's run before this one was last alive, by a clock that can be compared.
         control_faults: control socket on which no one can connect -> why.
+        metrics_fault: why nobody can read the metrics; None where they can be read, or are not wanted.
         untrained_sessions: closed sessions that nothing trains on -> why; those that newer ones make up for are not
             there.
         unwatched: rule or part of the evidence that has failed itself -> why.
@@ -51,6 +52,7 @@ class Evidence:
     is_store_new: bool = False
     previous_run: Stamp | None = None
     control_faults: Mapping[str, str] = field(default_factory=dict)
+    metrics_fault: str | None = None
     untrained_sessions: Mapping[str, str] = field(default_factory=dict)
     unwatched: Mapping[str, str] = field(default_factory=dict)
 
@@ -102,6 +104,7 @@ _PARTS = {
     "is_store_new": "the models",
     "untrained_sessions": "the sessions",
     "control_faults": "the control sockets",
+    "metrics_fault": "the metrics",
 }
 
 
