@@ -13,6 +13,7 @@ from daemon.alarms.board import AlarmBoard
 from daemon.composition import Parts
 from daemon.models.drift import gap_status
 from daemon.models.registry import ModelRegistry
+from daemon.monitoring.notices import Notices
 from daemon.sessions.manager import SessionKeeper
 from daemon.store.errors import StoreError
 from daemon.store.health import StoreHealth
@@ -34,7 +35,7 @@ class Overview:
         parts: rig and mode.
         store: open for writing.
         store_health, acquisition: tell of the store and of acquisition.
-        alarms, sessions, jobs, models, model_table: the parts.
+        alarms, notices, sessions, jobs, models, model_table: the parts.
     """
 
     parts: Parts
@@ -42,6 +43,7 @@ class Overview:
     store_health: Callable[[], StoreHealth]
     acquisition: Callable[[], AcquisitionStatus]
     alarms: AlarmBoard
+    notices: Notices
     sessions: SessionKeeper
     jobs: JobTable
     models: ModelRegistry
@@ -64,6 +66,7 @@ class Overview:
             "mode": self.parts.mode,
             "version": importlib.metadata.version("rigcal"),
             "alarms": self.alarms.status(),
+            "notices": self.notices.status(),
             "acquisition": asdict(self.acquisition()),
             "session": stored("session", self.sessions.open_session),
             "control_shots": stored("control_shots", SetupTable(self.store).newest_shots) or [],

@@ -29,6 +29,7 @@ from daemon.models.live_tip import FRESH_S, LiveTip
 from daemon.models.registry import ModelRegistry
 from daemon.models.tip_sender import TipSender
 from daemon.monitoring.metrics_server import MetricsServer
+from daemon.monitoring.notices import Notices
 from daemon.overview import Overview
 from daemon.sessions.manager import SessionKeeper
 from daemon.sessions.station_setups import SetupBook
@@ -37,6 +38,7 @@ from daemon.store.errors import storage_errors, storage_sentence, unwritable_err
 from daemon.store.health import StoreHealth, StoreWatch
 from daemon.store.jobs import JobTable
 from daemon.store.models import ModelTable
+from daemon.store.notices import NoticeTable
 from daemon.store.sessions import SessionTable
 from daemon.store.setups import SetupTable
 from daemon.store.store import Store
@@ -118,11 +120,11 @@ class Daemon:
         self._job_table, self._model_table = JobTable(store, parts.rig.name), models
         self._servers: list[ControlServer] = []
         self._unserved: dict[str, str] = {}  # sockets that could not be made, and why
-        self._alarms = AlarmBoard(
-            AlarmTable(store),
-            Gatherer(parts.clock, before, self._evidence()),
-            parts.clock,
-        )
+        alarms = AlarmTable(store)
+        notify = config.notify if parts.mode != "replayed" else None  # what a log says happened long ago
+        self._notices = Notices(notify, NoticeTable(store), alarms.active(), parts.rig.name, parts.clock)
+        evidence = Gatherer(parts.clock, before, self._evidence())
+        self._alarms = AlarmBoard(alarms, evidence, parts.clock, tell=self._notices.take)
         self._models = ModelRegistry(models, parts.rig.name, self._live_model, compare=self._jobs.compare)
         self._overview = Overview(
             parts,
@@ -130,6 +132,7 @@ class Daemon:
             lambda: self._watch.health,
             self._acquisition.status,
             self._alarms,
+            self._notices,
             self._sessions,
             self._job_table,
             self._models,
@@ -153,6 +156,7 @@ class Daemon:
             "is_store_new": lambda: is_store_new(self._job_table, self._config.models_directory),
             "untrained_sessions": sessions.untrained,
             "control_faults": self._control_faults,
+            "notice_faults": self._notices.faults,
             "metrics_fault": lambda: None if self._metrics is None else self._metrics.trouble(),
         }
 
@@ -182,6 +186,7 @@ class Daemon:
             self._live_model.start()
             self._acquisition.start()
             self._watch.start()
+            self._notices.start()
             if self._sender is not None:
                 self._sender.start()
             if self._config.jobs.enabled:
@@ -212,7 +217,7 @@ class Daemon:
         """Stop all parts within `STOP_S`, side by side, so that no one's stop delays what was captured."""
         budget = TimeBudget(STOP_S)
         stops = [server.close for server in self._servers]
-        stops += [self._live_model.stop, self._jobs.stop, self._watch.stop]
+        stops += [self._live_model.stop, self._jobs.stop, self._watch.stop, self._notices.stop]
         stops += [part.stop for part in (self._sender, self._metrics) if part is not None]
         others = [threading.Thread(target=_stop_part, args=(stop,), daemon=True) for stop in stops]
         for thread in others:
@@ -263,6 +268,7 @@ class Daemon:
             "model.compare": models.compare_command,
             "tip": self._tip.tip_command,
             "alarms.list": self._alarms.list_command,
+            "alarms.test-notice": self._notices.try_command,
             "devices.configure": self._configure_devices,
             **({} if self._parts.visit is None else {"simulation.visit": self._visit}),
         }

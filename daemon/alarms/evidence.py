@@ -35,6 +35,7 @@ class Evidence:
         previous_run: when the daemon's run before this one was last alive, by a clock that can be compared.
         control_faults: control socket on which no one can connect -> why.
         metrics_fault: why nobody can read the metrics; None where they can be read, or are not wanted.
+        notice_faults: ways out of the machine by which notices are not delivered at present -> why.
         untrained_sessions: closed sessions that nothing trains on -> why; those that newer ones make up for are not
             there.
         unwatched: rule or part of the evidence that has failed itself -> why.
@@ -53,6 +54,7 @@ class Evidence:
     previous_run: Stamp | None = None
     control_faults: Mapping[str, str] = field(default_factory=dict)
     metrics_fault: str | None = None
+    notice_faults: Mapping[str, str] = field(default_factory=dict)
     untrained_sessions: Mapping[str, str] = field(default_factory=dict)
     unwatched: Mapping[str, str] = field(default_factory=dict)
 
@@ -105,6 +107,7 @@ _PARTS = {
     "untrained_sessions": "the sessions",
     "control_faults": "the control sockets",
     "metrics_fault": "the metrics",
+    "notice_faults": "the notices",
 }
 
 

@@ -95,6 +95,10 @@ def _alarm_counts(status: Status) -> Iterator[Sample]:
         yield (severity,), float(sum(alarm["severity"] == severity for alarm in active))
 
 
+def _notices(key: str) -> Callable[[Status], Iterator[Sample]]:
+    return lambda status: (((one["target"],), one[key]) for one in status["notices"])
+
+
 def _is(flag: object) -> float | None:
     return None if flag is None else float(bool(flag))
 
@@ -346,6 +350,21 @@ FAMILIES: tuple[Family, ...] = (
         (),
         _one(lambda s: s["alarms"]["looked_age_s"]),
     ),
+    Family(
+        "rigcal_notices_waiting",
+        "gauge",
+        "Notices of alarms that are not delivered yet, by the way they go.",
+        ("target",),
+        _notices("waiting"),
+    ),
+    Family(
+        "rigcal_notice_messages_total",
+        "counter",
+        "Messages of notices that were delivered.",
+        ("target",),
+        _notices("sent"),
+    ),
+    Family("rigcal_notice_failures_total", "counter", "Deliveries that failed.", ("target",), _notices("failures")),
 )
 
 _HEAD = """# Metrics
