@@ -17,7 +17,7 @@ from calibration.rig.channels import Cia404Analogue, Cia406Encoder, Cia406Linear
 from calibration.rig.description import Rig
 from daemon.acquisition.channels import decoder_factories, node_setups
 from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_inputs
-from daemon.acquisition.simulated_rig import SimulatedRig, SimulationError, stops_of
+from daemon.acquisition.simulated_rig import SimulatedRig, SimulationError
 from daemon.commands import CommandError
 from daemon.config import CanSection, Config, ConfigError, RigSource
 from daemon.sessions.prism_guard import MotionLimit
@@ -31,6 +31,7 @@ from drivers.readings import Decoder, LinkLoop
 from drivers.stations.decoder import StationDecoder
 from drivers.stations.link import StationLink
 from drivers.stations.serial_port import SerialConfig
+from simulators.plan import stops_of
 from simulators.replay import ReplayLink
 
 SIMULATED_SYNC_MS = 200

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, get_args
+from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
@@ -142,6 +143,52 @@ class TipSection(_Section):
     can: TipCanSection | None = None
 
 
+class MetricsSection(_Section):
+    """Metrics for Prometheus, on the loopback interface alone.
+
+    Attributes:
+        port: where they are served, as docs/metrics.md says; 0 for any that is free, which the log names.
+    """
+
+    port: int = Field(ge=0, le=65535)
+
+
+class NotifySection(_Section):
+    """Notices of alarms to people elsewhere: by a webhook, by a command, or by both.
+
+    Attributes:
+        webhook_url: takes each message as JSON by POST; its key `text` is what chat services show.
+        command: a program with its arguments, run without a shell; it gets each message as an e-mail on its standard
+            input, as `sendmail ADDRESS` and `msmtp ADDRESS` take it.
+        least: alarms below this severity are not told.
+    """
+
+    webhook_url: str | None = None
+    command: tuple[str, ...] = ()
+    least: Literal["warning", "critical"] = "warning"
+
+    @field_validator("webhook_url")
+    @classmethod
+    def _is_http(cls, url: str | None) -> str | None:
+        parts = urlsplit(url or "http://none")
+        if parts.scheme not in ("http", "https") or not parts.hostname or not (url or "").isascii():
+            raise ValueError("give the address of a web server: https://HOST/PATH")
+        return url
+
+    @field_validator("command")
+    @classmethod
+    def _is_a_program(cls, command: tuple[str, ...]) -> tuple[str, ...]:
+        if command and not command[0].startswith("/"):
+            raise ValueError("the program needs its whole path, as in ['/usr/bin/msmtp', 'someone@example.com']")
+        return command
+
+    @model_validator(mode="after")
+    def _goes_somewhere(self) -> NotifySection:
+        if self.webhook_url is None and not self.command:
+            raise ValueError("give webhook_url, command, or both: notices need a way out")
+        return self
+
+
 class Config(_Section):
     """Everything `rigcal run` needs to know.
 
@@ -151,6 +198,8 @@ class Config(_Section):
         socket: the control socket; `control.sock` in the runtime or state directory when absent.
         read_group: whose members may look at the daemon's state and not change it, by a socket `status.sock` beside the
             control socket; no one when absent.
+        metrics: where metrics are served; nowhere when absent.
+        notify: where notices of alarms go; nowhere when absent.
     """
 
     rig: str
@@ -162,6 +211,8 @@ class Config(_Section):
     sessions: SessionsSection = SessionsSection()
     jobs: JobsSection = JobsSection()
     tip: TipSection | None = None
+    metrics: MetricsSection | None = None
+    notify: NotifySection | None = None
 
     @model_validator(mode="after")
     def _names_differ(self) -> Config:

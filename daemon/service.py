@@ -7,10 +7,9 @@ import signal
 import sqlite3
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from calibration.rig.description import Rig
 from daemon.acquisition.acquisition import Acquisition
@@ -26,18 +25,21 @@ from daemon.control.protocol import reading_only
 from daemon.control.server import ControlServer
 from daemon.host.systemd import Notifier
 from daemon.jobs.runner import JobRunner
-from daemon.models.drift import gap_status
 from daemon.models.live_model import LiveModel
 from daemon.models.live_tip import FRESH_S, LiveTip
 from daemon.models.registry import ModelRegistry
 from daemon.models.tip_sender import TipSender
+from daemon.monitoring.metrics_server import MetricsServer
+from daemon.monitoring.notices import Notices
+from daemon.overview import Overview
 from daemon.sessions.manager import SessionKeeper
 from daemon.sessions.station_setups import SetupBook
 from daemon.store.alarms import AlarmTable
-from daemon.store.errors import StoreError, storage_errors, storage_sentence, unwritable_errors
+from daemon.store.errors import storage_errors, storage_sentence, unwritable_errors
 from daemon.store.health import StoreHealth, StoreWatch
 from daemon.store.jobs import JobTable
 from daemon.store.models import ModelTable
+from daemon.store.notices import NoticeTable
 from daemon.store.packing import Packing
 from daemon.store.sessions import SessionTable
 from daemon.store.setups import SetupTable
@@ -48,12 +50,9 @@ from drivers.readings import Record
 
 log = logging.getLogger(__name__)
 
-T = TypeVar("T")
-
 BEAT_S = 1.0
 STOP_S = 20.0  # real seconds for all parts together, well within the unit's TimeoutStopSec
 STORE_END_S = 3.0  # of them for the store's last commits
-_EVENTS = 12  # the newest are shown in `status`
 
 
 class Daemon:
@@ -125,13 +124,27 @@ class Daemon:
         self._job_table, self._model_table = JobTable(store, parts.rig.name), models
         self._servers: list[ControlServer] = []
         self._unserved: dict[str, str] = {}  # sockets that could not be made, and why
-        self._alarms = AlarmBoard(
-            AlarmTable(store),
-            Gatherer(parts.clock, before, self._evidence()),
-            parts.clock,
-        )
+        alarms = AlarmTable(store)
+        notify = config.notify if parts.mode != "replayed" else None  # what a log says happened long ago
+        self._notices = Notices(notify, NoticeTable(store), alarms.active(), parts.rig.name, parts.clock)
+        evidence = Gatherer(parts.clock, before, self._evidence())
+        self._alarms = AlarmBoard(alarms, evidence, parts.clock, tell=self._notices.take)
         self._models = ModelRegistry(models, parts.rig.name, self._live_model, compare=self._jobs.compare)
+        self._overview = Overview(
+            parts,
+            store,
+            lambda: self._watch.health,
+            self._acquisition.status,
+            self._alarms,
+            self._notices,
+            self._sessions,
+            self._job_table,
+            self._models,
+            self._model_table,
+        )
         self._servers, self._unserved = control_servers(config, self._commands())
+        metrics = config.metrics
+        self._metrics = None if metrics is None else MetricsServer(metrics.port, lambda: self._overview.command({}))
 
     def _evidence(self) -> dict[str, Callable[[], object]]:
         """Part of the alarms' evidence -> function that tells it."""
@@ -147,6 +160,8 @@ class Daemon:
             "is_store_new": lambda: is_store_new(self._job_table, self._config.models_directory),
             "untrained_sessions": sessions.untrained,
             "control_faults": self._control_faults,
+            "notice_faults": self._notices.faults,
+            "metrics_fault": lambda: None if self._metrics is None else self._metrics.trouble(),
         }
 
     def _control_faults(self) -> dict[str, str]:
@@ -176,6 +191,7 @@ class Daemon:
             self._acquisition.start()
             self._watch.start()
             self._packing.start()
+            self._notices.start()
             if self._sender is not None:
                 self._sender.start()
             if self._config.jobs.enabled:
@@ -185,6 +201,8 @@ class Daemon:
             while not stop.wait(beat_s):
                 self._acquisition.check()
                 self._watch.look()
+                if self._metrics is not None:
+                    self._metrics.look()
                 self._alarms.evaluate()
                 self._sessions.aim_again()  # after the alarm that somebody should
                 # The watchdog hears of the writer and of the control sockets, not of this loop: a hung disk must
@@ -204,9 +222,8 @@ class Daemon:
         """Stop all parts within `STOP_S`, side by side, so that no one's stop delays what was captured."""
         budget = TimeBudget(STOP_S)
         stops = [server.close for server in self._servers]
-        stops += [self._live_model.stop, self._jobs.stop, self._watch.stop, self._packing.stop]
-        if self._sender is not None:
-            stops.append(self._sender.stop)
+        stops += [self._live_model.stop, self._jobs.stop, self._watch.stop, self._notices.stop, self._packing.stop]
+        stops += [part.stop for part in (self._sender, self._metrics) if part is not None]
         others = [threading.Thread(target=_stop_part, args=(stop,), daemon=True) for stop in stops]
         for thread in others:
             thread.start()
@@ -234,7 +251,7 @@ class Daemon:
     def _commands(self) -> Mapping[str, Handler]:
         sessions, jobs, models = self._sessions, self._jobs, self._models
         commands: dict[str, Handler] = {
-            "status": self._status,
+            "status": self._overview.command,
             "setup.new": self._setups.new_command,
             "setup.list": self._setups.list_command,
             "session.start": self._start_session,
@@ -256,6 +273,7 @@ class Daemon:
             "model.compare": models.compare_command,
             "tip": self._tip.tip_command,
             "alarms.list": self._alarms.list_command,
+            "alarms.test-notice": self._notices.try_command,
             "devices.configure": self._configure_devices,
             **({} if self._parts.visit is None else {"simulation.visit": self._visit}),
         }
@@ -264,32 +282,6 @@ class Daemon:
     def _carry_out(self, handler: Handler, arguments: Mapping[str, Any]) -> Any:
         with unwritable_errors(self._store.path):
             return handler(arguments)
-
-    def _status(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
-        unreadable: dict[str, str] = {}  # a table that is damaged must not hide the rest
-
-        def stored(part: str, read: Callable[[], T]) -> T | None:
-            try:
-                return read()
-            except (sqlite3.Error, StoreError) as error:
-                self._store.note_damage(error)
-                unreadable[part] = str(error)
-                return None
-
-        return {
-            "rig": self._parts.rig.name,
-            "mode": self._parts.mode,
-            "alarms": self._alarms.status(),
-            "acquisition": asdict(self._acquisition.status()),
-            "session": stored("session", self._sessions.open_session),
-            "jobs": stored("jobs", self._job_table.unfinished) or [],
-            "models": stored("models", self._models.status),
-            "gap": stored("gap", lambda: gap_status(self._job_table, self._model_table)),
-            "events": stored("events", lambda: self._store.newest_events(_EVENTS)) or [],
-            "store": str(self._config.store_path),
-            "store_health": self._watch.health.as_dict(),
-            "unreadable": unreadable,
-        }
 
     def _start_session(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Open a session, unless its store would be lost when the daemon stops."""

@@ -1,4 +1,10 @@
-"""`python -m simulators`: a simulated rig as a process of its own, on two ptys."""
+"""`python -m simulators`: a simulated rig as a process of its own.
+
+Its links are two pseudo-terminals that it makes (`--can-port`, `--station-port`), or a real CAN interface and a real
+serial device, at the other end of which any host listens: an installed service too.
+
+    python -m simulators --rig swdt82 --can socketcan:vcan0 --station-device /dev/ttyS1 --aim r --drive PLAN.csv --loop
+"""
 
 from __future__ import annotations
 
@@ -8,37 +14,56 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 
 import numpy as np
 
 from calibration.errors import RigError
+from drivers.can.ports import Interface
 from drivers.clock import ScaledClock, Stamp, SystemClock
+from drivers.errors import LinkError
 from simulators.blind.hiding import HiddenEffect, draw_hidden_effect
 from simulators.devices.stations.total_station import StationSettings
+from simulators.drive import PlanDriver
 from simulators.effects.library import parse_effects
 from simulators.faults import parse_faults, random_faults
+from simulators.link_ends import BusEnd, CanEnd, SerialEnd, SlcanEnd, StationEnd
 from simulators.live import LiveRig, print_line
+from simulators.plan import Stop, read_plan
+from simulators.pty_port import PtyPort
 from simulators.rig.truth import RigTruth, load_rig, replace_effects
 from simulators.rig_simulator import RigSimulator, SimulatorSettings
 from simulators.wire_log import WireLog
 
 HIDDEN = "hidden_effect.json"
+INTERFACES: tuple[Interface, ...] = ("socketcan", "udp_multicast")
 MAP_HELP = "what a commissioned node's TPDO carries, as hexadecimal words of object 1A00h: 38:60040020+65050010"
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m simulators", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m simulators", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     add = parser.add_argument
     add("--rig", required=True, help="a shipped rig's name or a path to a TOML file")
     add("--seed", type=int, default=0, help="the machine and its noise")
     add("--perturbation", type=float, default=1.0, help="deviation of the machine in build tolerances")
     add("--rate", type=float, default=1.0, help="simulated seconds per real second")
     add("--origin", type=_origin, help="UTC_NS,MONOTONIC_NS,BOOT_ID at which simulated and real time agree")
-    add("--can-port", type=Path, required=True, help="where the slcan port appears")
-    add("--station-port", type=Path, required=True, help="where the station's port appears")
+    bus = parser.add_mutually_exclusive_group(required=True)
+    bus.add_argument("--can-port", type=Path, help="where a pseudo-terminal with an slcan adapter appears")
+    bus.add_argument("--can", type=_interface, metavar="INTERFACE:CHANNEL", help="a real bus: socketcan:vcan0")
+    add("--can-option", action="append", default=[], type=_option, metavar="NAME=VALUE", help="of python-can's bus")
+    line = parser.add_mutually_exclusive_group(required=True)
+    line.add_argument("--station-port", type=Path, help="where the station's pseudo-terminal appears")
+    line.add_argument("--station-device", metavar="DEVICE", help="a real serial port, 8N1: /dev/ttyS1")
+    add("--aim", metavar="TARGET", help="turn the station to a prism or control point at the beginning")
+    add("--drive", type=Path, metavar="PLAN.csv", help="start at a plan's first pose, drive to the others, and end")
+    add("--loop", action="store_true", help="drive the plan again and again")
+    add("--dwell-s", type=float, default=5.0, help="how long to stand at each pose, unless the plan says longer")
+    add("--speed", type=float, default=0.25, help="of driving: share of the joints' greatest rates")
     add("--effects", default="", help="hidden effects: FAMILY@WHERE[:NAME=VALUE...],...")
     add("--secret", type=Path, metavar="DIR", help=f"hide one more effect, drawn here, and name it in {HIDDEN} there")
     add("--faults", default="", help="scripted faults: KIND@SECONDS[:NAME=VALUE...],...")
@@ -54,6 +79,20 @@ def _parser() -> argparse.ArgumentParser:
     add("--push-s", type=float, help="the station sends records unasked at this interval")
     add("--wire-log", type=Path, metavar="FILE", help="append the rig's traffic and measurements to this file")
     return parser
+
+
+def _interface(text: str) -> tuple[Interface, str]:
+    interface, _, channel = text.partition(":")
+    if interface not in INTERFACES or not channel:
+        raise argparse.ArgumentTypeError(f"{text!r} is not INTERFACE:CHANNEL, with {' or '.join(INTERFACES)}")
+    return interface, channel
+
+
+def _option(text: str) -> tuple[str, str | int]:
+    name, equals, value = text.partition("=")
+    if not name or not equals:
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE")
+    return name, int(value) if value.lstrip("-").isdigit() else value
 
 
 def _mapping(text: str) -> tuple[int, tuple[int, ...]]:
@@ -72,7 +111,7 @@ def _origin(text: str) -> Stamp:
         raise argparse.ArgumentTypeError(f"{text!r} is not UTC_NS,MONOTONIC_NS,BOOT_ID") from None
 
 
-def _build(options: argparse.Namespace) -> tuple[RigSimulator, HiddenEffect | None]:
+def _build(options: argparse.Namespace, start: Mapping[str, float] | None) -> tuple[RigSimulator, HiddenEffect | None]:
     if min(options.rate, options.sync_ms, options.signal_ms, options.baud) <= 0 or options.seed < 0:
         raise ValueError("rate, sync-ms, signal-ms and baud must be positive, seed not negative")
     if options.push_s is not None and options.push_s <= 0:
@@ -105,11 +144,36 @@ def _build(options: argparse.Namespace) -> tuple[RigSimulator, HiddenEffect | No
             raise ValueError("random-faults must be positive")
         kinds = ("lock_loss", "prism_jump", "bad_check", "dropped_ack", "clutter", "joined_buffers")
         faults += random_faults(options.seed, 86_400.0, options.random_faults, kinds)
-    return RigSimulator(truth, options.seed, settings, faults=faults), hidden
+    return RigSimulator(truth, options.seed, settings, faults=faults, start=start), hidden
+
+
+def _stops(options: argparse.Namespace) -> list[Stop]:
+    """Return the stops of the plan that is to be driven; none without one."""
+    if options.dwell_s < 0 or not 0 < options.speed <= 1:
+        raise ValueError("dwell-s must not be negative, speed must be above 0 and at most 1")
+    if options.drive is None:
+        if options.loop:
+            raise ValueError("--loop needs a plan: --drive PLAN.csv")
+        return []
+    stops = read_plan(options.drive, load_rig(options.rig), options.dwell_s)
+    if options.loop and not any(stand_s for _, stand_s in stops) and len(stops) == 1:
+        raise ValueError("a plan of one pose without a dwell cannot be driven again and again")
+    return stops
+
+
+def _ends(options: argparse.Namespace, stack: contextlib.ExitStack) -> tuple[CanEnd, StationEnd]:
+    """Open the rig's ends of its links; `stack` closes them."""
+    bus = options.can
+    can: CanEnd = SlcanEnd(options.can_port) if bus is None else BusEnd(bus[0], bus[1], dict(options.can_option))
+    stack.callback(can.unplug)
+    device = options.station_device
+    station: StationEnd = PtyPort(options.station_port) if device is None else SerialEnd(device, options.baud)
+    stack.callback(station.unplug)
+    return can, station
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a simulated rig until its standard input ends; returns the exit status."""
+    """Run a simulated rig until its plan or, without one, its standard input ends; returns the exit status."""
     options = _parser().parse_args(arguments)
     origin = options.origin or SystemClock().now()
     wake_read, wake_write = os.pipe()
@@ -124,21 +188,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with contextlib.ExitStack() as stack:
         try:
             log = None if options.wire_log is None else stack.enter_context(WireLog(options.wire_log))
-            simulator, hidden = _build(options)
+            stops = _stops(options)
+            simulator, hidden = _build(options, stops[0][0] if stops else None)
             clock = ScaledClock(options.rate, origin)
-            live = LiveRig(simulator, clock, options.can_port, options.station_port, print_line, log)
+            driver = PlanDriver(simulator, stops, speed=options.speed, repeat=options.loop) if stops else None
+            live = LiveRig(simulator, clock, *_ends(options, stack), print_line, log, driver)
+            if options.aim is not None:
+                simulator.aim(options.aim, 0.0)
             if hidden is not None:  # its instants count from simulated second 0
                 told = json.dumps(hidden.as_dict() | {"begin_utc_ns": live.begin.utc_ns})
                 (options.secret / HIDDEN).write_text(told, encoding="utf-8")
-        except (RigError, ValueError, OSError) as error:
+        except (RigError, LinkError, ValueError, OSError) as error:
             sys.stderr.write(f"simulators: {error}\n")
             return 2
         try:
             live.run(sys.stdin.fileno(), wake_read)
         except BrokenPipeError:  # the reader of the answers has ended
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        finally:
-            live.close()
     return 0
 
 

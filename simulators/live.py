@@ -1,4 +1,4 @@
-"""A simulated rig on ptys, in real or scaled time: one thread, one loop."""
+"""A simulated rig on its links, in real or scaled time: one thread, one loop."""
 
 from __future__ import annotations
 
@@ -7,18 +7,19 @@ import os
 import select
 import sys
 from collections.abc import Callable, Mapping
-from pathlib import Path
 
 from drivers.clock import NS_PER_S, Clock
+from drivers.errors import LinkError
 from simulators.control import Control
-from simulators.devices.can.slcan_adapter import Channel, SlcanAdapter
-from simulators.pty_port import PtyPort
+from simulators.drive import PlanDriver
+from simulators.link_ends import CanEnd, LinkEnd, StationEnd
 from simulators.rig_simulator import Output, RigSimulator
 from simulators.wire_log import WireLog
 
 _SHORTEST_SLEEP_S = 0.001  # real: finer would only cost
 _LONGEST_SLEEP_S = 0.5
 _LONGEST_LINE = 65536
+_REOPEN_S = 1.0  # after an interface or a device has gone
 
 
 class LiveRig:
@@ -30,43 +31,31 @@ class LiveRig:
     Args:
         simulator: the rig.
         clock: shared with the host.
-        can_port, station_port: where the ports appear.
+        can, station: its ends of the links.
         send: takes each answer and event.
         log: takes the traffic on the links; None: no log.
-
-    Raises:
-        OSError: a port cannot be made.
+        driver: drives the boom, if anything but commands does; the rig ends with its plan.
     """
 
     def __init__(
         self,
         simulator: RigSimulator,
         clock: Clock,
-        can_port: Path,
-        station_port: Path,
+        can: CanEnd,
+        station: StationEnd,
         send: Callable[[Mapping[str, object]], None],
         log: WireLog | None = None,
+        driver: PlanDriver | None = None,
     ) -> None:
         self._simulator, self._clock, self._send = simulator, clock, send
+        self._can, self._station, self._driver = can, station, driver
         self.begin = clock.now()
-        self._adapter = SlcanAdapter()
-        self._can = PtyPort(can_port)
-        try:
-            self._station = PtyPort(station_port)
-        except OSError:
-            self._can.unplug()
-            raise
-        self._replug: dict[PtyPort, float] = {}
+        self._replug: dict[str, float] = {}  # link -> when it comes back, simulated seconds
         self._control = Control(simulator)
         self._lines = bytearray()
         self._log = log
         if log is not None:
             simulator.station.on_measured = self._log_measured
-
-    def close(self) -> None:
-        """Take both ports away."""
-        self._can.unplug()
-        self._station.unplug()
 
     def _now_s(self) -> float:
         return (self._clock.monotonic_ns() - self.begin.monotonic_ns) / NS_PER_S
@@ -81,26 +70,39 @@ class LiveRig:
         self._log.measured(self._monotonic_ns(at_s), target, place, machine.motion.values(at_s))
 
     def run(self, commands: int, wake: int) -> None:
-        """Run until the commands end (`quit`, end of file) or a byte arrives at `wake`.
+        """Run until `quit`, the end of the driver's plan, or a byte at `wake`; without a driver, to the commands' end.
 
         Args:
             commands: file descriptor of the JSON lines.
             wake: file descriptor that a signal handler writes to.
         """
-        self._send({"event": "ready", "can_port": str(self._can.path), "station_port": str(self._station.path)})
+        if self._driver is not None:
+            self._driver.start(self._now_s())
+        self._send({"event": "ready", "can_port": self._can.name, "station_port": self._station.name})
+        sources = [commands, wake]
         while not self._control.finished:
-            ports = [p.fileno() for p in (self._can, self._station) if p.plugged]
-            ready, _, _ = select.select([commands, wake, *ports], [], [], self._sleep_s())
+            ports = [end.fileno() for end in self._ends().values() if end.plugged]
+            ready, _, _ = select.select([*sources, *ports], [], [], self._sleep_s())
             if wake in ready:
                 return
             now_s = self._now_s()
             if commands in ready and not self._read_commands(commands, now_s):
-                return
+                if self._driver is None:
+                    return
+                sources.remove(commands)
             self._hear(now_s)
             self._speak(self._simulator.poll(now_s), now_s)
+            self._plug_again(now_s)
+            if self._driver is not None and self._driver.is_over(now_s):
+                self._send({"event": "driven"})
+                return
+
+    def _ends(self) -> dict[str, LinkEnd]:
+        return {"can": self._can, "station": self._station}
 
     def _sleep_s(self) -> float:
-        due_s = min([self._simulator.next_deadline(), *self._replug.values()])
+        driven_s = [] if self._driver is None else [self._driver.next_deadline()]
+        due_s = min([self._simulator.next_deadline(), *self._replug.values(), *driven_s])
         wait_s = min(due_s - self._now_s(), 60.0)
         return max(_SHORTEST_SLEEP_S, min(_LONGEST_SLEEP_S, self._clock.real_seconds(wait_s)))
 
@@ -116,37 +118,53 @@ class LiveRig:
         return bool(data)
 
     def _hear(self, now_s: float) -> None:
-        data = self._can.read()
-        if data:
-            was = self._adapter.channel
-            answers, frames = self._adapter.feed(data)
-            if was is Channel.CLOSED and self._adapter.channel is not Channel.CLOSED:
-                self._can.discard()  # what an earlier host left unread
-            self._can.write(answers)
-            for frame in frames:
+        try:
+            for frame in self._can.receive():
                 self._simulator.receive_can(frame, now_s)
-        self._simulator.receive_station(self._station.read(), now_s)
+        except LinkError as error:
+            self._lose("can", str(error), now_s)
+        try:
+            self._simulator.receive_station(self._station.read(), now_s)
+        except LinkError as error:
+            self._lose("station", str(error), now_s)
 
     def _speak(self, output: Output, now_s: float) -> None:
         if self._log is not None:
             at_ns = self._monotonic_ns(now_s)
             self._log.frames(at_ns, output.frames)
             self._log.station(at_ns, output.station)
-        self._can.write(b"".join(self._adapter.encode(frame) for frame in output.frames))
-        self._station.write(output.station)
+        try:
+            self._can.send(output.frames)
+        except LinkError as error:
+            self._lose("can", str(error), now_s)
+        try:
+            self._station.write(output.station)
+        except LinkError as error:
+            self._lose("station", str(error), now_s)
         for event in output.events:
             if event.get("kind") == "unplug":
-                port = self._can if event["link"] == "can" else self._station
-                port.unplug()
-                self._replug[port] = now_s + float(str(event["seconds"]))
+                link = "can" if event["link"] == "can" else "station"
+                self._ends()[link].unplug()
+                self._replug[link] = now_s + float(str(event["seconds"]))
             self._tell(event, now_s)
-        for port, at_s in list(self._replug.items()):
-            if now_s >= at_s:
-                del self._replug[port]
-                if port is self._can:
-                    self._adapter = SlcanAdapter()
-                port.plug()
-                self._tell({"event": "plugged", "link": "can" if port is self._can else "station"}, now_s)
+
+    def _lose(self, link: str, text: str, now_s: float) -> None:
+        """A real interface or device is gone; it is opened again when it is back."""
+        self._ends()[link].unplug()
+        self._replug[link] = now_s + _REOPEN_S
+        self._tell({"event": "unplugged", "link": link, "text": text}, now_s)
+
+    def _plug_again(self, now_s: float) -> None:
+        for link, at_s in list(self._replug.items()):
+            if now_s < at_s:
+                continue
+            try:
+                self._ends()[link].plug()
+            except LinkError:
+                self._replug[link] = now_s + _REOPEN_S
+                continue
+            del self._replug[link]
+            self._tell({"event": "plugged", "link": link}, now_s)
 
     def _tell(self, event: Mapping[str, object], now_s: float) -> None:
         if self._log is not None:

@@ -11,12 +11,40 @@ from pathlib import Path
 _BACKLOG = 65536  # bytes kept for a host that does not read; further ones are lost, as on a real line
 
 
+class Backlog:
+    """Bytes that wait for a host that does not read.
+
+    Attributes:
+        lost: number of bytes for which there was no room.
+    """
+
+    def __init__(self) -> None:
+        self.lost = 0
+        self._waiting = bytearray()
+
+    def write(self, descriptor: int, data: bytes) -> None:
+        """Write to a descriptor that does not block what it takes, and keep the rest for the next call."""
+        if not (data or self._waiting):
+            return
+        room = _BACKLOG - len(self._waiting)
+        self.lost += max(0, len(data) - room)
+        self._waiting += data[: max(0, room)]
+        try:
+            sent = os.write(descriptor, self._waiting)
+        except BlockingIOError:
+            return
+        del self._waiting[:sent]
+
+    def clear(self) -> None:
+        """Forget what waits."""
+        self._waiting.clear()
+
+
 class PtyPort:
     """A port that can be unplugged.
 
     Attributes:
         path: the symbolic link.
-        lost: number of bytes that no host read.
 
     Args:
         path: where the link appears; its directory must exist. A link that is there already is replaced.
@@ -27,11 +55,20 @@ class PtyPort:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.lost = 0
         self._master = -1
         self._slave = -1
-        self._waiting = bytearray()
+        self._backlog = Backlog()
         self.plug()
+
+    @property
+    def name(self) -> str:
+        """The symbolic link, for people."""
+        return str(self.path)
+
+    @property
+    def lost(self) -> int:
+        """Number of bytes that no host read."""
+        return self._backlog.lost
 
     @property
     def plugged(self) -> bool:
@@ -71,7 +108,7 @@ class PtyPort:
         os.close(self._master)
         os.close(self._slave)
         self._master = self._slave = -1
-        self._waiting.clear()
+        self._backlog.clear()
 
     def read(self) -> bytes:
         """Return the bytes that the host wrote since the last call."""
@@ -84,19 +121,11 @@ class PtyPort:
 
     def write(self, data: bytes) -> None:
         """Send; never blocks."""
-        if not self.plugged or not (data or self._waiting):
-            return
-        room = _BACKLOG - len(self._waiting)
-        self.lost += max(0, len(data) - room)
-        self._waiting += data[: max(0, room)]
-        try:
-            sent = os.write(self._master, self._waiting)
-        except BlockingIOError:
-            return
-        del self._waiting[:sent]
+        if self.plugged:
+            self._backlog.write(self._master, data)
 
     def discard(self) -> None:
         """Discard the bytes that the host has not read yet."""
         if self.plugged:
-            self._waiting.clear()
+            self._backlog.clear()
             termios.tcflush(self._slave, termios.TCIFLUSH)

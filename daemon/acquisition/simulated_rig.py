@@ -19,56 +19,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from calibration.rig.description import Rig
 from daemon.config import ConfigError
 from drivers.clock import ScaledClock
 
 log = logging.getLogger(__name__)
 
 BOOM_SPEED = 0.45  # of the joints' greatest rates
-APPROACH = {"deg": 3.0, "mm": 50.0}  # from how far a joint comes to a pose that says from which side
 _REFUSES = 2  # exit status of a simulator that was asked for what there is not
 POSES_AHEAD = 30  # drawn at a time, and visited by the short way
 
 
 Stop = tuple[Mapping[str, float], float]  # joint -> deg or mm; how long to stand there, s
-
-
-def stops_of(rig: Rig, rows: Iterable[Mapping[str, Any]], dwell_s: float) -> list[Stop]:
-    """Return the stops for the rows of a pose plan.
-
-    Where a row says from which side a joint comes, the boom first goes to that side of the pose, without a stop. Other
-    conditions than that and the dwell are nothing that driving could bring about.
-
-    Args:
-        rig: whose poses they are.
-        rows: as `rigcal plan` has them.
-        dwell_s: how long to stand at each, unless a row says longer.
-
-    Raises:
-        ValueError: a row without a number for each joint, or with one beyond its limits.
-    """
-    stops: list[Stop] = []
-    for row in rows:
-        try:
-            pose = {joint.name: float(row[joint.column]) for joint in rig.joints}
-            sides = {joint.name: float(row.get(f"{joint.name}_dir", 0.0)) for joint in rig.joints}
-            stand_s = max(dwell_s, float(row.get("dwell_s", 0.0)))
-        except (KeyError, TypeError) as error:
-            raise ValueError(f"a pose has a number for each of {', '.join(j.column for j in rig.joints)}") from error
-        before = {
-            joint.name: min(
-                max(pose[joint.name] - sides[joint.name] * APPROACH[joint.unit], joint.limits[0]), joint.limits[1]
-            )
-            for joint in rig.joints
-        }
-        beyond = next((j for j in rig.joints if not j.limits[0] <= pose[j.name] <= j.limits[1]), None)
-        if beyond is not None:
-            raise ValueError(f"{beyond.name} = {pose[beyond.name]:g} {beyond.unit} is beyond its limits")
-        if before != pose:
-            stops.append((before, 0.0))
-        stops.append((pose, stand_s))
-    return stops
 
 
 class SimulationError(Exception):

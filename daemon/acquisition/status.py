@@ -161,11 +161,42 @@ class EventStatus:
 
 
 @dataclass(frozen=True)
+class GapCount:
+    """The gaps of one channel for one reason since the start, open ones too.
+
+    Attributes:
+        channel, reason: as of `GapStatus`.
+        count: how many.
+        missed: how many readings or frames are missing in them, as far as that could be told.
+    """
+
+    channel: str
+    reason: str
+    count: int
+    missed: int
+
+
+@dataclass(frozen=True)
+class EventCount:
+    """How many events of a kind a device or link had since the start.
+
+    Attributes:
+        device, kind: as of `EventStatus`.
+        count: how many.
+    """
+
+    device: str
+    kind: str
+    count: int
+
+
+@dataclass(frozen=True)
 class AcquisitionStatus:
     """A snapshot of acquisition.
 
     Attributes:
         links, frames, channels, stations: see their classes.
+        gap_counts, event_counts: see their classes.
         decode_failures: device -> how many captures could not be decoded since the start.
         decoding: the same with the commonest reason of each.
         gaps: those that are open, longest first.
@@ -184,6 +215,8 @@ class AcquisitionStatus:
     decoding: list[DecodeStatus] = field(default_factory=list)
     gaps: list[GapStatus] = field(default_factory=list)
     last_events: list[EventStatus] = field(default_factory=list)
+    gap_counts: list[GapCount] = field(default_factory=list)
+    event_counts: list[EventCount] = field(default_factory=list)
     writer_lag_s: float = 0.0
     writer_lag_p99_s: float = 0.0
     error: str | None = None

@@ -22,8 +22,10 @@ from daemon.acquisition.present_state import (
 from daemon.acquisition.status import (
     AcquisitionStatus,
     ChannelStatus,
+    EventCount,
     EventStatus,
     FrameStatus,
+    GapCount,
     GapStatus,
     LinkStatus,
     StationStatus,
@@ -84,6 +86,9 @@ class StatusBoard:
         self._fix_counts: Counter[str] = Counter()
         self._failures = FailureCounter()
         self._gaps: dict[tuple[str, str], Gap] = {}
+        self._gap_counts: Counter[tuple[str, str]] = Counter()
+        self._missed: Counter[tuple[str, str]] = Counter()
+        self._event_counts: Counter[tuple[str, str]] = Counter()
         self._events: dict[tuple[str, str], tuple[int, DeviceEvent]] = {}
         self._event_count = 0
         self._error: str | None = None
@@ -124,14 +129,23 @@ class StatusBoard:
                     self._failures.add(record.device, record.reason)
                 elif isinstance(record, DeviceEvent):
                     self._happened(record)
-                elif record.end is None:
-                    self._gaps[record.channel, record.reason] = record
                 else:
-                    self._gaps.pop((record.channel, record.reason), None)
+                    self._note_gap(record)
             self._failures.decoded.update(decoded)
+
+    def _note_gap(self, gap: Gap) -> None:
+        key = gap.channel, gap.reason.value
+        was_open = self._gaps.pop(key, None)
+        if gap.end is None:
+            self._gaps[key] = gap
+        if was_open is None or was_open.start != gap.start:  # it is told when it opens and again when it closes
+            self._gap_counts[key] += 1
+        if gap.end is not None:
+            self._missed[key] += gap.missed or 0
 
     def _happened(self, event: DeviceEvent) -> None:
         self._event_count += 1
+        self._event_counts[event.device, event.kind.value] += 1
         self._events[event.device, event.kind] = self._event_count, event
         if event.kind in (EventKind.LINK_UP, EventKind.LINK_LOST):
             link = self._links.setdefault(event.device, _Link(event.stamp))
@@ -175,6 +189,11 @@ class StatusBoard:
                 last_events=sorted(
                     (_event(number, event, now) for number, event in self._events.values()), key=lambda e: e.number
                 ),
+                gap_counts=[
+                    GapCount(channel, reason, count, self._missed[channel, reason])
+                    for (channel, reason), count in self._gap_counts.items()
+                ],
+                event_counts=[EventCount(device, kind, count) for (device, kind), count in self._event_counts.items()],
                 writer_lag_s=last_lag / NS_PER_S,
                 writer_lag_p99_s=lags[int(0.99 * (len(lags) - 1))] / NS_PER_S if lags else 0.0,
                 error=self._error,

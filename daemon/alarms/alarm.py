@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Literal
 
 from daemon.alarms.evidence import Evidence
 from daemon.host.safe_output import shown
+from daemon.monitoring.notice import Severity
 
-Severity = Literal["warning", "critical"]
 # Subject and text of what is wrong, and its severity where it is not the rule's usual one.
 Finding = tuple[str, str] | tuple[str, str, Severity]
 

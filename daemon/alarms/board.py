@@ -12,12 +12,13 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
-from daemon.alarms.alarm import Alarm, Rule, Severity
+from daemon.alarms.alarm import Alarm, Rule
 from daemon.alarms.evidence import Evidence
 from daemon.alarms.library import library
 from daemon.host.safe_output import duration
+from daemon.monitoring.notice import Notice, Severity
 from daemon.store.alarms import AlarmTable
 from daemon.store.errors import StoreError
 from drivers.clock import NS_PER_S, Clock, Stamp
@@ -54,6 +55,14 @@ class _Active:
     cleared: Stamp | None = None
 
 
+def _nobody(notice: Notice) -> None:
+    del notice
+
+
+def _notice(event: Literal["raised", "cleared"], active: _Active, at: Stamp) -> Notice:
+    return Notice(event, **vars(active.alarm), raised=active.raised, at=at)
+
+
 class AlarmBoard:
     """Keeps the alarms. `evaluate` belongs to one thread, once a second; everything else may be called from any.
 
@@ -62,11 +71,19 @@ class AlarmBoard:
         gather: what is known now.
         clock: for ages.
         rules: what raises and clears alarms; all that there are by default.
+        tell: takes each alarm that is raised, becomes critical or is cleared; returns at once.
     """
 
     def __init__(
-        self, table: AlarmTable, gather: Callable[[], Evidence], clock: Clock, rules: Sequence[Rule] | None = None
+        self,
+        table: AlarmTable,
+        gather: Callable[[], Evidence],
+        clock: Clock,
+        rules: Sequence[Rule] | None = None,
+        *,
+        tell: Callable[[Notice], None] = _nobody,
     ) -> None:
+        self._tell = tell
         self._table, self._gather, self._clock = table, gather, clock
         self._rules = library() if rules is None else rules
         self._turn = threading.Lock()
@@ -144,9 +161,13 @@ class AlarmBoard:
         for key, (alarm, rule) in found.items():
             active = self._active.get(key)
             if active is not None:
+                is_worse = alarm.severity == "critical" != active.alarm.severity
                 active.alarm, active.seen, active.hold_s = alarm, now, rule.hold_s
+                if is_worse:
+                    self._tell(_notice("raised", active, now))
             elif now.since(self._sighted[key]) >= rule.after_s * NS_PER_S:
                 self._active[key] = _Active(alarm, now, now, rule.hold_s)
+                self._tell(_notice("raised", self._active[key], now))
                 said = alarm.kind, alarm.subject, alarm.text, alarm.remedy
                 log.log(_LEVELS[alarm.severity], "alarm %s, %s: %s. %s", *said)
 
@@ -158,6 +179,7 @@ class AlarmBoard:
                 del self._active[key]
                 active.cleared = now
                 self._unwritten.append(active)
+                self._tell(_notice("cleared", active, now))
                 lasted = duration(max(now.since(active.raised) / NS_PER_S, 0.0))
                 log.info("alarm %s, %s is over after %s", active.alarm.kind, active.alarm.subject, lasted)
 

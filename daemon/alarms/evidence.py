@@ -34,6 +34,8 @@ class Evidence:
         is_store_new: the store has never seen a job, and yet models lie beside it.
         previous_run: when the daemon's run before this one was last alive, by a clock that can be compared.
         control_faults: control socket on which no one can connect -> why.
+        metrics_fault: why nobody can read the metrics; None where they can be read, or are not wanted.
+        notice_faults: ways out of the machine by which notices are not delivered at present -> why.
         untrained_sessions: closed sessions that nothing trains on -> why; those that newer ones make up for are not
             there.
         unwatched: rule or part of the evidence that has failed itself -> why.
@@ -51,6 +53,8 @@ class Evidence:
     is_store_new: bool = False
     previous_run: Stamp | None = None
     control_faults: Mapping[str, str] = field(default_factory=dict)
+    metrics_fault: str | None = None
+    notice_faults: Mapping[str, str] = field(default_factory=dict)
     untrained_sessions: Mapping[str, str] = field(default_factory=dict)
     unwatched: Mapping[str, str] = field(default_factory=dict)
 
@@ -102,6 +106,8 @@ _PARTS = {
     "is_store_new": "the models",
     "untrained_sessions": "the sessions",
     "control_faults": "the control sockets",
+    "metrics_fault": "the metrics",
+    "notice_faults": "the notices",
 }
 
 

@@ -42,6 +42,13 @@ def cleared_line(alarm: Mapping[str, Any]) -> str:
     return f"{lasted} {alarm['severity']} {alarm['kind']} {alarm['subject']}: {alarm['text']}"
 
 
+def notice_lines(notices: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Return the ways by which notices of alarms are not delivered, with how many wait."""
+    for one in notices:
+        if one["error"] is not None:
+            yield f"notices by {one['target']}: {one['waiting']} wait, the last delivery failed: {one['error']}"
+
+
 def gap_state_lines(acquisition: Mapping[str, Any]) -> Iterator[str]:
     """Return the open gaps, one line for all channels of a link that lack data for one reason."""
     links = {channel["name"]: channel["link"] for channel in acquisition["channels"]}

@@ -218,6 +218,10 @@ class JobTable:
         sql = f"SELECT {_SHOWN} FROM jobs WHERE state IN ('queued', 'running', 'interrupted') ORDER BY id"
         return self._store.rows(sql)
 
+    def counts(self) -> list[dict[str, Any]]:
+        """Kind, state and `count` of all jobs."""
+        return self._store.rows("SELECT kind, state, count(*) AS count FROM jobs GROUP BY kind, state")
+
     def running(self) -> list[dict[str, Any]]:
         """Id and host_boot of the jobs that are marked as running."""
         return self._store.rows("SELECT id, host_boot FROM jobs WHERE state = 'running'")

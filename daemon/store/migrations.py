@@ -343,6 +343,23 @@ def m015_large_chunks(db: Database) -> None:
     )
 
 
+@MIGRATIONS()
+def m020_notices(db: Database) -> None:
+    """What was told of alarms to people elsewhere, and what is still to be told."""
+    _create(
+        db,
+        # target: way out of the machine. utc_ns ..: when the alarm was raised or cleared, or a test asked for; raised_:
+        # when it was raised. sent_ is NULL until the target was told, alone or in a sum.
+        f"""CREATE TABLE notices (id INTEGER PRIMARY KEY, target TEXT NOT NULL,
+            {_one_of("event", "raised", "cleared", "test")}, kind TEXT NOT NULL, subject TEXT NOT NULL,
+            {_one_of("severity", "warning", "critical")}, text TEXT NOT NULL, remedy TEXT NOT NULL,
+            {_instant()}, {_instant("raised_")}, {_instant("sent_", optional=True)}) STRICT""",
+        "CREATE INDEX notices_waiting ON notices(target, id) WHERE sent_utc_ns IS NULL",
+        "CREATE INDEX notices_sent ON notices(target, sent_utc_ns) WHERE sent_utc_ns IS NOT NULL",
+        "CREATE INDEX notices_by_alarm ON notices(target, kind, subject, id)",
+    )
+
+
 def unknown_migrations(db: Database) -> list[str]:
     """Migrations that `db` has and this program does not know: it was made by a newer one."""
     empty = Database(memory=True)

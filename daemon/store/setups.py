@@ -15,6 +15,10 @@ _OF_SESSIONS = """SELECT id, instrument, state FROM station_setups
 _MISCLOSURES = """SELECT s.name, s.phase, s.x_mm - p.x_mm AS x, s.y_mm - p.y_mm AS y, s.z_mm - p.z_mm AS z
     FROM control_shots AS s JOIN control_points AS p ON p.setup_id = s.setup_id AND p.name = s.name
     WHERE s.setup_id = ? AND s.session_id IN ({}) ORDER BY s.id"""
+# The newest shot of each control point of the newest set-up: with max(), SQLite takes the other columns from its row.
+_NEWEST_SHOTS = """SELECT max(id) AS id, setup_id AS setup, name AS point, session_id AS session, phase, utc_ns,
+        misclosure_mm FROM control_shots
+    WHERE setup_id = (SELECT id FROM station_setups ORDER BY rowid DESC LIMIT 1) GROUP BY name ORDER BY name"""
 _POINTS = "SELECT name, x_mm, y_mm, z_mm FROM control_points WHERE setup_id = ? ORDER BY rowid"
 
 
@@ -62,6 +66,10 @@ class SetupTable:
         """Session, phase and misclosure_mm of a control point's shots."""
         sql = "SELECT session_id, phase, misclosure_mm FROM control_shots WHERE setup_id = ? AND name = ?"
         return self._store.rows(sql, (setup_id, name))
+
+    def newest_shots(self) -> list[dict[str, Any]]:
+        """The newest shot of each control point of the newest set-up: setup, point, session, phase, misclosure_mm."""
+        return self._store.rows(_NEWEST_SHOTS)
 
     def add(self, created: Stamp, **columns: object) -> None:
         """Add a set-up."""

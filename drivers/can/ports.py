@@ -161,6 +161,10 @@ class CanPort(abc.ABC):
     def receive(self, timeout_s: float) -> Batch:
         """Return up to BATCH_MAX frames; wait for at most `timeout_s` real seconds for the first."""
 
+    def fileno(self) -> int:
+        """Return the descriptor that is readable when a frame has come; LinkError where there is none (`virtual`)."""
+        raise LinkError(self._where, "an in-process bus has no descriptor")
+
     def send(self, frame: Frame) -> None:
         """Send one frame."""
         message = can.Message(
@@ -206,6 +210,9 @@ class _DatagramPort(CanPort):
         self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         self._socket.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
         self._overflows = 0
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
 
     def receive(self, timeout_s: float) -> Batch:
         received: list[Received] = []
@@ -321,6 +328,9 @@ class SlcanPort(CanPort):
         # Two readers on one port get half of the bytes each
         fcntl.ioctl(self._fd, termios.TIOCEXCL)
         self._lines = SlcanLines()
+
+    def fileno(self) -> int:
+        return self._fd
 
     def receive(self, timeout_s: float) -> Batch:
         try:

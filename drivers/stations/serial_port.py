@@ -87,6 +87,10 @@ class SerialPort:
             with self._failing("locking failed"):
                 forbid_other_openers(self._port.fileno())
 
+    def fileno(self) -> int:
+        """Return its descriptor, which does not block."""
+        return int(self._port.fileno())
+
     def read(self, timeout_s: float) -> bytes:
         """Return the received bytes; wait up to `timeout_s` real seconds for the first. Empty when none came.
 

@@ -15,9 +15,12 @@ from daemon.cli.terminal import echo
 
 @click.command(cls=Command)
 @click.option("--all", "everything", is_flag=True, help="Also those that are over, newest first.")
+@click.option("--send-test", is_flag=True, help="Send a test notice the way that alarms go ([notify]).")
 @client_options
-def alarms(everything: bool, **where: Any) -> Any:
+def alarms(everything: bool, send_test: bool, **where: Any) -> Any:
     """Show what is wrong now, since when, and what to do about it."""
+    if send_test:
+        return ask(where, "alarms.test-notice", echo)
     return ask(where, "alarms.list", _show, all=everything)
 
 

@@ -16,6 +16,7 @@ from daemon.cli.state_lines import (
     gap_state_lines,
     job_line,
     model_lines,
+    notice_lines,
     show_alarms,
     show_session,
     station_line,
@@ -35,7 +36,7 @@ def _show(status: Mapping[str, Any], *, frames: bool) -> None:
     acquisition = status["acquisition"]
     echo(f"rig {status['rig']} ({status['mode']}), store {status['store']}")
     show_alarms(status["alarms"])
-    for line in (*_store_lines(status), *gap_state_lines(acquisition)):
+    for line in (*notice_lines(status["notices"]), *_store_lines(status), *gap_state_lines(acquisition)):
         echo(line)
     _show_links(acquisition["links"])
     _show_channels(acquisition["channels"])

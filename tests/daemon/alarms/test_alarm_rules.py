@@ -313,6 +313,8 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
         (known(previous_run=NOW.shifted(3600 * NS_PER_S)), ["clock"], known(previous_run=NOW.shifted(-NS_PER_S))),
     ],
     "control_dead": [(known(control_faults={"control.sock": "taken away"}), ["control.sock"], known())],
+    "metrics_unserved": [(known(metrics_fault="the port is taken"), ["metrics"], known())],
+    "notices_undelivered": [(known(notice_faults={"webhook": "no route"}), ["webhook"], known())],
     "not_watched": [(known(unwatched={"the jobs": "a fault"}), ["the jobs"], known())],
 }
 

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 from calibration.rig.description import Rig, shipped_rig
-from daemon.acquisition.simulated_rig import APPROACH, SimulatedRig, stops_of
+from daemon.acquisition.simulated_rig import SimulatedRig
 from daemon.cli.hidden import HIDDEN as HIDDEN_FILE
 from daemon.cli.hidden import Truth, concessions, outcome, rounds, show
 from daemon.config import ConfigError
 from drivers.clock import NS_PER_S, ScaledClock, Stamp, SystemClock
 from simulators.blind.hiding import draw_hidden_effect
 from simulators.effects.library import FAMILIES
+from simulators.plan import APPROACH, stops_of
 from simulators.rig.truth import RigTruth
 
 RATE = 50.0

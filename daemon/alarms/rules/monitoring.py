@@ -1,0 +1,29 @@
+"""What leaves the daemon for people who are elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from daemon.alarms.alarm import Finding, rule
+from daemon.alarms.evidence import Evidence
+
+
+@rule("warning", "Give `[metrics]` a port that no other program listens on, and restart rigcal.", after_s=10.0)
+def metrics_unserved(evidence: Evidence) -> Iterator[Finding]:
+    """The port of the metrics cannot be opened for 10 s; it is tried again every 5 s."""
+    if evidence.metrics_fault is not None:
+        yield "metrics", evidence.metrics_fault
+
+
+@rule(
+    "warning",
+    "Check the network and the section `[notify]`; `rigcal alarms --send-test` tries it. Nothing is lost meanwhile.",
+    after_s=900.0,
+)
+def notices_undelivered(evidence: Evidence) -> Iterator[Finding]:
+    """Notices of alarms have not been delivered for 15 minutes, by a webhook or a command.
+
+    They are kept and tried again, at least every 15 minutes.
+    """
+    for target, why in evidence.notice_faults.items():
+        yield target, f"notices of alarms do not leave the machine: {why}"

@@ -1,0 +1,107 @@
+"""Serves the metrics on the loopback interface, by the official client of Prometheus."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+from wsgiref.simple_server import WSGIServer
+
+from daemon.monitoring.metrics import FAMILIES, Status
+from drivers.clock import NS_PER_S, SystemClock
+
+if TYPE_CHECKING:
+    from prometheus_client.metrics_core import Metric
+
+log = logging.getLogger(__name__)
+
+HOST = "127.0.0.1"
+RETRY_S = 5.0
+STOP_S = 5.0
+
+
+class StatusCollector:
+    """Makes metrics of the daemon's status at every scrape.
+
+    Args:
+        status: returns it; called in the thread of a scrape.
+    """
+
+    def __init__(self, status: Callable[[], Status]) -> None:
+        self._status = status
+
+    def describe(self) -> list[Metric]:
+        """Return nothing: a registry need not ask for the status to know its names."""
+        return []
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield every family with the samples that there are."""
+        from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily
+
+        status = self._status()
+        for family in FAMILIES:
+            made = {"gauge": GaugeMetricFamily, "counter": CounterMetricFamily}[family.kind](
+                family.name, family.help, labels=family.labels
+            )
+            for labels, value in family.samples(status):
+                if value is not None:
+                    made.add_metric(labels, value)
+            yield made
+
+
+class MetricsServer:
+    """Serves `/metrics` on a port of the loopback interface; a port that is taken is tried again.
+
+    Args:
+        port: to listen on; 0 for any that is free.
+        status: returns the daemon's status.
+    """
+
+    def __init__(self, port: int, status: Callable[[], Status]) -> None:
+        from prometheus_client import CollectorRegistry, ProcessCollector
+
+        self._wanted = port
+        self._registry = CollectorRegistry(auto_describe=False)
+        self._registry.register(StatusCollector(status))
+        ProcessCollector(registry=self._registry)
+        self._clock = SystemClock()  # ports and people wait in real time
+        self._next_ns = 0
+        self._served: tuple[WSGIServer, threading.Thread] | None = None
+        self._trouble: str | None = None
+        self.look()
+
+    @property
+    def port(self) -> int | None:
+        """The port that is served; None while there is none."""
+        return None if self._served is None else self._served[0].server_port
+
+    def trouble(self) -> str | None:
+        """Return why nobody can read the metrics, a clause; None where all is well."""
+        return self._trouble
+
+    def look(self) -> None:
+        """Begin to serve where that has not succeeded yet; to be called now and then."""
+        now_ns = self._clock.monotonic_ns()
+        if self._served is not None or now_ns < self._next_ns:
+            return
+        from prometheus_client import start_http_server
+
+        try:
+            self._served = start_http_server(self._wanted, addr=HOST, registry=self._registry)
+        except OSError as error:
+            self._next_ns = now_ns + round(RETRY_S * NS_PER_S)
+            if self._trouble is None:
+                log.error("metrics cannot be served at %s:%d: %s", HOST, self._wanted, error.strerror)
+            self._trouble = f"metrics cannot be served at {HOST}:{self._wanted}: {error.strerror}"
+        else:
+            self._trouble = None
+            log.info("metrics are served at http://%s:%d/metrics", HOST, self._served[0].server_port)
+
+    def stop(self) -> None:
+        """Serve no more."""
+        if self._served is not None:
+            server, thread = self._served
+            server.shutdown()
+            server.server_close()
+            thread.join(STOP_S)

@@ -1,0 +1,150 @@
+"""Notices: alarms that leave the machine, by a thread of their own that nothing waits for."""
+
+from __future__ import annotations
+
+import logging
+import sqlite3
+import threading
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from daemon.commands import CommandError, current_caller
+from daemon.config import NotifySection
+from daemon.monitoring.delivery import Command, Target, Webhook
+from daemon.monitoring.notice import Notice
+from daemon.monitoring.outbox import USUAL, Outbox, Pace
+from daemon.store.errors import StoreError
+from daemon.store.notices import NoticeTable
+from drivers.clock import Clock
+
+log = logging.getLogger(__name__)
+
+STOP_S = 5.0
+REWRITE_S = 5.0  # between two attempts to write to a store that cannot be written
+
+
+class Notices:
+    """Tells every target what happens to alarms.
+
+    Args:
+        section: where notices go; where it is absent, nothing is kept and nothing is sent.
+        table: of the store.
+        active: the alarms that an earlier run has left active, as rows.
+        rig: name of the machine.
+        clock: of the store's instants.
+        pace: how often messages are sent; as docs/alarms.md says by default.
+    """
+
+    def __init__(
+        self,
+        section: NotifySection | None,
+        table: NoticeTable,
+        active: Sequence[Mapping[str, Any]],
+        rig: str,
+        clock: Clock,
+        *,
+        pace: Pace | None = None,
+    ) -> None:
+        self._clock = clock
+        self._outboxes = (
+            []
+            if section is None
+            else [Outbox(target, table, rig, clock, pace or USUAL, section.least) for target in targets_of(section)]
+        )
+        for outbox in self._outboxes:
+            outbox.reconcile(active, clock.now())
+        self._inbox: list[Notice] = []
+        self._changed = threading.Condition()
+        self._is_stopping = False
+        self._is_told = False  # that the store cannot be written
+        self._thread = threading.Thread(target=self._run, name="notices", daemon=True)
+        self._status = [outbox.status() for outbox in self._outboxes]
+
+    def start(self) -> None:
+        """Begin to send."""
+        if self._outboxes:
+            self._thread.start()
+
+    def stop(self) -> None:
+        """Send no more; what waits is in the store for the next start."""
+        with self._changed:
+            self._is_stopping = True
+            self._changed.notify()
+        for outbox in self._outboxes:
+            outbox.target.cancel()
+        if self._thread.is_alive():
+            self._thread.join(STOP_S)
+
+    def take(self, notice: Notice) -> None:
+        """Take a notice; from any thread, at once."""
+        if self._outboxes:
+            with self._changed:
+                self._inbox.append(notice)
+                self._changed.notify()
+
+    def try_command(self, _arguments: Mapping[str, Any]) -> str:
+        """Send a notice that is no alarm, to see whether notices arrive."""
+        if not self._outboxes:
+            raise CommandError("no notices are sent: the configuration has no [notify]")
+        now, caller = self._clock.now(), current_caller()
+        text = f"asked for by {caller}" if caller is not None else "asked for"
+        self.take(Notice("test", "test", "notices", "warning", text, "Nothing is wrong.", now, now))
+        names = " and ".join(outbox.target.name for outbox in self._outboxes)
+        return f"a test notice goes out by {names}; `rigcal status` shows if it does not arrive"
+
+    def status(self) -> list[dict[str, Any]]:
+        """For each target: `target`, `waiting`, `sent`, `failures`, `error`."""
+        return self._status
+
+    def faults(self) -> dict[str, str]:
+        """Targets whose last delivery failed -> why."""
+        return {one["target"]: one["error"] for one in self._status if one["error"] is not None}
+
+    # ---- the thread --------------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                if not self._inbox and not self._is_stopping:
+                    self._changed.wait(self._patience_s())
+                taken, self._inbox = self._inbox, []
+                is_stopping = self._is_stopping
+            for outbox in self._outboxes:
+                for notice in taken:
+                    outbox.add(notice)
+            self._write()
+            if is_stopping:
+                return
+            for outbox in self._outboxes:
+                if outbox.due_in_s() == 0.0 and not self._is_stopping:
+                    outbox.send()
+            self._write()
+            self._status = [outbox.status() for outbox in self._outboxes]
+
+    def _patience_s(self) -> float | None:
+        """Return how long the thread may sleep; None until it is woken."""
+        waits = [due for outbox in self._outboxes if (due := outbox.due_in_s()) is not None]
+        if not all(outbox.is_written for outbox in self._outboxes):
+            waits.append(REWRITE_S)
+        return min(waits, default=None)
+
+    def _write(self) -> None:
+        try:
+            for outbox in self._outboxes:
+                outbox.write()
+        except (sqlite3.Error, StoreError):
+            if not self._is_told:
+                log.warning("notices cannot be written to the store; they are sent all the same", exc_info=True)
+            self._is_told = True
+        else:
+            self._is_told = False
+
+
+def targets_of(section: NotifySection) -> list[Target]:
+    """Return where notices go by a configuration."""
+    targets: list[Target] = []
+    if section.webhook_url is not None:
+        targets.append(Webhook(section.webhook_url))
+    if section.command:
+        targets.append(Command(section.command))
+    return targets

@@ -1,0 +1,81 @@
+"""The daemon's state as one JSON object: what `rigcal status`, `rigcal health` and the metrics are made of."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import sqlite3
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, TypeVar
+
+from daemon.acquisition.status import AcquisitionStatus
+from daemon.alarms.board import AlarmBoard
+from daemon.composition import Parts
+from daemon.models.drift import gap_status
+from daemon.models.registry import ModelRegistry
+from daemon.monitoring.notices import Notices
+from daemon.sessions.manager import SessionKeeper
+from daemon.store.errors import StoreError
+from daemon.store.health import StoreHealth
+from daemon.store.jobs import JobTable
+from daemon.store.models import ModelTable
+from daemon.store.setups import SetupTable
+from daemon.store.store import Store
+
+T = TypeVar("T")
+
+_EVENTS = 12  # the newest are shown in `status`
+
+
+@dataclass(frozen=True)
+class Overview:
+    """Gathers the state of all parts; may be asked from any thread.
+
+    Attributes:
+        parts: rig and mode.
+        store: open for writing.
+        store_health, acquisition: tell of the store and of acquisition.
+        alarms, notices, sessions, jobs, models, model_table: the parts.
+    """
+
+    parts: Parts
+    store: Store
+    store_health: Callable[[], StoreHealth]
+    acquisition: Callable[[], AcquisitionStatus]
+    alarms: AlarmBoard
+    notices: Notices
+    sessions: SessionKeeper
+    jobs: JobTable
+    models: ModelRegistry
+    model_table: ModelTable
+
+    def command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the state of everything; a part of the store that is damaged hides no other."""
+        unreadable: dict[str, str] = {}
+
+        def stored(part: str, read: Callable[[], T]) -> T | None:
+            try:
+                return read()
+            except (sqlite3.Error, StoreError) as error:
+                self.store.note_damage(error)
+                unreadable[part] = str(error)
+                return None
+
+        return {
+            "rig": self.parts.rig.name,
+            "mode": self.parts.mode,
+            "version": importlib.metadata.version("rigcal"),
+            "alarms": self.alarms.status(),
+            "notices": self.notices.status(),
+            "acquisition": asdict(self.acquisition()),
+            "session": stored("session", self.sessions.open_session),
+            "control_shots": stored("control_shots", SetupTable(self.store).newest_shots) or [],
+            "jobs": stored("jobs", self.jobs.unfinished) or [],
+            "job_counts": stored("job_counts", self.jobs.counts) or [],
+            "models": stored("models", self.models.status),
+            "gap": stored("gap", lambda: gap_status(self.jobs, self.model_table)),
+            "events": stored("events", lambda: self.store.newest_events(_EVENTS)) or [],
+            "store": str(self.store.path),
+            "store_health": self.store_health().as_dict(),
+            "unreadable": unreadable,
+        }

@@ -1,0 +1,368 @@
+"""Alarms leave the machine: to a real web server and a real command that fail at first, through restarts."""
+
+from __future__ import annotations
+
+import email
+import email.policy
+import json
+import logging
+import os
+import stat
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+
+from daemon.config import ConfigError, NotifySection, parse_config
+from daemon.control.protocol import request
+from daemon.monitoring import delivery
+from daemon.monitoring.notice import LISTED, Notice, message_of
+from daemon.monitoring.notices import Notices
+from daemon.monitoring.outbox import Pace
+from daemon.store import Store
+from daemon.store.alarms import AlarmTable
+from daemon.store.notices import NoticeTable
+from drivers.clock import ManualClock
+from tests.daemon.acquisition_support import wait_until
+from tests.daemon.idle_daemon import idle_daemon
+from tests.daemon.session_support import disk_fails
+from tests.daemon.store_support import at, table
+
+FAST = Pace(gather_s=0.02, first_retry_s=0.02, longest_retry_s=0.1, per_hour=1000)
+SECRET = "T0ken"
+
+
+class WebServer(ThreadingHTTPServer):
+    """Takes what is posted; answers with the next of `answers`, and then with 200."""
+
+    def __init__(self, port: int = 0) -> None:
+        self.answers: list[int] = []
+        self.got: list[dict[str, Any]] = []
+        server = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_POST(self) -> None:
+                body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+                status = server.answers.pop(0) if server.answers else 200
+                if status == 200:
+                    server.got.append(body)
+                self.send_response(status)
+                if status == 302:
+                    self.send_header("Location", "/elsewhere")
+                self.end_headers()
+
+            def do_GET(self) -> None:
+                server.got.append({"text": "a redirection was followed"})
+                self.send_response(200)
+                self.end_headers()
+
+            def log_message(self, *arguments: object) -> None:
+                pass
+
+        super().__init__(("127.0.0.1", port), Handler)
+        self._thread = threading.Thread(target=self.serve_forever, kwargs={"poll_interval": 0.02})
+        self._thread.start()
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.server_port}/hooks/{SECRET}"
+
+    def close(self) -> None:
+        self.shutdown()
+        self._thread.join()
+        self.server_close()
+
+    def events(self) -> list[tuple[str, str]]:
+        return [(notice["event"], notice["subject"]) for message in self.got for notice in message["notices"]]
+
+
+@pytest.fixture
+def web() -> Iterator[WebServer]:
+    server = WebServer()
+    try:
+        yield server
+    finally:
+        server.close()
+
+
+class Sender:
+    """A store whose notices are sent; closed and opened again by tests."""
+
+    def __init__(self, path: Path, section: NotifySection, pace: Pace = FAST) -> None:
+        self.path, self.section, self.pace = path, section, pace
+        self.clock = ManualClock(at(0))
+        self.rows: dict[str, int] = {}
+        self.open()
+
+    def open(self) -> None:
+        self.store = Store(self.path)
+        active = AlarmTable(self.store).active()
+        self.notices = Notices(self.section, NoticeTable(self.store), active, "swdt82", self.clock, pace=self.pace)
+        self.notices.start()
+
+    def close(self) -> None:
+        self.notices.stop()
+        self.store.close()
+
+    def tell(self, event: Literal["raised", "cleared"], subject: str, severity: Any = "critical") -> None:
+        """As the board of alarms does, which writes the alarm to the store as well."""
+        now = self.clock.now()
+        if event == "raised":
+            about = {"severity": severity, "text": "no such port", "remedy": "Plug it in."}
+            self.rows[subject] = AlarmTable(self.store).add(now, "link_down", subject, **about)
+        else:
+            AlarmTable(self.store).clear(self.rows.pop(subject), now)
+        self.tell_only(event, subject, severity)
+
+    def tell_only(self, event: Literal["raised", "cleared"], subject: str, severity: Any = "critical") -> None:
+        now = self.clock.now()
+        self.notices.take(Notice(event, "link_down", subject, severity, "no such port", "Plug it in.", now, now))
+
+    def status(self) -> dict[str, Any]:
+        return self.notices.status()[0]
+
+
+@pytest.fixture
+def opened(tmp_path: Path) -> Iterator[Callable[..., Sender]]:
+    senders: list[Sender] = []
+
+    def make(pace: Pace = FAST, **section: Any) -> Sender:
+        senders.append(Sender(tmp_path / "rigcal.sqlite", NotifySection(**section), pace))
+        return senders[-1]
+
+    yield make
+    for sender in senders:
+        sender.close()
+
+
+def script(path: Path, text: str) -> str:
+    path.write_text(f"#!/bin/sh\n{text}\n", encoding="utf-8")
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return str(path)
+
+
+# ---- delivery --------------------------------------------------------------------------------------------------------
+
+
+def test_a_server_that_fails_first_gets_every_notice_once_and_in_order(
+    web: WebServer, opened: Callable[..., Sender], caplog: pytest.LogCaptureFixture
+) -> None:
+    web.answers = [503, 500, 302]
+    sender = opened(webhook_url=web.url)
+    sender.tell("raised", "boom")
+    wait_until(lambda: bool(web.got))
+    sender.tell("cleared", "boom")
+    wait_until(lambda: len(web.events()) == 2)
+    assert web.events() == [("raised", "boom"), ("cleared", "boom")]
+    (message, _) = web.got
+    assert message["rig"] == "swdt82"
+    assert "CRITICAL link_down boom: no such port. Plug it in." in message["text"]
+    wait_until(lambda: sender.status()["sent"] == 2)
+    assert sender.status() == {"target": "webhook", "waiting": 0, "sent": 2, "failures": 3, "error": None}
+    wait_until(lambda: all(row["sent_utc_ns"] is not None for row in table(sender.path, "notices")))
+    warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert any("127.0.0.1 answers 503" in text for text in warnings)
+    assert SECRET not in caplog.text, "the address may hold a secret"
+
+
+def test_a_command_gets_an_email_on_its_input_and_its_failure_is_told(
+    tmp_path: Path, opened: Callable[..., Sender]
+) -> None:
+    mail = tmp_path / "mail"
+    fails_once = f'[ -e {tmp_path}/tried ] || {{ touch {tmp_path}/tried; echo "no route to host" >&2; exit 75; }}'
+    program = script(
+        tmp_path / "send", f'{fails_once}\ncat > {mail}.part && mv {mail}.part {mail}; echo "$1" > {mail}.to'
+    )
+    sender = opened(
+        pace=replace(FAST, first_retry_s=0.3), command=[program, "someone@example.com; touch /tmp/not-a-shell"]
+    )
+    now = sender.clock.now()
+    sender.notices.take(Notice("raised", "job_failed", "7", "warning", "zu wenig Übung", "Mehr messen.", now, now))
+    wait_until(lambda: bool(sender.notices.faults()))
+    assert sender.notices.faults() == {"command": f"{program} ended with status 75: no route to host"}
+    wait_until(lambda: not sender.notices.faults())
+    message = email.message_from_bytes(mail.read_bytes(), policy=email.policy.default)
+    assert str(message["Subject"]).endswith("WARNING job_failed 7")
+    assert "zu wenig Übung. Mehr messen." in message.get_content()
+    assert Path(f"{mail}.to").read_text(encoding="utf-8") == "someone@example.com; touch /tmp/not-a-shell\n"
+
+
+def test_a_command_that_hangs_is_ended_with_its_children(
+    tmp_path: Path, opened: Callable[..., Sender], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(delivery, "COMMAND_TIMEOUT_S", 0.2)
+    sender = opened(command=[script(tmp_path / "send", f"echo $$ > {tmp_path}/pid; sleep 600")])
+    sender.tell("raised", "boom")
+    wait_until(lambda: bool(sender.notices.faults()))
+    assert "did not end within 0.2 s" in sender.notices.faults()["command"]
+    group = int((tmp_path / "pid").read_text(encoding="utf-8"))
+    sender.notices.stop()
+
+    def is_gone() -> bool:
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return True
+        return False
+
+    wait_until(is_gone)
+
+
+def test_one_way_that_fails_does_not_hold_up_the_other(web: WebServer, opened: Callable[..., Sender]) -> None:
+    sender = opened(webhook_url=web.url, command=["/no/such/program"])
+    sender.tell("raised", "boom")
+    wait_until(lambda: bool(web.got) and bool(sender.notices.faults()))
+    assert sender.notices.faults() == {"command": "/no/such/program: No such file or directory"}
+    assert sender.status()["error"] is None
+
+
+# ---- restarts, limits, full disks ------------------------------------------------------------------------------------
+
+
+def test_what_could_not_be_sent_is_sent_by_the_next_run_and_only_once(opened: Callable[..., Sender]) -> None:
+    web = WebServer()
+    web.close()
+    port = web.server_port
+    sender = opened(webhook_url=web.url)
+    sender.tell("raised", "boom")
+    wait_until(lambda: bool(sender.notices.faults()))
+    sender.tell("raised", "station")
+    sender.close()
+    again = WebServer(port)
+    try:
+        sender.open()
+        wait_until(lambda: len(again.events()) == 2)
+        assert again.events() == [("raised", "boom"), ("raised", "station")]
+        sender.close()
+        sender.open()
+        sender.tell("cleared", "boom")
+        wait_until(lambda: len(again.events()) == 3)
+        assert again.events()[2] == ("cleared", "boom")
+    finally:
+        again.close()
+
+
+def test_alarms_that_a_killed_run_did_not_tell_are_told_by_the_next(
+    web: WebServer, opened: Callable[..., Sender]
+) -> None:
+    sender = opened(webhook_url=web.url)
+    alarms = AlarmTable(sender.store)
+    boom = alarms.add(sender.clock.now(), "link_down", "boom", severity="critical", text="gone", remedy="Plug it in.")
+    sender.tell_only("raised", "station")  # its alarm is over when the next run begins, and nobody was told
+    wait_until(lambda: bool(web.got))
+    sender.close()
+    sender.open()
+    wait_until(lambda: len(web.events()) == 3)
+    assert sorted(web.events()[1:]) == [("cleared", "station"), ("raised", "boom")]
+    AlarmTable(sender.store).clear(boom, sender.clock.now())
+    sender.close()
+    sender.open()
+    wait_until(lambda: ("cleared", "boom") in web.events())
+    assert len(web.events()) == 4
+
+
+def test_beyond_the_limit_of_an_hour_notices_wait_and_are_told_in_one(
+    web: WebServer, opened: Callable[..., Sender]
+) -> None:
+    sender = opened(pace=replace(FAST, per_hour=2), webhook_url=web.url)
+    for n in range(2):
+        sender.clock.advance(1.0)
+        sender.tell("raised", f"first{n}")
+        wait_until(lambda n=n: len(web.got) == n + 1)
+    for n in range(3):
+        sender.tell("raised", f"more{n}")
+    wait_until(lambda: len(table(sender.path, "notices")) == 5)
+    sender.close()
+    sender.open()  # the hour is not begun anew by a restart
+    sender.tell("raised", "more3")
+    wait_until(lambda: sender.status()["waiting"] == 4)
+    assert len(web.got) == 2
+    sender.close()
+    sender.pace = replace(FAST, per_hour=3)
+    sender.open()
+    wait_until(lambda: len(web.got) == 3)
+    assert [subject for _, subject in web.events()[2:]] == [f"more{n}" for n in range(4)]
+    assert web.got[2]["subject"].endswith(": 4 notices, CRITICAL")
+
+
+def test_alarms_of_one_fault_are_one_message(web: WebServer, opened: Callable[..., Sender]) -> None:
+    sender = opened(pace=replace(FAST, gather_s=0.3), webhook_url=web.url)
+    for subject in ("boom", "station"):
+        sender.tell("raised", subject)
+    wait_until(lambda: bool(web.got))
+    assert len(web.events()) == 2
+
+
+def test_a_store_that_cannot_be_written_keeps_no_notice_back(
+    web: WebServer, opened: Callable[..., Sender], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daemon.monitoring.notices.REWRITE_S", 0.05)
+    sender = opened(webhook_url=web.url)
+    with disk_fails():
+        sender.tell_only("raised", "store")
+        wait_until(lambda: bool(web.got))
+        assert table(sender.path, "notices") == []
+    wait_until(lambda: bool(table(sender.path, "notices")))
+    (row,) = table(sender.path, "notices")
+    assert row["sent_utc_ns"] is not None
+    assert web.events() == [("raised", "store")]
+
+
+def test_only_critical_alarms_are_told_where_that_is_asked_for_also_when_a_warning_becomes_critical(
+    web: WebServer, opened: Callable[..., Sender]
+) -> None:
+    sender = opened(webhook_url=web.url, least="critical")
+    sender.tell("raised", "station", "warning")
+    sender.tell("cleared", "station", "warning")
+    sender.tell("raised", "boom", "warning")
+    sender.tell("raised", "boom", "critical")
+    wait_until(lambda: bool(web.got))
+    sender.tell("cleared", "boom", "warning")
+    wait_until(lambda: len(web.events()) == 2)
+    assert web.events() == [("raised", "boom"), ("cleared", "boom")]
+
+
+def test_a_message_lists_the_newest_and_counts_the_rest_and_is_safe_to_show() -> None:
+    now = at(0)
+    notices = [
+        Notice("raised", "k", f"s{n}", "warning", "te\x1b[2Jxt\nline", "R.", now, now) for n in range(LISTED + 5)
+    ]
+    message = message_of("swdt82", notices, unlisted=7)
+    assert message.subject.endswith(f"{LISTED + 12} notices")
+    assert "12 earlier notices are not listed" in message.text
+    assert "\x1b" not in message.text
+    assert len(message.text.splitlines()) == LISTED + 3
+    assert [notice["subject"] for notice in message.data["notices"]] == [f"s{n}" for n in range(5, LISTED + 5)]
+
+
+# ---- the daemon ------------------------------------------------------------------------------------------------------
+
+
+def test_a_daemon_tells_of_its_alarms_and_of_a_test(
+    tmp_path: Path, web: WebServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daemon.monitoring.notices.USUAL", FAST)
+    with idle_daemon(tmp_path, notify=NotifySection(webhook_url=web.url)) as config:
+        told = request(config.socket_path, "alarms.test-notice")
+        assert told.startswith("a test notice goes out by webhook")
+        (tmp_path / "models" / "job-1").mkdir(parents=True)  # models beside a store that never saw a job: an alarm
+        wait_until(lambda: ("raised", "store") in web.events())
+        assert ("test", "notices") in web.events()
+        (waiting,) = request(config.socket_path, "status")["notices"]
+        assert (waiting["waiting"], waiting["error"]) == (0, None)
+
+
+def test_a_way_that_leads_nowhere_is_refused(tmp_path: Path) -> None:
+    for section, complaint in (
+        ('webhook_url = "file:///etc/passwd"', "notify.webhook_url: give the address of a web server"),
+        ('command = ["mail"]', "notify.command: the program needs its whole path"),
+        ("", "notify: give webhook_url, command, or both"),
+        ('webhook = "x"', "notify.webhook: unknown key; allowed here: command, least, webhook_url"),
+    ):
+        with pytest.raises(ConfigError) as caught:
+            parse_config(f'rig = "swdt82"\n[notify]\n{section}\n', tmp_path / "rigcal.toml")
+        assert complaint in str(caught.value)
