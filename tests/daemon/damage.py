@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from daemon.store import Store
+
 
 def tear(path: Path, *names: str) -> None:
     """Overwrite the first page of tables or indexes of a store that is closed."""
@@ -24,6 +26,13 @@ def tear(path: Path, *names: str) -> None:
         for page in pages:
             file.seek((page - 1) * size)
             file.write(b"\xa5" * size)
+
+
+def fill_up(store: Store) -> None:
+    """Let a store have no further page, as on a full disk, and none that is free."""
+    with contextlib.closing(sqlite3.connect(store.path)) as other:
+        other.execute("VACUUM")
+    store.rows(f"PRAGMA max_page_count = {store.rows('PRAGMA page_count')[0]['page_count']}")
 
 
 @contextlib.contextmanager

@@ -26,7 +26,7 @@ from daemon.store import Reader, Store
 from drivers.clock import SystemClock
 from drivers.readings import Capture, LinkItem, Record
 from tests.daemon.acquisition_support import DEADLINE_S, ListLink, NumberDecoder, wait_until
-from tests.daemon.damage import tear
+from tests.daemon.damage import fill_up, tear
 from tests.daemon.job_support import SOURCE
 from tests.daemon.store_support import frame, reading, serial_bytes, table
 
@@ -124,7 +124,7 @@ def test_what_a_full_disk_keeps_from_being_stored_before_the_end_is_counted(
     link = ListLink("boom", [frame(n) for n in range(3000)], gate)
     acquisition = acquisition_on(store, [link])
     acquisition.start()
-    store.rows(f"PRAGMA max_page_count = {store.rows('PRAGMA page_count')[0]['page_count']}")
+    fill_up(store)
     gate.set()
     wait_until(link.done.is_set)
     wait_until(lambda: acquisition.status().error is not None)
@@ -229,7 +229,7 @@ def test_a_run_whose_captures_were_lost_at_its_end_did_not_end_in_order(tmp_path
     running = threading.Thread(target=run)
     running.start()
     wait_until(lambda: daemon._acquisition.alive(within_s=DEADLINE_S))
-    store.rows(f"PRAGMA max_page_count = {store.rows('PRAGMA page_count')[0]['page_count']}")
+    fill_up(store)
     gate.set()
     wait_until(lambda: daemon._acquisition.status().error is not None)
     stop.set()
@@ -316,7 +316,7 @@ def test_damage_that_keeps_readings_out_of_the_store_does_not_keep_raw_captures_
     before = opened(path)
     before.insert_records([reading("theta1", n / 10, float(n)) for n in range(10)])
     before.close()
-    tear(path, "joint_samples_by_time")
+    tear(path, "joint_samples")
     store = opened(path)
     gate = threading.Event()
     links = [ListLink("boom", [frame(1)]), ListLink("boom", [frame(2)], gate)]

@@ -80,14 +80,13 @@ def test_an_owner_that_is_set_late_ends_the_wait(tmp_path: Path) -> None:
 
 
 def test_a_pseudo_terminal_that_is_made_ends_the_wait() -> None:
-    master, slave = pty.openpty()
-    path = os.ttyname(slave)
-    os.close(slave)
-    os.close(master)
-    made: list[int] = []
+    # The lowest free number is given: with others free below it, no other process takes this one.
+    made = [n for _ in range(24) for n in pty.openpty()]
+    path = os.ttyname(made[-1])
+    while made:
+        os.close(made.pop())
     try:
-        # The lowest free number is given, which another process may take first
-        assert wakes(watch_path(path), lambda: made.extend(n for _ in range(8) for n in pty.openpty()))
+        assert wakes(watch_path(path), lambda: made.extend(n for _ in range(32) for n in pty.openpty()))
     finally:
         for descriptor in made:
             os.close(descriptor)

@@ -37,6 +37,7 @@ from tests.daemon.acquisition_support import (
     SilenceDecoder,
     wait_until,
 )
+from tests.daemon.damage import fill_up
 from tests.daemon.store_support import at, frame, serial_bytes, table
 
 Make = Callable[..., Acquisition]
@@ -259,8 +260,7 @@ def test_a_full_disk_is_told_and_waited_for_and_nothing_is_lost(
     link = ListLink("boom", frames, gate)
     acquisition = acquire([link])
     acquisition.start()
-    pages = store.rows("PRAGMA page_count")[0]["page_count"]
-    store.rows(f"PRAGMA max_page_count = {pages}")
+    fill_up(store)
     gate.set()
     wait_until(lambda: acquisition.status().error is not None)
     assert "full" in str(acquisition.status().error)
@@ -280,8 +280,7 @@ def test_a_disk_that_stays_full_does_not_keep_the_daemon_from_stopping(
     link = ListLink("boom", [frame(n) for n in range(3000)], gate)
     acquisition = acquire([link])
     acquisition.start()
-    pages = store.rows("PRAGMA page_count")[0]["page_count"]
-    store.rows(f"PRAGMA max_page_count = {pages}")
+    fill_up(store)
     gate.set()
     wait_until(lambda: acquisition.status().error is not None)
     with caplog.at_level(logging.CRITICAL):
@@ -605,8 +604,7 @@ def test_time_of_one_boot_means_nothing_to_a_decoder_in_another(acquire: Make) -
 
 
 def test_a_replay_onto_a_full_disk_fails_at_once(store: Store, acquire: Make) -> None:
-    pages = store.rows("PRAGMA page_count")[0]["page_count"]
-    store.rows(f"PRAGMA max_page_count = {pages}")
+    fill_up(store)
     with pytest.raises(sqlite3.OperationalError, match="full"):
         acquire([]).run_inline([frame(n) for n in range(3000)])
 

@@ -17,6 +17,7 @@ from daemon.store import Store
 from daemon.store.alarms import AlarmTable
 from daemon.store.jobs import FailedJob
 from drivers.clock import ManualClock
+from tests.daemon.damage import fill_up
 from tests.daemon.store_support import at, table
 
 
@@ -101,9 +102,8 @@ def test_a_text_that_changes_is_the_same_alarm(rig: Rig) -> None:
 
 def test_an_alarm_shows_although_the_store_cannot_be_written_and_is_written_later(rig: Rig) -> None:
     rig.store.boot_row(rig.clock.now())
-    pages = rig.store.rows("PRAGMA page_count")[0]["page_count"]
     long = "x" * 300
-    rig.store.rows(f"PRAGMA max_page_count = {pages}")
+    fill_up(rig.store)
     rig.pass_s(4, **{f"link{n}": long for n in range(200)})
     assert len(rig.active()) == 200
     assert len(rig.stored()) < 200

@@ -18,6 +18,7 @@ from daemon.store.errors import unwritable_errors
 from daemon.store.migrations import MIGRATIONS
 from daemon.store.store import Store
 from drivers.readings import Reading, Record
+from tests.daemon.damage import fill_up
 from tests.daemon.session_support import SOURCE, STEP_S, Rig, disk_fails
 
 
@@ -54,8 +55,7 @@ def test_a_session_whose_end_cannot_be_stored_stays_open_here_and_there(rig: Rig
 
 
 def test_a_session_whose_start_finds_the_disk_full_is_not_open(rig: Rig) -> None:
-    (pages,) = rig.store.rows("PRAGMA page_count")
-    rig.store.rows(f"PRAGMA max_page_count = {pages['page_count']}")
+    fill_up(rig.store)
     with pytest.raises(sqlite3.OperationalError, match="database or disk is full"):
         rig.say("start", prism="r")
     assert rig.keeper.open_session() is None
@@ -73,8 +73,7 @@ def test_a_full_disk_is_told_in_a_sentence_that_says_what_to_do(
 
     server = ControlServer(tmp_path / "s", {"session.start": start})
     try:
-        (pages,) = rig.store.rows("PRAGMA page_count")
-        rig.store.rows(f"PRAGMA max_page_count = {pages['page_count']}")
+        fill_up(rig.store)
         with pytest.raises(CommandError) as caught:
             request(tmp_path / "s", "session.start", {"prism": "r"})
     finally:

@@ -54,7 +54,7 @@ CYCLES = st.lists(st.tuples(INT64, st.integers(0, 3), st.binary(max_size=9), st.
 def test_a_large_chunk_gives_back_what_small_ones_held(cycle: list[tuple[int, int, bytes, bool]], serial: bool) -> None:
     """Stamps that jump anywhere, and few kinds of frames that come again and again, of any length."""
     captures: list[Capture] = [
-        SerialCapture("station", Stamp(-ns, ns, "boot-a", doubt), data, doubt)
+        SerialCapture("station", Stamp(~ns, ns, "boot-a", doubt), data, doubt)
         if serial
         else CanCapture("boom", Stamp(ns // 3, ns, "boot-a"), number, data, is_error=doubt)
         for ns, number, data, doubt in cycle

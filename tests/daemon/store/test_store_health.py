@@ -31,7 +31,7 @@ from tests.daemon.acquisition_support import ListLink, wait_until
 from tests.daemon.damage import fill, small_disk, tear
 from tests.daemon.job_support import SOURCE, JobRig
 from tests.daemon.session_support import disk_fails
-from tests.daemon.store_support import at, frame, reading, table
+from tests.daemon.store_support import at, fix, frame, table
 
 
 @pytest.fixture
@@ -86,9 +86,9 @@ def damaged(path: Path) -> None:
     """A store whose run was killed, and one of whose indexes is torn."""
     with watched(path, ends_in_order=False) as (store, _):
         store.declare_channels({"theta1": "deg"}, {})
-        store.insert_records([reading("theta1", n / 10, float(n)) for n in range(100)])
+        store.insert_records([fix(n / 10) for n in range(100)])
     shutil.copy(path, path.with_name("backup"))
-    tear(path, "joint_samples_by_time")
+    tear(path, "fixes_by_instant")
 
 
 def test_damage_after_an_unclean_end_is_told_and_not_forgotten_by_the_next_start(path: Path) -> None:
