@@ -15,6 +15,12 @@ from daemon.store.rows import sql_value, stamp_of, stored_text
 from drivers.clock import Stamp
 from drivers.readings import Capture
 
+# By the index alone, then chunk by chunk in their order: neither all chunks are read, nor any sorted. One statement, so
+# that chunks which are packed meanwhile are read as they were.
+CHUNKS = """SELECT id, chunk FROM raw_chunks WHERE id IN (SELECT id FROM raw_chunks
+        WHERE (last_boot_id, last_monotonic_ns) >= (?1, ?2) AND (first_boot_id, first_monotonic_ns) <= (?3, ?4)
+            AND (?5 IS NULL OR link_id = (SELECT id FROM links WHERE name = ?5)))
+    ORDER BY id"""
 _SAMPLE = "channels.name AS channel, unit, utc_ns, value, status, raw_counts"
 _RECORDS = {
     "joint_samples": _SAMPLE,
@@ -124,13 +130,7 @@ class Reader:
 
         first = place(since) if since is not None else (0, -(2**63))
         last = place(until) if until is not None else (2**63 - 1, 0)
-        sql = (
-            "SELECT raw_chunks.id, chunk FROM raw_chunks JOIN links ON links.id = link_id "
-            "WHERE (last_boot_id, last_monotonic_ns) >= (?, ?) AND (first_boot_id, first_monotonic_ns) <= (?, ?)"
-            + (" AND links.name = ?" if link is not None else "")
-        )
-        parameters = [*first, *last] if link is None else [*first, *last, link]
-        for chunk_id, blob in self._connection.execute(sql + " ORDER BY raw_chunks.id", parameters):
+        for chunk_id, blob in self._connection.execute(CHUNKS, [*first, *last, link]):
             try:
                 captures = decode_captures(blob)
             except StoreError as error:
