@@ -195,6 +195,10 @@ class Connection:
         found = self.rows(sql, parameters)
         return int(next(iter(found[0].values()))) if found else None
 
+    def pragma(self, name: str) -> int:
+        """The number that SQLite tells of the database: `page_count`, `page_size`, `freelist_count`."""
+        return self.number(f"PRAGMA {name}", []) or 0
+
     def instant(self, stamp: Stamp, prefix: str = "") -> dict[str, SqlValue]:
         """The three columns of an instant, to be merged into a row: `<prefix>utc_ns`, ..."""
         return {

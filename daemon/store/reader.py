@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -76,6 +76,18 @@ class Reader:
     def close(self) -> None:
         """Close the connection."""
         self._connection.close()
+
+    def interrupt_by(self, look: Callable[[], None]) -> None:
+        """Let `look`, which long queries call again and again, end them by what it raises: with SQLITE_INTERRUPT."""
+
+        def is_over() -> int:
+            try:
+                look()
+            except Exception:  # noqa: BLE001 - the caller asks again, and gets what is raised itself
+                return 1
+            return 0
+
+        self._connection.set_progress_handler(is_over, 100_000)
 
     def rows(self, sql: str, parameters: Sequence[object] = ()) -> Iterator[dict[str, Any]]:
         """Rows of a query as mappings, one at a time.
