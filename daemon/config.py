@@ -104,6 +104,29 @@ class JobsSection(_Section):
     seed: int = 0
 
 
+class StoreSection(_Section):
+    """What the store keeps, and its backups. Sessions, what was captured in them, and models are always kept.
+
+    Attributes:
+        keep_days: captures and readings outside sessions that are older are deleted; kept while there is room when
+            absent.
+        free_gb: where the disk and free pages of the store together have less room, in GiB, or less than a tenth of the
+            disk, the oldest of them are deleted.
+        backup_directory: where a backup is made every day, better on another disk; none are made when absent.
+        backups: how many are kept.
+    """
+
+    keep_days: float | None = Field(default=None, ge=1)
+    free_gb: float = Field(default=5.0, gt=0)
+    backup_directory: Path | None = None
+    backups: int = Field(default=3, ge=1)
+
+    @property
+    def free_bytes(self) -> int:
+        """Room that the store should have."""
+        return round(self.free_gb * 2**30)
+
+
 class TipCanSection(_Section):
     """The live corrected tip on a CAN link: two frames a time, as docs/tip-frames.md has them.
 
@@ -210,6 +233,7 @@ class Config(_Section):
     station: tuple[StationConfig, ...] = ()
     sessions: SessionsSection = SessionsSection()
     jobs: JobsSection = JobsSection()
+    store: StoreSection = StoreSection()
     tip: TipSection | None = None
     metrics: MetricsSection | None = None
     notify: NotifySection | None = None
@@ -282,6 +306,11 @@ def parse_config(text: str, source: Path) -> Config:
             "rig": rig,
             "state_directory": base / config.state_directory,
             "socket": base / config.socket if config.socket else None,
+            "store": config.store.model_copy(
+                update={
+                    "backup_directory": base / config.store.backup_directory if config.store.backup_directory else None
+                }
+            ),
         }
     )
     if config.read_group is not None and config.socket_path == reading_socket(config.socket_path):

@@ -15,6 +15,7 @@ from calibration.rig.description import Rig
 from daemon.acquisition.acquisition import Acquisition
 from daemon.acquisition.clock_watch import ClockWatch
 from daemon.acquisition.present_state import expected_of
+from daemon.acquisition.store_commands import go_on_for_caller, prune, redecode_command
 from daemon.acquisition.thinning import Thinning
 from daemon.alarms.board import AlarmBoard
 from daemon.alarms.evidence import Gatherer
@@ -37,10 +38,10 @@ from daemon.sessions.station_setups import SetupBook
 from daemon.store.alarms import AlarmTable
 from daemon.store.errors import storage_errors, storage_sentence, unwritable_errors
 from daemon.store.health import StoreHealth, StoreWatch
+from daemon.store.housekeeping import Housekeeping, Keeping
 from daemon.store.jobs import JobTable
 from daemon.store.models import ModelTable
 from daemon.store.notices import NoticeTable
-from daemon.store.packing import Packing
 from daemon.store.sessions import SessionTable
 from daemon.store.setups import SetupTable
 from daemon.store.store import Store
@@ -82,7 +83,7 @@ class Daemon:
     def _compose(self, config: Config, store: Store, parts: Parts) -> None:
         declare_channels(store, parts.rig)
         self._watch = StoreWatch(store, parts.clock)
-        self._packing = Packing(store)
+        self._housekeeping = Housekeeping(store, parts.clock, keeping_of(config))
         self._setups = SetupBook(parts.rig, store, parts.clock, config.sessions.control_tolerance_mm)
         self._sessions = SessionKeeper(
             parts.rig,
@@ -118,7 +119,7 @@ class Daemon:
             on_records=self._on_records,
             expected=expected_of(config, parts.rig),
             clock_watch=ClockWatch(before) if parts.mode == "live" else None,
-            thinning=Thinning(self._sessions.is_of_session),
+            thinning=None if parts.mode == "replayed" else Thinning(self._sessions.is_of_session),
         )
         self._jobs = JobRunner(store, config, parts.rig.name, parts.clock, is_held=self._are_jobs_held)
         self._job_table, self._model_table = JobTable(store, parts.rig.name), models
@@ -157,6 +158,7 @@ class Daemon:
             "failed_jobs": self._job_table.failed,
             "model": self._live_model.health,
             "store": lambda: self._watch.health,
+            "keeping": lambda: self._housekeeping.state,
             "is_store_new": lambda: is_store_new(self._job_table, self._config.models_directory),
             "untrained_sessions": sessions.untrained,
             "control_faults": self._control_faults,
@@ -190,7 +192,7 @@ class Daemon:
             self._live_model.start()
             self._acquisition.start()
             self._watch.start()
-            self._packing.start()
+            self._housekeeping.start()
             self._notices.start()
             if self._sender is not None:
                 self._sender.start()
@@ -222,7 +224,7 @@ class Daemon:
         """Stop all parts within `STOP_S`, side by side, so that no one's stop delays what was captured."""
         budget = TimeBudget(STOP_S)
         stops = [server.close for server in self._servers]
-        stops += [self._live_model.stop, self._jobs.stop, self._watch.stop, self._notices.stop, self._packing.stop]
+        stops += [self._live_model.stop, self._jobs.stop, self._watch.stop, self._notices.stop, self._housekeeping.stop]
         stops += [part.stop for part in (self._sender, self._metrics) if part is not None]
         others = [threading.Thread(target=_stop_part, args=(stop,), daemon=True) for stop in stops]
         for thread in others:
@@ -275,6 +277,8 @@ class Daemon:
             "alarms.list": self._alarms.list_command,
             "alarms.test-notice": self._notices.try_command,
             "devices.configure": self._configure_devices,
+            "store.prune": self._prune,
+            "store.redecode": self._redecode,
             **({} if self._parts.visit is None else {"simulation.visit": self._visit}),
         }
         return {name: partial(self._carry_out, handler) for name, handler in commands.items()}
@@ -297,6 +301,14 @@ class Daemon:
             raise CommandError("poses: the rows of a plan, as `rigcal plan --json` prints them")
         assert self._parts.visit is not None  # else there is no such command
         return {"left": self._parts.visit(rows)}
+
+    def _prune(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Delete captures and readings outside sessions that are older than so many days."""
+        return prune(self._housekeeping, arguments, self._parts.clock.now().utc_ns, go_on_for_caller)
+
+    def _redecode(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Make all readings and fixes of a session, or of some time, again from raw captures."""
+        return redecode_command(self._store, self._parts.decoders, arguments, go_on_for_caller)
 
     def _configure_devices(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Set up CANopen devices, if the operator says that the machine is parked."""
@@ -371,6 +383,17 @@ def declare_channels(store: Store, rig: Rig) -> None:
     """Tell the store which channels are the rig's joints and which are signals."""
     joints = {joint.name: joint.unit for joint in rig.joints}
     store.declare_channels(joints, {c.name: c.unit for c in rig.channels if c.name not in joints})
+
+
+def keeping_of(config: Config) -> Keeping:
+    """Return what the store keeps, as configured."""
+    return Keeping(
+        keep_days=config.store.keep_days,
+        free_bytes=config.store.free_bytes,
+        models=config.models_directory,
+        backup_directory=config.store.backup_directory,
+        backups=config.store.backups,
+    )
 
 
 def stop_on_signals(stop: threading.Event) -> Callable[[], None]:

@@ -10,6 +10,7 @@ from daemon.acquisition.status import AcquisitionStatus, EventStatus, LinkStatus
 from daemon.models.live_model import LiveModelHealth
 from daemon.sessions.prism_guard import Suspicion
 from daemon.store.health import StoreHealth
+from daemon.store.housekeeping import KeepingState
 from daemon.store.jobs import FailedJob
 from daemon.store.sessions import OpenSessionRow
 from daemon.store.setups import SetupRow
@@ -31,6 +32,7 @@ class Evidence:
         failed_jobs: those that somebody should look at.
         model: the live one.
         store: its file and its disk; None while not known.
+        keeping: its room and its backups.
         is_store_new: the store has never seen a job, and yet models lie beside it.
         previous_run: when the daemon's run before this one was last alive, by a clock that can be compared.
         control_faults: control socket on which no one can connect -> why.
@@ -50,6 +52,7 @@ class Evidence:
     failed_jobs: Sequence[FailedJob] = ()
     model: LiveModelHealth | None = None
     store: StoreHealth | None = None
+    keeping: KeepingState = field(default_factory=KeepingState)
     is_store_new: bool = False
     previous_run: Stamp | None = None
     control_faults: Mapping[str, str] = field(default_factory=dict)
@@ -103,6 +106,7 @@ _PARTS = {
     "failed_jobs": "the jobs",
     "model": "the live model",
     "store": "the store's files",
+    "keeping": "the store's room and backups",
     "is_store_new": "the models",
     "untrained_sessions": "the sessions",
     "control_faults": "the control sockets",

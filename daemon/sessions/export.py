@@ -15,16 +15,13 @@ from daemon.sessions.session_data import sessions_csv
 from daemon.sessions.session_file import DoubtfulCaptures, SessionFile
 from daemon.sessions.steady_time import SteadyTime
 from daemon.store.reader import Reader
-from daemon.store.sessions import prism_confirmations, session
+from daemon.store.sessions import AFTER_NS, BEFORE_NS, prism_confirmations, session
 from daemon.store.setups import control_points
-from drivers.clock import NS_PER_S
 from drivers.logs.can_log import write_can_log
 from drivers.logs.serial_log import SerialLogHeader, SerialLogWriter
 from drivers.readings import CanCapture, Capture, SerialCapture
 
 CanFormat = Literal["log", "asc", "blf"]
-BEFORE_NS = 60 * NS_PER_S  # dwell and direction of the first fixes come from motion before the session
-AFTER_NS = 2 * NS_PER_S  # the last fixes are interpolated between joints
 
 
 def export_session(config: Config, session_id: str, out: Path, can_format: CanFormat) -> list[Path]:

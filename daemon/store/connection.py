@@ -83,11 +83,14 @@ class Connection:
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = FULL")
         connection.execute("PRAGMA foreign_keys = ON")
-        connection.execute("PRAGMA temp_store = MEMORY")  # what a statement may undo needs no file, hence no descriptor
+        connection.execute("PRAGMA secure_delete = OFF")  # Debian's default: pages that are freed are written once more
         connection.execute("PRAGMA journal_size_limit = 67108864")  # a WAL grown behind a slow reader shrinks again
         if later := unknown_migrations(self._db):
             raise StoreError(f"{self.path}: made by a newer rigcal (it has {later[0]}); install that version")
         MIGRATIONS.apply(self._db)
+        # What a statement may undo needs no file, hence no descriptor. Not before: an index of a large store is sorted
+        # in files, where memory would not hold it.
+        connection.execute("PRAGMA temp_store = MEMORY")
 
     def close(self) -> None:
         """Close the database and let others write to it; harmless when it was closed before.
@@ -191,6 +194,10 @@ class Connection:
         """The integer in the first column of a query's first row; None where there is no row."""
         found = self.rows(sql, parameters)
         return int(next(iter(found[0].values()))) if found else None
+
+    def pragma(self, name: str) -> int:
+        """The number that SQLite tells of the database: `page_count`, `page_size`, `freelist_count`."""
+        return self.number(f"PRAGMA {name}", []) or 0
 
     def instant(self, stamp: Stamp, prefix: str = "") -> dict[str, SqlValue]:
         """The three columns of an instant, to be merged into a row: `<prefix>utc_ns`, ..."""

@@ -336,10 +336,20 @@ def m015_large_chunks(db: Database) -> None:
         "DROP INDEX raw_chunks_by_time",
         """CREATE INDEX raw_chunks_by_end
             ON raw_chunks(last_boot_id, last_monotonic_ns, first_boot_id, first_monotonic_ns, link_id)""",
-        # No query uses these.
+        # One index for what is asked by time: which rows may be deleted, and which decoding again replaces.
         "DROP INDEX joint_samples_by_time",
         "DROP INDEX signals_by_time",
+        "DROP INDEX decode_failures_by_time",
+        *(
+            f"CREATE INDEX {table}_by_instant ON {table}(boot_id, monotonic_ns)"
+            for table in ("joint_samples", "signals", "decode_failures")
+        ),
+        # A fix that is deleted is looked for among the observations: a foreign key.
+        "CREATE INDEX observations_by_fix ON observations(fix_id) WHERE fix_id IS NOT NULL",
+        # No query uses these.
         "DROP INDEX fixes_by_time",
+        "DROP INDEX device_events_by_time",
+        "DROP INDEX gaps_by_time",
     )
 
 

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
-import sqlite3
-import threading
 from collections.abc import Sequence
 from typing import Any
 
 from daemon.store.captures import CaptureRun, Chunk, decode_run, encode_large
-from daemon.store.errors import StoreError, storage_sentence
+from daemon.store.errors import StoreError
 from daemon.store.packed_captures import joined
 from daemon.store.store import Store
 
@@ -19,10 +15,6 @@ log = logging.getLogger(__name__)
 
 SPAN_NS = 60_000_000_000  # of a large chunk: what is newer lies in small ones
 MOST_CAPTURES = 100_000
-LOOK_S = 10.0  # real seconds between looks
-PAUSE_S = 0.2  # between one chunk and the next: acquisition comes first
-STOP_S = 5.0
-_NICE = 15
 _LOOKED_AT = 10_000  # small chunks
 
 _SMALL = """SELECT raw_chunks.id, link_id, captures, first_boot_id AS boot, first_monotonic_ns AS first_ns,
@@ -38,7 +30,7 @@ Row = dict[str, Any]
 
 
 class Packing:
-    """Packs the chunks of a store, in a thread of its own.
+    """Packs the chunks of a store, a large one at a time.
 
     A large chunk is read again and compared, byte for byte and stamp for stamp, with the small ones before these go. It
     comes and they go in one transaction: a kill or a power cut leaves the one or the others.
@@ -49,30 +41,6 @@ class Packing:
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._stopping = threading.Event()
-        self._thread: threading.Thread | None = None
-
-    def start(self) -> None:
-        """Begin to pack."""
-        self._thread = threading.Thread(target=self._run, name="packing", daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End after the chunk in work. Harmless when not started."""
-        self._stopping.set()
-        if self._thread is not None:
-            self._thread.join(STOP_S)
-
-    def _run(self) -> None:
-        with contextlib.suppress(OSError):  # this thread alone: acquisition comes first
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
-        pause_s = LOOK_S
-        while not self._stopping.wait(pause_s):
-            try:
-                pause_s = PAUSE_S if self.pack_next() else LOOK_S
-            except sqlite3.Error as error:
-                pause_s = LOOK_S
-                log.warning("captures stay in small chunks for now: %s", storage_sentence(self._store.path, error))
 
     def pack_next(self) -> bool:
         """Make one large chunk, if there are small ones for it.
@@ -81,7 +49,7 @@ class Packing:
             whether there may be more.
 
         Raises:
-            sqlite3.Error: the store cannot be read or written; it is as it was.
+            sqlite3.Error, StoreError: the store cannot be read or written; it is as it was.
         """
         run = self._due()
         if not run:
@@ -101,8 +69,12 @@ class Packing:
             if large is not None:
                 last = large.last
                 values = last.utc_ns, last.monotonic_ns, large.captures, large.payload_bytes, large.blob, ids[0]
-                db.execute(_LARGE, values)
-                db.conn.executemany("DELETE FROM raw_chunks WHERE id = ?", marks[1:])
+                changed = db.execute(_LARGE, values).rowcount
+                changed += db.conn.executemany("DELETE FROM raw_chunks WHERE id = ?", marks[1:]).rowcount
+                if changed != len(ids):
+                    raise StoreError(
+                        f"{self._store.path}: raw chunks {ids[0]} to {ids[-1]} changed while they were packed"
+                    )
         return True
 
     def _chunk(self, number: int) -> bytes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -15,6 +15,12 @@ from daemon.store.rows import sql_value, stamp_of, stored_text
 from drivers.clock import Stamp
 from drivers.readings import Capture
 
+# By the index alone, then chunk by chunk in their order: neither all chunks are read, nor any sorted. One statement, so
+# that chunks which are packed meanwhile are read as they were.
+CHUNKS = """SELECT id, chunk FROM raw_chunks WHERE id IN (SELECT id FROM raw_chunks
+        WHERE (last_boot_id, last_monotonic_ns) >= (?1, ?2) AND (first_boot_id, first_monotonic_ns) <= (?3, ?4)
+            AND (?5 IS NULL OR link_id = (SELECT id FROM links WHERE name = ?5)))
+    ORDER BY id"""
 _SAMPLE = "channels.name AS channel, unit, utc_ns, value, status, raw_counts"
 _RECORDS = {
     "joint_samples": _SAMPLE,
@@ -71,6 +77,18 @@ class Reader:
         """Close the connection."""
         self._connection.close()
 
+    def interrupt_by(self, look: Callable[[], None]) -> None:
+        """Let `look`, which long queries call again and again, end them by what it raises: with SQLITE_INTERRUPT."""
+
+        def is_over() -> int:
+            try:
+                look()
+            except Exception:  # noqa: BLE001 - the caller asks again, and gets what is raised itself
+                return 1
+            return 0
+
+        self._connection.set_progress_handler(is_over, 100_000)
+
     def rows(self, sql: str, parameters: Sequence[object] = ()) -> Iterator[dict[str, Any]]:
         """Rows of a query as mappings, one at a time.
 
@@ -124,13 +142,7 @@ class Reader:
 
         first = place(since) if since is not None else (0, -(2**63))
         last = place(until) if until is not None else (2**63 - 1, 0)
-        sql = (
-            "SELECT raw_chunks.id, chunk FROM raw_chunks JOIN links ON links.id = link_id "
-            "WHERE (last_boot_id, last_monotonic_ns) >= (?, ?) AND (first_boot_id, first_monotonic_ns) <= (?, ?)"
-            + (" AND links.name = ?" if link is not None else "")
-        )
-        parameters = [*first, *last] if link is None else [*first, *last, link]
-        for chunk_id, blob in self._connection.execute(sql + " ORDER BY raw_chunks.id", parameters):
+        for chunk_id, blob in self._connection.execute(CHUNKS, [*first, *last, link]):
             try:
                 captures = decode_captures(blob)
             except StoreError as error:

@@ -13,6 +13,8 @@ from daemon.store.errors import NotInStoreError
 from daemon.store.rows import RowSource
 from drivers.clock import NS_PER_S, Stamp
 
+BEFORE_NS = 60 * NS_PER_S  # dwell and direction of a session's first fixes come from motion before it
+AFTER_NS = 2 * NS_PER_S  # its last fixes are interpolated between joints
 CLOCK_STEP_NS = NS_PER_S // 20  # less may be the time between reading the one clock and the other
 
 # Fixes of these may still come: of the open ones, and of those that ended after the oldest capture that waits to be

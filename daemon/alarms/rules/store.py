@@ -6,8 +6,10 @@ from collections.abc import Iterator
 
 from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
+from drivers.clock import NS_PER_S
 
 CRITICAL_BYTES = 200 * 2**20
+OVERDUE_NS = 3 * 86_400 * NS_PER_S
 
 
 @rule("critical", "Free space on the disk, or check it; captures wait in memory meanwhile.", hold_s=5.0)
@@ -37,6 +39,44 @@ def store_new(evidence: Evidence) -> Iterator[Finding]:
     """
     if evidence.is_store_new:
         yield "store", "the store is new and empty, but models of an earlier one lie beside it"
+
+
+@rule(
+    "warning",
+    "Free space on the disk of the store, or move the state directory to a larger one: docs/store.md says how.",
+)
+def store_short_of_room(evidence: Evidence) -> Iterator[Finding]:
+    """The store has less room to grow than `free_gb` of its configuration: the oldest captures outside sessions go.
+
+    Room is what is free on the disk and in the store's own file. Critical where nothing is left that may be deleted.
+    Cleared when there is room again.
+    """
+    keeping = evidence.keeping
+    if not keeping.is_short:
+        return
+    if keeping.has_nothing_left:
+        yield (
+            "store",
+            "little room is left, and nothing that may be deleted: only sessions and the last hour",
+            "critical",
+        )
+    else:
+        yield "store", "little room is left, so the oldest captures outside sessions are deleted"
+
+
+@rule("warning", "Look at the disk of the backups; `rigcal store backup` makes one now and says what is wrong.")
+def backup_overdue(evidence: Evidence) -> Iterator[Finding]:
+    """The last backup failed, or the newest is older than 3 days. Cleared by the next one that is made.
+
+    Only where `backup_directory` is configured.
+    """
+    keeping = evidence.keeping
+    if not keeping.has_backups:
+        return
+    if keeping.backup_error:
+        yield "backup", f"no backup was made: {keeping.backup_error}"
+    elif keeping.newest_backup_utc_ns is not None and evidence.now.utc_ns - keeping.newest_backup_utc_ns > OVERDUE_NS:
+        yield "backup", "the newest backup is older than 3 days"
 
 
 @rule("warning", "Free space on the disk of the store.", hold_s=60.0)

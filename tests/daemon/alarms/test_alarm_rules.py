@@ -24,6 +24,7 @@ from daemon.alarms.library import library, page
 from daemon.models.live_model import LiveModelHealth
 from daemon.sessions.prism_guard import Suspicion
 from daemon.store.health import HealthState, StoreHealth
+from daemon.store.housekeeping import KeepingState
 from daemon.store.jobs import FailedJob
 from daemon.store.sessions import OpenSessionRow
 from daemon.store.setups import SetupRow
@@ -270,6 +271,22 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
     "not_storing": [(known(error="disk full"), ["store"], known())],
     "store_unsound": [(known(store=store_health("missing", "the file is gone")), ["store"], known())],
     "store_new": [(known(is_store_new=True), ["store"], known())],
+    "store_short_of_room": [
+        (known(keeping=KeepingState(is_short=True)), ["store"], known(keeping=KeepingState())),
+        (known(keeping=KeepingState(is_short=True, has_nothing_left=True)), ["store"], known()),
+    ],
+    "backup_overdue": [
+        (
+            known(keeping=KeepingState(has_backups=True, backup_error="no room")),
+            ["backup"],
+            known(keeping=KeepingState(has_backups=True)),
+        ),
+        (
+            known(keeping=KeepingState(has_backups=True, newest_backup_utc_ns=NOW.utc_ns - 4 * 86_400 * NS_PER_S)),
+            ["backup"],
+            known(keeping=KeepingState(has_backups=True, newest_backup_utc_ns=NOW.utc_ns - 86_400 * NS_PER_S)),
+        ),
+    ],
     "disk_nearly_full": [
         (known(store=store_health(is_low=True)), ["store"], known(store=store_health(free_bytes=10**10))),
         (known(store=store_health(free_bytes=10**8)), ["store"], known(store=store_health(free_bytes=10**9))),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 
 from daemon.store import Reader, Store
 from daemon.store.packing import Packing
+from daemon.store.reader import CHUNKS
 from drivers.readings import Capture
 from tests.daemon.store_support import at, frame, serial_bytes, table
 
@@ -114,12 +116,11 @@ def test_a_disk_that_refuses_leaves_all_as_it_was(path: Path, store: Store) -> N
     assert pack(store) > 0
 
 
-def test_captures_of_a_time_are_found_by_an_index_alone(path: Path, store: Store) -> None:
+def test_captures_of_a_time_are_found_by_an_index_and_no_other_chunk_is_read(path: Path, store: Store) -> None:
     fill(store, 3)
-    with sqlite3.connect(path) as db:
-        plan = db.execute(
-            """EXPLAIN QUERY PLAN SELECT raw_chunks.id FROM raw_chunks
-                WHERE (last_boot_id, last_monotonic_ns) >= (1, 5) AND (first_boot_id, first_monotonic_ns) <= (1, 9)"""
-        ).fetchall()
-    db.close()
-    assert "SEARCH raw_chunks USING COVERING INDEX raw_chunks_by_end" in str(plan)
+    with contextlib.closing(sqlite3.connect(path)) as db:
+        plan = str(db.execute(f"EXPLAIN QUERY PLAN {CHUNKS}", (1, 5, 1, 9, "boom")).fetchall())
+    assert "SEARCH raw_chunks USING COVERING INDEX raw_chunks_by_end" in plan
+    assert "SEARCH raw_chunks USING INTEGER PRIMARY KEY" in plan
+    assert "SCAN raw_chunks" not in plan
+    assert "TEMP B-TREE" not in plan

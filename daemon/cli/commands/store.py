@@ -1,0 +1,264 @@
+"""`rigcal store`: what the store holds, whether it is sound, its backups, and what it keeps."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from daemon.cli.client import utc
+from daemon.cli.command import DONE, FAILED, Command, Delivered, json_option
+from daemon.cli.terminal import echo, echo_error
+
+if TYPE_CHECKING:
+    from daemon.config import Config
+    from daemon.store import Store
+
+TIMEOUT_S = 86_400.0  # a command that deletes a year, or decodes a week again; Ctrl-C ends it
+_MIB = 2**20
+
+
+def _config_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    return click.option(
+        "--config", type=click.Path(path_type=Path), required=True, help="Configuration of the store's daemon."
+    )(json_option(command))
+
+
+@click.group()
+def store() -> None:
+    """The store: its size, its soundness, its backups, and what it keeps."""
+
+
+@store.command(cls=Command, name="stats")
+@click.option("--tables", is_flag=True, help="Also the size of each table and index; reads the whole store.")
+@_config_option
+def store_stats(config: Path, *, tables: bool, as_json: bool) -> dict[str, Any]:
+    """Show how large the store is and what it holds."""
+    from daemon.config import read_config
+    from daemon.store.statistics import statistics
+
+    found = statistics(read_config(config).store_path, tables=tables)
+    if not as_json:
+        echo(f"{found['store']}: {_size(found['file_bytes'])}, of which {_size(found['free_inside_bytes'])} will be")
+        echo(f"used again; {_size(found['disk_free_bytes'])} are free on its disk")
+        if found["oldest_utc_ns"] is not None:
+            echo(f"captures from {utc(found['oldest_utc_ns'])} to {utc(found['newest_utc_ns'])}")
+        echo(f"{found['chunks']} chunks of captures, {found['small_chunks']} of them wait to be packed")
+        echo(f"{found['undecoded_chunks']} wait to be decoded; {found['sessions']} sessions, {found['boots']} boots")
+        for name, size in (found.get("tables") or {}).items():
+            echo(f"  {name:32} {size / _MIB:12.2f} MiB")
+    return found
+
+
+@store.command(cls=Command, name="check")
+@click.option("--backup", type=click.Path(path_type=Path), help="Check this backup in place of the store.")
+@_config_option
+def store_check(config: Path, backup: Path | None, *, as_json: bool) -> Delivered:
+    """Look for damage: the database, every chunk of captures, the live model. The daemon may run.
+
+    Exit status 1 where something is damaged.
+    """
+    from daemon.config import read_config
+    from daemon.store import backup as backup_module
+    from daemon.store.soundness import check_store
+
+    settings = read_config(config)
+    path, models = settings.store_path, settings.models_directory
+    if backup is not None:
+        backup_module.read_backup(backup)
+        path, models = backup / backup_module.STORE, backup / backup_module.MODELS
+    found = check_store(path, models)
+    if not as_json:
+        echo(f"{path}: {found.captures} captures in {found.chunks} chunks, {found.models} live models looked at")
+        for finding in found.findings:
+            echo(f"  damaged: {finding}", fg="red")
+        echo("restore the store from a backup: `rigcal store restore`" if found.findings else "all is sound")
+    result = {
+        "store": str(path),
+        "is_sound": not found.findings,
+        "findings": list(found.findings),
+        "chunks": found.chunks,
+        "captures": found.captures,
+        "live_models": found.models,
+    }
+    return Delivered(result, FAILED if found.findings else DONE)
+
+
+@store.command(cls=Command, name="backup")
+@click.option(
+    "--to", type=click.Path(file_okay=False, path_type=Path), help="Directory of backups; the configured one."
+)
+@click.option("--keep", type=click.IntRange(1), help="How many backups stay there; as configured.")
+@click.option("--list", "is_list", is_flag=True, help="List the backups and make none.")
+@_config_option
+def store_backup(config: Path, to: Path | None, keep: int | None, *, is_list: bool, as_json: bool) -> dict[str, Any]:
+    """Copy store and models to a backup, verify it, and delete the oldest ones. The daemon may run."""
+    from daemon.config import read_config
+    from daemon.store.backup import backups, make_backup
+
+    settings = read_config(config)
+    directory = to or settings.store.backup_directory
+    if directory is None:
+        raise click.UsageError(
+            "give the directory with --to, or set `backup_directory` in [store] of the configuration"
+        )
+    if not is_list:
+        now_ns = _now_ns()
+        made = make_backup(
+            settings.store_path, settings.models_directory, directory, keep or settings.store.backups, now_ns, _go_on
+        )
+        if not as_json:
+            echo(f"{made.path}: made and verified, {_size(made.size_bytes)}")
+    found = backups(directory)
+    if not as_json and is_list:
+        for backup in found:
+            echo(f"{backup.path}  {utc(backup.made_utc_ns)}  {_size(backup.size_bytes)}")
+        if not found:
+            echo(f"{directory}: no backups")
+    listed = [
+        {"path": str(b.path), "made_utc_ns": b.made_utc_ns, "size_bytes": b.size_bytes, "rigcal": b.rigcal}
+        for b in found
+    ]
+    return {"backups": listed} if is_list else {"backup": str(made.path), "backups": listed}
+
+
+@store.command(cls=Command, name="restore")
+@click.argument("backup", type=click.Path(path_type=Path))
+@_config_option
+def store_restore(backup: Path, config: Path, *, as_json: bool) -> dict[str, Any]:
+    """Put BACKUP, a directory that `rigcal store backup` made, in the place of store and models.
+
+    Stop the daemon first. What was there is moved to a directory beside the store and nothing of it is deleted.
+    """
+    from daemon.config import read_config
+    from daemon.store.backup import restore_backup
+
+    settings = read_config(config)
+    aside = restore_backup(backup, settings.store_path, settings.models_directory, _now_ns(), _go_on)
+    if not as_json:
+        echo(f"{settings.store_path} is now that of {backup}")
+        if aside is not None:
+            echo(f"what was there before is in {aside}; delete it once all is well")
+    return {"store": str(settings.store_path), "replaced": None if aside is None else str(aside)}
+
+
+@store.command(cls=Command, name="prune")
+@click.option("--days", type=click.FloatRange(1), help="Keep so many days; `keep_days` of the configuration.")
+@_config_option
+def store_prune(config: Path, days: float | None, *, as_json: bool) -> dict[str, Any]:
+    """Delete captures and readings outside sessions that are older than so many days. The daemon may run.
+
+    Sessions, what was captured in them and a minute before, and models always stay. The file does not become smaller:
+    its free pages are used again.
+    """
+    from daemon.acquisition.store_commands import prune
+    from daemon.config import read_config
+    from daemon.service import keeping_of
+    from daemon.store.housekeeping import Housekeeping
+    from drivers.clock import SystemClock
+
+    settings = read_config(config)
+    kept = days or settings.store.keep_days
+    if kept is None:
+        raise click.UsageError("give --days, or set `keep_days` in [store] of the configuration")
+    arguments = {"days": kept}
+
+    def work(store: Store) -> dict[str, Any]:
+        housekeeping = Housekeeping(store, SystemClock(), keeping_of(settings))
+        return prune(housekeeping, arguments, _now_ns(), _go_on)
+
+    result = _on_store(settings, work, "store.prune", arguments)
+    if not as_json:
+        until_ns = result["deleted_until_utc_ns"]
+        echo("nothing to delete" if until_ns is None else f"deleted what lies outside sessions up to {utc(until_ns)}")
+    return result
+
+
+@store.command(cls=Command, name="redecode")
+@click.option("--session", help="All readings and fixes of this session.")
+@click.option("--from", "since", type=click.DateTime(), help="Begin of a time, UTC, in place of a session.")
+@click.option("--to", "until", type=click.DateTime(), help="Its end, UTC.")
+@_config_option
+def store_redecode(
+    config: Path, session: str | None, since: datetime | None, until: datetime | None, *, as_json: bool
+) -> dict[str, Any]:
+    """Make every reading and fix of a session, or of some time, again from raw captures. The daemon may run.
+
+    Outside sessions the store has one reading a second and channel; raw captures have them all.
+    """
+    from daemon.acquisition.store_commands import redecode_command
+    from daemon.composition import decoders
+    from daemon.config import load_rig, read_config
+
+    if (session is None) == (since is None or until is None):
+        raise click.UsageError("give either --session, or --from and --to")
+    settings = read_config(config)
+    source = load_rig(settings.rig)
+    arguments = {
+        "session": session,
+        "first_utc_ns": None if since is None else _utc_ns(since),
+        "last_utc_ns": None if until is None else _utc_ns(until),
+    }
+
+    def work(store: Store) -> dict[str, Any]:
+        from daemon.service import declare_channels
+
+        declare_channels(store, source.rig)
+        return redecode_command(store, decoders(settings, source), arguments, _go_on)
+
+    result = _on_store(settings, work, "store.redecode", arguments)
+    if not as_json:
+        for stretch in result["stretches"]:
+            echo(f"decoded again: {utc(stretch['first_utc_ns'])} to {utc(stretch['last_utc_ns'])}")
+        echo(f"{result['added']} readings and fixes more than before")
+    return result
+
+
+def _on_store(
+    settings: Config, work: Callable[[Store], dict[str, Any]], command: str, arguments: dict[str, Any]
+) -> dict[str, Any]:
+    """Change the store: through the daemon where one writes to it, else here."""
+    from daemon.control.protocol import request
+    from daemon.store import Store, StoreBusyError, StoreError
+
+    if not settings.store_path.is_file():
+        raise StoreError(f"{settings.store_path}: there is no store")
+    try:
+        opened = Store(settings.store_path)
+    except StoreBusyError:
+        given = {key: value for key, value in arguments.items() if value is not None}
+        answer: dict[str, Any] = request(settings.socket_path, command, given, timeout_s=TIMEOUT_S)
+        return answer
+    with contextlib.closing(opened), _told(settings.store_path):
+        return work(opened)
+
+
+@contextlib.contextmanager
+def _told(path: Path) -> Iterator[None]:
+    from daemon.store.errors import storage_errors
+
+    echo_error(f"no daemon runs on {path}: it is changed here")
+    with storage_errors(path):
+        yield
+
+
+def _go_on() -> None:
+    """Ctrl-C ends what runs here by itself."""
+
+
+def _now_ns() -> int:
+    from drivers.clock import SystemClock
+
+    return SystemClock().now().utc_ns
+
+
+def _utc_ns(when: datetime) -> int:
+    return round(when.replace(tzinfo=UTC).timestamp()) * 10**9
+
+
+def _size(size_bytes: int) -> str:
+    return f"{size_bytes / 2**30:.2f} GiB" if size_bytes >= 2**30 else f"{size_bytes / _MIB:.1f} MiB"

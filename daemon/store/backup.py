@@ -1,0 +1,250 @@
+"""Backups of a store and its models, made while the daemon writes; verified, rotated, and put back.
+
+A backup is a directory, `rigcal-<UTC>`: `rigcal.sqlite`, `models/`, and `backup.json`, which is written last. A backup
+without it was never finished.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import json
+import os
+import re
+import shutil
+import sqlite3
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from daemon.host.safe_output import write_file
+from daemon.store.errors import StoreError, storage_errors
+from daemon.store.files import BESIDE, WriterLock
+from daemon.store.soundness import Soundness, check_store
+
+STORE, MODELS, ABOUT = "rigcal.sqlite", "models", "backup.json"
+FORM = 1
+RESERVE_BYTES = 256 * 2**20  # stays free where a backup is written
+STEP_PAGES = 4096
+_NAME = re.compile(r"rigcal-\d{8}T\d{6}Z")
+_UNFINISHED = ".unfinished"
+
+GoOn = Callable[[], None]
+
+
+@dataclass(frozen=True)
+class Backup:
+    """A backup that was finished.
+
+    Attributes:
+        path: its directory.
+        made_utc_ns: when it was begun.
+        size_bytes: of its files.
+        rigcal: version of the program that made it.
+    """
+
+    path: Path
+    made_utc_ns: int
+    size_bytes: int
+    rigcal: str
+
+
+def backups(directory: Path) -> list[Backup]:
+    """Return the finished backups in a directory, oldest first; none where there is no such directory."""
+    found = []
+    for path in sorted(directory.glob("rigcal-*")) if directory.is_dir() else ():
+        if _NAME.fullmatch(path.name):
+            with contextlib.suppress(StoreError):
+                found.append(read_backup(path))
+    return found
+
+
+def read_backup(path: Path) -> Backup:
+    """Return what a backup says of itself.
+
+    Raises:
+        StoreError: it is none, was never finished, or is of a later form.
+    """
+    try:
+        about = json.loads((path / ABOUT).read_text(encoding="utf-8"))
+        form = int(about["form"])
+        backup = Backup(path, int(about["made_utc_ns"]), int(about["size_bytes"]), str(about["rigcal"]))
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise StoreError(f"{path}: no backup of rigcal, or one that was never finished ({ABOUT}: {error})") from error
+    if form > FORM:
+        raise StoreError(f"{path}: a backup of form {form}, made by rigcal {backup.rigcal}; install that version")
+    return backup
+
+
+def make_backup(store: Path, models: Path, directory: Path, keep: int, now_utc_ns: int, go_on: GoOn) -> Backup:
+    """Copy a store and its models, verify the copy, and delete the oldest backups.
+
+    Args:
+        store: the database; the daemon may write to it, and what it had committed is copied.
+        models: directory of the models.
+        directory: where backups are; made if need be.
+        keep: how many stay, this one among them.
+        now_utc_ns: the instant that it is named by.
+        go_on: called again and again; what it raises ends the work and leaves no backup.
+
+    Raises:
+        StoreError: there is no room, the file system refuses, or the copy is not sound; earlier backups stay.
+    """
+    name = f"rigcal-{datetime.fromtimestamp(now_utc_ns // 10**9, UTC):%Y%m%dT%H%M%SZ}"
+    target, scratch = directory / name, directory / f".{name}{_UNFINISHED}"
+    with storage_errors(directory):
+        directory.mkdir(parents=True, exist_ok=True)
+        for left in directory.glob(f".rigcal-*{_UNFINISHED}"):  # of one that was killed
+            shutil.rmtree(left)
+        if target.exists():
+            raise StoreError(f"{target} exists: a backup was made within the last second")
+        _require_room(directory, _size(store) + _size(models))
+        scratch.mkdir()
+        try:
+            _copy_store(store, scratch / STORE, go_on)
+            _copy_models(models, scratch / MODELS, go_on)
+            _require_sound(check_store(scratch / STORE, scratch / MODELS, go_on), scratch / STORE)
+            size = _size(scratch)
+            about = {
+                "form": FORM,
+                "made_utc_ns": now_utc_ns,
+                "size_bytes": size,
+                "rigcal": importlib.metadata.version("rigcal"),
+            }
+            write_file(scratch / ABOUT, json.dumps(about).encode() + b"\n")
+            _sync_tree(scratch)
+            scratch.rename(target)
+        except BaseException:
+            shutil.rmtree(scratch, ignore_errors=True)
+            raise
+        _sync(directory)
+        others = [made for made in backups(directory) if made.path != target]  # whatever the clock showed then
+        for old in others[: max(0, len(others) + 1 - keep)]:
+            shutil.rmtree(old.path)
+    return read_backup(target)
+
+
+def restore_backup(backup: Path, store: Path, models: Path, now_utc_ns: int, go_on: GoOn) -> Path | None:
+    """Put a backup in the place of a store and its models; these are kept beside.
+
+    Args:
+        backup: its directory.
+        store: the database to be replaced, or made.
+        models: directory of the models, likewise.
+        now_utc_ns: names the directory that what was replaced is moved to.
+        go_on: as of `make_backup`.
+
+    Returns:
+        The directory with what was replaced; None where there was nothing.
+
+    Raises:
+        StoreBusyError: a daemon runs on the store.
+        StoreError: the backup is damaged, or made by a newer rigcal, or the file system refuses; all is as it was.
+    """
+    read_backup(backup)
+    with storage_errors(store):
+        store.parent.mkdir(parents=True, exist_ok=True)
+    lock = WriterLock(store)
+    try:
+        with storage_errors(store):
+            _require_sound(check_store(backup / STORE, backup / MODELS, go_on), backup / STORE)
+            _require_room(store.parent, _size(backup))
+            scratch = store.parent / f".rigcal-restore{_UNFINISHED}"
+            shutil.rmtree(scratch, ignore_errors=True)
+            try:
+                shutil.copytree(backup, scratch)
+                _sync_tree(scratch)
+                aside = store.parent / f"replaced-{datetime.fromtimestamp(now_utc_ns // 10**9, UTC):%Y%m%dT%H%M%SZ}"
+                moves = [(beside, aside / beside.name) for beside in _files_of(store) if beside.exists()]
+                moves += [(models, aside / MODELS)] if models.exists() else []
+                had_some = bool(moves)
+                _move_all([*moves, (scratch / STORE, store), (scratch / MODELS, models)])
+            finally:
+                shutil.rmtree(scratch, ignore_errors=True)
+            _sync(store.parent)
+    finally:
+        lock.release()
+    return aside if had_some else None
+
+
+def _files_of(store: Path) -> list[Path]:
+    return [store.with_name(store.name + suffix) for suffix in BESIDE]
+
+
+def _move_all(moves: list[tuple[Path, Path]]) -> None:
+    """Rename files and directories in order; where one cannot be, the others are put back."""
+    done: list[tuple[Path, Path]] = []
+    try:
+        for source, target in moves:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            source.rename(target)
+            done.append((source, target))
+    except OSError:
+        for source, target in reversed(done):
+            target.rename(source)
+        raise
+
+
+def _copy_store(store: Path, copy: Path, go_on: GoOn) -> None:
+    if not store.is_file():
+        raise StoreError(f"{store}: there is no store")
+    with (
+        contextlib.closing(sqlite3.connect(f"{store.resolve().as_uri()}?mode=ro", uri=True)) as source,
+        contextlib.closing(sqlite3.connect(copy)) as target,
+    ):
+        # Within one read transaction what the daemon commits meanwhile does not make the copy begin anew.
+        source.isolation_level = None
+        source.execute("BEGIN")
+        source.execute("SELECT count(*) FROM boots").fetchone()
+        source.backup(target, pages=STEP_PAGES, progress=lambda *_: go_on(), sleep=0.0)
+        # One file, that needs no other beside it to be read.
+        target.execute("PRAGMA journal_mode = DELETE")
+
+
+def _copy_models(models: Path, copy: Path, go_on: GoOn) -> None:
+    """Copy all models; a directory that is being written, whose name begins with a dot, is none yet."""
+    copy.mkdir()
+    for directory in sorted(models.iterdir()) if models.is_dir() else ():
+        if directory.is_dir() and not directory.name.startswith("."):
+            go_on()
+            shutil.copytree(directory, copy / directory.name)
+
+
+def _require_sound(found: Soundness, path: Path) -> None:
+    if found.findings:
+        raise StoreError(f"{path}: not sound, and not used: {'; '.join(found.findings)}")
+
+
+def _require_room(directory: Path, needed_bytes: int) -> None:
+    free_bytes = shutil.disk_usage(directory).free
+    if free_bytes < needed_bytes + RESERVE_BYTES:
+        raise StoreError(
+            f"{directory}: {free_bytes / 2**20:.0f} MiB are free, and {(needed_bytes + RESERVE_BYTES) / 2**20:.0f} MiB "
+            "are needed: free space there, or name a directory on another disk"
+        )
+
+
+def _size(path: Path) -> int:
+    """Return the bytes of a file, or of all files in a directory; 0 where there is nothing."""
+    return sum(file.stat().st_size for file in _walk(path))
+
+
+def _walk(path: Path) -> Iterator[Path]:
+    if path.is_file():
+        yield path
+    elif path.is_dir():
+        yield from (file for file in path.rglob("*") if file.is_file())
+
+
+def _sync_tree(path: Path) -> None:
+    for file in (path, *path.rglob("*")):
+        _sync(file)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

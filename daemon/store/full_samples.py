@@ -1,0 +1,98 @@
+"""Readings and fixes of a stretch of time, made again from raw captures: what thinning left out is added."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+
+from daemon.store.reader import Reader
+from daemon.store.store import Store
+from drivers.clock import Stamp
+from drivers.readings import Fix, Reading
+
+_SAMPLES = """SELECT {0}.id, channels.name, unit, monotonic_ns FROM {0} JOIN channels ON channels.id = channel_id
+    WHERE boot_id = ? AND monotonic_ns BETWEEN ? AND ?"""
+_FIXES = "SELECT monotonic_ns FROM fixes WHERE station = ? AND boot_id = ? AND monotonic_ns BETWEEN ? AND ?"
+_SESSION = "SELECT * FROM calibration_sessions WHERE id = ?"
+# By the wall clock there is no index: a rare question, for which every chunk's row is read, without its captures.
+_STRETCHES = """SELECT first_boot_id AS boot_id, min(first_monotonic_ns) AS first_ns, max(last_monotonic_ns) AS last_ns,
+        min(first_utc_ns) AS first_utc_ns, max(last_utc_ns) AS last_utc_ns
+    FROM raw_chunks WHERE last_utc_ns >= ? AND first_utc_ns <= ? GROUP BY first_boot_id ORDER BY first_boot_id"""
+_BETWEEN = """SELECT first_boot_id AS boot_id, min(first_monotonic_ns) AS first_ns, max(last_monotonic_ns) AS last_ns,
+        min(first_utc_ns) AS first_utc_ns, max(last_utc_ns) AS last_utc_ns
+    FROM raw_chunks WHERE (last_boot_id, last_monotonic_ns) >= (?, ?) AND (first_boot_id, first_monotonic_ns) <= (?, ?)
+    GROUP BY first_boot_id ORDER BY first_boot_id"""
+
+Stretch = tuple[Stamp, Stamp]
+
+
+def put_again(store: Store, records: Sequence[Reading | Fix]) -> int:
+    """Store readings and fixes of one boot that were decoded again.
+
+    A reading takes the place of the stored one of its channel and instant. A stored fix stays as it is: observations
+    name it.
+
+    Args:
+        store: open for writing.
+        records: of a short stretch of time.
+
+    Returns:
+        How many there are now that were not there before.
+    """
+    if not records:
+        return 0
+    with store.transaction() as db:
+        boot = store.boot_row(records[0].stamp)
+        instants = [record.stamp.monotonic_ns for record in records]
+        span = boot, min(instants), max(instants)
+        added = 0
+        readings = [record for record in records if isinstance(record, Reading)]
+        keys = {(r.channel, r.unit, r.stamp.monotonic_ns) for r in readings}
+        for table in ("joint_samples", "signals"):
+            stored = store.rows(_SAMPLES.format(table), span)
+            again = [(row["id"],) for row in stored if (row["name"], row["unit"], row["monotonic_ns"]) in keys]
+            db.conn.executemany(f"DELETE FROM {table} WHERE id = ?", again)
+            added -= len(again)
+        fixes: defaultdict[str, list[Fix]] = defaultdict(list)
+        for record in records:
+            if isinstance(record, Fix):
+                fixes[record.station].append(record)
+        new: list[Reading | Fix] = list(readings)
+        for station, own in fixes.items():
+            known = {row["monotonic_ns"] for row in store.rows(_FIXES, (station, *span))}
+            new += [fix for fix in own if fix.stamp.monotonic_ns not in known]
+        store.insert_records(new)
+    return added + len(new)
+
+
+def stretches_of_session(reader: Reader, session_id: str) -> list[Stretch]:
+    """Return the stretches of captures that lie in a session, one a boot; none where there is no such session."""
+    for row in reader.rows(_SESSION, (session_id,)):
+        since = reader.stamp(row, "started_")
+        until = reader.stamp(row, "ended_") if row["ended_utc_ns"] is not None else None
+        first = row["started_boot_id"], since.monotonic_ns
+        last = (2**63 - 1, 0) if until is None else (row["ended_boot_id"], until.monotonic_ns)
+        return _stretches(reader, _BETWEEN, (*first, *last), since, until)
+    return []
+
+
+def stretches_between(reader: Reader, first_utc_ns: int, last_utc_ns: int) -> list[Stretch]:
+    """Return the stretches of captures between two instants of the wall clock, one a boot."""
+    return _stretches(reader, _STRETCHES, (first_utc_ns, last_utc_ns), None, None)
+
+
+def _stretches(
+    reader: Reader, sql: str, parameters: Sequence[int], since: Stamp | None, until: Stamp | None
+) -> list[Stretch]:
+    boots = reader.boots()
+    found = []
+    for row in reader.rows(sql, parameters):
+        boot = boots[row["boot_id"]]
+        first = Stamp(row["first_utc_ns"], row["first_ns"], boot)
+        last = Stamp(row["last_utc_ns"], row["last_ns"], boot)
+        if since is not None and since.boot_id == boot and since.monotonic_ns > first.monotonic_ns:
+            first = since
+        if until is not None and until.boot_id == boot and until.monotonic_ns < last.monotonic_ns:
+            last = until
+        found.append((first, last))
+    return found

@@ -1,0 +1,229 @@
+"""Looks after a store while the daemon writes to it: packs captures, deletes what may go, and makes backups.
+
+All of it is done in one thread of low priority, a bounded step at a time: acquisition comes first.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import sqlite3
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from daemon.store.backup import Backup, backups, make_backup
+from daemon.store.errors import StoreError, storage_sentence
+from daemon.store.packing import Packing
+from daemon.store.retention import Retention, cutoff_ns, room
+from daemon.store.store import Store
+from drivers.clock import NS_PER_S, Clock, SystemClock
+
+log = logging.getLogger(__name__)
+
+LOOK_S = 10.0  # real seconds between looks
+PAUSE_S = 0.2  # between one step and the next
+ROOM_S = 60.0  # between two looks at the room
+STOP_S = 5.0
+NICE = 15
+DAY_S = 86_400.0
+# By age, no more than this many days of records go in one day: a clock that is set wrongly must not cost a year.
+AGED_DAYS = 7.0
+BACKUP_AFTER_S = 600.0  # of running: not in the midst of a start
+BACKUP_RETRY_S = 3600.0
+
+
+class _StoppedError(Exception):
+    """The daemon stops; a backup in work is given up."""
+
+
+@dataclass(frozen=True)
+class Keeping:
+    """What the store keeps.
+
+    Attributes:
+        keep_days: older captures outside sessions go; None for no such limit.
+        free_bytes: room that the store should have.
+        models: directory of the models.
+        backup_directory: of daily backups; None for none.
+        backups: how many are kept.
+    """
+
+    keep_days: float | None
+    free_bytes: int
+    models: Path
+    backup_directory: Path | None
+    backups: int
+
+
+@dataclass(frozen=True)
+class KeepingState:
+    """How it goes.
+
+    Attributes:
+        is_short: there is less room than there should be.
+        deleted_until_utc_ns: for want of room captures up to this instant were deleted outside sessions; None if none
+            were.
+        has_nothing_left: there is too little room, and nothing that may go.
+        newest_backup_utc_ns: when the newest backup was made; None without one.
+        backup_error: why the last one could not be made; "" where it could.
+        has_backups: they are configured.
+    """
+
+    is_short: bool = False
+    deleted_until_utc_ns: int | None = None
+    has_nothing_left: bool = False
+    newest_backup_utc_ns: int | None = None
+    backup_error: str = ""
+    has_backups: bool = False
+
+
+class Housekeeping:
+    """Looks after a store, in a thread of its own.
+
+    Args:
+        store: open for writing.
+        clock: for the age of captures, and names of backups.
+        keeping: what is kept.
+
+    Attributes:
+        state: how it goes; to be read from any thread.
+    """
+
+    def __init__(self, store: Store, clock: Clock, keeping: Keeping) -> None:
+        self._store, self._clock, self._keeping = store, clock, keeping
+        self._packing, self._retention = Packing(store), Retention(store)
+        self._real = SystemClock()
+        self._turn = threading.Lock()  # of steps: a command may delete as well
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._began_ns = self._real.monotonic_ns()
+        self._next_room_s = 0.0
+        self._next_backup_s = BACKUP_AFTER_S
+        self._aged_until: tuple[float, int] | None = None  # running time of the next pass by age, and where it ends
+        directory = keeping.backup_directory
+        self.state = KeepingState(has_backups=directory is not None, newest_backup_utc_ns=self._newest_backup())
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread = threading.Thread(target=self._run, name="housekeeping", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End after the step in work. Harmless when not started."""
+        self._stopping.set()
+        if self._thread is not None:
+            self._thread.join(STOP_S)
+
+    def _run(self) -> None:
+        with contextlib.suppress(OSError):  # this thread alone
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
+        pause_s = LOOK_S
+        while not self._stopping.wait(pause_s):
+            pause_s = PAUSE_S if self.step() else LOOK_S
+
+    def step(self) -> bool:
+        """Do a bounded piece of what is due; only a backup takes as long as it takes.
+
+        Returns:
+            Whether there may be more.
+        """
+        try:
+            with self._turn:
+                return self._make_room() or self._packing.pack_next() or self._forget_old() or self._back_up()
+        except sqlite3.Error as error:
+            log.warning("the store is not looked after for now: %s", storage_sentence(self._store.path, error))
+        except (StoreError, OSError) as error:
+            log.warning("the store is not looked after for now: %s", error)
+        return False
+
+    def prune(self, older_than_ns: int, go_on: Callable[[], None]) -> int | None:
+        """Delete all captures outside sessions that are older; as a command, in any thread.
+
+        Args:
+            older_than_ns: UTC.
+            go_on: called between steps; what it raises ends the work.
+
+        Returns:
+            UTC in ns of the newest that was deleted; None where there was nothing to delete.
+        """
+        newest: int | None = None
+        while True:
+            go_on()
+            with self._turn:
+                deleted = self._retention.delete_oldest(older_than_ns)
+            if deleted is None:
+                return newest
+            newest = deleted
+
+    def _running_s(self) -> float:
+        return (self._real.monotonic_ns() - self._began_ns) / NS_PER_S
+
+    def _make_room(self) -> bool:
+        if self._running_s() < self._next_room_s:
+            return False
+        found = room(self._store, self._keeping.free_bytes)
+        if not found.is_short:
+            if self.state.is_short:
+                log.info("%s: there is room again", self._store.path)
+                self.state = replace(self.state, is_short=False, has_nothing_left=False)
+            self._next_room_s = self._running_s() + ROOM_S
+            return False
+        if not self.state.is_short:
+            log.warning("%s: little room is left; the oldest captures outside sessions are deleted", self._store.path)
+        deleted = self._retention.delete_oldest()
+        if deleted is None:
+            self.state = replace(self.state, is_short=True, has_nothing_left=True)
+            self._next_room_s = self._running_s() + ROOM_S
+            return False
+        self.state = replace(self.state, is_short=True, has_nothing_left=False, deleted_until_utc_ns=deleted)
+        return True
+
+    def _forget_old(self) -> bool:
+        if self._keeping.keep_days is None:
+            return False
+        limit_ns = cutoff_ns(self._clock.now().utc_ns, self._keeping.keep_days)
+        if limit_ns is None:
+            return False
+        if self._aged_until is None or self._running_s() >= self._aged_until[0]:
+            oldest = self._retention.oldest_ns()
+            if oldest is None:
+                return False
+            self._aged_until = self._running_s() + DAY_S, oldest + round(AGED_DAYS * DAY_S * NS_PER_S)
+        return self._retention.delete_oldest(min(limit_ns, self._aged_until[1])) is not None
+
+    # ---- backups ---------------------------------------------------------------------------------------------------
+
+    def _newest_backup(self) -> int | None:
+        directory = self._keeping.backup_directory
+        made: list[Backup] = [] if directory is None else backups(directory)
+        return made[-1].made_utc_ns if made else None
+
+    def _back_up(self) -> bool:
+        directory = self._keeping.backup_directory
+        if directory is None or self._running_s() < self._next_backup_s:
+            return False
+        now_ns = self._clock.now().utc_ns
+        newest = self.state.newest_backup_utc_ns
+        if newest is not None and abs(now_ns - newest) < DAY_S * NS_PER_S:
+            return False
+        self._next_backup_s = self._running_s() + BACKUP_RETRY_S
+        keep = self._keeping.backups
+        try:
+            made = make_backup(self._store.path, self._keeping.models, directory, keep, now_ns, self._go_on)
+        except _StoppedError:
+            return False
+        except (StoreError, OSError) as error:
+            if str(error) != self.state.backup_error:
+                log.error("no backup was made: %s", error)
+            self.state = replace(self.state, backup_error=str(error))
+            return False
+        log.info("backup %s made and verified, %.0f MiB", made.path, made.size_bytes / 2**20)
+        self.state = replace(self.state, backup_error="", newest_backup_utc_ns=made.made_utc_ns)
+        return False
+
+    def _go_on(self) -> None:
+        if self._stopping.is_set():
+            raise _StoppedError

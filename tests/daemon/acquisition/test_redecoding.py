@@ -1,0 +1,109 @@
+"""What thinning leaves out is made again from raw captures, as it would have been stored in a session."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon.acquisition.link_decoders import LinkDecoders
+from daemon.acquisition.redecoding import redecode
+from daemon.acquisition.store_commands import redecode_command
+from daemon.acquisition.thinning import Thinning
+from daemon.commands import CommandError
+from daemon.composition import decoders
+from daemon.config import load_rig, parse_config
+from daemon.service import declare_channels
+from daemon.store import Store
+from daemon.store.full_samples import stretches_between
+from daemon.store.packing import Packing
+from drivers.clock import NS_PER_S, Stamp
+from drivers.readings import Capture
+from tests.bench.store_growth import CONFIG, UTC_0_NS, traffic
+from tests.daemon.store_support import table
+
+SECONDS = 6.0
+SOURCE = load_rig("swdt82")
+DECODERS = decoders(parse_config(CONFIG, Path.cwd()), SOURCE)
+TABLES = {
+    "joint_samples": ("channel_id", "value", "status", "raw_counts"),
+    "signals": ("channel_id", "value", "status"),
+    "fixes": ("station", "status", "hz_angle_rad", "slope_distance_m"),
+}
+
+
+@pytest.fixture(scope="module")
+def sent() -> list[list[Capture]]:
+    return list(traffic(SECONDS, 1))
+
+
+def stored(path: Path, sent: list[list[Capture]], is_of_session: Callable[[Stamp], bool]) -> Store:
+    store = Store(path)
+    declare_channels(store, SOURCE.rig)
+    decoding, thinning = LinkDecoders(DECODERS), Thinning(is_of_session)
+    for batch in sent:
+        ids = store.append_captures(batch)
+        with store.transaction():
+            store.insert_records(thinning.kept(decoding.feed_and_tick(batch)))
+            store.mark_decoded(ids)
+    return store
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory: pytest.TempPathFactory, sent: list[list[Capture]]) -> Path:
+    path = tmp_path_factory.mktemp("full") / "rigcal.sqlite"
+    stored(path, sent, lambda _: True).close()
+    return path
+
+
+@pytest.fixture
+def thinned(tmp_path: Path, sent: list[list[Capture]]) -> Iterator[Store]:
+    with contextlib.closing(stored(tmp_path / "rigcal.sqlite", sent, lambda _: False)) as store:
+        yield store
+
+
+def facts(path: Path, name: str, since: Stamp, until: Stamp) -> set[tuple[Any, ...]]:
+    return {
+        (row["monotonic_ns"], *(row[column] for column in TABLES[name]))
+        for row in table(path, name)
+        if since.monotonic_ns <= row["monotonic_ns"] <= until.monotonic_ns
+    }
+
+
+def test_a_stretch_has_all_readings_and_fixes_again_and_each_once(full: Path, thinned: Store) -> None:
+    while Packing(thinned).pack_next():
+        pass
+    since, until = (Stamp(UTC_0_NS + s * NS_PER_S, s * NS_PER_S, "bench") for s in (2, 4))
+    before = {name: len(table(thinned.path, name)) for name in TABLES}
+    assert before["joint_samples"] < 0.1 * len(table(full, "joint_samples"))
+    added = redecode(thinned, DECODERS, [(since, until)])
+    after = {name: len(table(thinned.path, name)) for name in TABLES}
+    assert added == sum(after.values()) - sum(before.values()) > 1500
+    for name in TABLES:
+        assert facts(thinned.path, name, since, until) >= facts(full, name, since, until)
+        rows = [(row["monotonic_ns"], row[TABLES[name][0]]) for row in table(thinned.path, name)]
+        assert len(rows) == len(set(rows))
+    assert redecode(thinned, DECODERS, [(since, until)]) == 0
+
+
+def test_a_fix_that_observations_name_keeps_its_row(thinned: Store) -> None:
+    first = table(thinned.path, "fixes")[0]
+    redecode(thinned, DECODERS, [(thinned.stamp(first), thinned.stamp(first).shifted(NS_PER_S))])
+    assert table(thinned.path, "fixes")[0] == first
+
+
+def test_a_time_of_the_wall_clock_is_found_and_one_without_captures_is_refused(thinned: Store) -> None:
+    with thinned.reader() as reader:
+        ((since, until),) = stretches_between(reader, UTC_0_NS + 2 * NS_PER_S, UTC_0_NS + 3 * NS_PER_S)
+    assert abs(since.monotonic_ns - 2 * NS_PER_S) < 0.1 * NS_PER_S  # whole chunks, which are small ones yet
+    assert abs(until.monotonic_ns - 3 * NS_PER_S) < 0.1 * NS_PER_S
+    for arguments, said in (
+        ({"session": "s009-x"}, "no captures of session 's009-x'"),
+        ({"first_utc_ns": 1, "last_utc_ns": 2}, "no captures of the time from 1970"),
+        ({"first_utc_ns": 2, "last_utc_ns": 1}, "whose end is later"),
+    ):
+        with pytest.raises(CommandError, match=said):
+            redecode_command(thinned, DECODERS, arguments, lambda: None)

@@ -1,0 +1,93 @@
+"""`rigcal store`: with the daemon running and without, each command says what it did or why it did not."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+
+from daemon.cli.main import main
+from daemon.store import Store
+from tests.daemon.idle_daemon import idle_daemon
+from tests.daemon.store_support import frame
+
+CONFIG = 'rig = "swdt82"\nstate_directory = "."\n[[can]]\nchannel = "can0"\n[store]\nbackup_directory = "backups"\n'
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    path = tmp_path / "rigcal.toml"
+    path.write_text(CONFIG, encoding="utf-8")
+    store = Store(tmp_path / "rigcal.sqlite")
+    store.mark_decoded(store.append_captures([frame(n) for n in range(10)]))
+    store.close()
+    return path
+
+
+def say(config: Path, *words: str) -> Result:
+    return CliRunner().invoke(main, ["store", *words, "--config", str(config)])
+
+
+def told(config: Path, *words: str) -> dict[str, Any]:
+    result = say(config, *words, "--json")
+    found: dict[str, Any] = json.loads(result.stdout)
+    return found
+
+
+def test_a_store_is_told_checked_backed_up_damaged_and_restored(config: Path) -> None:
+    found = told(config, "stats", "--tables")
+    assert (found["chunks"], found["small_chunks"], found["undecoded_chunks"]) == (1, 1, 0)
+    assert found["tables"]["raw_chunks"] >= 4096
+    assert told(config, "check")["is_sound"]
+    backup = told(config, "backup")["backup"]
+    assert [b["path"] for b in told(config, "backup", "--list")["backups"]] == [backup]
+    assert "all is sound" in say(config, "check", "--backup", backup).stdout
+    config.with_name("rigcal.sqlite").write_bytes(b"\0" * 8192)
+    broken = say(config, "check")
+    assert broken.exit_code == 1
+    assert "restore the store from a backup" in broken.output
+    restored = told(config, "restore", backup)
+    assert (Path(restored["replaced"]) / "rigcal.sqlite").stat().st_size == 8192
+    assert told(config, "check")["captures"] == 10
+
+
+def test_while_a_daemon_runs_it_is_asked_and_only_a_restore_is_refused(config: Path) -> None:
+    with idle_daemon(config.parent):
+        assert told(config, "check")["is_sound"]
+        backup = told(config, "backup")["backup"]
+        assert told(config, "prune", "--days", "30")["deleted_until_utc_ns"] is None  # the last hour always stays
+        refused = say(config, "redecode", "--session", "s001-r")
+        assert "no captures of session 's001-r'" in refused.stderr
+        busy = say(config, "restore", backup)
+        assert busy.exit_code == 1
+        assert "stop it first" in busy.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["prune"], "give --days"),
+        (["redecode"], "give either --session"),
+        (["redecode", "--from", "2026-01-01"], "give either --session"),
+        (["restore", "/nowhere"], "no backup of rigcal"),
+    ],
+)
+def test_wrong_use_is_one_sentence_that_says_what_to_do(config: Path, words: list[str], said: str) -> None:
+    result = say(config, *words)
+    assert result.exit_code != 0
+    assert said in result.stderr
+    assert "Traceback" not in result.output
+
+
+def test_no_command_makes_a_store_where_there_is_none(config: Path) -> None:
+    shutil.rmtree(config.with_name("backups"), ignore_errors=True)
+    config.with_name("rigcal.sqlite").unlink()
+    for words in (["stats"], ["check"], ["backup"], ["prune", "--days", "3"], ["redecode", "--session", "s1"]):
+        result = say(config, *words)
+        assert result.exit_code != 0
+        assert "there is no store" in result.stderr, words
+    assert not config.with_name("rigcal.sqlite").exists()

@@ -1,0 +1,198 @@
+"""A backup is whole, verified, and can be put back; a damaged or a newer one never takes a good store's place."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import shutil
+import sqlite3
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from daemon.store import Reader, Store, StoreBusyError, StoreError
+from daemon.store.backup import backups, make_backup, restore_backup
+from daemon.store.housekeeping import BACKUP_AFTER_S, Housekeeping, Keeping
+from daemon.store.soundness import MANIFEST, check_store
+from drivers.clock import NS_PER_S, ManualClock
+from tests.daemon.damage import small_disk
+from tests.daemon.store_support import UTC_0, at, frame, table
+
+
+def nothing() -> None:
+    pass
+
+
+class Site:
+    """A state directory with a store and a live model, and a directory of backups."""
+
+    def __init__(self, directory: Path) -> None:
+        self.path, self.models = directory / "state" / "rigcal.sqlite", directory / "state" / "models"
+        self.backups = directory / "backups"
+        self.path.parent.mkdir()
+        self.store = Store(self.path)
+        for n in range(20):
+            self.store.mark_decoded(self.store.append_captures([frame(n)]))
+        model = self.models / "00001-gap"
+        model.mkdir(parents=True)
+        (model / MANIFEST).write_text('{"a": 1}')
+        (model / "model.json").write_text("{}")
+        (self.models / ".rigcal-x").mkdir()  # one that is being written
+        manifest = hashlib.sha256((model / MANIFEST).read_bytes()).hexdigest()
+        row = {"rig": "swdt82", "path": str(model), "manifest_sha256": manifest, "stage": "hybrid", "state": "live"}
+        self.store.insert("models", row | self.store.instant(at(0.0), "created_"))
+
+    def back_up(self, day: int = 0, keep: int = 3) -> Path:
+        return make_backup(self.path, self.models, self.backups, keep, UTC_0 + day * 86_400 * NS_PER_S, nothing).path
+
+    def restore(self, backup: Path) -> Path | None:
+        return restore_backup(backup, self.path, self.models, UTC_0, nothing)
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
+    site = Site(tmp_path)
+    yield site
+    site.store.close()
+
+
+def captures(path: Path) -> int:
+    with Reader(path) as reader:
+        return len(list(reader.captures()))
+
+
+def test_a_backup_of_a_store_that_is_written_to_is_restored_with_its_live_model(site: Site) -> None:
+    stop = threading.Event()
+
+    def write() -> None:
+        while not stop.is_set():
+            site.store.append_captures([frame(99)])
+
+    writing = threading.Thread(target=write)
+    writing.start()
+    try:
+        backup = site.back_up()
+    finally:
+        stop.set()
+        writing.join()
+    assert {path.name for path in backup.iterdir()} == {"rigcal.sqlite", "models", "backup.json"}
+    assert {path.name for path in (backup / "models").iterdir()} == {"00001-gap"}
+    held = captures(backup / "rigcal.sqlite")
+    assert 20 <= held <= captures(site.path)
+    site.store.close()
+    shutil.rmtree(site.models)
+    site.path.write_bytes(b"rust")
+    aside = site.restore(backup)
+    assert aside is not None
+    assert (aside / "rigcal.sqlite").read_bytes() == b"rust"
+    assert check_store(site.path, site.models).findings == ()
+    assert (site.models / "00001-gap" / "model.json").read_text() == "{}"
+    with contextlib.closing(Store(site.path)) as again:
+        assert again.number("SELECT sum(captures) FROM raw_chunks", []) == held
+
+
+def test_nothing_is_restored_under_a_running_daemon(site: Site) -> None:
+    backup = site.back_up()
+    before = table(site.path, "raw_chunks")
+    with pytest.raises(StoreBusyError, match="stop it first"):
+        site.restore(backup)
+    assert table(site.path, "raw_chunks") == before
+
+
+def test_a_backup_of_a_newer_program_is_refused_by_name(site: Site) -> None:
+    site.store.rows("SELECT 1")
+    backup = site.back_up()
+    with contextlib.closing(sqlite3.connect(backup / "rigcal.sqlite")) as db, db:
+        db.execute("UPDATE _sqlite_migrations SET name = 'm999_tomorrow' WHERE name LIKE 'm015%'")
+    site.store.close()
+    with pytest.raises(StoreError, match="made by a newer rigcal"):
+        site.restore(backup)
+    assert captures(site.path) == 20
+
+
+@pytest.mark.parametrize("damage", ["page", "chunk", "model", "unfinished", "form"])
+def test_a_damaged_backup_takes_no_good_stores_place(site: Site, damage: str) -> None:
+    backup = site.back_up()
+    if damage == "page":
+        with (backup / "rigcal.sqlite").open("r+b") as file:
+            file.seek(3 * 4096)
+            file.write(b"\xa5" * 4096)
+    elif damage == "chunk":
+        with contextlib.closing(sqlite3.connect(backup / "rigcal.sqlite")) as db, db:
+            db.execute("UPDATE raw_chunks SET chunk = zeroblob(200) WHERE id = 7")
+    elif damage == "model":
+        (backup / "models" / "00001-gap" / MANIFEST).write_text('{"a": 2}')
+    elif damage == "unfinished":
+        (backup / "backup.json").unlink()
+    else:
+        about = json.loads((backup / "backup.json").read_text())
+        (backup / "backup.json").write_text(json.dumps(about | {"form": 2}))
+    site.store.close()
+    with pytest.raises(StoreError, match=r"not sound|no backup|form 2"):
+        site.restore(backup)
+    assert captures(site.path) == 20
+    assert not [path for path in site.path.parent.iterdir() if not path.name.startswith(("models", "rigcal.sqlite"))]
+
+
+def test_the_oldest_backups_go_once_a_new_one_is_sound(site: Site) -> None:
+    made = [site.back_up(day, keep=2) for day in range(3)]
+    assert [backup.path for backup in backups(site.backups)] == made[1:]
+    site.store.update("raw_chunks", {"id": 3}, {"chunk": b"RCAP and nonsense"})
+    with pytest.raises(StoreError, match="raw chunk 3"):
+        site.back_up(3, keep=2)
+    assert [backup.path for backup in backups(site.backups)] == made[1:]
+    assert not list(site.backups.glob(".*"))
+    site.store.update("raw_chunks", {"id": 3}, {"chunk": table(made[2] / "rigcal.sqlite", "raw_chunks")[2]["chunk"]})
+    earlier = site.back_up(-100, keep=2)  # the clock was set back: it stays all the same
+    assert [backup.path for backup in backups(site.backups)] == [earlier, made[2]]
+
+
+def test_a_backup_that_is_given_up_or_killed_leaves_nothing_that_counts(site: Site) -> None:
+    left = site.backups / ".rigcal-20200101T000000Z.unfinished"
+    left.mkdir(parents=True)
+
+    def give_up() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_backup(site.path, site.models, site.backups, 3, UTC_0, give_up)
+    assert list(site.backups.iterdir()) == []
+
+
+def test_a_disk_without_room_for_a_backup_is_told_before_it_is_filled(site: Site, tmp_path: Path) -> None:
+    with (
+        small_disk(tmp_path / "small", 1024) as place,
+        pytest.raises(StoreError, match=r"MiB are free.*name a directory on another disk"),
+    ):
+        make_backup(site.path, site.models, place / "backups", 3, UTC_0, nothing)
+
+
+def test_the_daemon_makes_one_a_day_and_tells_when_it_cannot(
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daemon.store.housekeeping.BACKUP_RETRY_S", 0.0)
+    clock = ManualClock(at(0.0))
+    keeping = Keeping(None, 0, site.models, site.backups, 3)
+    housekeeping = Housekeeping(site.store, clock, keeping)
+    housekeeping._began_ns -= round(BACKUP_AFTER_S * NS_PER_S)
+    for _ in range(3):
+        housekeeping.step()
+    assert len(backups(site.backups)) == 1
+    clock.advance(90_000.0)
+    (site.models / "00001-gap" / MANIFEST).unlink()
+    while housekeeping.step():
+        pass
+    assert "manifest.json cannot be read" in housekeeping.state.backup_error
+    assert len(backups(site.backups)) == 1
+    again = Housekeeping(site.store, clock, keeping)
+    assert again.state.newest_backup_utc_ns == at(0.0).utc_ns // NS_PER_S * NS_PER_S
+
+
+def test_a_check_names_what_is_damaged(site: Site) -> None:
+    assert check_store(site.path, site.models).captures == 20
+    site.store.update("raw_chunks", {"id": 5}, {"chunk": b"RCAP and nonsense"})
+    (finding,) = check_store(site.path, site.models).findings
+    assert finding.startswith("raw chunk 5: ")

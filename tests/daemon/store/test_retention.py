@@ -1,0 +1,225 @@
+"""What may go goes, the oldest first; no session, nothing that was captured in it, and nothing new ever does."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from daemon.store import Reader, Store
+from daemon.store.housekeeping import Housekeeping, Keeping
+from daemon.store.retention import Retention, cutoff_ns, room
+from drivers.clock import NS_PER_S, ManualClock, Stamp
+from drivers.readings import Capture, Fix, Reading
+from tests.daemon.damage import small_disk
+from tests.daemon.store_support import at, fix, frame, reading, table
+
+MINUTE_S = 60.0
+NOW_NS = 1_800_000_000 * NS_PER_S  # of the wall clock, at 0 s
+DAY_S = 86_400.0
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "rigcal.sqlite"
+
+
+@pytest.fixture
+def store(path: Path) -> Iterator[Store]:
+    with contextlib.closing(Store(path)) as store:
+        store.declare_channels({"theta1": "deg"}, {"valve": "mA"})
+        yield store
+
+
+def fill(store: Store, minutes: int, begin_s: float = 0.0, boot: str = "boot-a", utc_ns: int = NOW_NS) -> None:
+    """A chunk a minute, with what was decoded of it."""
+
+    def when(seconds: float) -> Stamp:
+        stamp = at(begin_s + seconds, boot)
+        return replace(stamp, utc_ns=stamp.utc_ns - at(0.0).utc_ns + utc_ns)
+
+    with store.transaction():
+        for minute in range(minutes):
+            second = minute * MINUTE_S
+            captures = [replace(frame(n), stamp=when(second + n)) for n in range(3)]
+            store.mark_decoded(store.append_captures(captures))
+            records: list[Reading | Fix] = [
+                replace(reading(channel, 0.0, 1.0, unit), stamp=when(second))
+                for channel, unit in (("theta1", "deg"), ("valve", "mA"))
+            ]
+            store.insert_records([*records, replace(fix(0.0), stamp=when(second), last_byte=when(second))])
+
+
+def session(store: Store, name: str, since: Stamp, until: Stamp | None, state: str = "closed") -> None:
+    about = {
+        "id": name,
+        "rig": "swdt82",
+        "rig_sha256": "",
+        "rig_text": "",
+        "prism": "r",
+        "operator": "",
+        "state": state,
+    }
+    ended = {} if until is None else store.instant(until, "ended_")
+    store.insert("calibration_sessions", about | {"kind": "static_poses"} | store.instant(since, "started_") | ended)
+
+
+def minutes_left(path: Path, boot: str = "boot-a") -> list[int]:
+    with Reader(path) as reader:
+        captures: list[Capture] = [c for c in reader.captures() if c.stamp.boot_id == boot]
+    return sorted({round((c.stamp.monotonic_ns - at(0.0).monotonic_ns) / NS_PER_S) // 60 for c in captures})
+
+
+def delete_all(store: Store, older_than_ns: int | None = None) -> int:
+    retention = Retention(store)
+    return sum(1 for _ in iter(lambda: retention.delete_oldest(older_than_ns), None))
+
+
+def test_all_but_sessions_and_the_last_hour_may_go_for_room(path: Path, store: Store) -> None:
+    fill(store, 200)
+    session(store, "s1", at(50 * MINUTE_S), at(60 * MINUTE_S))
+    session(store, "s2", at(90 * MINUTE_S), at(95 * MINUTE_S), "aborted")
+    assert delete_all(store) > 0
+    left = minutes_left(path)
+    in_sessions = [*range(49, 61), *range(89, 96)]  # a minute before, and a little after
+    assert left[: len(in_sessions)] == in_sessions
+    assert left[len(in_sessions) :] == [*range(139, 200)]
+    for name in ("joint_samples", "signals", "fixes"):
+        rows = {(row["monotonic_ns"] - at(0.0).monotonic_ns) // (60 * NS_PER_S) for row in table(path, name)}
+        assert rows >= set(left)
+        assert not rows & {*range(45), *range(65, 88), *range(100, 135)}
+    with contextlib.closing(sqlite3.connect(path)) as db:
+        assert db.execute("PRAGMA foreign_key_check").fetchall() == []
+
+
+def test_what_was_captured_in_an_open_session_stays_in_every_boot(path: Path, store: Store) -> None:
+    fill(store, 30)
+    session(store, "s1", at(20 * MINUTE_S), None, "open")
+    fill(store, 300, boot="boot-b")
+    delete_all(store)
+    assert minutes_left(path) == [*range(19, 30)]
+    assert minutes_left(path, "boot-b") == [*range(300)]
+
+
+def test_only_what_is_older_goes_by_age(path: Path, store: Store) -> None:
+    fill(store, 100)
+    fill(store, 100, begin_s=10 * DAY_S)
+    assert delete_all(store, NOW_NS + round(5 * DAY_S * NS_PER_S)) == 5  # steps of 20 chunks
+    assert minutes_left(path)[0] == round(10 * DAY_S / 60)
+    assert delete_all(store, NOW_NS + round(5 * DAY_S * NS_PER_S)) == 0
+
+
+def test_captures_of_a_clock_that_was_not_set_are_as_old_as_those_after_them(path: Path, store: Store) -> None:
+    fill(store, 5, utc_ns=0)  # 1970, then NTP
+    fill(store, 200, begin_s=400.0)
+    assert delete_all(store, NOW_NS) == 0
+    assert minutes_left(path)[:5] == [0, 1, 2, 3, 4]
+    assert delete_all(store, NOW_NS + round(3600 * NS_PER_S)) > 0
+    assert minutes_left(path)[0] == 60
+
+
+def test_what_waits_to_be_decoded_stays(path: Path, store: Store) -> None:
+    waiting = store.append_captures([frame(0, 0.0)])
+    fill(store, 120, begin_s=10.0)
+    delete_all(store)
+    assert store.undecoded_chunks() == waiting
+    assert len(table(path, "raw_chunks")) == 1 + 61
+
+
+def test_a_fix_that_an_observation_names_stays(path: Path, store: Store) -> None:
+    fill(store, 100)
+    session(store, "s1", at(90 * MINUTE_S), at(95 * MINUTE_S))
+    observation = {"session_id": "s1", "fix_id": 1, "prism": "r", "x_mm": 0.0, "y_mm": 0.0, "z_mm": 0.0}
+    observation |= {"moving": 0, "values_json": {}}
+    store.insert("observations", observation | store.instant(at(0.0)))
+    delete_all(store)
+    assert table(path, "fixes")[0]["id"] == 1
+    assert table(path, "observations")[0]["fix_id"] == 1
+
+
+def test_freed_pages_are_used_again_and_are_room(path: Path, store: Store) -> None:
+    fill(store, 400)
+    before = room(store, 2**30)
+    pages = store.pragma("page_count")
+    delete_all(store)
+    assert room(store, 2**30).inside_bytes > before.inside_bytes
+    fill(store, 200, begin_s=DAY_S)
+    assert store.pragma("page_count") <= pages + 5
+
+
+def test_deleting_reads_by_indexes(store: Store) -> None:
+    from daemon.store import retention
+
+    fill(store, 3)
+    statements = {
+        retention._CHUNKS: (0, 0, 9, 9, 20),
+        retention._ROWS.format("joint_samples"): (0, 0, 9, 9, 20),
+        retention._ROWS.format("signals"): (0, 0, 9, 9, 20),
+        retention._ROWS.format("decode_failures"): (0, 0, 9, 9, 20),
+        retention._FIXES: (0, 0, 9, 9, 20, "ts1"),
+        retention._NEWEST: (),
+    }
+    for sql, parameters in statements.items():
+        plan = str(store.rows(f"EXPLAIN QUERY PLAN {sql}", parameters))
+        assert "SEARCH" in plan or "USING COVERING INDEX" in plan
+        assert "SCAN observations" not in plan
+        assert not any(f"SCAN {name}'" in plan for name in ("raw_chunks", "joint_samples", "signals", "fixes")), plan
+
+
+# ---- as the daemon does it -------------------------------------------------------------------------------------------
+
+
+def keeping(path: Path, **changes: object) -> Keeping:
+    kept = Keeping(keep_days=None, free_bytes=0, models=path.parent / "models", backup_directory=None, backups=2)
+    return replace(kept, **changes)  # type: ignore[arg-type]
+
+
+def run(housekeeping: Housekeeping) -> int:
+    return sum(1 for _ in iter(housekeeping.step, False))
+
+
+def test_want_of_room_deletes_the_oldest_and_tells(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "small", 16_000) as place:
+        path = place / "rigcal.sqlite"
+        with contextlib.closing(Store(path)) as store:
+            store.declare_channels({"theta1": "deg"}, {"valve": "mA"})
+            fill(store, 400)
+            clock = ManualClock(at(400 * MINUTE_S))
+            wanted = keeping(path, free_bytes=2**60)  # of which a tenth of the disk counts
+            easy = Housekeeping(store, clock, wanted)
+            run(easy)
+            assert not easy.state.is_short
+            usage = shutil.disk_usage(place)
+            (place / "ballast").write_bytes(bytes(usage.free - round(0.08 * usage.total)))
+            housekeeping = Housekeeping(store, clock, wanted)
+            assert housekeeping.step()
+            assert housekeeping.state.is_short
+            assert not housekeeping.state.has_nothing_left
+            run(housekeeping)
+            assert housekeeping.state.deleted_until_utc_ns is not None
+            assert minutes_left(path)[-1] == 399
+            if housekeeping.state.is_short:
+                assert housekeeping.state.has_nothing_left
+                assert minutes_left(path)[0] == 400 - 61
+            else:  # before all was deleted that might go
+                assert 0 < minutes_left(path)[0] <= 400 - 61
+
+
+def test_age_deletes_at_most_a_week_of_records_a_day_whatever_the_clock_says(path: Path, store: Store) -> None:
+    for day in range(20):
+        fill(store, 3, begin_s=day * DAY_S)
+    clock = ManualClock(
+        Stamp(NOW_NS + round(50 * 365 * DAY_S) * NS_PER_S, 0, "boot-a")
+    )  # a clock that runs ahead by decades
+    run(Housekeeping(store, clock, keeping(path, keep_days=30.0)))
+    assert minutes_left(path)[0] in range(7 * 24 * 60, 7 * 24 * 60 + 3)  # by whole chunks, which were packed
+
+
+def test_a_clock_that_is_not_set_deletes_nothing() -> None:
+    assert cutoff_ns(10**9 * NS_PER_S, 30.0) is None
+    assert cutoff_ns(1_800_000_000 * NS_PER_S, 30.0) == (1_800_000_000 - 30 * 86_400) * NS_PER_S
