@@ -176,15 +176,27 @@ class Bars:
         print(f"  {what:{CELL}s} {seconds * 1000:9.1f} ms{bar}", flush=True)
         self.are_held = self.are_held and (bar_s is None or seconds <= bar_s)
 
-    def took(self, what: str, bar_s: float | None, work: Callable[[], object]) -> None:
+    def took(self, what: str, bar_s: float | None, work: Callable[..., object], *arguments: object) -> None:
         """Measure work, and print the longest of three times."""
-        self.note(what, max(_seconds(work) for _ in range(3)), bar_s)
+        self.note(what, max(_seconds(work, *arguments) for _ in range(3)), bar_s)
 
 
-def _seconds(work: Callable[[], object]) -> float:
+def _seconds(work: Callable[..., object], *arguments: object) -> float:
     begin = time.perf_counter()
-    work()
+    work(*arguments)
     return time.perf_counter() - begin
+
+
+def _observations(reader: Reader, name: str) -> int:
+    return sum(1 for _ in all_observations(reader, [name]))
+
+
+def _first_capture(reader: Reader, since: Stamp, until: Stamp) -> Capture:
+    return next(iter(reader.captures("boom", since, until)))
+
+
+def _captures(reader: Reader, since: Stamp, until: Stamp) -> int:
+    return sum(1 for _ in reader.captures(None, since, until))
 
 
 def measure(directory: Path, path: Path) -> bool:
@@ -193,33 +205,26 @@ def measure(directory: Path, path: Path) -> bool:
     bars.took("open and close the store", OPEN_S, lambda: Store(path).close())
     begin = time.perf_counter()
     with idle_daemon(directory) as running:
-        answers = _until_it_answers(running.socket_path)
-        bars.note("start of the daemon, until `status` answers", answers - begin, OPEN_S)
-        bars.took("status", STATUS_S, lambda: request(running.socket_path, "status"))
-        sessions = request(running.socket_path, "session.list")
+        socket = running.socket_path
+        bars.note("start of the daemon, until `status` answers", _until_it_answers(socket) - begin, OPEN_S)
+        bars.took("status", STATUS_S, request, socket, "status")
+        sessions = request(socket, "session.list")
         names = [sessions[0]["id"], sessions[len(sessions) // 2]["id"], sessions[-1]["id"]]
-        bars.took(
-            f"session list ({len(sessions)} sessions)", QUERY_S, lambda: request(running.socket_path, "session.list")
-        )
+        bars.took(f"session list ({len(sessions)} sessions)", QUERY_S, request, socket, "session.list")
         for name in names:
-            about = {"id": name}
-            bars.took(f"session show {name}", QUERY_S, lambda a=about: request(running.socket_path, "session.show", a))
+            bars.took(f"session show {name}", QUERY_S, request, socket, "session.show", {"id": name})
     with Reader(path) as reader:
         for name in names:
             (row,) = reader.rows("SELECT * FROM calibration_sessions WHERE id = ?", [name])
             since, until = reader.stamp(row, "started_"), reader.stamp(row, "ended_")
-            bars.took(f"observations of {name}", QUERY_S, lambda n=name: list(all_observations(reader, [n])))
-            bars.took(
-                f"first capture of {name}", QUERY_S, lambda s=since, u=until: next(iter(reader.captures("boom", s, u)))
-            )
+            bars.took(f"observations of {name}", QUERY_S, _observations, reader, name)
+            bars.took(f"first capture of {name}", QUERY_S, _first_capture, reader, since, until)
             later = until.shifted(3600 * NS_PER_S)  # where no session is
-            bars.took("captures of an instant", QUERY_S, lambda s=later: list(reader.captures("boom", s, s)))
-        bars.took("all captures of 8 minutes", None, lambda: sum(1 for _ in reader.captures(None, since, until)))
+            bars.took("captures of an instant", QUERY_S, _captures, reader, later, later)
+        bars.took("all captures of 8 minutes", None, _captures, reader, since, until)
     config = parse_config(CONFIG, path).model_copy(update={"state_directory": directory})
     with tempfile.TemporaryDirectory() as out:
-        bars.note(
-            "session export of 8 minutes", _seconds(lambda: export_session(config, names[0], Path(out), "log")), None
-        )
+        bars.note("session export of 8 minutes", _seconds(export_session, config, names[0], Path(out), "log"), None)
     return bars.are_held
 
 
@@ -251,7 +256,7 @@ def main() -> int:
     with _directory(options.keep) as directory:
         path = directory / "rigcal.sqlite"
         if not path.exists():
-            print(f"made in {_seconds(lambda: build(path, options.samples, options.seed)):.0f} s")
+            print(f"made in {_seconds(build, path, options.samples, options.seed):.0f} s")
         print(f"the store has {path.stat().st_size / 2**30:.2f} GiB")
         return int(not measure(directory, path))
 
