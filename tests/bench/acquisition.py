@@ -1,9 +1,10 @@
-"""Acquisition under a saturated bus: `python -m tests.bench.acquisition [--seconds 60] [--json]`.
+"""Acquisition under a saturated bus: `python -m tests.bench.acquisition [--seconds 60] [--jobs] [--json]`.
 
 A sending process puts 8,000 frames of 8 bytes a second on a bus between processes, and a station speaks 20 times a
 second on a pseudo-terminal. Two processes listen, side by side, to the same frames: rigcal's acquisition (links, raw
-capture, decoding, store) and python-can's own logger (`Notifier` and `SqliteWriter`). Counted is every single frame by
-the number that it carries. Exit status 1: rigcal has lost one.
+capture, decoding, store, packing) and python-can's own logger (`Notifier` and `SqliteWriter`). Counted is every single
+frame by the number that it carries. With `--jobs` calibrations with their training run beside, one after the other, as
+the daemon's jobs do: with low priority and a process for each core. Exit status 1: rigcal has lost a frame.
 """
 
 from __future__ import annotations
@@ -14,8 +15,10 @@ import multiprocessing as mp
 import os
 import resource
 import sqlite3
+import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -28,6 +31,7 @@ import can
 
 from daemon.acquisition.acquisition import Acquisition
 from daemon.store import Reader, Store
+from daemon.store.housekeeping import Housekeeping, Keeping
 from drivers.can.ports import CanLinkConfig
 from drivers.can_decoder import CanDecoder
 from drivers.can_link import CanLink
@@ -54,6 +58,8 @@ from tests.bench.traffic import (
 
 BIT_RATE = 1_000_000
 START_S = 30.0
+JOB_NICE = 10
+MEASURED = Path(__file__).parents[1] / "data" / "ur10_random_poses.csv"
 SETTLE_S = 1.0  # after the last frame, before the listeners are stopped
 POSITION_32_BIT = 0x60040020  # object 6004h.0, mapped first
 
@@ -73,10 +79,12 @@ class Cost:
 
     Attributes:
         cpu_s: user and system time of its process.
+        packing_s: of these, what packing of captures took.
         writer_lag_p99_s: age of the oldest frame of a batch when it was stored; None where it is not known.
     """
 
     cpu_s: float
+    packing_s: float = 0.0
     writer_lag_p99_s: float | None = None
 
 
@@ -88,7 +96,8 @@ class Result:
         name: which.
         frames: stored, each number once.
         lost, repeated: frames that are not there, or more than once.
-        core_share: CPU time by the time that the frames took.
+        core_share: CPU time by the time that the frames took, without packing.
+        packing_share: likewise, of packing.
         us_per_frame: CPU time by frame stored.
         writer_lag_p99_ms: see Cost.
         bytes_per_frame: size of its database by frame.
@@ -100,6 +109,7 @@ class Result:
     lost: int
     repeated: int
     core_share: float
+    packing_share: float
     us_per_frame: float
     writer_lag_p99_ms: float | None
     bytes_per_frame: float
@@ -114,6 +124,12 @@ def cpu_s() -> float:
     """CPU time of this process so far."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
+
+
+def thread_cpu_s(name: str) -> float:
+    """CPU time so far of a thread of this process (proc(5), schedstat)."""
+    (number,) = (thread.native_id for thread in threading.enumerate() if thread.name == name)
+    return int(Path(f"/proc/self/task/{number}/schedstat").read_text(encoding="ascii").split()[0]) / 1e9
 
 
 def run_rigcal(listening: Listening, station_port: str, path: Path, parent: Connection) -> None:
@@ -149,6 +165,9 @@ def run_rigcal(listening: Listening, station_port: str, path: Path, parent: Conn
         on_records=lambda _: None,
     )
     acquisition.start()
+    keeping = Keeping(keep_days=None, free_bytes=0, models=path.parent, backup_directory=None, backups=1)
+    housekeeping = Housekeeping(store, clock, keeping)
+    housekeeping.start()
     deadline = time.monotonic() + START_S
     while not all(link.up for link in acquisition.status().links) and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -156,11 +175,12 @@ def run_rigcal(listening: Listening, station_port: str, path: Path, parent: Conn
     parent.recv()
     before = cpu_s()
     parent.recv()
-    lag_s = acquisition.status().writer_lag_p99_s
+    lag_s, packing_s = acquisition.status().writer_lag_p99_s, thread_cpu_s("housekeeping")
     acquisition.stop()
+    housekeeping.stop()
     store.end_run(clock.now())
     store.close()
-    parent.send(Cost(cpu_s() - before, lag_s))
+    parent.send(Cost(cpu_s() - before, packing_s, lag_s))
 
 
 def run_python_can(listening: Listening, path: Path, parent: Connection) -> None:
@@ -220,11 +240,56 @@ class Child:
         self.process.join(START_S)
 
 
+class Jobs:
+    """Calibrations with their training, one after the other, in processes of low priority.
+
+    Attributes:
+        done: how many have ended well.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self.done = 0
+        self._data, self._out = directory / "poses.csv", directory / "model"
+        header, *rows = MEASURED.read_text(encoding="utf-8").splitlines(keepends=True)
+        self._data.write_text(header + "".join(rows[::8]), encoding="utf-8")
+        self._stopping = threading.Event()
+        self._running: subprocess.Popen[bytes] | None = None
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def start(self) -> None:
+        """Begin with the first."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End, in the midst of one."""
+        self._stopping.set()
+        if self._running is not None:
+            self._running.terminate()
+        self._thread.join()
+
+    def _run(self) -> None:
+        command = ["nice", "-n", str(JOB_NICE), sys.executable, "-m", "daemon.cli.main", "calibrate", "--rig", "ur10"]
+        command += ["--data", str(self._data), "--out", str(self._out)]
+        while not self._stopping.is_set():
+            self._running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+            said = self._running.communicate()[1]
+            if self._running.returncode == 0:
+                self.done += 1
+            elif not self._stopping.is_set():
+                raise SystemExit(f"a calibration has failed: {said.decode()}")
+
+
 # ---- the benchmark ---------------------------------------------------------------------------------------------------
 
 
-def measure(seconds: float, transport: Transport, directory: Path) -> dict[str, object]:
+def measure(seconds: float, transport: Transport, directory: Path, *, has_jobs: bool) -> dict[str, object]:
     """Run the benchmark.
+
+    Args:
+        seconds: how long frames are sent.
+        transport: the bus.
+        directory: for all files.
+        has_jobs: calibrations run beside.
 
     Returns:
         what `--json` prints.
@@ -240,6 +305,9 @@ def measure(seconds: float, transport: Transport, directory: Path) -> dict[str, 
     listeners = [rigcal, python_can]
     for child in listeners:
         child.hear(START_S)
+    jobs = Jobs(directory) if has_jobs else None
+    if jobs is not None:
+        jobs.start()
     for child in (*listeners, sender):
         child.tell()
     station.start()
@@ -247,6 +315,8 @@ def measure(seconds: float, transport: Transport, directory: Path) -> dict[str, 
     assert isinstance(took_s, float)
     time.sleep(SETTLE_S)
     station.stop()
+    if jobs is not None:
+        jobs.stop()
     for child in listeners:
         child.tell()
     costs = [child.hear(seconds + START_S) for child in listeners]
@@ -264,6 +334,7 @@ def measure(seconds: float, transport: Transport, directory: Path) -> dict[str, 
         "frames_sent": sent,
         "frames_per_s": sent / took_s,
         "fixes_sent": station.sent,
+        "calibrations": 0 if jobs is None else jobs.done,
         "results": [asdict(result) for result in results],
     }
 
@@ -308,7 +379,8 @@ def _result(
         frames=frames,
         lost=sent - frames,
         repeated=len(numbers) - frames,
-        core_share=cost.cpu_s / took_s,
+        core_share=(cost.cpu_s - cost.packing_s) / took_s,
+        packing_share=cost.packing_s / took_s,
         us_per_frame=1e6 * cost.cpu_s / max(frames, 1),
         writer_lag_p99_ms=None if cost.writer_lag_p99_s is None else 1000 * cost.writer_lag_p99_s,
         bytes_per_frame=path.stat().st_size / max(frames, 1),
@@ -326,6 +398,7 @@ def table(report: dict[str, object]) -> str:
         ("frames stored", lambda r: f"{r['frames']:,}"),
         ("frames lost", lambda r: f"{r['lost']:,}"),
         ("share of one core", lambda r: f"{100 * r['core_share']:.1f} %"),
+        ("and for packing", lambda r: f"{100 * r['packing_share']:.1f} %"),
         ("CPU per frame", lambda r: f"{r['us_per_frame']:.1f} us"),
         ("database per frame", lambda r: f"{r['bytes_per_frame']:.1f} B"),
         ("writer lag, p99", lambda r: "-" if r["writer_lag_p99_ms"] is None else f"{r['writer_lag_p99_ms']:.0f} ms"),
@@ -334,7 +407,8 @@ def table(report: dict[str, object]) -> str:
     ]
     lines = [
         f"{report['frames_sent']:,} frames in {report['seconds']:.1f} s ({report['frames_per_s']:,.0f}/s) over "
-        f"{report['transport']}, {report['fixes_sent']:,} fixes at {STATION_HZ} Hz"
+        f"{report['transport']}, {report['fixes_sent']:,} fixes at {STATION_HZ} Hz, "
+        f"{report['calibrations']} calibrations beside"
     ]
     lines += [f"{label:20}" + "".join(f"{cell(result):>26}" for result in results) for label, cell in rows]
     return "\n".join(lines)
@@ -348,12 +422,13 @@ def main() -> None:
         "--transport", choices=("udp_multicast", "slcan"), help="the bus; udp_multicast where the host has multicast"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object in place of the table")
+    parser.add_argument("--jobs", action="store_true", help="calibrations and training run beside")
     arguments = parser.parse_args()
     transport: Transport = arguments.transport or (
         "udp_multicast" if multicast_works(20_000 + os.getpid() % 20_000) else "slcan"
     )
     with tempfile.TemporaryDirectory(prefix="rigcal-bench-") as directory:
-        report = measure(arguments.seconds, transport, Path(directory))
+        report = measure(arguments.seconds, transport, Path(directory), has_jobs=arguments.jobs)
     print(json.dumps(report, indent=2) if arguments.json else table(report))
     results = report["results"]
     assert isinstance(results, list)
