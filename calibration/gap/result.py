@@ -240,6 +240,11 @@ class GapResult:
     warnings: tuple[str, ...] = ()
     machine_break: Break | None = None
 
+    @property
+    def raises_held_out(self) -> bool:
+        """True if held-out rows fit worse with the effects than without."""
+        return bool(self.effects) and self.held_out is not None and self.held_out[1] > self.held_out[0]
+
     def _effect(self, effect: FittedEffect) -> dict[str, object]:
         """Return the JSON object of one effect, with its evidence."""
         name = f"{effect.family}@{effect.where}"
@@ -260,7 +265,11 @@ class GapResult:
             "noise_source": self.noise_source,
             "holdout": None
             if self.held_out is None
-            else {"rms_before_mm": self.held_out[0], "rms_after_mm": self.held_out[1]},
+            else {
+                "rms_before_mm": self.held_out[0],
+                "rms_after_mm": self.held_out[1],
+                "is_worse": self.raises_held_out,
+            },
             "break": None if self.machine_break is None else self.machine_break.as_dict(),
             "disagreements": [d.as_dict() for d in self.disagreements],
             "experiments": [e.as_dict() for e in self.experiments],

@@ -143,7 +143,7 @@ def _answer(
         observations=observations,
         error_before_mm=error_before,
         error_after_mm=error_after,
-        warnings=tuple(_warnings(rest, model, holdout, held_out)),
+        warnings=tuple(_warnings(rest, model, holdout)),
     )
 
 
@@ -224,14 +224,10 @@ def _warnings(
     rest: Remaining,
     model: CalibratedModel,
     holdout: Observations | None,
-    held_out_mm: tuple[float, float] | None,
 ) -> Iterator[str]:
     found = rest.found
     yield from model.warnings
     yield from rest.open_places()
-    if held_out_mm is not None and held_out_mm[1] > held_out_mm[0]:
-        before, after = held_out_mm
-        yield f"the effects raise the error of the held-out rows from {before:.3g} to {after:.3g} mm RMS"
     if holdout is not None:
         yield from (f"in the held-out rows: {warning}" for warning in model_warnings(model, holdout))
     if found.formulas and found.adopted.effects:

@@ -7,7 +7,15 @@ from daemon.report.words import number, place_name, spoken
 
 
 def gap_headline(gap: GapResult) -> str:
-    """Say the verdict in one sentence."""
+    """Say the verdict in one sentence, and in a second one that held-out rows speak against it."""
+    if gap.raises_held_out and gap.held_out is not None:
+        before, after = gap.held_out
+        against = f"held-out rows fit worse with it, {number(after)} mm instead of {number(before)} mm"
+        return f"{_verdict(gap)} But {against}: do not use this model there."
+    return _verdict(gap)
+
+
+def _verdict(gap: GapResult) -> str:
     if gap.verdict == "named":
         return f"The simulation lacked {spoken([(e.family, e.where) for e in gap.effects])}."
     if gap.verdict == "none":

@@ -76,6 +76,16 @@ def test_the_verdict_is_the_headline(gap: Callable[[], GapResult], headline: str
     assert gap_headline(gap()).startswith(headline)
 
 
+def test_the_verdict_says_that_held_out_rows_fit_worse() -> None:
+    worse, better = (replace(support.named(), held_out=(0.5, after)) for after in (0.61, 0.4))
+    assert gap_headline(worse) == (
+        "The simulation lacked backlash at theta4. "
+        "But held-out rows fit worse with it, 0.610 mm instead of 0.500 mm: do not use this model there."
+    )
+    assert gap_headline(better) == "The simulation lacked backlash at theta4."
+    assert worse.as_dict()["holdout"] == {"rms_before_mm": 0.5, "rms_after_mm": 0.61, "is_worse": True}
+
+
 def test_the_coefficient_stands_with_its_interval_between_its_bounds(named: Outline) -> None:
     (line,) = intervals(support.named())
     (coefficient,) = support.named().effects[0].coefficients
