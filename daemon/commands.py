@@ -80,6 +80,12 @@ def caller_has_left() -> bool:
     return _has_left.get()()
 
 
+def go_on_for_caller() -> None:
+    """Raise CommandError if nobody waits any more for the command that this thread carries out."""
+    if caller_has_left():
+        raise CommandError("given up, as nobody waits for it any more; what was done until then stays", FAILED)
+
+
 @contextlib.contextmanager
 def acting_for(caller: Caller, has_left: Callable[[], bool] = lambda: False) -> Iterator[None]:
     """Make `caller` the current one of this thread; `has_left` tells when it no longer waits for the answer."""

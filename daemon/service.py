@@ -15,11 +15,11 @@ from calibration.rig.description import Rig
 from daemon.acquisition.acquisition import Acquisition
 from daemon.acquisition.clock_watch import ClockWatch
 from daemon.acquisition.present_state import expected_of
-from daemon.acquisition.store_commands import go_on_for_caller, prune, redecode_command
+from daemon.acquisition.redecoding import redecode_command
 from daemon.acquisition.thinning import Thinning
 from daemon.alarms.board import AlarmBoard
 from daemon.alarms.evidence import Gatherer
-from daemon.commands import FAILED, REFUSED, CommandError, Handler, reading_socket
+from daemon.commands import FAILED, REFUSED, CommandError, Handler, go_on_for_caller, reading_socket
 from daemon.composition import Parts, motion_limits
 from daemon.config import Config
 from daemon.control.protocol import reading_only
@@ -38,13 +38,13 @@ from daemon.sessions.station_setups import SetupBook
 from daemon.store.alarms import AlarmTable
 from daemon.store.errors import storage_errors, storage_sentence, unwritable_errors
 from daemon.store.health import StoreHealth, StoreWatch
-from daemon.store.housekeeping import Housekeeping, Keeping
 from daemon.store.jobs import JobTable
 from daemon.store.models import ModelTable
 from daemon.store.notices import NoticeTable
 from daemon.store.sessions import SessionTable
 from daemon.store.setups import SetupTable
 from daemon.store.store import Store
+from daemon.store.upkeep.housekeeping import Housekeeping, Keeping
 from drivers.clock import NS_PER_S, TimeBudget
 from drivers.errors import DeviceError, TransmitForbiddenError
 from drivers.readings import Record
@@ -304,7 +304,7 @@ class Daemon:
 
     def _prune(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Delete captures and readings outside sessions that are older than so many days."""
-        return prune(self._housekeeping, arguments, self._parts.clock.now().utc_ns, go_on_for_caller)
+        return self._housekeeping.prune_command(arguments, go_on_for_caller)
 
     def _redecode(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Make all readings and fixes of a session, or of some time, again from raw captures."""

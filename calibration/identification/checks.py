@@ -133,7 +133,7 @@ def row_warnings(rig: Rig, observations: Observations) -> Iterator[str]:
 def _warn_of_ignored(rig: Rig, observations: Observations) -> Iterator[str]:
     columns = observations.ignored_numbers
     for column in columns[:_LISTED]:
-        yield how_to_use(column, rig)
+        yield how_to_use(column, rig.taken)
     more = columns[_LISTED:]
     if more:
         yield f"{len(more)} more columns hold numbers and are not used: {', '.join(ascii(name) for name in more)}"

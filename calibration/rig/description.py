@@ -27,7 +27,7 @@ from pydantic_core import ErrorDetails
 from calibration.errors import RigError
 from calibration.rig.channels import Channel, Signal
 from calibration.rig.columns import POSITION, SIGMA, WRITTEN, names
-from calibration.rig.signals import signal_faults, signal_lines, signal_of, taken_names
+from calibration.rig.signals import Taken, signal_faults, signal_lines, signal_of
 from calibration.rig.toml import parse_toml
 
 Vector = tuple[float, float, float]
@@ -277,7 +277,7 @@ class Rig(_Part):
             doubled = sorted({n for n in called if called.count(n) > 1})
             if doubled:
                 raise ValueError(f"two {what}s are called {doubled[0]!r}")
-        for fault in signal_faults(self):
+        for fault in signal_faults(self.signals, self.taken):
             raise ValueError(fault)
         return self
 
@@ -365,7 +365,7 @@ class Rig(_Part):
         lines = [self.text.rstrip("\n")]
         for column in columns:
             try:
-                lines += ["", *signal_lines(signal_of(column, taken_names(self)))]
+                lines += ["", *signal_lines(signal_of(column, self.taken.names))]
             except ValueError as error:
                 raise RigError(f"rig {self.name!r}", "signal", str(error)) from error
         return parse_rig("\n".join((*lines, "")), f"rig {self.name!r}")
@@ -410,6 +410,11 @@ class Rig(_Part):
     def prism_names(self) -> tuple[str, ...]:
         """Names of the prisms, in file order."""
         return tuple(p.name for p in self.prisms)
+
+    @property
+    def taken(self) -> Taken:
+        """Names and columns that no signal can have."""
+        return Taken.by(self.joint_names, self.prism_names, self.channels)
 
 
 _SECTIONS: dict[str, type[BaseModel]] = {

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator
-from typing import TYPE_CHECKING, get_args
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import get_args
 
 from pydantic import ValidationError
 
-from calibration.rig.channels import Signal, Unit
+from calibration.rig.channels import Channel, Signal, Unit
 from calibration.rig.columns import own_columns
-
-if TYPE_CHECKING:
-    from calibration.rig.description import Rig
 
 # The longest ending that fits is the unit: `wind_mm_per_s` is in mm/s.
 _ENDINGS = sorted(
@@ -29,10 +27,24 @@ def is_read_anyway(column: str) -> bool:
     return _READ_ANYWAY.fullmatch(column) is not None
 
 
-def taken_names(rig: Rig) -> dict[str, str]:
-    """Return each name that no signal of a rig can have -> what has it."""
-    channels = dict.fromkeys((channel.name for channel in rig.channels), "channel")
-    return channels | dict.fromkeys(rig.prism_names, "prism") | dict.fromkeys(rig.joint_names, "joint")
+@dataclass(frozen=True)
+class Taken:
+    """Names and columns of a rig that its signals cannot have.
+
+    Attributes:
+        names: name -> kind of thing that has it: joint, prism or channel.
+        columns: of observations tables, of joints and channels.
+    """
+
+    names: Mapping[str, str]
+    columns: frozenset[str]
+
+    @classmethod
+    def by(cls, joints: Sequence[str], prisms: Iterable[str], channels: Collection[Channel]) -> Taken:
+        """Return what joints and prisms of these names, and channels, leave to no signal."""
+        names = dict.fromkeys((channel.name for channel in channels), "channel")
+        names |= dict.fromkeys(prisms, "prism") | dict.fromkeys(joints, "joint")
+        return cls(names, frozenset(own_columns(joints)) | {channel.column for channel in channels})
 
 
 def signal_of(column: str, taken: Collection[str]) -> Signal:
@@ -62,28 +74,27 @@ def signal_lines(signal: Signal) -> tuple[str, str, str]:
     return "[[signal]]", f'name = "{signal.name}"', f'unit = "{signal.unit}"'
 
 
-def signal_faults(rig: Rig) -> Iterator[str]:
+def signal_faults(signals: Iterable[Signal], taken: Taken) -> Iterator[str]:
     """Yield why signals of a rig cannot be: each is a name that something else has."""
-    taken, own = taken_names(rig), own_columns(rig.joint_names) | {channel.column for channel in rig.channels}
-    for signal in rig.signals:
-        if signal.column in own:
+    for signal in signals:
+        if signal.column in taken.columns:
             yield f"signal {signal.name!r}: the column {signal.column} is known without it; leave it out"
-        elif signal.name in taken:
+        elif signal.name in taken.names:
             read = "; its column is read without it" if is_read_anyway(signal.column) else ""
-            yield f"signal {signal.name!r}: a {taken[signal.name]} is called so{read}"
+            yield f"signal {signal.name!r}: a {taken.names[signal.name]} is called so{read}"
         elif _FEATURE.fullmatch(signal.column):
             yield f"signal {signal.name!r}: rigcal computes something called {signal.column}; give it another name"
 
 
-def how_to_use(column: str, rig: Rig) -> str:
+def how_to_use(column: str, taken: Taken) -> str:
     """Return a sentence on how a column of numbers that nothing uses can be used."""
     fitting = _NEITHER_LETTER_NOR_DIGIT.sub("_", column).strip("_")
     for name in (column, fitting, f"signal_{fitting}"):
         try:
-            signal = signal_of(name, taken_names(rig))
+            signal = signal_of(name, taken.names)
         except ValueError:
             continue
-        if any(signal_faults(rig.model_copy(update={"signals": (signal,)}))):
+        if any(signal_faults([signal], taken)):
             continue
         rename = "" if name == column else f"rename it to {name} and "
         header, *keys = signal_lines(signal)

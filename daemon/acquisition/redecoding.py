@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any
 
 from daemon.acquisition.link_decoders import LinkDecoders
+from daemon.commands import CommandError
 from daemon.store import Store
-from daemon.store.full_samples import Stretch, put_again
+from daemon.store.full_samples import Stretch, put_again, stretches_between, stretches_of_session
 from daemon.store.reader import Reader
 from daemon.store.sessions import AFTER_NS, BEFORE_NS
 from drivers.clock import NS_PER_S, Stamp
@@ -73,3 +76,40 @@ def _slices(captures: Iterator[Capture]) -> Iterator[list[Capture]]:
         batch.append(capture)
     if batch:
         yield batch
+
+
+def redecode_command(
+    store: Store,
+    decoders: Mapping[str, Callable[[], Decoder]],
+    arguments: Mapping[str, Any],
+    go_on: Callable[[], None],
+) -> dict[str, Any]:
+    """Make all readings and fixes of a session, or of some time, again from raw captures.
+
+    Args:
+        store: open for writing.
+        decoders: link -> what makes its decoder.
+        arguments: `session`, or `first_utc_ns` and `last_utc_ns`.
+        go_on: called again and again; what it raises ends the work, and what was stored stays.
+    """
+    with store.reader() as reader:
+        if session := arguments.get("session"):
+            stretches = stretches_of_session(reader, str(session))
+            what = f"session {str(session)!r:.80}"
+        else:
+            first_ns, last_ns = arguments.get("first_utc_ns"), arguments.get("last_utc_ns")
+            if not isinstance(first_ns, int) or not isinstance(last_ns, int) or first_ns >= last_ns:
+                raise CommandError("give a session, or a time whose end is later than its begin")
+            stretches = stretches_between(reader, first_ns, last_ns)
+            what = f"the time from {_text(first_ns)} to {_text(last_ns)}"
+    if not stretches:
+        raise CommandError(f"the store has no captures of {what}; `rigcal session list` shows the sessions")
+    added = redecode(store, decoders, stretches, go_on)
+    return {
+        "added": added,
+        "stretches": [{"first_utc_ns": first.utc_ns, "last_utc_ns": last.utc_ns} for first, last in stretches],
+    }
+
+
+def _text(utc_ns: int) -> str:
+    return f"{datetime.fromtimestamp(utc_ns // NS_PER_S, UTC):%Y-%m-%d %H:%M:%S} UTC"

@@ -10,10 +10,10 @@ from daemon.acquisition.status import AcquisitionStatus, EventStatus, LinkStatus
 from daemon.models.live_model import LiveModelHealth
 from daemon.sessions.prism_guard import Suspicion
 from daemon.store.health import StoreHealth
-from daemon.store.housekeeping import KeepingState
 from daemon.store.jobs import FailedJob
 from daemon.store.sessions import OpenSessionRow
 from daemon.store.setups import SetupRow
+from daemon.store.upkeep.housekeeping import KeepingState
 from drivers.clock import NS_PER_S, Clock, Stamp
 from drivers.readings import EventKind
 

@@ -31,7 +31,7 @@ import can
 
 from daemon.acquisition.acquisition import Acquisition
 from daemon.store import Reader, Store
-from daemon.store.housekeeping import Housekeeping, Keeping
+from daemon.store.upkeep.housekeeping import Housekeeping, Keeping
 from drivers.can.ports import CanLinkConfig
 from drivers.can_decoder import CanDecoder
 from drivers.can_link import CanLink

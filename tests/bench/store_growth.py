@@ -24,7 +24,7 @@ from daemon.composition import decoders
 from daemon.config import load_rig, parse_config
 from daemon.service import declare_channels
 from daemon.store import Reader, Store
-from daemon.store.packing import SPAN_NS, Packing
+from daemon.store.upkeep.packing import SPAN_NS, Packing
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import CanCapture, Capture, SerialCapture
 from simulators.devices.stations.total_station import StationSettings

@@ -29,8 +29,8 @@ from daemon.service import declare_channels
 from daemon.sessions.export import export_session
 from daemon.store import Reader, Store
 from daemon.store.captures import Chunk, decode_run, encode_captures
-from daemon.store.packing import SPAN_NS, packed_run
 from daemon.store.sessions import SessionTable, all_observations
+from daemon.store.upkeep.packing import SPAN_NS, packed_run
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import Capture, Fix, Reading
 from tests.bench.store_growth import CONFIG, UTC_0_NS, traffic

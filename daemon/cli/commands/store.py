@@ -39,7 +39,7 @@ def store() -> None:
 def store_stats(config: Path, *, tables: bool, as_json: bool) -> dict[str, Any]:
     """Show how large the store is and what it holds."""
     from daemon.config import read_config
-    from daemon.store.statistics import statistics
+    from daemon.store.upkeep.statistics import statistics
 
     found = statistics(read_config(config).store_path, tables=tables)
     if not as_json:
@@ -63,8 +63,8 @@ def store_check(config: Path, backup: Path | None, *, as_json: bool) -> Delivere
     Exit status 1 where something is damaged.
     """
     from daemon.config import read_config
-    from daemon.store import backup as backup_module
-    from daemon.store.soundness import check_store
+    from daemon.store.upkeep import backup as backup_module
+    from daemon.store.upkeep.soundness import check_store
 
     settings = read_config(config)
     path, models = settings.store_path, settings.models_directory
@@ -98,7 +98,7 @@ def store_check(config: Path, backup: Path | None, *, as_json: bool) -> Delivere
 def store_backup(config: Path, to: Path | None, keep: int | None, *, is_list: bool, as_json: bool) -> dict[str, Any]:
     """Copy store and models to a backup, verify it, and delete the oldest ones. The daemon may run."""
     from daemon.config import read_config
-    from daemon.store.backup import backups, make_backup
+    from daemon.store.upkeep.backup import backups, make_backup
 
     settings = read_config(config)
     directory = to or settings.store.backup_directory
@@ -135,7 +135,7 @@ def store_restore(backup: Path, config: Path, *, as_json: bool) -> dict[str, Any
     Stop the daemon first. What was there is moved to a directory beside the store and nothing of it is deleted.
     """
     from daemon.config import read_config
-    from daemon.store.backup import restore_backup
+    from daemon.store.upkeep.backup import restore_backup
 
     settings = read_config(config)
     aside = restore_backup(backup, settings.store_path, settings.models_directory, _now_ns(), _go_on)
@@ -155,10 +155,9 @@ def store_prune(config: Path, days: float | None, *, as_json: bool) -> dict[str,
     Sessions, what was captured in them and a minute before, and models always stay. The file does not become smaller:
     its free pages are used again.
     """
-    from daemon.acquisition.store_commands import prune
     from daemon.config import read_config
     from daemon.service import keeping_of
-    from daemon.store.housekeeping import Housekeeping
+    from daemon.store.upkeep.housekeeping import Housekeeping
     from drivers.clock import SystemClock
 
     settings = read_config(config)
@@ -169,7 +168,7 @@ def store_prune(config: Path, days: float | None, *, as_json: bool) -> dict[str,
 
     def work(store: Store) -> dict[str, Any]:
         housekeeping = Housekeeping(store, SystemClock(), keeping_of(settings))
-        return prune(housekeeping, arguments, _now_ns(), _go_on)
+        return housekeeping.prune_command(arguments, _go_on)
 
     result = _on_store(settings, work, "store.prune", arguments)
     if not as_json:
@@ -190,7 +189,7 @@ def store_redecode(
 
     Outside sessions the store has one reading a second and channel; raw captures have them all.
     """
-    from daemon.acquisition.store_commands import redecode_command
+    from daemon.acquisition.redecoding import redecode_command
     from daemon.composition import decoders
     from daemon.config import load_rig, read_config
 

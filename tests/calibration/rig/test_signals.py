@@ -96,7 +96,7 @@ def test_what_is_said_of_an_unused_column_makes_it_a_signal(column: str) -> None
     text = f"{HEADER},{column},remark\n{ROW},1.5,good\n{ROW},2.5,\n"
     assert read(text, shipped_rig("ur10")).ignored_numbers == (column,)
 
-    said = how_to_use(column, shipped_rig("ur10"))
+    said = how_to_use(column, shipped_rig("ur10").taken)
 
     header, name, unit, flag = re.search(
         r"--signal (\S+), .* the three lines (\[\[signal\]\]), (name = \S+) and (unit = \S+)$", said

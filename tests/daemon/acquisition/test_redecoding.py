@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from daemon.acquisition.link_decoders import LinkDecoders
-from daemon.acquisition.redecoding import redecode
-from daemon.acquisition.store_commands import redecode_command
+from daemon.acquisition.redecoding import redecode, redecode_command
 from daemon.acquisition.thinning import Thinning
 from daemon.commands import CommandError
 from daemon.composition import decoders
@@ -19,7 +18,7 @@ from daemon.config import load_rig, parse_config
 from daemon.service import declare_channels
 from daemon.store import Store
 from daemon.store.full_samples import stretches_between
-from daemon.store.packing import Packing
+from daemon.store.upkeep.packing import Packing
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import Capture
 from tests.bench.store_growth import CONFIG, UTC_0_NS, traffic

@@ -24,10 +24,10 @@ from daemon.alarms.library import library, page
 from daemon.models.live_model import LiveModelHealth
 from daemon.sessions.prism_guard import Suspicion
 from daemon.store.health import HealthState, StoreHealth
-from daemon.store.housekeeping import KeepingState
 from daemon.store.jobs import FailedJob
 from daemon.store.sessions import OpenSessionRow
 from daemon.store.setups import SetupRow
+from daemon.store.upkeep.housekeeping import KeepingState
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import EventKind
 

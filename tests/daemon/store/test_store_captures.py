@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from daemon.store.captures import decode_captures, decode_run, encode_captures, encode_large
 from daemon.store.errors import StoreError
 from daemon.store.packed_captures import packed, unpacked
-from daemon.store.packing import packed_run
+from daemon.store.upkeep.packing import packed_run
 from drivers.clock import Stamp
 from drivers.readings import CanCapture, Capture, SerialCapture
 from tests.daemon.store_support import at, frame, serial_bytes

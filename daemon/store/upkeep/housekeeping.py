@@ -10,15 +10,17 @@ import logging
 import os
 import sqlite3
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from daemon.store.backup import Backup, backups, make_backup
+from daemon.commands import CommandError, number_argument
 from daemon.store.errors import StoreError, storage_sentence
-from daemon.store.packing import Packing
-from daemon.store.retention import Retention, cutoff_ns, room
 from daemon.store.store import Store
+from daemon.store.upkeep.backup import Backup, backups, make_backup
+from daemon.store.upkeep.packing import Packing
+from daemon.store.upkeep.retention import Retention, cutoff_ns, room
 from drivers.clock import NS_PER_S, Clock, SystemClock
 
 log = logging.getLogger(__name__)
@@ -29,6 +31,7 @@ ROOM_S = 60.0  # between two looks at the room
 STOP_S = 5.0
 NICE = 15
 DAY_S = 86_400.0
+LEAST_DAYS = 1.0  # that a command keeps
 # By age, no more than this many days of records go in one day: a clock that is set wrongly must not cost a year.
 AGED_DAYS = 7.0
 BACKUP_AFTER_S = 600.0  # of running: not in the midst of a start
@@ -139,16 +142,21 @@ class Housekeeping:
             log.warning("the store is not looked after for now: %s", error)
         return False
 
-    def prune(self, older_than_ns: int, go_on: Callable[[], None]) -> int | None:
-        """Delete all captures outside sessions that are older; as a command, in any thread.
+    def prune_command(self, arguments: Mapping[str, Any], go_on: Callable[[], None]) -> dict[str, Any]:
+        """Delete captures and readings outside sessions that are older than `days`; for operators, in any thread.
 
         Args:
-            older_than_ns: UTC.
+            arguments: `days`.
             go_on: called between steps; what it raises ends the work.
-
-        Returns:
-            UTC in ns of the newest that was deleted; None where there was nothing to delete.
         """
+        days = number_argument(arguments, "days")
+        if days is None or days < LEAST_DAYS:
+            raise CommandError(f"days must be {LEAST_DAYS:g} or more, not {days!r:.80}")
+        newest_ns = self._prune(self._clock.now().utc_ns - round(days * DAY_S * NS_PER_S), go_on)
+        return {"deleted_until_utc_ns": newest_ns}
+
+    def _prune(self, older_than_ns: int, go_on: Callable[[], None]) -> int | None:
+        """Delete all that is older and may go; return the UTC in ns of the newest deleted, None where nothing was."""
         newest: int | None = None
         while True:
             go_on()

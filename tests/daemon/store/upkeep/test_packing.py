@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from daemon.store import Reader, Store
-from daemon.store.packing import Packing
 from daemon.store.reader import CHUNKS
+from daemon.store.upkeep.packing import Packing
 from drivers.readings import Capture
 from tests.daemon.store_support import at, frame, serial_bytes, table
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from daemon.host.safe_output import write_file
 from daemon.store.errors import StoreError, storage_errors
 from daemon.store.files import BESIDE, WriterLock
-from daemon.store.soundness import Soundness, check_store
+from daemon.store.upkeep.soundness import Soundness, check_store
 
 STORE, MODELS, ABOUT = "rigcal.sqlite", "models", "backup.json"
 FORM = 1

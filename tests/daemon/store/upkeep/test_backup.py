@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from daemon.store import Reader, Store, StoreBusyError, StoreError
-from daemon.store.backup import backups, make_backup, restore_backup
-from daemon.store.housekeeping import BACKUP_AFTER_S, Housekeeping, Keeping
-from daemon.store.soundness import MANIFEST, check_store
+from daemon.store.upkeep.backup import backups, make_backup, restore_backup
+from daemon.store.upkeep.housekeeping import BACKUP_AFTER_S, Housekeeping, Keeping
+from daemon.store.upkeep.soundness import MANIFEST, check_store
 from drivers.clock import NS_PER_S, ManualClock
 from tests.daemon.damage import small_disk
 from tests.daemon.store_support import UTC_0, at, frame, table
@@ -173,7 +173,7 @@ def test_a_disk_without_room_for_a_backup_is_told_before_it_is_filled(site: Site
 def test_the_daemon_makes_one_a_day_and_tells_when_it_cannot(
     site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("daemon.store.housekeeping.BACKUP_RETRY_S", 0.0)
+    monkeypatch.setattr("daemon.store.upkeep.housekeeping.BACKUP_RETRY_S", 0.0)
     clock = ManualClock(at(0.0))
     keeping = Keeping(None, 0, site.models, site.backups, 3)
     housekeeping = Housekeeping(site.store, clock, keeping)

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from daemon.store import Reader, Store
-from daemon.store.housekeeping import Housekeeping, Keeping
-from daemon.store.retention import Retention, cutoff_ns, room
+from daemon.store.upkeep.housekeeping import Housekeeping, Keeping
+from daemon.store.upkeep.retention import Retention, cutoff_ns, room
 from drivers.clock import NS_PER_S, ManualClock, Stamp
 from drivers.readings import Capture, Fix, Reading
 from tests.daemon.damage import small_disk
@@ -153,7 +153,7 @@ def test_freed_pages_are_used_again_and_are_room(path: Path, store: Store) -> No
 
 
 def test_deleting_reads_by_indexes(store: Store) -> None:
-    from daemon.store import retention
+    from daemon.store.upkeep import retention
 
     fill(store, 3)
     statements = {
