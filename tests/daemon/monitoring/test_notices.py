@@ -352,8 +352,12 @@ def test_a_daemon_tells_of_its_alarms_and_of_a_test(
         (tmp_path / "models" / "job-1").mkdir(parents=True)  # models beside a store that never saw a job: an alarm
         wait_until(lambda: ("raised", "store") in web.events())
         assert ("test", "notices") in web.events()
-        (waiting,) = request(config.socket_path, "status")["notices"]
-        assert (waiting["waiting"], waiting["error"]) == (0, None)
+
+        def is_all_told() -> bool:
+            (target,) = request(config.socket_path, "status")["notices"]
+            return (target["waiting"], target["error"]) == (0, None)
+
+        wait_until(is_all_told)
 
 
 def test_a_way_that_leads_nowhere_is_refused(tmp_path: Path) -> None:

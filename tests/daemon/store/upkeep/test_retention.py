@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from daemon.store import Reader, Store
+from daemon.store.upkeep import retention
 from daemon.store.upkeep.housekeeping import Housekeeping, Keeping
 from daemon.store.upkeep.retention import Retention, cutoff_ns, room
 from drivers.clock import NS_PER_S, ManualClock, Stamp
@@ -153,8 +154,6 @@ def test_freed_pages_are_used_again_and_are_room(path: Path, store: Store) -> No
 
 
 def test_deleting_reads_by_indexes(store: Store) -> None:
-    from daemon.store.upkeep import retention
-
     fill(store, 3)
     statements = {
         retention._CHUNKS: (0, 0, 9, 9, 20),
@@ -205,7 +204,7 @@ def test_want_of_room_deletes_the_oldest_and_tells(tmp_path: Path) -> None:
             assert minutes_left(path)[-1] == 399
             if housekeeping.state.is_short:
                 assert housekeeping.state.has_nothing_left
-                assert minutes_left(path)[0] == 400 - 61
+                assert minutes_left(path)[0] in (400 - 62, 400 - 61)  # two minutes may be packed in one chunk
             else:  # before all was deleted that might go
                 assert 0 < minutes_left(path)[0] <= 400 - 61
 
