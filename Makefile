@@ -14,7 +14,7 @@ export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 # The tests start a hundred processes: each would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help environment setup demo check test long lint style types imports quick blind bench soak fuzz lock clean
+.PHONY: help environment setup demo deb wheel check test long lint style types imports quick blind bench soak fuzz lock clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -32,6 +32,12 @@ $(KERNELS)/warm: | environment
 
 demo: setup ## a simulated rig, from bus traffic to a calibrated model and a report
 	@$(BIN)/rigcal demo
+
+wheel: environment ## the wheel of the last commit, in dist/; the same commit gives the same bytes
+	@$(BIN)/python deploy/debian/build.py wheel
+
+deb: environment ## Debian packages of the last commit, for Debian 12 and 13, in dist/
+	@$(BIN)/python deploy/debian/build.py deb
 
 # The deployment tests ask systemd's own tools about the files in deploy/. What reads devices and what keeps their data
 # must be reached by its own tests almost line by line.
