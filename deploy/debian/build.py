@@ -272,7 +272,7 @@ def _write_control(root: Path, source: Source, version: str, python: str) -> Non
 def _packed(root: Path, target: Path, epoch: int) -> Path:
     for path in [root, *root.rglob("*")]:
         if not path.is_symlink():
-            is_executable = path.is_dir() or path.parent.name in ("bin", "DEBIAN") and os.access(path, os.X_OK)
+            is_executable = path.is_dir() or (path.parent.name in ("bin", "DEBIAN") and os.access(path, os.X_OK))
             path.chmod(0o755 if is_executable else 0o644)
     target.parent.mkdir(parents=True, exist_ok=True)
     # One thread: with more, the compressed bytes depend on how many there are.
