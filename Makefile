@@ -14,7 +14,7 @@ export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 # The tests start a hundred processes: each would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help environment setup demo deb wheel check test long lint style types imports quick blind bench soak fuzz lock clean
+.PHONY: help environment setup demo deb debtest wheel check test long lint style types imports quick blind bench soak fuzz lock clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -38,6 +38,9 @@ wheel: environment ## the wheel of the last commit, in dist/; the same commit gi
 
 deb: environment ## Debian packages of the last commit, for Debian 12 and 13, in dist/
 	@$(BIN)/python deploy/debian/build.py deb
+
+debtest: environment ## the packages in fresh Debian 12 and 13 roots without a network; root, ten minutes
+	@$(BIN)/python -m tests.deploy.packages
 
 # The deployment tests ask systemd's own tools about the files in deploy/. What reads devices and what keeps their data
 # must be reached by its own tests almost line by line.

@@ -59,19 +59,20 @@ SCRIPTS = ("preinst", "postinst", "prerm", "postrm")
 CONTROL = """Package: rigcal
 Version: {version}
 Architecture: amd64
-Maintainer: rigcal contributors <rigcal@localhost.localdomain>
+Maintainer: rigcal contributors <rigcal@users.noreply.github.com>
 Installed-Size: {size_kib}
-Depends: python{python}, libgomp1, systemd | systemd-standalone-sysusers, passwd
+Depends: libc6 (>= 2.36), python{python}, libgomp1, systemd | systemd-standalone-sysusers, passwd
 Recommends: udev
 Section: science
 Priority: optional
 Description: calibration of a drilling boom, by its joints and a total station
- rigcal reads joint encoders and length transducers over CAN and CANopen, and the
- fixes of a total station over a serial line, and finds the boom's true kinematic
- model: it identifies geometry and physical effects, and learns what remains.
+ rigcal reads joint encoders and length transducers over CAN and CANopen, and
+ the fixes of a total station over a serial line, and finds the boom's true
+ kinematic model: it identifies geometry and physical effects, and learns what
+ remains.
  .
- The package has all that it needs beside Python itself, and neither enables nor
- starts the service: /usr/share/doc/rigcal/README.md says what to set up first.
+ The package has all that it needs beside Python itself. It neither enables
+ nor starts the service: /usr/share/doc/rigcal/README.md says what to do first.
 """
 
 
@@ -183,7 +184,7 @@ def _fill_environment(home: Path, source: Source, wheel: Path, python: str) -> N
     for record in [*site.glob("*.dist-info/direct_url.json"), *site.glob("*.dist-info/RECORD")]:
         record.unlink()  # where the wheel lay; and lists with the scripts in them
     _put(home / "pyvenv.cfg", f"home = /usr/bin\ninclude-system-site-packages = false\nversion = {python}\n".encode())
-    _link(home / "bin/python", f"/usr/bin/python{python}")
+    _link(home / "bin/python", f"../../../bin/python{python}")
     _link(home / "bin/python3", "python")
     program = "#!/usr/lib/rigcal/bin/python -I\nimport sys\n\nfrom daemon.cli.main import main\n\nsys.exit(main())\n"
     _put(home / "bin/rigcal", program.encode(), mode=0o755)
@@ -283,7 +284,7 @@ def _packed(root: Path, target: Path, epoch: int) -> Path:
 
 def _changelog(version: str, epoch: int) -> str:
     entry = f"rigcal ({version}) unstable; urgency=medium\n\n  * See changelog.gz.\n"
-    return f"{entry}\n -- rigcal contributors <rigcal@localhost.localdomain>  {formatdate(epoch)}\n"
+    return f"{entry}\n -- rigcal contributors <rigcal@users.noreply.github.com>  {formatdate(epoch)}\n"
 
 
 def _gzipped(text: str) -> bytes:
