@@ -20,6 +20,7 @@ log = logging.getLogger(__name__)
 
 # -P keeps the current directory off the process's path: what lies there is no code of ours.
 JOB_COMMAND = (sys.executable, "-P", "-m", "daemon.jobs.process")
+NICE = 10  # of a job and all that it starts: acquisition comes first
 MAX_LINE_BYTES = 16 * 2**20
 MAX_LOGGED_BYTES = 4096
 END_TIMEOUT_S = 5.0  # from the end of a process's output to its own
@@ -44,6 +45,8 @@ class JobChild:
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
         )
         self.pid = self._process.pid
+        with contextlib.suppress(ProcessLookupError):  # it has ended already
+            os.setpriority(os.PRIO_PROCESS, self.pid, max(NICE, os.getpriority(os.PRIO_PROCESS, 0)))
         self._lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._job_id = order.job_id
         # All pipes have a thread of their own: one that the process does not empty must not hold up a cancellation.

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import os
 import resource
 from pathlib import Path
 from typing import Any
@@ -183,6 +184,14 @@ def test_a_job_that_takes_too_long_is_ended_with_all_that_it_started(tmp_path: P
         rig.wait(lambda: is_gone(child), "the job's own child to end")
     finally:
         rig.close()
+
+
+def test_a_job_gives_way_to_acquisition(rig: JobRig) -> None:
+    rig.session("a")
+    rig.plan(gap="hang")
+    rig.start()
+    pid = rig.running(1)["pid"]
+    assert os.getpriority(os.PRIO_PROCESS, pid) == max(10, os.getpriority(os.PRIO_PROCESS, 0))
 
 
 def test_a_command_that_cannot_be_started_is_tried_as_often_as_allowed(tmp_path: Path) -> None:
