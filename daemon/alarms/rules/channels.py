@@ -18,6 +18,7 @@ _WHY = {
     Status.OUT_OF_RANGE: "the value is beyond what the device can measure",
     Status.DEVICE_ALARM: "the device reports an alarm that makes its value void",
     Status.MALFORMED: "the value cannot be decoded",
+    Status.TIME_DOUBTFUL: "this computer reads too late to know when the value was measured; see what keeps it busy",
 }
 
 
@@ -54,8 +55,8 @@ def signal_silent(evidence: Evidence) -> Iterator[Finding]:
 def joint_not_usable(evidence: Evidence) -> Iterator[Finding]:
     """The readings of a joint carry no value.
 
-    The device has none, reports an alarm, is out of its range, or its value cannot be decoded. Raised after 1.5 s,
-    so that one bad sample is no alarm; cleared after 3 s of good ones. Where the device's own alarm or emergency
+    The device has none, reports an alarm, is out of its range, its value cannot be decoded, or it was read so late that
+    its time is not known. Raised after 1.5 s, so that one bad sample is no alarm; cleared after 3 s of good ones. Where the device's own alarm or emergency
     stands, it explains that its values are void.
     """
     yield from _not_usable(evidence, "joint")

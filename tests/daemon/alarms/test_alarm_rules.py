@@ -29,7 +29,7 @@ from daemon.store.sessions import OpenSessionRow
 from daemon.store.setups import SetupRow
 from daemon.store.upkeep.housekeeping import KeepingState
 from drivers.clock import NS_PER_S, Stamp
-from drivers.readings import EventKind
+from drivers.readings import EventKind, Status
 
 NOW = Stamp(1_790_000_000 * NS_PER_S, 5000 * NS_PER_S, "boot")
 SESSION = OpenSessionRow("s001-r", NOW.shifted(-100 * NS_PER_S))
@@ -211,8 +211,8 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
     ],
     "joint_not_usable": [
         (
-            known(channels=[channel(s, s) for s in ("not_available", "out_of_range", "device_alarm", "malformed")]),
-            ["not_available", "out_of_range", "device_alarm", "malformed"],
+            known(channels=[channel(s, s) for s in Status if s != Status.OK]),
+            [str(s) for s in Status if s != Status.OK],
             known(channels=[channel(s) for s in ("ok", "silent", "link_down", "starting")]),
         ),
         (
