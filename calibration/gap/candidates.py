@@ -7,7 +7,7 @@ tried seven times and must not win by that.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -83,6 +83,30 @@ def candidate_effects(
         without: `family@where` of the effects that are in the model already.
         like: candidates about another fit, most of whose columns are the same.
     """
+    found, disabled = _possible(situation, families, without)
+    alike = {(c.family, c.where): c.additions for c in like}
+    log_prior = _log_priors([name for name, _, _ in found], {name.partition("@")[0] for name in without})
+    return CandidateEffects(
+        tuple(
+            candidate_at(situation, over, name, where, choices, log_prior[name], alike.get((name, where), ()))
+            for name, where, choices in found
+        ),
+        disabled,
+    )
+
+
+def each_candidate(situation: EffectContext, over: Projection, families: Collection[str]) -> Iterator[CandidateEffect]:
+    """Yield the candidates of the given families, one at a time: all of them are gigabytes for thousands of fixes."""
+    found, _ = _possible(situation, families, ())
+    log_prior = _log_priors([name for name, _, _ in found], ())
+    for name, where, choices in found:
+        yield candidate_at(situation, over, name, where, choices, log_prior[name])
+
+
+def _possible(
+    situation: EffectContext, families: Collection[str], without: Collection[str]
+) -> tuple[list[tuple[str, str, tuple[Choice, ...]]], dict[str, str]]:
+    """Return family, place and variants of each effect that the data can show; why they cannot show the others."""
     found: list[tuple[str, str, tuple[Choice, ...]]] = []
     disabled: dict[str, str] = {}
     for name in sorted(families):
@@ -99,15 +123,7 @@ def candidate_effects(
         elif here and not any(choices for _, _, choices in here):
             disabled[name] = "these poses show nothing of it"
         found += [one for one in here if one[2]]
-    alike = {(c.family, c.where): c.additions for c in like}
-    log_prior = _log_priors([name for name, _, _ in found], {name.partition("@")[0] for name in without})
-    return CandidateEffects(
-        tuple(
-            candidate_at(situation, over, name, where, choices, log_prior[name], alike.get((name, where), ()))
-            for name, where, choices in found
-        ),
-        disabled,
-    )
+    return found, disabled
 
 
 def _log_priors(names: Sequence[str], again: Collection[str]) -> dict[str, float]:

@@ -7,14 +7,14 @@ the variable, so that all borders of it cost little more than one.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calibration.effects.fitted import Choice
 from calibration.effects.regime import Regime, variables
-from calibration.gap.candidates import CandidateEffect, candidate_at, candidate_effects, variants_at
+from calibration.gap.candidates import CandidateEffect, candidate_at, each_candidate, variants_at
 from calibration.gap.joint_fit import JointFit, Problem
 from calibration.gap.projection import Integers, Projection, SoftProjection, rows_of
 from calibration.gap.screening import Screen
@@ -155,19 +155,19 @@ def _screened(projection: Projection, families: Collection[str]) -> list[tuple[C
 
     The odds are against nothing and averaged over forms, sides and borders.
     """
-    every = candidate_effects(projection.situation, projection, families).candidates
-    candidates = [c for c in every if len(set(c.first_equal)) <= _MOST_FORMS]
+    every = each_candidate(projection.situation, projection, families)
     values = {name: projection.samples.average(v[:, None])[:, 0] for name, v in variables(projection.situation).items()}
     log_prior = _REGIME - math.log(2.0 * max(len(values), 1))
     some = np.unique(np.linspace(0, len(projection.samples) - 1, _SCREENED).astype(np.intp))
-    columns, found = _Columns(projection, candidates, some), dict[int, tuple[Choice, float]]()
+    columns = _Columns(projection, (c for c in every if len(set(c.first_equal)) <= _MOST_FORMS), some)
+    found: dict[int, tuple[Choice, float]] = {}
     for variable, own in values.items():
         border = borders(own, _BORDERS)
         if not len(border):
             continue
         slice_of = np.searchsorted(border, np.where(np.isfinite(own), own, -math.inf))[some]
         for number, evidence in enumerate(columns.evidence(len(border), slice_of)):
-            most, candidate = float(evidence.max()), candidates[number]
+            most, candidate = float(evidence.max()), columns.candidates[number]
             together = most + math.log(float(np.exp(evidence - most).sum()) / len(border))
             log_odds = together + candidate.log_prior + log_prior
             if number not in found or log_odds > found[number][1]:
@@ -194,24 +194,31 @@ class _Columns:
 
     Args:
         projection: about a fit.
-        candidates: effects.
+        candidates: effects; the columns of one are over all samples only while it is read.
         some: (s,) index of the samples.
+
+    Attributes:
+        candidates: the effects, without columns.
     """
 
-    def __init__(self, projection: Projection, candidates: Sequence[CandidateEffect], some: Integers) -> None:
+    def __init__(self, projection: Projection, candidates: Iterable[CandidateEffect], some: Integers) -> None:
         rows = rows_of(some)
-        self._candidates = candidates
         self._kinematics, self._target = projection.kinematics[rows], projection.target[rows]
         self._without = SoftProjection(self._kinematics)
+        self._removed_target = self._without.removed(self._target)
+        self.candidates: list[CandidateEffect] = []
         self._of: dict[int, list[tuple[int, int]]] = {}  # number of columns -> candidates with their options
+        own_sigma: dict[int, list[Floats]] = {}
+        own_rows: dict[int, list[Floats]] = {}
         for number, candidate in enumerate(candidates):
             for option, additions in enumerate(candidate.additions):
                 self._of.setdefault(len(additions), []).append((number, option))
-        self._rows = {}
-        for width, options in self._of.items():
-            moved = (projection.moved_mm(candidates[n].additions[o]) for n, o in options)
-            self._rows[width] = np.hstack([projection.whitened(own)[rows] for own in moved])
-        self._removed_target = self._without.removed(self._target)
+                own_sigma.setdefault(len(additions), []).append(_LIKELY * additions.prior_sigma)
+                moved = projection.whitened(projection.moved_mm(additions))
+                own_rows.setdefault(len(additions), []).append(moved[rows])
+            self.candidates.append(replace(candidate, additions=()))
+        self._sigma = {width: np.array(each) for width, each in own_sigma.items()}
+        self._rows = {width: np.hstack(own_rows.pop(width)) for width in self._of}
 
     def evidence(self, borders: int, slice_of: Integers) -> list[Floats]:
         """Return for each candidate (options, borders, 2) log evidence with the prior odds of its forms.
@@ -224,12 +231,12 @@ class _Columns:
             For the samples that are not above a border, and for those that are.
         """
         index = [rows_of(np.flatnonzero(slice_of == number)) for number in range(borders + 1)]
-        found: list[list[Floats]] = [[] for _ in self._candidates]
+        found: list[list[Floats]] = [[] for _ in self.candidates]
         for width, options in self._of.items():
-            sigma = _LIKELY * np.array([self._candidates[n].additions[o].prior_sigma for n, o in options])
-            values = _log_bayes_factors(*self._products(self._rows[width], width, index), sigma[:, None, None])
+            products = self._products(self._rows[width], width, index)
+            values = _log_bayes_factors(*products, self._sigma[width][:, None, None])
             for (number, option), own in zip(options, values, strict=True):
-                found[number].append(own + self._candidates[number].log_odds[option])
+                found[number].append(own + self.candidates[number].log_odds[option])
         return [np.array(own) for own in found]
 
     def _products(self, columns: Floats, width: int, index: Sequence[Integers]) -> tuple[Floats, Floats]:

@@ -24,7 +24,7 @@ from calibration.gap.projection import Projection, follows_path
 from calibration.gap.regimes import EffectInRegime, effect_in_regime
 from calibration.gap.reselection import explain_outliers, reselect
 from calibration.gap.screening import ScoredEffect, Screen, by_family
-from calibration.gap.search_result import STRUCTURE, SearchResult, SelectionStep, conclude
+from calibration.gap.search_result import COMPARED, STRUCTURE, SearchResult, SelectionStep, conclude
 from calibration.gap.selection import Selection, select_effect
 from calibration.identification.reading_steps import in_true_steps
 from calibration.identification.refinement import Prior, refine
@@ -238,7 +238,9 @@ class _Search:
 
 
 def _step(joint: JointFit, projection: Projection, selection: Selection, taken: tuple[Choice, ...]) -> SelectionStep:
-    return SelectionStep(joint, projection, selection.scored, selection.posterior, taken, selection.reasons)
+    # Each holds its columns, and all candidates of thousands of fixes are a good part of a gigabyte.
+    scored = selection.scored[:COMPARED]
+    return SelectionStep(joint, projection, scored, selection.posterior, taken, selection.reasons)
 
 
 def _in_regimes(problem: Problem, families: Collection[str], found: SearchResult, least_cost: float) -> SearchResult:

@@ -33,7 +33,7 @@ _LEFT = 0.05  # of what an effect and the remaining errors together explain, at 
 _HIGH = 6.0  # standard errors of the variance that the gap must have to be judged
 _MISJUDGED = 0.1  # share by which a sigma may be off
 _FAR_MISJUDGED = 1.0  # the same where nothing says that it is anything but noise
-_COMPARED = 12  # effects that are held against a formula
+COMPARED = 12  # effects that are held against a formula
 _ANY_SIZE = 1e3  # of the plausible sizes of an effect
 STRUCTURE = 12.0  # log Bayes factor of a background that is more than chance
 _LISTED = 4  # parts of a background
@@ -47,7 +47,7 @@ class SelectionStep:
     Attributes:
         fit: kinematics and effects at its beginning.
         projection: about that fit.
-        scored: all candidates, the most probable first.
+        scored: the most probable candidates, in their order.
         posterior: family -> probability that it is there.
         adopted: one effect, at one place or several; none in the last step.
         reasons: `family@where` -> why it was not named, a clause.
@@ -378,11 +378,11 @@ def _background_text(names: Names) -> str:
 def _library_says(found: SearchResult, formula: Formula) -> str:
     """Return a clause: which effect that was not named would do what a formula says, if any."""
     step, projection = found.steps[-1], found.final.projection
-    for scored in () if found.formulas else step.scored[:_COMPARED]:
+    for scored in () if found.formulas else step.scored[:COMPARED]:
         if scored.log_bayes_factor > 0.0 and explains(scored, formula, projection):
             reason = step.reasons.get(str(scored.candidate), "it does not stand out enough to be named")
             return f"{scored.candidate} would do this, but {reason}"
-    for scored in Screen(projection, found.candidates.candidates).score()[:_COMPARED]:
+    for scored in Screen(projection, found.candidates.candidates).score()[:COMPARED]:
         names = beyond(projection.situation, scored)
         if names and stands_for(replace(scored, scale=_ANY_SIZE), formula, projection):
             return f"{scored.candidate} would do this, but {', '.join(names)} would be beyond what is physical"

@@ -24,12 +24,16 @@ HIDDEN = (
 CPU_BAR_S, MEMORY_BAR_GB = 60.0, 1.0
 
 
-def measure(poses: int, seed: int) -> str:
+def simulated(poses: int, seed: int) -> bytes:
+    """The observations of one machine, as a file has them."""
+    scene = draw_scene(load_rig("ur10").rig, seed, SceneSettings(poses=poses, held_out=1))
+    return scene.observe(parse_effects(HIDDEN)).training.csv_text().encode()
+
+
+def measure(table: bytes) -> str:
     """Calibrate one machine and return the line about it."""
     source = load_rig("ur10")
-    scene = draw_scene(source.rig, seed, SceneSettings(poses=poses, held_out=1))
-    table = scene.observe(parse_effects(HIDDEN)).training
-    observations = parse_observations(table.csv_text().encode(), source.rig, "simulated.csv")
+    observations = parse_observations(table, source.rig, "simulated.csv")
     began, wall = time.process_time(), time.monotonic()
     model, _ = calibrate(source.rig, source.text, observations)
     cpu_s, wall_s = time.process_time() - began, time.monotonic() - wall
@@ -48,7 +52,7 @@ def main() -> None:
     options = parser.parse_args()
     for poses in options.poses:
         with get_context("spawn").Pool(1) as pool:
-            print(pool.apply(measure, (poses, options.seed)), flush=True)
+            print(pool.apply(measure, (simulated(poses, options.seed),)), flush=True)
 
 
 if __name__ == "__main__":

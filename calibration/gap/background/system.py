@@ -104,12 +104,13 @@ class System:
         return self.projection.whitened(self.projection.moved_mm(additions)) * additions.prior_sigma
 
     def of_rows(self, rows: Integers) -> System:
-        """Return the same system of some of the whitened rows (r,) alone."""
+        """Return the same system of some of the whitened rows (r,) alone: their products, and no columns."""
         out = copy(self)
-        out.columns, target = self.columns[rows], self.projection.target[rows]
+        out.columns = self.columns[:0]
+        columns, target = self.columns[rows], self.projection.target[rows]
         out.products = Products(
-            out.columns.T @ out.columns,
-            out.columns.T @ target,
+            columns.T @ columns,
+            columns.T @ target,
             float(target @ target),
             len(rows),
             self.products.least_noise,
