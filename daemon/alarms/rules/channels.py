@@ -56,8 +56,8 @@ def joint_not_usable(evidence: Evidence) -> Iterator[Finding]:
     """The readings of a joint carry no value.
 
     The device has none, reports an alarm, is out of its range, its value cannot be decoded, or it was read so late that
-    its time is not known. Raised after 1.5 s, so that one bad sample is no alarm; cleared after 3 s of good ones. Where the device's own alarm or emergency
-    stands, it explains that its values are void.
+    its time is not known. Raised after 1.5 s, so that one bad sample is no alarm; cleared after 3 s of good ones. Where
+    the device's own alarm or emergency stands, it explains that its values are void.
     """
     yield from _not_usable(evidence, "joint")
 
