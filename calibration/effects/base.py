@@ -87,6 +87,8 @@ class Family(ABC):
         column: the optional column that it needs, `{where}` in it for its place; empty for none.
         limit_sigma: relative uncertainty of the hard limits, where they follow from a load.
         goes_by_travel: True if it grows with the path that its joint travels.
+        comes_after: families that the same load causes and that are the larger ones as a rule: beside structure without
+            a name it is looked for only when all of them that the data ask for are there.
         moves_machine: True if it moves prisms in the base frame; False where only fixes err, or where the base moves
             and all the machine with it.
     """
@@ -101,6 +103,7 @@ class Family(ABC):
     column: ClassVar[str] = ""
     limit_sigma: ClassVar[float] = 0.0
     goes_by_travel: ClassVar[bool] = False
+    comes_after: ClassVar[tuple[str, ...]] = ()
     moves_machine: ClassVar[bool] = True
 
     # -- where it may be, and from which data it is known --------------------------------------------------------------

@@ -22,6 +22,7 @@ class LateralCompliance(LinkFamily):
         "turn about the joint's place = compliance * (M - (M z) z), M the moment of all weights beyond, z the axis"
     )
     source = "bearing and link as a linear spring against tilting, equal about both axes across the joint's"
+    comes_after = ("joint_compliance",)
     confused_with = ("joint_compliance", "base_compliance", "boom_droop")
     revealed_by = "loads far out to the side of the link: the head turned to either side, or the machine on a slope"
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.effects.fitted import Choice
+from calibration.effects.library import library
 from calibration.gap.background.blocks import Block
 from calibration.gap.background.evidence import Scales
 from calibration.gap.background.system import Effect, Model, System
@@ -127,7 +128,12 @@ def _joined(possible: Sequence[CandidateEffect], known: Sequence[CandidateEffect
 
 
 def gains(
-    system: System, model: Model, most: int = _TRIED, always: int | None = None, without: Collection[str] = ()
+    system: System,
+    model: Model,
+    most: int = _TRIED,
+    always: int | None = None,
+    without: Collection[str] = (),
+    later: Collection[str] = (),
 ) -> list[Gain]:
     """Return what a model gains by the candidates that promise most, the greatest first.
 
@@ -137,10 +143,11 @@ def gains(
         most: candidates.
         always: number of a candidate that is among them whatever it promises.
         without: names of blocks that the model is to do without.
+        later: families whose turn has not come.
     """
     every, context = system.screen(model).score(), system.projection.situation
     scored = sorted(
-        (w for w in every if w.log_bayes_factor > 0.0 and not beyond(context, w)),
+        (w for w in every if w.log_bayes_factor > 0.0 and w.candidate.family not in later and not beyond(context, w)),
         key=lambda w: -w.log_bayes_factor - log_prior(system, model, w.candidate),
     )[:most]
     scored += [
@@ -196,10 +203,17 @@ def needed(system: System, model: Model, candidate: CandidateEffect) -> float:
 
 
 def _grown(system: System, model: Model) -> Model:
-    """Return a model with the effect of the greatest gain added until none is beyond doubt."""
-    while len(model.effects) < _MOST:
-        found = [g for g in gains(system, model) if g.log_odds > needed(system, model, g.scored.candidate)]
-        if not found:
-            break
-        model = system.fit(found[0].model.effects, found[0].model.scales)
+    """Return a model with the effect of the greatest gain added until none is beyond doubt.
+
+    One coefficient of an effect that comes after another can stand for several of that one, and would be taken for it:
+    it has its turn when none of the others is beyond doubt any more.
+    """
+    families = {c.family for c in system.candidates}
+    for later in ({name for name in families if families & set(library()[name].comes_after)}, set[str]()):
+        while len(model.effects) < _MOST:
+            every = gains(system, model, later=later)
+            found = [g for g in every if g.log_odds > needed(system, model, g.scored.candidate)]
+            if not found:
+                break
+            model = system.fit(found[0].model.effects, found[0].model.scales)
     return model
