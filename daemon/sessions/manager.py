@@ -33,7 +33,7 @@ from daemon.sessions.lifecycle import SessionLifecycle
 from daemon.sessions.open_session import OpenSession, Shot
 from daemon.sessions.prism_guard import MotionLimit, Suspicion
 from daemon.sessions.prism_watch import PrismWatch, as_dict
-from daemon.sessions.standstill_places import StandstillPlaces
+from daemon.sessions.standstill_places import Exclusions, StandstillPlaces
 from daemon.sessions.station_setups import AXES, Place, SetupBook
 from daemon.store.errors import is_unwritable
 from daemon.store.jobs import JobTable
@@ -46,6 +46,7 @@ log = logging.getLogger(__name__)
 
 STANDING_KINDS = ("static_poses", CHECK)
 CHECK_POSES = (3, 5)
+LOAD_S = 3.0  # how long a session's start waits for what tells prisms apart; it is heeded later as well
 _LOOK_S = 0.5  # how often a shot looks whether anyone still waits for it
 LATE_NS = 60 * NS_PER_S  # once a fix was joined that was measured so long after a session's end, it has all of its own
 SHOT_SPREAD_MM = 20.0  # fixes of one shot that lie further apart are not of one standing target
@@ -90,7 +91,7 @@ class SessionKeeper:
         self._commands = threading.Lock()
         self._shot: Shot | None = None
         self._places = StandstillPlaces(rig)
-        self._prisms = PrismWatch(store, rig.name, clock, limits or {})
+        self._prisms = PrismWatch(store, rig, clock, limits or {})
         self._unstored: list[Callable[[], object]] = []  # observations that the store has yet to take, in their order
         self._is_waiting = False
         self._late: set[str] = set()  # sessions that got fixes after their end, and must be judged again
@@ -164,11 +165,8 @@ class SessionKeeper:
             return None
         standing = joined.standstill is not None
         excluded = self._exclusion(session, joined, place_mm)
-        if standing and excluded is None:
-            at_ns = joined.stamp.monotonic_ns
-            standstill = (session.id, joined.standstill)
-            changed = self._places.add(standstill, at_ns, place_mm, joined.values)
-            excluded = changed.pop(at_ns)
+        if excluded is None:
+            changed, excluded = self._which_prism(session, joined, place_mm)
             if changed:
                 self._unstored.append(partial(self._table.exclude, session.id, changed, joined.stamp))
         row = {
@@ -184,6 +182,21 @@ class SessionKeeper:
         }
         self._unstored.append(partial(self._lifecycle.add_observation, row, joined.fix, joined.stamp))
         return session
+
+    def _which_prism(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> tuple[Exclusions, str | None]:
+        """Why a fix must not be used since it may be of another prism, and earlier ones for which that has changed."""
+        changed = self._prisms.ask_joints(session, joined, place_mm)
+        if changed:
+            changed |= self._places.withdraw([at_ns for at_ns, why in changed.items() if why is not None])
+        doubt = self._prisms.doubt(session, joined.fix)
+        if doubt is not None or joined.standstill is None:
+            return changed, doubt
+        at_ns = joined.stamp.monotonic_ns
+        confirmations = session.confirmations_by(joined.fix.stamp)
+        standstill = (session.id, joined.standstill)
+        here = self._places.add(standstill, at_ns, place_mm, joined.values, confirmations)
+        excluded = here.pop(at_ns)
+        return changed | here, excluded
 
     def _store_observations(self) -> None:
         """Store what was observed; while the disk is full it waits, with what comes after it."""
@@ -210,9 +223,6 @@ class SessionKeeper:
                 return f"{joint} jumped: its readings from then on do not fit those before"
         if session.is_control_point(place_mm):
             return "a control point, not the prism"
-        doubt = self._prisms.doubt(session, joined.fix)
-        if doubt is not None:
-            return doubt
         if session.kind in STANDING_KINDS and joined.standstill is None:
             return "moving"
         return None
@@ -237,6 +247,7 @@ class SessionKeeper:
             if session_id in self._table.ids():
                 raise CommandError(f"session {session_id!r} exists already; choose another --id")
             points = self._setups.control_points(setup_id)
+            self._prisms.prepare(LOAD_S)
             if self._aim is not None:
                 self._aim(prism)
             now = self._clock.now()
@@ -253,7 +264,9 @@ class SessionKeeper:
             }
             self._table.start(now, **row)
             order = self._store.order
-            self._open = session = OpenSession(session_id, setup_id, prism, kind, order, now, control_points=points)
+            session = OpenSession(session_id, setup_id, prism, kind, order, now, control_points=points)
+            self._prisms.begin(session)
+            self._open = session
             if self._aim is not None:
                 self._prisms.turned(session, now)
             return {

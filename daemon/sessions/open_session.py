@@ -6,6 +6,7 @@ import math
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 
+from daemon.sessions.prism_evidence import PrismEvidence
 from daemon.sessions.prism_guard import PrismGuard, Word
 from daemon.sessions.station_setups import Place
 from drivers.clock import Order, Stamp, lies_within
@@ -48,6 +49,7 @@ class OpenSession:
         control_points: where those of its set-up are, mm.
         words: who said when that its stations are on its prism.
         guards: station -> what watches that it stays there; for the writer's thread.
+        evidence: what the joints say of its prism; likewise.
     """
 
     id: str
@@ -62,6 +64,7 @@ class OpenSession:
     control_points: list[Place] = field(default_factory=list)
     words: list[Word] = field(default_factory=list)
     guards: dict[str, PrismGuard] = field(default_factory=dict)
+    evidence: PrismEvidence | None = None
 
     def lasted(self, stamp: Stamp) -> bool:
         """Whether that instant lies in it."""
@@ -72,6 +75,10 @@ class OpenSession:
         return self.lasted(stamp) and not any(
             lies_within(self.order, stamp, shot.since, shot.until) for shot in self.shots
         )
+
+    def confirmations_by(self, stamp: Stamp) -> int:
+        """How often an operator had confirmed its prism by then."""
+        return sum(not word.is_turning and self.order(word.at) <= self.order(stamp) for word in self.words)
 
     def is_control_point(self, place_mm: Place) -> bool:
         """Whether a control point of its set-up is there."""
