@@ -65,7 +65,7 @@ class Sighting:
     slack_mm: float = 0.0
 
 
-@dataclass
+@dataclass(eq=False)
 class Stretch:
     """Fixes of one target.
 
@@ -75,8 +75,8 @@ class Stretch:
         is_believed: an operator says that they are of the prism that is meant; the joints are not asked.
         sightings: those that are looked at.
         instants_ns: of its observations that calibration may use as far as the target goes, monotonic.
-        newest: instant of the newest of these.
         verdict: so far.
+        is_sure: there was enough to compare with.
     """
 
     station: str
@@ -84,8 +84,8 @@ class Stretch:
     is_believed: bool = False
     sightings: list[Sighting] = field(default_factory=list)
     instants_ns: list[int] = field(default_factory=list)
-    newest: Stamp | None = None
     verdict: Verdict = Verdict.OPEN
+    is_sure: bool = False
 
 
 @dataclass(frozen=True)
@@ -215,34 +215,42 @@ class PrismEvidence:
         found: list[Finding] = []
         asked = list(stretches)
         for _ in range(3):
-            news = [finding for stretch in asked if (finding := self._judge_one(identity, stretch)) is not None]
+            news = [finding for stretch in asked for finding in self._judge_as_one(identity, [stretch])]
+            unsure = [s for s in self._stretches if not s.is_sure and not s.is_believed]
+            if len(unsure) > 1:
+                news += self._judge_as_one(identity, unsure)
             found += news
             if not news:
                 break
-            asked = [s for s in self._stretches if s not in [finding.stretch for finding in news]]
+            asked = self._stretches
         return list({id(finding.stretch): finding for finding in found}.values())
 
-    def _judge_one(self, identity: PrismIdentity, stretch: Stretch) -> Finding | None:
-        if stretch.is_believed or not stretch.sightings:
-            return None
-        before, own = stretch.verdict, targets(self._rig, stretch.sightings)
-        relied = self._relied_on(identity, stretch)
-        nothing = targets(self._rig, [])
-        misfits = identity.misfits(nothing, own) if len(relied) < STRONG and len(own) > STRONG else None
-        verdict = Verdict.OPEN if misfits is None else self._verdict(misfits, 0, len(own))
-        if verdict is Verdict.OPEN or misfits is None:
-            if len(relied) + len(own) < 2:
-                return None
-            misfits = identity.misfits(relied, own)
-            verdict = self._verdict(misfits, len(relied), len(own))
-        if verdict is before or (verdict is Verdict.OPEN and before is not Verdict.OTHER):
-            return None
-        if verdict is Verdict.OPEN and misfits.prism[self._index()] > 1.0:
-            return None  # nothing fits: what was found before stays
-        stretch.verdict = verdict
-        if verdict is not Verdict.OTHER:
-            return Finding(stretch)
-        return Finding(stretch, float(misfits.distance_mm[self._index()]) / 1000, self._likeness(misfits, len(own)))
+    def _judge_as_one(self, identity: PrismIdentity, judged: Sequence[Stretch]) -> list[Finding]:
+        """Judge one stretch, or several that may be of one target; the verdicts that change.
+
+        What is compared with something that determines where the base stands, or is enough for that itself, is judged
+        for sure. Several stretches are judged together only so: each by itself was too little.
+        """
+        sightings = [one for stretch in judged for one in _some(stretch.sightings)]
+        if any(stretch.is_believed for stretch in judged) or not sightings:
+            return []
+        relied, own = self._relied_on(identity, judged), targets(self._rig, sightings)
+        is_sure = len(relied) >= STRONG or len(own) > STRONG
+        if len(relied) < STRONG and is_sure:
+            relied = targets(self._rig, [])
+        if len(relied) + len(own) < 2 or (len(judged) > 1 and not is_sure):
+            return []
+        misfits = identity.misfits(relied, own)
+        verdict = self._verdict(misfits, len(relied), len(own))
+        # Where nothing fits, what was found before stays
+        ends_doubt = len(judged) == 1 and judged[0].verdict is Verdict.OTHER and misfits.prism[self._index()] <= 1.0
+        if verdict is Verdict.OPEN and not ends_doubt:
+            return []
+        changed = [stretch for stretch in judged if stretch.verdict is not verdict]
+        for stretch in judged:
+            stretch.verdict, stretch.is_sure = verdict, is_sure and verdict is not Verdict.OPEN
+        distance_m = float(misfits.distance_mm[self._index()]) / 1000
+        return [Finding(stretch, distance_m, self._likeness(misfits, len(own))) for stretch in changed]
 
     def _verdict(self, misfits: Misfits, relied: int, own: int) -> Verdict:
         named, other = float(misfits.prism[self._index()]), self._best_other(misfits, own)[0]
@@ -266,18 +274,15 @@ class PrismEvidence:
         misfit, name = self._best_other(misfits, own)
         return name if misfit <= 1.0 else ""
 
-    def _relied_on(self, identity: PrismIdentity, judged: Stretch) -> Targets:
-        """Return what a stretch is compared with: the groups that fit each other; those that fit worst are left out."""
+    def _relied_on(self, identity: PrismIdentity, judged: Sequence[Stretch]) -> Targets:
+        """Return what stretches are compared with: groups that fit each other; those that fit worst are left out."""
         groups = [_some(group) for group in self._earlier]
         is_later = False
         for stretch in self._stretches:
-            is_later |= stretch is judged
+            if stretch in judged:
+                is_later = True
             # An operator's word counts from then on, never backwards
-            if (
-                stretch is not judged
-                and stretch.verdict is not Verdict.OTHER
-                and not (is_later and stretch.is_believed)
-            ):
+            elif stretch.verdict is not Verdict.OTHER and not (is_later and stretch.is_believed):
                 groups.append(_some(stretch.sightings))
         groups = [group for group in groups if group]
         while groups:

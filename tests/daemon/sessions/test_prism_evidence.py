@@ -71,7 +71,7 @@ def test_another_prism_from_a_session_s_first_fix_on_is_told_by_what_the_set_up_
     assert rig.used(session) == 0
     (suspicion,) = rig.keeper.prism_suspicions()
     assert f"it fits prism {target}" in suspicion.reason
-    assert "where the joints put r" in texts(rig, EventKind.PRISM_JUMP)[0]
+    assert "where the joints put r" in texts(rig, EventKind.PRISM_JUMP)[-1]
     rig.stand(5, "r")
     assert rig.keeper.prism_suspicions() == []
     assert rig.used(session) > 0
@@ -91,16 +91,14 @@ def test_another_prism_that_is_found_on_the_way_back_from_a_control_point_is_exc
     session = rig.say("start", prism="r")["id"]
     rig.stand(0, "r", 0.0)
     rig.shoot("cp1", CONTROL_MM)
-    for pose in range(3):  # of r there was no fix yet, and nothing to compare with
+    for pose in range(5):  # of r there was no fix yet, and nothing to compare with
         rig.stand(pose, "s")
     assert rig.used(session) == 0
     assert [s.station for s in rig.keeper.prism_suspicions()] == ["station"]
-    rig.stand(3, "r")
-    rig.stand(4, "r")
-    rig.stand(5, "r")
-    rig.stand(6, "r")
+    for pose in range(5, 9):
+        rig.stand(pose, "r")
     assert rig.keeper.prism_suspicions() == []
-    assert rig.used(session) > 100
+    assert rig.used(session) > 80
 
 
 def test_a_reflector_that_stands_beside_the_machine_is_no_prism(rig: TrueRig) -> None:
@@ -169,7 +167,7 @@ def test_an_earlier_session_on_the_wrong_prism_does_not_make_the_right_one_wrong
     evidence = PrismEvidence(RIG, "r", loader, [seen("r", range(3)), seen("b", range(3, 5)), seen("r", range(5, 7))])
     stretch = evidence.stretch("station", rig.clock.now(), False)
     stretch.sightings += seen("r", range(8, 9))
-    relied = evidence._relied_on(identity, stretch)
+    relied = evidence._relied_on(identity, [stretch])
     assert len(relied) == 5
     assert (identity.own_misfits(relied) <= 1.0).all()
     (finding,) = evidence._judge(identity, [stretch])
