@@ -1,4 +1,4 @@
-"""The error curve of an encoder, a gear or a worn rack: many cycles over the joint's own angle."""
+"""Errors of an encoder's own reading: scale, eccentricity, error curve, slip on its shaft."""
 
 from __future__ import annotations
 
@@ -9,7 +9,56 @@ from typing import ClassVar
 import numpy as np
 
 from calibration.rig.description import Rig
-from simulators.effects.base import Body, DrawContext, Effect, Floats
+from simulators.effects.base import Body, DrawContext, Effect, Floats, step_time_s
+
+
+@dataclass(frozen=True)
+class AngleScale(Effect):
+    """An encoder whose scale is off.
+
+    d_theta = scale * theta as read, from the zero of the reading; 1e-3 is 0.9 mrad at 50 deg.
+    """
+
+    amplitudes: ClassVar[Mapping[str, float]] = {"scale": 5e-3}
+    has_either_sign = True
+    acts_at = ("revolute",)
+    scale: float = 1.0e-3
+
+    def joint_change(self, body: Body) -> Floats:
+        return self.scale * body.read[self.where]
+
+
+@dataclass(frozen=True)
+class EncoderHarmonic(Effect):
+    """An encoder that sits off its axis: an error that repeats k times a turn.
+
+    True angle - read angle = A cos(k theta) + B sin(k theta), theta the true angle.
+
+    Attributes:
+        cosk_rad, sink_rad: A and B.
+        k: cycles per turn.
+    """
+
+    amplitudes: ClassVar[Mapping[str, float]] = {"cosk_rad": 6e-3, "sink_rad": 6e-3}
+    has_either_sign = True
+    acts_at = ("revolute",)
+    cosk_rad: float = 1.0e-3
+    sink_rad: float = 1.0e-3
+    k: int = 1
+
+    def draw_shape(self, data: DrawContext, rng: np.random.Generator) -> Effect:
+        del data
+        return replace(self, k=int(rng.integers(1, 3)))
+
+    def joint_change(self, body: Body) -> Floats:
+        read = body.read[self.where]
+        change = np.zeros_like(read)
+        # The disc's error belongs to the shaft's true angle; the fixed point is reached to 1e-9 rad in three rounds.
+        for _ in range(3):
+            true = read + change
+            change = self.cosk_rad * np.cos(self.k * true) + self.sink_rad * np.sin(self.k * true)
+        return change
+
 
 _EVEN_POINTS = 721
 _WAVES = 60
@@ -17,7 +66,9 @@ _WAVES = 60
 
 @dataclass(frozen=True)
 class JointErrorMap(Effect):
-    """True angle - read angle = a curve of the angle as read, drawn once from `seed`.
+    """The error curve of an encoder, a gear or a worn rack: many cycles over the joint's own angle.
+
+    True angle - read angle = a curve of the angle as read, drawn once from `seed`.
 
     With `lines` 0 a smooth random curve (of Gaussian correlation over `length_deg`), else a sum of that many cycles of
     equal size whose numbers a turn are drawn from 3 to `highest`.
@@ -78,3 +129,23 @@ class JointErrorMap(Effect):
 def _curve(angle: Floats, cycles: Floats, phase: Floats) -> Floats:
     total: Floats = np.cos(np.outer(angle, cycles) + phase).sum(axis=1)
     return total
+
+
+@dataclass(frozen=True)
+class ZeroStep(Effect):
+    """An encoder that slips on its shaft: from one instant on the joint's zero is another one.
+
+    d_theta = jump for every instant after `time_s` (column `time_s`).
+    """
+
+    amplitudes: ClassVar[Mapping[str, float]] = {"jump_rad": 35e-3}
+    has_either_sign = True
+    acts_at = ("revolute",)
+    jump_rad: float = 2e-3
+    time_s: float = 0.0
+
+    def draw_shape(self, data: DrawContext, rng: np.random.Generator) -> Effect:
+        return replace(self, time_s=step_time_s(data, rng))
+
+    def joint_change(self, body: Body) -> Floats:
+        return np.where(body.column("time_s") > self.time_s, self.jump_rad, 0.0)

@@ -1,4 +1,4 @@
-"""A reducer that stiffens under load: soft while its teeth and bearings take up their play, stiff beyond."""
+"""Particular forms of library effects: gear teeth make an error map, a reducer is compliant."""
 
 from __future__ import annotations
 
@@ -12,8 +12,30 @@ from simulators.effects.base import Body, DrawContext, Effect, Floats
 
 
 @dataclass(frozen=True)
+class GearMesh(Effect):
+    """Teeth that mesh unevenly: an error that repeats with every tooth of a worm wheel or rack.
+
+    d_theta = A cos(n theta) + B sin(n theta), n cycles a turn, theta as read.
+    """
+
+    amplitudes: ClassVar[Mapping[str, float]] = {"cos_rad": 6e-3, "sin_rad": 6e-3}
+    has_either_sign = True
+    acts_at = ("revolute",)
+    cos_rad: float = 1.0e-3
+    sin_rad: float = 1.0e-3
+    cycles: int = 9
+
+    def joint_change(self, body: Body) -> Floats:
+        angle = self.cycles * body.read[self.where]
+        change: Floats = self.cos_rad * np.cos(angle) + self.sin_rad * np.sin(angle)
+        return change
+
+
+@dataclass(frozen=True)
 class StiffeningCompliance(Effect):
-    """Compliance falls from a soft zone around zero torque to that of the loaded reducer, in the deflected posture.
+    """A reducer that stiffens under load: soft while its teeth and bearings take up their play, stiff beyond.
+
+    Compliance falls from a soft zone around zero torque to that of the loaded reducer, in the deflected posture.
 
     dtheta/dtau = stiff + (soft - stiff) / (1 + (tau / knee)^2), so that
     theta(tau) = stiff * tau + (soft - stiff) * knee * arctan(tau / knee).
