@@ -3,37 +3,15 @@
 from __future__ import annotations
 
 import math
-from concurrent.futures import Future
 from dataclasses import dataclass, field
 
+from daemon.sessions.control_shot import Shot
 from daemon.sessions.prism_evidence import PrismEvidence
 from daemon.sessions.prism_guard import PrismGuard, Word
 from daemon.sessions.station_setups import Place
 from drivers.clock import Order, Stamp, lies_within
-from drivers.readings import Fix
 
 CONTROL_POINT_RADIUS_MM = 300.0  # a fix this close to a control point is of the control point, not of the boom
-
-
-@dataclass
-class Shot:
-    """A control point being measured: the mean of the next good fixes.
-
-    Attributes:
-        wanted: how many.
-        since, until: fixes measured in between are not of the prism.
-        aimed: fixes measured from then on may be of the point; None until the station was told to turn to it.
-        fixes, places_mm: so far.
-        done: when there are enough.
-    """
-
-    wanted: int
-    since: Stamp
-    until: Stamp | None = None
-    aimed: Stamp | None = None
-    fixes: list[Fix] = field(default_factory=list)
-    places_mm: list[Place] = field(default_factory=list)
-    done: Future[None] = field(default_factory=Future)
 
 
 @dataclass
