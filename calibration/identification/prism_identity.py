@@ -1,4 +1,4 @@
-"""Which prism a target is: the distances between places that the joints give tell the prisms of a machine apart.
+"""Identity of a target: the distances between places that the joints give tell the prisms of a machine apart.
 
 A base that stands still places all prisms by one rigid transform. Targets that are taken for the wrong prisms fit none:
 prisms are fixed to different links, or to different places of one.
@@ -40,7 +40,7 @@ class Targets:
 
 @dataclass(frozen=True)
 class Misfits:
-    """How badly targets fit each name, in units of what build tolerances and motion explain: up to 1 they do.
+    """Misfits of targets to each name, in units of what build tolerances and motion explain: up to 1 they do.
 
     Attributes:
         prism: (prisms,) where the targets are that prism.

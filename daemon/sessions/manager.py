@@ -329,7 +329,7 @@ class SessionKeeper:
         return self._table.summary(session_id) | {"jobs": self._jobs.of_session(session_id)}
 
     def open_session(self) -> dict[str, Any] | None:
-        """What `status` shows of the open session."""
+        """Return the open session as `status` shows it; None without one."""
         session = self._open
         if session is None:
             return None
@@ -337,7 +337,7 @@ class SessionKeeper:
         return self._table.summary(session.id) | {"prism_suspicions": suspicions}
 
     def aim_again(self) -> None:
-        """Where something can aim the station, do what an operator would when it may be on another prism."""
+        """Aim the station again when it may be on another prism, where something can."""
         session = self._open
         if self._aim is None or session is None or not self._prisms.suspicions(session):
             return

@@ -45,19 +45,19 @@ class OpenSession:
     evidence: PrismEvidence | None = None
 
     def lasted(self, stamp: Stamp) -> bool:
-        """Whether that instant lies in it."""
+        """Return True if that instant lies in it."""
         return lies_within(self.order, stamp, self.since, self.until)
 
     def has(self, stamp: Stamp) -> bool:
-        """Whether what the station measured then is its prism."""
+        """Return True if a fix of that instant is of its prism, and not of a shot."""
         return self.lasted(stamp) and not any(
             lies_within(self.order, stamp, shot.since, shot.until) for shot in self.shots
         )
 
     def confirmations_by(self, stamp: Stamp) -> int:
-        """How often an operator had confirmed its prism by then."""
+        """Return the number of times that an operator had confirmed its prism by then."""
         return sum(not word.is_turning and self.order(word.at) <= self.order(stamp) for word in self.words)
 
     def is_control_point(self, place_mm: Place) -> bool:
-        """Whether a control point of its set-up is there."""
+        """Return True if a control point of its set-up is there."""
         return any(math.dist(place_mm, point) < CONTROL_POINT_RADIUS_MM for point in self.control_points)

@@ -1,4 +1,4 @@
-"""Whether the joints say that a station is on the prism that is meant: evidence from the rigid fit of its targets.
+"""Evidence of the joints that a station is on the prism that is meant: the rigid fit of its targets.
 
 Fixes between two instants at which a station may have changed its target are of one target: a stretch. Each stretch is
 held against the others of the session and against the poses that earlier sessions of the set-up have left, by
@@ -41,7 +41,7 @@ CLEARLY = 2.0  # another name must fit so many times better, or worse
 
 
 class Verdict(Enum):
-    """What the joints say of a stretch."""
+    """Verdict of the joints on a stretch."""
 
     OPEN = "nothing yet"
     NAMED = "the prism that is meant"

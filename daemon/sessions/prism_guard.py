@@ -1,4 +1,4 @@
-"""Whether a station still follows the prism that is meant: a pure state machine over one station's fixes in a session.
+"""Guard of the prism that is meant: a pure state machine over one station's fixes in a session.
 
 A total station follows whatever reflector it finds, and its fixes look as good as before. Which prism is meant only an
 operator knows: who starts a session names it, and the station is believed to be on it then.
@@ -29,7 +29,7 @@ _Point = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class MotionLimit:
-    """What motion can do to a prism, and how a station follows it.
+    """Limit of the motion of a prism, and how a station follows it.
 
     Attributes:
         max_speed_m_s: faster than this no prism moves. The default is the bound of a field-proven program, 1 m
@@ -50,13 +50,13 @@ class MotionLimit:
         return cls(config.max_speed_m_s, config.jump_slack_m, config.relock_within_m, config.tracks_silently)
 
     def reach_m(self, within_ns: float) -> float:
-        """How far apart two fixes of one prism may be that were measured within so long a time."""
+        """Return the largest distance of two fixes of one prism that were measured within so long a time."""
         return self.slack_m + self.max_speed_m_s * max(0.0, within_ns) / NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
 class Word:
-    """What fixes cannot tell.
+    """The word of an operator or program that a station is on the prism, which fixes cannot tell.
 
     Attributes:
         at: from then on the station is on the prism that is meant.
@@ -93,7 +93,7 @@ class Suspicion:
 
     @property
     def remedy(self) -> str:
-        """What to do about it."""
+        """Instruction to the operator."""
         return f"aim {self.station} at the prism again; where it is on it already, {CONFIRM}"
 
 

@@ -104,7 +104,7 @@ class PrismWatch:
         return suspicion.reason if suspicion is not None else None
 
     def suspicions(self, session: OpenSession) -> list[Suspicion]:
-        """Those of the session that last."""
+        """Return the suspicions of the session that last."""
         return [guard.suspicion for guard in list(session.guards.values()) if guard.suspicion is not None]
 
     def confirm(self, session: OpenSession, operator: str) -> dict[str, Any]:
@@ -139,7 +139,7 @@ class PrismWatch:
         session.words.append(Word(at, is_turning=True))
 
     def restore(self, session: OpenSession) -> None:
-        """What an earlier run of the daemon knew, from what it stored; where it left off, the next fix is a new lock.
+        """Restore the knowledge of an earlier run of the daemon from the store; the next fix is a new lock.
 
         A restart ends no suspicion, and what happened while nobody listened may begin one.
         """
