@@ -23,6 +23,7 @@ CONFIRM = "`rigcal session confirm-prism` says that it is the prism that is mean
 USUAL_OF = 5  # intervals, whose median no single late fix and no pause changes
 USUAL_NS = NS_PER_S  # at most, and while fewer than three are known
 PAUSE_NS = 2 * NS_PER_S  # a station that is aimed by hand may have been aimed anew in so long a time without a fix
+TURN_NS = 10 * NS_PER_S  # a jump so long after the station was told to turn is no turn
 
 _Point = tuple[float, float, float]
 
@@ -160,6 +161,7 @@ class PrismGuard:
     _intervals_ns: deque[int] = field(default_factory=partial(deque, maxlen=USUAL_OF))  # between fixes, lately
     _is_new_lock: bool = False
     _is_turning: bool = False
+    _turning_until: Stamp | None = None
 
     @property
     def suspicion(self) -> Suspicion | None:
@@ -227,6 +229,8 @@ class PrismGuard:
         last, self._last = self._last, seen
         if last is not None and last.stamp.boot_id == seen.stamp.boot_id:
             self._intervals_ns.append(seen.stamp.since(last.stamp))
+        if self._turning_until is not None and lies_within(self.order, seen.stamp, self._turning_until, None):
+            self._is_turning = False
         if is_new_lock or last is None or self._has_turned(last, seen):
             self.turns.append(Turn(seen.stamp, self._is_believed))
             self._is_believed = False
@@ -247,6 +251,7 @@ class PrismGuard:
         self._good = self._last = None
         self._intervals_ns.clear()
         self._is_new_lock, self._is_turning = False, word.is_turning
+        self._turning_until = word.at.shifted(TURN_NS)
         self._is_believed = not word.is_turning
 
     def _judge(self, seen: _Seen, good: _Seen, is_new_lock: bool) -> DeviceEvent | None:
