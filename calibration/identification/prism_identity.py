@@ -57,20 +57,15 @@ class PrismIdentity:
     """Tells which prism targets are.
 
     Args:
-        rig: the machine.
-        values: (p,) row and prism parameters of a calibrated model, in the order of its chain; nominal by default.
-        sigma_mm: RMS 3-D error of that model; by default the build tolerances say how far each target may be off.
+        rig: the machine; its nominal kinematics are used, and its build tolerances say how far a target may be off.
     """
 
-    def __init__(self, rig: Rig, values: Floats | None = None, sigma_mm: float | None = None) -> None:
+    def __init__(self, rig: Rig) -> None:
         self._chain = Chain(rig, {"": Placement.identity()})
         self._x = np.zeros(len(self._chain))
-        if values is not None:
-            self._x[: self._chain.base_start] = values[: self._chain.base_start]
         self._prior = np.array(
             [0.0 if p.kind == "base" or p.is_flat else p.prior_sigma for p in self._chain.parameters]
         )
-        self._sigma_mm = sigma_mm
 
     def own_misfits(self, targets: Targets) -> Floats:
         """Return how badly targets (n,) fit the names that they have, in units of `Misfits`."""
@@ -109,8 +104,6 @@ class PrismIdentity:
 
     def _limits_mm(self, errors_mm: Floats, slack_mm: Floats) -> Floats:
         """Return how far (n,) targets may be off, mm: what moves all of them alike is part of the rigid transform."""
-        if self._sigma_mm is not None:
-            return BEYOND_BUILDING * self._sigma_mm + SLACK_MM + slack_mm
         own_mm: Floats = np.sqrt(((errors_mm - errors_mm.mean(axis=0)) ** 2).sum(axis=(1, 2)))
         return BEYOND_BUILDING * own_mm + SLACK_MM + slack_mm
 
