@@ -235,13 +235,16 @@ class PrismEvidence:
         if any(stretch.is_believed for stretch in judged) or not sightings:
             return []
         relied, own = self._relied_on(identity, judged), targets(self._rig, sightings)
-        is_sure = len(relied) >= STRONG or len(own) > STRONG
-        if len(relied) < STRONG and is_sure:
-            relied = targets(self._rig, [])
-        if len(relied) + len(own) < 2 or (len(judged) > 1 and not is_sure):
+        if len(relied) + len(own) < 2:
             return []
-        misfits = identity.misfits(relied, own)
+        misfits, is_sure = identity.misfits(relied, own), len(relied) >= STRONG
         verdict = self._verdict(misfits, len(relied), len(own))
+        if not is_sure and len(own) > STRONG:
+            alone = identity.misfits(targets(self._rig, []), own)
+            if (by_itself := self._verdict(alone, 0, len(own))) is not Verdict.OPEN:
+                misfits, verdict, is_sure = alone, by_itself, True
+        if len(judged) > 1 and not is_sure:
+            return []
         # Where nothing fits, what was found before stays
         ends_doubt = len(judged) == 1 and judged[0].verdict is Verdict.OTHER and misfits.prism[self._index()] <= 1.0
         if verdict is Verdict.OPEN and not ends_doubt:
