@@ -150,7 +150,7 @@ def _of_descriptions() -> Iterator[tuple[str, str, bytes]]:
     for path in sorted(_RIGS.glob("*.toml")) + sorted(_MORE_RIGS.glob("*.toml")):
         yield "rig", path.stem, path.read_bytes()
     yield "dbc", "machine", (_RIGS / "machine.dbc").read_bytes()
-    yield "dbc", "tip", (_RIGS.parents[1] / "drivers" / "tip.dbc").read_bytes()
+    yield "dbc", "tip", (_RIGS.parents[1] / "drivers" / "can" / "tip.dbc").read_bytes()
     yield "dbc", "multiplexed", _MULTIPLEXED
     yield "eds", "cia406", (_RIGS / "cia406.eds").read_bytes()
     yield "eds", "arrays", _ARRAYS
