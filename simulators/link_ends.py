@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 from drivers.can import frame as drivers_frame
 from drivers.can.ports import CanLinkConfig, CanPort, Interface, open_port
@@ -17,9 +17,11 @@ from simulators.devices.can.bus import Frame
 from simulators.devices.can.slcan_adapter import Channel, SlcanAdapter
 from simulators.pty_port import Backlog, PtyPort
 
+Port = TypeVar("Port", CanPort, SerialPort)
+
 
 class LinkEnd(Protocol):
-    """What both links have."""
+    """The rig's end of a link."""
 
     @property
     def name(self) -> str:
@@ -103,7 +105,25 @@ class SlcanEnd:
         self._port.write(b"".join(self._adapter.encode(frame) for frame in frames))
 
 
-class BusEnd:
+class _DeviceEnd(Generic[Port]):
+    """An end at a real interface or device, whose port is open while it is plugged in."""
+
+    _port: Port | None = None
+
+    @property
+    def plugged(self) -> bool:
+        return self._port is not None
+
+    def fileno(self) -> int:
+        return -1 if self._port is None else self._port.fileno()
+
+    def unplug(self) -> None:
+        if self._port is not None:
+            self._port.close()
+        self._port = None
+
+
+class BusEnd(_DeviceEnd[CanPort]):
     """A real interface of python-can.
 
     Error frames are a controller's own: none are sent here.
@@ -121,24 +141,11 @@ class BusEnd:
         self._config = CanLinkConfig(
             name=self.name, interface=interface, channel=channel, allow_transmit=True, options=options
         )
-        self._port: CanPort | None = None
         self.plug()
-
-    @property
-    def plugged(self) -> bool:
-        return self._port is not None
-
-    def fileno(self) -> int:
-        return -1 if self._port is None else self._port.fileno()
 
     def plug(self) -> None:
         if self._port is None:
             self._port = open_port(self._config)
-
-    def unplug(self) -> None:
-        if self._port is not None:
-            self._port.close()
-        self._port = None
 
     def receive(self) -> list[Frame]:
         received = [] if self._port is None else self._port.receive(0.0).received
@@ -150,7 +157,7 @@ class BusEnd:
                 self._port.send(drivers_frame.Frame(*frame))
 
 
-class SerialEnd:
+class SerialEnd(_DeviceEnd[SerialPort]):
     """A real serial device.
 
     Args:
@@ -164,25 +171,15 @@ class SerialEnd:
     def __init__(self, path: str, baud: int) -> None:
         self.name = path
         self._config = SerialConfig(path=path, baud=baud)
-        self._port: SerialPort | None = None
         self._backlog = Backlog()
         self.plug()
-
-    @property
-    def plugged(self) -> bool:
-        return self._port is not None
-
-    def fileno(self) -> int:
-        return -1 if self._port is None else self._port.fileno()
 
     def plug(self) -> None:
         if self._port is None:
             self._port = SerialPort(self._config, "simulator")
 
     def unplug(self) -> None:
-        if self._port is not None:
-            self._port.close()
-        self._port = None
+        super().unplug()
         self._backlog.clear()
 
     def read(self) -> bytes:

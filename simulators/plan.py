@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -64,8 +65,12 @@ def stops_of(rig: Rig, rows: Iterable[Mapping[str, Any]], dwell_s: float) -> lis
             pose = {joint.name: float(row[joint.column]) for joint in rig.joints}
             sides = {joint.name: float(row.get(f"{joint.name}_dir", 0.0)) for joint in rig.joints}
             stand_s = max(dwell_s, float(row.get("dwell_s", 0.0)))
+            if not all(map(math.isfinite, (*pose.values(), *sides.values(), stand_s))):
+                raise ValueError("not finite")
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"a pose has a number for each of {', '.join(j.column for j in rig.joints)}") from error
+            raise ValueError(
+                f"a pose has a finite number for each of {', '.join(j.column for j in rig.joints)}"
+            ) from error
         before = {
             joint.name: min(
                 max(pose[joint.name] - sides[joint.name] * APPROACH[joint.unit], joint.limits[0]), joint.limits[1]

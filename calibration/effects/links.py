@@ -35,7 +35,7 @@ _LEAST_SHARE = 0.01  # of the largest moment; a link that gives way to less of i
 
 @dataclass(frozen=True)
 class Link:
-    """What a turning row carries, in n rows of observations; vectors are of the base frame.
+    """Weights that a turning row carries, in n rows of observations; vectors are of the base frame.
 
     Attributes:
         context: the rows of observations.

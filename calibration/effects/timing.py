@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calibration.effects.base import Family, FittedCoefficient, Settings
+from calibration.effects.base import Family, FittedCoefficient, JointFamily, Settings
 from calibration.effects.context import EffectContext
 from calibration.observations import Floats
 
@@ -72,6 +72,37 @@ class StepFamily(Family):
         plausible = settings["span_s"] / math.sqrt(12.0)  # anywhere between the first row and the last
         instant = FittedCoefficient("time_s", "s", settings["time_s"], settings["time_error_s"], plausible)
         return (*coefficients, instant)
+
+
+class JointStepFamily(StepFamily, JointFamily):
+    """A joint whose zero is another one from an instant on; its one coefficient is the jump, rad or mm."""
+
+    def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
+        del where
+        return step_grid(context.extra("time_s"))
+
+    def refined(self, context: EffectContext, where: str, settings: Settings) -> tuple[Settings, ...]:
+        del where
+        return refined_steps(context.extra("time_s"), settings)
+
+    def check_settings(self, settings: Settings) -> None:
+        if set(settings) != set(STEP_SETTINGS):
+            raise ValueError(f"the settings are {', '.join(STEP_SETTINGS)}")
+        check_step(settings)
+
+    def columns(self, context: EffectContext, where: str, settings: Settings) -> Floats:
+        del where
+        after = context.extra("time_s") > settings["time_s"]
+        return self._in_readings(after.astype(np.float64))[:, None]
+
+    def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
+        """Return the mean square for rows as likely before the step as after it."""
+        del plausible, settings
+        return float(0.5 * self._in_readings(values[:1])[0] ** 2)
+
+    def _in_readings(self, values: Floats) -> Floats:
+        """Return rad or mm as the unit of the joint's readings, deg or mm."""
+        return np.degrees(values) if self.kind == "revolute" else values
 
 
 class _Instants(NamedTuple):

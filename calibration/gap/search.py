@@ -11,10 +11,10 @@ import numpy as np
 from calibration.effects.fitted import Choice
 from calibration.gap.adoption import Adopted, adopted
 from calibration.gap.background.blocks import displacement_blocks, smooth_blocks, time_blocks
+from calibration.gap.background.breaks import find_break
 from calibration.gap.background.naming import Names, evidence_alone, names_beside
 from calibration.gap.background.outside import formula_block, is_in_library, what_is_left
 from calibration.gap.background.search import background_log_bayes_factor
-from calibration.gap.breaks import find_break
 from calibration.gap.candidates import CandidateEffect, candidate_effects
 from calibration.gap.criteria import best_of_each_family, beyond_doubt
 from calibration.gap.detection import detect

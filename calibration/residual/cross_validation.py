@@ -57,7 +57,7 @@ class Data:
 
 @dataclass(frozen=True)
 class Shared:
-    """What learners of many rows share, whichever fold is left out; None for what each finds for itself.
+    """Parts that learners of many rows share, whichever fold is left out; None for those that each finds itself.
 
     Attributes:
         shape: of networks.

@@ -175,7 +175,7 @@ class Acquisition:
         return self._backlog.is_behind
 
     def check(self) -> None:
-        """Whether the writer lives; a disk that is full or slow is no reason to raise, it is waited for.
+        """Return True if the writer lives; a disk that is full or slow is no reason to raise, it is waited for.
 
         Raises:
             AcquisitionError: the writer has ended, and nothing is stored any more.
@@ -189,7 +189,7 @@ class Acquisition:
         return self._failure is None
 
     def alive(self, within_s: float) -> bool:
-        """Whether the writer has gone round within the last real `within_s`: a hung disk or a dead writer has not."""
+        """Return True if the writer has gone round within the last real `within_s`; a hung or a dead one has not."""
         since_s = (self._clock.monotonic_ns() - self._last_cycle_ns) / NS_PER_S
         return self._writer is not None and self._writer.is_alive() and self._clock.real_seconds(since_s) <= within_s
 
@@ -363,7 +363,7 @@ class Acquisition:
             log.exception("records are stored, but could not be handed on")
 
     def _insist(self, work: Callable[[], T]) -> T:
-        """What `work` returns, however long the disk is full or faulty; when stopping, only a few times."""
+        """Do `work` and return its result, however long the disk is full or faulty; when stopping, only a few times."""
         tries = 0
         while True:
             try:
@@ -380,7 +380,7 @@ class Acquisition:
                 return result
 
     def _try(self, what: str, work: Callable[[], None]) -> bool:
-        """Whether the disk lets `work` be done; where it does not, captures are stored first, if they can be."""
+        """Return True if the disk lets `work` be done; where it does not, captures are stored first, if they can be."""
         try:
             work()
         except sqlite3.DatabaseError as error:

@@ -39,7 +39,7 @@ class Batch:
 
 
 class Backlog:
-    """What waits to be decoded, oldest first. Belongs to the writer's thread.
+    """Captures that wait to be decoded, oldest first. Belongs to the writer's thread.
 
     Args:
         store: where the captures are.

@@ -47,7 +47,7 @@ def decoder_factories(rig: Rig, directory: Path, link: str) -> list[Callable[[],
 
 
 def node_setups(rig: Rig, directory: Path, link: str) -> list[NodeSetup]:
-    """What active set-up expects of each CANopen node of a link, and tells it to do."""
+    """Settings that active set-up expects of each CANopen node of a link, and writes to it."""
     return [
         NodeSetup(
             node=channel.node,
@@ -134,7 +134,7 @@ def _factory(
 
 
 class _CanopenPart(TypedDict):
-    """What the drivers' CANopen channels have in common."""
+    """Settings that the drivers' CANopen channels have in common."""
 
     name: str
     unit: str

@@ -1,4 +1,4 @@
-"""How much of what arrives cannot be decoded, and mostly why."""
+"""Share of the captures that cannot be decoded, and the commonest reason."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _PARTICULARS = re.compile(r"'[^']*'|\"[^\"]*\"|b'[^']*'|[0-9A-F]*\d[0-9A-Fa-f.]*
 
 @dataclass(frozen=True)
 class DecodeStatus:
-    """What of a device could not be decoded.
+    """Failed decodes of one device.
 
     Attributes:
         device: channel, station or link.

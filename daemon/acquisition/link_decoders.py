@@ -72,7 +72,7 @@ class LinkDecoders:
         return records
 
     def summaries(self, now: Stamp) -> list[CanSummary]:
-        """What the CAN links have heard until `now`; from any thread."""
+        """Return the frames that CAN links have heard until `now`; from any thread."""
         decoders = [self._decoders.get(link) for link in self._factories]
         return [decoder.summary(now) for decoder in decoders if isinstance(decoder, CanDecoder)]
 

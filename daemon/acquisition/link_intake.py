@@ -63,11 +63,11 @@ class LinkIntake:
 
     @property
     def queued(self) -> int:
-        """How many items wait."""
+        """Number of items that wait."""
         return len(self._queue)
 
     def drain(self) -> list[LinkItem]:
-        """What waits, oldest first, and at its end what was lost."""
+        """Return the items that wait, oldest first, and at their end a gap for those that were lost."""
         queue = self._queue
         items = [queue.popleft() for _ in range(len(queue))]
         if self._loss is not None:

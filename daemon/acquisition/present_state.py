@@ -1,4 +1,4 @@
-"""What every channel and station is at this moment, from the last that is known of it and how long ago that was.
+"""State of every channel and station at this moment, from its last record and the age of that.
 
 The last reading says what a device was when it was read. Whether it still is follows from its age and from its link:
 status, alarms and interfaces all ask here, so that nothing old is shown as fresh.
@@ -53,7 +53,7 @@ class ExpectedStation:
 
 @dataclass(frozen=True)
 class Expected:
-    """What should be heard.
+    """Devices that should be heard.
 
     Attributes:
         channels: of the rig.
@@ -68,7 +68,7 @@ NOTHING_EXPECTED = Expected()
 
 
 def expected_of(config: Config, rig: Rig) -> Expected:
-    """What a configured rig should be heard to say."""
+    """Return the devices that a configured rig should be heard by."""
     joints = rig.joint_names
     return Expected(
         tuple(
@@ -105,12 +105,12 @@ def present_status(
 
 
 def is_present(status: str) -> bool:
-    """Whether a status is that of a last reading, which is fresh."""
+    """Return True if a status is that of a last reading, which is fresh."""
     return status not in (STARTING, SILENT, LINK_DOWN)
 
 
 def station_sentence(status: str, age_s: float | None, last_lock: str, last_status: str, reason: str) -> str:
-    """What a station is, in one clause: `locked, ok, 0 s ago` or `silent for 40 s (last: locked, ok)`."""
+    """Return the state of a station in one clause: `locked, ok, 0 s ago` or `silent for 40 s (last: locked, ok)`."""
     words = {STARTING: "not heard yet", SILENT: "silent", LINK_DOWN: "link down"}
     if age_s is None:
         return words[status] if status == STARTING else f"{words[status]}, not heard since the start"

@@ -1,4 +1,4 @@
-"""What acquisition is doing, as a snapshot for `rigcal status`, the alarms and the interfaces."""
+"""State of acquisition, as a snapshot for `rigcal status`, the alarms and the interfaces."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ class GapCount:
 
 @dataclass(frozen=True)
 class EventCount:
-    """How many events of a kind a device or link had since the start.
+    """Return the number of events of a kind that a device or link had since the start.
 
     Attributes:
         device, kind: as of `EventStatus`.

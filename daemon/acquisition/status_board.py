@@ -51,7 +51,7 @@ LAG_WINDOW_BATCHES = 1200  # a minute at the usual 20 batches a second
 
 @dataclass
 class _Link:
-    """What was last heard of a link, and what was last counted of it."""
+    """Last record of a link, and its counters."""
 
     since: Stamp
     up: bool | None = None
@@ -202,7 +202,7 @@ class StatusBoard:
 
     @staticmethod
     def _known(expected: Mapping[str, object], heard: Mapping[str, object]) -> list[str]:
-        """What is expected, in its order, then what else was heard."""
+        """Return the expected devices in their order, then the others that were heard."""
         return [*dict.fromkeys([*expected, *heard])]
 
     def _channel(self, name: str, links: Mapping[str, LinkStatus], now: Stamp) -> ChannelStatus:
@@ -279,7 +279,7 @@ def _age_s(stamp: Stamp, now: Stamp) -> float:
 
 
 def _open(link: LinkStatus | None) -> tuple[bool | None, float]:
-    """Whether a link is open, and for how long it has been; unknown of none."""
+    """Return the state of a link and since when it has it; unknown of none."""
     return (None, 0.0) if link is None else (link.up, link.since_s)
 
 

@@ -1,4 +1,4 @@
-"""What is known of joints and signals over the last seconds, and how the boom moves.
+"""Joints and signals over the last seconds, and the motion of the boom.
 
 Motion is told from noise by a reference that follows a resting joint slowly: a joint moves when it is further than
 `motion_threshold` from its reference, which then jumps to it. So a joint that creeps more slowly than the threshold per
@@ -85,7 +85,7 @@ class History(Generic[T]):
             del times_ns[:old], self.items[:old]
 
     def newer(self, at_ns: int) -> bool:
-        """Whether `at_ns` is beyond all that is here."""
+        """Return True if `at_ns` is beyond all samples."""
         return not self.times_ns or at_ns > self.times_ns[-1]
 
     def latest(self, at_ns: int) -> int:
@@ -245,7 +245,7 @@ class Motion:
         self._moves.add(at_ns, self._ended)
 
     def restart(self) -> None:
-        """What stood may have moved unseen: the next standstill is another."""
+        """Begin another standstill: joints may have moved unseen."""
         self._ended += bool(self._moves.times_ns)
         self._moves.clear()
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import math
 import sqlite3
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -20,35 +19,33 @@ from calibration.rig.description import Rig
 from daemon.acquisition.joiner import JoinedFix, ObservationJoiner
 from daemon.commands import (
     CHECK,
-    FAILED,
     SESSION_KINDS,
     CommandError,
     caller_columns,
-    caller_has_left,
     identifier,
     text_argument,
 )
 from daemon.config import SessionsSection
+from daemon.sessions.advice import SessionAdvice, after_a_move
+from daemon.sessions.control_shot import Shot
 from daemon.sessions.lifecycle import SessionLifecycle
-from daemon.sessions.open_session import OpenSession, Shot
+from daemon.sessions.open_session import OpenSession
 from daemon.sessions.prism_guard import MotionLimit, Suspicion
 from daemon.sessions.prism_watch import PrismWatch, as_dict
-from daemon.sessions.standstill_places import StandstillPlaces
+from daemon.sessions.standstill_places import Exclusions, StandstillPlaces
 from daemon.sessions.station_setups import AXES, Place, SetupBook
 from daemon.store.errors import is_unwritable
 from daemon.store.jobs import JobTable
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, Clock, Stamp, lies_within
-from drivers.readings import DeviceEvent, EventKind, Fix, Record, Status
+from drivers.readings import DeviceEvent, EventKind, Fix, Record
 from drivers.stations.survey import position_mm
 
 log = logging.getLogger(__name__)
 
 STANDING_KINDS = ("static_poses", CHECK)
-CHECK_POSES = (3, 5)
-_LOOK_S = 0.5  # how often a shot looks whether anyone still waits for it
+LOAD_S = 3.0  # how long a session's start waits for what tells prisms apart; it is heeded later as well
 LATE_NS = 60 * NS_PER_S  # once a fix was joined that was measured so long after a session's end, it has all of its own
-SHOT_SPREAD_MM = 20.0  # fixes of one shot that lie further apart are not of one standing target
 
 
 class SessionKeeper:
@@ -90,7 +87,8 @@ class SessionKeeper:
         self._commands = threading.Lock()
         self._shot: Shot | None = None
         self._places = StandstillPlaces(rig)
-        self._prisms = PrismWatch(store, rig.name, clock, limits or {})
+        self._prisms = PrismWatch(store, rig, clock, limits or {})
+        self._advice = SessionAdvice(rig, setups, self._table, self._prisms)
         self._unstored: list[Callable[[], object]] = []  # observations that the store has yet to take, in their order
         self._is_waiting = False
         self._late: set[str] = set()  # sessions that got fixes after their end, and must be judged again
@@ -105,7 +103,8 @@ class SessionKeeper:
         """Take records that are stored now: complete a shot, or store observations of the open session."""
         for record in records:
             if isinstance(record, Fix):
-                self._feed_shot(record)
+                if self._shot is not None:
+                    self._shot.take(record, self._store.order)
                 self._watch_prism(record)
             elif isinstance(record, DeviceEvent) and record.kind is EventKind.PRESET_JUMP:
                 for session in self._taking():
@@ -123,21 +122,6 @@ class SessionKeeper:
     def is_of_session(self, stamp: Stamp) -> bool:
         """Return True if an instant lies in the open session, or in one that ended and may still get fixes."""
         return any(session.lasted(stamp) for session in self._taking())
-
-    def _feed_shot(self, fix: Fix) -> None:
-        shot = self._shot
-        place_mm = position_mm(fix)
-        if shot is None or shot.done.done() or place_mm is None or fix.status is not Status.OK:
-            return
-        if not lies_within(self._store.order, fix.stamp, shot.aimed, None):
-            return
-        if shot.places_mm and math.dist(place_mm, shot.places_mm[0]) > SHOT_SPREAD_MM:
-            shot.fixes.clear()  # the station was still turning to it
-            shot.places_mm.clear()
-        shot.fixes.append(fix)
-        shot.places_mm.append(place_mm)
-        if len(shot.fixes) == shot.wanted:
-            shot.done.set_result(None)
 
     def _watch_prism(self, fix: Fix) -> None:
         for session in self._taking():
@@ -164,11 +148,8 @@ class SessionKeeper:
             return None
         standing = joined.standstill is not None
         excluded = self._exclusion(session, joined, place_mm)
-        if standing and excluded is None:
-            at_ns = joined.stamp.monotonic_ns
-            standstill = (session.id, joined.standstill)
-            changed = self._places.add(standstill, at_ns, place_mm, joined.values)
-            excluded = changed.pop(at_ns)
+        if excluded is None:
+            changed, excluded = self._which_prism(session, joined, place_mm)
             if changed:
                 self._unstored.append(partial(self._table.exclude, session.id, changed, joined.stamp))
         row = {
@@ -184,6 +165,21 @@ class SessionKeeper:
         }
         self._unstored.append(partial(self._lifecycle.add_observation, row, joined.fix, joined.stamp))
         return session
+
+    def _which_prism(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> tuple[Exclusions, str | None]:
+        """Why a fix must not be used since it may be of another prism, and earlier ones for which that has changed."""
+        changed = self._prisms.ask_joints(session, joined, place_mm)
+        if changed:
+            changed |= self._places.withdraw([at_ns for at_ns, why in changed.items() if why is not None])
+        doubt = self._prisms.doubt(session, joined.fix)
+        if doubt is not None or joined.standstill is None:
+            return changed, doubt
+        at_ns = joined.stamp.monotonic_ns
+        confirmations = session.confirmations_by(joined.fix.stamp)
+        standstill = (session.id, joined.standstill)
+        here = self._places.add(standstill, at_ns, place_mm, joined.values, confirmations)
+        excluded = here.pop(at_ns)
+        return changed | here, excluded
 
     def _store_observations(self) -> None:
         """Store what was observed; while the disk is full it waits, with what comes after it."""
@@ -210,9 +206,6 @@ class SessionKeeper:
                 return f"{joint} jumped: its readings from then on do not fit those before"
         if session.is_control_point(place_mm):
             return "a control point, not the prism"
-        doubt = self._prisms.doubt(session, joined.fix)
-        if doubt is not None:
-            return doubt
         if session.kind in STANDING_KINDS and joined.standstill is None:
             return "moving"
         return None
@@ -237,6 +230,7 @@ class SessionKeeper:
             if session_id in self._table.ids():
                 raise CommandError(f"session {session_id!r} exists already; choose another --id")
             points = self._setups.control_points(setup_id)
+            self._prisms.prepare(LOAD_S)
             if self._aim is not None:
                 self._aim(prism)
             now = self._clock.now()
@@ -251,9 +245,11 @@ class SessionKeeper:
                 "kind": kind,
                 "note": text_argument(arguments, "note"),
             }
-            self._table.start(now, **row)
             order = self._store.order
-            self._open = session = OpenSession(session_id, setup_id, prism, kind, order, now, control_points=points)
+            session = OpenSession(session_id, setup_id, prism, kind, order, now, control_points=points)
+            self._prisms.begin(session)
+            self._table.start(now, **row)
+            self._open = session
             if self._aim is not None:
                 self._prisms.turned(session, now)
             return {
@@ -261,14 +257,14 @@ class SessionKeeper:
                 "setup": setup_id,
                 "prism": prism,
                 "kind": kind,
-                "advice": self._advice(session, "start"),
+                "advice": self._advice.at_start(session),
             }
 
     def stop_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Close the open session; its jobs follow by themselves."""
         with self._commands:
             session = self._close("closed")
-            return self._table.summary(session.id) | {"advice": self._advice(session, "end")}
+            return self._table.summary(session.id) | {"advice": self._advice.at_end(session)}
 
     def abort_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Close the open session as unusable: kept, never calibrated with."""
@@ -297,7 +293,7 @@ class SessionKeeper:
                     self._aim(name)
                 shot.aimed = self._clock.now()
                 self._shot = shot
-                self._await(shot)
+                shot.wait(self._clock, self._settings.shot_timeout_s)
                 phase = self._table.phase(session.id, name)
                 result = self._setups.store_shot(session.setup_id, session.id, name, phase, shot.fixes, shot.places_mm)
                 # Before the shot is over: fixes that come late are of the point, and known to be
@@ -309,7 +305,7 @@ class SessionKeeper:
                 shot.until = self._clock.now()
                 if self._aim is not None:
                     self._prisms.turned(session, shot.until)
-            return result | {"advice": _after_a_move(session) if result["moved"] else []}
+            return result | {"advice": after_a_move(session.id) if result["moved"] else []}
 
     def confirm_prism_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Take the operator's word that the station is on the session's prism: its fixes count from now on."""
@@ -333,7 +329,7 @@ class SessionKeeper:
         return self._table.summary(session_id) | {"jobs": self._jobs.of_session(session_id)}
 
     def open_session(self) -> dict[str, Any] | None:
-        """What `status` shows of the open session."""
+        """Return the open session as `status` shows it; None without one."""
         session = self._open
         if session is None:
             return None
@@ -341,7 +337,7 @@ class SessionKeeper:
         return self._table.summary(session.id) | {"prism_suspicions": suspicions}
 
     def aim_again(self) -> None:
-        """Where something can aim the station, do what an operator would when it may be on another prism."""
+        """Aim the station again when it may be on another prism, where something can."""
         session = self._open
         if self._aim is None or session is None or not self._prisms.suspicions(session):
             return
@@ -361,65 +357,6 @@ class SessionKeeper:
         return [] if session is None else self._prisms.suspicions(session)
 
     # ---- parts -------------------------------------------------------------------------------------------------------
-
-    def _await(self, shot: Shot) -> None:
-        """Wait until the shot is complete; the time-out runs on the clock of the rig.
-
-        An operator who gives up turns the station back to the prism: a shot that nobody waits for ends at once.
-        """
-        arrived = threading.Event()
-        shot.done.add_done_callback(lambda _: arrived.set())
-        left_s, is_complete = self._settings.shot_timeout_s, False
-        while left_s > 0 and not is_complete:
-            is_complete = self._clock.wait(arrived, min(left_s, _LOOK_S))
-            left_s -= _LOOK_S
-            if caller_has_left():
-                log.info("a shot of a control point was given up: nobody waits for it any more")
-                raise CommandError("the shot was given up, and nothing was stored", FAILED)
-        if not is_complete:
-            raise CommandError(
-                f"{len(shot.fixes)} of {shot.wanted} good fixes within {self._settings.shot_timeout_s:g} s; is the "
-                "station aimed at the control point, and locked? `rigcal status` shows",
-                FAILED,
-            )
-
-    def _advice(self, session: OpenSession, phase: str) -> list[str]:
-        """What the operator should still do, in sentences."""
-        points = self._setups.control_point_names(session.setup_id)
-        shot = self._table.points_shot(session.id, phase)
-        advice = []
-        missing = [name for name in points if name not in shot]
-        if phase == "start" and (missing or not points):
-            which = f"the control points {', '.join(missing)}" if missing else "a control point"
-            advice.append(
-                f"shoot {which} before the first pose (`rigcal session shoot NAME`), and again before the end"
-            )
-        elif missing or not points:
-            advice.append(
-                f"control points not shot at the session's end: {', '.join(missing) or 'none was shot at all'}"
-            )
-        advice += [
-            f"{joint} jumped during the session, and nothing after that is used: if its encoder was preset, start anew"
-            for joint in self._rig.joint_names
-            if joint in session.jumped
-        ]
-        advice += [
-            f"{suspicion.reason}; its fixes since then do not count: {suspicion.remedy}"
-            for suspicion in self._prisms.suspicions(session)
-        ]
-        if phase == "start":
-            advice.append("stand still at every pose until status counts it; move all joints through their ranges")
-            return advice
-        summary = self._table.summary(session.id)
-        if session.kind == CHECK and not CHECK_POSES[0] <= summary["poses"] <= CHECK_POSES[1]:
-            advice.append(f"a check wants {CHECK_POSES[0]} to {CHECK_POSES[1]} poses; this one has {summary['poses']}")
-        advice += [
-            f"the computer's clock was set back by {-step['step_s']:.1f} s during the session: its rows keep the times "
-            "that it showed, and calibration goes by the monotonic clock"
-            for step in summary["clock_steps"]
-            if step["step_s"] < 0
-        ]
-        return advice
 
     def _close(self, state: str) -> OpenSession:
         """End the open session, in the store and then here; what the store refuses leaves it open in both."""
@@ -448,13 +385,3 @@ class SessionKeeper:
         if self._aim is not None:  # what aims may have forgotten; an operator's station has kept its lock
             self._aim(opened.prism)
             self._prisms.turned(opened, self._clock.now())
-
-
-def _after_a_move(session: OpenSession) -> list[str]:
-    """What to do when a control point shows that the station moved."""
-    return [
-        "the station has moved, and nothing measured from now on fits what was measured before: stop the session, "
-        "describe where the station stands now with `rigcal setup new`, then start the next session",
-        f"session {session.id} is kept and not used; if you know that only the control point was wrong, say so after "
-        f"its end with `rigcal session accept {session.id}`",
-    ]

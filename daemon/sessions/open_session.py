@@ -3,36 +3,15 @@
 from __future__ import annotations
 
 import math
-from concurrent.futures import Future
 from dataclasses import dataclass, field
 
+from daemon.sessions.control_shot import Shot
+from daemon.sessions.prism_evidence import PrismEvidence
 from daemon.sessions.prism_guard import PrismGuard, Word
 from daemon.sessions.station_setups import Place
 from drivers.clock import Order, Stamp, lies_within
-from drivers.readings import Fix
 
 CONTROL_POINT_RADIUS_MM = 300.0  # a fix this close to a control point is of the control point, not of the boom
-
-
-@dataclass
-class Shot:
-    """A control point being measured: the mean of the next good fixes.
-
-    Attributes:
-        wanted: how many.
-        since, until: fixes measured in between are not of the prism.
-        aimed: fixes measured from then on may be of the point; None until the station was told to turn to it.
-        fixes, places_mm: so far.
-        done: when there are enough.
-    """
-
-    wanted: int
-    since: Stamp
-    until: Stamp | None = None
-    aimed: Stamp | None = None
-    fixes: list[Fix] = field(default_factory=list)
-    places_mm: list[Place] = field(default_factory=list)
-    done: Future[None] = field(default_factory=Future)
 
 
 @dataclass
@@ -48,6 +27,7 @@ class OpenSession:
         control_points: where those of its set-up are, mm.
         words: who said when that its stations are on its prism.
         guards: station -> what watches that it stays there; for the writer's thread.
+        evidence: what the joints say of its prism; likewise.
     """
 
     id: str
@@ -62,17 +42,22 @@ class OpenSession:
     control_points: list[Place] = field(default_factory=list)
     words: list[Word] = field(default_factory=list)
     guards: dict[str, PrismGuard] = field(default_factory=dict)
+    evidence: PrismEvidence | None = None
 
     def lasted(self, stamp: Stamp) -> bool:
-        """Whether that instant lies in it."""
+        """Return True if that instant lies in it."""
         return lies_within(self.order, stamp, self.since, self.until)
 
     def has(self, stamp: Stamp) -> bool:
-        """Whether what the station measured then is its prism."""
+        """Return True if a fix of that instant is of its prism, and not of a shot."""
         return self.lasted(stamp) and not any(
             lies_within(self.order, stamp, shot.since, shot.until) for shot in self.shots
         )
 
+    def confirmations_by(self, stamp: Stamp) -> int:
+        """Return the number of times that an operator had confirmed its prism by then."""
+        return sum(not word.is_turning and self.order(word.at) <= self.order(stamp) for word in self.words)
+
     def is_control_point(self, place_mm: Place) -> bool:
-        """Whether a control point of its set-up is there."""
+        """Return True if a control point of its set-up is there."""
         return any(math.dist(place_mm, point) < CONTROL_POINT_RADIUS_MM for point in self.control_points)

@@ -1,4 +1,4 @@
-"""Whether a station still follows the prism that is meant: a pure state machine over one station's fixes in a session.
+"""Guard of the prism that is meant: a pure state machine over one station's fixes in a session.
 
 A total station follows whatever reflector it finds, and its fixes look as good as before. Which prism is meant only an
 operator knows: who starts a session names it, and the station is believed to be on it then.
@@ -7,6 +7,7 @@ operator knows: who starts a session names it, and the station is believed to be
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -22,13 +23,14 @@ CONFIRM = "`rigcal session confirm-prism` says that it is the prism that is mean
 USUAL_OF = 5  # intervals, whose median no single late fix and no pause changes
 USUAL_NS = NS_PER_S  # at most, and while fewer than three are known
 PAUSE_NS = 2 * NS_PER_S  # a station that is aimed by hand may have been aimed anew in so long a time without a fix
+TURN_NS = 10 * NS_PER_S  # a jump so long after the station was told to turn is no turn
 
 _Point = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class MotionLimit:
-    """What motion can do to a prism, and how a station follows it.
+    """Limit of the motion of a prism, and how a station follows it.
 
     Attributes:
         max_speed_m_s: faster than this no prism moves. The default is the bound of a field-proven program, 1 m
@@ -49,13 +51,13 @@ class MotionLimit:
         return cls(config.max_speed_m_s, config.jump_slack_m, config.relock_within_m, config.tracks_silently)
 
     def reach_m(self, within_ns: float) -> float:
-        """How far apart two fixes of one prism may be that were measured within so long a time."""
+        """Return the largest distance of two fixes of one prism that were measured within so long a time."""
         return self.slack_m + self.max_speed_m_s * max(0.0, within_ns) / NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
 class Word:
-    """What fixes cannot tell.
+    """The word of an operator or program that a station is on the prism, which fixes cannot tell.
 
     Attributes:
         at: from then on the station is on the prism that is meant.
@@ -75,22 +77,38 @@ class Suspicion:
         since: the first of them.
         distance_m: how far from the place of the prism that is meant the station's target was when it last jumped.
         until: fixes from then on count again; None while it lasts.
+        evidence: what tells that it may be another prism, a clause; a jump by default.
     """
 
     station: str
     since: Stamp
     distance_m: float
     until: Stamp | None = None
+    evidence: str = ""
 
     @property
     def reason(self) -> str:
         """Why calibration must not use its fixes."""
-        return f"perhaps another prism: the station's target jumped by {self.distance_m:.2f} m"
+        evidence = self.evidence or f"the station's target jumped by {self.distance_m:.2f} m"
+        return f"perhaps another prism: {evidence}"
 
     @property
     def remedy(self) -> str:
-        """What to do about it."""
+        """Instruction to the operator."""
         return f"aim {self.station} at the prism again; where it is on it already, {CONFIRM}"
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """An instant from which on the station may have another target.
+
+    Attributes:
+        at: of the first fix since then.
+        is_believed: an operator has said before it that the station is on the prism that is meant.
+    """
+
+    at: Stamp
+    is_believed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +144,7 @@ class PrismGuard:
         words: of the session, oldest first; grows meanwhile.
         order: of instants.
         suspicions: all so far; only the last one can still last.
+        turns: all so far, in order; between two of them the station follows one target.
     """
 
     station: str
@@ -133,6 +152,8 @@ class PrismGuard:
     words: Sequence[Word]
     order: Order
     suspicions: list[Suspicion] = field(default_factory=list)
+    turns: list[Turn] = field(default_factory=list)
+    _is_believed: bool = False
     _heeded: int = 0  # words
     _good: _Seen | None = None  # the last fix that was surely of the prism
     _near_m: float = 0.0  # so near to its place a target that has jumped again is the prism
@@ -140,6 +161,7 @@ class PrismGuard:
     _intervals_ns: deque[int] = field(default_factory=partial(deque, maxlen=USUAL_OF))  # between fixes, lately
     _is_new_lock: bool = False
     _is_turning: bool = False
+    _turning_until: Stamp | None = None
 
     @property
     def suspicion(self) -> Suspicion | None:
@@ -150,6 +172,44 @@ class PrismGuard:
     def doubt(self, stamp: Stamp) -> Suspicion | None:
         """The suspicion under which a fix of that instant falls."""
         return next((s for s in self.suspicions if lies_within(self.order, stamp, s.since, s.until)), None)
+
+    def turn(self, stamp: Stamp) -> Turn | None:
+        """The last turn before a fix of that instant; None where it was not seen."""
+        number = bisect_right(self.turns, self.order(stamp), key=lambda turn: self.order(turn.at))
+        return self.turns[number - 1] if number else None
+
+    def suspect(self, turn: Turn, distance_m: float, evidence: str) -> Suspicion:
+        """Suspect the fixes from a turn to the next one, or to the end of a suspicion that lasts."""
+        self.clear(turn)
+        until = self._next(turn)
+        made = Suspicion(self.station, turn.at, distance_m, until, evidence)
+        self.suspicions.append(made)
+        self.suspicions.sort(key=lambda suspicion: self.order(suspicion.since))
+        if until is None:
+            self._good = None  # where the prism is nobody knows
+        return made
+
+    def clear(self, turn: Turn) -> None:
+        """Suspect the fixes from a turn to the next one no more: they are of the prism that is meant."""
+        begin, until = turn.at, self._next(turn)
+        left: list[Suspicion] = []
+        for suspicion in self.suspicions:
+            if not lies_within(self.order, suspicion.since, begin, None):
+                left.append(replace(suspicion, until=self._earlier(suspicion.until, begin)))
+            if until is not None and (suspicion.until is None or self.order(suspicion.until) > self.order(until)):
+                since = max(suspicion.since, until, key=self.order)
+                left.append(replace(suspicion, since=since))
+        if until is None and self._lasting() is not None:
+            self._good = self._last
+        self.suspicions[:] = left
+
+    def _earlier(self, until: Stamp | None, other: Stamp) -> Stamp:
+        return other if until is None else min(until, other, key=self.order)
+
+    def _next(self, turn: Turn) -> Stamp | None:
+        """When the station next turned; None before it has."""
+        number = bisect_right(self.turns, self.order(turn.at), key=lambda one: self.order(one.at))
+        return self.turns[number].at if number < len(self.turns) else None
 
     def look_away(self) -> None:
         """The station was on something else on purpose: its next fix is compared as after a new lock."""
@@ -169,6 +229,11 @@ class PrismGuard:
         last, self._last = self._last, seen
         if last is not None and last.stamp.boot_id == seen.stamp.boot_id:
             self._intervals_ns.append(seen.stamp.since(last.stamp))
+        if self._turning_until is not None and lies_within(self.order, seen.stamp, self._turning_until, None):
+            self._is_turning = False
+        if is_new_lock or last is None or self._has_turned(last, seen):
+            self.turns.append(Turn(seen.stamp, self._is_believed))
+            self._is_believed = False
         suspicion = self._lasting()
         if suspicion is not None:
             return self._judge_suspected(suspicion, seen, last, is_new_lock)
@@ -186,6 +251,8 @@ class PrismGuard:
         self._good = self._last = None
         self._intervals_ns.clear()
         self._is_new_lock, self._is_turning = False, word.is_turning
+        self._turning_until = word.at.shifted(TURN_NS)
+        self._is_believed = not word.is_turning
 
     def _judge(self, seen: _Seen, good: _Seen, is_new_lock: bool) -> DeviceEvent | None:
         moved_m = good.distance_m(seen)
@@ -232,6 +299,12 @@ class PrismGuard:
         how = "locked again" if is_new_lock else "the target jumped again"
         text = f"{how} {back_m:.2f} m from the prism: perhaps another one; its fixes still do not count"
         return self._event(seen, EventKind.PRISM_JUMP, text)
+
+    def _has_turned(self, last: _Seen, seen: _Seen) -> bool:
+        """True if a fix may be of another target than the one before although no lock was lost."""
+        if last.has_circles != seen.has_circles or seen.stamp.since(last.stamp) > PAUSE_NS:
+            return True
+        return last.distance_m(seen) > self._reach_m(last, seen)
 
     def _reach_m(self, earlier: _Seen, later: _Seen) -> float:
         usual_ns = min(USUAL_NS, median_high(self._intervals_ns)) if len(self._intervals_ns) > 2 else USUAL_NS

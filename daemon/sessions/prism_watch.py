@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Mapping
 from typing import Any
 
+from calibration.rig.description import Rig
+from daemon.acquisition.joiner import JoinedFix
 from daemon.commands import caller_columns
 from daemon.sessions.open_session import OpenSession
-from daemon.sessions.prism_guard import MotionLimit, PrismGuard, Suspicion, Word
-from daemon.store.sessions import SessionTable, fixes_since_used, prism_confirmations
+from daemon.sessions.prism_evidence import Finding, IdentityLoader, PrismEvidence, Verdict, sightings_of
+from daemon.sessions.prism_guard import CONFIRM, MotionLimit, PrismGuard, Suspicion, Turn, Word
+from daemon.sessions.standstill_places import Exclusions
+from daemon.sessions.station_setups import Place
+from daemon.store.sessions import SessionTable, fixes_since_used, preset_jumps, prism_confirmations
 from daemon.store.store import Store
 from drivers.clock import Clock, Stamp
 from drivers.readings import DeviceEvent, EventKind, Fix, LockState, Status
@@ -25,14 +31,29 @@ class PrismWatch:
 
     Args:
         store: where operators' words are kept; fixes and observations are there.
-        rig_name: whose sessions are watched.
+        rig: whose sessions are watched.
         clock: for when they were given.
         limits: station -> what motion can do to its prism.
     """
 
-    def __init__(self, store: Store, rig_name: str, clock: Clock, limits: Mapping[str, MotionLimit]) -> None:
-        self._store, self._clock, self._limits = store, clock, limits
-        self._table = SessionTable(store, rig_name)
+    def __init__(self, store: Store, rig: Rig, clock: Clock, limits: Mapping[str, MotionLimit]) -> None:
+        self._store, self._rig, self._clock, self._limits = store, rig, clock, limits
+        self._table = SessionTable(store, rig.name)
+        self._loader = IdentityLoader(rig)
+
+    def prepare(self, wait_s: float = 0.0) -> None:
+        """Be ready to ask the joints of a session's prism, and wait for that at most so long."""
+        self._loader.start(wait_s)
+
+    def begin(self, session: OpenSession) -> None:
+        """Take a session's set-up into account: what was measured there before."""
+        jumps = [jump for jump in preset_jumps(self._store, None) if jump.device in self._rig.joint_names]
+        groups: dict[str, list[tuple[str, Mapping[str, float], Place]]] = {}
+        for row in self._table.standing(session.setup_id, jumps[-1].at if jumps else None):
+            place_mm = row["x_mm"], row["y_mm"], row["z_mm"]
+            groups.setdefault(row["session_id"], []).append((row["prism"], json.loads(row["values_json"]), place_mm))
+        earlier = [sightings_of(self._rig, rows) for rows in groups.values()]
+        session.evidence = PrismEvidence(self._rig, session.prism, self._loader, earlier)
 
     def see(self, session: OpenSession, fix: Fix) -> DeviceEvent | None:
         """Take a fix of the session, in order; what there is to tell an operator."""
@@ -41,6 +62,41 @@ class PrismWatch:
             log.warning("station %s: %s", fix.station, event.text)
         return event
 
+    def ask_joints(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> Exclusions:
+        """Ask the joints of a fix that was seen; why earlier observations must not be used, where that has changed."""
+        guard, evidence = session.guards.get(joined.fix.station), session.evidence
+        turn = None if guard is None else guard.turn(joined.fix.stamp)
+        if guard is None or evidence is None or turn is None:
+            return {}
+        changed: Exclusions = {}
+        stretch = evidence.stretch(joined.fix.station, turn.at, turn.is_believed)
+        for finding in evidence.take(stretch, joined, place_mm):
+            changed |= self._heed(session, finding)
+        stretch.instants_ns.append(joined.stamp.monotonic_ns)
+        return changed
+
+    def _heed(self, session: OpenSession, finding: Finding) -> Exclusions:
+        """Suspect a stretch, or suspect it no more, as the joints say; its observations for which that is news."""
+        stretch, station = finding.stretch, finding.stretch.station
+        guard = session.guards[station]
+        turn, is_suspected = Turn(stretch.since, stretch.is_believed), guard.doubt(stretch.since) is not None
+        if is_suspected == (stretch.verdict is Verdict.OTHER):
+            return {}
+        if stretch.verdict is Verdict.OTHER:
+            fits = f"; it fits {finding.is_like}" if finding.is_like else ""
+            evidence = f"{finding.distance_m:.2f} m from where the joints put {session.prism}{fits}"
+            reason: str | None = guard.suspect(turn, finding.distance_m, evidence).reason
+            text = f"the target is {evidence}; its fixes do not count until the station is back, or until {CONFIRM}"
+            event = DeviceEvent(station, self._clock.now(), EventKind.PRISM_JUMP, text)
+        else:
+            guard.clear(turn)
+            reason = None
+            text = f"the target is where the joints put {session.prism}; its fixes count"
+            event = DeviceEvent(station, self._clock.now(), EventKind.LOCK_ACQUIRED, text)
+        log.warning("station %s: %s", station, text)
+        self._store.insert_records([event])
+        return dict.fromkeys(stretch.instants_ns, reason)
+
     def doubt(self, session: OpenSession, fix: Fix) -> str | None:
         """Why a fix that was seen must not be used; None when it may."""
         guard = session.guards.get(fix.station)
@@ -48,7 +104,7 @@ class PrismWatch:
         return suspicion.reason if suspicion is not None else None
 
     def suspicions(self, session: OpenSession) -> list[Suspicion]:
-        """Those of the session that last."""
+        """Return the suspicions of the session that last."""
         return [guard.suspicion for guard in list(session.guards.values()) if guard.suspicion is not None]
 
     def confirm(self, session: OpenSession, operator: str) -> dict[str, Any]:
@@ -83,10 +139,12 @@ class PrismWatch:
         session.words.append(Word(at, is_turning=True))
 
     def restore(self, session: OpenSession) -> None:
-        """What an earlier run of the daemon knew, from what it stored; where it left off, the next fix is a new lock.
+        """Restore the knowledge of an earlier run of the daemon from the store; the next fix is a new lock.
 
         A restart ends no suspicion, and what happened while nobody listened may begin one.
         """
+        self.prepare()
+        self.begin(session)
         with self._store.reader() as reader:
             words = prism_confirmations(reader, session.id)
             session.words += [Word(reader.stamp(row), bool(row["turning"])) for row in words]

@@ -1,4 +1,4 @@
-"""What a stored session holds, for calibration and report.
+"""Contents of a stored session, for calibration and report.
 
 Observations come as CSV (docs/formats.md): from here on a session is read exactly as an imported file is.
 """

@@ -1,4 +1,4 @@
-"""What a replay must know of a session that its captures do not tell: what the operator said."""
+"""The file of an exported session: the commands of its operator, which its captures do not tell."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class DoubtfulCaptures(BaseModel):
     runs: tuple[tuple[int, int], ...]
 
     def is_among(self, number: int) -> bool:
-        """Whether the capture of that number is of doubtful time."""
+        """Return True if the capture of that number is of doubtful time."""
         at = bisect_right(self.runs, number, key=lambda run: run[0]) - 1
         return at >= 0 and number <= self.runs[at][1]
 
@@ -57,7 +57,7 @@ class SessionFile(BaseModel):
 
 
 def read_session_file(path: Path) -> SessionFile:
-    """What `rigcal session export` wrote of a session.
+    """Read the file that `rigcal session export` wrote of a session.
 
     Raises:
         DescriptionError: it cannot be read, or is no such file.

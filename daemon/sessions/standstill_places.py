@@ -2,13 +2,14 @@
 
 A station that lost its prism may lock on to another one, or to a reflection, and its fixes look as good as before.
 Where the fixes of a standstill lie at several places, the place with the most fixes is taken for the prism's and the
-fixes of the others are excluded; while two places have equally many, both are. More fixes may turn the decision.
+fixes of the others are excluded; while two places have equally many, both are. More fixes may turn the decision, and
+so does an operator who confirms the prism: then only the fixes since count.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Mapping
+from collections.abc import Collection, Hashable, Mapping
 from dataclasses import dataclass, field
 
 from calibration.rig.description import Rig
@@ -32,7 +33,7 @@ class _Place:
     Attributes:
         first_mm: where its first fix lies.
         latest_mm, joints: its latest fix, and the machine's joints then: a boom that sinks slowly counts as standing.
-        count: how many fixes lie there.
+        count: how many fixes lie there, since an operator last confirmed the prism.
         instants_ns: of those fixes whose exclusion may still change.
         excluded: why these must not be used.
     """
@@ -53,13 +54,16 @@ class StandstillPlaces:
     """
 
     def __init__(self, rig: Rig) -> None:
-        self._travel_mm = _travel_mm(rig)
+        self._travel_mm = travel_mm(rig)
         self._standstill: Hashable = None
         self._places: list[_Place] = []
         self._fixes = 0
         self._decided_at = 0
+        self._confirmations = 0
 
-    def add(self, standstill: Hashable, at_ns: int, place_mm: Place, values: Mapping[str, float]) -> Exclusions:
+    def add(
+        self, standstill: Hashable, at_ns: int, place_mm: Place, values: Mapping[str, float], confirmations: int = 0
+    ) -> Exclusions:
         """Take a fix.
 
         Args:
@@ -67,12 +71,18 @@ class StandstillPlaces:
             at_ns: when it was measured, monotonic within the standstill.
             place_mm: where the prism was.
             values: observations CSV column -> number, with the joints at that instant.
+            confirmations: how often an operator had confirmed the prism by then: fixes since the last time decide.
 
         Returns:
             The exclusion of this fix, and of earlier ones of the standstill for which it has changed.
         """
         if standstill != self._standstill:
             self._standstill, self._places, self._fixes, self._decided_at = standstill, [], 0, 0
+            self._confirmations = confirmations
+        if confirmations > self._confirmations:
+            self._confirmations, self._decided_at = confirmations, 0
+            for place in self._places:
+                place.count = 0
         joints = {column: values[column] for column in self._travel_mm if column in values}
         place = self._place(place_mm, joints)
         place.latest_mm, place.joints = place_mm, joints
@@ -85,6 +95,17 @@ class StandstillPlaces:
                 changed = self._decide()
         changed[at_ns] = place.excluded
         return changed
+
+    def withdraw(self, instants_ns: Collection[int]) -> Exclusions:
+        """Take fixes back that are known to be of another prism; the fixes for which the exclusion has changed."""
+        gone = set(instants_ns)
+        for place in self._places:
+            kept = [at_ns for at_ns in place.instants_ns if at_ns not in gone]
+            place.count = max(0, place.count - (len(place.instants_ns) - len(kept)))
+            place.instants_ns = kept
+        self._places = [place for place in self._places if place.count > 0]
+        self._decided_at = 0
+        return self._decide() if self._places else {}
 
     def _place(self, place_mm: Place, joints: Mapping[str, float]) -> _Place:
         """The nearest place that a fix may belong to, or a new one."""
@@ -140,8 +161,8 @@ def _size(column: str, change: float) -> float:
     return abs(math.remainder(change, 360.0) if column.endswith("_deg") else change)
 
 
-def _travel_mm(rig: Rig) -> dict[str, float]:
-    """A joint's column -> how far a change of 1 in it moves any prism at most, mm."""
+def travel_mm(rig: Rig) -> dict[str, float]:
+    """Return, for each joint's column, how far a change of 1 in it moves any prism at most, mm."""
     reach_mm = sum(abs(row.a_mm) + abs(row.d_mm) + abs(row.b_mm) for row in rig.rows)
     reach_mm += sum(math.hypot(b.x_mm, b.y_mm, b.z_mm) for row in rig.rows if (b := row.before) is not None)
     reach_mm += sum(max(map(abs, joint.limits)) for joint in rig.joints if joint.kind == "prismatic")

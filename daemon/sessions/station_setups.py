@@ -149,7 +149,7 @@ class SetupBook:
         }
 
     def _known_place(self, setup_id: str, session_id: str, name: str, phase: str) -> dict[str, float] | None:
-        """Where a control point is known to be; None if this shot defines it.
+        """Return the known place of a control point; None if this shot defines it.
 
         A point that only this session's start has shot, and that was not given with the set-up, is defined anew: the
         operator shoots again because the shot before was no good.

@@ -78,6 +78,12 @@ _FIXES = """SELECT fixes.* FROM fixes,
         AND fixes.id >= coalesce((SELECT max(fix_id) FROM observations JOIN fixes AS used ON used.id = fix_id
             WHERE session_id = ?1 AND excluded IS NULL AND used.station = ?2), 0)
     ORDER BY fixes.id"""
+# The newest fix of each standstill, by session, from an instant on.
+_STANDING = """SELECT max(o.id) AS id, o.session_id, o.prism, o.x_mm, o.y_mm, o.z_mm, o.values_json
+    FROM calibration_sessions AS s JOIN observations AS o ON o.session_id = s.id
+    WHERE s.setup_id = ? AND s.rig = ? AND s.state != 'aborted' AND o.excluded IS NULL AND o.pose IS NOT NULL
+        AND (o.boot_id, o.monotonic_ns) >= (?, ?)
+    GROUP BY o.session_id, o.pose ORDER BY id DESC LIMIT 500"""
 # Those after the newest session that is used: later measurements make up for the earlier ones.
 _UNTRAINED = """SELECT id, excluded FROM calibration_sessions
     WHERE rig = ?1 AND state = 'closed' AND excluded IS NOT NULL AND rowid >
@@ -256,6 +262,19 @@ class SessionTable:
             boot = self._store.boot_row(newest)
             rows = [(excluded, session_id, boot, at_ns) for at_ns, excluded in exclusions.items()]
             db.conn.executemany(_EXCLUDE, rows)
+
+    def standing(self, setup_id: str, since: Stamp | None) -> list[dict[str, Any]]:
+        """The newest observation of each standstill at a set-up that calibration may use, oldest first.
+
+        Args:
+            setup_id: of the station.
+            since: earlier ones do not count; all do when None.
+
+        Returns:
+            session_id, prism, x_mm, y_mm, z_mm and values_json, at most 500 of them.
+        """
+        first = (0, 0) if since is None else self._store.order(since)
+        return self._store.rows(_STANDING, (setup_id, self._rig, *first))[::-1]
 
     def add_confirmation(self, session_id: str, at: Stamp, **columns: object) -> None:
         """Add a word that the session's stations are on its prism: `operator` and caller, or `turning`."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from simulators.blind.hiding import UnreachableError
 from simulators.blind.scene import Fixes, Scene
-from simulators.effects.families.zero_step import ZeroStep
+from simulators.effects.families.encoders import ZeroStep
 from simulators.rig.screws import Floats
 
 _VISIT_H, _NEXT_VISIT_H = 0.2, 5.0

@@ -20,9 +20,7 @@ from simulators.blind.scene import Scene
 from simulators.blind.visibility import Visibility
 from simulators.effects.base import Effect
 from simulators.effects.library import LIBRARY
-from simulators.effects.unknown.jack_lean import JackLean
-from simulators.effects.unknown.joint_pair_error import JointPairError
-from simulators.effects.unknown.place_pair_error import PlacePairError
+from simulators.effects.unknown import JackLean, JointPairError, PlacePairError
 
 SIZES = LEAST_IN_MACHINE, 15.0  # visible size of each effect, in units of the noise
 UNKNOWN = 3.0, 8.0  # visible size of the unknown structure together, likewise

@@ -11,7 +11,7 @@ from simulators.blind.alternatives import MARGIN, SIGMAS, effect_columns, librar
 from simulators.blind.scene import Scene
 from simulators.blind.visibility import Visibility
 from simulators.effects.base import Effect
-from simulators.effects.unknown.surface import LENGTH, scaled_reading
+from simulators.effects.unknown import LENGTH, scaled_reading
 from simulators.rig.screws import Floats
 
 _CURVES = ("joint_error_map",)

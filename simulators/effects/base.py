@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, Protocol
@@ -155,7 +156,7 @@ class Effect:
     acts.
 
     Attributes:
-        family: its name, which is that of its file.
+        family: its name, which is that of its class: `joint_compliance` of JointCompliance.
         amplitudes: coefficients that scale the effect (twice of each is twice the effect) -> hard bound of
             plausible values.
         bounded_at: the quantity that the bounds limit: the coefficient itself, the angle (rad) at the largest load of
@@ -178,7 +179,7 @@ class Effect:
     where: str
 
     def __init_subclass__(cls) -> None:
-        cls.family = cls.__module__.rpartition(".")[2]
+        cls.family = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", cls.__name__).lower()
 
     def check(self, rig: Rig) -> None:
         """Raise ValueError if the rig has no such place, or a coefficient is impossible."""

@@ -43,15 +43,15 @@ _SEEDED_ORDER = (
 )
 
 
-def _found_in(package: ModuleType) -> dict[str, type[Effect]]:
-    """Effects defined in the modules of a package, in alphabetical order of the modules."""
+def _found_in(room: ModuleType) -> dict[str, type[Effect]]:
+    """Effects defined in a module, or in the modules of a package, in alphabetical order of their families."""
+    names = [f"{room.__name__}.{module.name}" for module in pkgutil.iter_modules(getattr(room, "__path__", []))]
     found: dict[str, type[Effect]] = {}
-    for name in sorted(module.name for module in pkgutil.iter_modules(package.__path__)):
-        module = importlib.import_module(f"{package.__name__}.{name}")
+    for module in [importlib.import_module(name) for name in names] or [room]:
         for kind in vars(module).values():
             if isinstance(kind, type) and issubclass(kind, Effect) and kind.__module__ == module.__name__:
                 found[kind.family] = kind
-    return found
+    return dict(sorted(found.items()))
 
 
 def _in_seeded_order(found: Mapping[str, type[Effect]]) -> dict[str, type[Effect]]:

@@ -11,8 +11,8 @@ import numpy as np
 from calibration.observations import Observations, parse_observations
 from calibration.rig.description import Rig, shipped_rig
 from simulators.effects.base import Effect
-from simulators.effects.families.joint_compliance import JointCompliance
-from simulators.effects.variants.stiffening_compliance import StiffeningCompliance
+from simulators.effects.families.joints import JointCompliance
+from simulators.effects.variants import StiffeningCompliance
 from simulators.rig.dataset import random_poses
 from simulators.rig.truth import RigTruth
 from tests.simulated.observations import simulate_observations

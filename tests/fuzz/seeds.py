@@ -26,6 +26,7 @@ from daemon.config import load_rig
 from daemon.models.first_load import encode
 from daemon.sessions.session_file import SessionFile
 from daemon.store.captures import encode_captures
+from daemon.store.packed_captures import CaptureColumns, packed
 from drivers.logs.can_log import read_can_log, write_can_log
 from drivers.logs.serial_log import read_serial_log
 from drivers.readings import CanCapture, SerialCapture
@@ -149,7 +150,7 @@ def _of_descriptions() -> Iterator[tuple[str, str, bytes]]:
     for path in sorted(_RIGS.glob("*.toml")) + sorted(_MORE_RIGS.glob("*.toml")):
         yield "rig", path.stem, path.read_bytes()
     yield "dbc", "machine", (_RIGS / "machine.dbc").read_bytes()
-    yield "dbc", "tip", (_RIGS.parents[1] / "drivers" / "tip.dbc").read_bytes()
+    yield "dbc", "tip", (_RIGS.parents[1] / "drivers" / "can" / "tip.dbc").read_bytes()
     yield "dbc", "multiplexed", _MULTIPLEXED
     yield "eds", "cia406", (_RIGS / "cia406.eds").read_bytes()
     yield "eds", "arrays", _ARRAYS
@@ -231,6 +232,9 @@ def _of_texts() -> Iterator[tuple[str, str, bytes]]:
     for folder in ("standing", "sokkia-pushed"):
         yield "config", folder, (_GOLDEN / folder / "rigcal.toml").read_bytes()
     yield "config", "everything", _CONFIG
+    yield "config", "upkeep", _UPKEEP
+    yield "rig", "signals", load_rig("swdt82").rig.with_signals("tilt_x_deg", "hose_bar").text.encode()
+    yield "plan", "swdt82", _plan()
     yield "observations", "ur10", b"".join(held_out_csv().splitlines(keepends=True)[:8])
     yield "observations", "everything", _OBSERVATIONS
     session = {
@@ -287,9 +291,52 @@ tmac,S1,a,1,0.5,1,2,3,4,5,6,1000,2000.5,-300,0.1,0.1,0.1,1,0.5,10,3,20,5,100,5,x
 """
 
 
+_UPKEEP = b"""rig = "swdt82"
+state_directory = "/tmp/rigcal"
+
+[store]
+keep_days = 30
+free_gb = 5.0
+backup_directory = "/mnt/backup"
+
+[metrics]
+port = 9464
+
+[notify]
+webhook_url = "https://chat.example/hook?token=a"
+command = ["/usr/bin/msmtp", "someone@example.com"]
+least = "critical"
+"""
+
+
+def _plan() -> bytes:
+    joints = load_rig("swdt82").rig.joints
+    head = [*(joint.column for joint in joints), "theta1_dir", "dwell_s"]
+    poses = [
+        [*(f"{low + share * (high - low):.3f}" for low, high in (j.limits for j in joints))] for share in (0.3, 0.6)
+    ]
+    return "\n".join(",".join(row) for row in (head, [*poses[0], "1", ""], [*poses[1], "-1", "7.5"])).encode()
+
+
+def _packed(*, is_serial: bool) -> bytes:
+    count, payload = 12, np.arange(96, dtype=np.uint8)
+    columns = CaptureColumns(
+        monotonic_ns=np.arange(count, dtype=np.int64) * 200_000_000,
+        utc_ns=np.arange(count, dtype=np.int64) * 200_000_000 + 10**18,
+        identifier=np.tile(np.array([0x1A0, 0x1A1], dtype=np.uint32), count // 2),
+        flags=np.zeros(count, dtype=np.uint8),
+        length=np.full(count, 8, dtype=np.uint32),
+        payload=payload,
+    )
+    return bytes([is_serial]) + count.to_bytes(2, "little") + packed(columns, is_serial=is_serial)
+
+
 def _of_stored() -> Iterator[tuple[str, str, bytes]]:
     arrays = io.BytesIO()
     np.savez(arrays, a=np.eye(3), names=np.array(["x", "y"]), f=np.asfortranarray(np.ones((2, 3))))
+    yield "backup", "daily", b'{"form": 1, "made_utc_ns": 1790000000000000000, "size_bytes": 4096, "rigcal": "0.2.0"}'
+    for is_serial in (False, True):
+        yield "packed-captures", "serial" if is_serial else "can", _packed(is_serial=is_serial)
     yield "npz", "saved", arrays.getvalue()
     compressed = io.BytesIO()
     np.savez_compressed(compressed, a=np.eye(3))

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from calibration.effects.base import Coefficient, JointFamily, Settings
-from calibration.effects.context import EffectContext
-from calibration.effects.timing import STEP_SETTINGS, StepFamily, check_step, refined_steps, step_grid
-from calibration.observations import Floats
+from calibration.effects.base import Coefficient
+from calibration.effects.timing import JointStepFamily
 
 
-class ZeroStep(StepFamily, JointFamily):
+class ZeroStep(JointStepFamily):
     """From an instant on a revolute joint has another zero; that of a prismatic one is `transducer_index_jump`."""
 
     name = "zero_step"
@@ -20,29 +16,6 @@ class ZeroStep(StepFamily, JointFamily):
     revealed_by = "returning to poses measured before, with a prism before the joint and one behind it"
     fixed = (Coefficient("jump_rad", "rad", 2e-3, -35e-3, 35e-3),)
     kind = "revolute"
-
-    def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
-        del where
-        return step_grid(context.extra("time_s"))
-
-    def refined(self, context: EffectContext, where: str, settings: Settings) -> tuple[Settings, ...]:
-        del where
-        return refined_steps(context.extra("time_s"), settings)
-
-    def check_settings(self, settings: Settings) -> None:
-        if set(settings) != set(STEP_SETTINGS):
-            raise ValueError(f"the settings are {', '.join(STEP_SETTINGS)}")
-        check_step(settings)
-
-    def columns(self, context: EffectContext, where: str, settings: Settings) -> Floats:
-        del where
-        after = context.extra("time_s") > settings["time_s"]
-        return np.degrees(after.astype(np.float64))[:, None]
-
-    def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
-        """Return the mean square for rows as likely before the step as after it."""
-        del plausible, settings
-        return 0.5 * float(np.degrees(values[0])) ** 2
 
 
 FAMILY = ZeroStep()

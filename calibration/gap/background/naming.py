@@ -32,7 +32,7 @@ _HARM = 1e-3  # share by which held-out squares may grow: rounding, and no more
 
 @dataclass(frozen=True)
 class Names:
-    """What is certain beside a background.
+    """Effects that are certain beside a background.
 
     Attributes:
         joint: kinematics with the effects that are named, without the background.

@@ -159,7 +159,7 @@ class CurveSearch:
 
     @property
     def terms(self) -> Terms:
-        """What was found."""
+        """Return the curves that were found."""
         amplitude, length = tuple(self._log_amplitude), tuple(self._log_length)
         return Terms(tuple(self.curves), amplitude, length, self._log_correction, self._log_sigma)
 

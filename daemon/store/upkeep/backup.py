@@ -29,6 +29,7 @@ RESERVE_BYTES = 256 * 2**20  # stays free where a backup is written
 STEP_PAGES = 4096
 _NAME = re.compile(r"rigcal-\d{8}T\d{6}Z")
 _UNFINISHED = ".unfinished"
+_ABOUT_MOST = 1 << 16  # characters of backup.json, which has some hundred
 
 GoOn = Callable[[], None]
 
@@ -67,14 +68,23 @@ def read_backup(path: Path) -> Backup:
         StoreError: it is none, was never finished, or is of a later form.
     """
     try:
-        about = json.loads((path / ABOUT).read_text(encoding="utf-8"))
-        form = int(about["form"])
-        backup = Backup(path, int(about["made_utc_ns"]), int(about["size_bytes"]), str(about["rigcal"]))
-    except (OSError, ValueError, LookupError, TypeError) as error:
-        raise StoreError(f"{path}: no backup of rigcal, or one that was never finished ({ABOUT}: {error})") from error
+        with (path / ABOUT).open(encoding="utf-8") as file:
+            about = json.loads(file.read(_ABOUT_MOST))
+        form, made_utc_ns, size_bytes = (_count(about[name]) for name in ("form", "made_utc_ns", "size_bytes"))
+        backup = Backup(path, made_utc_ns, size_bytes, f"{about['rigcal']!s:.40}")
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
+        why = f"{ABOUT}: {error!s:.200}"
+        raise StoreError(f"{path}: no backup of rigcal, or one that was never finished ({why})") from error
     if form > FORM:
-        raise StoreError(f"{path}: a backup of form {form}, made by rigcal {backup.rigcal}; install that version")
+        raise StoreError(f"{path}: a backup of form {form}, made by rigcal {backup.rigcal!r}; install that version")
     return backup
+
+
+def _count(value: object) -> int:
+    """Return a number of `backup.json`; ValueError for what a backup does not write."""
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**63:
+        raise ValueError(f"{value!r:.40} is no count")
+    return value
 
 
 def make_backup(store: Path, models: Path, directory: Path, keep: int, now_utc_ns: int, go_on: GoOn) -> Backup:

@@ -84,7 +84,7 @@ def room(store: Store, free_bytes: int) -> Room:
 
 
 class Retention:
-    """What may go, and its deletion, the oldest first, in steps that keep acquisition from the store for a moment.
+    """Deletion of what may go, the oldest first, in steps that keep acquisition from the store for a moment.
 
     Args:
         store: open for writing.

@@ -1,4 +1,4 @@
-"""Whether a store can be trusted: SQLite's own check, the checksum of every chunk of captures, the live models."""
+"""Soundness of a store: SQLite's own check, the checksum of every chunk of captures, the live models."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MODELS = """SELECT id, path, manifest_sha256 FROM models WHERE state = 'live' O
 
 @dataclass(frozen=True)
 class Soundness:
-    """What a check of a store has found.
+    """Result of the check of a store.
 
     Attributes:
         findings: what is wrong, a clause each; empty for a sound store.

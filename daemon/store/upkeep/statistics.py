@@ -1,4 +1,4 @@
-"""How large a store is, what is in it, and how much of it may go."""
+"""Size and contents of a store, and the share of it that may be deleted."""
 
 from __future__ import annotations
 

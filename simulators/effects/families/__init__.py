@@ -1,1 +1,1 @@
-"""Effects that a library of physical effects names, one file each."""
+"""Effects that a library of physical effects names, in files by the place at which they act."""

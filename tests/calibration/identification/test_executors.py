@@ -17,7 +17,7 @@ from calibration.observations import parse_observations
 from calibration.pipeline.calibrate import calibrate
 from calibration.rig.description import shipped_rig
 from calibration.run import Run
-from simulators.effects.families.encoder_harmonic import EncoderHarmonic
+from simulators.effects.families.encoders import EncoderHarmonic
 from simulators.rig.truth import RigTruth
 from tests.calibration.conftest import rig_text
 from tests.calibration.searches import SEARCHES, File, assert_same, search_until_killed

@@ -17,7 +17,7 @@ from daemon.composition import decoders
 from daemon.config import load_rig, parse_config
 from daemon.service import declare_channels
 from daemon.store import Store
-from daemon.store.full_samples import stretches_between
+from daemon.store.upkeep.full_samples import stretches_between
 from daemon.store.upkeep.packing import Packing
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import Capture

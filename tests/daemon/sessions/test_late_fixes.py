@@ -125,8 +125,8 @@ def test_whether_a_session_is_used_is_decided_again_when_its_poses_are_decoded_a
     rig.live(3)
     rig.shoot("cp1", CONTROL_MM)
     late = []
-    for _ in range(6):
-        rig.values["theta1"] += 5
+    for change in (1, -1) * 3:
+        rig.values["theta8"] += change  # which hardly moves prism r
         late += captured(rig, 3)
     rig.say("stop")
     assert rig.say("show", id="s001-r")["not_used"] is None

@@ -275,3 +275,44 @@ def test_coordinates_and_circles_are_never_compared_and_end_no_suspicion() -> No
     watched.fixes(0.8, 2, 20)
     assert not watched.coordinates(1.0, 500.0)
     assert not any(watched.fixes(1.1, 2, 20))
+
+
+def test_a_jump_long_after_the_station_was_told_to_turn_is_another_prism() -> None:
+    watched = Watched(says_lock=False)
+    watched.say(0.0, is_turning=True)
+    assert watched.fixes(30.0, 10, 10.0) == [True] * 10
+    assert watched.fixes(31.0, 10, 13.0) == [False] * 10
+
+
+def test_the_turns_of_a_station_divide_its_fixes_by_target() -> None:
+    watched = Watched()
+    watched.fixes(0, 5, 10)
+    watched.no_prism(0.5)
+    watched.fixes(1.0, 5, 10.2)
+    watched.say(1.6)
+    watched.fixes(2.0, 5, 10.2)
+    assert [(turn.at, turn.is_believed) for turn in watched.guard.turns] == [
+        (at(0), False),
+        (at(1), False),
+        (at(2), True),
+    ]
+    assert watched.guard.turn(at(1.2)) == watched.guard.turns[1]
+    assert watched.guard.turn(START.shifted(-1)) is None
+
+
+def test_only_the_fixes_between_two_turns_are_suspected_and_cleared_by_other_evidence() -> None:
+    watched = Watched()
+    watched.fixes(0, 5, 10)
+    watched.no_prism(0.5)
+    watched.fixes(1.0, 5, 10.2)
+    first, second = watched.guard.turns
+    watched.guard.suspect(first, 3.0, "3 m off")
+    assert watched.guard.doubt(at(0.2)) is not None
+    assert watched.guard.doubt(at(1.0)) is None
+    watched.guard.suspect(second, 3.0, "3 m off")
+    assert watched.guard.suspicion is not None
+    watched.guard.clear(first)
+    assert watched.guard.doubt(at(0.2)) is None
+    assert watched.guard.doubt(at(1.2)) is not None
+    watched.guard.clear(second)
+    assert watched.guard.suspicion is None

@@ -136,11 +136,11 @@ def test_a_new_session_on_a_named_prism_is_a_confirmation(rig: Rig) -> None:
     start(rig)
     rig.live(2)
     rig.say("stop")
-    rig.target_mm = ANOTHER_MM
+    rig.target_mm = (PRISM_MM[0], PRISM_MM[1] + 1500.0, PRISM_MM[2])  # as far as s is from r
     rig.live(1)
     rig.say("start", prism="s")
     rig.live(2)
-    assert set(used(rig)) == {8000, 18000}
+    assert set(used(rig)) == {8000, 9500}
     assert rig.keeper.prism_suspicions() == []
 
 

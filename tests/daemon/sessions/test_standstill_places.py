@@ -47,14 +47,16 @@ def test_another_prism_too_near_to_be_a_jump_is_excluded_by_name(rig: Rig) -> No
     assert summary["observations"] == sum(y == 8000.0 for y, _ in observed(rig))
 
 
-def test_another_prism_that_an_operator_takes_for_the_right_one_is_excluded_by_name(rig: Rig) -> None:
+def test_a_place_that_an_operator_confirms_counts_within_its_standstill_and_the_others_are_excluded(rig: Rig) -> None:
     rig.say("start", prism="r")
-    stand(rig, PRISM, 60)
-    stand(rig, away(10.02), 20)
+    stand(rig, away(0.5), 60)
+    stand(rig, PRISM, 20)
     rig.say("confirm_prism", operator="Ada")
-    stand(rig, away(10.02), 40)
+    stand(rig, PRISM, 30)
+    assert {y for y, why in observed(rig) if why is None} == {8000.0}
+    stand(rig, away(0.5), 3)  # and the fixes since then decide, as before
     excluded = rig.say("stop")["excluded"]
-    assert excluded["another prism or a reflection: more fixes of this standstill lie 10.02 m away"] > 20
+    assert excluded["another prism or a reflection: more fixes of this standstill lie 0.50 m away"] > 40
     assert {y for y, why in observed(rig) if why is None} == {8000.0}
 
 

@@ -1,4 +1,4 @@
-"""Captures in the store, arrays of a checkpoint, and what a job's process says."""
+"""Captures in the store, backups, arrays of a checkpoint, and what a job's process says."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from calibration.numerics.stored_arrays import read_npz
 from daemon.jobs.order import parse_message
 from daemon.store.captures import decode_captures
 from daemon.store.errors import StoreError
+from daemon.store.packed_captures import unpacked
+from daemon.store.upkeep.backup import ABOUT, read_backup
 from tests.fuzz.mutate import change
-from tests.fuzz.target import Run, Target, check_refusal
+from tests.fuzz.target import Run, Target, check_refusal, scratch_directory
 
 _HEADER = struct.Struct("<4sBBBxIIHH")
 
@@ -26,6 +28,31 @@ def _captures() -> Run:
             decode_captures(data)
         except StoreError as error:
             check_refusal(error)
+
+    return run
+
+
+def _packed() -> Run:
+    def run(data: bytes) -> None:
+        """Take a body behind one byte that says whether it is serial, and two that count its captures."""
+        if len(data) < 3:
+            return
+        with suppress(ValueError, IndexError, struct.error):
+            found = unpacked(data[3:], int.from_bytes(data[1:3], "little"), is_serial=bool(data[0] & 1))
+            assert found.length.sum() == len(found.payload)
+
+    return run
+
+
+def _backup() -> Run:
+    folder = scratch_directory()
+
+    def run(data: bytes) -> None:
+        (folder / ABOUT).write_bytes(data)
+        try:
+            read_backup(folder)
+        except StoreError as error:
+            check_refusal(error, str(folder))
 
     return run
 
@@ -82,6 +109,8 @@ def _message() -> Run:
 
 
 TARGETS = [
+    Target("packed-captures", _packed, is_slow=True),
+    Target("backup", _backup, "json", is_slow=True),
     Target("captures", _captures, change=_changed_chunk, repair=_crc, is_slow=True),
     Target(
         "npz",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from pathlib import Path
 
@@ -14,8 +15,9 @@ from daemon.config import ConfigError, load_rig, parse_config
 from daemon.sessions.session_file import read_session_file
 from drivers.can_decoder import CanDecoder
 from drivers.errors import DescriptionError
+from simulators.plan import read_plan
 from tests.fuzz.streams import frames, pack_frames
-from tests.fuzz.target import Run, Target, check_refusal
+from tests.fuzz.target import Run, Target, check_refusal, scratch_directory
 from tests.fuzz.targets.logs import on_file
 
 _TOML = (
@@ -55,6 +57,12 @@ _CSV = (
     b'"',
     b'""',
     b"\n,\n",
+)
+
+
+_SECTIONS = (
+    *(b"[[can]]\n", b"[[station]]\n", b"[tip]\n", b"[jobs]\n", b"[store]\n", b"[metrics]\n", b"[notify]\n"),
+    *(b'webhook_url = "http://[::1"\n', b'command = ["/bin/cat"]\n', b'least = "critical"\n', b"keep_days = -1\n"),
 )
 
 
@@ -110,13 +118,30 @@ def _observations() -> Run:
     return run
 
 
+def _plan() -> Run:
+    path, rig = scratch_directory() / "plan.csv", load_rig("swdt82").rig
+
+    def run(data: bytes) -> None:
+        path.write_bytes(data)
+        try:
+            stops = read_plan(path, rig, 2.0)
+        except ValueError as error:
+            check_refusal(error, str(path))
+        else:
+            for pose, stand_s in stops:
+                assert all(map(math.isfinite, (*pose.values(), stand_s)))
+
+    return run
+
+
 def _session(path: Path) -> None:
     read_session_file(path)
 
 
 TARGETS = [
     Target("rig", _rig, "text", _TOML, is_slow=True),
-    Target("config", _config, "text", (*_TOML, b"[[can]]\n", b"[[station]]\n", b"[tip]\n", b"[jobs]\n"), is_slow=True),
+    Target("config", _config, "text", (*_TOML, *_SECTIONS), is_slow=True),
+    Target("plan", _plan, "text", (*_CSV, b"theta1_deg", b"L2_mm", b"theta1_dir", b"dwell_s", b"nan"), is_slow=True),
     Target("observations", _observations, "text", _CSV, is_slow=True),
     Target("session-file", lambda: on_file(".json", _session), "json", is_slow=True),
 ]

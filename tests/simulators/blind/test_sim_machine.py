@@ -18,7 +18,7 @@ from simulators.blind.scene import Scene, SceneSettings, draw_scene
 from simulators.blind.visibility import Visibility
 from simulators.effects.library import LIBRARY, parse_effects
 from simulators.effects.part import Part, PartialEffect
-from simulators.effects.unknown.surface import draw_surface
+from simulators.effects.unknown import draw_surface
 from simulators.rig.noise import NoiseSettings, draw_noise
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from calibration.rig.description import Rig, shipped_rig
-from simulators.effects.families.boom_droop import BoomDroop
-from simulators.effects.families.joint_compliance import JointCompliance
+from simulators.effects.families.joints import JointCompliance
+from simulators.effects.families.links import BoomDroop
 from simulators.effects.library import parse_effects
-from simulators.effects.variants.stiffening_compliance import StiffeningCompliance
+from simulators.effects.variants import StiffeningCompliance
 from simulators.rig.dataset import random_poses
 from simulators.rig.truth import RigTruth, replace_effects
 from tests.simulators.matrices import Matrix, frames_by_matrices, positions_by_matrices

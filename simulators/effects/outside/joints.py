@@ -1,0 +1,162 @@
+"""Errors of joints that no library names, in whatever form."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from calibration.rig.description import Rig
+from simulators.effects.base import Body, Effect, Floats, boom_stroke, warming
+from simulators.hydraulics import DEAD_BAND_MA, RATED_BAR, VALVE_JOINTS
+
+
+@dataclass(frozen=True)
+class Creep(Effect):
+    """A joint that goes on giving way under its load, quickly at first: hoses, seals and rubber.
+
+    d_theta = c torque log(1 + dwell / tau), dwell of the column `dwell_s`, the torque that of the deflected posture.
+
+    Attributes:
+        rad_per_Nm: c.
+        tau_s: tau.
+    """
+
+    amplitudes: ClassVar[Mapping[str, float]] = {"rad_per_Nm": 5e-3}
+    bounded_at = "largest_load"
+    needs_load = True
+    acts_at = ("revolute",)
+    positive = ("tau_s",)
+    rad_per_Nm: float = 2e-9  # noqa: N815 - the unit is N m
+    tau_s: float = 10.0
+
+    def joint_change(self, body: Body) -> Floats:
+        change: Floats = self.rad_per_Nm * body.torque(self.where) * np.log1p(body.column("dwell_s") / self.tau_s)
+        return change
+
+
+@dataclass(frozen=True)
+class StickSlipRate(Effect):
+    """A joint that is dragged back while it moves, at once and by much the same whatever its speed.
+
+    d_theta = e tanh(rate / v), the rate of the column `<joint>_rate`; nothing at rest.
+
+    Attributes:
+        rad: e.
+        deg_per_s: v.
+    """
+
+    amplitudes: ClassVar[Mapping[str, float]] = {"rad": 6e-3}
+    acts_at = ("revolute",)
+    positive = ("deg_per_s",)
+    rad: float = 1.5e-3
+    deg_per_s: float = 0.15
+
+    def joint_change(self, body: Body) -> Floats:
+        change: Floats = self.rad * np.tanh(body.column(f"{self.where}_rate") / self.deg_per_s)
+        return change
+
+
+@dataclass(frozen=True)
+class ThermalCross(Effect):
+    """A telescope that jams in the warmth: its joint errs with temperature times extension.
+
+    d_theta = e (T - T0) / 10 K * L / upper limit, T of the column `temperature_degC`, L the stroke as read.
+
+    Attributes:
+        rad_at_10K: e.
+        at_degC: T0; None: the mean of the rows given.
+    """
+
+    amplitudes: ClassVar[Mapping[str, float]] = {"rad_at_10K": 6e-3}
+    has_either_sign = True
+    acts_at = ("revolute",)
+    rad_at_10K: float = 1.0e-3  # noqa: N815 - the unit is K
+    at_degC: float | None = None  # noqa: N815 - the unit is degC
+
+    def check(self, rig: Rig) -> None:
+        super().check(rig)
+        boom_stroke(rig)
+
+    def joint_change(self, body: Body) -> Floats:
+        stroke = boom_stroke(body.rig)
+        out = body.read[stroke] / body.rig.joint(stroke).limits[1]
+        change: Floats = self.rad_at_10K * warming(body, self.at_degC) / 10.0 * out
+        return change
+
+
+@dataclass(frozen=True)
+class CrossLaw(Effect):
+    """A hose or linkage that one joint drags along another: no law of either alone.
+
+    d_theta = e sin(3 phi) (L / mid-stroke - 1), as read: phi the revolute joint before this one, L the stroke.
+    """
+
+    amplitudes: ClassVar[Mapping[str, float]] = {"rad": 6e-3}
+    has_either_sign = True
+    acts_at = ("revolute",)
+    rad: float = 1.0e-3
+
+    def check(self, rig: Rig) -> None:
+        super().check(rig)
+        boom_stroke(rig)
+        self._joint_before(rig)
+
+    def _joint_before(self, rig: Rig) -> str:
+        turning = [joint.name for joint in rig.joints if joint.kind == "revolute"]
+        place = turning.index(self.where)
+        if place == 0:
+            raise ValueError(f"{self.family}@{self.where}: there is no revolute joint before this one")
+        return turning[place - 1]
+
+    def joint_change(self, body: Body) -> Floats:
+        other, stroke = self._joint_before(body.rig), boom_stroke(body.rig)
+        beside = body.read[stroke] / (sum(body.rig.joint(stroke).limits) / 2) - 1.0
+        change: Floats = self.rad * np.sin(3.0 * body.read[other]) * beside
+        return change
+
+
+@dataclass(frozen=True)
+class ValveCurrentError(Effect):
+    """Oil pressure in a moving actuator winds up its mounting, beyond the encoder's reach.
+
+    d_theta = e * sign(i) * s^2 / (1 + s^2) * pump_bar / 200 bar, with s = (|i| - dead band) / knee, never below 0.
+
+    Opening the spool meters oil into the chamber that pushes. What leaks past the piston seals grows with the pressure
+    drop, so the drop settles where leakage and seal friction take up the metered flow: small at first, as a spool's
+    fine-control notches open with the square of its stroke, and in the end the pump's pressure itself. That force
+    bends cylinder pins and brackets that lie between the encoder and the link. The joint's true value is therefore off
+    by an amount that the valve's current and the pump's pressure tell and the encoder does not see.
+
+    Needs the columns `<valve>_valve_mA` of the joint's valve and `pump_bar`.
+
+    Attributes:
+        rad_at_rated: e, far above the knee at rated pressure.
+        knee_mA: current past the dead band where half of it is reached.
+    """
+
+    amplitudes: ClassVar[Mapping[str, float]] = {"rad_at_rated": 6e-3}
+    has_either_sign = True
+    acts_at = ("revolute",)
+    positive = ("knee_mA",)
+    rad_at_rated: float = 2e-3
+    knee_mA: float = 25.0  # noqa: N815 - the unit is mA
+
+    def check(self, rig: Rig) -> None:
+        super().check(rig)
+        if self._valve() is None:
+            known = ", ".join(VALVE_JOINTS.values())
+            raise ValueError(f"{self.family}@{self.where}: no valve's current is measured there; known: {known}")
+
+    def _valve(self) -> str | None:
+        return next((valve for valve, joint in VALVE_JOINTS.items() if joint == self.where), None)
+
+    def joint_change(self, body: Body) -> Floats:
+        current = body.column(f"{self._valve()}_valve_mA")
+        opening = np.maximum(np.abs(current) - DEAD_BAND_MA, 0.0) / self.knee_mA
+        share = opening**2 / (1.0 + opening**2)
+        pressure = body.column("pump_bar") / RATED_BAR
+        change: Floats = self.rad_at_rated * np.sign(current) * share * pressure
+        return change
