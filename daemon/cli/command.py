@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from calibration.errors import DataError, ModelError, RigError, UnsafeError
+from daemon.cli.job_lines import percent
 from daemon.cli.terminal import echo_error
 from daemon.commands import CommandError
 from daemon.host.safe_output import json_line, shown, shown_lines
@@ -145,10 +146,10 @@ def progress_display(*, as_json: bool) -> Iterator[Progress]:
             seconds += every_s
             share, text = now
             if is_watched:
-                bar = "#" * round(_BAR * share)
+                bar = "#" * min(round(_BAR * share), _BAR - 1)  # full only when there is nothing left to show
                 click.echo(f"\r\x1b[K[{bar:{_BAR}}] {seconds:.0f} s  {shown(text)}", nl=False, err=True)
             else:
-                echo_error(f"{seconds:.0f} s: {text} ({share:.0%})")
+                echo_error(f"{seconds:.0f} s: {text} ({percent(share)})")
         if is_watched:
             click.echo("\r\x1b[K", nl=False, err=True)
 

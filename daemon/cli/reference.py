@@ -14,12 +14,13 @@ HEAD = """# Commands
 Every command with its arguments and options. This page is made from the commands: `python -m daemon.cli.reference >
 docs/commands.md`. Each command says the same with `--help`.
 
-Exit status of all commands: 0 done, 1 failed, 2 wrong use or bad input, 3 refused because the result would be unsafe to use;
-`rigcal health` alone has those of monitoring systems. With `--json`, standard output holds one JSON object and nothing else
-([formats.md](formats.md)). Where standard output is no terminal, what is printed has no colours and no moving parts.
+Exit status of all commands: 0 done, 1 failed, 2 wrong use or bad input, 3 refused because the result would be unsafe
+to use; `rigcal health` alone has those of monitoring systems. With `--json`, standard output holds one JSON object and
+nothing else ([formats.md](formats.md)). Where standard output is no terminal, what is printed has no colours and no
+moving parts.
 
-`rigcal completion bash | zsh | fish` prints the script by which a shell completes commands and options with the Tab key; the
-Debian package and `deploy/install.sh` put all three in place.
+`rigcal completion bash | zsh | fish` prints the script by which a shell completes commands and options with the Tab
+key; the Debian package and `deploy/install.sh` put all three in place.
 """
 
 

@@ -47,6 +47,7 @@ from drivers.clock import NS_PER_S, SystemClock
 
 log = logging.getLogger(__name__)
 
+_COMPUTED = 0.9  # share of a job's work that is done when its model is known and nothing is written yet
 _LEAST_FIXES = 4  # three place a base and say nothing more
 
 
@@ -117,8 +118,9 @@ def _find_gap(order: Order, progress: Progress) -> dict[str, Any]:
             text,
             observations,
             holdout=held_out,
-            run=Run(order.seed, progress=progress, checkpoint=checkpoint),
+            run=Run(order.seed, progress=progress, checkpoint=checkpoint).part(0.0, _COMPUTED),
         )
+        progress(_COMPUTED, "drawing the report and writing the model")
         directory = models / f"{order.job_id:05d}-gap"
         answer = gap_answer(found, (clock.monotonic_ns() - started_ns) / NS_PER_S)
         checks = ", ".join(np.unique(held_out.session).tolist()) if held_out else "none"
@@ -164,14 +166,15 @@ def _trained_on(order: Order, model: CalibratedModel) -> Observations:
 def _train_residual(order: Order, progress: Progress) -> dict[str, Any]:
     model = read_model(Path(str(order.model)), order.model_sha256)
     observations = _trained_on(order, model)
-    model = train_residual(model, observations, run=Run(order.seed, progress=progress))
+    model = train_residual(model, observations, run=Run(order.seed, progress=progress).part(0.0, _COMPUTED))
+    progress(_COMPUTED, "writing the model")
     directory = Path(order.models_directory) / f"{order.job_id:05d}-hybrid"
     made = _made(directory, write_model(directory, model), model, "hybrid", observations)
     return made | {"sessions": list(order.train_ids)}
 
 
 def _report(order: Order, progress: Progress) -> dict[str, Any]:
-    progress(0.0, "evaluating")
+    progress(0.0, "evaluating the model on the check sessions")
     directory = Path(str(order.model))
     model = read_model(directory, order.model_sha256)
     training = evaluate(model, _trained_on(order, model))
@@ -180,7 +183,7 @@ def _report(order: Order, progress: Progress) -> dict[str, Any]:
         checks = _observations(order, model.rig, order.session_ids)
         known = bool(np.isin(checks.setup, training.observations.setup).all())
         held_out = evaluate(model, checks, refit_base=not known)
-    progress(0.3, "drawing")
+    progress(0.3, "drawing the report")
     with _store(order) as reader:
         setups = setup_lines(reader, (*order.train_ids, *order.session_ids))
     page = calibration_report(report_input(training, held_out, setups=setups))

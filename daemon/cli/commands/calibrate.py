@@ -115,6 +115,7 @@ def calibrate(
                 checkpoint=checkpoint,
             ),
         )
+        progress(1.0, "drawing the report and checking that the model loads")
         with ThreadPoolExecutor(1) as pool:  # another process loads the model while this one draws
             loaded = pool.submit(model_files.check_loads, model, out)
             sources = {"data": offline.source_line(data, raw)}

@@ -80,10 +80,11 @@ def gap(
     with progress_display(as_json=as_json) as progress:
         run = Run(seed, progress=progress)
         found = find_gap(source.rig, source.text, observations, holdout=held_out, prior=prior, run=run)
-    found = replace(found, warnings=(*overlap, *found.warnings))
-    document = gap_report(found, provenance(found.model, watch.utc_ns, files))
-    result = gap_answer(found, watch.seconds)
-    write_gap(out, found, result, document)
+        progress(1.0, "drawing the report and writing the model")
+        found = replace(found, warnings=(*overlap, *found.warnings))
+        document = gap_report(found, provenance(found.model, watch.utc_ns, files))
+        result = gap_answer(found, watch.seconds)
+        write_gap(out, found, result, document)
     if not as_json:
         show_gap(found)
         echo(f"Model: {out / 'model'}   report: {out / REPORT}   {result['seconds']} s")
