@@ -88,6 +88,8 @@ def echo_table(
         is_bold = bool(bold) and bold[number]
         styled = [
             click.style(padded(i, text), fg=cell.colour or None, bold=is_bold or None)
+            if cell.colour or is_bold
+            else padded(i, text)
             for i, (cell, text) in enumerate(zip(row, line, strict=True))
         ]
         click.echo("  ".join(styled).rstrip(), color=_color())
