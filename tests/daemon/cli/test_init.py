@@ -19,7 +19,6 @@ from drivers.clock import SystemClock
 from drivers.stations.topcon.codec import CODEC
 from tests.drivers.serial_support import framed
 
-
 RECORD = framed(b"U+00006148-00023344-00029912m+2515656d")
 
 
