@@ -24,23 +24,23 @@ h2 { font-size: 1.3rem; line-height: 1.3; margin: 3rem 0 .4rem; padding-top: 1.1
   border-top: 1px solid var(--line); }
 h3 { font-size: 1rem; margin: 1.6rem 0 .3rem; }
 p, ul { max-width: 46rem; margin: .4rem 0 .8rem; }
-.facts { width: 100%; margin: .8rem 0 1.2rem; border-top: 1px solid var(--line); }
-.facts th, .facts td { text-align: left; padding: .22rem 1rem .22rem 0; font-size: .92rem; white-space: normal;
-  overflow-wrap: anywhere; }
-.facts th { width: 9rem; color: var(--soft); }
+.facts { width: 100%; table-layout: fixed; margin: .8rem 0 1.2rem; border-top: 1px solid var(--line); }
+.facts th, .facts td { text-align: left; padding: .22rem 1rem .22rem 0; font-size: .92rem; }
+.facts th { width: 9rem; }
+.facts td { white-space: normal; overflow-wrap: break-word; }
 .verdict { max-width: none; padding: .55rem 1rem; border-left: 5px solid var(--line); background: var(--plain-paper);
   font-size: 1.1rem; font-weight: 600; }
 .verdict.passed { border-color: var(--good); background: var(--good-paper); color: var(--good); }
 .verdict.failed { border-color: var(--warn); background: var(--warn-paper); color: var(--warn); }
 .accuracy { font-size: 1.08rem; }
-.headline { font-size: 1.95rem; line-height: 1.25; font-weight: 650; letter-spacing: -.01em; margin: 1.4rem 0 .6rem;
+.headline { font-size: 1.95rem; line-height: 1.25; font-weight: 700; letter-spacing: -.01em; margin: 1.4rem 0 .6rem;
   max-width: 50rem; }
 .lead { font-size: 1.08rem; color: var(--soft); max-width: 46rem; }
 .figures { display: grid; grid-template-columns: repeat(4, 1fr); gap: 1rem; margin: 1.6rem 0 .5rem; padding: 0; }
 .figures div { border-top: 3px solid var(--line); padding-top: .5rem; }
 .figures div.after { border-color: var(--blue); }
 .figures dt { color: var(--soft); font-size: .88rem; line-height: 1.35; }
-.figures dd { margin: 0; font-size: 1.7rem; font-weight: 650; font-variant-numeric: tabular-nums; white-space: nowrap; }
+.figures dd { margin: 0; font-size: 1.7rem; font-weight: 700; font-variant-numeric: tabular-nums; white-space: nowrap; }
 .figures small { font-size: .95rem; font-weight: 400; color: var(--soft); }
 .notice { border-left: 4px solid var(--warn); background: var(--warn-paper); padding: .7rem 1rem; margin: 1.4rem 0;
   max-width: none; }
@@ -53,8 +53,8 @@ th, td { padding: .34rem .9rem .34rem 0; text-align: right; border-bottom: 1px s
 th { font-weight: 600; color: var(--soft); font-size: .86rem; }
 th:first-child, td:first-child, td.text, th.text { text-align: left; }
 td:not(.text) { white-space: nowrap; }
-td.text { font-variant-numeric: normal; overflow-wrap: anywhere; }
-tr.best td { font-weight: 650; color: var(--blue); }
+td.text { font-variant-numeric: normal; overflow-wrap: break-word; }
+tr.best td { font-weight: 700; color: var(--blue); }
 tr.flag td:last-child { color: var(--warn); font-weight: 600; }
 figure { margin: 1rem 0 1.2rem; }
 figure img { width: 100%; height: auto; display: block; }
@@ -70,8 +70,8 @@ code { font: .88em/1.4 ui-monospace, "DejaVu Sans Mono", monospace; }
     @bottom-right { content: "page " counter(page) " of " counter(pages); font: 8pt "DejaVu Sans", sans-serif;
       color: #5b6670; } }
   h1 { string-set: report content(); }
-  body { font-size: 9.5pt; line-height: 1.4; } main { padding: 0; max-width: none; }
-  .headline { font-size: 17pt; margin: 8pt 0 4pt; } .figures dd { font-size: 14pt; }
+  html { font-size: 9.5pt; } body { font-size: 9.5pt; line-height: 1.4; } main { padding: 0; max-width: none; }
+  p, ul, .headline, .lead, figcaption { max-width: none; }
   .figures { display: flex; } .figures div { flex: 1; }
   h1, h2, h3, caption, .keep > h2, .keep > p { break-after: avoid; }
   h2 { margin-top: 1.4rem; } thead { display: table-header-group; }

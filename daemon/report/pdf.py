@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from typing import Any
 
 HOW_TO_INSTALL = "pip install 'rigcal[pdf]' and apt install libpango-1.0-0 libpangoft2-1.0-0 libharfbuzz-subset0"
 
@@ -23,18 +22,14 @@ def pdf_of(page: str) -> bytes:
     """
     try:
         import weasyprint
-        from weasyprint.urls import default_url_fetcher
+        from weasyprint.urls import URLFetcher
     except (ImportError, OSError) as error:  # OSError: the package is there, and Pango is not
         raise PdfError(
             f"a PDF needs WeasyPrint with Pango: {HOW_TO_INSTALL}; or print the HTML page from any browser"
         ) from error
 
-    def fetch(url: str, *arguments: Any, **options: Any) -> Any:
-        if not url.startswith("data:"):
-            raise ValueError(f"a report loads nothing from elsewhere, and asks for {url:.80}")
-        return default_url_fetcher(url, *arguments, **options)
-
     for name in ("weasyprint", "fontTools"):
         logging.getLogger(name).setLevel(logging.ERROR)  # it tells of every CSS property that it does not know
-    document: bytes = weasyprint.HTML(string=page, url_fetcher=fetch).write_pdf()
+    fetcher = URLFetcher(allowed_protocols=["data"])
+    document: bytes = weasyprint.HTML(string=page, url_fetcher=fetcher).write_pdf()
     return document
