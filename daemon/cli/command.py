@@ -121,6 +121,11 @@ def print_json(result: Mapping[str, Any]) -> None:
     click.echo(json_line(result))
 
 
+def stream_json(result: Mapping[str, Any]) -> None:
+    """Print one JSON object on a line of its own, while a command with `--json` goes on: standard output is kept."""
+    click.echo(json_line(result), file=sys.__stdout__)
+
+
 @contextlib.contextmanager
 def progress_display(*, as_json: bool) -> Iterator[Progress]:
     """Show on standard error how far long work is: a bar where a person is watching, else a line now and then.

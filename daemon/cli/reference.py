@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import click
 
 from daemon.cli.main import main
+from daemon.cli.terminal import echo_text
 
 HEAD = """# Commands
 
@@ -66,4 +67,4 @@ def _cell(text: str) -> str:
 
 
 if __name__ == "__main__":
-    click.echo(reference(), nl=False)
+    echo_text(reference().rstrip("\n"))

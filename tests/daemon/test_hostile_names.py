@@ -225,6 +225,7 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Config]:
         ("model", "list"),
         ("status",),
         ("status", "--frames"),
+        ("watch", "--count", "1"),
         ("alarms", "--all"),
     ],
     ids=" ".join,

@@ -6,6 +6,7 @@ import click
 from click.shell_completion import get_completion_class
 
 from daemon.cli.command import Command
+from daemon.cli.terminal import echo_text
 
 PROGRAM = "rigcal"
 VARIABLE = "_RIGCAL_COMPLETE"  # click's name for it, made of the program's
@@ -23,4 +24,4 @@ def completion(context: click.Context, shell: str) -> None:
     shell_class = get_completion_class(shell)
     assert shell_class is not None  # click has all three
     script = shell_class(context.find_root().command, {}, PROGRAM, VARIABLE)
-    click.echo(script.source_template % script.source_vars())  # `source` would run the shell to learn its version
+    echo_text(script.source_template % script.source_vars())  # `source` would run the shell to learn its version

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import logging
-import sys
 import time
 from typing import Any
 
 import click
 
 from daemon.cli.client import client_options, socket_of
-from daemon.cli.command import DONE, FAILED, Command, Delivered
+from daemon.cli.command import DONE, FAILED, Command, Delivered, stream_json
 from daemon.cli.terminal import echo, echo_error
 from daemon.control.protocol import request
 
@@ -43,8 +41,7 @@ def tip(prism: str | None, *, follow: bool, **where: Any) -> Any:
         while True:
             result = request(socket, "tip", arguments)
             if where["as_json"]:
-                # A command's standard output is kept for its one result; here each line is one.
-                click.echo(json.dumps(result), file=sys.__stdout__)
+                stream_json(result)
             else:
                 _show(result)
             time.sleep(FOLLOW_S)

@@ -13,19 +13,15 @@ from typing import Any
 import click
 
 from daemon.cli.client import client_options, socket_of
-from daemon.cli.command import Command
+from daemon.cli.command import Command, stream_json
 from daemon.cli.job_lines import job_line
-from daemon.cli.summary import LINES, reading, state_sentence, summary
-from daemon.cli.terminal import echo
+from daemon.cli.summary import LINES, Line, reading, state_sentence, summary
+from daemon.cli.terminal import begin_screen, draw_screen, echo, end_screen
 from daemon.commands import CommandError
 from daemon.control.protocol import request
-from daemon.host.safe_output import json_line
 
 WIDTH = 100
 TIMEOUT_S = 10.0
-# xterm's sequences: another screen without a cursor, its first place, and back to the terminal as it was.
-_BEGIN, _HOME, _END = "\x1b[?1049h\x1b[?25l", "\x1b[H", "\x1b[?25h\x1b[?1049l"
-_REST_OF_LINE, _REST_OF_SCREEN = "\x1b[K", "\x1b[J"
 
 
 @click.command(cls=Command)
@@ -50,7 +46,7 @@ def watch(interval_s: float, count: int | None, **where: Any) -> None:
     socket = socket_of(where["socket"], where["config"])
     looks = itertools.count() if count is None else range(count)
     if is_screen:
-        click.echo(_BEGIN, nl=False)
+        begin_screen()
     try:
         for look in looks:
             if look:
@@ -59,8 +55,7 @@ def watch(interval_s: float, count: int | None, **where: Any) -> None:
             if is_screen:
                 _draw(status, fault)
             elif where["as_json"]:
-                line = json_line({"error": fault} if status is None else status)
-                click.echo(line, file=sys.__stdout__)  # a command's standard output is kept for its one result
+                stream_json({"error": fault} if status is None else status)
             else:
                 echo(f"{datetime.now(UTC):%Y-%m-%d %H:%M:%S} {fault if status is None else one_line(status)}")
             sys.stdout.flush()
@@ -68,7 +63,7 @@ def watch(interval_s: float, count: int | None, **where: Any) -> None:
         pass
     finally:
         if is_screen:
-            click.echo(_END, nl=False)
+            end_screen()
     raise click.exceptions.Exit(0)  # nothing is left to be printed as the one result
 
 
@@ -95,11 +90,8 @@ def _look(socket: Any) -> tuple[Mapping[str, Any] | None, str]:
 
 
 def _draw(status: Mapping[str, Any] | None, fault: str) -> None:
-    """Write over the screen from its first line on, so that nothing flickers."""
     columns, rows = shutil.get_terminal_size((WIDTH, LINES + 1))
-    lines = [click.style(fault, fg="red", bold=True)]
+    lines = [Line(fault, {"fg": "red", "bold": True})]
     if status is not None:
-        told = summary(status, columns, rows - 2, with_joints=True)
-        lines = [click.style(line.text, **line.style) for line in told[: rows - 2]]
-    lines.append(click.style(f"{datetime.now(UTC):%H:%M:%S} UTC, Ctrl-C ends", dim=True))
-    click.echo(_HOME + "".join(f"{line}{_REST_OF_LINE}\r\n" for line in lines) + _REST_OF_SCREEN, nl=False)
+        lines = summary(status, columns, rows - 2, with_joints=True)[: rows - 2]
+    draw_screen([*lines, Line(f"{datetime.now(UTC):%H:%M:%S} UTC, Ctrl-C ends", {"dim": True})])
