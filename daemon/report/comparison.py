@@ -67,8 +67,8 @@ def comparison_page(comparison: Comparison, sources: Mapping[str, str], facts: F
                 drawing.picture(
                     dots(comparison),
                     "Mean, greatest and standard deviation of the error per method, and the noise floor",
-                    "On the held-out fixes; the axes are logarithmic. The dashed line is what the instruments' noise "
-                    "explains: no method can be truer.",
+                    "On the held-out fixes; the axes are logarithmic. The dashed line is the instruments' noise, "
+                    "root mean square.",
                 ),
                 drawing.picture(
                     curves(comparison),
