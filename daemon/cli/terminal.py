@@ -54,12 +54,12 @@ def echo_text(text: str) -> None:
 
 def begin_screen() -> None:
     """Take another screen of the terminal, without a cursor; `end_screen` gives it back."""
-    click.echo(_BEGIN, nl=False)
+    click.echo(_BEGIN, nl=False, color=True)
 
 
 def end_screen() -> None:
     """Show the terminal again as it was before `begin_screen`."""
-    click.echo(_END, nl=False)
+    click.echo(_END, nl=False, color=True)
 
 
 def draw_screen(lines: Sequence[tuple[str, Mapping[str, Any]]]) -> None:
@@ -68,8 +68,10 @@ def draw_screen(lines: Sequence[tuple[str, Mapping[str, Any]]]) -> None:
     Args:
         lines: each with its style, as `click.style` names it.
     """
-    drawn = "".join(f"{click.style(shown(text), **style)}{_REST_OF_LINE}\r\n" for text, style in lines)
-    click.echo(_HOME + drawn + _REST_OF_SCREEN, nl=False, color=_color())
+    is_plain = _color() is False
+    texts = [shown(text) if is_plain else click.style(shown(text), **style) for text, style in lines]
+    drawn = "".join(f"{text}{_REST_OF_LINE}\r\n" for text in texts)
+    click.echo(_HOME + drawn + _REST_OF_SCREEN, nl=False, color=True)  # without colours it is a screen all the same
 
 
 def echo_list(title: str, sentences: Sequence[str], most: int = _LISTED) -> None:

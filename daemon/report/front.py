@@ -136,7 +136,8 @@ def front(facts: Facts, verdict: Verdict | None, accuracy: Accuracy) -> str:
     if accuracy.columns:
         figures = [[f"{number(value)} mm" for value in accuracy.columns.values()]]
         columns = markup.table(list(accuracy.columns), figures, text_columns=range(len(accuracy.columns)))
-    return markup.facts(facts.lines()) + box + markup.paragraph(accuracy.sentence, "accuracy") + columns
+    said = markup.unbroken(box + markup.paragraph(accuracy.sentence, "accuracy"))
+    return markup.facts(facts.lines()) + said + columns
 
 
 def signatures() -> str:

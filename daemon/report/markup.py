@@ -142,6 +142,11 @@ def paragraph(text: str, kind: str = "") -> str:
     return f'<p class="{kind}">{escape(text)}</p>' if kind else f"<p>{escape(text)}</p>"
 
 
+def unbroken(paragraphs: str) -> str:
+    """Return ready HTML in which no line ends between a number and its mm."""
+    return paragraphs.replace(" mm", "&nbsp;mm")
+
+
 def items(sentences: Iterable[str]) -> str:
     """Return a list of escaped sentences."""
     return "<ul>" + "".join(f"<li>{escape(s)}</li>" for s in sentences) + "</ul>"
@@ -185,7 +190,7 @@ def header(title: str, front: str, headline: str, lead: str, tiles: Iterable[Til
     )
     return (
         f"<header><h1>{escape(title)}</h1>{front}"
-        f'<p class="headline">{escape(headline).replace(" mm", "&nbsp;mm")}</p>{paragraph(lead, "lead")}'
+        f'<p class="headline">{unbroken(escape(headline))}</p>{paragraph(lead, "lead")}'
         + (f'<dl class="figures">{figures}</dl></header>' if figures else "</header>")
     )
 

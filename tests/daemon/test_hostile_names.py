@@ -225,7 +225,6 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Config]:
         ("model", "list"),
         ("status",),
         ("status", "--frames"),
-        ("watch", "--count", "1"),
         ("alarms", "--all"),
     ],
     ids=" ".join,
@@ -236,6 +235,14 @@ def test_one_bad_name_in_the_store_spoils_no_list(full: Config, command: tuple[s
     if "list" in command:
         for name in ANY.values():
             assert shown(name) in said
+
+
+def test_one_bad_name_moves_nothing_on_the_live_screen(full: Config) -> None:
+    said = on_terminal("watch", "--count", "1", "--socket", str(full.socket_path))
+    for own in ("\x1b[?1049h\x1b[?25l", "\x1b[H", "\x1b[K\r\n", "\x1b[J", "\x1b[?25h\x1b[?1049l"):
+        said = said.replace(own, "")
+    assert_plain(re.sub(r"\x1b\[\d*m", "", said))  # colours are the screen's own, and names have lost their escapes
+    assert "rig       swdt82" in said
 
 
 @pytest.mark.parametrize("number", range(len(ANY)), ids=ANY.keys())
