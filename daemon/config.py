@@ -127,6 +127,17 @@ class StoreSection(_Section):
         return round(self.free_gb * 2**30)
 
 
+class ReportSection(_Section):
+    """The reports of jobs.
+
+    Attributes:
+        tolerance_mm: root mean square error on held-out fixes that the machine may have; reports then say whether it
+            passed. Without it they say that no tolerance is stated.
+    """
+
+    tolerance_mm: float | None = Field(default=None, gt=0)
+
+
 class TipCanSection(_Section):
     """The live corrected tip on a CAN link: two frames a time, as docs/tip-frames.md has them.
 
@@ -234,6 +245,7 @@ class Config(_Section):
     sessions: SessionsSection = SessionsSection()
     jobs: JobsSection = JobsSection()
     store: StoreSection = StoreSection()
+    report: ReportSection = ReportSection()
     tip: TipSection | None = None
     metrics: MetricsSection | None = None
     notify: NotifySection | None = None

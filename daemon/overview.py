@@ -19,7 +19,7 @@ from daemon.store.errors import StoreError
 from daemon.store.health import StoreHealth
 from daemon.store.jobs import JobTable
 from daemon.store.models import ModelTable
-from daemon.store.setups import SetupTable
+from daemon.store.setups import SetupRow, SetupTable
 from daemon.store.store import Store
 
 T = TypeVar("T")
@@ -53,6 +53,8 @@ class Overview:
         """Return the state of everything; a part of the store that is damaged hides no other."""
         unreadable: dict[str, str] = {}
 
+        setups = SetupTable(self.store)
+
         def stored(part: str, read: Callable[[], T]) -> T | None:
             try:
                 return read()
@@ -69,7 +71,8 @@ class Overview:
             "notices": self.notices.status(),
             "acquisition": asdict(self.acquisition()),
             "session": stored("session", self.sessions.open_session),
-            "control_shots": stored("control_shots", SetupTable(self.store).newest_shots) or [],
+            "setup": stored("setup", lambda: _setup(setups.newest())),
+            "control_shots": stored("control_shots", setups.newest_shots) or [],
             "jobs": stored("jobs", self.jobs.unfinished) or [],
             "job_counts": stored("job_counts", self.jobs.counts) or [],
             "models": stored("models", self.models.status),
@@ -79,3 +82,7 @@ class Overview:
             "store_health": self.store_health().as_dict(),
             "unreadable": unreadable,
         }
+
+
+def _setup(row: SetupRow | None) -> dict[str, Any] | None:
+    return None if row is None else asdict(row)

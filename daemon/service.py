@@ -96,6 +96,7 @@ class Daemon:
             run_id=store.run_id or parts.clock.now().utc_ns // NS_PER_S,  # unique also where the runs are damaged
             aim=parts.aim,
             limits=motion_limits(config),
+            are_jobs_enabled=config.jobs.enabled,
         )
         models = ModelTable(store, parts.rig.name, parts.clock)
         self._live_model = LiveModel(models, parts.rig)

@@ -26,6 +26,12 @@ place_once() {
     fi
 }
 
+# The script by which a shell completes rigcal's commands and options.
+complete() {
+    install -d "$(dirname "$2")"
+    /opt/rigcal/venv/bin/rigcal completion "$1" >"$2"
+}
+
 place_files() {
     place rigcal.service /etc/systemd/system/rigcal.service
     place rigcal.sysusers /etc/sysusers.d/rigcal.conf
@@ -57,6 +63,9 @@ fi
 
 "$here/bootstrap.sh" /opt/rigcal/venv "$here/../requirements.lock"
 ln -sfn /opt/rigcal/venv/bin/rigcal /usr/local/bin/rigcal
+complete bash /usr/local/share/bash-completion/completions/rigcal
+complete zsh /usr/local/share/zsh/site-functions/_rigcal
+complete fish /usr/local/share/fish/vendor_completions.d/rigcal.fish
 place_files
 systemd-sysusers rigcal.conf
 # As the service's user, whose cache it is; without it the first calibration would wait for the compiler.

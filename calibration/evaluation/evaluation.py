@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 
@@ -10,6 +11,7 @@ import numpy as np
 from calibration.design.accuracy import ExpectedAccuracy, expected_accuracy
 from calibration.errors import DataError, UnsafeError
 from calibration.identification.checks import row_warnings
+from calibration.identification.noise import joint_rates, reading_covariance, station_covariance
 from calibration.identification.reading_steps import rounding
 from calibration.identification.samples import averaged
 from calibration.identification.sweeps.circles import find_axes
@@ -193,3 +195,11 @@ def statistics(size_mm: Floats) -> dict[str, float]:
         "max_mm": float(size_mm.max()),
         "std_mm": float(size_mm.std()),
     }
+
+
+def instrument_noise_mm(model: CalibratedModel, observations: Observations) -> float:
+    """Return the RMS 3-D error, mm, that station and encoders explain on these rows."""
+    lin = Predictor.of(model).linearise(observations)
+    station: Floats = station_covariance(model.rig, lin.position_mm, observations.sigma_mm)
+    readings = reading_covariance(model.rig, lin.joint_jacobian, joint_rates(model.rig, observations))
+    return math.sqrt(float(np.trace(station + readings, axis1=1, axis2=2).mean()))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
-from calibration.evaluation.evaluation import Evaluation, evaluate, sizes_mm
+from calibration.evaluation.evaluation import Evaluation, evaluate, instrument_noise_mm, sizes_mm
 from calibration.experiments.residual_comparison import RESIDUALS, MethodResult, compare_residuals, families
 from calibration.identification.refinement import Prior
 from calibration.observations import Floats, Observations
@@ -39,6 +39,11 @@ class Comparison:
     results: tuple[MethodResult, ...]
     warnings: tuple[str, ...]
 
+    @property
+    def noise_mm(self) -> float | None:
+        """RMS 3-D error that station and encoders explain on the held-out rows; None where no method says so."""
+        return next((r.noise_mm for r in reversed(self.results) if r.noise_mm is not None), None)
+
     def lowest(self, figure: str) -> frozenset[str]:
         """Methods with the lowest value of one of `FIGURES`."""
         values = {str(row["method"]): row[figure] for row in (result.as_dict() for result in self.results)}
@@ -51,6 +56,7 @@ class Comparison:
             "rig": self.rig,
             "n": self.training,
             "n_holdout": self.held_out,
+            "noise_mm": self.noise_mm,
             "methods": [result.as_dict() for result in self.results],
             "warnings": [*self.warnings, *(f"{r.method}: {note}" for r in self.results for note in r.notes)],
         }
@@ -165,7 +171,8 @@ class _Task:
         held, fitted = (sizes_mm(e.errors_mm["hybrid"]) for e in (evaluation, trained))
         model = evaluation.model
         adds = families(model) + (() if model.residual is None else (model.residual.learner.kind,))
-        own = MethodResult(method, held, fitted, round(seconds, 3), adds, notes=evaluation.warnings)
+        noise_mm = instrument_noise_mm(model, evaluation.observations)
+        own = MethodResult(method, held, fitted, round(seconds, 3), adds, notes=evaluation.warnings, noise_mm=noise_mm)
         return [MethodResult(NOMINAL, before, fitted_before), own]
 
     def _limited(self, run: Run, began: float) -> Run:

@@ -47,6 +47,7 @@ class MethodResult:
         adds: families of effects, then the residual's learner, that come on top of the kinematics.
         reason: why the method does not apply.
         notes: about data and fit, of this method alone.
+        noise_mm: RMS 3-D error that station and encoders explain on the held-out rows, by this model.
     """
 
     method: str
@@ -56,6 +57,7 @@ class MethodResult:
     adds: tuple[str, ...] = ()
     reason: str | None = None
     notes: tuple[str, ...] = ()
+    noise_mm: float | None = None
 
     def as_dict(self) -> dict[str, object]:
         """For JSON: the figures in mm, None where the method does not apply."""

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from calibration.errors import DataError, ModelError, RigError, UnsafeError
+from daemon.cli.job_lines import percent
 from daemon.cli.terminal import echo_error
 from daemon.commands import CommandError
 from daemon.host.safe_output import json_line, shown, shown_lines
@@ -120,6 +121,11 @@ def print_json(result: Mapping[str, Any]) -> None:
     click.echo(json_line(result))
 
 
+def stream_json(result: Mapping[str, Any]) -> None:
+    """Print one JSON object on a line of its own, while a command with `--json` goes on: standard output is kept."""
+    click.echo(json_line(result), file=sys.__stdout__)
+
+
 @contextlib.contextmanager
 def progress_display(*, as_json: bool) -> Iterator[Progress]:
     """Show on standard error how far long work is: a bar where a person is watching, else a line now and then.
@@ -145,10 +151,10 @@ def progress_display(*, as_json: bool) -> Iterator[Progress]:
             seconds += every_s
             share, text = now
             if is_watched:
-                bar = "#" * round(_BAR * share)
+                bar = "#" * min(round(_BAR * share), _BAR - 1)  # full only when there is nothing left to show
                 click.echo(f"\r\x1b[K[{bar:{_BAR}}] {seconds:.0f} s  {shown(text)}", nl=False, err=True)
             else:
-                echo_error(f"{seconds:.0f} s: {text} ({share:.0%})")
+                echo_error(f"{seconds:.0f} s: {text} ({percent(share)})")
         if is_watched:
             click.echo("\r\x1b[K", nl=False, err=True)
 

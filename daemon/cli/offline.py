@@ -50,6 +50,13 @@ seed_option = click.option(
 csv_out_option = click.option(
     "--out", type=DIRECTORY, metavar="CSV", help="Where to write; standard output by default."
 )
+tolerance_option = click.option(
+    "--tolerance",
+    "tolerance_mm",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="MM",
+    help="Root mean square error that the machine may have: say whether it passed. Fixes that were fitted cannot pass.",
+)
 time_limit_option = click.option(
     "--time-limit",
     type=click.FloatRange(min=0, min_open=True),
@@ -217,6 +224,30 @@ def show_evaluation(result: Mapping[str, Any], rows: str) -> None:
     echo_list("Please note", result["warnings"])
     if result["ignored_columns"]:
         echo(f"Ignored columns: {', '.join(result['ignored_columns'])}")
+
+
+def judged(
+    result: dict[str, object], tolerance_mm: float | None, rms_mm: float, rows: str, *, is_held_out: bool, as_json: bool
+) -> dict[str, object]:
+    """Return a result with the verdict on a tolerance, if one is stated; print it for people.
+
+    Args:
+        result: the JSON object.
+        tolerance_mm: root mean square error that the machine may have; None where none is stated.
+        rms_mm: the error.
+        rows: which fixes it is of.
+        is_held_out: the model was not fitted to them.
+        as_json: nothing is printed.
+    """
+    from daemon.report.front import judge
+
+    verdict = judge(tolerance_mm, rms_mm, is_held_out=is_held_out, rows=rows)
+    if verdict is None:
+        return result
+    if not as_json:
+        colour = {"passed": "green", "failed": "red", "not judged": "yellow"}[verdict.outcome]
+        echo(verdict.sentence, fg=colour, bold=True)
+    return result | {"tolerance": verdict.as_dict()}
 
 
 def _show_axes(axes: Sequence[Mapping[str, Any]]) -> None:

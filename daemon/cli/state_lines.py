@@ -49,6 +49,16 @@ def notice_lines(notices: Sequence[Mapping[str, Any]]) -> Iterator[str]:
             yield f"notices by {one['target']}: {one['waiting']} wait, the last delivery failed: {one['error']}"
 
 
+def store_lines(status: Mapping[str, Any]) -> Iterator[str]:
+    """Return the store's present work and its unreadable parts; its faults are alarms."""
+    if status["store_health"]["state"] == "checking":
+        yield status["store_health"]["text"]
+    if status["acquisition"]["is_behind"]:
+        yield "captures wait to be decoded: readings and fixes come late, and jobs wait"
+    for part, reason in status["unreadable"].items():
+        yield f"{part}: cannot be read from the store ({reason})"
+
+
 def gap_state_lines(acquisition: Mapping[str, Any]) -> Iterator[str]:
     """Return the open gaps, one line for all channels of a link that lack data for one reason."""
     links = {channel["name"]: channel["link"] for channel in acquisition["channels"]}
@@ -107,15 +117,6 @@ def show_session(session: Mapping[str, Any]) -> None:
         accepted = session["accepted"]
         by = who(accepted["by"], accepted["user"]) or "an operator"
         echo(f"  accepted by {by}, although {accepted['despite']}")
-
-
-def job_line(job: Mapping[str, Any]) -> str:
-    """Return a job's state, with its error or its report."""
-    name = f"job {job['id']} {job['kind']}" + (f" of {job['session_id']}" if job.get("session_id") else "")
-    if job["state"] == "running":
-        return f"{name}: running, {100 * job['progress']:.0f} %, {job['message'] or 'starting'}"
-    more = job["error"] or (job.get("result") or {}).get("report")
-    return f"{name}: {job['state']}" + (f", {more}" if more else "")
 
 
 # ---- models ----------------------------------------------------------------------------------------------------------

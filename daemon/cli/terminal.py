@@ -10,7 +10,7 @@ import logging
 import os
 import sys
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import click
@@ -19,6 +19,9 @@ from daemon.host.safe_output import shown, shown_lines
 from daemon.host.systemd import is_journal, priority_prefix
 
 _LISTED = 10
+# xterm's sequences: another screen without a cursor, its first place, and back to the terminal as it was.
+_BEGIN, _HOME, _END = "\x1b[?1049h\x1b[?25l", "\x1b[H", "\x1b[?25h\x1b[?1049l"
+_REST_OF_LINE, _REST_OF_SCREEN = "\x1b[K", "\x1b[J"
 
 
 class Coloured(NamedTuple):
@@ -42,6 +45,33 @@ def echo_error(text: str, level: int = logging.INFO) -> None:
     """
     prefix = priority_prefix(level) if is_journal(sys.stderr) else ""
     click.echo("\n".join(prefix + line for line in shown_lines(text).split("\n")), err=True)
+
+
+def echo_text(text: str) -> None:
+    """Print lines on standard output as they are, but for what is not safe to show."""
+    click.echo(shown_lines(text))
+
+
+def begin_screen() -> None:
+    """Take another screen of the terminal, without a cursor; `end_screen` gives it back."""
+    click.echo(_BEGIN, nl=False, color=True)
+
+
+def end_screen() -> None:
+    """Show the terminal again as it was before `begin_screen`."""
+    click.echo(_END, nl=False, color=True)
+
+
+def draw_screen(lines: Sequence[tuple[str, Mapping[str, Any]]]) -> None:
+    """Write lines over the screen from its first line on, so that nothing flickers.
+
+    Args:
+        lines: each with its style, as `click.style` names it.
+    """
+    is_plain = _color() is False
+    texts = [shown(text) if is_plain else click.style(shown(text), **style) for text, style in lines]
+    drawn = "".join(f"{text}{_REST_OF_LINE}\r\n" for text in texts)
+    click.echo(_HOME + drawn + _REST_OF_SCREEN, nl=False, color=True)  # without colours it is a screen all the same
 
 
 def echo_list(title: str, sentences: Sequence[str], most: int = _LISTED) -> None:
@@ -88,6 +118,8 @@ def echo_table(
         is_bold = bool(bold) and bold[number]
         styled = [
             click.style(padded(i, text), fg=cell.colour or None, bold=is_bold or None)
+            if cell.colour or is_bold
+            else padded(i, text)
             for i, (cell, text) in enumerate(zip(row, line, strict=True))
         ]
         click.echo("  ".join(styled).rstrip(), color=_color())

@@ -142,6 +142,7 @@ class JobQueue:
             models_directory=str(config.models_directory),
             session_ids=session_ids,
             seed=config.jobs.seed,
+            tolerance_mm=config.report.tolerance_mm,
             live_model=str(live.path) if live else None,
             live_sha256=live.manifest_sha256 if live else None,
             live_id=live.id if live else None,

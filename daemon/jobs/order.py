@@ -33,6 +33,7 @@ class Order:
         live_id: its number in the store (comparison, drift).
         live_since: number of the change by which it went live (drift).
         held_out_ids: sessions that nothing is fitted to, to judge by (gap).
+        tolerance_mm: root mean square error that the machine may have (gap, report); None where none is stated.
         store_file: device and inode of the store that the daemon has open: another file of that name is none of its.
     """
 
@@ -50,6 +51,7 @@ class Order:
     live_id: int | None = None
     live_since: int | None = None
     held_out_ids: tuple[str, ...] = ()
+    tolerance_mm: float | None = None
     store_file: tuple[int, int] | None = None
 
     def to_line(self) -> bytes:

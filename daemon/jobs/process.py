@@ -12,6 +12,8 @@ import logging
 import os
 import sys
 import threading
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -35,9 +37,10 @@ from daemon.models.gap_files import MODEL, gap_answer, write_gap
 from daemon.models.model_files import REPORT, read_model, write_model
 from daemon.report.calibration import calibration_report
 from daemon.report.from_model import provenance, report_input
+from daemon.report.front import Facts
 from daemon.report.gap import gap_report
 from daemon.report.gap_words import gap_headline
-from daemon.sessions.session_data import sessions_csv, setup_lines
+from daemon.sessions.session_data import sessions_csv, sessions_measured, setup_lines
 from daemon.store.errors import StoreError
 from daemon.store.files import FileIdentity
 from daemon.store.reader import Reader
@@ -47,6 +50,7 @@ from drivers.clock import NS_PER_S, SystemClock
 
 log = logging.getLogger(__name__)
 
+_COMPUTED = 0.9  # share of a job's work that is done when its model is known and nothing is written yet
 _LEAST_FIXES = 4  # three place a base and say nothing more
 
 
@@ -117,13 +121,15 @@ def _find_gap(order: Order, progress: Progress) -> dict[str, Any]:
             text,
             observations,
             holdout=held_out,
-            run=Run(order.seed, progress=progress, checkpoint=checkpoint),
+            run=Run(order.seed, progress=progress, checkpoint=checkpoint).part(0.0, _COMPUTED),
         )
+        progress(_COMPUTED, "drawing the report and writing the model")
         directory = models / f"{order.job_id:05d}-gap"
         answer = gap_answer(found, (clock.monotonic_ns() - started_ns) / NS_PER_S)
         checks = ", ".join(np.unique(held_out.session).tolist()) if held_out else "none"
         sources = {"sessions": ", ".join(order.session_ids), "held-out sessions": checks}
-        sha256 = write_gap(directory, found, answer, gap_report(found, provenance(found.model, None, sources)))
+        facts = _facts(order, found.model, (*order.session_ids, *order.held_out_ids), directory.name)
+        sha256 = write_gap(directory, found, answer, gap_report(found, provenance(found.model, None, sources), facts))
     made = _made(directory / MODEL, sha256, found.model, "effects" if found.effects else "geometric", observations)
     return made | {
         "sessions": list(order.session_ids),
@@ -164,14 +170,15 @@ def _trained_on(order: Order, model: CalibratedModel) -> Observations:
 def _train_residual(order: Order, progress: Progress) -> dict[str, Any]:
     model = read_model(Path(str(order.model)), order.model_sha256)
     observations = _trained_on(order, model)
-    model = train_residual(model, observations, run=Run(order.seed, progress=progress))
+    model = train_residual(model, observations, run=Run(order.seed, progress=progress).part(0.0, _COMPUTED))
+    progress(_COMPUTED, "writing the model")
     directory = Path(order.models_directory) / f"{order.job_id:05d}-hybrid"
     made = _made(directory, write_model(directory, model), model, "hybrid", observations)
     return made | {"sessions": list(order.train_ids)}
 
 
 def _report(order: Order, progress: Progress) -> dict[str, Any]:
-    progress(0.0, "evaluating")
+    progress(0.0, "evaluating the model on the check sessions")
     directory = Path(str(order.model))
     model = read_model(directory, order.model_sha256)
     training = evaluate(model, _trained_on(order, model))
@@ -180,10 +187,12 @@ def _report(order: Order, progress: Progress) -> dict[str, Any]:
         checks = _observations(order, model.rig, order.session_ids)
         known = bool(np.isin(checks.setup, training.observations.setup).all())
         held_out = evaluate(model, checks, refit_base=not known)
-    progress(0.3, "drawing")
+    progress(0.3, "drawing the report")
+    session_ids = (*order.train_ids, *order.session_ids)
     with _store(order) as reader:
-        setups = setup_lines(reader, (*order.train_ids, *order.session_ids))
-    page = calibration_report(report_input(training, held_out, setups=setups))
+        setups = setup_lines(reader, session_ids)
+    facts = _facts(order, model, session_ids, directory.name)
+    page = calibration_report(report_input(training, held_out, setups=setups, facts=facts))
     path = directory / REPORT
     write_file(path, page.encode())
     judged = held_out or training
@@ -240,6 +249,19 @@ def _check_drift(order: Order, progress: Progress) -> dict[str, Any]:
             about = {"fixes": found.fixes, "scores": list(found.scores), "ratio": found.ratio, "reason": fitted}
             checks.append({"session": name, **about})
     return {"drift": {"live": order.live_id, "live_since": order.live_since, "checks": checks}}
+
+
+def _facts(order: Order, model: CalibratedModel, session_ids: Sequence[str], name: str) -> Facts:
+    """The first lines of a report: who measured what, when and with what, as the store knows it."""
+    with _store(order) as reader:
+        measured = sessions_measured(reader, session_ids)
+    return Facts(
+        rig=model.rig.name,
+        model=name,
+        made_utc_ns=SystemClock().now().utc_ns,
+        tolerance_mm=order.tolerance_mm,
+        **asdict(measured),
+    )
 
 
 def _store(order: Order) -> Reader:

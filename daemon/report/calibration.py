@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from calibration.rig.description import BEYOND_BUILDING
 from daemon.report import calibration_figures as figures
 from daemon.report import drawing, markup
+from daemon.report.front import Accuracy, Facts, Verdict, front, judge, signatures
 from daemon.report.inputs import STAGES, USUAL, ErrorTable, ReportInput, SetupLine, Stage
+from daemon.report.plain_names import coefficient_words, constant_words, in_words, joint_words, unit_words
 from daemon.report.words import DASH, INTERVAL_SIGMAS, PLUS_MINUS, number, signed
+
+if TYPE_CHECKING:
+    from calibration.design.accuracy import ExpectedAccuracy
 
 _STAGE_WORDS: dict[Stage, str] = {
     "nominal": "Nominal: the drawings",
@@ -21,6 +28,9 @@ _OUTLIERS_SHOWN = 20
 _PARAMETERS_SHOWN = 14
 _COEFFICIENTS_SHOWN = 2
 _FEATURES_SHOWN = 10
+_MUCH_OPEN = 0.2  # of the expected error: what a direction of approach, a load or a temperature decides
+_KNOWN = "direction of approach, load and temperature known"
+_UNKNOWN = "not known"
 
 
 def calibration_report(report: ReportInput) -> str:
@@ -39,6 +49,7 @@ def calibration_report(report: ReportInput) -> str:
             _outliers(report),
             _setups(report),
             markup.sources_section(report.provenance, _ignored(report)),
+            signatures(),
         ]
     return markup.page(f"Calibration of {report.rig}", "".join(parts))
 
@@ -82,10 +93,44 @@ def _head(report: ReportInput) -> str:
     moved = [
         f"Station set-up {setup.name!r} moved: its fixes do not fit together." for setup in report.setups if setup.moved
     ]
-    title, made = f"Calibration report: {report.rig}", report.provenance.get("made", "")
-    return markup.header(title, made, headline(report), _meaning(report), tiles) + markup.notice(
-        [*report.warnings, *moved]
+    facts = report.facts or Facts(report.rig)
+    first = front(facts, _verdict(report, facts.tolerance_mm), _accuracy_sentence(report))
+    notes = [in_words(text) for text in [*report.warnings, *moved]]
+    return markup.header(f"Calibration report: {report.rig}", first, headline(report), _meaning(report), tiles) + (
+        markup.notice(notes)
     )
+
+
+def _rows(report: ReportInput) -> str:
+    if report.held_out is None:
+        return f"on the {len(report.judged)} fixes it was fitted to"
+    return f"on {len(report.judged)} held-out fixes"
+
+
+def _verdict(report: ReportInput, tolerance_mm: float | None) -> Verdict | None:
+    rms_mm = report.judged.stage("hybrid").rms_mm
+    return judge(tolerance_mm, rms_mm, is_held_out=report.held_out is not None, rows=_rows(report))
+
+
+def _accuracy_sentence(report: ReportInput) -> Accuracy:
+    """Say how accurate the model is where it was judged, and over the work volume."""
+    after = report.judged.stage("hybrid")
+    sentence = (
+        f"Accuracy: {number(after.rms_mm)} mm root mean square {_rows(report)}, {number(after.max_mm)} mm at worst"
+    )
+    expected = report.expected
+    if expected is None:
+        return Accuracy(f"{sentence}.")
+    sentence += "; over the whole work volume the model itself is expected to be off by"
+    if not _depends_on_more(expected):
+        return Accuracy(f"{sentence} {number(expected.rms_mm)} mm.")
+    known_mm = float(np.hypot(expected.parameters_mm, expected.lacking_mm))
+    return Accuracy(f"{sentence}:", {_KNOWN: known_mm, _UNKNOWN: expected.rms_mm})
+
+
+def _depends_on_more(expected: ExpectedAccuracy) -> bool:
+    """True if poses alone leave so much open that accuracy with and without the rest is told apart."""
+    return expected.open_mm > _MUCH_OPEN * expected.rms_mm
 
 
 def _accuracy(report: ReportInput) -> str:
@@ -98,9 +143,9 @@ def _accuracy(report: ReportInput) -> str:
         if report.held_out is not None:
             cells.append(number(report.training.stage(stage).rms_mm))
         rows.append(cells)
-    columns = ["stage of the model", "mean, mm", "rms, mm", "max, mm", "std, mm"]
+    columns = ["stage of the model", "mean, mm", "root mean square, mm", "worst, mm", "standard deviation, mm"]
     if report.held_out is not None:
-        columns.append("rms where fitted, mm")
+        columns.append("root mean square where fitted, mm")
     stages = markup.table(columns, rows, classes=["", "", "", "best"], caption=f"Position error in space on the {what}")
     note = markup.paragraph(_stage_notes(report), "note")
     return markup.section(
@@ -121,9 +166,10 @@ def _stage_notes(report: ReportInput) -> str:
     sentences = []
     if np.array_equal(errors["effects"], errors["geometric"]):
         sentences.append(
-            f"No named effect is part of this model ({report.effects_reason}), so that stage repeats the one before it."
+            f"No named effect is part of this model ({in_words(report.effects_reason)}), so that stage repeats the one "
+            "before it."
         )
-    sentences.append(f"Learned residual: {report.residual_reason.rstrip('.')}.")
+    sentences.append(f"Learned residual: {in_words(report.residual_reason).rstrip('.')}.")
     sentences.append(f"Scatter of a single fix about the fitted model: {number(report.noise_mm)} mm.")
     return " ".join(sentences)
 
@@ -142,10 +188,7 @@ def _per_prism(judged: ErrorTable) -> str:
 def _expected(report: ReportInput) -> str:
     if report.expected is None:
         return ""
-    rows = [
-        [prism, *(number(value) for value in (of.rms_mm, of.median_mm, of.p95_mm, of.p99_mm))]
-        for prism, of in report.expected.per_prism.items()
-    ]
+    rows, columns = _expected_rows(report.expected)
     place = f" at set-up {report.expected.setup!r}" if report.expected.setup else ""
     return markup.section(
         "What to expect elsewhere",
@@ -154,8 +197,23 @@ def _expected(report: ReportInput) -> str:
             f"work volume{place}, measured or not, without the noise of a fix: {number(report.expected.rms_mm)} mm "
             f"root mean square, {report.expected.where}."
         ),
-        markup.table(["prism", "rms, mm", "median, mm", "95 % within, mm", "99 % within, mm"], rows),
+        markup.table(columns, rows, caption="Expected error in mm of each prism"),
     )
+
+
+def _expected_rows(expected: ExpectedAccuracy) -> tuple[list[list[str]], list[str]]:
+    """Return the rows and headings of the expected errors, in two columns where they depend on more than the pose."""
+    columns = ["prism", "root mean square", "median", "95 % within", "99 % within"]
+    rows = [
+        [prism, *(number(value) for value in (of.rms_mm, of.median_mm, of.p95_mm, of.p99_mm))]
+        for prism, of in expected.per_prism.items()
+    ]
+    if not _depends_on_more(expected):
+        return rows, columns
+    closed_mm2 = np.trace(expected.parameters_mm2 + expected.lacking_mm2, axis1=2, axis2=3)
+    known = [number(float(value)) for value in np.sqrt(closed_mm2.mean(axis=0))]
+    columns[1:2] = [f"root mean square, {_KNOWN}", f"root mean square, {_UNKNOWN}"]
+    return [[row[0], value, *row[1:]] for row, value in zip(rows, known, strict=True)], columns
 
 
 def _axes(report: ReportInput) -> str:
@@ -166,7 +224,7 @@ def _axes(report: ReportInput) -> str:
         offset = f"{number(axis.offset_mm)} {PLUS_MINUS} {number(axis.offset_sigma_mm, 2)}"
         angle = f"{number(axis.angle_deg)} {PLUS_MINUS} {number(axis.angle_sigma_deg, 2)}"
         chance = number(min(axis.p_axis, axis.p_curve))
-        rows.append([axis.joint, axis.prism, angle, offset, chance, "disagrees" if axis.sentence else ""])
+        rows.append([joint_words(axis.joint), axis.prism, angle, offset, chance, "disagrees" if axis.sentence else ""])
         classes.append("flag" if axis.sentence else "")
     return markup.section(
         "Axes measured by single-joint sweeps",
@@ -175,7 +233,7 @@ def _axes(report: ReportInput) -> str:
             "is held against the axis of the calibrated model; intervals are one standard deviation."
         ),
         markup.table(
-            ["joint", "prism", "angle between, deg", "distance, mm", "by chance", "remark"],
+            ["joint", "prism", "angle between, degrees", "distance, mm", "by chance", "remark"],
             rows,
             text_columns=(0, 1, 5),
             classes=classes,
@@ -229,10 +287,11 @@ def _effects(report: ReportInput) -> str:
         return ""
     rows: list[list[str]] = []
     for effect in report.effects:
-        head = [effect.family.replace("_", " "), effect.where, f"{number(effect.change)} {effect.unit}"]
+        head = [effect.family.replace("_", " "), effect.where, f"{number(effect.change)} {unit_words(effect.unit)}"]
         for name, value, sigma, unit in effect.coefficients[:_COEFFICIENTS_SHOWN]:
-            interval = f"{PLUS_MINUS} {number(INTERVAL_SIGMAS * sigma, 2)} {unit}"
-            rows.append([*head, name, f"{signed(value)} {unit}", interval])
+            spoken = unit_words(unit)
+            interval = f"{PLUS_MINUS} {number(INTERVAL_SIGMAS * sigma, 2)} {spoken}"
+            rows.append([*head, coefficient_words(name), f"{signed(value)} {spoken}", interval])
             head = [""] * 3
         more = len(effect.coefficients) - _COEFFICIENTS_SHOWN
         if more > 0:
@@ -248,7 +307,8 @@ def _effects(report: ReportInput) -> str:
     return markup.section(
         "Named effects",
         markup.paragraph(
-            f"Physics beyond true lengths and angles, fitted together with them: {report.effects_reason.rstrip('.')}."
+            "Physics beyond true lengths and angles, fitted together with them: "
+            f"{in_words(report.effects_reason).rstrip('.')}."
         ),
         markup.table(columns, rows, text_columns=(0, 1, 3)),
     )
@@ -278,7 +338,7 @@ def _parameters(report: ReportInput) -> str:
     beyond = sum(p.is_beyond_building for p in lines)
     content = [markup.paragraph(_identifiability_words(report))]
     if report.unidentifiable:
-        content.append(markup.items(report.unidentifiable))
+        content.append(markup.items(in_words(text) for text in report.unidentifiable))
     if lines:
         rows, classes = [], []
         for p in lines[:_PARAMETERS_SHOWN]:
@@ -286,10 +346,10 @@ def _parameters(report: ReportInput) -> str:
             remark = remark or ("" if p.determined else "not determined")
             rows.append(
                 [
-                    p.name,
-                    f"{signed(p.correction)} {p.unit}",
-                    f"{PLUS_MINUS} {number(INTERVAL_SIGMAS * p.sigma, 2)} {p.unit}",
-                    f"{number(p.tolerance)} {p.unit}",
+                    constant_words(p.name),
+                    f"{signed(p.correction)} {unit_words(p.unit)}",
+                    f"{PLUS_MINUS} {number(INTERVAL_SIGMAS * p.sigma, 2)} {unit_words(p.unit)}",
+                    f"{number(p.tolerance)} {unit_words(p.unit)}",
                     signed(p.in_tolerances, 2),
                     remark,
                 ]

@@ -8,6 +8,7 @@ import numpy as np
 
 from daemon.report import drawing
 from daemon.report.inputs import USUAL, ErrorTable, Floats, ReportInput, Stage
+from daemon.report.plain_names import constant_words, joint_words, unit_words
 from daemon.report.words import INTERVAL_SIGMAS, number
 
 if TYPE_CHECKING:
@@ -96,7 +97,7 @@ def residual_by_joint(report: ReportInput) -> Figure:
                 axes.set_title(f"{component} component")
             if column == 0:
                 axes.set_ylabel("mm")
-            axes.set_xlabel(f"{joint.name}, {joint.unit}", labelpad=1, color=drawing.INK)
+            axes.set_xlabel(f"{joint_words(joint)}, {unit_words(joint.unit)}", labelpad=1, color=drawing.INK)
     figure.legend(
         handles=[drawing.key(colour, label) for _, colour, label in stages], loc="outside upper left", ncols=2
     )
@@ -134,8 +135,10 @@ def joint_coverage(report: ReportInput) -> Figure:
                 markeredgewidth=0.9, rasterized=len(ticks) > 200,
             )  # fmt: skip
         axes.annotate(f"{low:g}", (-0.03, place), ha="right", va="center", color=drawing.SOFT, fontsize=8)
-        axes.annotate(f"{high:g} {joint.unit}", (1.035, place), ha="left", va="center", color=drawing.SOFT, fontsize=8)
-    axes.set_yticks(range(len(joints)), [joint.name for joint in joints])
+        axes.annotate(
+            f"{high:g} {unit_words(joint.unit)}", (1.035, place), ha="left", va="center", color=drawing.SOFT, fontsize=8
+        )
+    axes.set_yticks(range(len(joints)), [joint_words(joint) for joint in joints])
     axes.tick_params(axis="y", length=0, labelcolor=drawing.INK, pad=34)
     axes.set_xlim(-0.03, 1.1)
     axes.set_ylim(len(joints) - 0.45, -0.55)
@@ -199,7 +202,7 @@ def corrections(report: ReportInput, most: int = 14) -> Figure:
         half = INTERVAL_SIGMAS * line.sigma / line.tolerance
         axes.plot([line.in_tolerances - half, line.in_tolerances + half], [place, place], color=colour, linewidth=2)
         axes.plot(line.in_tolerances, place, "o" if line.determined else "D", color=colour, markersize=5)
-    drawing.name_rows(axes, [p.name for p in lines], (len(lines) - 0.4, -0.6))
+    drawing.name_rows(axes, [constant_words(p.name) for p in lines], (len(lines) - 0.4, -0.6))
     axes.set_xlim(-reach, reach)
     axes.set_xlabel(
         f"correction, in build tolerances (the band, {USUAL:g} tolerances, holds 95 % of what building does)"

@@ -10,7 +10,9 @@ import numpy as np
 from calibration.experiments.comparison import NOMINAL, Comparison
 from calibration.experiments.residual_comparison import EFFECTS, FIGURES, RESIDUALS, MethodResult
 from daemon.report import drawing, markup
-from daemon.report.words import number
+from daemon.report.front import Accuracy, Facts, front, judge, signatures
+from daemon.report.plain_names import in_words, method_words, residual_words
+from daemon.report.words import listed, number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,36 +36,49 @@ HEADER = ("method", "mean", "max", "std", "rms", "mean, training", "seconds", "o
 LOWEST = "*"
 TEXT_COLUMNS = (0, len(HEADER) - 1)
 _TRAINING = "training_mean_mm"  # the lowest of these is no merit
-_BARS = (("mean_mm", "mean"), ("max_mm", "max"), ("std_mm", "standard deviation"))
+_FIGURES = (("mean_mm", "mean"), ("max_mm", "worst fix"), ("std_mm", "standard deviation"))
+_PAGE_HEADER = ("method", "mean", "worst", "standard deviation", "root mean square", "mean where fitted", "seconds")
 
 
-def comparison_page(comparison: Comparison, sources: Mapping[str, str]) -> str:
-    """Return one self-contained HTML document; `sources` is label -> origin of the data."""
+def comparison_page(comparison: Comparison, sources: Mapping[str, str], facts: Facts | None = None) -> str:
+    """Return one self-contained HTML document.
+
+    Args:
+        comparison: of the methods.
+        sources: label -> origin of the data.
+        facts: the first lines of the page; the rig alone where nothing more is known.
+    """
     with drawing.styled():
         content = [
-            _head(comparison),
+            _head(comparison, facts or Facts(comparison.rig)),
             markup.section(
                 "Errors",
                 markup.table(
-                    HEADER,
-                    table_rows(comparison),
+                    [*_PAGE_HEADER, HEADER[-1]],
+                    [
+                        _in_words(row, result)
+                        for row, result in zip(table_rows(comparison), comparison.results, strict=True)
+                    ],
                     caption=f"Position error in mm on {comparison.held_out} held-out fixes; {LOWEST} the lowest",
                     text_columns=TEXT_COLUMNS,
                     classes=["best" if r.method == "default" else "" for r in comparison.results],
                 ),
-                markup.items(refused) if (refused := refusals(comparison)) else "",
+                markup.items(in_words(text) for text in refused) if (refused := _refusals(comparison)) else "",
                 drawing.picture(
-                    bars(comparison),
-                    "Mean, greatest and standard deviation of the error per method",
-                    "On the held-out fixes; the axes are logarithmic.",
+                    dots(comparison),
+                    "Mean, greatest and standard deviation of the error per method, and the noise floor",
+                    "On the held-out fixes; the axes are logarithmic. The dashed line is the instruments' noise, "
+                    "root mean square.",
                 ),
                 drawing.picture(
                     curves(comparison),
                     "Held-out errors of every method, sorted by size",
-                    "Every method's held-out errors, sorted: at 50 % is the median, at 100 % the worst fix.",
+                    "Every method's held-out errors, sorted: at 50 % is the median, at 100 % the worst fix. The dashed "
+                    "line is the instruments' noise.",
                 ),
             ),
             markup.sources_section(sources),
+            signatures(),
         ]
     return markup.page(f"Methods compared: {comparison.rig}", "".join(content))
 
@@ -99,27 +114,30 @@ def refusals(comparison: Comparison) -> list[str]:
     return [f"{label(r.method)}: not applicable: {r.reason}" for r in comparison.results if r.reason is not None]
 
 
-def bars(comparison: Comparison) -> Figure:
-    """Draw mean, greatest and standard deviation of the held-out error, a bar for every method."""
-    from matplotlib.ticker import LogLocator
-
+def dots(comparison: Comparison) -> Figure:
+    """Draw mean, greatest and standard deviation of the held-out error, a dot for every method, and the noise floor."""
     results = _applicable(comparison)
-    figure = drawing.new_figure(0.9 + 0.34 * len(results))
-    for axes, (key, title) in zip(figure.subplots(1, len(_BARS), sharey=True), _BARS, strict=True):
+    figure = drawing.new_figure(1.2 + 0.34 * len(results))
+    for axes, (key, title) in zip(figure.subplots(1, len(_FIGURES), sharey=True), _FIGURES, strict=True):
         values = [value for r in results if isinstance(value := r.as_dict()[key], float)]
-        drawn = axes.barh(range(len(values)), values, height=0.62, color=[_COLOURS[r.method] for r in results])
+        floor = comparison.noise_mm if key == "mean_mm" else None
+        for place, (result, value) in enumerate(zip(results, values, strict=True)):
+            axes.axhline(place, color=drawing.GRID, linewidth=0.8, zorder=0)
+            axes.plot(max(value, drawing.FLOOR_MM), place, "o", color=_COLOURS[result.method], markersize=7)
+            axes.annotate(number(value), (max(value, drawing.FLOOR_MM), place), (7, 0), textcoords="offset points",
+                va="center", fontsize=8.5)  # fmt: skip
         drawing.plain_log_axis(axes, "x")
-        axes.xaxis.set_major_locator(LogLocator(10))
-        low, high = max(min(values), 1e-6), max(values)
-        span = max(high / low, 2.0)
-        axes.set_xlim(low / span**0.25, high * span**0.35)
-        axes.bar_label(drawn, labels=[number(value) for value in values], padding=3, fontsize=8.5)
+        known = [max(value, drawing.FLOOR_MM) for value in (*values, *([floor] if floor else []))]
+        span = max(max(known) / min(known), 2.0)
+        axes.set_xlim(min(known) / span**0.15, max(known) * span**0.4)
+        if floor:
+            axes.axvline(floor, color=drawing.INK, linewidth=1.2, linestyle=(0, (4, 3)))
         axes.set_title(title)
         axes.set_xlabel("mm")
         axes.grid(False, axis="y")
         axes.tick_params(axis="y", length=0, labelcolor=drawing.INK)
-        axes.set_yticks(range(len(results)), [label(r.method) for r in results])
-    figure.axes[0].invert_yaxis()
+        axes.set_yticks(range(len(results)), [method_words(r.method) for r in results])
+    figure.axes[0].set_ylim(len(results) - 0.5, -0.5)
     return figure
 
 
@@ -128,7 +146,7 @@ def curves(comparison: Comparison) -> Figure:
     results = _applicable(comparison)
     panels = {
         "methods": [r for r in results if r.method not in RESIDUALS],
-        "residuals on the default's kinematics": [r for r in results if r.method in (*RESIDUALS, "default")],
+        "learned residuals on rigcal's kinematics": [r for r in results if r.method in (*RESIDUALS, "default")],
     }
     drawn = {title: part for title, part in panels.items() if len(part) > 1}
     figure = drawing.new_figure(4.6)
@@ -138,9 +156,11 @@ def curves(comparison: Comparison) -> Figure:
         for result in part:
             assert result.error_mm is not None
             share = 100.0 * (np.arange(len(result.error_mm)) + 1) / len(result.error_mm)
-            look = {"color": _COLOURS[result.method], "label": label(result.method)}
+            look = {"color": _COLOURS[result.method], "label": method_words(result.method)}
             axes.plot(share, np.sort(result.error_mm), linewidth=2.4 if result.method == "default" else 1.4, **look)
         drawing.plain_log_axis(axes)
+        if comparison.noise_mm:
+            axes.axhline(comparison.noise_mm, color=drawing.INK, linewidth=1.2, linestyle=(0, (4, 3)))
         axes.set_xlim(0, 100)
         axes.set_title(title)
         axes.set_xlabel("share of the held-out fixes with at most this error, %")
@@ -161,23 +181,57 @@ def headline(comparison: Comparison) -> str:
     nominal = comparison.results[0]
     assert best.error_mm is not None
     assert nominal.error_mm is not None
+    name = _sentence_start(method_words(best.method))
     return (
-        f"{label(best.method)} has the lowest mean error on {comparison.held_out} held-out fixes: "
+        f"{name} has the lowest mean error on {comparison.held_out} held-out fixes: "
         f"{number(float(best.error_mm.mean()))} mm, where the nominal model has "
         f"{number(float(nominal.error_mm.mean()))} mm."
     )
 
 
-def _head(comparison: Comparison) -> str:
+def _head(comparison: Comparison, facts: Facts) -> str:
     lead = (
-        "Every method was calibrated on the same training fixes and judged on the held-out ones, by its last "
-        "stage. Names are those of `calibrate --method` and `--residual`. Rows from \u201cresidual none\u201d to "
-        "the default share one identification, and differ in what is learned on top of it; `table` is a table of "
-        "corrections and `rbfn-paper` a published network. Seconds are of the whole calibration."
+        f"Every method was calibrated on the same {comparison.training} training fixes and judged on the held-out "
+        "ones, by its last stage. Learned residuals share rigcal's own identification, and differ in what is learned "
+        "on top of it. Seconds are of the whole calibration."
     )
-    warnings = comparison.as_dict()["warnings"]  # with the methods' notes
-    assert isinstance(warnings, list)
-    fixes = f"{comparison.training} training fixes and {comparison.held_out} held-out ones"
-    return markup.header(f"Methods compared: {comparison.rig}", fixes, headline(comparison), lead) + markup.notice(
-        warnings
-    )
+    own = next((r for r in comparison.results if r.method == "default"), comparison.results[-1])
+    rows = f"on {comparison.held_out} held-out fixes"
+    verdict, accuracy = None, f"Accuracy: {method_words(own.method)} does not apply to these data."
+    if own.error_mm is not None:
+        rms_mm = float(np.sqrt(np.mean(own.error_mm**2)))
+        verdict = judge(facts.tolerance_mm, rms_mm, is_held_out=True, rows=f"{rows} by {method_words(own.method)}")
+        noise = "" if comparison.noise_mm is None else f"; the instruments' noise is {number(comparison.noise_mm)} mm"
+        accuracy = f"Accuracy by {method_words(own.method)}: {number(rms_mm)} mm root mean square {rows}{noise}."
+    first = front(facts, verdict, Accuracy(accuracy))
+    title = f"Methods compared: {comparison.rig}"
+    return markup.header(title, first, headline(comparison), lead) + markup.notice(notices(comparison))
+
+
+def notices(comparison: Comparison) -> list[str]:
+    """Return what there is to note, each sentence once, with the methods that it is about."""
+    about: dict[str, list[str]] = {}
+    for result in comparison.results:
+        for note in result.notes:
+            about.setdefault(note, []).append(method_words(result.method))
+    own = [f"{_sentence_start(listed(names))}: {note}" for note, names in about.items()]
+    return [in_words(note) for note in dict.fromkeys([*comparison.warnings, *own])]
+
+
+def _refusals(comparison: Comparison) -> list[str]:
+    """Return a sentence for every reason that methods do not apply."""
+    about: dict[str, list[str]] = {}
+    for result in comparison.results:
+        if result.reason is not None:
+            about.setdefault(result.reason, []).append(method_words(result.method))
+    return [f"{_sentence_start(listed(names))}: not applicable: {reason}" for reason, names in about.items()]
+
+
+def _in_words(cells: list[str], result: MethodResult) -> list[str]:
+    """Return a row of the table with its method and what it adds in words."""
+    adds = ", ".join(residual_words(part) if part in RESIDUALS else part.replace("_", " ") for part in result.adds)
+    return [method_words(result.method), *cells[1:-1], adds]
+
+
+def _sentence_start(text: str) -> str:
+    return text if text.startswith("rigcal") else text[:1].upper() + text[1:]

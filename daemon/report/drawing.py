@@ -56,6 +56,28 @@ _STYLE: Any = {
     "svg.hashsalt": "rigcal",  # the same report gives the same bytes
     "image.cmap": "viridis",
 }
+# On a dark screen a drawing turns its own neutral colours round: paper, ink, lines. A printed page stays light.
+_TURNED = {
+    "#ffffff": "#14191f",
+    "white": "#14191f",
+    INK: "#e8ecef",
+    "#000000": "#e8ecef",
+    SOFT: "#a9b4bd",
+    GRID: "#2b343d",
+    "#b8c0c6": "#55606b",
+    "#eef1f3": "#242c34",
+    "#eef4f8": "#1c2731",
+    "#e8f1f7": "#1f3040",
+    AFTER: "#56b4e9",
+    BEFORE: "#9aa3aa",
+    WARN: "#ff8a7d",
+}
+_TURNED_RULES = "".join(
+    f'[style*="{kind}: {old}"]{{{kind}:{new} !important}}'
+    for old, new in _TURNED.items()
+    for kind in ("fill", "stroke")
+)
+_DARK = f"@media screen and (prefers-color-scheme: dark) {{{_TURNED_RULES}}}"
 RASTER_DPI = 150
 WIDTH_IN = 9.6
 LABEL_CHARACTERS = 60  # of a name beside an axis
@@ -87,7 +109,8 @@ def picture(figure: Figure, description: str, caption: str) -> str:
     """
     out = io.BytesIO()
     figure.savefig(out, format="svg", dpi=RASTER_DPI, metadata={"Date": None, "Creator": None})
-    data = base64.b64encode(out.getvalue()).decode("ascii")
+    drawn = out.getvalue().replace(b"</style>", _DARK.encode() + b"</style>", 1)
+    data = base64.b64encode(drawn).decode("ascii")
     image = f'<img alt="{html.escape(description, quote=True)}" src="data:image/svg+xml;base64,{data}">'
     return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"
 

@@ -10,12 +10,12 @@ import numpy as np
 
 from calibration.effects.base import FittedCoefficient
 from calibration.effects.fitted import AppliedEffects
-from calibration.evaluation.evaluation import Evaluation
-from calibration.identification.noise import joint_rates, reading_covariance, station_covariance
+from calibration.evaluation.evaluation import Evaluation, instrument_noise_mm
 from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor
 from calibration.observations import Observations
 from calibration.residual.learners import tree_importance
+from daemon.report.front import Facts
 from daemon.report.inputs import (
     STAGES,
     EffectLine,
@@ -48,6 +48,7 @@ def report_input(
     made_utc_ns: int | None = None,
     sources: Mapping[str, str] | None = None,
     setups: Sequence[SetupLine] = (),
+    facts: Facts | None = None,
 ) -> ReportInput:
     """Gather the content of a calibration report.
 
@@ -57,6 +58,7 @@ def report_input(
         made_utc_ns: when the report is made; without it the same model and rows give the same report.
         sources: label -> text: files or sessions that the data came from, and the model's hash.
         setups: station set-ups and control points, where known.
+        facts: the first lines of the report; by default what the rows say.
     """
     model = training.model
     judged = training if held_out is None else held_out
@@ -67,7 +69,7 @@ def report_input(
         training=_error_table(training),
         held_out=None if held_out is None else _error_table(held_out),
         noise_mm=model.noise_mm,
-        instrument_mm=_instrument_mm(judged.model, judged.observations),
+        instrument_mm=instrument_noise_mm(judged.model, judged.observations),
         residual=learner.kind if learner else None,
         residual_reason=model.residual_reason,
         parameters=list(_parameters(model)),
@@ -83,7 +85,35 @@ def report_input(
         effects_reason=model.effects_reason,
         expected=judged.expected,
         axes=judged.axes,
+        facts=facts or facts_of(training.observations, model, made_utc_ns=made_utc_ns),
         importance=[(line.feature, line.share) for line in tree_importance(learner) or () if line.share > 0.0],
+    )
+
+
+def facts_of(
+    observations: Observations,
+    model: CalibratedModel,
+    *,
+    name: str = "",
+    made_utc_ns: int | None = None,
+    tolerance_mm: float | None = None,
+) -> Facts:
+    """Return the first lines of a report from rows and model alone: who measured with what is not in them.
+
+    Args:
+        observations: the rows that the model was fitted to.
+        model: the model.
+        name: of the model, as its directory.
+        made_utc_ns: when the report is made.
+        tolerance_mm: root mean square error that the machine may have; None where none is stated.
+    """
+    return Facts(
+        rig=model.rig.name,
+        model=name or f"fitted to data with SHA-256 {str(model.provenance.get('data_sha256', ''))[:12]}...",
+        sessions=np.unique(observations.session).tolist(),
+        setups=np.unique(observations.setup).tolist(),
+        made_utc_ns=made_utc_ns,
+        tolerance_mm=tolerance_mm,
     )
 
 
@@ -104,13 +134,6 @@ def measured_in_base_mm(model: CalibratedModel, observations: Observations) -> F
     origin = np.array([chain.base(model.values, s).translation_mm for s in range(len(chain.setups))])
     from_base_mm = observations.position_mm - origin[chain.bind(observations).setup]
     return Predictor.of(model).to_base(observations, from_base_mm)
-
-
-def _instrument_mm(model: CalibratedModel, observations: Observations) -> float:
-    lin = Predictor.of(model).linearise(observations)
-    station: Floats = station_covariance(model.rig, lin.position_mm, observations.sigma_mm)
-    readings = reading_covariance(model.rig, lin.joint_jacobian, joint_rates(model.rig, observations))
-    return math.sqrt(float(np.trace(station + readings, axis1=1, axis2=2).mean()))
 
 
 def _parameters(model: CalibratedModel) -> Iterator[ParameterLine]:

@@ -14,8 +14,18 @@ from calibration.effects.library import library
 from calibration.gap.result import Candidate, Forecast, GapResult
 from daemon.report import drawing, markup
 from daemon.report import gap_figures as figures
+from daemon.report.from_model import facts_of
+from daemon.report.front import Accuracy, Facts, front, judge, signatures
 from daemon.report.gap_figures import Bar, Interval
-from daemon.report.gap_words import before_and_after, closed_share, dependence, gap_headline, remaining
+from daemon.report.gap_words import (
+    HELD_OUT_IN_TURN,
+    before_and_after,
+    closed_share,
+    dependence,
+    gap_headline,
+    remaining,
+)
+from daemon.report.plain_names import coefficient_words, in_words, unit_words
 from daemon.report.words import (
     DASH,
     INTERVAL_SIGMAS,
@@ -35,21 +45,22 @@ _CANDIDATES_SHOWN = 6
 _POSES_SHOWN = 12
 _LEAST_SEPARATION = 0.1
 _COLUMNS = {
-    "time_s": ("Time", "time since the first fix, h", 3600.0),
-    "temperature_degC": ("Temperature", "deg C", 1.0),
+    "time_s": ("Time", "time since the first fix, hours", 3600.0),
+    "temperature_degC": ("Temperature", "degrees Celsius", 1.0),
 }
 
 
-def gap_report(gap: GapResult, sources: Mapping[str, str]) -> str:
+def gap_report(gap: GapResult, sources: Mapping[str, str], facts: Facts | None = None) -> str:
     """Return one self-contained HTML document, the same bytes for the same input.
 
     Args:
         gap: the workflow's answer.
         sources: label -> origin of the data.
+        facts: the first lines of the report; by default what the rows say.
     """
     with drawing.styled():
         parts = [
-            _head(gap),
+            _head(gap, facts or facts_of(gap.observations, gap.model)),
             _steps(gap),
             _found(gap),
             _where(gap),
@@ -57,6 +68,7 @@ def gap_report(gap: GapResult, sources: Mapping[str, str]) -> str:
             _not_shown(gap),
             _next(gap),
             markup.sources_section(sources),
+            signatures(),
         ]
     return markup.page(f"Gap between simulation and {gap.model.rig.name}", "".join(parts))
 
@@ -73,13 +85,13 @@ def intervals(gap: GapResult) -> list[Interval]:
             scale, unit = readable_unit(coefficient.unit, max(abs(lower), abs(upper)))
             found.append(
                 Interval(
-                    f"{place_name(effect.family, effect.where)}, {coefficient.name}",
+                    f"{place_name(effect.family, effect.where)}, {coefficient_words(coefficient.name)}",
                     coefficient.value * scale,
                     coefficient.standard_error * scale,
                     coefficient.prior_sigma * scale,
                     lower * scale,
                     upper * scale,
-                    unit,
+                    unit_words(unit),
                 )
             )
     return found
@@ -100,8 +112,13 @@ def coefficient_bounds(gap: GapResult, effect: FittedEffect) -> dict[str, tuple[
 # ---- sections --------------------------------------------------------------------------------------------------------
 
 
-def _head(gap: GapResult) -> str:
+def _head(gap: GapResult, facts: Facts) -> str:
     before, after, rows = before_and_after(gap)
+    is_held_out = gap.held_out is not None or rows == HELD_OUT_IN_TURN
+    verdict = judge(facts.tolerance_mm, after, is_held_out=is_held_out, rows=rows)
+    accuracy = Accuracy(
+        f"Accuracy: {number(after)} mm root mean square {rows}; the noise is {number(gap.noise_mm)} mm."
+    )
     tiles = [markup.Tile(f"error of the simulation, {rows}", number(before))]
     if gap.effects:
         share = closed_share(before, after, gap.noise_mm)
@@ -111,8 +128,9 @@ def _head(gap: GapResult) -> str:
             markup.Tile("of the gap above the noise closed", closed, "%", "after"),
         ]
     tiles.append(markup.Tile(f"noise floor, {gap.noise_source}", number(gap.noise_mm)))
-    title, below = f"Gap report: {gap.model.rig.name}", f"{len(gap.observations)} fixes; verdict: {gap.verdict}"
-    return markup.header(title, below, gap_headline(gap), _meaning(gap), tiles) + markup.notice(gap.warnings)
+    title, first = f"Gap report: {gap.model.rig.name}", front(facts, verdict, accuracy)
+    notes = [in_words(text) for text in gap.warnings]
+    return markup.header(title, first, gap_headline(gap), _meaning(gap), tiles) + markup.notice(notes)
 
 
 def _meaning(gap: GapResult) -> str:
@@ -125,7 +143,7 @@ def _meaning(gap: GapResult) -> str:
             named = spoken([(e.family, e.where) for e in gap.effects])
             sentences.append(f"Certain already, and part of the model: {named}.")
     if gap.description:
-        sentences.append(f"{dependence(gap)}.")
+        sentences.append(f"{in_words(dependence(gap))}.")
     if gap.remaining_significant:
         sentences.append(f"{remaining(gap)} that was not named; a learned residual may take it.")
     elif gap.verdict in ("named", "none"):
@@ -173,7 +191,8 @@ def _found(gap: GapResult) -> str:
             scale, unit = readable_unit(c.unit, max(map(abs, ends)) if ends else abs(c.value))
             limits = f"{number(ends[0] * scale)} .. {number(ends[1] * scale)}" if ends else ""
             interval = f"{PLUS_MINUS} {number(INTERVAL_SIGMAS * c.standard_error * scale, 2)}"
-            rows.append([*head, c.name, number(c.value * scale), interval, unit, limits, posterior])
+            words = coefficient_words(c.name)
+            rows.append([*head, words, number(c.value * scale), interval, unit_words(unit), limits, posterior])
             head, posterior = ["", ""], ""
     columns = [
         "effect",
@@ -292,10 +311,10 @@ def _candidate_row(candidate: Candidate, place: int, gap: GapResult) -> list[str
     values = []
     for c in candidate.coefficients:
         scale, unit = readable_unit(c.unit, max(map(abs, candidate.bounds.get(c.name, (c.value,)))))
-        values.append(f"{number(c.value * scale)} {unit}".rstrip())
+        values.append(f"{number(c.value * scale)} {unit_words(unit)}".rstrip())
     return [
         place_name(candidate.family, candidate.where),
-        verdict,
+        in_words(verdict),
         ", ".join(values),
         probability(candidate.posterior),
         odds(candidate.log_bayes_factor),
@@ -343,7 +362,9 @@ def _not_shown(gap: GapResult) -> str:
     if gap.disabled:
         content += [
             "<h3>Not looked for</h3>",
-            markup.items(f"{family.replace('_', ' ')}: {reason}" for family, reason in sorted(gap.disabled.items())),
+            markup.items(
+                f"{family.replace('_', ' ')}: {in_words(reason)}" for family, reason in sorted(gap.disabled.items())
+            ),
         ]
     seen = [f for f in gap.forecasts if math.isfinite(f.nameable)]
     if seen:
@@ -372,7 +393,7 @@ def _forecast_table(forecasts: Sequence[Forecast]) -> str:
             [
                 f.family.replace("_", " "),
                 f.where,
-                f"{number(f.nameable * scale, 2)} {unit}".rstrip(),
+                f"{number(f.nameable * scale, 2)} {unit_words(unit)}".rstrip(),
                 f"{100 * f.visible:.0f} %",
                 f.alternative.replace("_", " ").replace("@", " at "),
                 f"{100 * f.separation:.0f} %" if f.alternative else "",
@@ -388,7 +409,7 @@ def _next(gap: GapResult) -> str:
     poses = [dict(row) for experiment in gap.experiments for row in experiment.poses]
     return markup.section(
         "What to measure next",
-        markup.items(experiment.text for experiment in gap.experiments),
+        markup.items(in_words(experiment.text) for experiment in gap.experiments),
         _pose_table(poses) if poses else "",
     )
 

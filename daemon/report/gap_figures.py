@@ -16,6 +16,7 @@ from calibration.pipeline.find_gap import rms
 from calibration.rig.description import Joint
 from daemon.report import drawing
 from daemon.report.from_model import measured_in_base_mm
+from daemon.report.plain_names import joint_words, unit_words
 from daemon.report.words import INTERVAL_SIGMAS, PLUS_MINUS, number, signed
 
 if TYPE_CHECKING:
@@ -167,8 +168,8 @@ def by_joint(gap: GapResult) -> Figure:
     for axes, joint in zip(grid, joints, strict=False):
         own = found[joint.name]
         _layers(axes, gap, gap.observations.joints[joint.name][own.rows], own.errors)
-        axes.set_title(joint.name)
-        axes.set_xlabel(f"reading, {joint.unit}", labelpad=1)
+        axes.set_title(joint_words(joint))
+        axes.set_xlabel(f"reading, {unit_words(joint.unit)}", labelpad=1)
         axes.set_ylabel(_unit(joint), labelpad=1)
     for axes in grid[len(joints) :]:
         axes.set_visible(False)
@@ -314,4 +315,4 @@ def _legend(figure: Figure, gap: GapResult) -> None:
 
 
 def _unit(joint: Joint) -> str:
-    return "mrad" if joint.kind == "revolute" else "mm"
+    return "milliradians" if joint.kind == "revolute" else "mm"

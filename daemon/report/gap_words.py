@@ -5,6 +5,8 @@ from __future__ import annotations
 from calibration.gap.result import GapResult
 from daemon.report.words import number, place_name, spoken
 
+HELD_OUT_IN_TURN = "on poses held out in turn"
+
 
 def gap_headline(gap: GapResult) -> str:
     """Say the verdict in one sentence, and in a second one that held-out rows speak against it."""
@@ -31,7 +33,7 @@ def before_and_after(gap: GapResult) -> tuple[float, float, str]:
     if gap.held_out is not None:
         return *gap.held_out, "on the held-out file"
     if gap.rounds and not gap.rounds[-1].adopted:
-        return gap.rounds[0].held_out_mm, gap.rounds[-1].held_out_mm, "on poses held out in turn"
+        return gap.rounds[0].held_out_mm, gap.rounds[-1].held_out_mm, HELD_OUT_IN_TURN
     return gap.before_mm, gap.after_mm, "on the fixes themselves"
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.rig.description import BEYOND_BUILDING, Joint
+from daemon.report.front import Facts
 
 if TYPE_CHECKING:  # both bring numba, which `status` and `--help` must not wait for
     from calibration.design.accuracy import ExpectedAccuracy
@@ -186,6 +187,7 @@ class ReportInput:
         axes: the model held against single-joint sweeps of the judged rows.
         importance: (feature, its share of what the learned trees' splits gained), the most important first; empty
             without trees.
+        facts: the first lines of the report; the rig alone where nothing more is known.
     """
 
     rig: str
@@ -210,6 +212,7 @@ class ReportInput:
     expected: ExpectedAccuracy | None = None
     axes: Sequence[AxisCheck] = ()
     importance: Sequence[tuple[str, float]] = ()
+    facts: Facts | None = None
 
     @property
     def judged(self) -> ErrorTable:

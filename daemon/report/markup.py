@@ -9,9 +9,13 @@ from typing import NamedTuple
 from daemon.host.safe_output import shown
 
 STYLE = """
-:root { color-scheme: light; --ink: #1d2733; --soft: #5b6670; --line: #dfe4e8; --blue: #0072b2; --warn: #b3261e; }
+:root { color-scheme: light dark; --paper: #fff; --ink: #1d2733; --soft: #5b6670; --line: #dfe4e8; --blue: #0072b2;
+  --warn: #b3261e; --warn-paper: #fdf3f2; --good: #1b6e3c; --good-paper: #eef7f1; --plain-paper: #f4f6f8; }
+@media screen and (prefers-color-scheme: dark) {
+  :root { --paper: #14191f; --ink: #e8ecef; --soft: #a9b4bd; --line: #36414c; --blue: #6cb8e6; --warn: #ff9d92;
+    --warn-paper: #331b1a; --good: #7fd6a1; --good-paper: #15291d; --plain-paper: #1d242c; } }
 * { box-sizing: border-box; }
-body { margin: 0; background: #fff; color: var(--ink);
+body { margin: 0; background: var(--paper); color: var(--ink);
   font: 16px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Noto Sans", "DejaVu Sans", sans-serif; }
 main { max-width: 62rem; margin: 0 auto; padding: 2.5rem 1.5rem 4rem; }
 header h1 + p { margin: 0; color: var(--soft); }
@@ -20,37 +24,61 @@ h2 { font-size: 1.3rem; line-height: 1.3; margin: 3rem 0 .4rem; padding-top: 1.1
   border-top: 1px solid var(--line); }
 h3 { font-size: 1rem; margin: 1.6rem 0 .3rem; }
 p, ul { max-width: 46rem; margin: .4rem 0 .8rem; }
-.headline { font-size: 1.95rem; line-height: 1.25; font-weight: 650; letter-spacing: -.01em; margin: 1.4rem 0 .6rem;
+.facts { width: 100%; table-layout: fixed; margin: .8rem 0 1.2rem; border-top: 1px solid var(--line); }
+.facts th, .facts td { text-align: left; padding: .22rem 1rem .22rem 0; font-size: .92rem; }
+.facts th { width: 9rem; }
+.facts td { white-space: normal; overflow-wrap: break-word; }
+.verdict { max-width: none; padding: .55rem 1rem; border-left: 5px solid var(--line); background: var(--plain-paper);
+  font-size: 1.1rem; font-weight: 600; }
+.verdict.passed { border-color: var(--good); background: var(--good-paper); color: var(--good); }
+.verdict.failed { border-color: var(--warn); background: var(--warn-paper); color: var(--warn); }
+.accuracy { font-size: 1.08rem; }
+.headline { font-size: 1.95rem; line-height: 1.25; font-weight: 700; letter-spacing: -.01em; margin: 1.4rem 0 .6rem;
   max-width: 50rem; }
 .lead { font-size: 1.08rem; color: var(--soft); max-width: 46rem; }
 .figures { display: grid; grid-template-columns: repeat(4, 1fr); gap: 1rem; margin: 1.6rem 0 .5rem; padding: 0; }
 .figures div { border-top: 3px solid var(--line); padding-top: .5rem; }
 .figures div.after { border-color: var(--blue); }
 .figures dt { color: var(--soft); font-size: .88rem; line-height: 1.35; }
-.figures dd { margin: 0; font-size: 1.7rem; font-weight: 650; font-variant-numeric: tabular-nums; white-space: nowrap; }
+.figures dd { margin: 0; font-size: 1.7rem; font-weight: 700; font-variant-numeric: tabular-nums; white-space: nowrap; }
 .figures small { font-size: .95rem; font-weight: 400; color: var(--soft); }
-.notice { border-left: 4px solid var(--warn); background: #fdf3f2; padding: .7rem 1rem; margin: 1.4rem 0;
+.notice { border-left: 4px solid var(--warn); background: var(--warn-paper); padding: .7rem 1rem; margin: 1.4rem 0;
   max-width: none; }
 .notice ul { margin: .2rem 0 0; padding-left: 1.1rem; }
 .note { color: var(--soft); font-size: .92rem; }
+.scroll { overflow-x: auto; }
 table { border-collapse: collapse; margin: .8rem 0 1rem; font-size: .94rem; font-variant-numeric: tabular-nums; }
 caption { text-align: left; color: var(--soft); font-size: .9rem; padding-bottom: .3rem; }
 th, td { padding: .34rem .9rem .34rem 0; text-align: right; border-bottom: 1px solid var(--line); vertical-align: top; }
 th { font-weight: 600; color: var(--soft); font-size: .86rem; }
 th:first-child, td:first-child, td.text, th.text { text-align: left; }
 td:not(.text) { white-space: nowrap; }
-td.text { font-variant-numeric: normal; overflow-wrap: anywhere; }
-tr.best td { font-weight: 650; color: var(--blue); }
+td.text { font-variant-numeric: normal; overflow-wrap: break-word; }
+tr.best td { font-weight: 700; color: var(--blue); }
 tr.flag td:last-child { color: var(--warn); font-weight: 600; }
 figure { margin: 1rem 0 1.2rem; }
 figure img { width: 100%; height: auto; display: block; }
 figcaption { color: var(--soft); font-size: .92rem; max-width: 46rem; margin-top: .3rem; }
 code { font: .88em/1.4 ui-monospace, "DejaVu Sans Mono", monospace; }
+.signatures { width: 100%; table-layout: fixed; margin-top: 3rem; border-spacing: 1.5rem 0; border-collapse: separate; }
+.signatures td { border: 0; border-top: 1px solid var(--ink); padding: .3rem 0 0; text-align: left; font-size: .88rem;
+  color: var(--soft); white-space: normal; }
 @media (max-width: 40rem) { .figures { grid-template-columns: 1fr 1fr; } .headline { font-size: 1.5rem; } }
 @media print {
-  @page { margin: 15mm; }
-  body { font-size: 10.5pt; } main { padding: 0; max-width: none; }
-  h2 { break-after: avoid; margin-top: 1.6rem; } figure, table, .notice, .figures { break-inside: avoid; }
+  @page { size: A4; margin: 16mm 15mm 18mm;
+    @bottom-left { content: string(report); font: 8pt "DejaVu Sans", sans-serif; color: #5b6670; }
+    @bottom-right { content: "page " counter(page) " of " counter(pages); font: 8pt "DejaVu Sans", sans-serif;
+      color: #5b6670; } }
+  h1 { string-set: report content(); }
+  html { font-size: 9.5pt; } body { font-size: 9.5pt; line-height: 1.4; } main { padding: 0; max-width: none; }
+  p, ul, .headline, .lead, figcaption { max-width: none; }
+  .figures { display: flex; } .figures div { flex: 1; }
+  h1, h2, h3, caption, .keep > h2, .keep > p { break-after: avoid; }
+  h2 { margin-top: 1.4rem; } thead { display: table-header-group; }
+  figure, tr, .notice, .figures, .facts, .verdict, .signatures { break-inside: avoid; }
+  figure { break-before: avoid; } p, li { orphans: 3; widows: 3; }
+  figure img { max-height: 215mm; object-fit: contain; }
+  details > * { display: block; } .scroll { overflow: visible; }
 }
 """
 
@@ -85,7 +113,19 @@ def table(
         body.append(f"<tr{kind}>{cells}</tr>")
     title = f"<caption>{escape(caption)}</caption>" if caption else ""
     head = f"<thead><tr>{head}</tr></thead>" if header else ""
-    return f"<table>{title}{head}<tbody>{''.join(body)}</tbody></table>"
+    return f'<div class="scroll"><table>{title}{head}<tbody>{"".join(body)}</tbody></table></div>'
+
+
+def facts(lines: Mapping[str, str]) -> str:
+    """Return a table of label and text, a line each."""
+    rows = "".join(f'<tr><th scope="row">{escape(k)}</th><td>{escape(text)}</td></tr>' for k, text in lines.items())
+    return f'<table class="facts"><tbody>{rows}</tbody></table>'
+
+
+def signature_block(roles: Sequence[str]) -> str:
+    """Return a line to sign on for each role, with place for a name and a date."""
+    cells = "".join(f"<td>{escape(role)}<br>name, date, signature</td>" for role in roles)
+    return f'<table class="signatures"><tbody><tr>{cells}</tr></tbody></table>'
 
 
 def _text(column: int, text_columns: Sequence[int]) -> str:
@@ -100,6 +140,11 @@ def section(title: str, *content: str) -> str:
 def paragraph(text: str, kind: str = "") -> str:
     """Return a paragraph of escaped text."""
     return f'<p class="{kind}">{escape(text)}</p>' if kind else f"<p>{escape(text)}</p>"
+
+
+def unbroken(paragraphs: str) -> str:
+    """Return ready HTML in which no line ends between a number and its mm."""
+    return paragraphs.replace(" mm", "&nbsp;mm")
 
 
 def items(sentences: Iterable[str]) -> str:
@@ -128,12 +173,12 @@ class Tile(NamedTuple):
     kind: str = ""
 
 
-def header(title: str, below: str, headline: str, lead: str, tiles: Iterable[Tile] = ()) -> str:
+def header(title: str, front: str, headline: str, lead: str, tiles: Iterable[Tile] = ()) -> str:
     """Return the top of a page.
 
     Args:
         title: of the page.
-        below: a line under the title; none if empty.
+        front: ready HTML under the title: what the page is of.
         headline: the result in one sentence.
         lead: its meaning in a few sentences.
         tiles: the figures of the result.
@@ -144,8 +189,8 @@ def header(title: str, below: str, headline: str, lead: str, tiles: Iterable[Til
         for tile in tiles
     )
     return (
-        f"<header><h1>{escape(title)}</h1>{paragraph(below) if below else ''}"
-        f'<p class="headline">{escape(headline).replace(" mm", "&nbsp;mm")}</p>{paragraph(lead, "lead")}'
+        f"<header><h1>{escape(title)}</h1>{front}"
+        f'<p class="headline">{unbroken(escape(headline))}</p>{paragraph(lead, "lead")}'
         + (f'<dl class="figures">{figures}</dl></header>' if figures else "</header>")
     )
 

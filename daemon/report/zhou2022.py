@@ -14,6 +14,8 @@ from calibration.experiments.zhou2022.protocol import PAPER_BEFORE, Protocol
 from calibration.experiments.zhou2022.table3 import PAPER_AFTER, Way
 from calibration.experiments.zhou2022.weights import Front
 from daemon.report import drawing, markup
+from daemon.report.front import Accuracy, Facts, front, judge, signatures
+from daemon.report.plain_names import in_words
 from daemon.report.words import DASH, PLUS_MINUS, number
 
 if TYPE_CHECKING:
@@ -24,26 +26,33 @@ _WAY_COLOURS: Mapping[Way, str] = {"paper": drawing.MIDDLE, "converged": drawing
 PATH_NAMES: Mapping[str, str] = {
     "before": "before (nominal)",
     "geometric": "geometric",
-    "rbfn": "geometric + RBFN",
-    "lightgbm": "geometric + LightGBM",
-    "chain": "geometric + RBFN + LightGBM (the paper's hybrid)",
+    "rbfn": "geometric, radial basis function network",
+    "lightgbm": "geometric, gradient-boosted trees",
+    "chain": "geometric, network and trees (the paper's hybrid)",
     "hybrid": "hybrid (rigcal's default)",
 }
 _PATH_LINES = (("before", drawing.BEFORE, 1.2), ("geometric", drawing.MIDDLE, 1.2), ("hybrid", drawing.AFTER, 1.8))
 _SMOOTHED = 24  # points, below which every one is drawn as it is
 
 
-def protocol_page(protocol: Protocol, sources: Mapping[str, str]) -> str:
-    """Return one self-contained HTML document; `sources` is label -> origin of the data."""
+def protocol_page(protocol: Protocol, sources: Mapping[str, str], facts: Facts | None = None) -> str:
+    """Return one self-contained HTML document.
+
+    Args:
+        protocol: the experiments.
+        sources: label -> origin of the data.
+        facts: the first lines of the page; the rig alone where nothing more is known.
+    """
     with drawing.styled():
         content = [
-            _head(protocol),
+            _head(protocol, facts or Facts(protocol.rig)),
             _before(protocol),
             _identification(protocol),
             _front(protocol.front),
             _learning(protocol),
             _trajectory(protocol.trajectory),
             markup.sources_section(sources),
+            signatures(),
         ]
     return markup.page(f"Zhou et al. 2022, section 4: {protocol.rig}", "".join(content))
 
@@ -143,20 +152,26 @@ def _cell(value: float | None) -> str:
     return DASH if value is None else number(value)
 
 
-def _head(protocol: Protocol) -> str:
+def _head(protocol: Protocol, facts: Facts) -> str:
     path = protocol.trajectory.error_mm
     before, after = (float(path[name].mean()) for name in ("before", "hybrid"))
     sentence = (
         f"Along {len(protocol.trajectory.rows)} held-out points of prism {protocol.trajectory.prism} the mean error "
         f"goes from {number(before)} mm to {number(after)} mm."
     )
-    size = f"{protocol.training} training fixes and {protocol.held_out} held-out ones"
+    error_mm = protocol.trajectory.error_mm["hybrid"]
+    rms_mm = float(np.sqrt(np.mean(error_mm**2)))
+    rows = f"along {len(error_mm)} held-out points of prism {protocol.trajectory.prism}"
+    verdict = judge(facts.tolerance_mm, rms_mm, is_held_out=True, rows=rows)
+    size = f"{protocol.training} fixes were fitted and {protocol.held_out} held out"
+    accuracy = Accuracy(f"Accuracy: {number(rms_mm)} mm root mean square {rows}; {size}.")
     lead = (
         "The experiments of Zhou et al. (2022), section 4, on other data. The paper's own figures are of a machine "
         "whose drawings were a metre off: compare ratios, not millimetres."
     )
     title = f"Zhou et al. 2022, section 4: {protocol.rig}"
-    return markup.header(title, size, sentence, lead) + markup.notice(protocol.warnings)
+    notes = [in_words(text) for text in dict.fromkeys(protocol.warnings)]
+    return markup.header(title, front(facts, verdict, accuracy), sentence, lead) + markup.notice(notes)
 
 
 def _before(protocol: Protocol) -> str:
@@ -191,32 +206,35 @@ def _identification(protocol: Protocol) -> str:
         drawing.picture(
             identification_figure(protocol),
             "Held-out mean error per prism, data set and way of solving",
-            "Mean error on the held-out fixes; every prism has its own scale.",
+            "Mean error on the held-out fixes; every prism has its own scale, logarithmic.",
         ),
     )
 
 
 def identification_figure(protocol: Protocol) -> Figure:
-    """Draw a panel for each prism: bars by data set and way of solving."""
+    """Draw a panel for each prism: dots by data set and way of solving."""
     prisms = [p for p in prisms_of(protocol) if p in protocol.held_out_before_mm]
     sets = list(dict.fromkeys(line.data for line in protocol.identified))
     figure = drawing.new_figure(1.35 + 0.7 * max(len(sets), 1))
     grid = figure.subplots(1, len(prisms), sharey=True, squeeze=False)[0]
     for axes, prism in zip(grid, prisms, strict=True):
         nominal = protocol.held_out_before_mm[prism]
-        most = max(nominal, *(line.held_out_mm[prism] for line in protocol.identified), 0.0)
+        known = [nominal, *(line.held_out_mm[prism] for line in protocol.identified)]
         axes.axvline(nominal, color=drawing.INK, linewidth=1, linestyle=(0, (4, 3)), label="nominal model")
         for number_of_way, (way, colour) in enumerate(_WAY_COLOURS.items()):
             lines = [line for line in protocol.identified if line.way == way]
             values = [line.held_out_mm[prism] for line in lines]
             places = [sets.index(line.data) + 0.27 * (number_of_way - 1) for line in lines]
-            drawn = axes.barh(places, values, height=0.24, color=colour, label=WAYS[way])
-            # On the dashed line a number needs a background.
-            labels = axes.bar_label(drawn, labels=[number(value) for value in values], padding=3, fontsize=8)
-            for label in labels:
-                label.set_bbox({"facecolor": "white", "edgecolor": "none", "pad": 1.0})
+            axes.plot(values, places, "o", color=colour, markersize=6, label=WAYS[way])
+            for value, place in zip(values, places, strict=True):
+                text = axes.annotate(number(value), (value, place), (6, 0), textcoords="offset points", va="center",
+                    fontsize=8)  # fmt: skip
+                # On the dashed line a number needs a background.
+                text.set_bbox({"facecolor": axes.get_facecolor(), "edgecolor": "none", "pad": 0.5})
         axes.set_title(f"prism {prism}")
-        axes.set_xlim(0, 1.28 * most)
+        drawing.plain_log_axis(axes, "x")
+        span = max(max(known) / min(known), 2.0)
+        axes.set_xlim(min(known) / span**0.1, max(known) * span**0.35)
         axes.set_xlabel("mm")
         axes.grid(False, axis="y")
         axes.tick_params(axis="y", length=0, labelcolor=drawing.INK)
@@ -309,7 +327,7 @@ def learning_figure(points: tuple[LearningPoint, ...]) -> Figure:
     axes.set_xticks(poses, [str(n) for n in poses])
     axes.set_xticks([], minor=True)
     axes.set_xlabel("training poses")
-    axes.set_ylabel("held-out RMS error, mm")
+    axes.set_ylabel("held-out root mean square error, mm")
     figure.legend(loc="outside upper left", ncols=2)
     return figure
 
@@ -353,7 +371,7 @@ def trajectory_figure(path: Trajectory) -> Figure:
     along.set_ylim(bottom=0)
     along.margins(x=0.01)
     names = [name for name in PATH_NAMES if name != "before"]
-    short = {"rbfn": "RBFN", "lightgbm": "LightGBM", "chain": "paper's hybrid", "hybrid": "rigcal"}
+    short = {"rbfn": "network", "lightgbm": "trees", "chain": "paper's hybrid", "hybrid": "rigcal"}
     for place, name in enumerate(names):
         error = path.error_mm[name]
         colour = {"geometric": drawing.MIDDLE, "hybrid": drawing.AFTER}.get(name, drawing.SOFT)

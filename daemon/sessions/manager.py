@@ -34,6 +34,7 @@ from daemon.sessions.prism_guard import MotionLimit, Suspicion
 from daemon.sessions.prism_watch import PrismWatch, as_dict
 from daemon.sessions.standstill_places import Exclusions, StandstillPlaces
 from daemon.sessions.station_setups import AXES, Place, SetupBook
+from daemon.sessions.without_job import why_no_job
 from daemon.store.errors import is_unwritable
 from daemon.store.jobs import JobTable
 from daemon.store.store import Store
@@ -62,6 +63,7 @@ class SessionKeeper:
         aim: turns the station to a prism or control point where something can (a simulated rig); None where the
             operator does it.
         limits: station -> what motion can do to its prism.
+        are_jobs_enabled: closed sessions start jobs.
     """
 
     def __init__(
@@ -77,10 +79,11 @@ class SessionKeeper:
         run_id: int,
         aim: Callable[[str], None] | None = None,
         limits: Mapping[str, MotionLimit] | None = None,
+        are_jobs_enabled: bool = True,
     ) -> None:
         self._rig, self._rig_text = rig, rig_text
         self._store, self._joiner, self._settings, self._clock = store, joiner, settings, clock
-        self._setups, self._run_id = setups, run_id
+        self._setups, self._run_id, self._are_jobs_enabled = setups, run_id, are_jobs_enabled
         self._lifecycle = SessionLifecycle(store, rig.name, clock, settings.control_tolerance_mm)
         self._table, self._jobs = self._lifecycle.table, JobTable(store, rig.name)
         self._aim = aim
@@ -321,12 +324,16 @@ class SessionKeeper:
 
     def list_command(self, _arguments: Mapping[str, Any]) -> list[dict[str, Any]]:
         """All sessions with what they hold, oldest first."""
-        return self._table.all()
+        return [session | self._without_job(session) for session in self._table.all()]
 
     def show_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """One session: what it holds, what was excluded and why, how its set-up kept its place, and its jobs."""
         session_id = str(arguments.get("id", ""))
-        return self._table.summary(session_id) | {"jobs": self._jobs.of_session(session_id)}
+        session = self._table.summary(session_id)
+        return session | {"jobs": self._jobs.of_session(session_id)} | self._without_job(session)
+
+    def _without_job(self, session: Mapping[str, Any]) -> dict[str, str | None]:
+        return {"no_job": why_no_job(session, self._jobs, are_jobs_enabled=self._are_jobs_enabled)}
 
     def open_session(self) -> dict[str, Any] | None:
         """Return the open session as `status` shows it; None without one."""

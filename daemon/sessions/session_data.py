@@ -9,13 +9,14 @@ import csv
 import io
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from calibration.rig.description import Rig
 from calibration.table import LABEL_COLUMNS, POSITION_COLUMNS, SIGMA_COLUMNS
 from daemon.report.inputs import ControlPoint, SetupLine
 from daemon.sessions.steady_time import SteadyTime
 from daemon.store.reader import Reader
-from daemon.store.sessions import first_observation_ns, observations
+from daemon.store.sessions import first_observation_ns, observations, session
 from daemon.store.setups import misclosures, setups_of
 from drivers.clock import NS_PER_S, Stamp
 
@@ -49,6 +50,37 @@ def sessions_csv(reader: Reader, rig: Rig, session_ids: Sequence[str]) -> bytes:
         cells += [row[name] for name in SIGMA_COLUMNS] + [row["dwell_s"], *(measured.get(name) for name in more)]
         writer.writerow("" if cell is None else repr(cell) if isinstance(cell, float) else cell for cell in cells)
     return out.getvalue().encode()
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Who measured some sessions, when and with what.
+
+    Attributes:
+        sessions, operators, instruments, setups: names, each once; an operator is the name that was given, else the
+            user's.
+        measured_utc_ns: from the start of the first session to the end of the last; None without any.
+    """
+
+    sessions: tuple[str, ...]
+    operators: tuple[str, ...]
+    instruments: tuple[str, ...]
+    setups: tuple[str, ...]
+    measured_utc_ns: tuple[int, int] | None
+
+
+def sessions_measured(reader: Reader, session_ids: Sequence[str]) -> Measured:
+    """Return who measured the given sessions, when and with what."""
+    rows = [row for name in session_ids if (row := session(reader, name)) is not None]
+    instants = [row[key] for row in rows for key in ("started_utc_ns", "ended_utc_ns") if row[key] is not None]
+    setups = setups_of(reader, session_ids)
+    return Measured(
+        tuple(row["id"] for row in rows),
+        tuple(dict.fromkeys(name for row in rows if (name := row["operator"] or row["caller_user"]))),
+        tuple(dict.fromkeys(" ".join(filter(None, (s["instrument"], s.get("serial")))) for s in setups)),
+        tuple(setup["id"] for setup in setups),
+        (min(instants), max(instants)) if instants else None,
+    )
 
 
 def setup_lines(reader: Reader, session_ids: Sequence[str]) -> list[SetupLine]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -49,7 +49,16 @@ _FAILED = """SELECT max(job.id) AS id, job.kind, job.error FROM jobs AS job
     WHERE job.state = 'failed' AND session.rig = ? GROUP BY job.kind ORDER BY job.id"""
 _DONE_LATER = """SELECT 1 FROM jobs AS job CROSS JOIN calibration_sessions AS session ON session.id = job.session_id
     WHERE job.state = 'done' AND job.id > ? AND job.kind = ? AND session.rig = ? LIMIT 1"""
-_SHOWN = "id, kind, session_id, state, progress, message, attempts, error"
+# The first job that works on a session, one of some kinds: it was queued after the session ended, or was accepted.
+_FIRST_ON = """SELECT job.id, job.session_id FROM jobs AS job
+    JOIN calibration_sessions AS through ON through.id = job.through_session_id
+    JOIN calibration_sessions AS session ON session.id = ?1
+    WHERE job.kind IN ({kinds}) AND through.rig = session.rig AND through.rowid >= session.rowid
+        AND job.id > coalesce(session.accepted_after_job, 0) ORDER BY job.id LIMIT 1"""
+_SHOWN = """id, kind, session_id, state, progress, message, attempts, error,
+    created_utc_ns, started_utc_ns, ended_utc_ns,
+    CASE WHEN started_boot_id = ended_boot_id THEN (ended_monotonic_ns - started_monotonic_ns) / 1e9
+        ELSE (ended_utc_ns - started_utc_ns) / 1e9 END AS duration_s"""
 
 
 class JobKind(StrEnum):
@@ -210,8 +219,7 @@ class JobTable:
     def all(self) -> list[dict[str, Any]]:
         """All jobs with their results, newest last. Read beside the writing connection, which must not wait."""
         with self._store.reader() as reader:
-            rows = list(reader.rows(f"SELECT {_SHOWN}, result_json FROM jobs ORDER BY id"))
-        return [row | {"result": json.loads(row.pop("result_json") or "null")} for row in rows]
+            return _with_results(reader.rows(f"SELECT {_SHOWN}, result_json FROM jobs ORDER BY id"))
 
     def unfinished(self) -> list[dict[str, Any]]:
         """Jobs that run, wait, or will be offered again, without results, newest last."""
@@ -227,9 +235,18 @@ class JobTable:
         return self._store.rows("SELECT id, host_boot FROM jobs WHERE state = 'running'")
 
     def of_session(self, session_id: str) -> list[dict[str, Any]]:
-        """The jobs that a session has triggered."""
-        sql = "SELECT id, kind, state, progress, message, error FROM jobs WHERE session_id = ? ORDER BY id"
-        return self._store.rows(sql, (session_id,))
+        """The jobs that a session has triggered, with their results."""
+        sql = f"SELECT {_SHOWN}, result_json FROM jobs WHERE session_id = ? ORDER BY id"
+        return _with_results(self._store.rows(sql, (session_id,)))
+
+    def has_of_session(self, session_id: str) -> bool:
+        """True if a session has triggered a job."""
+        return bool(self._store.rows("SELECT 1 FROM jobs WHERE session_id = ? LIMIT 1", (session_id,)))
+
+    def first_on(self, session_id: str, *kinds: JobKind) -> dict[str, Any] | None:
+        """Id and session_id of the first job of some kinds that works on a session; None where there is none."""
+        sql = _FIRST_ON.format(kinds=", ".join("?" * len(kinds)))
+        return next(iter(self._store.rows(sql, (session_id, *kinds))), None)
 
     def failed(self) -> list[FailedJob]:
         """The newest failed job of each kind, where no later one of the kind is done."""
@@ -256,6 +273,10 @@ class JobTable:
     def offer_again(self, job_id: int) -> bool:
         """Queue an interrupted job again; False if it is interrupted no more."""
         return bool(self._store.update("jobs", {"id": job_id, "state": "interrupted"}, {"state": "queued"}))
+
+
+def _with_results(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [row | {"result": json.loads(row.pop("result_json") or "null")} for row in rows]
 
 
 def _result(row: Mapping[str, Any]) -> dict[str, Any]:

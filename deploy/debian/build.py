@@ -55,6 +55,11 @@ FILES = {
     "debian/lintian-overrides": "usr/share/lintian/overrides/rigcal",
     "debian/copyright": "usr/share/doc/rigcal/copyright",
 }
+COMPLETIONS = {  # shell -> where it looks for what completes a program's commands
+    "bash": "usr/share/bash-completion/completions/rigcal",
+    "zsh": "usr/share/zsh/vendor-completions/_rigcal",
+    "fish": "usr/share/fish/vendor_completions.d/rigcal.fish",
+}
 SCRIPTS = ("preinst", "postinst", "prerm", "postrm")
 CONTROL = """Package: rigcal
 Version: {version}
@@ -160,6 +165,8 @@ def build_package(source: Source, wheel: Path, release: int, out: Path) -> Path:
             unit.read_text(encoding="utf-8").replace("/opt/rigcal/venv/bin/", "/usr/bin/"), encoding="utf-8"
         )
         _link(root / "usr/bin/rigcal", "../lib/rigcal/bin/rigcal")
+        for shell, place in COMPLETIONS.items():
+            _put(root / place, completion(source.tree, shell))
         documents = root / "usr/share/doc/rigcal"
         _put(documents / "changelog.Debian.gz", _gzipped(_changelog(version, source.epoch)))
         _put(documents / "changelog.gz", _gzipped((source.tree / "CHANGELOG.md").read_text(encoding="utf-8")))
@@ -188,6 +195,12 @@ def _fill_environment(home: Path, source: Source, wheel: Path, python: str) -> N
     _link(home / "bin/python3", "python")
     program = "#!/usr/lib/rigcal/bin/python -I\nimport sys\n\nfrom daemon.cli.main import main\n\nsys.exit(main())\n"
     _put(home / "bin/rigcal", program.encode(), mode=0o755)
+
+
+def completion(tree: Path, shell: str) -> bytes:
+    """Return the script by which a shell completes the commands of the rigcal in a directory."""
+    command = [sys.executable, "-m", "daemon.cli.main", "completion", shell]
+    return subprocess.run(command, cwd=tree, check=True, capture_output=True).stdout
 
 
 def locked_for(lock: Path, python: str) -> str:

@@ -35,6 +35,13 @@ def test_relative_paths_start_at_the_file(tmp_path: Path) -> None:
     assert config.rig == str(tmp_path / "rigs/mine.toml")
 
 
+def test_no_tolerance_is_assumed_and_a_stated_one_is_positive(tmp_path: Path) -> None:
+    assert parse_config(GOOD, tmp_path / "rigcal.toml").report.tolerance_mm is None
+    stated = parse_config(f"{GOOD}\n[report]\ntolerance_mm = 7.5\n", tmp_path / "rigcal.toml")
+    assert stated.report.tolerance_mm == 7.5
+    assert "report.tolerance_mm" in check(f"{GOOD}\n[report]\ntolerance_mm = 0\n", tmp_path)
+
+
 def test_an_unknown_key_is_named_with_what_is_allowed(tmp_path: Path) -> None:
     message = check(GOOD.replace("channel =", "bitrat = 250000\nchannel ="), tmp_path)
     assert "rigcal.toml: can.1.bitrat: unknown key; allowed here: allow_transmit, bitrate" in message

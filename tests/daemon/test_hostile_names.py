@@ -237,6 +237,14 @@ def test_one_bad_name_in_the_store_spoils_no_list(full: Config, command: tuple[s
             assert shown(name) in said
 
 
+def test_one_bad_name_moves_nothing_on_the_live_screen(full: Config) -> None:
+    said = on_terminal("watch", "--count", "1", "--socket", str(full.socket_path))
+    for own in ("\x1b[?1049h\x1b[?25l", "\x1b[H", "\x1b[K\r\n", "\x1b[J", "\x1b[?25h\x1b[?1049l"):
+        said = said.replace(own, "")
+    assert_plain(re.sub(r"\x1b\[\d*m", "", said))  # colours are the screen's own, and names have lost their escapes
+    assert "rig       swdt82" in said
+
+
 @pytest.mark.parametrize("number", range(len(ANY)), ids=ANY.keys())
 def test_one_bad_name_spoils_no_session_and_no_model(full: Config, number: int) -> None:
     runner = CliRunner(env={"COLUMNS": "400"})

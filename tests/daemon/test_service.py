@@ -119,7 +119,8 @@ def test_status_says_what_every_channel_reads(finished: DaemonProcess) -> None:
     assert {"theta1", "L3", "rod_feed", "boom_valve", "boom_pressure"} <= set(channels)
     assert channels["theta1"]["unit"] == "deg"
     assert all(link["dropped"] == 0 for link in told["acquisition"]["links"])
-    assert "theta1" in rigcal("status", "--socket", str(finished.socket)).stdout
+    assert "9 of 9 joints" in rigcal("status", "--socket", str(finished.socket)).stdout
+    assert "theta1" in rigcal("status", "--all", "--socket", str(finished.socket)).stdout
 
 
 def test_every_list_is_shown_to_people_too(finished: DaemonProcess) -> None:

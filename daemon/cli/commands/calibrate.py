@@ -53,6 +53,7 @@ CONNECT_TIMEOUT_S = 5
 @offline.prior_option
 @offline.seed_option
 @offline.time_limit_option
+@offline.tolerance_option
 @click.option(
     "--dask",
     metavar="ADDRESS",
@@ -70,6 +71,7 @@ def calibrate(
     prior: Prior,
     seed: int,
     time_limit: float | None,
+    tolerance_mm: float | None,
     dask: str | None,
     *,
     as_json: bool,
@@ -87,7 +89,7 @@ def calibrate(
     from daemon.jobs.checkpoint import FileCheckpoint
     from daemon.models import model_files
     from daemon.report.calibration import calibration_report
-    from daemon.report.from_model import report_input
+    from daemon.report.from_model import facts_of, report_input
 
     source = load_rig(rig, signals)
     _check_effects(effects, method, source.rig)
@@ -115,17 +117,23 @@ def calibrate(
                 checkpoint=checkpoint,
             ),
         )
+        progress(1.0, "drawing the report and checking that the model loads")
         with ThreadPoolExecutor(1) as pool:  # another process loads the model while this one draws
             loaded = pool.submit(model_files.check_loads, model, out)
             sources = {"data": offline.source_line(data, raw)}
-            document = calibration_report(report_input(training, None, made_utc_ns=watch.utc_ns, sources=sources))
+            facts = facts_of(observations, model, name=out.name, made_utc_ns=watch.utc_ns, tolerance_mm=tolerance_mm)
+            document = calibration_report(
+                report_input(training, None, made_utc_ns=watch.utc_ns, sources=sources, facts=facts)
+            )
             loaded.result()
         model_files.write_model(out, model, {model_files.REPORT: document.encode("utf-8")})
     result = training.as_dict(watch.seconds)
     if not as_json:
         offline.show_evaluation(result, f"the {len(training)} fixes it was fitted to")
         echo(f"Model: {out}   report: {out / model_files.REPORT}   {result['seconds']} s")
-    return result
+    rows = f"on the {len(training)} fixes it was fitted to"
+    rms_mm = float(training.stages()[-1]["rms_mm"])
+    return offline.judged(result, tolerance_mm, rms_mm, rows, is_held_out=False, as_json=as_json)
 
 
 def _check_effects(effects: str, method: str, rig: Rig) -> None:

@@ -53,6 +53,7 @@ _MOST = 1000  # sentences: all of them
 )
 @offline.seed_option
 @offline.time_limit_option
+@offline.tolerance_option
 @json_option
 def compare(
     rig: str,
@@ -64,6 +65,7 @@ def compare(
     prior: Prior,
     seed: int,
     time_limit: float | None,
+    tolerance_mm: float | None,
     *,
     refit_base: bool,
     as_json: bool,
@@ -87,6 +89,7 @@ def compare(
     from calibration.run import Run
     from daemon.config import load_rig
     from daemon.report.comparison import comparison_page
+    from daemon.report.front import Facts
     from daemon.report.zhou2022 import protocol_page
 
     watch = offline.Stopwatch()
@@ -102,6 +105,14 @@ def compare(
         "held-out rows": offline.source_line(holdout, held_out_raw),
         "prior and seed": f"{prior}, {seed}",
     }
+    facts = Facts(
+        source.rig.name,
+        sessions=[str(name) for name in sorted({*training.session, *held_out.session})],
+        setups=[str(name) for name in sorted({*training.setup, *held_out.setup})],
+        model="none: methods side by side",
+        made_utc_ns=watch.utc_ns,
+        tolerance_mm=tolerance_mm,
+    )
     given = source.rig, source.text, training, held_out
     with progress_display(as_json=as_json) as progress:
         if protocol is None:
@@ -114,7 +125,7 @@ def compare(
                 run=Run(seed, progress=progress),
             )
             comparison = replace(comparison, warnings=(*overlap, *comparison.warnings))
-            result, document = comparison.as_dict(), comparison_page(comparison, sources)
+            result, document = comparison.as_dict(), comparison_page(comparison, sources, facts)
         else:
             with ThreadPoolExecutor(max_workers=os.cpu_count()) as executor:
                 experiments = run_protocol(
@@ -125,7 +136,7 @@ def compare(
                     run=Run(seed, executor, progress),
                 )
             experiments = replace(experiments, warnings=(*overlap, *experiments.warnings))
-            result, document = experiments.as_dict(), protocol_page(experiments, sources)
+            result, document = experiments.as_dict(), protocol_page(experiments, sources, facts)
     write_file(page, document.encode("utf-8"))
     if not as_json:
         if protocol is None:
@@ -133,7 +144,13 @@ def compare(
         else:
             show_protocol(experiments)
         echo(f"Page with plots: {page}")
-    return {**result, "page": str(page)}
+    result |= {"page": str(page)}
+    own = next((r for r in comparison.results if r.method == "default"), None) if protocol is None else None
+    if own is None or own.error_mm is None:
+        return result
+    rms_mm = float((own.error_mm**2).mean() ** 0.5)
+    rows = f"on {len(held_out)} held-out fixes by rigcal"
+    return offline.judged(result, tolerance_mm, rms_mm, rows, is_held_out=True, as_json=as_json)
 
 
 def show_comparison(comparison: Comparison) -> None:

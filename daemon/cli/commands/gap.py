@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 @offline.signal_option
 @offline.prior_option
 @offline.seed_option
+@offline.tolerance_option
 @json_option
 def gap(
     rig: str,
@@ -46,6 +47,7 @@ def gap(
     signals: tuple[str, ...],
     prior: Prior,
     seed: int,
+    tolerance_mm: float | None,
     *,
     as_json: bool,
 ) -> dict[str, object]:
@@ -63,7 +65,7 @@ def gap(
     from calibration.run import Run
     from daemon.config import load_rig
     from daemon.models.gap_files import REPORT, check_gap_target, gap_answer, write_gap
-    from daemon.report.from_model import provenance
+    from daemon.report.from_model import facts_of, provenance
     from daemon.report.gap import gap_report
 
     source = load_rig(rig, signals)
@@ -80,10 +82,12 @@ def gap(
     with progress_display(as_json=as_json) as progress:
         run = Run(seed, progress=progress)
         found = find_gap(source.rig, source.text, observations, holdout=held_out, prior=prior, run=run)
-    found = replace(found, warnings=(*overlap, *found.warnings))
-    document = gap_report(found, provenance(found.model, watch.utc_ns, files))
-    result = gap_answer(found, watch.seconds)
-    write_gap(out, found, result, document)
+        progress(1.0, "drawing the report and writing the model")
+        found = replace(found, warnings=(*overlap, *found.warnings))
+        facts = facts_of(observations, found.model, name=out.name, made_utc_ns=watch.utc_ns, tolerance_mm=tolerance_mm)
+        document = gap_report(found, provenance(found.model, watch.utc_ns, files), facts)
+        result = gap_answer(found, watch.seconds)
+        write_gap(out, found, result, document)
     if not as_json:
         show_gap(found)
         echo(f"Model: {out / 'model'}   report: {out / REPORT}   {result['seconds']} s")

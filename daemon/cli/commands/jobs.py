@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import click
 
 from daemon.cli.client import ask, client_options
 from daemon.cli.command import Command
-from daemon.cli.state_lines import job_line
+from daemon.cli.job_lines import show_jobs
 from daemon.cli.terminal import echo
 
 
@@ -21,15 +20,18 @@ def jobs() -> None:
 @jobs.command(cls=Command, name="list")
 @client_options
 def jobs_list(**where: Any) -> Any:
-    """List all jobs."""
-    return ask(where, "jobs.list", _show)
+    """List all jobs: session, how long each took, its result or why it failed, and its report.
 
-
-def _show(found: Sequence[Mapping[str, Any]]) -> None:
-    for job in found:
-        echo(job_line(job))
-    if not found:
-        echo("no jobs yet; those of a session are queued some seconds after it was closed")
+    Sessions that have started no job are listed with the reason.
+    """
+    silent = where | {"as_json": True}
+    found = ask(silent, "jobs.list", echo)
+    without = [session for session in ask(silent, "session.list", echo)["result"] if session.get("no_job")]
+    if not where["as_json"]:
+        show_jobs(found["result"], without)
+        if not found["result"] and not without:
+            echo("no jobs yet: `rigcal session start` opens a session, and its jobs are queued after it is closed")
+    return found | {"without_job": [{key: session[key] for key in ("id", "no_job")} for session in without]}
 
 
 @jobs.command(cls=Command, name="cancel")

@@ -10,7 +10,8 @@ import click
 
 from daemon.cli.client import ask, client_options, operator_option, who
 from daemon.cli.command import Command, json_option
-from daemon.cli.state_lines import job_line, show_session
+from daemon.cli.job_lines import show_jobs
+from daemon.cli.state_lines import show_session
 from daemon.cli.terminal import echo, echo_error, echo_table
 from daemon.commands import SESSION_KINDS
 
@@ -118,8 +119,7 @@ def session_show(name: str, **where: Any) -> Any:
 
     def show(found: Mapping[str, Any]) -> None:
         show_session(found)
-        for job in found["jobs"]:
-            echo(job_line(job))
+        show_jobs(found["jobs"], [found] if found.get("no_job") else [])
 
     return ask(where, "session.show", show, id=name)
 
@@ -165,3 +165,6 @@ def _show_list(sessions: Sequence[Mapping[str, Any]]) -> None:
         for found in sessions
     ]
     echo_table(("session", "kind", "prism", "set-up", "state", "poses", "observations", "operator"), rows)
+    for found in sessions:
+        if found.get("no_job"):
+            echo(f"session {found['id']} has no job of its own: {found['no_job']}")

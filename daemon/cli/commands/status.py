@@ -1,8 +1,9 @@
-"""`rigcal status`: the state of links, channels, station, sessions, jobs and models."""
+"""`rigcal status`: the state on one screen, or in full."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import shutil
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -10,33 +11,45 @@ import click
 
 from daemon.cli.client import ask, client_options, utc
 from daemon.cli.command import Command
+from daemon.cli.job_lines import job_line
 from daemon.cli.state_lines import (
     decoding_lines,
     gap_lines,
     gap_state_lines,
-    job_line,
     model_lines,
     notice_lines,
     show_alarms,
     show_session,
     station_line,
+    store_lines,
 )
+from daemon.cli.summary import next_step, state_sentence, summary
 from daemon.cli.terminal import Coloured, echo, echo_table
+
+WIDTH = 100  # where the terminal's is not known
 
 
 @click.command(cls=Command)
-@click.option("--frames", is_flag=True, help="Also every CAN identifier that was heard, with its rate.")
+@click.option("--all", "everything", is_flag=True, help="Also every link, channel and event.")
+@click.option("--frames", is_flag=True, help="Everything, and every CAN identifier that was heard, with its rate.")
 @client_options
-def status(frames: bool, **where: Any) -> Any:
-    """Show the state of the rig's links, channels and station, and what is going on."""
-    return ask(where, "status", partial(_show, frames=frames))
+def status(everything: bool, frames: bool, **where: Any) -> Any:
+    """Show on one screen what the rig is doing, what is wrong, and what to do next."""
+    show = partial(_show_all, frames=frames) if everything or frames else _show
+    told = ask(where, "status", show)
+    return told | {"summary": {"state": state_sentence(told), "next": next_step(told)}}
 
 
-def _show(status: Mapping[str, Any], *, frames: bool) -> None:
+def _show(status: Mapping[str, Any]) -> None:
+    for line in summary(status, shutil.get_terminal_size((WIDTH, 0)).columns):
+        echo(line.text, **line.style)
+
+
+def _show_all(status: Mapping[str, Any], *, frames: bool) -> None:
     acquisition = status["acquisition"]
     echo(f"rig {status['rig']} ({status['mode']}), store {status['store']}")
     show_alarms(status["alarms"])
-    for line in (*notice_lines(status["notices"]), *_store_lines(status), *gap_state_lines(acquisition)):
+    for line in (*notice_lines(status["notices"]), *store_lines(status), *gap_state_lines(acquisition)):
         echo(line)
     _show_links(acquisition["links"])
     _show_channels(acquisition["channels"])
@@ -53,16 +66,6 @@ def _show(status: Mapping[str, Any], *, frames: bool) -> None:
         echo(line)
     for event in reversed(status["events"]):
         echo(f"{utc(event['utc_ns'])} {event['device']} {event['kind']}: {event['text']}")
-
-
-def _store_lines(status: Mapping[str, Any]) -> Iterator[str]:
-    """Return the store's present work and its unreadable parts; its faults are alarms."""
-    if status["store_health"]["state"] == "checking":
-        yield status["store_health"]["text"]
-    if status["acquisition"]["is_behind"]:
-        yield "captures wait to be decoded: readings and fixes come late, and jobs wait"
-    for part, reason in status["unreadable"].items():
-        yield f"{part}: cannot be read from the store ({reason})"
 
 
 def _show_links(links: Sequence[Mapping[str, Any]]) -> None:

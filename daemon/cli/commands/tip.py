@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import sys
+import logging
 import time
 from typing import Any
 
 import click
 
 from daemon.cli.client import client_options, socket_of
-from daemon.cli.command import Command
-from daemon.cli.terminal import echo
+from daemon.cli.command import DONE, FAILED, Command, Delivered, stream_json
+from daemon.cli.terminal import echo, echo_error
 from daemon.control.protocol import request
 
 FOLLOW_S = 0.2
@@ -25,22 +24,24 @@ def tip(prism: str | None, *, follow: bool, **where: Any) -> Any:
     """Show where a prism is now: the joints' latest readings through the live model.
 
     The position is in the base frame, and in the station's, as it would measure the prism, if the model knows its
-    set-up. If the position is not known, the status says why. With --follow and --json, standard output holds one
-    object a line.
+    set-up. If the position is not known, the exit status is 1 and the reason says what to do; --follow goes on. With
+    --follow and --json, standard output holds one object a line.
     """
     arguments = {} if prism is None else {"prism": prism}
     socket = socket_of(where["socket"], where["config"])
     if not follow:
         result = request(socket, "tip", arguments)
-        if not where["as_json"]:
+        is_known = result["base_mm"] is not None
+        if is_known and not where["as_json"]:
             _show(result)
-        return result
+        if not is_known:
+            echo_error(f"Error: {_unknown(result)}", logging.ERROR)
+        return Delivered(result, DONE if is_known else FAILED)
     try:
         while True:
             result = request(socket, "tip", arguments)
             if where["as_json"]:
-                # A command's standard output is kept for its one result; here each line is one.
-                click.echo(json.dumps(result), file=sys.__stdout__)
+                stream_json(result)
             else:
                 _show(result)
             time.sleep(FOLLOW_S)
@@ -50,7 +51,7 @@ def tip(prism: str | None, *, follow: bool, **where: Any) -> Any:
 
 def _show(tip: dict[str, Any]) -> None:
     if tip["base_mm"] is None:
-        echo(f"prism {tip['prism']}: {tip['status']}: {tip['reason']}")
+        echo(_unknown(tip))
         return
     line = f"prism {tip['prism']}: base {_place(tip['base_mm'])} mm, sigma {tip['sigma_mm']:.1f} mm"
     if tip["setup"] is not None:
@@ -58,6 +59,11 @@ def _show(tip: dict[str, Any]) -> None:
     echo(f"{line}; {tip['age_s']:.2f} s ago, model {tip['model']}, {tip['status']}")
     for warning in tip["warnings"]:
         echo(f"  note: {warning}")
+
+
+def _unknown(tip: dict[str, Any]) -> str:
+    remedy = "; `rigcal status` says what leads to a live model" if tip["status"] == "no_model" else ""
+    return f"prism {tip['prism']}: {tip['status'].replace('_', ' ')}: {tip['reason']}{remedy}"
 
 
 def _place(place: list[float]) -> str:

@@ -71,7 +71,7 @@ def test_links_that_cannot_be_opened_are_alarms_that_outlive_a_restart(
         channels = {c["name"]: c["status"] for c in request(socket, "status")["acquisition"]["channels"]}
         assert channels["theta1"] == "link_down"
         shown = rigcal("status", "--socket", str(socket)).stdout.splitlines()
-        assert shown[1].startswith("CRITICAL link_down boom: ")
+        assert shown[2].startswith("alarms    CRITICAL link_down boom: ")
         listed = rigcal("alarms", "--socket", str(socket)).stdout
         assert "rigcal opens the link again by itself" in listed
     raised = [r for r in caplog.records if r.name == "daemon.alarms.board"]

@@ -62,7 +62,7 @@ def pictures(page: str) -> int:
 @pytest.mark.slow
 def test_the_answer_has_a_row_for_every_method_and_a_page(ys100: list[object]) -> None:
     found = answer(*ys100, "--time-limit", 0.2)
-    assert list(found) == ["rig", "n", "n_holdout", "methods", "warnings", "page"]
+    assert list(found) == ["rig", "n", "n_holdout", "noise_mm", "methods", "warnings", "page"]
     assert (found["rig"], found["n"], found["n_holdout"]) == ("ys100", 50, 50)
     assert [row["method"] for row in found["methods"]] == METHODS
     for row in found["methods"]:
@@ -74,7 +74,8 @@ def test_the_answer_has_a_row_for_every_method_and_a_page(ys100: list[object]) -
     page = Path(found["page"]).read_text(encoding="utf-8")
     assert Path(found["page"]).name == "comparison-ys100.html"
     assert pictures(page) == 2
-    assert "default has the lowest mean error" in page
+    assert "rigcal has the lowest mean error" in page
+    assert "Tolerance: no tolerance stated" in page
 
 
 @pytest.mark.long

@@ -155,7 +155,8 @@ def test_following_the_tip_prints_a_json_object_a_line_until_it_is_stopped(socke
 
 def test_a_tip_without_a_position_says_why(socket: Path) -> None:
     shown = rigcal("tip", "--prism", "s", "--socket", str(socket))
-    assert shown.stdout == "prism s: stale: L2: no reading yet\n"
+    assert (shown.returncode, shown.stdout) == (1, "")
+    assert shown.stderr == "Error: prism s: stale: L2: no reading yet\n"
 
 
 # ---- who may send ----------------------------------------------------------------------------------------------------

@@ -117,6 +117,18 @@ def test_evaluate_prints_every_stage_for_people(work: Path) -> None:
         assert text in told
 
 
+@pytest.mark.parametrize(
+    ("tolerance_mm", "data", "verdict"),
+    [("1000", "test.csv", "passed"), ("0.001", "test.csv", "failed"), ("1000", "train.csv", "not judged")],
+)
+def test_evaluate_holds_the_error_against_a_tolerance(work: Path, tolerance_mm: str, data: str, verdict: str) -> None:
+    asked = ("evaluate", "--model", work / "model", "--data", work / data, "--tolerance", tolerance_mm)
+    assert verdict.capitalize() + ": " in run(*asked).stdout
+    answer = json.loads(run(*asked, "--json").stdout)
+    assert answer["tolerance"]["verdict"] == verdict
+    assert answer["tolerance"]["rms_mm"] == answer["stages"][-1]["rms_mm"]
+
+
 def test_evaluate_answers_with_the_contract(work: Path) -> None:
     result = run("evaluate", "--model", work / "model", "--data", work / "test.csv", "--json")
     assert result.exit_code == 0

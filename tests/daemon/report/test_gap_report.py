@@ -89,9 +89,9 @@ def test_the_verdict_says_that_held_out_rows_fit_worse() -> None:
 def test_the_coefficient_stands_with_its_interval_between_its_bounds(named: Outline) -> None:
     (line,) = intervals(support.named())
     (coefficient,) = support.named().effects[0].coefficients
-    assert (line.value, line.lower, line.upper, line.unit) == (1000.0 * coefficient.value, 0.0, 5.0, "mrad")
+    assert (line.value, line.lower, line.upper, line.unit) == (1000.0 * coefficient.value, 0.0, 5.0, "milliradians")
     assert line.error == 1000.0 * coefficient.standard_error
-    for words in ("width_rad", "0 .. 5.00", "over 99.9 %", "mrad"):
+    for words in ("width", "0 .. 5.00", "over 99.9 %", "milliradians"):
         assert words in named.text
 
 
@@ -139,7 +139,7 @@ def test_what_the_data_could_not_have_shown_is_said_by_effect(named: Outline) ->
     text = named.text.partition("What this data could not have shown")[2]
     for words in (
         "Too small to be named", "boom droop", "station scale", "thermal expansion: needs the column temperature_degC",
-        "latency: these poses show nothing of it", "What it could have shown (2 effects)", "260 \N{MICRO SIGN}rad",
+        "latency: these poses show nothing of it", "What it could have shown (2 effects)", "260 microradians",
     ):  # fmt: skip
         assert words in text
 

@@ -82,7 +82,13 @@ def test_named_effects_have_a_section_with_their_sizes() -> None:
     )
     outline = Outline(calibration_report(report_input(effects=[effect], effects_reason="the data ask for it")))
     assert "Named effects" in outline.headings
-    for words in ("the data ask for it.", "joint compliance", "0.071 deg", "+0.005 mrad/(kN m)", "and 1 more"):
+    for words in (
+        "the data ask for it.",
+        "joint compliance",
+        "0.071 degrees",
+        "+0.005 milliradians per kilonewton metre",
+        "and 1 more",
+    ):
         assert words in outline.text
 
 
@@ -146,7 +152,7 @@ def test_text_says_what_an_operator_must_know(outline: Outline) -> None:
         "Joint L2 moved over less than a tenth of its range.",
         "Station set-up 'north face' moved",
         "The data determine 54 of 56 parameters",
-        "row9.theta with prism.s.x",
+        "row 9, zero angle with prism s, offset along x",
         "beyond building: check the drawing",  # row1.alpha, 4.5 tolerances
         "1 of 60 fixes (1.7 %) did not fit",
         "operator_note",

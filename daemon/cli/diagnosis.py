@@ -1,0 +1,314 @@
+"""What `rigcal doctor` looks at: the computer, the configuration, and what a running daemon knows.
+
+Nothing is sent to any bus, instrument or server, no device is opened, and nothing is changed.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from daemon.config import CanSection, Config
+
+State = Literal["good", "warning", "fault", "unknown"]
+
+NETWORK_DEVICES = Path("/sys/class/net")
+_NETWORKD = "edit /etc/systemd/network/80-can0.network, then `systemctl restart systemd-networkd`"
+_USUAL_RATE = 250_000  # bit/s
+_RULES_FILE = "/etc/udev/rules.d/99-rigcal-station.rules"
+_OFTEN = 10  # silences of one channel since the start, from which on its time-out may be too short
+_LEAST_FREE = 0.1  # of the disk
+_TIME_ERROR = 5  # adjtimex(2): the clock is not synchronised
+_TOOL_TIMEOUT_S = 10.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at.
+
+    Attributes:
+        subject: its name.
+        state: good, warning (works, and may not for long), fault, or unknown (could not be looked at).
+        text: what was found.
+        remedy: what to type or do; "" where nothing needs doing.
+    """
+
+    subject: str
+    state: State
+    text: str
+    remedy: str = ""
+
+    def as_dict(self) -> dict[str, str]:
+        """Return the JSON object."""
+        return asdict(self)
+
+
+# ---- the computer ----------------------------------------------------------------------------------------------------
+
+
+def computer(config: Config | None) -> Iterator[Finding]:
+    """Look at the clock, the disk, and whether the kernels are compiled.
+
+    Args:
+        config: of the daemon; None where there is none.
+    """
+    yield _clock()
+    if config is not None:
+        yield _disk(config)
+    from daemon.warm_up import is_compiled
+
+    if is_compiled():
+        yield Finding("kernels", "good", "are compiled")
+    else:
+        remedy = "`python -m daemon.warm_up`, with the Python of rigcal, compiles them now"
+        yield Finding(
+            "kernels", "warning", "are not compiled yet: the first calibration takes half a minute more", remedy
+        )
+
+
+def _clock() -> Finding:
+    try:
+        state = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.create_string_buffer(512))  # only read: modes is 0
+    except (OSError, AttributeError):
+        state = -1
+    if state == -1:
+        return Finding("clock", "unknown", "the kernel does not say whether it is synchronised", "`timedatectl`")
+    if state == _TIME_ERROR:
+        return Finding(
+            "clock",
+            "warning",
+            "is not synchronised: records are ordered by another clock, but dates may be wrong",
+            "`timedatectl set-ntp true`, or give the network a time server (/etc/systemd/timesyncd.conf)",
+        )
+    return Finding("clock", "good", "is synchronised")
+
+
+def _disk(config: Config) -> Finding:
+    place = config.state_directory
+    existing = next((path for path in (place, *place.parents) if path.exists()), Path("/"))
+    usage = shutil.disk_usage(existing)
+    text = f"{usage.free / 2**30:.1f} GiB of {usage.total / 2**30:.0f} are free at {place}"
+    if usage.free < config.store.free_bytes or usage.free < _LEAST_FREE * usage.total:
+        why = f"{text}; captures outside sessions are deleted below {config.store.free_gb:g} GiB or a tenth of the disk"
+        return Finding("disk", "warning", why, f"`du -xh --max-depth=2 {existing} | sort -h` shows what takes it")
+    return Finding("disk", "good", text)
+
+
+# ---- the configuration -----------------------------------------------------------------------------------------------
+
+
+def read_configuration(path: Path) -> tuple[Config | None, Finding]:
+    """Read a configuration with its rig and the files that these name; return it, and whether it is good."""
+    from calibration.errors import RigError
+    from daemon.commands import CommandError
+    from daemon.composition import decoders
+    from daemon.config import load_rig, read_config
+    from drivers.errors import DescriptionError
+
+    config = None
+    try:
+        config = read_config(path)
+        source = load_rig(config.rig)
+        decoders(config, source)
+    except (CommandError, RigError, DescriptionError) as error:
+        return config, Finding(
+            "configuration", "fault", str(error), f"mend it; `rigcal config check {path}` reads it again"
+        )
+    return config, Finding("configuration", "good", f"{path}: rig {source.rig.name}")
+
+
+def devices(config: Config) -> Iterator[Finding]:
+    """Look at the interfaces and ports of a configuration without opening them."""
+    for section in config.can:
+        if section.interface == "socketcan":
+            yield can_interface(section, _link_details(section.channel), NETWORK_DEVICES / section.channel)
+    for station in config.station:
+        yield _station_port(station.name, Path(station.serial.path))
+
+
+def _link_details(channel: str) -> Mapping[str, Any] | None:
+    """Return what `ip` (iproute2) tells of an interface; None where it cannot be asked."""
+    command = ["ip", "-json", "-details", "link", "show", "dev", channel]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_TOOL_TIMEOUT_S, check=False)
+        return dict(json.loads(done.stdout)[0]) if done.returncode == 0 else None
+    except (OSError, subprocess.TimeoutExpired, ValueError, IndexError):
+        return None
+
+
+def can_interface(section: CanSection, details: Mapping[str, Any] | None, device: Path) -> Finding:
+    """Judge a CAN interface: there, up, listen-only unless the link may send, and of the configured bit rate.
+
+    Args:
+        section: the link.
+        details: what `ip -json -details link show` tells of its interface; None where it cannot be asked.
+        device: the interface's directory in /sys.
+    """
+    name = section.channel
+    if not device.exists():
+        seen = "`ip -details link show type can` shows those that there are; `dmesg` what became of the adapter"
+        return Finding(name, "fault", f"there is no such interface (link {section.name})", seen)
+    if details is None:
+        return Finding(name, "unknown", "its settings cannot be read", "`apt install iproute2` brings the program ip")
+    if "UP" not in details.get("flags", ()):
+        up = f"`ip link set {name} up type can bitrate {section.bitrate or _USUAL_RATE} listen-only on`, or {_NETWORKD}"
+        return Finding(name, "fault", "the interface is down", up)
+    info = details.get("linkinfo", {})
+    if info.get("info_kind") != "can":
+        return Finding(name, "good", f"is up; a {info.get('info_kind') or 'network'} interface has no bit rate")
+    return _controller(section, info.get("info_data", {}))
+
+
+def _controller(section: CanSection, data: Mapping[str, Any]) -> Finding:
+    """Judge the controller of an interface that is up, by what the kernel tells of it."""
+    rate, state = data.get("bittiming", {}).get("bitrate"), str(data.get("state", ""))
+    is_listening = "LISTEN-ONLY" in data.get("ctrlmode", ())
+    text = f"is up at {rate or 0:,} bit/s, {'listen-only' if is_listening else 'may transmit'}, {state.lower()}"
+    found: State = "good"
+    remedy = ""
+    if state == "BUS-OFF":
+        found, remedy = "fault", f"check cabling, termination (120 ohm at both ends) and bit rate; then {_NETWORKD}"
+    elif section.bitrate is not None and rate is not None and rate != section.bitrate:
+        found, text = "fault", f"{text}; the configuration has {section.bitrate:,} bit/s"
+        remedy = f"set BitRate: {_NETWORKD}"
+    elif section.allow_transmit and is_listening:
+        found, text = "fault", f"{text}, and the link has allow_transmit = true"
+        remedy = f"set ListenOnly=no: {_NETWORKD}"
+    elif not section.allow_transmit and not is_listening:
+        found, text, remedy = "warning", f"{text}: it acknowledges frames", f"set ListenOnly=yes: {_NETWORKD}"
+    return Finding(section.channel, found, text, remedy)
+
+
+def _station_port(name: str, path: Path) -> Finding:
+    if not path.exists():
+        plugged = ", ".join(
+            sorted(str(p) for p in Path("/dev").glob("ttyUSB*")) + sorted(str(p) for p in Path("/dev").glob("ttyACM*"))
+        )
+        found = f"plugged in: {plugged}" if plugged else "no serial adapter is plugged in"
+        remedy = (
+            f"plug it in; put its serial number into {_RULES_FILE}, then `udevadm control --reload && udevadm trigger`"
+        )
+        return Finding(name, "fault", f"{path} does not exist; {found}", remedy)
+    if not os.access(path, os.R_OK | os.W_OK):
+        remedy = f"join its group: `sudo adduser {_user()} dialout`, then log in anew (the service has it already)"
+        return Finding(name, "fault", f"{path} may not be opened by {_user()}", remedy)
+    if path.resolve().name.startswith(("ttyUSB", "ttyACM")) and not path.is_symlink():
+        remedy = f"name the adapter in {_RULES_FILE}, and use that name in [station.serial] path"
+        return Finding(
+            name, "warning", f"{path} names a socket, not an adapter: it may be another one after a restart", remedy
+        )
+    target = f" is {path.resolve()}" if path.is_symlink() else " is there"
+    return Finding(name, "good", f"{path}{target}")
+
+
+def _user() -> str:
+    import getpass
+
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):
+        return f"uid {os.getuid()}"
+
+
+# ---- the daemon ------------------------------------------------------------------------------------------------------
+
+
+def socket_finding(error: str) -> Finding:
+    """Return the finding that the daemon cannot be asked, from the client's error."""
+    remedy = "`systemctl status rigcal` says whether it runs, `journalctl -u rigcal -n 50` why not"
+    return Finding("daemon", "fault", error, remedy)
+
+
+def daemon_state(status: Mapping[str, Any], version: str) -> Iterator[Finding]:
+    """Judge what a running daemon tells: version, store, links, channels, station, time-outs, alarms.
+
+    Args:
+        status: its state.
+        version: of this program.
+    """
+    if status.get("version", version) != version:
+        text = f"version {status['version']} runs, and this program is {version}"
+        yield Finding("daemon", "warning", text, "`systemctl restart rigcal`")
+    else:
+        yield Finding("daemon", "good", f"answers, {status['mode']}, version {version}")
+    store, acquisition = status["store_health"], status["acquisition"]
+    if store["state"] in ("ok", "checking"):
+        yield Finding("store", "good", f"{status['store']}: {store['text'] or 'no fault is known'}")
+    else:
+        yield Finding("store", "fault", store["text"], "`rigcal store check` reads all of it; docs/store.md says more")
+    for link in acquisition["links"]:
+        yield _link(link)
+    yield from _channels(acquisition["channels"])
+    for station in acquisition["stations"]:
+        yield _station(station)
+    yield from _time_outs(acquisition)
+    alarms = status["alarms"]["active"]
+    if alarms:
+        is_critical = any(alarm["severity"] == "critical" for alarm in alarms)
+        named = ", ".join(f"{alarm['kind']} {alarm['subject']}" for alarm in alarms)
+        yield Finding("alarms", "fault" if is_critical else "warning", named, "`rigcal alarms` says what to do")
+    else:
+        yield Finding("alarms", "good", "none")
+
+
+def _link(link: Mapping[str, Any]) -> Finding:
+    if link["up"] is False:
+        return Finding(
+            f"link {link['name']}", "fault", link["reason"] or "is closed", "check plug, adapter and its power"
+        )
+    if link["up"] and not link["captures_per_s"]:
+        remedy = "check that the device is switched on, the cable, and the bit rate or baud: a wrong one looks the same"
+        return Finding(f"link {link['name']}", "fault", "is open, and nothing is heard", remedy)
+    if link["dropped"]:
+        text = f"{link['dropped']} captures were lost since the start: the computer or its disk is too slow"
+        return Finding(f"link {link['name']}", "warning", text, "`top` shows what keeps it busy")
+    return Finding(f"link {link['name']}", "good", f"{link['captures_per_s']:.0f} captures/s")
+
+
+def _channels(channels: list[Mapping[str, Any]]) -> Iterator[Finding]:
+    """Judge joints and signals; those of a kind that lack for the same reason are one finding."""
+    groups: dict[tuple[str, str], list[str]] = {}
+    for channel in channels:
+        if channel["status"] != "ok":
+            since = "never heard" if channel["age_s"] is None else channel["status"].replace("_", " ")
+            groups.setdefault((channel["kind"], since), []).append(channel["name"])
+    if channels and not groups:
+        yield Finding("channels", "good", f"all {len(channels)} joints and signals are read")
+    for (kind, since), names in groups.items():
+        state: State = "fault" if kind == "joint" else "warning"
+        remedy = "check power and cable; `rigcal status --frames` shows which identifiers are heard"
+        yield Finding(f"{kind}s", state, f"{since}: {', '.join(names)}", remedy)
+
+
+def _station(station: Mapping[str, Any]) -> Finding:
+    name = f"station {station['name']}"
+    if station["age_s"] is None:
+        remedy = "check its power, cable, baud and profile ([station] of the configuration)"
+        return Finding(name, "fault", "has not answered since the daemon's start", remedy)
+    state: State = "good" if station["status"] == "ok" else "warning"
+    return Finding(name, state, station["sentence"], "" if state == "good" else "aim it at the prism and lock it")
+
+
+def _time_outs(acquisition: Mapping[str, Any]) -> Iterator[Finding]:
+    """Find channels that fall silent and come back so often that their time-out may be too short."""
+    often = {
+        gap["channel"]: gap["count"]
+        for gap in acquisition.get("gap_counts", ())
+        if gap["reason"] == "silent" and gap["count"] >= _OFTEN
+    }
+    for name, count in often.items():
+        remedy = (
+            f"look at its cable; if the device is only slow, give channel {name} of the rig file a longer timeout_s "
+            "(a station: silence_timeout_s)"
+        )
+        yield Finding(f"time-out of {name}", "warning", f"silent {count} times since the start", remedy)
+    if not often:
+        yield Finding("time-outs", "good", "no channel falls silent again and again")

@@ -1,0 +1,70 @@
+"""The page of all commands and options, made from the commands themselves: `python -m daemon.cli.reference`."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator
+
+import click
+
+from daemon.cli.main import main
+from daemon.cli.terminal import echo_text
+
+HEAD = """# Commands
+
+Every command with its arguments and options. This page is made from the commands: `python -m daemon.cli.reference >
+docs/commands.md`. Each command says the same with `--help`.
+
+Exit status of all commands: 0 done, 1 failed, 2 wrong use or bad input, 3 refused because the result would be unsafe
+to use; `rigcal health` alone has those of monitoring systems. With `--json`, standard output holds one JSON object and
+nothing else ([formats.md](formats.md)). Where standard output is no terminal, what is printed has no colours and no
+moving parts.
+
+`rigcal completion bash | zsh | fish` prints the script by which a shell completes commands and options with the Tab
+key; the Debian package and `deploy/install.sh` put all three in place.
+"""
+
+
+def reference() -> str:
+    """Return the whole page."""
+    context = click.Context(main, info_name="rigcal")
+    return HEAD + "".join(f"\n{part}" for part in _parts(context, main))
+
+
+def _parts(context: click.Context, command: click.Command) -> Iterator[str]:
+    """Yield the section of a command, then those of its subcommands."""
+    if isinstance(command, click.Group):
+        if context.parent is not None:
+            yield f"## {context.command_path}\n\n{_text(command)}\n"
+        for name in command.list_commands(context):
+            sub = command.get_command(context, name)
+            assert sub is not None
+            if not sub.hidden:
+                yield from _parts(click.Context(sub, context, name), sub)
+        return
+    level = "##" if context.parent is not None and context.parent.parent is None else "###"
+    usage = " ".join((context.command_path, *command.collect_usage_pieces(context)))
+    lines = [f"{level} {context.command_path}", "", f"    {usage}", "", _text(command)]
+    records = [
+        record
+        for parameter in command.get_params(context)
+        if "--help" not in parameter.opts and (record := parameter.get_help_record(context)) is not None
+    ]
+    if records:
+        lines += ["", "| option | |", "|---|---|"]
+        lines += [f"| `{_cell(names)}` | {_cell(text)} |" for names, text in records]
+    yield "\n".join(lines) + "\n"
+
+
+def _text(command: click.Command) -> str:
+    """Return a command's help, a paragraph a line."""
+    text = textwrap.dedent(command.help or "").replace("\b\n", "").strip()
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in text.split("\n\n"))
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+if __name__ == "__main__":
+    echo_text(reference().rstrip("\n"))

@@ -1,0 +1,188 @@
+"""The commented configuration and rig file that `rigcal init` writes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from daemon.cli.listening import HeardBus
+from drivers.stations.serial_port import SerialConfig
+
+_IDENTIFIERS_SHOWN = 40
+
+
+@dataclass(frozen=True)
+class JointChoice:
+    """A joint of a new rig file.
+
+    Attributes:
+        name, kind: revolute or prismatic.
+        limits: deg or mm.
+        node: CANopen node that reads it.
+    """
+
+    name: str
+    kind: str
+    limits: tuple[float, float]
+    node: int
+
+    @property
+    def unit(self) -> str:
+        """Unit of its readings."""
+        return "deg" if self.kind == "revolute" else "mm"
+
+
+def configuration(
+    rig: str, interface: str, channel: str, bitrate: int | None, station: tuple[str, str, SerialConfig] | None
+) -> str:
+    """Return a configuration of the daemon.
+
+    Args:
+        rig: name or file name of the rig.
+        interface: kind of CAN adapter, as python-can has it.
+        channel: of that adapter.
+        bitrate: bit/s; None where the system sets it.
+        station: profile, family to listen to and port of the total station; None without one.
+    """
+    rate = f"bitrate = {bitrate}\n" if bitrate is not None else ""
+    text = f"""# The daemon's configuration. Check it after every change:  rigcal config check FILE
+# Every key is described at [[can]], [[station]], ... in the configuration that the package installs.
+
+# A rig that ships with rigcal (swdt82, ys100, ur10), or the path of a rig file, relative to this file.
+rig = {_quoted(rig)}
+
+# Where store, models and reports are kept; the service keeps them in /var/lib/rigcal where this is left out.
+# state_directory = "/var/lib/rigcal"
+
+# Members of this group may look and change nothing.
+# read_group = "rigcal-read"
+
+# The boom's bus. rigcal sends nothing on it unless allow_transmit = true stands here, with the nodes it may set up.
+[[can]]
+name = "boom" # the `link` of the rig's channels
+interface = {_quoted(interface)}
+channel = {_quoted(channel)}
+{rate}# allow_transmit = true
+# transmit_nodes = [32, 33, 34]
+"""
+    if station is not None:
+        profile, family, serial = station
+        listen = f"listen_to = {_quoted(family)}\n" if profile == "passive" else ""
+        text += f"""
+# The total station: topcon_gts8 (tracking), topcon_classic, sokkia_set, or passive, which never sends anything.
+[[station]]
+profile = {_quoted(profile)}
+{listen}
+# Its port, best by a name that stays the adapter's (/dev/rigcal-station by the udev rule); the rest as it is set.
+[station.serial]
+path = {_quoted(serial.path)}
+baud = {serial.baud}
+bytesize = {serial.bytesize}
+parity = {_quoted(serial.parity)}
+stopbits = {serial.stopbits}
+"""
+    return (
+        text
+        + """
+# The error that a calibrated model may have, root mean square on held-out fixes: reports then say passed or failed.
+# [report]
+# tolerance_mm = 10.0
+"""
+    )
+
+
+def rig_file(name: str, joints: Sequence[JointChoice], prisms: Sequence[str], heard: HeardBus | None) -> str:
+    """Return a rig file with a row for each joint, whose lengths and angles are still to be filled in.
+
+    Args:
+        name: of the rig.
+        joints: from the base outwards.
+        prisms: on the last link.
+        heard: what was heard on its bus; None where nobody listened.
+    """
+    parts = [
+        f"""# A rig file: docs/rig-files.md says how to write one, docs/reference.md lists every key.
+# FILL IN what the drawings say: numbers of [[row]], offsets of prisms, zeros of encoders. Lengths mm, angles deg.
+{_heard_comment(heard)}
+name = {_quoted(name)}
+convention = "mdh_beta_after"
+gravity = [0, 0, -1]      # direction in the base frame
+
+[tolerances]              # 1 sigma: how far the machine may be from these numbers
+length_mm = 5.0
+angle_deg = 0.2
+beta_deg = 0.1
+prism_mm = 3.0
+
+[station]                 # random error of a fix, from the instrument's data sheet
+angle_sigma_arcsec = 5.0
+distance_sigma_mm = 2.0
+distance_sigma_ppm = 2.0
+target_sigma_mm = 1.0
+"""
+    ]
+    parts += [_joint(joint) for joint in joints]
+    parts += [_row(number, joint) for number, joint in enumerate(joints, start=1)]
+    parts += [
+        f"""
+[[prism]]
+name = {_quoted(prism)}
+frame = {len(joints)}                 # it sits on the link after that row
+offset_mm = [0, 0, {100 * (place + 1)}]   # FILL IN, in that frame
+"""
+        for place, prism in enumerate(prisms)
+    ]
+    parts += [_channel(joint) for joint in joints]
+    return "".join(parts)
+
+
+def _heard_comment(heard: HeardBus | None) -> str:
+    if heard is None:
+        return ""
+    shown = list(heard.identifiers.items())[:_IDENTIFIERS_SHOWN]
+    told = ", ".join(f"{identifier:X}h" for identifier, _ in shown) or "nothing"
+    more = f" and {len(heard.identifiers) - len(shown)} more" if len(heard.identifiers) > len(shown) else ""
+    nodes = ", ".join(map(str, heard.nodes)) or "none"
+    return f"# Heard on the bus: identifiers {told}{more}\n# CANopen nodes among them: {nodes}\n"
+
+
+def _joint(joint: JointChoice) -> str:
+    low, high = joint.limits
+    sigma = 0.005 if joint.kind == "revolute" else 0.2
+    return f"""
+[[joint]]
+name = {_quoted(joint.name)}
+kind = {_quoted(joint.kind)}
+limits = [{low:g}, {high:g}]      # {joint.unit}
+sigma = {sigma}             # random error of a reading, {joint.unit}
+"""
+
+
+def _row(number: int, joint: JointChoice) -> str:
+    constant = "theta" if joint.kind == "revolute" else "d"
+    return f"""
+[[row]]  # {number}: Trans(x,a) Rot(x,alpha) Trans(z,d) Rot(z,theta); FILL IN
+alpha_deg = {90 if number % 2 else -90}
+a_mm = {1000 if joint.kind == "revolute" else 0}
+d_mm = 0
+drive = {{ {constant} = {{ {joint.name} = 1.0 }} }}  # -1.0 where the joint counts the other way round
+"""
+
+
+def _channel(joint: JointChoice) -> str:
+    if joint.kind == "revolute":
+        what = 'device = "cia406_encoder"\nunits_per_revolution = 65536  # object 6001h\nzero_counts = 0  # FILL IN'
+    else:
+        what = 'device = "cia406_linear"\nstep_nm = 100000  # object 6005h'
+    return f"""
+[[channel]]
+name = {_quoted(joint.name)}
+{what}
+node = {joint.node}
+"""
+
+
+def _quoted(text: str) -> str:
+    """Return a TOML basic string."""
+    escaped = "".join(c if c.isprintable() and c not in '"\\' else f"\\u{ord(c):04x}" for c in text)
+    return f'"{escaped}"'

@@ -1,0 +1,109 @@
+"""`rigcal doctor`: what it looks at, and what it says to type."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+
+from daemon.cli.diagnosis import can_interface, daemon_state
+from daemon.cli.main import main
+from daemon.config import CanSection
+from tests.daemon.idle_daemon import idle_daemon
+
+SECTION = CanSection(channel="can0", bitrate=250_000)
+CONFIG = (
+    'rig = "swdt82"\nstate_directory = "state"\n[[can]]\nchannel = "rigcal-none0"\n[[station]]\nserial.path = "{}"\n'
+)
+
+
+def details(state: str = "ERROR-ACTIVE", rate: int = 250_000, *modes: str, flags: tuple[str, ...] = ("UP",)) -> Any:
+    """What `ip -json -details link show` prints of an interface (iproute2 6.1)."""
+    data = {"state": state, "ctrlmode": list(modes), "bittiming": {"bitrate": rate}}
+    return {"flags": ["NOARP", *flags], "linkinfo": {"info_kind": "can", "info_data": data}}
+
+
+@pytest.mark.parametrize(
+    ("told", "section", "state", "remedy"),
+    [
+        (details("ERROR-ACTIVE", 250_000, "LISTEN-ONLY"), SECTION, "good", ""),
+        (details("ERROR-ACTIVE", 250_000), SECTION, "warning", "ListenOnly=yes"),
+        (details("ERROR-ACTIVE", 500_000, "LISTEN-ONLY"), SECTION, "fault", "BitRate"),
+        (details("BUS-OFF", 250_000, "LISTEN-ONLY"), SECTION, "fault", "termination"),
+        (details(flags=()), SECTION, "fault", "ip link set can0 up type can bitrate 250000 listen-only on"),
+        (
+            details("ERROR-ACTIVE", 250_000, "LISTEN-ONLY"),
+            CanSection(channel="can0", allow_transmit=True),
+            "fault",
+            "=no",
+        ),
+        ({"flags": ["UP"], "linkinfo": {"info_kind": "vcan"}}, SECTION, "good", ""),
+        (None, SECTION, "unknown", "iproute2"),
+    ],
+)
+def test_an_interface_is_judged_by_what_the_kernel_tells(
+    told: Any, section: CanSection, state: str, remedy: str, tmp_path: Path
+) -> None:
+    found = can_interface(section, told, tmp_path)
+    assert found.state == state, found
+    assert remedy in found.remedy
+
+
+def examine(*options: str) -> tuple[Result, dict[str, dict[str, str]]]:
+    done = CliRunner().invoke(main, ["doctor", *options, "--json"])
+    return done, {finding["subject"]: finding for finding in json.loads(done.stdout)["findings"]}
+
+
+def test_without_a_daemon_each_fault_says_what_to_type(tmp_path: Path) -> None:
+    config = tmp_path / "rigcal.toml"
+    config.write_text(CONFIG.format(tmp_path / "no-station"), encoding="utf-8")
+    done, findings = examine("--config", str(config))
+    assert done.exit_code == 1
+    assert findings["configuration"]["state"] == "good"
+    assert "no such interface" in findings["rigcal-none0"]["text"]
+    assert "udevadm" in findings["station"]["remedy"]
+    assert "systemctl status rigcal" in findings["daemon"]["remedy"]
+    assert {"clock", "disk", "kernels"} <= set(findings)
+    assert all(finding["remedy"] for finding in findings.values() if finding["state"] != "good")
+    shown = CliRunner().invoke(main, ["doctor", "--config", str(config)])
+    assert shown.exit_code == 1
+    assert shown.stdout.count("-> ") == sum(bool(finding["remedy"]) for finding in findings.values())
+
+
+def test_a_wrong_configuration_is_the_first_finding(tmp_path: Path) -> None:
+    config = tmp_path / "rigcal.toml"
+    config.write_text('rig = "swdt82"\ncolour = "red"\n', encoding="utf-8")
+    done, findings = examine("--config", str(config), "--socket", str(tmp_path / "none"))
+    assert done.exit_code == 1
+    assert next(iter(findings)) == "configuration"
+    assert "unknown key" in findings["configuration"]["text"]
+
+
+def test_a_running_daemon_tells_of_store_and_channels(tmp_path: Path) -> None:
+    with idle_daemon(tmp_path) as config:
+        _, findings = examine("--socket", str(config.socket_path))
+    assert findings["store"]["state"] == "good"
+    assert findings["daemon"]["state"] == "good"
+    assert "theta1" in findings["joints"]["text"]
+
+
+def test_a_channel_that_falls_silent_again_and_again_may_have_too_short_a_time_out() -> None:
+    status = {
+        "version": "0.1.0",
+        "mode": "live",
+        "store": "/x",
+        "store_health": {"state": "ok", "text": ""},
+        "alarms": {"active": []},
+        "acquisition": {
+            "links": [],
+            "channels": [],
+            "stations": [],
+            "gap_counts": [{"channel": "theta1", "reason": "silent", "count": 40, "missed": 0}],
+        },
+    }
+    findings = {finding.subject: finding for finding in daemon_state(status, "0.2.0")}
+    assert "timeout_s" in findings["time-out of theta1"].remedy
+    assert findings["daemon"].remedy == "`systemctl restart rigcal`"
