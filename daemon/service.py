@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import sqlite3
 import threading
@@ -25,6 +26,7 @@ from daemon.config import Config
 from daemon.control.protocol import reading_only
 from daemon.control.server import ControlServer
 from daemon.host.systemd import Notifier
+from daemon.jobs.job_processes import JOBS_SOCKET
 from daemon.jobs.runner import JobRunner
 from daemon.models.live_model import LiveModel
 from daemon.models.live_tip import FRESH_S, LiveTip
@@ -121,7 +123,14 @@ class Daemon:
             clock_watch=ClockWatch(before) if parts.mode == "live" else None,
             thinning=None if parts.mode == "replayed" else Thinning(self._sessions.is_of_session),
         )
-        self._jobs = JobRunner(store, config, parts.rig.name, parts.clock, is_held=self._are_jobs_held)
+        self._jobs = JobRunner(
+            store,
+            config,
+            parts.rig.name,
+            parts.clock,
+            jobs_socket=os.environ.get(JOBS_SOCKET),
+            is_held=self._are_jobs_held,
+        )
         self._job_table, self._model_table = JobTable(store, parts.rig.name), models
         self._servers: list[ControlServer] = []
         self._unserved: dict[str, str] = {}  # sockets that could not be made, and why

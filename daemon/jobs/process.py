@@ -65,6 +65,7 @@ def main() -> int:
         tell.write(json.dumps(message) + "\n")
         tell.flush()
 
+    say({"pid": os.getpid()})
     try:
         result = perform(order, lambda share, text: say({"progress": share, "message": text}))
     except Exception as error:

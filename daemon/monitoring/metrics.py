@@ -376,7 +376,8 @@ where the configuration has
     port = 9750
 
 at `http://127.0.0.1:9750/metrics`. It listens on the loopback interface alone: a collector on the rig's computer
-(Prometheus itself, its agent mode, Grafana Alloy, Telegraf) reads it and takes it further. Counters count since the
+(Prometheus itself, its agent mode, Grafana Alloy, Telegraf) reads it and takes it further. The service has no network
+until `network.conf` opens it ([deploy/README.md](../deploy/README.md#the-network)). Counters count since the
 daemon's start. All of it is in `rigcal status --json` too; besides stand the `process_` metrics of the official Python
 client (memory, descriptors, CPU time).
 

@@ -141,7 +141,7 @@ def try_release(release: int, package: Path, scratch: Path) -> None:
         step("installed without a network")
         expect(root.run("rigcal", "--version").startswith("rigcal, version"), "no version")
         expect(root.run("rigcal", "config", "check", "/etc/rigcal/rigcal.toml").count("good") == 1, "configuration")
-        said = root.run("systemd-analyze", "verify", "rigcal.service")
+        said = root.run("systemd-analyze", "verify", "rigcal.service", "rigcal-jobs.socket", "rigcal-jobs@0.service")
         expect("rigcal" not in said, said)
         root.run("systemd-analyze", "security", "--offline=true", f"--threshold={EXPOSURE}", "rigcal.service")
         step(f"the unit is sound, and its exposure at most {EXPOSURE / 10}")
