@@ -35,6 +35,7 @@ class Overview:
         parts: rig and mode.
         store: open for writing.
         store_health, acquisition: tell of the store and of acquisition.
+        clock: tells of the computer's clock; None where it is not known, or is another one.
         alarms, notices, sessions, jobs, models, model_table: the parts.
     """
 
@@ -42,6 +43,7 @@ class Overview:
     store: Store
     store_health: Callable[[], StoreHealth]
     acquisition: Callable[[], AcquisitionStatus]
+    clock: Callable[[], dict[str, Any] | None]
     alarms: AlarmBoard
     notices: Notices
     sessions: SessionKeeper
@@ -68,6 +70,7 @@ class Overview:
             "alarms": self.alarms.status(),
             "notices": self.notices.status(),
             "acquisition": asdict(self.acquisition()),
+            "clock": self.clock(),
             "session": stored("session", self.sessions.open_session),
             "control_shots": stored("control_shots", SetupTable(self.store).newest_shots) or [],
             "jobs": stored("jobs", self.jobs.unfinished) or [],

@@ -30,6 +30,8 @@ place_files() {
     place rigcal.service /etc/systemd/system/rigcal.service
     place rigcal-jobs.socket /etc/systemd/system/rigcal-jobs.socket
     place rigcal-jobs@.service /etc/systemd/system/rigcal-jobs@.service
+    place rigcal-clock.socket /etc/systemd/system/rigcal-clock.socket
+    place rigcal-clock@.service /etc/systemd/system/rigcal-clock@.service
     place system-rigcaljobs.slice /etc/systemd/system/system-rigcaljobs.slice
     place network.conf /opt/rigcal/network.conf
     place rigcal.sysusers /etc/sysusers.d/rigcal.conf

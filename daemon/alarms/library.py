@@ -44,8 +44,9 @@ The webhook gets a POST of a JSON object: `text` (all of it, as chat services sh
 
 The command is run without a shell, for at most 30 s, and gets an e-mail without recipients (RFC 5322) on its standard
 input. Exit status 0 is a delivery. The service's sandbox has no network until `network.conf` opens it to the address of
-the webhook or mail server ([deploy/README.md](../deploy/README.md#the-network)). The command runs in it too: programs that speak SMTP themselves,
-such as msmtp, work; those that hand over to a local mail system by a set-group-ID program (Postfix' sendmail) do not.
+the webhook or mail server ([deploy/README.md](../deploy/README.md#the-network)). The command runs in it too: programs
+that speak SMTP themselves, such as msmtp, work; those that hand over to a local mail system by a set-group-ID program
+(Postfix' sendmail) do not.
 
 This page is made from the rules in `daemon/alarms/rules`: `python -m daemon.alarms.library > docs/alarms.md`.
 """

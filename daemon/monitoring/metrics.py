@@ -74,6 +74,10 @@ def _candidate(status: Status) -> float:
     return 0.0 if candidate is None else float(candidate["is_acceptable"])
 
 
+def _clock(status: Status) -> Mapping[str, Any]:
+    return status["clock"] or {}
+
+
 def _drift(status: Status) -> Mapping[str, Any]:
     return (status["gap"] or {}).get("drift") or {}
 
@@ -268,6 +272,28 @@ FAMILIES: tuple[Family, ...] = (
         "Free space on the disk of the store.",
         (),
         _one(lambda s: s["store_health"]["free_bytes"]),
+    ),
+    # ---- the computer's clock
+    Family(
+        "rigcal_clock_synchronized",
+        "gauge",
+        "1 while a time service keeps the computer's clock; absent where nothing tells.",
+        (),
+        _one(lambda s: _is(_clock(s).get("is_synchronized"))),
+    ),
+    Family(
+        "rigcal_clock_offset_seconds",
+        "gauge",
+        "By how much the computer's clock is ahead of its time service's estimate.",
+        (),
+        _one(lambda s: _clock(s).get("offset_s")),
+    ),
+    Family(
+        "rigcal_clock_max_error_seconds",
+        "gauge",
+        "Greatest error that the computer's clock may have, as its time service or the kernel tells.",
+        (),
+        _one(lambda s: _clock(s).get("max_error_s")),
     ),
     # ---- sessions, jobs, models
     Family(

@@ -29,6 +29,7 @@ from daemon.commands import (
     text_argument,
 )
 from daemon.config import SessionsSection
+from daemon.host.time_service import ClockState
 from daemon.sessions.lifecycle import SessionLifecycle
 from daemon.sessions.open_session import OpenSession, Shot
 from daemon.sessions.prism_guard import MotionLimit, Suspicion
@@ -65,6 +66,7 @@ class SessionKeeper:
         aim: turns the station to a prism or control point where something can (a simulated rig); None where the
             operator does it.
         limits: station -> what motion can do to its prism.
+        clock_state: returns how the computer's clock is, to be noted with a session; None where it is another clock.
     """
 
     def __init__(
@@ -80,11 +82,12 @@ class SessionKeeper:
         run_id: int,
         aim: Callable[[str], None] | None = None,
         limits: Mapping[str, MotionLimit] | None = None,
+        clock_state: Callable[[], ClockState | None] = lambda: None,
     ) -> None:
         self._rig, self._rig_text = rig, rig_text
         self._store, self._joiner, self._settings, self._clock = store, joiner, settings, clock
         self._setups, self._run_id = setups, run_id
-        self._lifecycle = SessionLifecycle(store, rig.name, clock, settings.control_tolerance_mm)
+        self._lifecycle = SessionLifecycle(store, rig.name, clock, settings.control_tolerance_mm, clock_state)
         self._table, self._jobs = self._lifecycle.table, JobTable(store, rig.name)
         self._aim = aim
         self._commands = threading.Lock()
@@ -241,7 +244,6 @@ class SessionKeeper:
                 self._aim(prism)
             now = self._clock.now()
             row = {
-                "id": session_id,
                 "rig_sha256": hashlib.sha256(self._rig_text.encode()).hexdigest(),
                 "rig_text": self._rig_text,
                 "setup_id": setup_id,
@@ -251,7 +253,7 @@ class SessionKeeper:
                 "kind": kind,
                 "note": text_argument(arguments, "note"),
             }
-            self._table.start(now, **row)
+            self._lifecycle.start(now, session_id, **row)
             order = self._store.order
             self._open = session = OpenSession(session_id, setup_id, prism, kind, order, now, control_points=points)
             if self._aim is not None:

@@ -47,6 +47,8 @@ FILES = {
     "rigcal.service": "usr/lib/systemd/system/rigcal.service",
     "rigcal-jobs.socket": "usr/lib/systemd/system/rigcal-jobs.socket",
     "rigcal-jobs@.service": "usr/lib/systemd/system/rigcal-jobs@.service",
+    "rigcal-clock.socket": "usr/lib/systemd/system/rigcal-clock.socket",
+    "rigcal-clock@.service": "usr/lib/systemd/system/rigcal-clock@.service",
     "system-rigcaljobs.slice": "usr/lib/systemd/system/system-rigcaljobs.slice",
     "network.conf": "usr/share/doc/rigcal/network.conf",
     "rigcal.sysusers": "usr/lib/sysusers.d/rigcal.conf",

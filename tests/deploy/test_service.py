@@ -9,12 +9,21 @@ from pathlib import Path
 
 import pytest
 
+from daemon.host import time_service
+from daemon.host.time_service import CLOCK_SOCKET
 from daemon.jobs.child import JOB_COMMAND
 from daemon.jobs.job_processes import JOBS_SOCKET
 from tests.deploy.conftest import DEPLOY, program, run
 
 UNIT = Path("etc/systemd/system/rigcal.service")
-UNITS = ("rigcal.service", "rigcal-jobs.socket", "rigcal-jobs@0.service", "system-rigcaljobs.slice")
+UNITS = (
+    "rigcal.service",
+    "rigcal-jobs.socket",
+    "rigcal-jobs@0.service",
+    "system-rigcaljobs.slice",
+    "rigcal-clock.socket",
+    "rigcal-clock@0.service",
+)
 
 
 def settings(unit: Path) -> dict[str, list[str]]:
@@ -61,7 +70,9 @@ def test_the_check_sees_a_program_that_is_not_where_the_unit_says(rig_computer: 
     assert "/opt/rigcal/venv/bin/rigcal is not executable" in verify(rig_computer)
 
 
-@pytest.mark.parametrize(("unit", "tenths"), [("rigcal.service", 15), ("rigcal-jobs@0.service", 5)])
+@pytest.mark.parametrize(
+    ("unit", "tenths"), [("rigcal.service", 15), ("rigcal-jobs@0.service", 5), ("rigcal-clock@0.service", 15)]
+)
 def test_the_services_are_exposed_little(installed: Path, unit: str, tenths: int) -> None:
     options = ("--no-pager", "--offline=true", f"--threshold={tenths}", f"--root={installed}")
     result = run(program("systemd-analyze", "systemd"), "security", *options, unit)
@@ -87,6 +98,15 @@ def test_jobs_are_a_unit_of_their_own_with_less_of_the_computer_than_acquisition
     assert job["ExecStart"][0].split()[-2:] == [*JOB_COMMAND[-2:]]
     for both in ("User", "Group", "UMask", "StateDirectory", "CacheDirectory"):
         assert job[both] == service[both]
+
+
+def test_the_clock_is_read_by_a_unit_that_cannot_set_it() -> None:
+    service, reader = settings(DEPLOY / "rigcal.service"), settings(DEPLOY / "rigcal-clock@.service")
+    (path,) = settings(DEPLOY / "rigcal-clock.socket")["ListenStream"]
+    assert f"{CLOCK_SOCKET}={path}" in service["Environment"]
+    assert reader["ExecStart"][0].split()[-2:] == ["-m", time_service.__name__]
+    assert reader["CapabilityBoundingSet"] == [""]
+    assert reader["NoNewPrivileges"] == ["yes"]
 
 
 def test_network_conf_opens_loopback(rig_computer: Path) -> None:

@@ -22,6 +22,7 @@ from daemon.cli.state_lines import (
     station_line,
 )
 from daemon.cli.terminal import Coloured, echo, echo_table
+from daemon.cli.time_lines import clock_sentence
 
 
 @click.command(cls=Command)
@@ -38,6 +39,8 @@ def _show(status: Mapping[str, Any], *, frames: bool) -> None:
     show_alarms(status["alarms"])
     for line in (*notice_lines(status["notices"]), *_store_lines(status), *gap_state_lines(acquisition)):
         echo(line)
+    if status["clock"] is not None:
+        echo(f"the computer's clock: {clock_sentence(status['clock'])}")
     _show_links(acquisition["links"])
     _show_channels(acquisition["channels"])
     if frames:
