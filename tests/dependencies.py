@@ -1,7 +1,7 @@
 """Known vulnerabilities of the packages that the lock files pin, by pip-audit: `make check-deps`.
 
-Both locks are asked about, for the oldest and the newest Python that a rig may have. Exit status 1 where a package has a
-known vulnerability, 0 where none has. Where the advisories cannot be reached one line says so, and the status is 0.
+Both locks are asked about, for the oldest and the newest Python that a rig may have. Exit status 1 where a package has
+a known vulnerability, 0 where none has. Where the advisories cannot be reached one line says so, and the status is 0.
 """
 
 from __future__ import annotations
