@@ -27,6 +27,12 @@ T = TypeVar("T")
 _EVENTS = 12  # the newest are shown in `status`
 
 
+def newest_latency(by_session: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | None:
+    """Return the latency of the last session that has one, with the session's name."""
+    known = [{"session": name, **found} for name, found in by_session.items() if "seconds" in found]
+    return known[-1] if known else None
+
+
 @dataclass(frozen=True)
 class Overview:
     """Gathers the state of all parts; may be asked from any thread.
@@ -75,6 +81,7 @@ class Overview:
             "control_shots": stored("control_shots", SetupTable(self.store).newest_shots) or [],
             "jobs": stored("jobs", self.jobs.unfinished) or [],
             "job_counts": stored("job_counts", self.jobs.counts) or [],
+            "latency": stored("latency", lambda: newest_latency(self.jobs.latencies())),
             "models": stored("models", self.models.status),
             "gap": stored("gap", lambda: gap_status(self.jobs, self.model_table)),
             "events": stored("events", lambda: self.store.newest_events(_EVENTS)) or [],

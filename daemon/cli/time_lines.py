@@ -32,6 +32,15 @@ def session_clock_lines(session: Mapping[str, Any]) -> Iterator[str]:
             yield f"the computer's clock at its {phase}: {sentence}"
 
 
+def latency_sentence(latency: Mapping[str, Any]) -> str:
+    """Return the latency of a session's fixes against its joints, a clause."""
+    if "reason" in latency:
+        return f"not known: {latency['reason']}"
+    milliseconds, sigma = latency["seconds"] * 1e3, latency["standard_error_s"] * 1e3
+    basis = f"{latency['fixes']} fixes of {latency['motions']} motions"
+    return f"{milliseconds:.0f} ms, give or take {max(sigma, 1.0):.0f} ms, beyond link_delay_s (from {basis})"
+
+
 def _size(seconds: float) -> str:
     size = abs(seconds)
     _, unit, factor = next(row for row in _UNITS if size >= row[0])

@@ -74,6 +74,10 @@ def _candidate(status: Status) -> float:
     return 0.0 if candidate is None else float(candidate["is_acceptable"])
 
 
+def _latency(key: str) -> Callable[[Status], Iterable[Sample]]:
+    return lambda s: [((s["latency"]["session"],), s["latency"][key])] if s["latency"] else []
+
+
 def _clock(status: Status) -> Mapping[str, Any]:
     return status["clock"] or {}
 
@@ -236,6 +240,21 @@ FAMILIES: tuple[Family, ...] = (
         "Time since a station's last good fix.",
         ("station",),
         _stations(lambda one: one["good_age_s"]),
+    ),
+    Family(
+        "rigcal_station_latency_seconds",
+        "gauge",
+        "Latency of the station's fixes against the joints' readings beyond link_delay_s, of the newest session that "
+        "told it.",
+        ("session",),
+        _latency("seconds"),
+    ),
+    Family(
+        "rigcal_station_latency_error_seconds",
+        "gauge",
+        "Standard error of rigcal_station_latency_seconds.",
+        ("session",),
+        _latency("standard_error_s"),
     ),
     # ---- the store
     Family(

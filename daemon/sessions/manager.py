@@ -332,7 +332,8 @@ class SessionKeeper:
     def show_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """One session: what it holds, what was excluded and why, how its set-up kept its place, and its jobs."""
         session_id = str(arguments.get("id", ""))
-        return self._table.summary(session_id) | {"jobs": self._jobs.of_session(session_id)}
+        about = {"jobs": self._jobs.of_session(session_id), "latency": self._jobs.latencies().get(session_id)}
+        return self._table.summary(session_id) | about
 
     def open_session(self) -> dict[str, Any] | None:
         """What `status` shows of the open session."""

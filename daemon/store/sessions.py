@@ -74,6 +74,8 @@ _EXCLUDE = "UPDATE observations SET excluded = ? WHERE session_id = ? AND boot_i
 _OBSERVATIONS = """SELECT session_id, setup_id, prism, pose, utc_ns, monotonic_ns, boot_id, x_mm, y_mm, z_mm,
         sigma_x_mm, sigma_y_mm, sigma_z_mm, dwell_s, values_json
     FROM observations WHERE excluded IS NULL AND session_id IN ({}) ORDER BY id"""
+# Fixes of a moving boom; those of poses leave them out, for that reason alone.
+_MOVING = _OBSERVATIONS.replace("excluded IS NULL", "moving AND coalesce(excluded, 'moving') = 'moving'")
 # All that a station gave in a session from the last fix that calibration may use, or from the session's start.
 _FIXES = """SELECT fixes.* FROM fixes,
         (SELECT started_boot_id, started_monotonic_ns FROM calibration_sessions WHERE id = ?1)
@@ -283,6 +285,11 @@ def session(source: RowSource, session_id: str) -> dict[str, Any] | None:
 def observations(source: RowSource, session_ids: Sequence[str]) -> list[dict[str, Any]]:
     """Return the observations of sessions that calibration may use, oldest first."""
     return list(source.rows(_OBSERVATIONS.format(_marks(session_ids)), session_ids))
+
+
+def moving_observations(source: RowSource, session_ids: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the observations of sessions that were made while the boom moved and have no other fault."""
+    return list(source.rows(_MOVING.format(_marks(session_ids)), session_ids))
 
 
 def all_sessions(source: RowSource) -> list[dict[str, Any]]:

@@ -151,8 +151,8 @@ class JobRig:
         seed = 20 + kind.count(CHECK)
         self.observed(name, simulate_observations(truth, poses, seed, setup="S1", prisms=prisms))
 
-    def observed(self, session: str, data: SimulatedObservations) -> None:
-        """Observations of a session."""
+    def observed(self, session: str, data: SimulatedObservations, *, moving: bool = False) -> None:
+        """Observations of a session; those of a moving boom are left out of one of standing poses."""
         columns = {name: values.tolist() for name, values in data.columns.items()}
         numeric = [name for name in columns if name not in LABELS]
         with self.store.transaction():
@@ -160,9 +160,11 @@ class JobRig:
                 row = {
                     "session_id": session,
                     "setup_id": "S1",
-                    "moving": False,
+                    "moving": moving,
+                    "excluded": "moving" if moving else None,
                     **self.store.instant(START.shifted(round(columns["time_s"][i] * NS_PER_S))),
-                    **{name: columns[name][i] for name in ("prism", "pose", "x_mm", "y_mm", "z_mm", "dwell_s")},
+                    **{name: columns[name][i] for name in ("prism", "x_mm", "y_mm", "z_mm", "dwell_s")},
+                    "pose": None if moving else columns["pose"][i],
                     "values_json": {name: columns[name][i] for name in numeric},
                 }
                 self.store.insert("observations", row)

@@ -12,6 +12,7 @@ from daemon.cli.client import ask, client_options, operator_option, who
 from daemon.cli.command import Command, json_option
 from daemon.cli.state_lines import job_line, show_session
 from daemon.cli.terminal import echo, echo_error, echo_table
+from daemon.cli.time_lines import latency_sentence
 from daemon.commands import SESSION_KINDS
 
 SHOT_TIMEOUT_S = 600.0
@@ -118,6 +119,8 @@ def session_show(name: str, **where: Any) -> Any:
 
     def show(found: Mapping[str, Any]) -> None:
         show_session(found)
+        if found["latency"] is not None:
+            echo(f"  latency of the station's fixes: {latency_sentence(found['latency'])}")
         for job in found["jobs"]:
             echo(job_line(job))
 

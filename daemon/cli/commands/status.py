@@ -22,7 +22,7 @@ from daemon.cli.state_lines import (
     station_line,
 )
 from daemon.cli.terminal import Coloured, echo, echo_table
-from daemon.cli.time_lines import clock_sentence
+from daemon.cli.time_lines import clock_sentence, latency_sentence
 
 
 @click.command(cls=Command)
@@ -47,6 +47,8 @@ def _show(status: Mapping[str, Any], *, frames: bool) -> None:
         _show_frames(acquisition["frames"])
     for line in (*map(station_line, acquisition["stations"]), *decoding_lines(acquisition["decoding"])):
         echo(line)
+    if status["latency"] is not None:
+        echo(f"latency of the station's fixes in {status['latency']['session']}: {latency_sentence(status['latency'])}")
     if status["session"]:
         show_session(status["session"])
     for line in map(job_line, status["jobs"]):

@@ -126,6 +126,7 @@ def test_every_family_has_samples_of_a_status_that_has_everything() -> None:
         "mode": "live",
         "alarms": {"active": [alarm], "looked_age_s": 0.5},
         "notices": [{"target": "webhook", "waiting": 1, "sent": 2, "failures": 3}],
+        "latency": {"session": "a", "seconds": 0.05, "standard_error_s": 0.01},
         "clock": {"is_synchronized": True, "offset_s": -2e-4, "max_error_s": 5e-3},
         "session": {"prism": "r", "observations": 4, "poses": 2, "excluded": {"moving": 3}},
         "control_shots": [{"setup": "S1", "point": "cp1", "misclosure_mm": 2.5}],
