@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from daemon.overview import newest_latency
 from daemon.sessions.session_data import sessions_csv
 from daemon.store.reader import Reader
 from simulators.effects.library import parse_effects
+from simulators.rig.dataset import SimulatedObservations
 from simulators.rig.truth import RigTruth
 from tests.daemon.job_support import SOURCE, JobRig
 from tests.simulated.runs import simulate_runs
@@ -33,15 +33,16 @@ def rig(tmp_path: Path) -> Iterator[JobRig]:
     rig.close()
 
 
+@pytest.mark.slow
 def test_a_report_tells_the_latency_of_each_session(rig: JobRig, tmp_path: Path) -> None:
     rig.measured("a", 40, prisms=["r", "s"])
     rig.measured("c", 4, kind="check", prisms=["r", "s"])
     truth = RigTruth(SOURCE.rig, 1, effects=parse_effects(f"latency@clock:seconds={LATE_S}"))
     runs = simulate_runs(truth, 1, 120, 30, prisms=["r"], setup="S1")
     is_moving = np.asarray(runs.columns["dwell_s"]) == 0.0
-    rig.observed(
-        "a", replace(runs, columns={k: np.asarray(v)[is_moving] for k, v in runs.columns.items()}), moving=True
-    )
+    moving = {name: np.asarray(values)[is_moving] for name, values in runs.columns.items()}
+    path = SimulatedObservations(moving, runs.measured_mm[is_moving], runs.oracle_mm[is_moving])
+    rig.observed("a", path, moving=True)
     with Reader(rig.store.path) as reader:
         poses = parse_observations(sessions_csv(reader, SOURCE.rig, ("a",)), SOURCE.rig, "poses")
     model = identify(SOURCE.rig, SOURCE.text, poses, effects="none")
