@@ -14,10 +14,10 @@ export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 # The tests start a hundred processes: each would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help environment setup demo deb debtest wheel check test long lint style types imports quick blind bench soak fuzz lock clean
+.PHONY: help environment setup demo deb debtest wheel check test long lint style types imports quick blind bench soak fuzz lock check-deps clean
 
 help: ## what there is to make
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
 
 environment:
 	@$(BOOTSTRAP) .venv requirements-dev.lock
@@ -100,6 +100,9 @@ COMPILE := $(BIN)/uv pip compile --no-config --quiet --universal --python-versio
 lock: environment ## write the lock files anew from pyproject.toml
 	echo 'setuptools>=77' | $(COMPILE) pyproject.toml - --output-file requirements.lock
 	$(COMPILE) pyproject.toml --extra dev --extra bench --constraints requirements.lock --output-file requirements-dev.lock
+
+check-deps: environment ## known vulnerabilities of the locked packages, where advisories can be reached
+	@$(BIN)/python -m tests.dependencies
 
 clean: ## remove everything that make has made
 	rm -rf .venv .cache build rigcal-demo rigcal-sim fuzz-faults htmlcov .coverage* *.egg-info

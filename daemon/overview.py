@@ -27,6 +27,12 @@ T = TypeVar("T")
 _EVENTS = 12  # the newest are shown in `status`
 
 
+def newest_latency(by_session: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | None:
+    """Return the latency of the last session that has one, with the session's name."""
+    known = [{"session": name, **found} for name, found in by_session.items() if "seconds" in found]
+    return known[-1] if known else None
+
+
 @dataclass(frozen=True)
 class Overview:
     """Gathers the state of all parts; may be asked from any thread.
@@ -35,6 +41,7 @@ class Overview:
         parts: rig and mode.
         store: open for writing.
         store_health, acquisition: tell of the store and of acquisition.
+        clock: tells of the computer's clock; None where it is not known, or is another one.
         alarms, notices, sessions, jobs, models, model_table: the parts.
     """
 
@@ -42,6 +49,7 @@ class Overview:
     store: Store
     store_health: Callable[[], StoreHealth]
     acquisition: Callable[[], AcquisitionStatus]
+    clock: Callable[[], dict[str, Any] | None]
     alarms: AlarmBoard
     notices: Notices
     sessions: SessionKeeper
@@ -70,11 +78,13 @@ class Overview:
             "alarms": self.alarms.status(),
             "notices": self.notices.status(),
             "acquisition": asdict(self.acquisition()),
+            "clock": self.clock(),
             "session": stored("session", self.sessions.open_session),
             "setup": stored("setup", lambda: _setup(setups.newest())),
             "control_shots": stored("control_shots", setups.newest_shots) or [],
             "jobs": stored("jobs", self.jobs.unfinished) or [],
             "job_counts": stored("job_counts", self.jobs.counts) or [],
+            "latency": stored("latency", lambda: newest_latency(self.jobs.latencies())),
             "models": stored("models", self.models.status),
             "gap": stored("gap", lambda: gap_status(self.jobs, self.model_table)),
             "events": stored("events", lambda: self.store.newest_events(_EVENTS)) or [],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import sqlite3
 import threading
@@ -25,6 +26,8 @@ from daemon.config import Config
 from daemon.control.protocol import reading_only
 from daemon.control.server import ControlServer
 from daemon.host.systemd import Notifier
+from daemon.host.time_service import CLOCK_SOCKET, clock_state
+from daemon.jobs.job_processes import JOBS_SOCKET
 from daemon.jobs.runner import JobRunner
 from daemon.models.live_model import LiveModel
 from daemon.models.live_tip import FRESH_S, LiveTip
@@ -32,6 +35,7 @@ from daemon.models.registry import ModelRegistry
 from daemon.models.tip_sender import TipSender
 from daemon.monitoring.metrics_server import MetricsServer
 from daemon.monitoring.notices import Notices
+from daemon.monitoring.time_watch import TimeWatch
 from daemon.overview import Overview
 from daemon.sessions.manager import SessionKeeper
 from daemon.sessions.station_setups import SetupBook
@@ -84,6 +88,9 @@ class Daemon:
         declare_channels(store, parts.rig)
         self._watch = StoreWatch(store, parts.clock)
         self._housekeeping = Housekeeping(store, parts.clock, keeping_of(config))
+        # Simulated and replayed rigs have a clock of their own.
+        read_clock = partial(clock_state, os.environ.get(CLOCK_SOCKET))
+        self._time = TimeWatch(read_clock, parts.clock) if parts.mode == "live" else None
         self._setups = SetupBook(parts.rig, store, parts.clock, config.sessions.control_tolerance_mm)
         self._sessions = SessionKeeper(
             parts.rig,
@@ -97,6 +104,7 @@ class Daemon:
             aim=parts.aim,
             limits=motion_limits(config),
             are_jobs_enabled=config.jobs.enabled,
+            clock_state=lambda: None if self._time is None else self._time.state,
         )
         models = ModelTable(store, parts.rig.name, parts.clock)
         self._live_model = LiveModel(models, parts.rig)
@@ -122,7 +130,14 @@ class Daemon:
             clock_watch=ClockWatch(before) if parts.mode == "live" else None,
             thinning=None if parts.mode == "replayed" else Thinning(self._sessions.is_of_session),
         )
-        self._jobs = JobRunner(store, config, parts.rig.name, parts.clock, is_held=self._are_jobs_held)
+        self._jobs = JobRunner(
+            store,
+            config,
+            parts.rig.name,
+            parts.clock,
+            jobs_socket=os.environ.get(JOBS_SOCKET),
+            is_held=self._are_jobs_held,
+        )
         self._job_table, self._model_table = JobTable(store, parts.rig.name), models
         self._servers: list[ControlServer] = []
         self._unserved: dict[str, str] = {}  # sockets that could not be made, and why
@@ -137,6 +152,7 @@ class Daemon:
             store,
             lambda: self._watch.health,
             self._acquisition.status,
+            lambda: None if self._time is None else self._time.status(),
             self._alarms,
             self._notices,
             self._sessions,
@@ -163,6 +179,7 @@ class Daemon:
             "is_store_new": lambda: is_store_new(self._job_table, self._config.models_directory),
             "untrained_sessions": sessions.untrained,
             "control_faults": self._control_faults,
+            "clock_lost": lambda: None if self._time is None else self._time.lost(),
             "notice_faults": self._notices.faults,
             "metrics_fault": lambda: None if self._metrics is None else self._metrics.trouble(),
         }
@@ -195,6 +212,8 @@ class Daemon:
             self._watch.start()
             self._housekeeping.start()
             self._notices.start()
+            if self._time is not None:
+                self._time.start()
             if self._sender is not None:
                 self._sender.start()
             if self._config.jobs.enabled:
@@ -226,7 +245,7 @@ class Daemon:
         budget = TimeBudget(STOP_S)
         stops = [server.close for server in self._servers]
         stops += [self._live_model.stop, self._jobs.stop, self._watch.stop, self._notices.stop, self._housekeeping.stop]
-        stops += [part.stop for part in (self._sender, self._metrics) if part is not None]
+        stops += [part.stop for part in (self._sender, self._metrics, self._time) if part is not None]
         others = [threading.Thread(target=_stop_part, args=(stop,), daemon=True) for stop in stops]
         for thread in others:
             thread.start()

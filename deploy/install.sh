@@ -34,6 +34,12 @@ complete() {
 
 place_files() {
     place rigcal.service /etc/systemd/system/rigcal.service
+    place rigcal-jobs.socket /etc/systemd/system/rigcal-jobs.socket
+    place rigcal-jobs@.service /etc/systemd/system/rigcal-jobs@.service
+    place rigcal-clock.socket /etc/systemd/system/rigcal-clock.socket
+    place rigcal-clock@.service /etc/systemd/system/rigcal-clock@.service
+    place system-rigcaljobs.slice /etc/systemd/system/system-rigcaljobs.slice
+    place network.conf /opt/rigcal/network.conf
     place rigcal.sysusers /etc/sysusers.d/rigcal.conf
     place rigcal.modules-load /etc/modules-load.d/rigcal.conf
     place rigcal.sysctl /etc/sysctl.d/60-rigcal.conf

@@ -13,7 +13,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtr
 
 from calibration.observations import Floats
 
@@ -66,6 +65,8 @@ def chance_of_mean(draws: Floats) -> float:
     """
     if len(draws) < 2 or (spread := float(draws.std(ddof=1))) == 0.0:
         return 1.0
+    from scipy.special import stdtr  # the daemon, which never tests anything, does without scipy
+
     return float(stdtr(len(draws) - 1, -draws.mean() / (spread / np.sqrt(len(draws)))))
 
 

@@ -40,6 +40,7 @@ class Evidence:
         notice_faults: ways out of the machine by which notices are not delivered at present -> why.
         untrained_sessions: closed sessions that nothing trains on -> why; those that newer ones make up for are not
             there.
+        clock_lost: when the computer's clock was last synchronised, if it no longer is.
         unwatched: rule or part of the evidence that has failed itself -> why.
     """
 
@@ -59,6 +60,7 @@ class Evidence:
     metrics_fault: str | None = None
     notice_faults: Mapping[str, str] = field(default_factory=dict)
     untrained_sessions: Mapping[str, str] = field(default_factory=dict)
+    clock_lost: Stamp | None = None
     unwatched: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -112,6 +114,7 @@ _PARTS = {
     "control_faults": "the control sockets",
     "metrics_fault": "the metrics",
     "notice_faults": "the notices",
+    "clock_lost": "the computer's clock",
 }
 
 

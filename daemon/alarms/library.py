@@ -43,8 +43,10 @@ The webhook gets a POST of a JSON object: `text` (all of it, as chat services sh
 `at_utc_ns`) and `unlisted`, how many older ones there are besides. A status of 2xx is a delivery, a redirection is not.
 
 The command is run without a shell, for at most 30 s, and gets an e-mail without recipients (RFC 5322) on its standard
-input. Exit status 0 is a delivery. As a service it runs in the service's sandbox: programs that speak SMTP themselves,
-such as msmtp, work; those that hand over to a local mail system by a set-group-ID program (Postfix' sendmail) do not.
+input. Exit status 0 is a delivery. The service's sandbox has no network until `network.conf` opens it to the address of
+the webhook or mail server ([deploy/README.md](../deploy/README.md#the-network)). The command runs in it too: programs
+that speak SMTP themselves, such as msmtp, work; those that hand over to a local mail system by a set-group-ID program
+(Postfix' sendmail) do not.
 
 This page is made from the rules in `daemon/alarms/rules`: `python -m daemon.alarms.library > docs/alarms.md`.
 """

@@ -7,6 +7,7 @@ from typing import Any
 
 from daemon.cli.client import utc, who
 from daemon.cli.terminal import echo
+from daemon.cli.time_lines import session_clock_lines
 from daemon.host.safe_output import duration
 from daemon.report.words import number
 
@@ -105,6 +106,8 @@ def show_session(session: Mapping[str, Any]) -> None:
         echo(f"  control point {shot['point']} at the {shot['phase']}: {size}")
     if session["state"] == "open" and not session["control_shots"]:
         echo("  no control point has been shot yet: `rigcal session shoot NAME`, now and again before the end")
+    for line in session_clock_lines(session):
+        echo(f"  {line}")
     for step in session["clock_steps"]:
         back = "back" if step["step_s"] < 0 else "forward"
         echo(f"  {utc(step['at_utc_ns'])}: the computer's clock was set {back} by {abs(step['step_s']):.1f} s")

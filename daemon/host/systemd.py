@@ -1,4 +1,4 @@
-"""systemd: log lines with a priority for its journal, and its readiness and watchdog protocol.
+"""systemd: log lines with a priority for its journal, what its sandbox forbids, its readiness and watchdog protocol.
 
 A log line may quote an instrument, a file or a client. So unsafe characters are escaped, a message is one line, and the
 lines of a traceback are indented: nothing that is quoted looks like a line of its own.
@@ -9,6 +9,7 @@ Sources: sd-daemon(3), sd_notify(3), systemd.exec(5).
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import os
 import re
@@ -102,6 +103,16 @@ def parse_line(line: str) -> tuple[int, str]:
     if found is None:
         return logging.WARNING, line
     return _PRIORITIES.get(found[1], logging.INFO if found[1] == "5" else logging.CRITICAL), found[2]
+
+
+def network_hint(error: object, environ: Mapping[str, str] = os.environ) -> str:
+    """Return what to do where the service's unit forbids a connection; "" for any other error and outside a service."""
+    is_forbidden = isinstance(error, socket.gaierror) or (
+        isinstance(error, OSError) and error.errno in (errno.EAFNOSUPPORT, errno.EPERM)
+    )
+    if not is_forbidden or "INVOCATION_ID" not in environ:  # of each service, systemd.exec(5)
+        return ""
+    return " (the service has no network unless network.conf opens it: `The network` in deploy/README.md)"
 
 
 # ---- readiness and watchdog ----------------------------------------------------------------------------------------

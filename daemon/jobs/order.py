@@ -1,7 +1,7 @@
 """The messages between the daemon and a job's process: an order one way, a JSON object a line the other.
 
-The process tells any number of `{"progress": 0.3, "message": "..."}` and last `{"result": {...}}` or
-`{"error": "..."}`.
+The process tells its number first, `{"pid": 4711}`, then any number of `{"progress": 0.3, "message": "..."}` and last
+`{"result": {...}}` or `{"error": "..."}`.
 """
 
 from __future__ import annotations
@@ -67,6 +67,17 @@ class Order:
 
 
 @dataclass(frozen=True)
+class Started:
+    """The beginning of a job.
+
+    Attributes:
+        pid: of its process.
+    """
+
+    pid: int
+
+
+@dataclass(frozen=True)
 class Progress:
     """Progress of a job.
 
@@ -94,13 +105,15 @@ class Outcome:
     result: Mapping[str, Any] | None = None
 
 
-def parse_message(line: bytes) -> Progress | Outcome:
+def parse_message(line: bytes) -> Started | Progress | Outcome:
     """Return the message of a job's process in one line; a line that is no message is a job that failed."""
     try:
         message = json.loads(line)
     except (ValueError, RecursionError):
         message = None
     match message:
+        case {"pid": int() as pid}:
+            return Started(pid)
         case {"progress": float() | int() as share, "message": str() as text} if -math.inf < share < math.inf:
             return Progress(float(min(max(share, 0), 1)), text)
         case {"result": dict() as result}:

@@ -22,6 +22,7 @@ import numpy as np
 from calibration.errors import CalibrationError, DataError, ModelError, UnsafeError
 from calibration.evaluation.drift import check
 from calibration.evaluation.evaluation import evaluate
+from calibration.evaluation.latency import Latency, estimate_latency
 from calibration.evaluation.promotion import compare_held_out
 from calibration.model.model import CalibratedModel
 from calibration.observations import Observations, parse_observations
@@ -69,6 +70,7 @@ def main() -> int:
         tell.write(json.dumps(message) + "\n")
         tell.flush()
 
+    say({"pid": os.getpid()})
     try:
         result = perform(order, lambda share, text: say({"progress": share, "message": text}))
     except Exception as error:
@@ -88,7 +90,8 @@ def perform(order: Order, progress: Progress) -> dict[str, Any]:
     Returns:
         The result that the store keeps: of a new model `model` (its directory), `manifest_sha256`, `stage`, `metrics`,
         `sessions`, and for one of the gap workflow `gap` (the object of `rigcal gap`), `sentence` and `report` (the
-        file); for a report `report` (the file) and `evaluation` (the object of `rigcal evaluate`); for a comparison
+        file); for a report `report` (the file) and `evaluation` (the object of `rigcal evaluate`) and
+        `latency` (session -> latency of its fixes); for a comparison
         `comparison`; for drift `drift`.
 
     Raises:
@@ -202,7 +205,22 @@ def _report(order: Order, progress: Progress) -> dict[str, Any]:
         "sessions": list(order.train_ids),
         "held_out": held_out is not None,
         "evaluation": judged.as_dict(0.0),
+        "latency": _latencies(order, model),
     }
+
+
+def _latencies(order: Order, model: CalibratedModel) -> dict[str, dict[str, Any]]:
+    """The latency of each session's fixes against the joints, or the `reason` why it is not known."""
+    found: dict[str, dict[str, Any]] = {}
+    for name in (*order.train_ids, *order.session_ids):
+        try:
+            with _store(order) as reader:
+                data = sessions_csv(reader, model.rig, (name,), moving=True)
+            latency = estimate_latency(model, parse_observations(data, model.rig, f"fixes of {name} on the move"))
+        except CalibrationError as error:
+            latency = str(error)
+        found[name] = asdict(latency) if isinstance(latency, Latency) else {"reason": latency}
+    return found
 
 
 def _compare(order: Order, progress: Progress) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from daemon.commands import REFUSED, CommandError
 from daemon.config import Config
 from daemon.jobs.child import JOB_COMMAND, JobChild
 from daemon.jobs.job_queue import CANCELLED, STOPPED, JobQueue
-from daemon.jobs.order import Outcome
+from daemon.jobs.order import Outcome, Started
 from daemon.jobs.scheduler import DueChain, DueComparison, due_jobs, next_job, spent_jobs
 from daemon.store.errors import LACKING
 from daemon.store.jobs import JobFacts
@@ -40,6 +40,7 @@ class JobRunner:
         rig_name: whose sessions are used.
         clock: time.
         command: what carries out an order, with the protocol of `daemon.jobs.order`.
+        jobs_socket: where systemd listens, to start each job as a unit of its own; None: jobs are children.
         is_held: true while nothing may be started.
         work_clock: of the computer; work takes real time, whatever the rig's clock does.
     """
@@ -52,13 +53,14 @@ class JobRunner:
         clock: Clock,
         *,
         command: Sequence[str] = JOB_COMMAND,
+        jobs_socket: str | None = None,
         is_held: Callable[[], bool] = lambda: False,
         work_clock: Clock | None = None,
     ) -> None:
         self._settings = config.jobs
         self._config = config
         self._clock = clock
-        self._command = command
+        self._command, self._jobs_socket = command, jobs_socket
         self._is_held = is_held
         self._work_clock = work_clock or SystemClock()
         self._host_boot = self._work_clock.now().boot_id
@@ -175,8 +177,9 @@ class JobRunner:
     def _perform(self, job: JobFacts) -> None:
         """Run one job to its end."""
         log.info("job %d (%s for session %s) starts", job.id, job.kind, job.session_id)
-        with JobChild(self._queue.order(job, self._config), self._command) as child:
-            self._queue.note_process(job.id, child.pid)
+        with JobChild(self._queue.order(job, self._config), self._command, self._jobs_socket) as child:
+            if child.pid is not None:
+                self._queue.note_process(job.id, child.pid)
             outcome = self._follow(job.id, child)
         is_cut_off = outcome.state == "failed" and self._is_store_gone()
         if is_cut_off:  # its process read another store than the daemon's, or none: it waits until the file is back
@@ -207,5 +210,7 @@ class JobRunner:
             message = child.next_message(LISTEN_S)
             if isinstance(message, Outcome):
                 return message
-            if message is not None:
+            if isinstance(message, Started):
+                self._queue.note_process(job_id, message.pid)
+            elif message is not None:
                 self._queue.note_progress(job_id, message)

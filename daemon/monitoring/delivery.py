@@ -17,6 +17,7 @@ from typing import IO, Any, Protocol
 from urllib.parse import urlsplit
 
 from daemon.host.safe_output import shown
+from daemon.host.systemd import network_hint
 from daemon.monitoring.notice import Message
 
 WEBHOOK_TIMEOUT_S = 10.0
@@ -154,4 +155,4 @@ def _memory_file() -> IO[bytes]:
 
 def _reason(error: object) -> str:
     text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-    return shown(text or type(error).__name__, _QUOTED)
+    return shown(text or type(error).__name__, _QUOTED) + network_hint(error)

@@ -74,6 +74,14 @@ def _candidate(status: Status) -> float:
     return 0.0 if candidate is None else float(candidate["is_acceptable"])
 
 
+def _latency(key: str) -> Callable[[Status], Iterable[Sample]]:
+    return lambda s: [((s["latency"]["session"],), s["latency"][key])] if s["latency"] else []
+
+
+def _clock(status: Status) -> Mapping[str, Any]:
+    return status["clock"] or {}
+
+
 def _drift(status: Status) -> Mapping[str, Any]:
     return (status["gap"] or {}).get("drift") or {}
 
@@ -233,6 +241,21 @@ FAMILIES: tuple[Family, ...] = (
         ("station",),
         _stations(lambda one: one["good_age_s"]),
     ),
+    Family(
+        "rigcal_station_latency_seconds",
+        "gauge",
+        "Latency of the station's fixes against the joints' readings beyond link_delay_s, of the newest session that "
+        "told it.",
+        ("session",),
+        _latency("seconds"),
+    ),
+    Family(
+        "rigcal_station_latency_error_seconds",
+        "gauge",
+        "Standard error of rigcal_station_latency_seconds.",
+        ("session",),
+        _latency("standard_error_s"),
+    ),
     # ---- the store
     Family(
         "rigcal_writer_lag_seconds",
@@ -268,6 +291,28 @@ FAMILIES: tuple[Family, ...] = (
         "Free space on the disk of the store.",
         (),
         _one(lambda s: s["store_health"]["free_bytes"]),
+    ),
+    # ---- the computer's clock
+    Family(
+        "rigcal_clock_synchronized",
+        "gauge",
+        "1 while a time service keeps the computer's clock; absent where nothing tells.",
+        (),
+        _one(lambda s: _is(_clock(s).get("is_synchronized"))),
+    ),
+    Family(
+        "rigcal_clock_offset_seconds",
+        "gauge",
+        "By how much the computer's clock is ahead of its time service's estimate.",
+        (),
+        _one(lambda s: _clock(s).get("offset_s")),
+    ),
+    Family(
+        "rigcal_clock_max_error_seconds",
+        "gauge",
+        "Greatest error that the computer's clock may have, as its time service or the kernel tells.",
+        (),
+        _one(lambda s: _clock(s).get("max_error_s")),
     ),
     # ---- sessions, jobs, models
     Family(
@@ -376,7 +421,8 @@ where the configuration has
     port = 9750
 
 at `http://127.0.0.1:9750/metrics`. It listens on the loopback interface alone: a collector on the rig's computer
-(Prometheus itself, its agent mode, Grafana Alloy, Telegraf) reads it and takes it further. Counters count since the
+(Prometheus itself, its agent mode, Grafana Alloy, Telegraf) reads it and takes it further. The service has no network
+until `network.conf` opens it ([deploy/README.md](../deploy/README.md#the-network)). Counters count since the
 daemon's start. All of it is in `rigcal status --json` too; besides stand the `process_` metrics of the official Python
 client (memory, descriptors, CPU time).
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 from wsgiref.simple_server import WSGIServer
 
+from daemon.host.systemd import network_hint
 from daemon.monitoring.metrics import FAMILIES, Status
 from drivers.clock import NS_PER_S, SystemClock
 
@@ -91,9 +92,10 @@ class MetricsServer:
             self._served = start_http_server(self._wanted, addr=HOST, registry=self._registry)
         except OSError as error:
             self._next_ns = now_ns + round(RETRY_S * NS_PER_S)
-            if self._trouble is None:
-                log.error("metrics cannot be served at %s:%d: %s", HOST, self._wanted, error.strerror)
-            self._trouble = f"metrics cannot be served at {HOST}:{self._wanted}: {error.strerror}"
+            was_told = self._trouble is not None
+            self._trouble = f"metrics cannot be served at {HOST}:{self._wanted}: {error.strerror}{network_hint(error)}"
+            if not was_told:
+                log.error("%s", self._trouble)
         else:
             self._trouble = None
             log.info("metrics are served at http://%s:%d/metrics", HOST, self._served[0].server_port)

@@ -8,9 +8,10 @@ Each change is one transaction.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from daemon.commands import CommandError, caller_columns
+from daemon.host.time_service import ClockState
 from daemon.sessions.open_session import OpenSession
 from daemon.store.jobs import JobTable
 from daemon.store.sessions import SessionTable, preset_jumps
@@ -33,13 +34,22 @@ class SessionLifecycle:
         rig_name: whose sessions are opened.
         clock: time of the changes.
         tolerance_mm: a control point further off than this says that the station moved.
+        clock_state: returns how the computer's clock is; None where it is not that of the session.
 
     Attributes:
         table: of the sessions.
     """
 
-    def __init__(self, store: Store, rig_name: str, clock: Clock, tolerance_mm: float) -> None:
+    def __init__(
+        self,
+        store: Store,
+        rig_name: str,
+        clock: Clock,
+        tolerance_mm: float,
+        clock_state: Callable[[], ClockState | None] = lambda: None,
+    ) -> None:
         self._store, self._rig, self._clock, self._tolerance_mm = store, rig_name, clock, tolerance_mm
+        self._clock_state = clock_state
         self.table = SessionTable(store, rig_name)
         self._jobs = JobTable(store, rig_name)
 
@@ -71,6 +81,17 @@ class SessionLifecycle:
                 jumped.setdefault(jump.device, jump.at)
         return jumped
 
+    def start(self, started: Stamp, session_id: str, **columns: object) -> None:
+        """Add an open session."""
+        with self._store.transaction():
+            self.table.start(started, id=session_id, **columns)
+            self._note_clock(session_id, "start")
+
+    def _note_clock(self, session_id: str, phase: str) -> None:
+        state = self._clock_state()
+        if state is not None:
+            self.table.note_clock(session_id, phase, state)
+
     def end(self, session_id: str, state: str) -> Stamp:
         """Close or abort a session.
 
@@ -81,6 +102,7 @@ class SessionLifecycle:
             ended = self._clock.now()  # in the transaction: the writer's thread may have held the store for long
             excluded = self._why_not_used(session_id) if state == "closed" else None
             self.table.change(session_id, state=state, excluded=excluded, **self._store.instant(ended, "ended_"))
+            self._note_clock(session_id, "end")
         return ended
 
     def judge_again(self, session_id: str) -> None:

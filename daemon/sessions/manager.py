@@ -28,6 +28,7 @@ from daemon.commands import (
 from daemon.config import SessionsSection
 from daemon.sessions.advice import SessionAdvice, after_a_move
 from daemon.sessions.control_shot import Shot
+from daemon.host.time_service import ClockState
 from daemon.sessions.lifecycle import SessionLifecycle
 from daemon.sessions.open_session import OpenSession
 from daemon.sessions.prism_guard import MotionLimit, Suspicion
@@ -64,6 +65,7 @@ class SessionKeeper:
             operator does it.
         limits: station -> what motion can do to its prism.
         are_jobs_enabled: closed sessions start jobs.
+        clock_state: returns how the computer's clock is, to be noted with a session; None where it is another clock.
     """
 
     def __init__(
@@ -80,11 +82,12 @@ class SessionKeeper:
         aim: Callable[[str], None] | None = None,
         limits: Mapping[str, MotionLimit] | None = None,
         are_jobs_enabled: bool = True,
+        clock_state: Callable[[], ClockState | None] = lambda: None,
     ) -> None:
         self._rig, self._rig_text = rig, rig_text
         self._store, self._joiner, self._settings, self._clock = store, joiner, settings, clock
         self._setups, self._run_id, self._are_jobs_enabled = setups, run_id, are_jobs_enabled
-        self._lifecycle = SessionLifecycle(store, rig.name, clock, settings.control_tolerance_mm)
+        self._lifecycle = SessionLifecycle(store, rig.name, clock, settings.control_tolerance_mm, clock_state)
         self._table, self._jobs = self._lifecycle.table, JobTable(store, rig.name)
         self._aim = aim
         self._commands = threading.Lock()
@@ -238,7 +241,6 @@ class SessionKeeper:
                 self._aim(prism)
             now = self._clock.now()
             row = {
-                "id": session_id,
                 "rig_sha256": hashlib.sha256(self._rig_text.encode()).hexdigest(),
                 "rig_text": self._rig_text,
                 "setup_id": setup_id,
@@ -251,7 +253,7 @@ class SessionKeeper:
             order = self._store.order
             session = OpenSession(session_id, setup_id, prism, kind, order, now, control_points=points)
             self._prisms.begin(session)
-            self._table.start(now, **row)
+            self._lifecycle.start(now, session_id, **row)
             self._open = session
             if self._aim is not None:
                 self._prisms.turned(session, now)
@@ -330,7 +332,8 @@ class SessionKeeper:
         """One session: what it holds, what was excluded and why, how its set-up kept its place, and its jobs."""
         session_id = str(arguments.get("id", ""))
         session = self._table.summary(session_id)
-        return session | {"jobs": self._jobs.of_session(session_id)} | self._without_job(session)
+        about = {"jobs": self._jobs.of_session(session_id), "latency": self._jobs.latencies().get(session_id)}
+        return session | about | self._without_job(session)
 
     def _without_job(self, session: Mapping[str, Any]) -> dict[str, str | None]:
         return {"no_job": why_no_job(session, self._jobs, are_jobs_enabled=self._are_jobs_enabled)}

@@ -16,21 +16,21 @@ from calibration.table import LABEL_COLUMNS, POSITION_COLUMNS, SIGMA_COLUMNS
 from daemon.report.inputs import ControlPoint, SetupLine
 from daemon.sessions.steady_time import SteadyTime
 from daemon.store.reader import Reader
-from daemon.store.sessions import first_observation_ns, observations, session
+from daemon.store.sessions import first_observation_ns, moving_observations, observations, session
 from daemon.store.setups import misclosures, setups_of
 from drivers.clock import NS_PER_S, Stamp
 
 Misclosure = tuple[float, float, float]
 
 
-def sessions_csv(reader: Reader, rig: Rig, session_ids: Sequence[str]) -> bytes:
-    """Observations of the given sessions that calibration may use, oldest first.
+def sessions_csv(reader: Reader, rig: Rig, session_ids: Sequence[str], *, moving: bool = False) -> bytes:
+    """Observations of the given sessions that calibration may use, oldest first; with `moving` those of a moving boom.
 
     `time_s` counts from the store's first observation that calibration may use, on UTC, steady within a session:
     sessions may lie boots apart. It is the same whichever sessions are asked for: what a model has learned from some of
     them depends on time (a jump, a base that settles), and is applied to others.
     """
-    rows = observations(reader, session_ids)
+    rows = (moving_observations if moving else observations)(reader, session_ids)
     values = [json.loads(row["values_json"]) for row in rows]
     joints = [joint.column for joint in rig.joints]
     more = sorted({name for row in values for name in row} - set(joints))

@@ -202,6 +202,11 @@ class JobTable:
         found = self._store.rows(_NEWEST, (kind, state, self._rig))
         return found[0] | {"result": _result(found[0])} if found else None
 
+    def latencies(self) -> dict[str, dict[str, Any]]:
+        """Session -> latency of its fixes against the joints, of the newest report; empty before one."""
+        report = self.newest(JobKind.REPORT, "done")
+        return {} if report is None else dict(report["result"].get("latency", {}))
+
     def has_done(self, kind: JobKind) -> bool:
         """True if a job of a kind was ever done."""
         return bool(self._store.rows(_NEWEST, (kind, "done", self._rig)))

@@ -370,6 +370,19 @@ def m020_notices(db: Database) -> None:
     )
 
 
+@MIGRATIONS()
+def m028_session_clocks(db: Database) -> None:
+    """How the computer's clock was when a session began and ended, as its time service told."""
+    _create(
+        db,
+        # synchronized: NULL where nothing told. offset_s: by how much the clock was ahead; NULL where nothing told.
+        f"""CREATE TABLE session_clocks (session_id TEXT NOT NULL REFERENCES calibration_sessions(id),
+            {_one_of("phase", "start", "end")}, synchronized INTEGER CHECK (synchronized IN (0, 1)), offset_s REAL,
+            max_error_s REAL, source TEXT NOT NULL, error TEXT NOT NULL,
+            PRIMARY KEY (session_id, phase)) STRICT, WITHOUT ROWID""",
+    )
+
+
 def unknown_migrations(db: Database) -> list[str]:
     """Migrations that `db` has and this program does not know: it was made by a newer one."""
     empty = Database(memory=True)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
+from daemon.host.time_service import ClockState
 from daemon.store.connection import Connection
 from daemon.store.errors import NotInStoreError
 from daemon.store.rows import RowSource
@@ -52,6 +53,8 @@ _CLOCK_STEPS = f"""{_INSTANTS},
     steps AS (SELECT utc_ns, CASE WHEN is_same_boot THEN passed_ns - true_ns ELSE min(passed_ns, 0) END AS step_ns
         FROM pairs WHERE passed_ns IS NOT NULL)
     SELECT utc_ns AS at_utc_ns, step_ns FROM steps WHERE abs(step_ns) >= {CLOCK_STEP_NS}"""
+_CLOCKS = """SELECT phase, synchronized AS is_synchronized, offset_s, max_error_s, source, error
+    FROM session_clocks WHERE session_id = ?"""
 # Poses, and those between two shots of a control point. Where the boom moves, each observation is a pose of its own.
 _ENCLOSED = """SELECT count(DISTINCT coalesce(o.pose, o.id)) AS poses,
         count(DISTINCT CASE WHEN EXISTS (SELECT 1 FROM control_shots AS a JOIN control_shots AS b
@@ -71,6 +74,8 @@ _EXCLUDE = "UPDATE observations SET excluded = ? WHERE session_id = ? AND boot_i
 _OBSERVATIONS = """SELECT session_id, setup_id, prism, pose, utc_ns, monotonic_ns, boot_id, x_mm, y_mm, z_mm,
         sigma_x_mm, sigma_y_mm, sigma_z_mm, dwell_s, values_json
     FROM observations WHERE excluded IS NULL AND session_id IN ({}) ORDER BY id"""
+# Fixes of a moving boom; those of poses leave them out, for that reason alone.
+_MOVING = _OBSERVATIONS.replace("excluded IS NULL", "moving AND coalesce(excluded, 'moving') = 'moving'")
 # All that a station gave in a session from the last fix that calibration may use, or from the session's start.
 _FIXES = """SELECT fixes.* FROM fixes,
         (SELECT started_boot_id, started_monotonic_ns FROM calibration_sessions WHERE id = ?1)
@@ -216,6 +221,12 @@ class SessionTable:
         row = {**columns, "rig": self._rig, "state": "open", **self._store.instant(started, "started_")}
         self._store.insert("calibration_sessions", row)
 
+    def note_clock(self, session_id: str, phase: str, state: ClockState) -> None:
+        """Add how the computer's clock is at a session's `start` or `end`."""
+        told = asdict(state)
+        row = {"session_id": session_id, "phase": phase, "synchronized": told.pop("is_synchronized"), **told}
+        self._store.insert("session_clocks", row)
+
     def change(self, session_id: str, **columns: object) -> None:
         """Change columns of a session."""
         self._store.update("calibration_sessions", {"id": session_id}, columns)
@@ -295,6 +306,11 @@ def observations(source: RowSource, session_ids: Sequence[str]) -> list[dict[str
     return list(source.rows(_OBSERVATIONS.format(_marks(session_ids)), session_ids))
 
 
+def moving_observations(source: RowSource, session_ids: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the observations of sessions that were made while the boom moved and have no other fault."""
+    return list(source.rows(_MOVING.format(_marks(session_ids)), session_ids))
+
+
 def all_sessions(source: RowSource) -> list[dict[str, Any]]:
     """Return every session without its rig file, oldest first."""
     return list(
@@ -370,9 +386,19 @@ def _summary(source: RowSource, session_id: str) -> dict[str, Any]:
         "accepted": accepted if accepted["despite"] is not None else None,
         "excluded": {e["reason"]: e["n"] for e in source.rows(_EXCLUDED, (session_id,))},
         "control_shots": list(source.rows(_SHOTS, (session_id,))),
+        "clock": _clocks(source, session_id),
         "clock_steps": steps,
         "utc_ran_backwards": any(step["step_s"] < 0 for step in steps),
     }
+
+
+def _clocks(source: RowSource, session_id: str) -> dict[str, dict[str, Any] | None]:
+    """Return how the computer's clock was at a session's start and end; None where that was not noted."""
+    found: dict[str, dict[str, Any] | None] = {"start": None, "end": None}
+    for row in source.rows(_CLOCKS, (session_id,)):
+        phase, flag = row.pop("phase"), row["is_synchronized"]
+        found[phase] = {**row, "is_synchronized": None if flag is None else bool(flag)}
+    return found
 
 
 def _clock_steps(source: RowSource, session_id: str) -> list[dict[str, Any]]:

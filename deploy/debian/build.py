@@ -45,6 +45,12 @@ BUILD_ONLY = {"pip", "setuptools"}
 # Of deploy/: where a package has it. Those of /etc are edited by the site, and kept.
 FILES = {
     "rigcal.service": "usr/lib/systemd/system/rigcal.service",
+    "rigcal-jobs.socket": "usr/lib/systemd/system/rigcal-jobs.socket",
+    "rigcal-jobs@.service": "usr/lib/systemd/system/rigcal-jobs@.service",
+    "rigcal-clock.socket": "usr/lib/systemd/system/rigcal-clock.socket",
+    "rigcal-clock@.service": "usr/lib/systemd/system/rigcal-clock@.service",
+    "system-rigcaljobs.slice": "usr/lib/systemd/system/system-rigcaljobs.slice",
+    "network.conf": "usr/share/doc/rigcal/network.conf",
     "rigcal.sysusers": "usr/lib/sysusers.d/rigcal.conf",
     "rigcal.modules-load": "usr/lib/modules-load.d/rigcal.conf",
     "rigcal.sysctl": "usr/lib/sysctl.d/60-rigcal.conf",
@@ -160,10 +166,9 @@ def build_package(source: Source, wheel: Path, release: int, out: Path) -> Path:
         _fill_environment(root / HOME, source, wheel, python)
         for name, place in FILES.items():
             _put(root / place, (source.tree / "deploy" / name).read_bytes())
-        unit = root / FILES["rigcal.service"]
-        unit.write_text(
-            unit.read_text(encoding="utf-8").replace("/opt/rigcal/venv/bin/", "/usr/bin/"), encoding="utf-8"
-        )
+        for unit in (root / "usr/lib/systemd/system").glob("*.service"):
+            text = unit.read_text(encoding="utf-8").replace("/opt/rigcal/venv/bin/", f"/{HOME}/bin/")
+            unit.write_text(text, encoding="utf-8")
         _link(root / "usr/bin/rigcal", "../lib/rigcal/bin/rigcal")
         for shell, place in COMPLETIONS.items():
             _put(root / place, completion(source.tree, shell))

@@ -31,6 +31,7 @@ SCRIPT = """
 import json, os, pathlib, subprocess, sys, time
 directory = pathlib.Path(sys.argv[1])
 order = json.loads(sys.stdin.readline())
+print(json.dumps({"pid": os.getpid()}), flush=True)
 with (directory / "orders.jsonl").open("a") as file:
     file.write(json.dumps(order) + "\\n")
 say = lambda message: print(json.dumps(message), flush=True)
@@ -150,8 +151,8 @@ class JobRig:
         seed = 20 + kind.count(CHECK)
         self.observed(name, simulate_observations(truth, poses, seed, setup="S1", prisms=prisms))
 
-    def observed(self, session: str, data: SimulatedObservations) -> None:
-        """Observations of a session."""
+    def observed(self, session: str, data: SimulatedObservations, *, moving: bool = False) -> None:
+        """Observations of a session; those of a moving boom are left out of one of standing poses."""
         columns = {name: values.tolist() for name, values in data.columns.items()}
         numeric = [name for name in columns if name not in LABELS]
         with self.store.transaction():
@@ -159,9 +160,11 @@ class JobRig:
                 row = {
                     "session_id": session,
                     "setup_id": "S1",
-                    "moving": False,
+                    "moving": moving,
+                    "excluded": "moving" if moving else None,
                     **self.store.instant(START.shifted(round(columns["time_s"][i] * NS_PER_S))),
-                    **{name: columns[name][i] for name in ("prism", "pose", "x_mm", "y_mm", "z_mm", "dwell_s")},
+                    **{name: columns[name][i] for name in ("prism", "x_mm", "y_mm", "z_mm", "dwell_s")},
+                    "pose": None if moving else columns["pose"][i],
                     "values_json": {name: columns[name][i] for name in numeric},
                 }
                 self.store.insert("observations", row)
@@ -172,6 +175,11 @@ class JobRig:
         """What processes of each kind of job do from now on; those not named get done."""
         (self.directory / "plan.json").write_text(json.dumps(kinds), encoding="utf-8")
 
+    @property
+    def scripted(self) -> tuple[str, ...]:
+        """Command of a process that follows the plan."""
+        return (sys.executable, "-I", "-S", "-c", SCRIPT, str(self.directory))
+
     def start(
         self,
         *,
@@ -180,13 +188,20 @@ class JobRig:
         rig: str = "swdt82",
         is_held: Callable[[], bool] = lambda: False,
         boot: str = "boot-a",
+        jobs_socket: Path | None = None,
     ) -> JobRunner:
         """A new runner, as after a start of the daemon in a boot of the computer; all waits have passed."""
         self.clock.advance(100.0)
-        scripted = (sys.executable, "-I", "-S", "-c", SCRIPT, str(self.directory))
-        command = JOB_COMMAND if real else command or scripted
+        command = JOB_COMMAND if real else command or self.scripted
         self.runner = JobRunner(
-            self.store, self.config, rig, self.clock, command=command, is_held=is_held, work_clock=BootClock(boot)
+            self.store,
+            self.config,
+            rig,
+            self.clock,
+            command=command,
+            jobs_socket=None if jobs_socket is None else str(jobs_socket),
+            is_held=is_held,
+            work_clock=BootClock(boot),
         )
         self.runner.start()
         return self.runner

@@ -13,6 +13,7 @@ from typing import Any
 from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_inputs
 from daemon.commands import CommandError
 from daemon.config import SessionsSection, load_rig
+from daemon.host.time_service import ClockState
 from daemon.sessions.manager import SessionKeeper
 from daemon.sessions.station_setups import SetupBook
 from daemon.store.store import Store
@@ -44,6 +45,7 @@ class Rig:
         self.values = {j.name: sum(j.limits) / 2 for j in SOURCE.rig.joints}
         self.target_mm = (3000.0, 8000.0, 1000.0)
         self.aimed: list[str] = []
+        self.clock_state: ClockState | None = None  # of the computer
         self.setups = SetupBook(SOURCE.rig, self.store, self.clock, SessionsSection().control_tolerance_mm)
         self.keeper = self.new_keeper()
 
@@ -59,6 +61,7 @@ class Rig:
             self.clock,
             run_id=1,
             aim=aim,
+            clock_state=lambda: self.clock_state,
         )
 
     def live(self, seconds: float, **rates: float) -> None:

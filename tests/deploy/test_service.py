@@ -9,9 +9,21 @@ from pathlib import Path
 
 import pytest
 
+from daemon.host import time_service
+from daemon.host.time_service import CLOCK_SOCKET
+from daemon.jobs.child import JOB_COMMAND
+from daemon.jobs.job_processes import JOBS_SOCKET
 from tests.deploy.conftest import DEPLOY, program, run
 
 UNIT = Path("etc/systemd/system/rigcal.service")
+UNITS = (
+    "rigcal.service",
+    "rigcal-jobs.socket",
+    "rigcal-jobs@0.service",
+    "system-rigcaljobs.slice",
+    "rigcal-clock.socket",
+    "rigcal-clock@0.service",
+)
 
 
 def settings(unit: Path) -> dict[str, list[str]]:
@@ -30,19 +42,20 @@ def rig_computer(installed: Path) -> Path:
         path for path in (Path("/usr/lib/systemd/system"), Path("/lib/systemd/system")) if path.exists()
     )
     shutil.copytree(system_units, installed / "usr/lib/systemd/system", symlinks=True)
-    executable = installed / "opt/rigcal/venv/bin/rigcal"
-    executable.parent.mkdir(parents=True)
-    executable.write_text("#!/bin/sh\n", encoding="utf-8")
-    executable.chmod(0o755)
+    for name in ("rigcal", "python"):
+        executable = installed / "opt/rigcal/venv/bin" / name
+        executable.parent.mkdir(parents=True, exist_ok=True)
+        executable.write_text("#!/bin/sh\n", encoding="utf-8")
+        executable.chmod(0o755)
     return installed
 
 
 def verify(root: Path) -> str:
-    result = run(program("systemd-analyze", "systemd"), "verify", "--man=no", f"--root={root}", "rigcal.service")
+    result = run(program("systemd-analyze", "systemd"), "verify", "--man=no", f"--root={root}", *UNITS)
     return result.stdout + (f"\nexit status {result.returncode}" if result.returncode else "")
 
 
-def test_systemd_has_nothing_to_say_about_the_unit(rig_computer: Path) -> None:
+def test_systemd_has_nothing_to_say_about_the_units(rig_computer: Path) -> None:
     assert verify(rig_computer) == ""
 
 
@@ -57,16 +70,53 @@ def test_the_check_sees_a_program_that_is_not_where_the_unit_says(rig_computer: 
     assert "/opt/rigcal/venv/bin/rigcal is not executable" in verify(rig_computer)
 
 
-def test_the_service_is_exposed_little() -> None:
-    result = run(
-        program("systemd-analyze", "systemd"),
-        "security",
-        "--no-pager",
-        "--offline=true",
-        "--threshold=25",
-        DEPLOY / "rigcal.service",
-    )
+@pytest.mark.parametrize(
+    ("unit", "tenths"), [("rigcal.service", 15), ("rigcal-jobs@0.service", 5), ("rigcal-clock@0.service", 15)]
+)
+def test_the_services_are_exposed_little(installed: Path, unit: str, tenths: int) -> None:
+    options = ("--no-pager", "--offline=true", f"--threshold={tenths}", f"--root={installed}")
+    result = run(program("systemd-analyze", "systemd"), "security", *options, unit)
     assert result.returncode == 0, result.stdout
+
+
+def test_the_check_sees_a_service_that_is_more_exposed(installed: Path) -> None:
+    unit = installed / UNIT
+    unit.write_text(unit.read_text(encoding="utf-8").replace("PrivateMounts=yes\n", ""), encoding="utf-8")
+    options = ("--no-pager", "--offline=true", "--threshold=15", f"--root={installed}")
+    assert run(program("systemd-analyze", "systemd"), "security", *options, "rigcal.service").returncode != 0
+
+
+def test_jobs_are_a_unit_of_their_own_with_less_of_the_computer_than_acquisition() -> None:
+    job, slice_ = settings(DEPLOY / "rigcal-jobs@.service"), settings(DEPLOY / "system-rigcaljobs.slice")
+    service, listener = settings(DEPLOY / "rigcal.service"), settings(DEPLOY / "rigcal-jobs.socket")
+    assert job["Slice"] == ["system-rigcaljobs.slice"]  # within system.slice, where rigcal.service is: weights compare
+    assert int(slice_["CPUWeight"][0]) * 10 <= int(service["CPUWeight"][0])
+    assert "MemoryMax" in slice_
+    assert int(job["Nice"][0]) > 0
+    assert f"{JOBS_SOCKET}={listener['ListenStream'][0]}" in service["Environment"]
+    assert (listener["SocketUser"], listener["SocketMode"]) == (service["User"], ["0600"])
+    assert job["ExecStart"][0].split()[-2:] == [*JOB_COMMAND[-2:]]
+    for both in ("User", "Group", "UMask", "StateDirectory", "CacheDirectory"):
+        assert job[both] == service[both]
+
+
+def test_the_clock_is_read_by_a_unit_that_cannot_set_it() -> None:
+    service, reader = settings(DEPLOY / "rigcal.service"), settings(DEPLOY / "rigcal-clock@.service")
+    (path,) = settings(DEPLOY / "rigcal-clock.socket")["ListenStream"]
+    assert f"{CLOCK_SOCKET}={path}" in service["Environment"]
+    assert reader["ExecStart"][0].split()[-2:] == ["-m", time_service.__name__]
+    assert reader["CapabilityBoundingSet"] == [""]
+    assert reader["NoNewPrivileges"] == ["yes"]
+
+
+def test_network_conf_opens_loopback(rig_computer: Path) -> None:
+    drop_in = rig_computer / "etc/systemd/system/rigcal.service.d/network.conf"
+    drop_in.parent.mkdir()
+    shutil.copy(DEPLOY / "network.conf", drop_in)
+    assert verify(rig_computer) == ""
+    families = settings(DEPLOY / "network.conf")["RestrictAddressFamilies"]
+    assert families == ["AF_INET AF_INET6"]  # added to those of the unit, which has no network
+    assert "INET" not in settings(DEPLOY / "rigcal.service")["RestrictAddressFamilies"][0]
 
 
 def test_a_failing_service_is_restarted_for_ever() -> None:

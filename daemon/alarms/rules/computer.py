@@ -38,6 +38,22 @@ def clock_behind(evidence: Evidence) -> Iterator[Finding]:
         yield "clock", f"the computer's clock stands at an earlier time than {last}, when rigcal last ran"
 
 
+@rule(
+    "warning",
+    "Look after the time service and its network (`chronyc tracking`, `timedatectl`); where the rig has none any more, "
+    "restarting rigcal ends the alarm. Records are ordered by another clock, and lose nothing.",
+    after_s=600.0,
+)
+def clock_unsynchronized(evidence: Evidence) -> Iterator[Finding]:
+    """A time service kept the computer's clock in this run of rigcal, and has not for 10 minutes.
+
+    A computer whose clock nobody keeps, such as that of a rig without a network, has no such alarm: its clock is off by
+    some seconds a day, which matters to people who read times, and to nothing else.
+    """
+    if evidence.clock_lost is not None:
+        yield "clock", f"the computer's clock was synchronised until {_utc(evidence.clock_lost.utc_ns):%H:%M} UTC"
+
+
 @rule("warning", "Look what else the computer does; nothing is lost, and it stops by itself.", after_s=60.0, hold_s=5.0)
 def decoding_behind(evidence: Evidence) -> Iterator[Finding]:
     """Captures have waited in the store to be decoded for a minute.

@@ -13,6 +13,7 @@ from daemon.cli.command import Command, json_option
 from daemon.cli.job_lines import show_jobs
 from daemon.cli.state_lines import show_session
 from daemon.cli.terminal import echo, echo_error, echo_table
+from daemon.cli.time_lines import latency_sentence
 from daemon.commands import SESSION_KINDS
 
 SHOT_TIMEOUT_S = 600.0
@@ -119,6 +120,8 @@ def session_show(name: str, **where: Any) -> Any:
 
     def show(found: Mapping[str, Any]) -> None:
         show_session(found)
+        if found["latency"] is not None:
+            echo(f"  latency of the station's fixes: {latency_sentence(found['latency'])}")
         show_jobs(found["jobs"], [found] if found.get("no_job") else [])
 
     return ask(where, "session.show", show, id=name)

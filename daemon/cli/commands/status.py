@@ -25,6 +25,7 @@ from daemon.cli.state_lines import (
 )
 from daemon.cli.summary import next_step, state_sentence, summary
 from daemon.cli.terminal import Coloured, echo, echo_table
+from daemon.cli.time_lines import clock_sentence, latency_sentence
 
 WIDTH = 100  # where the terminal's is not known
 
@@ -51,12 +52,16 @@ def _show_all(status: Mapping[str, Any], *, frames: bool) -> None:
     show_alarms(status["alarms"])
     for line in (*notice_lines(status["notices"]), *store_lines(status), *gap_state_lines(acquisition)):
         echo(line)
+    if status["clock"] is not None:
+        echo(f"the computer's clock: {clock_sentence(status['clock'])}")
     _show_links(acquisition["links"])
     _show_channels(acquisition["channels"])
     if frames:
         _show_frames(acquisition["frames"])
     for line in (*map(station_line, acquisition["stations"]), *decoding_lines(acquisition["decoding"])):
         echo(line)
+    if status["latency"] is not None:
+        echo(f"latency of the station's fixes in {status['latency']['session']}: {latency_sentence(status['latency'])}")
     if status["session"]:
         show_session(status["session"])
     for line in map(job_line, status["jobs"]):

@@ -332,6 +332,7 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
     "control_dead": [(known(control_faults={"control.sock": "taken away"}), ["control.sock"], known())],
     "metrics_unserved": [(known(metrics_fault="the port is taken"), ["metrics"], known())],
     "notices_undelivered": [(known(notice_faults={"webhook": "no route"}), ["webhook"], known())],
+    "clock_unsynchronized": [(known(clock_lost=NOW.shifted(-1000 * NS_PER_S)), ["clock"], known())],
     "not_watched": [(known(unwatched={"the jobs": "a fault"}), ["the jobs"], known())],
 }
 

@@ -15,7 +15,7 @@ from sqlite_utils import Database
 from daemon.commands import CommandError
 from daemon.jobs.child import JobChild
 from daemon.jobs.job_queue import JobQueue
-from daemon.jobs.order import Order, Outcome, Progress, parse_message
+from daemon.jobs.order import Order, Outcome, Progress, Started, parse_message
 from daemon.jobs.process import perform
 from daemon.jobs.scheduler import CHAIN, next_job
 from daemon.models.model_files import model_sha256, read_model
@@ -105,6 +105,7 @@ def test_data_that_determine_nothing_fail_in_a_sentence_whatever_lies_in_the_cur
 def test_a_fault_inside_a_job_is_its_error(rig: JobRig) -> None:
     order = Order("no such kind", 1, str(rig.config.store_path), "models", (), 0)
     with JobChild(order) as child:
+        assert child.next_message(60.0) == Started(child.pid)
         message = child.next_message(60.0)
     assert message == Outcome("failed", "KeyError: 'no such kind'; the daemon's log has the whole story")
     assert is_gone(child.pid)

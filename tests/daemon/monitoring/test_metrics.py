@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 import threading
 import urllib.error
@@ -18,7 +19,7 @@ from daemon.acquisition.status_board import StatusBoard
 from daemon.composition import live
 from daemon.config import ConfigError, load_rig, parse_config
 from daemon.control.protocol import request
-from daemon.host.systemd import Notifier
+from daemon.host.systemd import Notifier, network_hint
 from daemon.monitoring import metrics_server
 from daemon.monitoring.metrics import FAMILIES, page
 from daemon.monitoring.metrics_server import MetricsServer
@@ -125,6 +126,8 @@ def test_every_family_has_samples_of_a_status_that_has_everything() -> None:
         "mode": "live",
         "alarms": {"active": [alarm], "looked_age_s": 0.5},
         "notices": [{"target": "webhook", "waiting": 1, "sent": 2, "failures": 3}],
+        "latency": {"session": "a", "seconds": 0.05, "standard_error_s": 0.01},
+        "clock": {"is_synchronized": True, "offset_s": -2e-4, "max_error_s": 5e-3},
         "session": {"prism": "r", "observations": 4, "poses": 2, "excluded": {"moving": 3}},
         "control_shots": [{"setup": "S1", "point": "cp1", "misclosure_mm": 2.5}],
         "job_counts": [{"kind": "gap", "state": "done", "count": 2}],
@@ -173,6 +176,15 @@ def test_a_port_that_is_taken_is_told_and_served_once_it_is_free(monkeypatch: py
         assert (server.trouble(), server.port) == (None, port)
     finally:
         server.stop()
+
+
+def test_a_service_whose_unit_forbids_the_network_says_how_to_open_it() -> None:
+    with pytest.raises(OSError, match="not supported") as refused:
+        socket.socket(socket.AF_APPLETALK, socket.SOCK_STREAM)  # as a unit's RestrictAddressFamilies answers
+    assert refused.value.errno == errno.EAFNOSUPPORT
+    assert "network.conf" in network_hint(refused.value, {"INVOCATION_ID": "1"})
+    assert network_hint(refused.value, {}) == ""
+    assert network_hint(ConnectionRefusedError(errno.ECONNREFUSED, "refused"), {"INVOCATION_ID": "1"}) == ""
 
 
 def test_gaps_are_counted_once_with_what_is_missing_in_them_and_events_by_kind() -> None:

@@ -9,9 +9,11 @@ import pytest
 
 from calibration.observations import parse_observations
 from daemon.acquisition.present_state import expected_of
+from daemon.cli.state_lines import show_session
 from daemon.commands import CommandError
 from daemon.config import Config, SessionsSection, load_rig
 from daemon.control.server import ControlServer
+from daemon.host.time_service import ClockState
 from daemon.sessions.session_data import sessions_csv, setup_lines
 from daemon.store.errors import NotInStoreError
 from daemon.store.reader import Reader
@@ -122,6 +124,36 @@ def test_a_session_that_goes_on_after_a_boot_with_an_earlier_clock_is_flagged(ri
     rig.say("start", prism="r")
     rig.live(2)
     assert rig.say("stop")["clock_steps"] == []
+
+
+def test_a_session_knows_how_the_computers_clock_was_at_its_start_and_end(
+    rig: Rig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig.clock_state = ClockState(False, source="kernel")
+    start(rig, id="a")
+    rig.live(2)
+    rig.clock_state = ClockState(True, 2e-4, 5e-3, "chrony")
+    summary = rig.say("stop")
+    assert summary["clock"]["start"]["is_synchronized"] is False
+    assert summary["clock"]["end"] == {
+        "is_synchronized": True,
+        "offset_s": 2e-4,
+        "max_error_s": 5e-3,
+        "source": "chrony",
+        "error": "",
+    }
+    show_session(summary)
+    said = capsys.readouterr().out
+    assert "the computer's clock at its start: not synchronised with other clocks\n" in said
+    assert "the computer's clock at its end: synchronised (chrony), 200 us ahead, off by at most 5 ms\n" in said
+
+
+def test_a_session_on_another_clock_than_the_computers_notes_none(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
+    start(rig, id="a")
+    summary = rig.say("abort")
+    assert summary["clock"] == {"start": None, "end": None}
+    show_session(summary)
+    assert "computer's clock" not in capsys.readouterr().out
 
 
 def test_a_steady_clock_is_not_flagged(rig: Rig) -> None:
