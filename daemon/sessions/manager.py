@@ -7,7 +7,6 @@ the store: what the store has refused has not happened. `on_records` runs in the
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import math
 import sqlite3
@@ -242,7 +241,6 @@ class SessionKeeper:
             now = self._clock.now()
             row = {
                 "id": session_id,
-                "rig_sha256": hashlib.sha256(self._rig_text.encode()).hexdigest(),
                 "rig_text": self._rig_text,
                 "setup_id": setup_id,
                 "prism": prism,
