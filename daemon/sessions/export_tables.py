@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from calibration.rig.description import Rig, parse_rig
 from calibration.table import LABEL_COLUMNS
 from daemon.commands import CommandError
-from daemon.host.safe_output import write_file
 from daemon.sessions.export import ended_session
 from daemon.sessions.session_data import sessions_csv
 from daemon.store.reader import Reader
@@ -125,12 +124,10 @@ def _write_mat(tables: Tables, base: Path) -> list[Path]:
     from scipy.io import savemat
 
     found = {name: _arrays(rows) for name, rows in tables.items()}
-    stream = io.BytesIO()
-    savemat(
-        stream, {name: columns for name, columns in found.items() if columns}, long_field_names=True, oned_as="column"
-    )
     path = base.with_name(f"{base.name}.mat")
-    write_file(path, stream.getvalue())
+    savemat(
+        path, {name: columns for name, columns in found.items() if columns}, long_field_names=True, oned_as="column"
+    )
     return [path]
 
 

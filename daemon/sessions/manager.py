@@ -241,7 +241,6 @@ class SessionKeeper:
             now = self._clock.now()
             row = {
                 "id": session_id,
-                "rig_text": self._rig_text,
                 "setup_id": setup_id,
                 "prism": prism,
                 "operator": text_argument(arguments, "operator"),
@@ -249,7 +248,7 @@ class SessionKeeper:
                 "kind": kind,
                 "note": text_argument(arguments, "note"),
             }
-            self._table.start(now, **row)
+            self._table.start(now, self._rig_text, **row)
             order = self._store.order
             self._open = session = OpenSession(session_id, setup_id, prism, kind, order, now, control_points=points)
             if self._aim is not None:

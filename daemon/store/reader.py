@@ -104,7 +104,7 @@ class Reader:
         except sqlite3.OperationalError as error:
             if str(error).startswith("no such") and pending_migrations(Database(self._connection)):
                 raise StoreError(
-                    f"{self.path}: made by an older rigcal; the daemon of this version brings it up to date at its start"
+                    f"{self.path}: made by an older rigcal; the daemon of this version updates it at its start"
                 ) from error
             raise
         for row in cursor:

@@ -85,7 +85,8 @@ def describe_new(joints: Iterable[tuple[str, str]], signals: Iterable[tuple[str,
     """Describe the store that a rig has at its start.
 
     Args:
-        joints, signals: name and unit of each.
+        joints: name and unit of each joint.
+        signals: name and unit of each other channel.
     """
     with tempfile.TemporaryDirectory() as directory:
         path = Path(directory) / "rigcal.sqlite"
@@ -104,11 +105,11 @@ def _described(db: Database, name: str, channels: Sequence[Channel], *, is_view:
             for column in (channel.column, f"{channel.name}_dir", f"{channel.name}_rate"):
                 meaning = channel_meaning(column, channel.name, channel.unit, is_joint=channel.is_joint)
                 meanings.setdefault(column, meaning)
-    refers = {} if is_view else {key.column: key.other_table for key in db[name].foreign_keys if key.column}
+    refers = {} if is_view else {key.column: key.other_table for key in db.table(name).foreign_keys if key.column}
     columns = []
-    for column in db[name].columns:
-        if column.name not in meanings:
-            raise StoreError(f"column {column.name!r} of {name!r} is not of this version of rigcal")
-        kind = "" if is_view else column.type
-        columns.append(ColumnDescription(column.name, kind, meanings[column.name], refers.get(column.name)))
+    for found in db[name].columns:
+        if found.name not in meanings:
+            raise StoreError(f"column {found.name!r} of {name!r} is not of this version of rigcal")
+        kind = "" if is_view else found.type
+        columns.append(ColumnDescription(found.name, kind, meanings[found.name], refers.get(found.name)))
     return TableDescription(name, words, tuple(columns), is_view)

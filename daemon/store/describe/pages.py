@@ -17,7 +17,9 @@ This page is made from the code: `python -m daemon.store.describe schema > docs/
 """
 _YAML_WORDS = {"y", "n", "yes", "no", "on", "off", "true", "false", "null"}
 _TITLE = "rigcal: acquisition and calibration of a drilling boom"
-_ABOUT = "Readings, fixes, sessions, observations, jobs and models of a rig. Begin with the views (v_...) and the queries below."
+_ABOUT = (
+    "Readings, fixes, sessions, observations, jobs and models of a rig. Begin with the views (v_...) and the queries."
+)
 
 
 def schema_page(store: StoreDescription) -> str:

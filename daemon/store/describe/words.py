@@ -59,7 +59,10 @@ _SAMPLE = {
     "time_doubtful",
     "raw_counts": "what the device sent, before it was scaled",
 }
-_XYZ = {f"{axis}_mm": f"{name}, mm, in the station's frame" for axis, name in zip("xyz", ("east", "north", "up"))}
+_XYZ = {
+    f"{axis}_mm": f"{name}, mm, in the station's frame"
+    for axis, name in zip("xyz", ("east", "north", "up"), strict=True)
+}
 _SIGMA = {f"sigma_{axis}_mm": f"standard deviation of `{axis}_mm`" for axis in "xyz"}
 _ALARM = {
     "kind": "kind of the alarm, as in docs/alarms.md",
@@ -141,8 +144,8 @@ TABLES: dict[str, Words] = {
     ),
     "signals": Words(
         "Signal readings",
-        "One row for each reading of a signal (valve currents, pressures, temperatures): all within sessions, elsewhere "
-        "one a second.",
+        "One row for each reading of a signal (valve currents, pressures, temperatures): all within sessions, "
+        "elsewhere one a second.",
         _SAMPLE,
         {"": "the reading"},
     ),
@@ -172,7 +175,7 @@ TABLES: dict[str, Words] = {
     ),
     "device_events": Words(
         "Events of devices",
-        "One row for each event of a device or a link: boot-up, heartbeat lost, emergency, bus off, a jump of an encoder.",
+        "One row for each event of a device or a link: boot-up, heartbeat lost, emergency, bus off, encoder jump.",
         {
             "id": "number of the event",
             "device": "name of the device, the joint or the link",
@@ -306,7 +309,7 @@ TABLES: dict[str, Words] = {
     ),
     "jobs": Words(
         "Jobs",
-        "One row for each piece of work that sessions cause: the gap workflow, the residual, reports, comparisons, drift.",
+        "One row for each piece of work that sessions cause: the gap workflow, residuals, reports, comparisons, drift.",
         {
             "id": "number of the job",
             "kind": "gap, residual, report, comparison or drift",
@@ -354,7 +357,7 @@ TABLES: dict[str, Words] = {
             "operator": "who said so",
             "reason": "why",
             "replaced_id": "the model that was live before",
-            "zeros_checked_through": "no change, but an operator's word that the joints' zeros are right up to that event",
+            "zeros_checked_through": "no change, but an operator's word that the zeros are right up to that event",
             "after_session": "number of the rig's newest session then; checks after it count",
             **CALLER,
         },
