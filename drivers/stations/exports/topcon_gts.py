@@ -37,7 +37,10 @@ def _guess(text: str, source: str) -> Guess:
 
 def _read(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:  # noqa: ARG001 - the format has no columns
     joined, lines = _blocks(text, source)
-    joined = joined.rstrip(" ").removesuffix("_")  # the last block is padded
+    joined = joined.rstrip(" ")  # the last block is padded
+    if not joined.endswith("_"):
+        refuse(source, "the download ends within a field: blocks are missing", lines[-1] if lines else None)
+    joined = joined[:-1]
     fixes: list[ExportedFix] = []
     point, target = "", ""
     end = 0

@@ -82,7 +82,9 @@ def test_damaged_gts_downloads_are_refused_with_their_line() -> None:
     text = gts_download()
     lines = text.split("\n")
     assert "line 2: the block check is wrong" in refused(text.replace("1539100", "1539101"))
-    assert "line 2: block 2 where block 1 is due" in refused("\n".join([lines[0], *lines[2:]]))
+    assert "line 1: the download ends within a field" in refused("\n".join([lines[0], *lines[2:]]))
+    many = gts_download(POINTS * 2).split("\n")
+    assert "line 2: block 2 where block 1 is due" in refused("\n".join([many[0], *many[2:]]))
     assert "line 1: 121 characters; a block has 128" in refused(text.replace("1317260", "1317260"[:0], 1)[:121])
     unchecked = gts_record(1000, 100.0, 0.0)[:-3] + "000"
     fields = f"_'_(_)1.540_+1_ {unchecked}_*_,1.500_".ljust(128) + "0"
