@@ -82,9 +82,12 @@ GROUP BY pose, prism ORDER BY min(id)""",
             "joints_of_session",
             "Joints in a session, second by second",
             "Mean reading of each joint in each second of a session that has ended.",
-            f"""SELECT {iso("min(row.utc_ns)")} AS time{_joint_means(joints)}
-{_IN_SESSION.format(table="joint_samples")}
-GROUP BY row.boot_id, row.monotonic_ns / 1000000000 ORDER BY row.boot_id, row.monotonic_ns / 1000000000""",
+            f"""WITH means AS (SELECT row.boot_id AS boot, row.monotonic_ns / 1000000000 AS second, row.channel_id,
+        min(row.utc_ns) AS utc_ns, avg(row.value) AS value
+    {_IN_SESSION.format(table="joint_samples")}
+    GROUP BY boot, second, row.channel_id)
+SELECT {iso("min(utc_ns)")} AS time{_joint_values(joints)}
+FROM means JOIN channels ON channels.id = channel_id GROUP BY boot, second ORDER BY boot, second""",
             ("session",),
         ),
         Query(
@@ -138,11 +141,11 @@ FROM model_states AS change JOIN models AS model ON model.id = change.model_id O
     )
 
 
-def _joint_means(joints: Iterable[Channel]) -> str:
+def _joint_values(joints: Iterable[Channel]) -> str:
     return "".join(
         f""",
-    avg(CASE WHEN row.channel_id = (SELECT id FROM channels WHERE kind = 'joint' AND name = '{_quoted(joint.name)}'
-        AND unit = '{_quoted(joint.unit)}') THEN row.value END) AS \"{joint.column.replace('"', '""')}\""""
+    max(CASE WHEN channels.name = '{_quoted(joint.name)}' AND channels.unit = '{_quoted(joint.unit)}'
+        THEN value END) AS \"{joint.column.replace('"', '""')}\""""
         for joint in joints
     )
 
