@@ -301,6 +301,15 @@ def all_sessions(source: RowSource) -> list[dict[str, Any]]:
     )
 
 
+def sessions_of_use(source: RowSource) -> tuple[list[str], list[str]]:
+    """Return the closed sessions that calibration may use, oldest first: those that train, and check sessions."""
+    rows = source.rows(
+        "SELECT id, kind FROM calibration_sessions WHERE state = 'closed' AND excluded IS NULL ORDER BY rowid"
+    )
+    found = [(row["id"], row["kind"] == "check") for row in rows]
+    return [name for name, is_check in found if not is_check], [name for name, is_check in found if is_check]
+
+
 def all_observations(source: RowSource, session_ids: Sequence[str] = ()) -> list[dict[str, Any]]:
     """Return the observations of sessions, or of all, oldest first, used or excluded; joints and signals as columns."""
     where = f"WHERE session_id IN ({_marks(session_ids)})" if session_ids else ""
