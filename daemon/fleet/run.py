@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 RESULTS = "rigs"
 _AHEAD = 2  # tasks in flight for each thread of a worker
-_DEATHS = 10  # of workers under the same rig, before it is left
+_TRIES = 3  # of a rig that several workers died at, each time as many as the scheduler allows (3 by default)
 
 Answer = dict[str, Any]
 Told = Callable[[int, int, str], None]
@@ -58,27 +58,31 @@ class Cluster:
 
     def answers(self, tasks: Iterator[RigTask]) -> Iterator[Answer]:
         """Yield the answers as they come."""
-        from distributed import as_completed
+        from distributed import KilledWorker, as_completed
 
         running = as_completed()
-        known: dict[object, RigTask] = {}
+        known: dict[object, tuple[RigTask, int]] = {}
+
+        def submit(task: RigTask, attempt: int) -> None:
+            key = f"{task.name}-{task.sha256}-{attempt}"
+            future = self._client.submit(assess, task, key=key, pure=False)
+            known[future.key] = task, attempt
+            running.add(future)
 
         def fill() -> None:
             width = _AHEAD * max(1, sum(self._client.nthreads().values()))
             while len(known) < width and (task := next(tasks, None)) is not None:
-                future = self._client.submit(
-                    assess, task, key=f"{task.name}-{task.sha256}", pure=False, retries=_DEATHS
-                )
-                known[future.key] = task
-                running.add(future)
+                submit(task, 1)
 
         fill()
         for future in running:
-            task = known.pop(future.key)
-            fill()
+            task, attempt = known.pop(future.key)
             error = future.exception()
+            if isinstance(error, KilledWorker) and attempt < _TRIES:
+                submit(task, attempt + 1)
+                continue
+            fill()
             yield future.result() if error is None else _failed(task.name, task.source, error)
-            future.release()
 
 
 def assess_all(

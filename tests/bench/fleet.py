@@ -4,8 +4,8 @@ Simulated rigs of one drawing (`tests.simulated.fleet`): swdt82, each built with
 prism in turn, 1 mm of noise on each coordinate; one length is wrong in the drawing of all, one rig in fifty has another
 boom. By default kinematics are identified without a search for effects (`rigcal fleet --no-gap`); `--gap` searches.
 
-First some of the rigs are done with one worker and with two, whose workers are killed again and again in a third run: the
-answers must be the same. Then the whole fleet is done with two workers. Exit status 1: two workers do less than 1.8
+First some of the rigs are done with one worker and with two, whose workers are killed again and again in a third run:
+the answers must be the same. Then the whole fleet is done with two workers. Exit status 1: two workers do less than 1.8
 times the work of one, an answer is missing or another, or the common error or an odd rig is not found.
 """
 
@@ -18,7 +18,6 @@ import resource
 import signal
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -27,14 +26,14 @@ from typing import Any
 
 from daemon.fleet.assess import FleetSettings
 from daemon.fleet.comparison import compare
-from daemon.fleet.run import RESULTS, Answer, Cluster, assess_all
+from daemon.fleet.run import RESULTS, Answer, Cluster, Told, assess_all
 from daemon.fleet.sources import find_rigs
 from daemon.fleet.table import write_table
 from daemon.warm_up import prepare
 from tests.simulated.fleet import COMMON, ODD, simulated_rig, write_rig
 
 BAR = 1.8
-KILL_EVERY_S = 3.0
+KILL_EVERY = 25  # answers
 
 
 @contextmanager
@@ -52,11 +51,13 @@ def workers(count: int) -> Iterator[Any]:
         yield client
 
 
-def run(directories: Sequence[Path], out: Path, client: Any, settings: FleetSettings) -> tuple[list[Answer], float]:
+def run(
+    directories: Sequence[Path], out: Path, client: Any, settings: FleetSettings, told: Told = lambda *_: None
+) -> tuple[list[Answer], float]:
     """Assess rigs; return the answers and the seconds that it took."""
     sources = find_rigs(directories, None, None)
     begin = time.perf_counter()
-    answers = assess_all(sources, settings, out, Cluster(client), lambda *_: None)
+    answers = assess_all(sources, settings, out, Cluster(client), told)
     return answers, time.perf_counter() - begin
 
 
@@ -65,13 +66,23 @@ def plain(answers: Sequence[Answer]) -> list[str]:
     return [json.dumps(answer, sort_keys=True) for answer in answers]
 
 
-def kill_workers(client: Any, over: threading.Event, killed: list[int]) -> None:
-    """Kill a worker process every few seconds, until it is over."""
-    while not over.wait(KILL_EVERY_S):
-        pids = list(client.run(os.getpid).values())
-        if pids:
-            os.kill(pids[len(killed) % len(pids)], signal.SIGKILL)
-            killed.append(pids[len(killed) % len(pids)])
+class Killer:
+    """Kills a worker process after every few answers.
+
+    Args:
+        client: of the workers.
+    """
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+        self.killed = 0
+
+    def __call__(self, done: int, of: int, name: str) -> None:
+        if done % KILL_EVERY == 0 and done < of:
+            pids = sorted(self._client.run(os.getpid, on_error="ignore").values())
+            if pids:
+                os.kill(pids[self.killed % len(pids)], signal.SIGKILL)
+                self.killed += 1
 
 
 def scaling(directories: Sequence[Path], scratch: Path, settings: FleetSettings, rounds: int) -> bool:
@@ -94,15 +105,11 @@ def scaling(directories: Sequence[Path], scratch: Path, settings: FleetSettings,
             )
     ratio = min(seconds[1]) / min(seconds[2])
     print(f"two workers do {ratio:.2f} times the work of one, bar {BAR}")
-    over, killed = threading.Event(), list[int]()
     with workers(2) as client:
-        killer = threading.Thread(target=kill_workers, args=(client, over, killed))
-        killer.start()
-        answers, took = run(directories, scratch / "killed", client, settings)
-        over.set()
-        killer.join()
+        killer = Killer(client)
+        answers, took = run(directories, scratch / "killed", client, settings, killer)
     is_same = is_same and plain(answers) == first
-    print(f"with {len(killed)} workers killed: {len(answers)} rigs in {took:.1f} s")
+    print(f"with {killer.killed} workers killed: {len(answers)} rigs in {took:.1f} s")
     print(f"answers: {'all the same' if is_same else 'NOT the same'}")
     return ratio >= BAR and is_same
 
@@ -115,7 +122,7 @@ def whole(directories: Sequence[Path], odd: set[str], out: Path, settings: Fleet
     rate = 3600 * len(answers) / took
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
     print(
-        f"{len(answers)} rigs in {took:.0f} s with two workers, {rate:.0f} an hour; this process grew by {grown:.0f} MiB"
+        f"{len(answers)} rigs in {took:.0f} s with two workers, {rate:.0f} an hour; the client grew by {grown:.0f} MiB"
     )
     begin = time.perf_counter()
     fleet = compare(answers)
