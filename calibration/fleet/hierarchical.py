@@ -2,8 +2,11 @@
 
 Rig i has measured y_i with standard error s_i; its true value is drawn from N(mean, spread^2), so that
 y_i ~ N(mean, spread^2 + s_i^2). The spread is that of Paule and Mandel (J. Res. Natl. Bur. Stand. 87, 1982): the
-weighted sum of squares about the weighted mean equals its degrees of freedom. Rigs that are too far off for that are
-found first by median and MAD, then against the estimate without them, until the set is the same twice.
+weighted sum of squares about the weighted mean equals its degrees of freedom. Rigs that are too far off are found first
+by median and MAD, then against the estimate without them, until the set is the same twice.
+
+How large the spread is, few rigs tell well, and a rig that is drawn to the fleet too much looks surer than it is. So the
+mean and each rig's value are averaged over the spreads that the data leave open, weighted by the restricted likelihood.
 """
 
 from __future__ import annotations
@@ -21,6 +24,8 @@ LEAST_RIGS = 5  # fewer tell no spread
 _ROUNDS = 20
 _LEVEL = 0.01  # chance that any of the rigs is taken for an outlier where none is
 _BISECTIONS = 200
+_GRID = 200  # spreads that are averaged over
+_REACH = 3.0  # standard deviations of the values: larger spreads are out of the question
 _MAD = 1.4826  # of a normal distribution: sigma over MAD
 _LEAST_GAIN = 0.19  # of the posterior's precision must be the data's own: sigma below 0.9 of the prior's
 
@@ -79,10 +84,9 @@ def fleet_estimate(value: Floats, sigma: Floats) -> FleetEstimate | None:
     inside = int((~outside).sum())
     expected = s**2 + between + np.where(outside, mean_variance, -mean_variance)  # the mean holds those inside
     deviation = (y - mean) / np.sqrt(np.maximum(expected, 1e-12 * s**2))
-    own, fleet = 1.0 / s**2, (1.0 / between if between > 0 else np.inf)
-    share = np.where(outside, 1.0, 0.0 if np.isinf(fleet) else own / (own + fleet))
-    estimate = share * y + (1.0 - share) * mean
-    posterior = np.sqrt(np.where(outside, s**2, share * s**2 + (1.0 - share) ** 2 * mean_variance))
+    mean, mean_variance, given, given_variance = _averaged(y[~outside], s[~outside])
+    estimate, variance = y.copy(), s**2
+    estimate[~outside], variance[~outside] = given, given_variance
     full = np.full(len(value), np.nan)
 
     def spread_out(values: Floats) -> Floats:
@@ -99,7 +103,7 @@ def fleet_estimate(value: Floats, sigma: Floats) -> FleetEstimate | None:
         inside,
         _two_sided(mean / np.sqrt(mean_variance), inside - 1).item(),
         spread_out(estimate),
-        spread_out(posterior),
+        spread_out(np.sqrt(variance)),
         spread_out(deviation),
         spread_out(_two_sided(deviation, inside - 1)),
         flags,
@@ -126,6 +130,26 @@ def _fit(y: Floats, s: Floats) -> tuple[float, float, float]:
         between = 0.5 * (low + high)
     w = 1.0 / (s**2 + between)
     return float((w * y).sum() / w.sum()), float(1.0 / w.sum()), between
+
+
+def _averaged(y: Floats, s: Floats) -> tuple[float, float, Floats, Floats]:
+    """Return mean, its variance, each rig's value given all, and its variance, averaged over possible spreads."""
+    reach = _REACH * float(np.std(y, ddof=1)) + float(s.min())
+    spread = reach * ((np.arange(_GRID) + 0.5) / _GRID)[:, None]
+    variance = s**2 + spread**2  # (spreads, rigs)
+    w = 1.0 / variance
+    total = w.sum(axis=1)
+    mean = (w * y).sum(axis=1) / total
+    squares = (w * (y - mean[:, None]) ** 2).sum(axis=1)
+    log_likelihood = -0.5 * (np.log(variance).sum(axis=1) + np.log(total) + squares)
+    weight = np.exp(log_likelihood - log_likelihood.max())
+    weight /= weight.sum()
+    drawn = s**2 / variance  # to the mean
+    given = y + drawn * (mean[:, None] - y)
+    given_variance = s**2 * (1.0 - drawn) + drawn**2 / total[:, None]
+    best, best_given = float(weight @ mean), weight @ given
+    mean_variance = float(weight @ (1.0 / total + (mean - best) ** 2))
+    return best, mean_variance, best_given, weight @ (given_variance + (given - best_given) ** 2)
 
 
 def _far(y: Floats, s: Floats, mean: float, mean_variance: float, between: float, rigs: int) -> Flags:

@@ -52,16 +52,23 @@ def _moved(text: str, name: str, by_mm: float) -> str:
     return "[[row]]".join([head, *rows])
 
 
-def simulated_rig(number: int, fixes: int, sessions: int = 1, odd_every: int = ODD_EVERY) -> SimulatedRig:
-    """Make a rig: poses one after another, a prism in turn, noise of 1 mm on each coordinate."""
+def simulated_rig(
+    number: int, fixes: int, sessions: int = 1, odd_every: int = ODD_EVERY, change_mm: float = 0.0
+) -> SimulatedRig:
+    """Make a rig: poses one after another, a prism in turn, noise of 1 mm on each coordinate.
+
+    Before its last session its boom may become longer by `change_mm`.
+    """
     is_odd = number % odd_every == odd_every - 1
     text = drawing()
     built = _moved(text, COMMON, COMMON_MM)
     if is_odd:
         built = _moved(built, ODD, ODD_MM)
-    truth = RigTruth(parse_rig(built, "built"), 10_000 + number)
     parts = []
     for session in range(sessions):
+        if change_mm and session == sessions - 1:
+            built = _moved(built, ODD, change_mm)
+        truth = RigTruth(parse_rig(built, "built"), 10_000 + number)
         name = f"s{session + 1}" if sessions > 1 else ""
         made = simulate_observations(
             truth,

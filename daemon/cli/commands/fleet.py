@@ -124,7 +124,9 @@ def _engine(workers: int | None, scheduler: str | None) -> Iterator[Engine]:
             yield Cluster(client)
         return
     with (
-        LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+        LocalCluster(
+            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
+        ) as cluster,
         Client(cluster) as client,
     ):
         yield Cluster(client)
