@@ -2,10 +2,10 @@
 
 Rig i has measured y_i with standard error s_i; its true value is drawn from N(mean, spread^2), so that
 y_i ~ N(mean, spread^2 + s_i^2). The spread is that of Paule and Mandel (J. Res. Natl. Bur. Stand. 87, 1982): the
-weighted sum of squares about the weighted mean equals its degrees of freedom. Rigs that are too far off are found first
-by median and MAD, then against the estimate without them, until the set is the same twice.
+weighted sum of squares about the weighted mean equals its degrees of freedom. Rigs that are too far off are found
+first by median and MAD, then against the estimate without them, until the set is the same twice.
 
-How large the spread is, few rigs tell well, and a rig that is drawn to the fleet too much looks surer than it is. So the
+Few rigs tell well how large the spread is, and a rig that is drawn to the fleet too much looks surer than it is. So the
 mean and each rig's value are averaged over the spreads that the data leave open, weighted by the restricted likelihood.
 """
 
