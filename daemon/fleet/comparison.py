@@ -174,10 +174,14 @@ def gains(group: Group, number: int) -> list[Gain]:
     if answer["verdict"] == "indistinguishable":
         found.append(Gain("resolve", float("nan"), "measure the poses that `rigcal gap` proposes"))
     offered = [
-        Gain("calibrate", stages["nominal"] - stages["geometric"], "use the calibrated kinematics"),
+        Gain(
+            "calibrate",
+            stages["nominal"] - stages["geometric"],
+            "use the calibrated kinematics in place of the drawing",
+        ),
         Gain("effects", stages["geometric"] - stages["effects"], "use the named effects"),
     ]
     if answer["expected_rms_mm"] is not None:
-        offered.append(Gain("poses", answer["expected_rms_mm"], "measure more poses: the model's own error is left"))
+        offered.append(Gain("poses", answer["expected_rms_mm"], "measure more poses"))
     worth = [gain for gain in offered if gain.gain_mm > _WORTH * noise]
     return [*found, *sorted(worth, key=lambda gain: -gain.gain_mm)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -42,8 +42,8 @@ def _header(fleet: Fleet, rigs: int, made: str) -> str:
     outlying = sum(bool(group.outlying(n)) for group in fleet.groups for n in range(len(group.answers)))
     changed = sum(_has_changed(answer) for group in fleet.groups for answer in group.answers)
     lead = (
-        f"{common} constants of the drawings are off in the same way on all rigs; {outlying} rigs differ from the "
-        f"others by more than rigs do; {changed} have changed since they were measured before."
+        f"Constants of the drawing that are off in the same way on all rigs: {common}. Rigs that differ from the "
+        f"others by more than rigs do: {outlying}. Rigs that have changed since they were measured before: {changed}."
     )
     before = np.median([a["stages"]["nominal"] for g in fleet.groups for a in g.answers]) if rigs else float("nan")
     after = np.median([a["stages"]["effects"] for g in fleet.groups for a in g.answers]) if rigs else float("nan")
@@ -187,19 +187,24 @@ def _drift(group: Group) -> str:
 
 
 def _gains(group: Group) -> str:
-    rows = list(_gain_rows(group))
+    rows = _gain_rows(group)
     text = "For each rig what helps most, what has changed first, then by the millimetres that its error would fall."
     heads = ("rig", "calibrated RMS, mm", "scatter of a fix, mm", "gain, mm", "what to do")
-    table = markup.table(heads, rows[:_MOST_RIGS], text_columns=(0, 4))
+    table = markup.table(heads, rows[:_MOST_RIGS], text_columns=(4,))
     more = f"{len(rows) - _MOST_RIGS} more rigs are in the table file." if len(rows) > _MOST_RIGS else ""
     return markup.section(
         "Who would gain from what", markup.paragraph(text), table, markup.paragraph(more) if more else ""
     )
 
 
-def _gain_rows(group: Group) -> Iterator[list[str]]:
+def _gain_rows(group: Group) -> list[list[str]]:
+    """Return a row for each rig, the most urgent first."""
+    rows = []
     for n, answer in enumerate(group.answers):
         offered = gains(group, n)
-        best = offered[0].gain_mm if offered else float("nan")
-        texts = "; ".join(gain.text for gain in offered) or "nothing: it is at its noise"
-        yield [answer["name"], number(answer["stages"]["effects"]), number(answer["noise_mm"]), number(best), texts]
+        first = offered[0].gain_mm if offered else 0.0
+        texts = [gain.text + (f" ({number(gain.gain_mm)} mm)" if np.isfinite(gain.gain_mm) else "") for gain in offered]
+        told = "; ".join(texts) or "nothing: it is at its noise"
+        row = [answer["name"], number(answer["stages"]["effects"]), number(answer["noise_mm"]), number(first), told]
+        rows.append((np.inf if np.isnan(first) else first, row))
+    return [row for _, row in sorted(rows, key=lambda each: -each[0])]
