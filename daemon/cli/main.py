@@ -1,12 +1,14 @@
 """`rigcal`: finds its commands in their folder, one file each.
 
 `commands/NAME.py` defines the command or group NAME as a function of that name. A module is imported for its help or
-when its command is used, so at its top level it imports nothing heavy.
+when its command is used, so at its top level it imports nothing heavy. A name that Python keeps for itself has an
+underscore at its end there (`import_.py`).
 """
 
 from __future__ import annotations
 
 import importlib
+import keyword
 import pkgutil
 
 import click
@@ -18,12 +20,13 @@ class _Commands(click.Group):
     """The group of all commands."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
-        return sorted(module.name for module in pkgutil.iter_modules(commands.__path__))
+        return sorted(module.name.removesuffix("_") for module in pkgutil.iter_modules(commands.__path__))
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in self.list_commands(ctx):
             return None
-        command = getattr(importlib.import_module(f"{commands.__name__}.{cmd_name}"), cmd_name)
+        name = f"{cmd_name}_" if keyword.iskeyword(cmd_name) else cmd_name
+        command = getattr(importlib.import_module(f"{commands.__name__}.{name}"), name)
         assert isinstance(command, click.Command)
         return command
 

@@ -1,11 +1,11 @@
-"""A stored session as files again: captured logs and what `rigcal replay` must know of them; the observations CSV."""
+"""A stored session as captured logs again, with what `rigcal replay` must know of them, and its observations CSV."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from calibration.rig.description import parse_rig
 from daemon.commands import CommandError
@@ -45,11 +45,7 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
         ConfigError: its station is not in the configuration.
     """
     with Reader(config.store_path) as reader:
-        found = session(reader, session_id)
-        if found is None:
-            raise CommandError(f"{config.store_path} has no session {session_id!r}; `rigcal session list` shows them")
-        if found["ended_utc_ns"] is None:
-            raise CommandError(f"session {session_id!r} is still open; stop it first")
+        found = ended_session(reader, session_id)
         started, ended = reader.stamp(found, "started_"), reader.stamp(found, "ended_")
         since, until = started.shifted(-BEFORE_NS), ended.shifted(AFTER_NS)
         out.mkdir(parents=True, exist_ok=True)
@@ -96,6 +92,20 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
         table = out / f"{session_id}.csv"
         write_file(table, sessions_csv(reader, parse_rig(found["rig_text"], "the session's rig"), [session_id]))
         return [*files, table]
+
+
+def ended_session(reader: Reader, session_id: str) -> dict[str, Any]:
+    """Return the row of a session that has ended.
+
+    Raises:
+        CommandError: no such session, or it is still open.
+    """
+    found = session(reader, session_id)
+    if found is None:
+        raise CommandError(f"{reader.path} has no session {session_id!r}; `rigcal session list` shows them")
+    if found["ended_utc_ns"] is None:
+        raise CommandError(f"session {session_id!r} is still open; stop it first")
+    return found
 
 
 class _Doubts:

@@ -81,10 +81,10 @@ class SessionLifecycle:
                 jumped.setdefault(jump.device, jump.at)
         return jumped
 
-    def start(self, started: Stamp, session_id: str, **columns: object) -> None:
-        """Add an open session."""
+    def start(self, started: Stamp, session_id: str, rig_text: str, **columns: object) -> None:
+        """Add an open session of the rig, which its file describes."""
         with self._store.transaction():
-            self.table.start(started, id=session_id, **columns)
+            self.table.start(started, rig_text, id=session_id, **columns)
             self._note_clock(session_id, "start")
 
     def _note_clock(self, session_id: str, phase: str) -> None:

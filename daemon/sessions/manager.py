@@ -7,7 +7,6 @@ the store: what the store has refused has not happened. `on_records` runs in the
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import sqlite3
 import threading
@@ -241,8 +240,6 @@ class SessionKeeper:
                 self._aim(prism)
             now = self._clock.now()
             row = {
-                "rig_sha256": hashlib.sha256(self._rig_text.encode()).hexdigest(),
-                "rig_text": self._rig_text,
                 "setup_id": setup_id,
                 "prism": prism,
                 "operator": text_argument(arguments, "operator"),
@@ -253,7 +250,7 @@ class SessionKeeper:
             order = self._store.order
             session = OpenSession(session_id, setup_id, prism, kind, order, now, control_points=points)
             self._prisms.begin(session)
-            self._lifecycle.start(now, session_id, **row)
+            self._lifecycle.start(now, session_id, self._rig_text, **row)
             self._open = session
             if self._aim is not None:
                 self._prisms.turned(session, now)

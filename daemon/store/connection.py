@@ -7,6 +7,7 @@ checkpoints, because SQLite up to 3.51.2 can corrupt a WAL that two connections 
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import sqlite3
 import threading
@@ -19,9 +20,10 @@ from sqlite_utils import Database
 
 from daemon.store.errors import StoreError, is_damage, storage_sentence
 from daemon.store.files import StoreFiles, WriterLock
-from daemon.store.migrations import MIGRATIONS, unknown_migrations
+from daemon.store.migrations import MIGRATIONS, pending_migrations, unknown_migrations
 from daemon.store.reader import Reader
 from daemon.store.rows import SqlValue, sql_value, stamp_of, stored_text
+from daemon.store.views import drop_views, make_views
 from drivers.clock import Stamp
 
 log = logging.getLogger(__name__)
@@ -87,10 +89,22 @@ class Connection:
         connection.execute("PRAGMA journal_size_limit = 67108864")  # a WAL grown behind a slow reader shrinks again
         if later := unknown_migrations(self._db):
             raise StoreError(f"{self.path}: made by a newer rigcal (it has {later[0]}); install that version")
+        if pending_migrations(self._db):
+            drop_views(self._db)  # a table that a view reads cannot be changed
         MIGRATIONS.apply(self._db)
+        self._show_views()
         # What a statement may undo needs no file, hence no descriptor. Not before: an index of a large store is sorted
         # in files, where memory would not hold it.
         connection.execute("PRAGMA temp_store = MEMORY")
+
+    def _show_views(self) -> None:
+        """Make the views for the joints and signals that the store knows; a damaged store is opened without."""
+        try:
+            make_views(self._db)
+        except sqlite3.DatabaseError as error:
+            if not is_damage(error):
+                raise
+            log.error("%s: damaged, so its views may not be those of its channels: %s", self.path, error)
 
     def close(self) -> None:
         """Close the database and let others write to it; harmless when it was closed before.
@@ -229,6 +243,14 @@ class Connection:
                     row = self.insert("boots", booted)
                 self._boots[stamp.boot_id] = row
         return row
+
+    def rig_file(self, rig: str, text: str) -> str:
+        """The SHA-256 of a rig file, which is stored on first sight."""
+        sha256 = hashlib.sha256(text.encode()).hexdigest()
+        with self.transaction() as db:
+            row = [sha256, rig, text]
+            db.execute("INSERT INTO rig_files (sha256, rig, text) VALUES (?, ?, ?) ON CONFLICT DO NOTHING", row)
+        return sha256
 
     def order(self, stamp: Stamp) -> tuple[int, int]:
         """Place of an instant among all that the store knows (`drivers.clock.Order`)."""

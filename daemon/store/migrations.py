@@ -7,6 +7,8 @@ column beside it says which. Columns that end in `_json` hold JSON text.
 
 from __future__ import annotations
 
+import hashlib
+
 from sqlite_utils import Database, Migrations
 
 MIGRATIONS = Migrations("rigcal")
@@ -383,9 +385,41 @@ def m028_session_clocks(db: Database) -> None:
     )
 
 
+@MIGRATIONS()
+def m030_rig_files(db: Database) -> None:
+    """Every rig file is stored once, by its hash; sessions and models refer to it."""
+    _create(
+        db,
+        """CREATE TABLE rig_files (sha256 TEXT PRIMARY KEY NOT NULL, rig TEXT NOT NULL, text TEXT NOT NULL) STRICT""",
+        "ALTER TABLE calibration_sessions ADD COLUMN rig_file TEXT REFERENCES rig_files(sha256)",
+        # Of the newest session that the model was trained on; NULL where its job's result does not name any.
+        "ALTER TABLE models ADD COLUMN rig_sha256 TEXT REFERENCES rig_files(sha256)",
+    )
+    # By what is stored, not by the hash beside it, which was never checked.
+    for rig, text in db.execute("SELECT rig, rig_text FROM calibration_sessions GROUP BY rig_text").fetchall():
+        sha256 = hashlib.sha256(text.encode()).hexdigest()
+        db.execute("INSERT INTO rig_files (sha256, rig, text) VALUES (?, ?, ?)", [sha256, rig, text])
+        db.execute("UPDATE calibration_sessions SET rig_file = ? WHERE rig_text = ?", [sha256, text])
+    _create(
+        db,
+        "ALTER TABLE calibration_sessions DROP COLUMN rig_text",
+        "ALTER TABLE calibration_sessions DROP COLUMN rig_sha256",
+        "ALTER TABLE calibration_sessions RENAME COLUMN rig_file TO rig_sha256",
+        """UPDATE models SET rig_sha256 =
+            (SELECT session.rig_sha256 FROM jobs, json_each(jobs.result_json, '$.sessions') AS of_job
+                JOIN calibration_sessions AS session ON session.id = of_job.value
+                WHERE jobs.id = models.job_id ORDER BY session.rowid DESC LIMIT 1)""",
+    )
+
+
 def unknown_migrations(db: Database) -> list[str]:
     """Migrations that `db` has and this program does not know: it was made by a newer one."""
     empty = Database(memory=True)
     known = {migration.name for migration in MIGRATIONS.pending(empty)}
     empty.close()
     return sorted({migration.name for migration in MIGRATIONS.applied(db)} - known)
+
+
+def pending_migrations(db: Database) -> list[str]:
+    """Migrations that `db` does not have yet: it was made by an older program."""
+    return [migration.name for migration in MIGRATIONS.pending(db)]

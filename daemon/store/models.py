@@ -188,6 +188,7 @@ class ModelTable:
             "rig": self._rig,
             "path": result["model"],
             "manifest_sha256": result["manifest_sha256"],
+            "rig_sha256": self._sessions.rig_of(result.get("sessions", ())),
             "stage": result["stage"],
             "state": "candidate",
             "job_id": job_id,

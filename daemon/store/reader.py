@@ -8,9 +8,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from sqlite_utils import Database
+
 from daemon.store.captures import decode_captures
 from daemon.store.errors import StoreError
 from daemon.store.files import FileIdentity
+from daemon.store.migrations import pending_migrations
 from daemon.store.rows import sql_value, stamp_of, stored_text
 from drivers.clock import Stamp
 from drivers.readings import Capture
@@ -93,9 +96,18 @@ class Reader:
         """Rows of a query as mappings, one at a time.
 
         Raises:
+            StoreError: an older rigcal has made the store, and what is asked for is not in it.
             sqlite3.Error: the query is wrong, or would write.
         """
-        for row in self._connection.execute(sql, [*map(sql_value, parameters)]):
+        try:
+            cursor = self._connection.execute(sql, [*map(sql_value, parameters)])
+        except sqlite3.OperationalError as error:
+            if str(error).startswith("no such") and pending_migrations(Database(self._connection)):
+                raise StoreError(
+                    f"{self.path}: made by an older rigcal; the daemon of this version updates it at its start"
+                ) from error
+            raise
+        for row in cursor:
             yield dict(row)
 
     def boots(self) -> dict[int, str]:

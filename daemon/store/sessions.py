@@ -95,6 +95,14 @@ _UNTRAINED = """SELECT id, excluded FROM calibration_sessions
         (SELECT coalesce(max(rowid), 0) FROM calibration_sessions
             WHERE rig = ?1 AND state = 'closed' AND excluded IS NULL)
     ORDER BY rowid"""
+_SESSION = """SELECT calibration_sessions.*, rig_files.text AS rig_text FROM calibration_sessions
+    LEFT JOIN rig_files ON rig_files.sha256 = rig_sha256 WHERE id = ?"""
+# What was measured from a session's start to its end; the index of the table behind the view finds it.
+_MEASURED = """SELECT row.* FROM calibration_sessions AS session CROSS JOIN {} AS row WHERE session.id = ?
+    AND (row.boot_id, row.monotonic_ns) >= (session.started_boot_id, session.started_monotonic_ns)
+    AND (row.boot_id, row.monotonic_ns) <= (session.ended_boot_id, session.ended_monotonic_ns)"""
+_FIXES_MEASURED = _MEASURED.format("links CROSS JOIN v_fixes") + " AND row.station = links.name ORDER BY row.id"
+_JOINTS_MEASURED = _MEASURED.format("v_joints") + " ORDER BY row.boot_id, row.monotonic_ns"
 _OPEN = """SELECT id, started_utc_ns, started_monotonic_ns, started_boot_id FROM calibration_sessions
     WHERE rig = ? AND state = 'open' ORDER BY rowid DESC LIMIT 1"""
 
@@ -205,6 +213,11 @@ class SessionTable:
         )
         return next((self._store.stamp(row, "started_") for row in rows if row["id"] in session_ids), None)
 
+    def rig_of(self, session_ids: Sequence[str]) -> str | None:
+        """SHA-256 of the rig file of the newest of some sessions; None without any of them."""
+        sql = f"SELECT rig_sha256 FROM calibration_sessions WHERE id IN ({_marks(session_ids)}) ORDER BY rowid DESC"
+        return next((row["rig_sha256"] for row in self._store.rows(sql, session_ids)), None)
+
     def state_and_exclusion(self, session_id: str) -> tuple[str, str | None]:
         """State of a session, and why calibration does not use it, None where it may.
 
@@ -216,10 +229,12 @@ class SessionTable:
             raise _unknown(session_id)
         return found[0]["state"], found[0]["excluded"]
 
-    def start(self, started: Stamp, **columns: object) -> None:
-        """Add an open session of the rig."""
+    def start(self, started: Stamp, rig_text: str, **columns: object) -> None:
+        """Add an open session of the rig, which its file describes."""
         row = {**columns, "rig": self._rig, "state": "open", **self._store.instant(started, "started_")}
-        self._store.insert("calibration_sessions", row)
+        with self._store.transaction():
+            sha256 = self._store.rig_file(self._rig, rig_text)
+            self._store.insert("calibration_sessions", {**row, "rig_sha256": sha256})
 
     def note_clock(self, session_id: str, phase: str, state: ClockState) -> None:
         """Add how the computer's clock is at a session's `start` or `end`."""
@@ -297,8 +312,8 @@ class SessionTable:
 
 
 def session(source: RowSource, session_id: str) -> dict[str, Any] | None:
-    """Return a session's row; None where there is none."""
-    return next(iter(source.rows("SELECT * FROM calibration_sessions WHERE id = ?", (session_id,))), None)
+    """Return a session's row with its `rig_text`; None where there is none."""
+    return next(iter(source.rows(_SESSION, (session_id,))), None)
 
 
 def observations(source: RowSource, session_ids: Sequence[str]) -> list[dict[str, Any]]:
@@ -319,6 +334,15 @@ def all_sessions(source: RowSource) -> list[dict[str, Any]]:
             "FROM calibration_sessions ORDER BY rowid"
         )
     )
+
+
+def sessions_of_use(source: RowSource) -> tuple[list[str], list[str]]:
+    """Return the closed sessions that calibration may use, oldest first: those that train, and check sessions."""
+    rows = source.rows(
+        "SELECT id, kind FROM calibration_sessions WHERE state = 'closed' AND excluded IS NULL ORDER BY rowid"
+    )
+    found = [(row["id"], row["kind"] == "check") for row in rows]
+    return [name for name, is_check in found if not is_check], [name for name, is_check in found if is_check]
 
 
 def all_observations(source: RowSource, session_ids: Sequence[str] = ()) -> list[dict[str, Any]]:
@@ -347,6 +371,16 @@ def newest_observation_ns(source: RowSource, session_ids: Sequence[str]) -> int:
 def prism_confirmations(source: RowSource, session_id: str) -> list[dict[str, Any]]:
     """Return the rows of words that a session's stations are on its prism, oldest first."""
     return list(source.rows("SELECT * FROM prism_confirmations WHERE session_id = ? ORDER BY id", (session_id,)))
+
+
+def joints_measured(source: RowSource, session_id: str) -> Iterator[dict[str, Any]]:
+    """Return the rows of `v_joints` from the start of a session that has ended to its end, oldest first."""
+    return iter(source.rows(_JOINTS_MEASURED, (session_id,)))
+
+
+def fixes_measured(source: RowSource, session_id: str) -> Iterator[dict[str, Any]]:
+    """Return the rows of `v_fixes` from the start of a session that has ended to its end, oldest first."""
+    return iter(source.rows(_FIXES_MEASURED, (session_id,)))
 
 
 def fixes_since_used(source: RowSource, session_id: str, station: str) -> Iterator[dict[str, Any]]:

@@ -226,6 +226,7 @@ class Store(Connection):
             self._channels.clear()
             for name, unit in (*joints.items(), *signals.items()):
                 self._channel(name, unit)
+            self._show_views()
 
     def _channel(self, name: str, unit: str) -> tuple[int, ChannelKind]:
         found = self._channels.get((name, unit))

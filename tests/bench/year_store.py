@@ -103,8 +103,8 @@ def moved(stamp: Stamp, minute: int) -> Stamp:
     )
 
 
-def build(path: Path, samples: float, seed: int) -> None:
-    """Make a store that has been sent so many samples."""
+def build(path: Path, samples: float, seed: int, *, is_dense: bool = False) -> None:
+    """Make a store that has been sent so many samples; a dense one has a row for each, outside sessions too."""
     own = Traffic(path.with_name("traffic.sqlite"), seed)
     minutes = max(round(samples / own.samples_a_minute), SESSION_EVERY)
     with contextlib.closing(Store(path)) as store:
@@ -118,14 +118,14 @@ def build(path: Path, samples: float, seed: int) -> None:
                 boot = store.boot_row(moved(Stamp(UTC_0_NS, 0, ""), begin))  # the same for the whole hour
                 db.execute("BEGIN")
                 for minute in range(begin, min(begin + COMMIT_MINUTES, minutes)):
-                    add_minute(db, own, minute, boot)
+                    add_minute(db, own, minute, boot, is_dense=is_dense)
                 db.execute("COMMIT")
         add_sessions(store, minutes)
     own.path.unlink()
     print(f"{minutes * own.samples_a_minute:.3g} samples sent in {minutes / 60:.0f} hours")
 
 
-def add_minute(db: sqlite3.Connection, own: Traffic, minute: int, boot: int) -> None:
+def add_minute(db: sqlite3.Connection, own: Traffic, minute: int, boot: int, *, is_dense: bool) -> None:
     """Add a minute of the traffic to a store: all of it within sessions, thinned elsewhere."""
     origin = minute % MINUTES
     is_whole = minute % SESSION_EVERY >= SESSION_EVERY - MINUTES
@@ -138,7 +138,7 @@ def add_minute(db: sqlite3.Connection, own: Traffic, minute: int, boot: int) -> 
         db.execute(_CHUNK, (chunk.link, *at, chunk.captures, chunk.payload_bytes, chunk.blob))
     origin_ns = origin * SPAN_NS
     there = moved(Stamp(0, origin_ns, ""), minute)
-    values = (there.utc_ns, there.monotonic_ns - origin_ns, boot, origin_ns, is_whole)
+    values = (there.utc_ns, there.monotonic_ns - origin_ns, boot, origin_ns, is_whole or is_dense)
     for statement in (_SAMPLES.format("joint_samples"), _SAMPLES.format("signals"), _FIXES):
         db.execute(statement, values)
 
@@ -155,7 +155,7 @@ def add_sessions(store: Store, minutes: int) -> None:
         begin = moved(Stamp(UTC_0_NS + SPAN_NS, SPAN_NS, ""), last - MINUTES + 2)
         name = f"s{number:04d}"
         with store.transaction():
-            table.start(begin, id=name, rig_sha256="", rig_text=rig.text, prism="r", operator="", kind="static_poses")
+            table.start(begin, id=name, rig_text=rig.text, prism="r", operator="", kind="static_poses")
             for second in range(60 * (MINUTES - 2)):
                 place = {"x_mm": 1000.0 + second, "y_mm": 2000.0, "z_mm": 3000.0, "moving": 0}
                 row = {"session_id": name, "prism": "r", "pose": f"1.{second // 10}", **place, "values_json": joints}
@@ -237,7 +237,8 @@ def _until_it_answers(socket: Path) -> float:
 
 
 @contextlib.contextmanager
-def _directory(keep: Path | None) -> Iterator[Path]:
+def scratch(keep: Path | None) -> Iterator[Path]:
+    """Yield the directory of the store: one that stays, or one for the time being."""
     if keep is not None:
         keep.mkdir(parents=True, exist_ok=True)
         yield keep
@@ -253,7 +254,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--keep", type=Path, help="directory of the store, which stays and is measured again")
     options = parser.parse_args()
-    with _directory(options.keep) as directory:
+    with scratch(options.keep) as directory:
         path = directory / "rigcal.sqlite"
         if not path.exists():
             print(f"made in {_seconds(build, path, options.samples, options.seed):.0f} s")

@@ -120,8 +120,7 @@ class JobRig:
         row = {
             "id": name,
             "rig": rig,
-            "rig_sha256": "",
-            "rig_text": SOURCE.text,
+            "rig_sha256": self.store.rig_file(rig, SOURCE.text),
             "prism": "r",
             "operator": "Ada",
             "kind": kind,

@@ -181,7 +181,7 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Config]:
         store.insert("station_setups", setup | store.instant(now, "created_"))
         place = {"setup_id": setup["id"], "name": name, "x_mm": 0.0, "y_mm": 0.0, "z_mm": 0.0}
         store.insert("control_points", place)
-        session = {"id": f"s{n}{name}", "rig": "swdt82", "rig_sha256": "", "rig_text": "", "setup_id": setup["id"]}
+        session = {"id": f"s{n}{name}", "rig": "swdt82", "setup_id": setup["id"]}
         session |= {"prism": name, "operator": name, "note": name, "caller_user": name, "kind": "static_poses"}
         state = "open" if n == 0 else "closed"
         store.insert("calibration_sessions", session | {"state": state} | store.instant(now, "started_"))

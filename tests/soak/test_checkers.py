@@ -173,7 +173,7 @@ def store(tmp_path: Path) -> Store:
 
 def add_session(store: Store, name: str, begin_s: float, end_s: float | None) -> None:
     ended = {} if end_s is None else store.instant(Stamp(0, round(end_s * NS_PER_S), "soak"), "ended_")
-    row = {"id": name, "rig": "swdt82", "rig_sha256": "", "rig_text": "", "setup_id": "one", "prism": "r"}
+    row = {"id": name, "rig": "swdt82", "setup_id": "one", "prism": "r"}
     row |= {"operator": "", "kind": "static_poses", "state": "open" if end_s is None else "closed"}
     begin = store.instant(Stamp(0, round(begin_s * NS_PER_S), "soak"), "started_")
     store.insert("calibration_sessions", row | begin | ended)

@@ -131,14 +131,30 @@ def session_show(name: str, **where: Any) -> Any:
 @click.argument("name")
 @click.option("--config", type=click.Path(path_type=Path), required=True, help="Configuration of the store's daemon.")
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True, help="Directory for the files.")
-@click.option("--format", "can_format", type=click.Choice(["log", "asc", "blf"]), default="log", show_default=True)
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(["log", "candump", "asc", "blf", "csv", "parquet", "mat"]),
+    default="log",
+    show_default=True,
+    help="CAN logs of candump (log, candump) or Vector (asc, blf); or tables.",
+)
 @json_option
-def session_export(name: str, config: Path, out: Path, can_format: Any, *, as_json: bool) -> Any:
-    """Write a session's CAN and serial captures as logs that `rigcal replay` reads, and its observations as CSV."""
+def session_export(name: str, config: Path, out: Path, form: Any, *, as_json: bool) -> Any:
+    """Write what was captured or measured in a session to files.
+
+    log, candump, asc, blf: CAN and serial captures as logs that `rigcal replay` reads, and the observations as CSV.
+    csv, parquet, mat: the observations, all joint readings and all fixes as tables.
+    """
     from daemon.config import read_config
     from daemon.sessions.export import export_session
+    from daemon.sessions.export_tables import TABLE_FORMATS, export_tables
 
-    files = export_session(read_config(config), name, out, can_format)
+    settings = read_config(config)
+    if form in TABLE_FORMATS:
+        files = export_tables(settings.store_path, name, out, form)
+    else:
+        files = export_session(settings, name, out, "log" if form == "candump" else form)
     if not as_json:
         for file in files:
             echo(file)

@@ -54,6 +54,25 @@ def store_stats(config: Path, *, tables: bool, as_json: bool) -> dict[str, Any]:
     return found
 
 
+@store.command(cls=Command, name="describe")
+@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="The file; standard output by default.")
+@_config_option
+def store_describe(config: Path, out: Path | None, *, as_json: bool) -> dict[str, Any]:
+    """Write the metadata.yaml with which Datasette shows the store: titles, meanings of columns, queries."""
+    from daemon.config import read_config
+    from daemon.host.safe_output import write_file
+    from daemon.store.describe.description import describe_store
+    from daemon.store.describe.pages import datasette_metadata
+
+    path = read_config(config).store_path
+    text = datasette_metadata(describe_store(path), path.stem)
+    if out is not None:
+        write_file(out, text.encode())
+    if not as_json:
+        echo(f"{out}: `datasette serve {path} -m {out}` shows the store" if out is not None else text)
+    return {"store": str(path), "metadata": text} if out is None else {"store": str(path), "out": str(out)}
+
+
 @store.command(cls=Command, name="check")
 @click.option("--backup", type=click.Path(path_type=Path), help="Check this backup in place of the store.")
 @_config_option

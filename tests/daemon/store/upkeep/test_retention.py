@@ -60,8 +60,6 @@ def session(store: Store, name: str, since: Stamp, until: Stamp | None, state: s
     about = {
         "id": name,
         "rig": "swdt82",
-        "rig_sha256": "",
-        "rig_text": "",
         "prism": "r",
         "operator": "",
         "state": state,

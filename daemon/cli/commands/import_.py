@@ -1,0 +1,99 @@
+"""`rigcal import`: an instrument's export as observations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from daemon.cli import offline
+from daemon.cli.command import Command, json_option
+from daemon.cli.terminal import echo
+
+
+@click.command(cls=Command, name="import")
+@click.argument("file", type=offline.FILE)
+@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), required=True, help="The observations CSV.")
+@click.option("--map", "map_path", type=offline.FILE, help="Read the file by this map, which an import has written.")
+@click.option("--rig", metavar="RIG", help="Name of a shipped rig, or path of a rig file: its prisms and joints.")
+@click.option(
+    "--joints",
+    type=offline.FILE,
+    help="CSV with a column for each joint (theta1_deg, ...) and pose (the point's number), time_s or time.",
+)
+@click.option("--prism", help="The prism that all points are of; otherwise by their codes or markers.")
+@click.option("--setup", default="", help="Name of the station set-up, for all rows.")
+@click.option("--session", default="", help="Name of the session, for all rows.")
+@json_option
+def import_(
+    file: Path,
+    out: Path,
+    map_path: Path | None,
+    rig: str | None,
+    joints: Path | None,
+    prism: str | None,
+    setup: str,
+    session: str,
+    *,
+    as_json: bool,
+) -> dict[str, Any]:
+    """Read FILE of a tracker or total station, and write observations.
+
+    Formats: Topcon GTS memory downloads, Sokkia SDR33, Vicon trajectories, tables of Leica, FARO and others. What was
+    guessed of a table is said, and written beside the result as a map; with --map the same is done again. A bad file is
+    refused whole, with line, column and reason.
+    """
+    from calibration.observations import parse_observations
+    from daemon.cli.imported_points import map_text, observations_csv, read_export, read_joints, read_map
+    from daemon.config import load_rig
+    from daemon.host.safe_output import write_file
+    from drivers.stations.exports import export_formats, format_of
+
+    if joints is not None and rig is None:
+        raise click.UsageError("--joints needs --rig, which names the joints")
+    for given in (file, joints, map_path):
+        if given is not None:
+            offline.check_out(out, given)
+    described = load_rig(rig).rig if rig is not None else None
+    if prism and described is not None and prism not in described.prism_names:
+        raise click.UsageError(
+            f"rig {described.name!r} has no prism {prism!r}; it has {', '.join(described.prism_names)}"
+        )
+    text = read_export(file)
+    notes: tuple[str, ...] = ()
+    if map_path is not None:
+        columns = read_map(map_path)
+        known = export_formats()[columns.format]
+    else:
+        known = format_of(text, file.name)
+        guess = known.guess(text, file.name)
+        columns, notes = guess.map, guess.notes
+    fixes = known.read(text, columns, file.name)
+    rows = None if joints is None or described is None else read_joints(joints, described)
+    labels = {"setup": setup, "session": session}
+    table = observations_csv(fixes, columns, file.name, described, rows, prism, labels)
+    if described is not None and rows is not None:
+        parse_observations(table.encode(), described, f"what {file.name} became")
+    saved = None
+    if map_path is None:
+        saved = out.with_name(f"{out.stem}.map.toml")
+        write_file(saved, map_text(columns, file.name).encode())
+    write_file(out, table.encode())
+    if not as_json:
+        echo(f"{known.title}: {len(fixes)} points, now rows of {out}")
+        for note in notes:
+            echo(f"  {note}")
+        if saved is not None:
+            echo(f"how it was read is in {saved}; --map {saved} does the same again")
+        if rows is None:
+            echo("no joint values: give them with --rig and --joints before you calibrate")
+    return {
+        "format": known.name,
+        "points": len(fixes),
+        "out": str(out),
+        "map": columns.model_dump(exclude_defaults=True),
+        "map_file": None if saved is None else str(saved),
+        "notes": list(notes),
+        "has_joints": rows is not None,
+    }

@@ -1,0 +1,247 @@
+"""Points of an instrument's export as observations: each with its prism, its pose, and the joints of a second file."""
+
+from __future__ import annotations
+
+import csv
+import io
+import tomllib
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from calibration.rig.columns import LABELS, POSITION, names
+from calibration.rig.description import Rig
+from drivers.errors import DescriptionError
+from drivers.files import read_whole
+from drivers.stations.delimited import cells_of, lines_of, number_of
+from drivers.stations.export_format import ColumnMap, ExportedFix, refuse
+from drivers.stations.exports import export_formats
+
+FILE_MAX_BYTES = 128 << 20
+MOST_GAP_S = 1.0  # between the joint rows on both sides of a fix
+POSE, TIME_S, TIME = "pose", "time_s", "time"
+
+
+def read_export(path: Path) -> str:
+    """Return the text of an export: UTF-8, UTF-16 with its mark, or the Windows code page of western Europe.
+
+    Raises:
+        DescriptionError: it cannot be read.
+    """
+    try:
+        data = read_whole(path, FILE_MAX_BYTES)
+    except OSError as error:
+        raise DescriptionError(str(path), f"cannot be read: {error.strerror}") from error
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return data.decode("utf-16", "replace")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("cp1252", "replace")
+
+
+def read_map(path: Path) -> ColumnMap:
+    """Read a map that an import has written, or a person.
+
+    Raises:
+        DescriptionError: it cannot be read, or a key of it is wrong.
+    """
+    try:
+        found = ColumnMap.model_validate(tomllib.loads(read_whole(path, 1 << 20).decode()))
+    except OSError as error:
+        raise DescriptionError(str(path), f"cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise DescriptionError(str(path), f"is not a TOML file: {error}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise DescriptionError(str(path), f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+    if found.format not in export_formats():
+        raise DescriptionError(str(path), f"format: {found.format!r} is unknown; known: {', '.join(export_formats())}")
+    return found
+
+
+def map_text(columns: ColumnMap, source: str) -> str:
+    """Return a map as TOML."""
+    told = columns.model_dump(exclude_defaults=True)
+    lines = [f"# How `rigcal import` read {_quoted(source)}. Edit it, and give it with --map."]
+    lines += [f"{key} = {_toml(value)}" for key, value in told.items() if not isinstance(value, dict)]
+    for section in ("columns", "prisms"):
+        if told.get(section):
+            lines += ["", f"[{section}]", *(f"{_quoted(key)} = {_toml(value)}" for key, value in told[section].items())]
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: object) -> str:
+    return _quoted(value) if isinstance(value, str) else str(value)
+
+
+def _quoted(text: str) -> str:
+    escaped = "".join(c if c.isprintable() and c not in '"\\' else f"\\u{ord(c):04x}" for c in text)
+    return f'"{escaped}"'
+
+
+# ---- joints ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class JointRows:
+    """Rows of a file of joint values.
+
+    Attributes:
+        source: name of the file.
+        columns: columns that go into the observations.
+        by_pose: pose -> values, where the file has poses.
+        times_s: of the rows, rising; empty where the file has no times.
+        rows: values of each row.
+    """
+
+    source: str
+    columns: tuple[str, ...]
+    by_pose: Mapping[str, Sequence[float]]
+    times_s: Sequence[float]
+    rows: Sequence[Sequence[float]]
+
+    def of(self, fix: ExportedFix, source: str) -> Sequence[float]:
+        """Return the joint values of a fix: those of its pose, or between the rows before and after its time.
+
+        Raises:
+            DescriptionError: there are none; with the line of the fix.
+        """
+        if self.by_pose:
+            found = self.by_pose.get(_plain(fix.point))
+            if found is None:
+                refuse(source, f"{self.source} has no pose {fix.point!r}", fix.line)
+            return found
+        if fix.time_s is None:
+            refuse(source, f"the point has no time, and {self.source} no column {POSE!r} to match it by", fix.line)
+        place = bisect_left(self.times_s, fix.time_s)
+        if place < len(self.times_s) and self.times_s[place] == fix.time_s:
+            return self.rows[place]
+        if not 0 < place < len(self.times_s) or self.times_s[place] - self.times_s[place - 1] > MOST_GAP_S:
+            span = f"{self.times_s[0]:.3f} to {self.times_s[-1]:.3f} s"
+            reason = f"{self.source} has no joints within {MOST_GAP_S:g} s on both sides of {fix.time_s:.3f} s ({span})"
+            refuse(source, reason, fix.line)
+        before, after = self.times_s[place - 1], self.times_s[place]
+        share = (fix.time_s - before) / (after - before)
+        return [a + share * (b - a) for a, b in zip(self.rows[place - 1], self.rows[place], strict=True)]
+
+
+def read_joints(path: Path, rig: Rig) -> JointRows:
+    """Read a file of joint values: a column for each joint as in observations, and `pose`, `time_s` or `time` (ISO).
+
+    Raises:
+        DescriptionError: a column is missing, a cell is no number, or a pose is there twice; with line and column.
+    """
+    source = path.name
+    lines = lines_of(read_export(path))
+    header = cells_of(lines[0], ",")
+    joints = tuple(joint.column for joint in rig.joints)
+    for column in joints:
+        if header.count(column) != 1:
+            problem = (
+                "is there twice" if column in header else f"is missing; rig {rig.name!r} needs {', '.join(joints)}"
+            )
+            refuse(source, f"the column {problem}", 1, column)
+    key = next((name for name in (POSE, TIME_S, TIME) if name in header), None)
+    if key is None:
+        refuse(
+            source, f"needs a column {POSE!r} (the point's name or number), {TIME_S!r} or {TIME!r} to match fixes by", 1
+        )
+    by_pose: dict[str, list[float]] = {}
+    timed: list[tuple[float, list[float]]] = []
+    for number, line in enumerate(lines[1:], 2):
+        if not line.strip():
+            continue
+        cells = cells_of(line, ",")
+        if len(cells) != len(header):
+            refuse(source, f"{len(cells)} cells where the header has {len(header)}", number)
+        row = []
+        for column in joints:
+            value = number_of(cells[header.index(column)], ".")
+            if value is None:
+                refuse(source, f"{cells[header.index(column)]!r} is not a number", number, column)
+            row.append(value)
+        cell = cells[header.index(key)]
+        if key == POSE:
+            if by_pose.setdefault(_plain(cell), row) is not row:
+                refuse(source, f"pose {cell!r} is there twice", number, POSE)
+        else:
+            timed.append((_seconds(cell, source, number, key), row))
+    if not by_pose and not timed:
+        refuse(source, "no rows below the header")
+    timed.sort(key=lambda each: each[0])
+    return JointRows(source, joints, by_pose, [at for at, _ in timed], [row for _, row in timed])
+
+
+def _seconds(cell: str, source: str, line: int, column: str) -> float:
+    value = number_of(cell, ".")
+    if value is not None:
+        return value
+    try:
+        found = datetime.fromisoformat(cell)
+    except ValueError:
+        refuse(source, f"{cell!r} is neither seconds nor an ISO time", line, column)
+    return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
+
+
+def _plain(pose: str) -> str:
+    """Return a pose's number without leading zeros, which memories of stations add."""
+    return pose.lstrip("0") or "0" if pose.isdigit() else pose
+
+
+# ---- observations ----------------------------------------------------------------------------------------------------
+
+
+def observations_csv(
+    fixes: Sequence[ExportedFix],
+    columns: ColumnMap,
+    source: str,
+    rig: Rig | None,
+    joints: JointRows | None,
+    prism: str | None,
+    labels: Mapping[str, str],
+) -> str:
+    """Return the observations CSV of an export's fixes.
+
+    Args:
+        fixes: as the file has them.
+        columns: its map, which may name prisms.
+        source: name of the file.
+        rig: whose prisms are measured; any name is taken when None.
+        joints: their joint values; none when None.
+        prism: of all fixes; by the file and the map when None.
+        labels: `setup` and `session` of all rows, where given.
+
+    Raises:
+        DescriptionError: a fix's prism is not known, or it has no joint values; with its line.
+    """
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    has_time = any(fix.time_s is not None for fix in fixes)
+    given = [name for name in names(LABELS) if labels.get(name)]
+    joint_columns = joints.columns if joints is not None else ()
+    writer.writerow(["prism", *joint_columns, *names(POSITION), *given, POSE, *([TIME_S] if has_time else [])])
+    for fix in fixes:
+        values = [] if joints is None else joints.of(fix, source)
+        cells = [prism or _prism(fix, columns, source, rig), *map(repr, map(float, values))]
+        cells += [f"{value:.4f}" for value in fix.position_mm] + [labels[name] for name in given] + [fix.point]
+        writer.writerow([*cells, *(["" if fix.time_s is None else repr(fix.time_s)] if has_time else [])])
+    return out.getvalue()
+
+
+def _prism(fix: ExportedFix, columns: ColumnMap, source: str, rig: Rig | None) -> str:
+    """Return a fix's prism: what the map says of its target or point, else the target itself, else the only prism."""
+    found = columns.prisms.get(fix.target) or columns.prisms.get(fix.point) or fix.target
+    if rig is None:
+        return found or "prism"
+    if found in rig.prism_names:
+        return found
+    if len(rig.prism_names) == 1 and not fix.target:
+        return rig.prism_names[0]
+    said = f"{fix.target!r}" if fix.target else "no code"
+    reason = f"point {fix.point!r} has {said}, which is no prism of rig {rig.name!r} ({', '.join(rig.prism_names)}); "
+    refuse(source, f"{reason}give --prism, or name it in [prisms] of the map", fix.line)

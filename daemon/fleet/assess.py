@@ -1,0 +1,169 @@
+"""The work on one rig of a fleet: calibrate it, look for what its model lacks, and see whether it has changed.
+
+A task carries all that the work needs, and the answer is text and numbers, so that any process on any computer may do
+it. The same task gives the same answer.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daemon.warm_up import prepare
+
+if TYPE_CHECKING:
+    from calibration.model.model import CalibratedModel
+    from calibration.observations import Observations
+    from calibration.rig.description import Rig
+    from calibration.run import Run
+
+FORM = 1  # of the answer; a later one is not read for an earlier one
+
+
+@dataclass(frozen=True)
+class FleetSettings:
+    """What is done with each rig.
+
+    Attributes:
+        gap: look for missing effects; kinematics alone without.
+        prior: how the build tolerances are used.
+        seed: of everything random.
+    """
+
+    gap: bool = True
+    prior: str = "recalibration"
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class RigTask:
+    """A rig with its data.
+
+    Attributes:
+        name: of the rig among the fleet.
+        source: where it was found, for people.
+        rig_text: its rig file.
+        data: observations CSV of the sessions that train.
+        checks: observations CSV of check sessions, which never train; None without any.
+        settings: what to do.
+    """
+
+    name: str
+    source: str
+    rig_text: str
+    data: bytes
+    checks: bytes | None
+    settings: FleetSettings
+
+    @property
+    def sha256(self) -> str:
+        """Of all that decides the answer."""
+        told = [str(FORM), self.rig_text, json.dumps(asdict(self.settings), sort_keys=True)]
+        parts = [*(text.encode() for text in told), self.data, self.checks or b""]
+        return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()
+
+
+def assess(task: RigTask) -> dict[str, Any]:
+    """Calibrate a rig and return what a comparison of rigs needs.
+
+    Returns:
+        JSON: `name`, `source`, `sha256`, `rig`, and either `error` and `kind`, or `fixes`, `sessions`, `noise_mm`,
+        `stages` (stage -> RMS, mm), `expected_rms_mm`, `verdict`, `effects`, `parameters` (`name`, `unit`, `value`,
+        `sigma`, `prior_sigma`), `unidentifiable`, `drift` (`session`, `ratio`, `alarm`) or None, and `warnings`.
+    """
+    prepare()
+    from calibration.errors import CalibrationError
+    from calibration.rig.description import parse_rig
+
+    answer: dict[str, Any] = {"name": task.name, "source": task.source, "sha256": task.sha256}
+    try:
+        rig = parse_rig(task.rig_text, f"the rig file of {task.name}")
+        with ThreadPoolExecutor(1) as pool:
+            return answer | {"rig": rig.name} | _assessed(task, rig, pool)
+    except CalibrationError as error:
+        return answer | {"error": str(error), "kind": type(error).__name__}
+
+
+def _assessed(task: RigTask, rig: Rig, pool: Executor) -> dict[str, Any]:
+    from calibration.evaluation.evaluation import evaluate
+    from calibration.observations import parse_observations
+    from calibration.pipeline.calibrate import identify
+    from calibration.pipeline.find_gap import find_gap
+    from calibration.run import Run
+
+    settings = task.settings
+    prior: Any = settings.prior
+    run = Run(settings.seed, pool)
+    observations = parse_observations(task.data, rig, task.name)
+    verdict = None
+    if settings.gap:
+        found = find_gap(rig, task.rig_text, observations, prior=prior, run=run)
+        model, verdict = found.model, found.verdict
+    else:
+        model = identify(rig, task.rig_text, observations, prior=prior, effects="none", run=run)
+    evaluation = evaluate(model, observations)
+    sessions = list(dict.fromkeys(observations.session.tolist()))
+    return {
+        "fixes": len(observations),
+        "sessions": [name for name in sessions if name],
+        "noise_mm": model.noise_mm,
+        "stages": {str(stage["stage"]): stage["rms_mm"] for stage in evaluation.stages()},
+        "expected_rms_mm": None if evaluation.expected is None else evaluation.expected.as_dict()["rms_mm"],
+        "verdict": verdict,
+        "effects": [effect.as_dict() for effect in model.effects],
+        "parameters": _parameters(model),
+        "unidentifiable": len(model.identifiability.as_dict()["unidentifiable"]),  # type: ignore[arg-type]  # a list
+        "drift": _drift(task, rig, model, observations, run),
+        "warnings": list(evaluation.warnings),
+    }
+
+
+def _parameters(model: CalibratedModel) -> list[dict[str, Any]]:
+    """Return the constants of the machine; where it stands is nothing that rigs have in common."""
+    return [
+        {
+            "name": parameter.name,
+            "unit": parameter.unit,
+            "value": parameter.value,
+            "sigma": parameter.standard_error,
+            "prior_sigma": parameter.prior_sigma if np.isfinite(parameter.prior_sigma) else None,
+        }
+        for parameter in model.parameters
+        if parameter.kind != "base"
+    ]
+
+
+def _drift(
+    task: RigTask, rig: Rig, model: CalibratedModel, observations: Observations, run: Run
+) -> Mapping[str, Any] | None:
+    """Hold the newest data against a model that has not seen them: check sessions, or the last of several sessions."""
+    from calibration.errors import CalibrationError
+    from calibration.evaluation.drift import check
+    from calibration.numerics.statistics import Cusum
+    from calibration.observations import parse_observations
+    from calibration.pipeline.calibrate import identify
+
+    try:
+        if task.checks is not None:
+            newest = parse_observations(task.checks, rig, f"checks of {task.name}")
+            name = str(newest.session[-1]) or "checks"
+        else:
+            name = str(observations.session[-1])
+            is_newest = observations.session == name
+            if not name or is_newest.all():
+                return None
+            effects = ",".join(f"{effect.family}@{effect.where}" for effect in model.effects) or "none"
+            earlier = observations.select(~is_newest)
+            prior: Any = task.settings.prior
+            model = identify(rig, task.rig_text, earlier, prior=prior, effects=effects, run=run.quiet())
+            newest = observations.select(is_newest)
+        found = check(model, newest)
+    except CalibrationError as error:
+        return {"session": None, "ratio": None, "alarm": None, "reason": str(error)}
+    return {"session": name, "ratio": found.ratio, "alarm": Cusum().after(found.scores).alarm, "reason": ""}

@@ -1,0 +1,151 @@
+"""Where the rigs of a fleet are found: stores of daemons, and directories of observations."""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from calibration.errors import DataError
+from calibration.rig.description import parse_rig
+from calibration.rig.toml import LONGEST
+from daemon.config import load_rig
+from daemon.fleet.assess import FleetSettings, RigTask
+from daemon.sessions.session_data import sessions_csv
+from daemon.sessions.session_file import read_session_file
+from daemon.store.reader import Reader
+from daemon.store.sessions import session, sessions_of_use
+from drivers.files import read_text, read_whole
+
+STORE = "rigcal.sqlite"
+RIG_FILE = "rig.toml"
+_CSV_MAX_BYTES = 128 << 20
+
+
+@dataclass(frozen=True)
+class RigSource:
+    """A rig of the fleet; its data are read when its turn comes.
+
+    Attributes:
+        name: unique among the fleet.
+        path: a store, or a directory of CSV files.
+        rig: the rig file of a directory that has none.
+    """
+
+    name: str
+    path: Path
+    rig: str | None
+
+    def task(self, settings: FleetSettings) -> RigTask:
+        """Read the rig's data.
+
+        Raises:
+            CalibrationError, StoreError: they cannot be used.
+            OSError: they cannot be read.
+        """
+        if self.path.is_file():
+            return _of_store(self, settings)
+        return _of_directory(self, settings)
+
+
+def find_rigs(directories: Sequence[Path], pattern: str | None, rig: str | None) -> list[RigSource]:
+    """Find the rigs of a fleet, in the order of their names.
+
+    Args:
+        directories: each of one rig, with a store or with CSV files of observations.
+        pattern: of the paths of further stores.
+        rig: the rig of directories without a `rig.toml`.
+
+    Raises:
+        DataError: a directory holds neither, the pattern matches nothing, or there is no rig at all.
+    """
+    found: list[tuple[Path, Path]] = []  # what names the rig, and where its data are
+    for directory in directories:
+        store = directory / STORE
+        if store.is_file():
+            found.append((directory, store))
+        elif directory.is_dir() and any(directory.glob("*.csv")):
+            found.append((directory, directory))
+        else:
+            raise DataError(str(directory), f"neither a {STORE} nor CSV files of observations in it")
+    if pattern is not None:
+        stores = sorted(Path(path) for path in glob.glob(pattern, recursive=True) if Path(path).is_file())
+        if not stores:
+            raise DataError(pattern, "no such store; quote the pattern, so that the shell leaves it alone")
+        found += [(store.parent if store.name == STORE else store, store) for store in stores]
+    if not found:
+        raise DataError("fleet", "name directories of rigs, or stores with --stores")
+    return [RigSource(name, path, rig) for name, path in sorted(_named(found))]
+
+
+def _named(found: Sequence[tuple[Path, Path]]) -> Iterator[tuple[str, Path]]:
+    """Name rigs by their directories, with so many of those above that no two have the same name."""
+    parts = [path.resolve().parts for path, _ in found]
+    depth = next(
+        (n for n in range(1, max(map(len, parts)) + 1) if len({part[-n:] for part in parts}) == len(parts)), None
+    )
+    if depth is None:
+        raise DataError("fleet", "the same rig is named twice")
+    for (_, data), part in zip(found, parts, strict=True):
+        yield "-".join(part[-depth:]).replace("/", "-"), data
+
+
+def _of_store(source: RigSource, settings: FleetSettings) -> RigTask:
+    with Reader(source.path) as reader:
+        training, checks = sessions_of_use(reader)
+        if not training:
+            raise DataError(str(source.path), "no closed session that calibration may use")
+        newest = session(reader, training[-1])
+        assert newest is not None  # it was just listed
+        text = str(newest["rig_text"])
+        rig = parse_rig(text, f"the rig of session {training[-1]}")
+        data = sessions_csv(reader, rig, training)
+        checked = sessions_csv(reader, rig, checks) if checks else None
+    return RigTask(source.name, str(source.path), text, data, checked, settings)
+
+
+def _of_directory(source: RigSource, settings: FleetSettings) -> RigTask:
+    own = source.path / RIG_FILE
+    if own.is_file():
+        text = read_text(own, LONGEST)
+    elif source.rig is not None:
+        text = load_rig(source.rig).text
+    else:
+        raise DataError(str(source.path), f"no {RIG_FILE} in it; name the rig with --rig")
+    training: list[Path] = []
+    checks: list[Path] = []
+    for path in sorted(source.path.glob("*.csv")):
+        if b"prism" in _header(path):  # joints and fixes of an export have their own files beside
+            (checks if _is_check(path) else training).append(path)
+    if not training:
+        raise DataError(str(source.path), "no CSV file of observations that may train: one with a column prism")
+    return RigTask(source.name, str(source.path), text, _joined(training), _joined(checks) or None, settings)
+
+
+def _header(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.readline(1 << 20).strip()
+
+
+def _is_check(path: Path) -> bool:
+    """Return True for a check session, as the file beside an exported session tells."""
+    told = path.with_suffix(".json")
+    return told.is_file() and read_session_file(told).kind == "check"
+
+
+def _joined(files: Sequence[Path]) -> bytes:
+    """Return several CSV files as one."""
+    if not files:
+        return b""
+    header = _header(files[0])
+    parts = []
+    for path in files:
+        if _header(path) != header:
+            raise DataError(path.name, f"has other columns than {files[0].name}; the files of a rig have the same", 1)
+        parts.append(_ended(read_whole(path, _CSV_MAX_BYTES).partition(b"\n")[2]))
+    return header + b"\n" + b"".join(parts)
+
+
+def _ended(data: bytes) -> bytes:
+    return data if not data or data.endswith(b"\n") else data + b"\n"

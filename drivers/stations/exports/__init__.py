@@ -1,0 +1,29 @@
+"""The registry of formats that instruments and their programs export: the `FORMAT` of every file in this folder."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from functools import cache
+
+from drivers.stations.export_format import ExportFormat, refuse
+
+
+@cache
+def export_formats() -> dict[str, ExportFormat]:
+    """Return the formats by name, in the order in which they are tried."""
+    modules = [importlib.import_module(f"{__name__}.{info.name}") for info in pkgutil.iter_modules(__path__)]
+    formats: list[ExportFormat] = sorted((module.FORMAT for module in modules), key=lambda known: known.rank)
+    return {known.name: known for known in formats}
+
+
+def format_of(text: str, source: str) -> ExportFormat:
+    """Return the format of a text.
+
+    Raises:
+        DescriptionError: it is of none.
+    """
+    for known in export_formats().values():
+        if known.recognises(text):
+            return known
+    refuse(source, f"the format is not known; known: {', '.join(known.title for known in export_formats().values())}")

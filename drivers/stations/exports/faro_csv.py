@@ -1,0 +1,16 @@
+"""Text exports of FARO trackers and CAM2: a name and X, Y, Z below a preamble with units."""
+
+from __future__ import annotations
+
+import re
+
+from drivers.stations.delimited import delimited_format
+
+_MARKS = re.compile(r"\b(faro|cam2|vantage)\b", re.IGNORECASE)
+
+
+def _recognises(text: str) -> bool:
+    return bool(_MARKS.search(text[:4000]))
+
+
+FORMAT = delimited_format("faro_csv", "FARO text export", 30, _recognises)

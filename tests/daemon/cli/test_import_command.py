@@ -1,0 +1,113 @@
+"""`rigcal import`: exports of instruments become observations that the other commands read."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+
+from calibration.observations import Observations
+from calibration.rig.description import shipped_rig
+from daemon.cli.main import main
+from tests.drivers.stations.exports.test_exports import VICON, gts_download
+
+RIG = shipped_rig("ur10")
+JOINTS = [joint.column for joint in RIG.joints]
+SURVEY = "PtID;X [mm];Y [mm];Z [mm];Code\n001;100,5;200;300;tmac\n002;110;210;310;tmac\n"
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(main, ["import", *map(str, arguments)])
+
+
+def told(*arguments: object) -> dict[str, Any]:
+    result = run(*arguments, "--json")
+    assert result.exit_code == 0, result.output
+    found: dict[str, Any] = json.loads(result.stdout)
+    return found
+
+
+def joints_csv(path: Path, key: str, cells: list[object]) -> Path:
+    rows = [",".join([str(cell), *(f"{n + 10 * k}" for k in range(len(JOINTS)))]) for n, cell in enumerate(cells)]
+    path.write_text("\n".join([",".join([key, *JOINTS]), *rows]) + "\n")
+    return path
+
+
+def test_joints_are_matched_by_the_number_of_the_pose(tmp_path: Path) -> None:
+    survey = tmp_path / "survey.csv"
+    survey.write_text(SURVEY)
+    joints, out = joints_csv(tmp_path / "joints.csv", "pose", [2, 1]), tmp_path / "out.csv"
+    result = told(survey, "--rig", "ur10", "--joints", joints, "--setup", "S1", "--out", out)
+    assert (result["format"], result["points"], result["has_joints"]) == ("leica_csv", 2, True)
+    found = Observations.from_csv(out, RIG)
+    assert found.position_mm.tolist() == [[100.5, 200.0, 300.0], [110.0, 210.0, 310.0]]
+    assert found.joints["q1"].tolist() == [1.0, 0.0]
+    assert (found.pose.tolist(), found.setup.tolist()) == (["001", "002"], ["S1", "S1"])
+
+
+def test_joints_are_matched_by_time(tmp_path: Path) -> None:
+    survey, out = tmp_path / "walk.csv", tmp_path / "out.csv"
+    survey.write_text(VICON)
+    joints = joints_csv(tmp_path / "joints.csv", "time_s", [0.0, 0.04])
+    refused = run(survey, "--rig", "ur10", "--joints", joints, "--out", out)
+    assert refused.exit_code == 2
+    assert "walk.csv, line 6: point '1' has 'rig:tip', which is no prism" in refused.stderr
+    mapped = told(survey, "--out", out)
+    map_path = Path(mapped["map_file"])
+    map_path.write_text(map_path.read_text() + '\n[prisms]\n"rig:tip" = "tmac"\n"rig:base" = "tmac"\n')
+    told(survey, "--map", map_path, "--rig", "ur10", "--joints", joints, "--out", out)
+    found = Observations.from_csv(out, RIG)
+    assert found.joints["q1"].tolist() == pytest.approx([0.25, 0.25, 0.5])
+
+
+def test_a_saved_map_makes_an_import_repeatable(tmp_path: Path) -> None:
+    survey, out, again = tmp_path / "survey.csv", tmp_path / "out.csv", tmp_path / "again.csv"
+    survey.write_text(SURVEY)
+    result = run(survey, "--out", out)
+    assert result.exit_code == 0, result.output
+    assert "columns are separated by semicolons" in result.stdout
+    told(survey, "--map", tmp_path / "out.map.toml", "--out", again)
+    assert again.read_bytes() == out.read_bytes()
+
+
+def test_a_gts_download_becomes_observations(tmp_path: Path) -> None:
+    download, out = tmp_path / "memory.gts", tmp_path / "out.csv"
+    download.write_text(gts_download(), encoding="latin-1")
+    result = run(download, "--rig", "swdt82", "--out", out)
+    assert "memory.gts, line 1: point '1' has no code" in result.stderr
+    assert not out.exists()
+    assert told(download, "--rig", "swdt82", "--prism", "r", "--out", out)["points"] == 3
+    assert [line.split(",")[0] for line in out.read_text().splitlines()] == ["prism", "r", "r", "r"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("q3_deg", "q9_deg"), "joints.csv, line 1, column q3_deg: the column is missing"),
+        (("\n1,1,", "\n1,x,"), "joints.csv, line 3, column q1_deg: 'x' is not a number"),
+        (("\n1,1,", "\n2,1,"), "joints.csv, line 3, column pose: pose '2' is there twice"),
+        (("\n1,1,", "\n9,1,"), "survey.csv, line 2: joints.csv has no pose '001'"),
+        (("pose,", "row,"), "joints.csv, line 1: needs a column 'pose'"),
+    ],
+)
+def test_joints_that_do_not_fit_are_refused(tmp_path: Path, change: tuple[str, str], said: str) -> None:
+    survey = tmp_path / "survey.csv"
+    survey.write_text(SURVEY)
+    joints = joints_csv(tmp_path / "joints.csv", "pose", [2, 1])
+    joints.write_text(joints.read_text().replace(*change))
+    result = run(survey, "--rig", "ur10", "--joints", joints, "--out", tmp_path / "out.csv")
+    assert result.exit_code == 2
+    assert said in result.stderr
+    assert not (tmp_path / "out.csv").exists()
+
+
+def test_a_wrong_map_is_refused(tmp_path: Path) -> None:
+    survey, columns = tmp_path / "survey.csv", tmp_path / "map.toml"
+    survey.write_text(SURVEY)
+    columns.write_text('format = "leica_csv"\nlength_unit = "furlong"\n')
+    result = run(survey, "--map", columns, "--out", tmp_path / "out.csv")
+    assert result.exit_code == 2
+    assert "map.toml: length_unit: Input should be" in result.stderr

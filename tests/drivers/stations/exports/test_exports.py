@@ -1,0 +1,193 @@
+"""Files of instruments and their programs: what is read of them, and how bad ones are refused.
+
+The samples are made here by the formats' rules. The real download of a GTS-229, which is not ours to keep, is read
+where RIGCAL_GTS229 names it (`sample_data/topcon_gts_229` of the repository totalopenstation/totalopenstation).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.errors import DescriptionError
+from drivers.stations.export_format import ExportedFix
+from drivers.stations.exports import export_formats, format_of
+from drivers.stations.topcon.framing import block_check
+
+POINTS = [
+    ("1", 43_575, 97.0930, 131.7260, ""),
+    ("2", 64_702, 96.8990, 136.0970, "w"),
+    ("3", 70_501, 96.8040, 153.91, "b"),
+]
+
+
+def gts_record(slope_mm: int, zenith_gon: float, hz_gon: float) -> str:
+    level_mm = round(slope_mm * math.sin(math.radians(zenith_gon * 0.9)))
+    data = f"?+{slope_mm:08d}m{round(zenith_gon * 1e4):07d}+{round(hz_gon * 1e4):07d}g+{level_mm:08d}t**+00+00"
+    return data + block_check(data.encode()).decode()
+
+
+def gts_download(points: list[tuple[str, int, float, float, str]] = POINTS) -> str:
+    """A memory download as the instrument sends it."""
+    fields = "_'_(_)1.540" + "".join(
+        f"_+{name}_ {gts_record(slope, zenith, hz)}_*{code}_,1.500" for name, slope, zenith, hz, code in points
+    )
+    fields += "_"
+    lines = []
+    for number, at in enumerate(range(0, len(fields), 128)):
+        data = fields[at : at + 128].ljust(128) + str(number % 10)
+        lines.append(f"\x02{data}{block_check(data.encode()).decode()}\x03\n")
+    return "".join(lines) + "\x04\n"
+
+
+def fixes(text: str, name: str) -> list[ExportedFix]:
+    found = format_of(text, "file")
+    assert found.name == name
+    return found.read(text, found.guess(text, "file").map, "file")
+
+
+def refused(text: str) -> str:
+    def read() -> None:
+        found = format_of(text, "survey.txt")
+        found.read(text, found.guess(text, "survey.txt").map, "survey.txt")
+
+    with pytest.raises(DescriptionError) as error:
+        read()
+    return str(error.value)
+
+
+# ---- Topcon GTS ------------------------------------------------------------------------------------------------------
+
+
+def test_a_gts_download_is_read_record_by_record() -> None:
+    first, second, third = fixes(gts_download(), "topcon_gts")
+    assert [(fix.point, fix.target) for fix in (first, second, third)] == [("1", ""), ("2", "w"), ("3", "b")]
+    zenith, hz = math.radians(97.0930 * 0.9), math.radians(131.7260 * 0.9)
+    level = 43_575 * math.sin(zenith)
+    expected = (level * math.sin(hz), level * math.cos(hz), 43_575 * math.cos(zenith))
+    np.testing.assert_allclose(first.position_mm, expected, atol=1e-6)
+
+
+def test_a_gts_download_of_more_than_ten_blocks() -> None:
+    points = [(str(n), 40_000 + n, 97.0, 130.0 + n / 10, "") for n in range(1, 54)]
+    found = fixes(gts_download(points), "topcon_gts")
+    assert [fix.point for fix in found] == [str(n) for n in range(1, 54)]
+
+
+def test_damaged_gts_downloads_are_refused_with_their_line() -> None:
+    text = gts_download()
+    lines = text.split("\n")
+    assert "line 2: the block check is wrong" in refused(text.replace("1539100", "1539101"))
+    assert "line 1: the download ends within a field" in refused("\n".join([lines[0], *lines[2:]]))
+    many = gts_download(POINTS * 2).split("\n")
+    assert "line 2: block 2 where block 1 is due" in refused("\n".join([many[0], *many[2:]]))
+    assert "line 1: 121 characters; a block has 128" in refused(text.replace("1317260", "1317260"[:0], 1)[:121])
+    unchecked = gts_record(1000, 100.0, 0.0)[:-3] + "000"
+    fields = f"_'_(_)1.540_+1_ {unchecked}_*_,1.500_".ljust(128) + "0"
+    broken = f"\x02{fields}{block_check(fields.encode()).decode()}\x03\n\x04\n"
+    assert "block check of the record of point 1 is wrong" in refused(broken)
+
+
+@pytest.mark.skipif("RIGCAL_GTS229" not in os.environ, reason="RIGCAL_GTS229 names no real download of a GTS-229")
+def test_the_real_download_of_a_gts_229() -> None:
+    found = fixes(Path(os.environ["RIGCAL_GTS229"]).read_text(encoding="latin-1"), "topcon_gts")
+    assert [fix.point for fix in found] == [str(n) for n in range(1, 54)]
+
+
+# ---- Sokkia SDR ------------------------------------------------------------------------------------------------------
+
+SDR_HEAD = "00NMSDR33 V04-04.02     01-Jan-26 12:00 211111\n10NMJOB1            121111\n"
+
+
+def sdr(code: str, *cells: object) -> str:
+    return code + "".join(f"{cell!s:16.16}" for cell in cells) + "\n"
+
+
+def test_sdr_coordinates_are_those_of_the_prism_from_the_instrument() -> None:
+    station, target = sdr("02TP", "0003", 937.274, 509.97, 20.053, 1.505), "03NM1.60000000\n"
+    text = SDR_HEAD + station + target + sdr("08TP", "0009", 908.838, 510.504, 19.699, "w") + "\x0358903\n"
+    (fix,) = fixes(text, "sokkia_sdr")
+    np.testing.assert_allclose(fix.position_mm, (534.0, -28436.0, 19699 + 1600 - 20053 - 1505), atol=1e-6)
+    assert (fix.point, fix.target, fix.line) == ("0009", "w", 5)
+
+
+def test_sdr_polar_measurements() -> None:
+    (fix,) = fixes(SDR_HEAD + sdr("09F1", "0003", "0004", 10.0, 100.0, 50.0, "r"), "sokkia_sdr")
+    np.testing.assert_allclose(fix.position_mm, (10_000 * math.sqrt(0.5), 10_000 * math.sqrt(0.5), 0.0), atol=1e-6)
+
+
+def test_bad_sdr_files_are_refused() -> None:
+    good = sdr("08TP", "1", 1.0, 2.0, 3.0)
+    assert "line 4: 'x.0' is not a number, in column 2" in refused(SDR_HEAD + good + sdr("08TP", "2", "x.0", 2.0, 3.0))
+    assert "columns of another width" in refused(SDR_HEAD.replace("SDR33", "SDR20") + good)
+    moved = sdr("02TP", "3", 0.0, 0.0, 0.0, 1.5) + good + sdr("02TP", "4", 9.0, 0.0, 0.0, 1.5)
+    assert "line 5: a second place of the station" in refused(SDR_HEAD + moved)
+
+
+# ---- tables ----------------------------------------------------------------------------------------------------------
+
+LEICA = "PtID,East [m],North [m],Height [m],Code,Date/Time\nP1,1.5,2.5,3.5,w,2026-11-24T10:00:00\nP2,1,2,3,b,\n"
+FARO = "FARO CAM2 export;;;\nUnits: millimeters;;;\nName;X;Y;Z\np1;1000,5;2000,25;-300,125\n"
+VICON = (
+    "Trajectories\n100\n,,rig:tip,,,rig:base,,\nFrame,Sub Frame,X,Y,Z,X,Y,Z\n,,mm,mm,mm,mm,mm,mm\n"
+    "1,0,1.5,2.5,3.5,4,5,6\n2,0,,,,4.5,5.5,6.5\n\nDevices\n1000\n"
+)
+ANGLES = "nr\thz (gon)\tv (gon)\tslope distance (m)\n7\t100\t100\t12.5\n"
+
+
+def test_a_leica_table() -> None:
+    first, second = fixes(LEICA, "leica_csv")
+    assert (first.point, first.target, first.position_mm) == ("P1", "w", (1500.0, 2500.0, 3500.0))
+    assert (first.time_s, second.time_s) == (1795514400.0, None)
+
+
+def test_a_faro_table_with_a_preamble_and_decimal_commas() -> None:
+    (fix,) = fixes(FARO, "faro_csv")
+    assert fix.position_mm == (1000.5, 2000.25, -300.125)
+    assert fix.line == 4
+
+
+@pytest.mark.parametrize("semicolons", [False, True])
+def test_vicon_trajectories(semicolons: bool) -> None:
+    found = fixes(VICON.replace(",", ";") if semicolons else VICON, "vicon_csv")
+    assert [(fix.point, fix.target) for fix in found] == [("1", "rig:tip"), ("1", "rig:base"), ("2", "rig:base")]
+    assert (found[2].position_mm, found[2].time_s) == ((4.5, 5.5, 6.5), 0.02)
+
+
+def test_angles_and_a_distance_become_a_position() -> None:
+    (fix,) = fixes(ANGLES, "plain_csv")
+    np.testing.assert_allclose(fix.position_mm, (12_500.0, 0.0, 0.0), atol=1e-6)
+
+
+def test_a_table_without_a_header() -> None:
+    first, second = fixes("a1 1000.0 2000.0 300.0\na2 1100.0 2000.0 300.0\n", "plain_csv")
+    assert (first.point, second.position_mm) == ("a1", (1100.0, 2000.0, 300.0))
+
+
+def test_what_is_not_named_is_guessed_and_said() -> None:
+    found = export_formats()["plain_csv"].guess("point,x,y,z\n1,1.5,2,3\n", "file")
+    assert found.map.length_unit == "m"
+    assert any("no unit of length is named" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (LEICA.replace("1.5,2.5", "1.5,2.5x"), "survey.txt, line 2, column North [m]: '2.5x' is not a number"),
+        (LEICA.replace(",b,", ",b,yesterday"), "survey.txt, line 3, column Date/Time: 'yesterday' is not a time"),
+        ("point,x,y,z\n1,2,3,4\n2,5\n", "survey.txt, line 3, column y: the line has 2 columns only"),
+        (VICON.replace("2,0,", "two,0,"), "survey.txt, line 7, column Frame: 'two' is not the number of a frame"),
+        (VICON.replace("mm", "deg"), "units are deg"),
+        ("some text\nand more\n", "no line names columns x, y, z"),
+    ],
+)
+def test_bad_tables_are_refused_whole(text: str, said: str) -> None:
+    assert said in refused(text)
+
+
+def test_an_empty_file_is_of_no_format() -> None:
+    assert "the format is not known" in refused("\n")
