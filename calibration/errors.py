@@ -25,8 +25,8 @@ class RigError(CalibrationError):
     """
 
     def __init__(self, source: str, where: str, reason: str, line: int | None = None) -> None:
-        at = f" (line {line})" if line is not None else ""
-        super().__init__(f"{source}: {where}{at}: {reason}" if where else f"{source}{at}: {reason}")
+        place = source if line is None else f"{source}, line {line}"
+        super().__init__(f"{place}: {where}: {reason}" if where else f"{place}: {reason}")
         self.source, self.where, self.reason, self.line = source, where, reason, line
 
 

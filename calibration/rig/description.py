@@ -286,7 +286,9 @@ def read_rig(text: str, source: str) -> tuple[Rig | None, tuple[RigError, ...]]:
     except ValidationError as error:
         # A misspelt key is unknown and missing; the spelling tells more.
         found = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-        return None, tuple(_fault(text, source, each) for each in found)
+        # Tables that are wrong do not count as there
+        own = [e for e in found if e["type"] != "too_short"] or found
+        return None, tuple(_fault(text, source, each) for each in own)
     rig._text = text
     return rig, ()
 

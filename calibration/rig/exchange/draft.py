@@ -75,7 +75,7 @@ class Draft:
         yield _ASSUMED
         for name, tables in self.sections.items():
             for number, table in enumerate(tables, 1):
-                remark = f"{number}: {table.remark}" if name == "row" else table.remark
+                remark = f"{number}: {table.remark}".removesuffix(": ") if name == "row" else table.remark
                 yield f"[[{name}]]" + (f"  # {remark}" if remark else "")
                 yield from (f"{key} = {_value(value)}" for key, value in table.keys.items())
                 yield ""

@@ -351,7 +351,9 @@ class _Import:
             table: dict[str, object] = {"name": link, "frame": carrier.row, "kg": inertial.kg}
             table["centre_mm"] = [tidy(x) for x in centre]
             if tensor.any():
-                table["inertia_kg_m2"] = [float(tensor[i, j]) for i, j in INERTIA_ORDER]
+                rounding = _SAME * np.abs(tensor).max()
+                entries = [float(tensor[at]) for at in INERTIA_ORDER]
+                table["inertia_kg_m2"] = [0.0 if abs(entry) <= rounding else entry for entry in entries]
             self._draft.add("mass", table | {"assumed": False})
 
 
