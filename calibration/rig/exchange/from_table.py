@@ -4,7 +4,8 @@ The columns are those of a row of a rig file, in any order and with other units 
 `alpha_rad`, `a_mm` or `a_m`, likewise `d`, `theta`, `beta` and `b`. A joint is named by `joint`, with `kind`
 (`revolute` by default), `lower` and `upper` in deg or mm, and `max_rate`. A row that several joints drive, or one that
 drives `a`, says so in `theta_drive`, `d_drive` or `a_drive`: `0.5*q1 - q2`. `after`, `x_mm` ... `rx_deg` and `identify`
-are those of a rig file. A comment `# convention: NAME` in front of the header says how the constants are meant.
+are those of a rig file. A line with `prism` is no row but a prism on the frame `frame` (the last row's
+by default), with its place `prism_x_mm` and so on. A comment `# convention: NAME` in front of the header says how the constants are meant.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from calibration.rig.exchange.frames import tidy
 CONSTANTS = {"alpha": "deg", "a": "mm", "d": "mm", "theta": "deg", "beta": "deg", "b": "mm"}
 BEFORE = ("x_mm", "y_mm", "z_mm", "rz_deg", "ry_deg", "rx_deg")
 DRIVES = ("theta", "d", "a")
-PRISM = ("prism", "prism_x_mm", "prism_y_mm", "prism_z_mm")
+PRISM = ("prism", "frame", "prism_x_mm", "prism_y_mm", "prism_z_mm")
 _JOINT = ("joint", "kind", "lower", "upper", "max_rate")
 _SCALES = {"deg": 1.0, "rad": math.degrees(1.0), "mm": 1.0, "m": 1e3}
 _OTHER = {"deg": "rad", "mm": "m"}
@@ -81,12 +82,15 @@ class _Table:
             raise RigError(self._source, "", "it has no rows below its header")
         continued = set()
         for number, (line, cells) in enumerate(rows, 1):
-            self._add_row(line, cells)
-            continued.add(int(self._number(line, cells, "after", number - 1)))
+            if "prism" in cells:
+                self._add_prism(line, cells)
+            else:
+                self._add_row(line, cells)
+                continued.add(int(self._number(line, cells, "after", number - 1)))
         if not draft.sections["joint"]:
             raise RigError(self._source, "", "no row names a joint, in a column `joint` or `theta_drive`")
         if not draft.sections["prism"]:
-            for end in sorted(set(range(1, len(rows) + 1)) - continued):
+            for end in sorted(set(range(1, len(draft.sections["row"]) + 1)) - continued):
                 name = "tool" if not draft.sections["prism"] else f"tool_{end}"
                 keys = {"name": free_name(name, self._kinds), "frame": end, "offset_mm": [0.0, 0.0, 0.0]}
                 draft.add("prism", keys | {"offset_known": False}, "where the reflector sits is not known")
@@ -139,10 +143,11 @@ class _Table:
         if "identify" in cells:
             keys["identify"] = [] if cells["identify"] == "-" else cells["identify"].split()
         self._draft.add("row", keys)
-        if "prism" in cells:
-            frame = len(self._draft.sections["row"])
-            offset = [self._number(line, cells, name, 0.0) for name in PRISM[1:]]
-            self._draft.add("prism", {"name": cells["prism"], "frame": frame, "offset_mm": offset})
+
+    def _add_prism(self, line: int, cells: Mapping[str, str]) -> None:
+        frame = int(self._number(line, cells, "frame", len(self._draft.sections["row"])))
+        offset = [self._number(line, cells, name, 0.0) for name in PRISM[2:]]
+        self._draft.add("prism", {"name": cells["prism"], "frame": frame, "offset_mm": offset})
 
     def _kind(self, line: int, cells: Mapping[str, str]) -> str:
         kind = cells.get("kind", "revolute")
