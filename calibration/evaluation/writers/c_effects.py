@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from calibration.effects.boom import Boom, boom_in
 from calibration.effects.context import EffectContext
-from calibration.effects.families import gravity_flip_play, joint_compliance
+from calibration.effects.families import boom_droop, gravity_flip_play, joint_compliance
 from calibration.effects.fitted import FittedEffect
 from calibration.effects.library import library
 from calibration.effects.links import LinkFamily
@@ -95,6 +96,7 @@ class EffectWriter:
         if regime.variable.startswith("torque("):
             joint = self._joint(regime.variable.removeprefix("torque(").removesuffix(")"))
             table = self._table(f"part{number}", self._weights(), out)
+            out.needs_pose = True
             value = f"rigcal_load(at, {table}, {joint})"
         else:
             value = f"q[{[joint.column for joint in self._rig.joints].index(regime.variable)}]"
@@ -248,6 +250,48 @@ class EffectWriter:
         along = int(effect.family == "passive_compliance")
         yield f"rigcal_bend(at, {table}, {self.tree.turning[row]}, {along}, 1.0, shift, prism_mm);"
 
+    def _droop(self, number: int, effect: FittedEffect, out: EffectCode) -> Iterator[str]:
+        out.needs_pose = True
+        boom = self._boom()
+        points = self._points()
+        newton = boom.weights[1][0]
+        factors = boom_droop.load_factors(boom, tuple(c.name for c in effect.coefficients))
+        tip, moment, centre, own = np.split(factors @ [c.value for c in effect.coefficients], 4)
+        weights = np.zeros((len(self._rig.rows) + 1, 4))
+        for (frame, offset_mm), force, of_whole, of_centre in zip(points, newton, moment, centre, strict=True):
+            weights[frame, 0] += force * of_whole
+            weights[frame, 1:] += force * (of_whole + of_centre) * offset_mm
+        table = self._table(f"load{number}", weights, out)
+        forces = f"{_c(newton @ tip)}, {_c(newton @ own)}"
+        yield f"rigcal_droop(at, {boom.root}, {boom.row}, {table}, {forces}, shift, prism_mm);"
+
+    def _pads(self, number: int, effect: FittedEffect, out: EffectCode) -> Iterator[str]:
+        out.needs_pose = True
+        boom, rig = self._boom(), self._rig
+        hanging = self._weights()
+        hanging[[boom.row not in rig.path(frame) for frame in range(len(hanging))]] = 0.0
+        table = self._table(f"load{number}", hanging, out)
+        low, high = rig.joint(boom.joint).limits
+        left = effect.settings["left"] * (high - low)
+        overlap = f"fmax({_c(high)} - q[{self._joint(boom.joint)}], 0.0) + {_c(left)}"
+        yield (
+            f"rigcal_pads(at, {boom.root}, {boom.row}, {table}, {_c(boom.outer_mm)}, {overlap}, "
+            f"{_c(effect.coefficients[0].value)}, shift, prism_mm);"
+        )
+
+    def _boom(self) -> Boom:
+        boom = boom_in(self.context)
+        assert boom is not None  # an effect of the boom is only on rigs that have one
+        return boom
+
+    def _points(self) -> list[tuple[int, Floats]]:
+        """Return the frames and places of the points at which weight hangs, in the order of `GravityModel`."""
+        found: list[tuple[int, Floats]] = []
+        for mass in self._rig.masses:
+            frames = (mass.frame,) if mass.centre_mm is not None else (mass.frame, mass.frame + 1)
+            found += [(frame, np.array(mass.centre_mm or (0.0, 0.0, 0.0))) for frame in frames]
+        return found
+
     # -- weights -------------------------------------------------------------------------------------------------------
 
     def _load(self, name: str, weights: Floats, joint: int, out: EffectCode) -> str:
@@ -308,6 +352,8 @@ _WRITERS: Mapping[str, _Writer] = {
     "linkage_coupling": EffectWriter._coupling,
     "joint_compliance": EffectWriter._compliance,
     "gravity_flip_play": EffectWriter._flip,
+    "boom_droop": EffectWriter._droop,
+    "pad_play": EffectWriter._pads,
 }
 
 

@@ -54,13 +54,15 @@ def c_header(
 
 def _with_effects(engine: str, code: EffectCode) -> str:
     lines = [f"    {line}" for line in code.lines]
-    if code.needs_pose or any("at," in line for line in code.lines):
+    if code.needs_pose:
         lines = [
             "    rigcal_frame_t at[RIGCAL_MOTIONS];",
             "    double prism_mm[RIGCAL_PRISMS][3];",
             "    rigcal_pose(q, at);",
-            "    for (int p = 0; p < RIGCAL_PRISMS; p++)",
+            "    for (int p = 0; p < RIGCAL_PRISMS; p++) {",
             "        rigcal_place(at, rigcal_prism_frame[p], rigcal_prism_place[p], prism_mm[p]);",
+            "    }",
+            "    (void)prism_mm;",
             *lines,
         ]
     return engine.replace(_SLOT, "\n".join(lines))

@@ -122,7 +122,7 @@ static inline double rigcal_load(const rigcal_frame_t at[], const double table[R
 /* A link that turns about its joint's place in proportion to a moment: the shift of the prisms, mm.
    `along` is 1 for the part of the moment along the axis, 0 for that across it. */
 static inline void rigcal_bend(const rigcal_frame_t at[], const double table[RIGCAL_FRAMES][4], int motion, int along,
-                               double amount, double shift[RIGCAL_PRISMS][3], const double prism_mm[RIGCAL_PRISMS][3])
+                               double amount, double shift[RIGCAL_PRISMS][3], double prism_mm[RIGCAL_PRISMS][3])
 {
     double sum[RIGCAL_MOTIONS][4], m[3], turn[3], about = 0.0;
     const int a = rigcal_axis[motion];
@@ -143,9 +143,100 @@ static inline void rigcal_bend(const rigcal_frame_t at[], const double table[RIG
     }
 }
 
+/* A boom from the origin of one frame to that of another: its length, mm, its axis, and how a point at `arm` from a
+   place on it moves as it turns down about its level axis, per rad times the cosine of its elevation. */
+static inline double rigcal_boom(const rigcal_frame_t at[], int root, int tip, double from[3], double to[3],
+                                 double axis[3])
+{
+    const double origin[3] = {0.0, 0.0, 0.0};
+    double length = 0.0;
+    rigcal_place(at, root, origin, from);
+    rigcal_place(at, tip, origin, to);
+    for (int i = 0; i < 3; i++) length += (to[i] - from[i]) * (to[i] - from[i]);
+    length = sqrt(length);
+    for (int i = 0; i < 3; i++) axis[i] = (to[i] - from[i]) / fmax(length, 1e-6);
+    return length;
+}
+
+static inline double rigcal_dot(const double a[3], const double b[3])
+{
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+static inline void rigcal_cross(const double a[3], const double b[3], double out[3])
+{
+    out[0] = a[1] * b[2] - a[2] * b[1];
+    out[1] = a[2] * b[0] - a[0] * b[2];
+    out[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* A beam that bends: `tip_newton` at its tip with the moment of a table's weights about it, `own_newton` along it, in
+   units of its flexibility. */
+static inline void rigcal_droop(const rigcal_frame_t at[], int root, int tip, const double table[RIGCAL_FRAMES][4],
+                                double tip_newton, double own_newton, double shift[RIGCAL_PRISMS][3],
+                                double prism_mm[RIGCAL_PRISMS][3])
+{
+    double from[3], to[3], e[3], first[3] = {0.0, 0.0, 0.0}, moment[3];
+    const double *g = rigcal_down, length = rigcal_boom(at, root, tip, from, to, e) / 1e3, rise = rigcal_dot(e, g);
+    for (int f = 1; f < RIGCAL_FRAMES; f++) {
+        double place[3];
+        const double *m = table[f];
+        const int k = rigcal_frame_motion[f];
+        for (int i = 0; i < 3; i++) {
+            place[i] = at[k].r[i][0] * m[1] + at[k].r[i][1] * m[2] + at[k].r[i][2] * m[3] + m[0] * at[k].t[i];
+            first[i] += (place[i] - m[0] * to[i]) / 1e3;
+        }
+    }
+    rigcal_cross(first, g, moment);
+    for (int p = 0; p < RIGCAL_PRISMS; p++) {
+        double s[3], lever[3], by_moment[3], twist[3];
+        if (!rigcal_carries(rigcal_frame_motion[tip], rigcal_prism_frame[p])) continue;
+        for (int i = 0; i < 3; i++) s[i] = (prism_mm[p][i] - to[i]) / 1e3;
+        for (int i = 0; i < 3; i++) lever[i] = e[i] * length * length / 2.0 + s[i] * length;
+        const double along = rigcal_dot(e, s), below = rigcal_dot(g, s), on_axis = rigcal_dot(moment, e);
+        rigcal_cross(moment, lever, by_moment);
+        rigcal_cross(e, s, twist);
+        for (int i = 0; i < 3; i++) {
+            const double across = (g[i] - rise * e[i]) * length * length * length;
+            const double turning = (along * g[i] - below * e[i]) * length * length;
+            shift[p][i] += 1e3 * (by_moment[i] - on_axis * twist[i] * length
+                                  + tip_newton * (across / 3.0 + turning / 2.0)
+                                  + own_newton * (across / 8.0 + turning / 6.0));
+        }
+    }
+}
+
+/* The inner section of a boom tilts about the mouth of the outer one until its pads touch. */
+static inline void rigcal_pads(const rigcal_frame_t at[], int root, int tip, const double table[RIGCAL_FRAMES][4],
+                               double outer_mm, double overlap_mm, double clearance_mm,
+                               double shift[RIGCAL_PRISMS][3], double prism_mm[RIGCAL_PRISMS][3])
+{
+    double from[3], to[3], e[3], mouth[3], about[3] = {0.0, 0.0, 0.0};
+    rigcal_boom(at, root, tip, from, to, e);
+    for (int i = 0; i < 3; i++) mouth[i] = from[i] + outer_mm * e[i];
+    for (int f = 1; f < RIGCAL_FRAMES; f++) {
+        const double *m = table[f];
+        const int k = rigcal_frame_motion[f];
+        for (int i = 0; i < 3; i++)
+            about[i] += at[k].r[i][0] * m[1] + at[k].r[i][1] * m[2] + at[k].r[i][2] * m[3]
+                        + m[0] * (at[k].t[i] - mouth[i]);
+    }
+    const double rise = rigcal_dot(e, rigcal_down), level = sqrt(fmax(1.0 - rise * rise, 0.0));
+    const double side = rigcal_dot(about, e) - rigcal_dot(about, rigcal_down) * rise;
+    if (level <= 1e-6) return;
+    const double tilt = clearance_mm * ((side > 0.0) - (side < 0.0)) / (overlap_mm * level);
+    for (int p = 0; p < RIGCAL_PRISMS; p++) {
+        double s[3];
+        if (!rigcal_carries(rigcal_frame_motion[tip], rigcal_prism_frame[p])) continue;
+        for (int i = 0; i < 3; i++) s[i] = prism_mm[p][i] - mouth[i];
+        const double along = rigcal_dot(e, s), below = rigcal_dot(rigcal_down, s);
+        for (int i = 0; i < 3; i++) shift[p][i] += tilt * (along * rigcal_down[i] - below * e[i]);
+    }
+}
+
 /* The term of one drive alone, `amount` further of its joint, deg or mm: the shift of the prisms, mm. */
 static inline void rigcal_follow(const rigcal_frame_t at[], int motion, int drive, double amount,
-                                 double shift[RIGCAL_PRISMS][3], const double prism_mm[RIGCAL_PRISMS][3])
+                                 double shift[RIGCAL_PRISMS][3], double prism_mm[RIGCAL_PRISMS][3])
 {
     for (int p = 0; p < RIGCAL_PRISMS; p++) {
         double s[3];
@@ -228,11 +319,11 @@ static inline void rigcal_forward(const double q[RIGCAL_JOINTS], const rigcal_in
     rigcal_solve_pose(q, in, at, out_mm);
 }
 
-/* The joint commands that bring `count` prisms to their targets (base frame, mm), nearest to those in q on entry and
-   inside the joints' limits. Returns the number of steps taken, or -1 where a target stays farther than
+/* The joint commands that bring `count` prisms to their targets (x, y, z of each, base frame, mm), near to those in q
+   on entry and inside the joints' limits. Returns the number of steps taken, or -1 where a target stays farther than
    RIGCAL_CLOSE_MM; q is then as near as it came. */
 #define RIGCAL_CLOSE_MM 1e-9
-static inline int rigcal_inverse(int count, const int prism[], const double target_mm[][3], const rigcal_inputs *in,
+static inline int rigcal_inverse(int count, const int prism[], const double *target_mm, const rigcal_inputs *in,
                                  double q[RIGCAL_JOINTS])
 {
     enum { MOST = 3 * RIGCAL_PRISMS };
@@ -251,7 +342,7 @@ static inline int rigcal_inverse(int count, const int prism[], const double targ
         rigcal_solve_pose(q, in, at, place);
         for (int c = 0; c < count; c++)
             for (int i = 0; i < 3; i++) {
-                const double e = target_mm[c][i] - place[prism[c]][i];
+                const double e = target_mm[3 * c + i] - place[prism[c]][i];
                 off += e * e;
             }
         off = sqrt(off);
@@ -263,7 +354,7 @@ static inline int rigcal_inverse(int count, const int prism[], const double targ
             for (int j = 0; j < RIGCAL_JOINTS; j++) kept[j] = q[j];
             if (off <= RIGCAL_CLOSE_MM) return step;
             for (int c = 0; c < count; c++) {
-                for (int i = 0; i < 3; i++) error[3 * c + i] = target_mm[c][i] - place[prism[c]][i];
+                for (int i = 0; i < 3; i++) error[3 * c + i] = target_mm[3 * c + i] - place[prism[c]][i];
                 for (int i = 0; i < 3; i++)
                     for (int j = 0; j < RIGCAL_JOINTS; j++) slope[3 * c + i][j] = 0.0;
                 for (int k = rigcal_frame_motion[rigcal_prism_frame[prism[c]]]; k >= 0; k = rigcal_parent[k]) {
