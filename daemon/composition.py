@@ -173,9 +173,7 @@ def simulated_campaign(
     """
     try:
         rows = [] if plan is None else plan_rows(plan, rig)
-        return simulate_campaign(
-            rig, poses, seed, plan=rows, effects=effects, noise_mm=noise_mm, recording=recording
-        )
+        return simulate_campaign(rig, poses, seed, plan=rows, effects=effects, noise_mm=noise_mm, recording=recording)
     except ValueError as error:
         raise ConfigError(str(error)) from error
 

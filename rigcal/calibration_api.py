@@ -161,7 +161,8 @@ class Model:
         out = Path(directory)
         out.mkdir(parents=True, exist_ok=True)
         manifest = model_to_files(self.data)[MANIFEST]
-        files = export_files(Export(self.data, hashlib.sha256(manifest).hexdigest()), () if format_name is None else (format_name,))
+        export = Export(self.data, hashlib.sha256(manifest).hexdigest())
+        files = export_files(export, () if format_name is None else (format_name,))
         for name, data in files.items():
             write_file(out / name, data)
         return tuple(out / name for name in files)

@@ -68,8 +68,8 @@ class RigCheck:
         assumed = [link for link in self.links if link.is_assumed]
         if assumed:
             yield (
-                f"`rigcal plan` assumes a radius of {assumed[0].radius_mm:.0f} mm (1.2 % of the reach) for the links of "
-                f"{len(assumed)} of {len(self.links)} rows; give them radius_mm"
+                f"`rigcal plan` assumes a radius of {assumed[0].radius_mm:.0f} mm (1.2 % of the reach) for the links "
+                f"of {len(assumed)} of {len(self.links)} rows; give them radius_mm"
             )
         outside = [j for j in self.rig.joints if not j.limits[0] <= 0.0 <= j.limits[1]]
         if outside:

@@ -1,8 +1,8 @@
 """Reachable poses and prisms in view of the station, by plain rules: links are capsules.
 
 A rig file knows frames and no shapes. So every link is the straight line between the origins of two frames that follow
-each other, with its row's `radius_mm`, or else an assumed 1.2 % of the reach, and a pedestal stands between the base and
-the floor. Everything here is in the base frame.
+each other, with its row's `radius_mm`, or else an assumed 1.2 % of the reach, and a pedestal stands between the base
+and the floor. Everything here is in the base frame.
 """
 
 from __future__ import annotations

@@ -216,4 +216,3 @@ def _warnings(grid: CorrectionGrid) -> Iterator[str]:
             f"than a tenth of the {grid.correction_rms_mm:.2g} mm that they are; allow more rows (--rows), or use "
             "`rigcal predict` or the C header"
         )
-

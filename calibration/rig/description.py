@@ -15,19 +15,43 @@ from pydantic_core import ErrorDetails
 
 from calibration.errors import RigError
 from calibration.rig.channels import Channel, Signal
-from calibration.rig.parts import Convention as Convention
-from calibration.rig.parts import Driven as Driven
-from calibration.rig.parts import FixedTransform as FixedTransform
-from calibration.rig.parts import Joint as Joint
-from calibration.rig.parts import Mass as Mass
-from calibration.rig.parts import Part, Vector, continues_from, tilting_rows
-from calibration.rig.parts import Prism as Prism
-from calibration.rig.parts import Row as Row
-from calibration.rig.parts import RowParameter as RowParameter
-from calibration.rig.parts import Station as Station
-from calibration.rig.parts import Tolerances as Tolerances
+from calibration.rig.parts import (
+    Convention,
+    Driven,
+    FixedTransform,
+    Joint,
+    Mass,
+    Part,
+    Prism,
+    Row,
+    RowParameter,
+    Station,
+    Tolerances,
+    Vector,
+    continues_from,
+    tilting_rows,
+)
 from calibration.rig.signals import Taken, signal_faults, signal_lines, signal_of
 from calibration.rig.toml import line_of, parse_toml
+
+__all__ = [
+    "ANOTHER_VALUE",
+    "BEYOND_BUILDING",
+    "Convention",
+    "FixedTransform",
+    "Joint",
+    "Mass",
+    "Prism",
+    "Rig",
+    "Row",
+    "RowParameter",
+    "Station",
+    "Tolerances",
+    "parse_rig",
+    "read_rig",
+    "shipped_rig",
+    "shipped_rigs",
+]
 
 BEYOND_BUILDING = 4.0  # build tolerances: no correction by building alone is larger
 ANOTHER_VALUE = 10.0  # build tolerances: so far off, the file's value is another machine's and tells nothing

@@ -146,8 +146,8 @@ class Mass(Part):
         frame: fixed to the frame after this row.
         kg: mass; a payload's is what is carried unless `payload_kg` is measured.
         centre_mm: centre of gravity in that frame; none with `midway`.
-        inertia_kg_m2: xx, yy, zz, xy, xz, yz about the centre, along the frame's axes; kept for exports, gravity does not
-            need it.
+        inertia_kg_m2: xx, yy, zz, xy, xz, yz about the centre, along the frame's axes; kept for exports, as gravity
+            does not need it.
         midway: the centre is midway between the origins of frames `frame` and `frame` + 1.
         payload: this is the payload that `payload_kg` replaces.
         assumed: not measured and not from the maker.
@@ -203,6 +203,7 @@ class Station(Part):
 
 
 def continues_from(rows: Sequence[Row], number: int) -> int:
+    """Return the frame that row `number` continues from."""
     after = rows[number - 1].after
     return number - 1 if after is None else after
 

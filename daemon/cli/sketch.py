@@ -36,7 +36,8 @@ def sketch(bodies: Bodies, across: Sequence[int]) -> list[str]:
         cells[lines - 1 - min(lines - 1, round(float(y) / _ASPECT))][min(columns - 1, round(float(x)))] = mark
 
     for number in bodies.links:
-        for place in _between(*(ends[0] for ends in bodies.link_mm(number)), mm):
+        start, end = bodies.link_mm(number)
+        for place in _between(start[0], end[0], mm):
             put(place, ".")
     for number in bodies.links:
         put(bodies.frames_mm[0, number], str(number % 10))

@@ -35,20 +35,20 @@ def chain_svg(poses: Mapping[str, Bodies], at: Site, title: str) -> bytes:
         forward = forward_axis(shown[-1].prisms_mm[0])
         for axes, across in ((plan, (0, 1)), (side, (forward, 2))):
             for bodies, colour in zip(shown, (BEFORE, AFTER), strict=False):
-                _draw(axes, bodies, at, across, colour, named=bodies is shown[-1])
+                _draw(axes, bodies, across, colour, named=bodies is shown[-1])
         views(plan, side, forward)
         side.axhline(at.floor_mm / 1e3, color=SOFT, linewidth=0.8, linestyle="--")
         handles = [key(colour, name) for name, colour in zip(poses, (BEFORE, AFTER), strict=False)]
         figure.legend(handles=[*handles, key(MIDDLE, "prism")], loc="outside lower right", ncols=len(handles) + 1)
         figure.canvas.draw()
-        _thicken(plan, at, shown)
-        _thicken(side, at, shown)
+        _thicken(plan, at)
+        _thicken(side, at)
         out = io.BytesIO()
         figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None})
     return out.getvalue()
 
 
-def _draw(axes: Axes, bodies: Bodies, at: Site, across: Sequence[int], colour: str, *, named: bool) -> None:
+def _draw(axes: Axes, bodies: Bodies, across: Sequence[int], colour: str, *, named: bool) -> None:
     u, v = across
     for number in bodies.links:
         start, end = (ends[0] / 1e3 for ends in bodies.link_mm(number))
@@ -61,7 +61,7 @@ def _draw(axes: Axes, bodies: Bodies, at: Site, across: Sequence[int], colour: s
     axes.plot(frames[1:, u], frames[1:, v], linestyle="", marker="o", color=colour, markersize=3.5)
     axes.plot(prisms[:, u], prisms[:, v], linestyle="", marker="D", color=MIDDLE, markersize=4.5)
     if named:
-        _name(axes, {name: place for name, place in zip(bodies.rig.prism_names, prisms, strict=True)}, u, v, MIDDLE)
+        _name(axes, dict(zip(bodies.rig.prism_names, prisms, strict=True)), u, v, MIDDLE)
         _name(axes, {str(n): frames[n] for n in bodies.links}, u, v, INK)
 
 
@@ -78,12 +78,11 @@ def _name(axes: Axes, places: Mapping[str, Sequence[float]], u: int, v: int, col
         )  # fmt: skip
 
 
-def _thicken(axes: Axes, at: Site, poses: Sequence[Bodies]) -> None:
+def _thicken(axes: Axes, at: Site) -> None:
     """Give the links their radii, now that the scale of the axes is settled."""
     (left, _), (right, _) = (axes.transData.transform((x, 0.0)) for x in axes.get_xlim())
     low, high = axes.get_xlim()
     points_per_m = (right - left) / (high - low) * _POINTS_PER_IN / axes.figure.dpi
-    del poses
     for line in axes.get_lines():
         gid = line.get_gid() or ""
         if gid.startswith("radius"):

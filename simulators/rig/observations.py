@@ -43,7 +43,8 @@ def simulate_observations(
         joint_noise: joint readings carry the rig's `sigma` and `resolution`, drawn once per pose: a standing joint
             reads the same at each of its fixes.
         sigma_columns: also give sigma_x_mm, sigma_y_mm, sigma_z_mm (without the joints' share).
-        setup: station set-up, also decides where the machine stands; session: label.
+        setup: station set-up, also decides where the machine stands.
+        session: label.
         columns: further columns by pose (`payload_kg`, `temperature_degC`) -> (n_poses,); one that is given here takes
             the place of the simulated one.
 

@@ -1,4 +1,5 @@
 """Observations of a simulated machine, as `rigcal simulate` makes them."""
 
-from simulators.rig.observations import anchored_truth as anchored_truth
-from simulators.rig.observations import simulate_observations as simulate_observations
+from simulators.rig.observations import anchored_truth, simulate_observations
+
+__all__ = ["anchored_truth", "simulate_observations"]

@@ -159,7 +159,7 @@ def _straightened(s: Floats, knot_power: float | None) -> Floats:
 
 @cache
 def shape_of_curve(knot_power: float | None) -> tuple[Floats, Floats]:
-    """Return the knots (inner ones + 2), and (2, inner) the straight lines that fit the splines best between -1 and 1."""
+    """Return the knots and (2, inner knots) the straight lines that fit the splines best between -1 and 1."""
     spread = np.linspace(0.0, 1.0, _KNOTS + 2)
     knots = 2.0 * spread - 1.0 if knot_power is None else spread**knot_power
     whole = np.linspace(-1.0, 1.0, 201)

@@ -59,7 +59,10 @@ def document(model: CalibratedModel) -> dict[str, object]:
 
 
 def _content(export: Export) -> bytes:
-    about = document(export.model) | {"manifest_sha256": export.manifest_sha256, "leaves_out": _left_out(export).as_dict()}
+    about = document(export.model) | {
+        "manifest_sha256": export.manifest_sha256,
+        "leaves_out": _left_out(export).as_dict(),
+    }
     return (json.dumps(about, indent=1, allow_nan=False) + "\n").encode()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from typing import Any, cast
 
 import numpy as np
 from scipy.io import savemat
@@ -51,7 +52,7 @@ def _content(export: Export) -> bytes:
         "check_prisms": np.stack([kinematics.corrected_mm(name, poses) for name, _ in prisms], axis=2),
     }
     out = io.BytesIO()
-    savemat(out, arrays, do_compression=True)
+    savemat(cast("Any", out), arrays, do_compression=True)  # takes files too, which its stubs do not say
     return out.getvalue()
 
 

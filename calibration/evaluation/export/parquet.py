@@ -1,4 +1,4 @@
-"""corrections.parquet: the correction grid as corrections.csv has it, as a Parquet table with its description inside."""
+"""corrections.parquet: the correction grid of corrections.csv as a Parquet table with its description inside."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ def _content(export: Export) -> bytes:
         import pyarrow
         from pyarrow import parquet
     except ImportError:
-        raise DataError("format", "parquet needs pyarrow, which is not installed: pip install 'rigcal[parquet]'") from None
+        raise DataError(
+            "format", "parquet needs pyarrow, which is not installed: pip install 'rigcal[parquet]'"
+        ) from None
     grid, rig = export.grid, export.model.rig
     prisms, n = list(grid.nominal_mm), len(grid.readings)
     columns: dict[str, object] = {"prism": np.repeat(prisms, n)}

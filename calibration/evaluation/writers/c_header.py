@@ -49,7 +49,14 @@ def c_header(
         f"/* {told}\n\n{_USE}{joints}   Prisms, in the order of the places:\n{prisms}*/\n\n"
         "#ifndef RIGCAL_MODEL_H\n#define RIGCAL_MODEL_H\n\n#include <math.h>\n#include <stddef.h>\n\n"
     )
-    return head + _sizes(rig, tree) + _inputs(code) + "\n".join(_tables(rig, tree, down, code)) + "\n\n" + _with_effects(engine, code)
+    return (
+        head
+        + _sizes(rig, tree)
+        + _inputs(code)
+        + "\n".join(_tables(rig, tree, down, code))
+        + "\n\n"
+        + _with_effects(engine, code)
+    )
 
 
 def _with_effects(engine: str, code: EffectCode) -> str:

@@ -126,7 +126,7 @@ class _Elements:
         child: str,
         origin: Floats,
         axis: str,
-        rotates: bool,  # noqa: FBT001 - of a motion, as its field
+        rotates: bool,
         ratio: float | None,
         place: str,
     ) -> None:

@@ -3,9 +3,10 @@
 The columns are those of a row of a rig file, in any order and with other units where the name says so: `alpha_deg` or
 `alpha_rad`, `a_mm` or `a_m`, likewise `d`, `theta`, `beta` and `b`. A joint is named by `joint`, with `kind`
 (`revolute` by default), `lower` and `upper` in deg or mm, and `max_rate`. A row that several joints drive, or one that
-drives `a`, says so in `theta_drive`, `d_drive` or `a_drive`: `0.5*q1 - q2`. `after`, `x_mm` ... `rx_deg` and `identify`
-are those of a rig file. A line with `prism` is no row but a prism on the frame `frame` (the last row's
-by default), with its place `prism_x_mm` and so on. A comment `# convention: NAME` in front of the header says how the constants are meant.
+drives `a`, says so in `theta_drive`, `d_drive` or `a_drive`: `0.5*q1 - q2`. `after`, `x_mm` ... `rx_deg` and
+`identify` are those of a rig file. A line with `prism` is no row but a prism on the frame `frame` (the last row's by
+default), with its place `prism_x_mm` and so on. A comment `# convention: NAME` in front of the header says how the
+constants are meant.
 """
 
 from __future__ import annotations

@@ -165,7 +165,9 @@ class _Import:
         how, seen = Mimic(joint.name, 1.0, 0.0), {joint.name}
         while joint.mimic is not None:
             further = joint.mimic
-            how = Mimic(further.joint, how.multiplier * further.multiplier, how.multiplier * further.offset + how.offset)
+            how = Mimic(
+                further.joint, how.multiplier * further.multiplier, how.multiplier * further.offset + how.offset
+            )
             joint = named[further.joint]
             if joint.name in seen:
                 raise RigError(self._source, f"joint {joint.name!r}", "it mimics itself, by way of others")
@@ -205,7 +207,7 @@ class _Import:
             if node.joint is None and number == 0:
                 self._add_first(child)
             elif number == 0:
-                self._add_row(node, child, node.row, self._link(node), node.frame)
+                self._add_row(child, node.row, self._link(node), node.frame)
             else:
                 self._add_branch(node, child)
             self._add_rows(child)
@@ -225,8 +227,9 @@ class _Import:
         """The first joint on the base: its mounting is part of the base's, which is always estimated."""
         self._append(child, 0, self._goal(child), 0.0, 0.0, (), fixed=True)
 
-    def _add_row(self, parent: _Node, child: _Node, after: int, link: Link | None, frame: Floats | None) -> None:
-        assert link is not None and frame is not None and parent.children
+    def _add_row(self, child: _Node, after: int, link: Link | None, frame: Floats | None) -> None:
+        assert link is not None
+        assert frame is not None
         self._append(child, after, turned(moved(frame, 0, link.a), "x", link.alpha), link.a, link.alpha, _IDENTIFIED)
 
     def _add_branch(self, node: _Node, child: _Node) -> None:
@@ -238,7 +241,7 @@ class _Import:
         name = child.joint.name if child.joint else ""
         keys = {"d": d, "theta": theta, "beta": link.beta}
         number, frame = self._row(node.row, node.frame, keys, {}, identify, f"mounting of {name}")
-        self._add_row(node, child, number, link, frame)
+        self._add_row(child, number, link, frame)
 
     def _append(
         self,
@@ -326,7 +329,7 @@ class _Import:
             frame, transform = carrier.row, np.linalg.inv(carrier.frame) @ self._place(tip)
             if np.abs(transform - np.eye(4)).max() > _SAME:
                 before, _ = _transform(transform)
-                table = {"before": before, "identify": []}
+                table: dict[str, object] = {"before": before, "identify": []}
                 if frame != len(self._draft.sections["row"]):
                     table = {"after": frame, **table}
                 self._draft.add("row", table, f"link {tip}")

@@ -128,7 +128,7 @@ def parse_urdf(text: str, source: str) -> Urdf:
     if "<!DOCTYPE" in text:
         raise RigError(source, "", "it declares a document type, which no URDF needs and rigcal does not read")
     try:
-        root = ET.fromstring(text)  # noqa: S314 - no document type, so no entities, and bounded in length
+        root = ET.fromstring(text)
     except ET.ParseError as error:
         raise RigError(source, f"line {error.position[0]}", f"no XML: {error}") from error
     return _Reader(source).robot(root)
@@ -153,9 +153,7 @@ class _Reader:
         self._check_tree(links, joints, by_child)
         return Urdf(root.get("name") or "robot", links, by_child)
 
-    def _check_tree(
-        self, links: Iterable[str], joints: list[UrdfJoint], by_child: Mapping[str, UrdfJoint]
-    ) -> None:
+    def _check_tree(self, links: Iterable[str], joints: list[UrdfJoint], by_child: Mapping[str, UrdfJoint]) -> None:
         known, names = set(links), {joint.name: joint for joint in joints}
         if len(names) < len(joints):
             raise self._fault("joint", "two joints have one name")
@@ -240,9 +238,7 @@ class _Reader:
         out[:3, :3] = rotation_of_rpy(*self._vector(element, "rpy", where, (0.0, 0.0, 0.0)))
         return out
 
-    def _vector(
-        self, element: ET.Element | None, key: str, where: str, default: tuple[float, float, float]
-    ) -> Floats:
+    def _vector(self, element: ET.Element | None, key: str, where: str, default: tuple[float, float, float]) -> Floats:
         text = None if element is None else element.get(key)
         if text is None:
             return np.array(default)
@@ -285,7 +281,11 @@ def rotation_of_rpy(roll: float, pitch: float, yaw: float) -> Floats:
     """Return Rot(z, yaw) Rot(y, pitch) Rot(x, roll), (3, 3)."""
     (a, b, c), (x, y, z) = np.cos([yaw, pitch, roll]), np.sin([yaw, pitch, roll])
     return np.array(
-        [[a * b, a * y * z - x * c, a * y * c + x * z], [x * b, x * y * z + a * c, x * y * c - a * z], [-y, b * z, b * c]]
+        [
+            [a * b, a * y * z - x * c, a * y * c + x * z],
+            [x * b, x * y * z + a * c, x * y * c - a * z],
+            [-y, b * z, b * c],
+        ]
     )
 
 

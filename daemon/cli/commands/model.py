@@ -115,7 +115,7 @@ def model_export(
     *,
     as_json: bool,
 ) -> Any:
-    """Write a model for other programs, and say what each form leaves out and what that costs.
+    r"""Write a model for other programs, and say what each form leaves out and what that costs.
 
     With --model no daemon is needed; else model NUMBER of the running daemon is taken, the live one by default.
 
@@ -129,7 +129,8 @@ def model_export(
     matlab    the identified kinematics as a .mat file
     c-header  forward kinematics with effects, and the inverse, as one C99 file
 
-    docs/models.md says how to use each. The error of what is left out is measured over the joint values of the training.
+    docs/models.md says how to use each. The error of what is left out is measured over the joint values of
+    the training.
     """
     if directory is not None and number is not None:
         raise click.UsageError("give either a model's NUMBER or --model DIR")

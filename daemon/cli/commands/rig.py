@@ -22,7 +22,7 @@ _FAULTS_SHOWN = 20
 
 @click.group()
 def rig() -> None:
-    """Rig files: check one, or make one from a URDF or a Denavit-Hartenberg table."""
+    """Rig files: check one, make one from a URDF or a Denavit-Hartenberg table, or write one as such."""
 
 
 @rig.command("check", cls=Command)
@@ -32,9 +32,9 @@ def rig() -> None:
 def rig_check(path: str, svg: Path | None, *, as_json: bool) -> dict[str, Any]:
     """Check a rig file (or the name of a shipped rig) and show what it amounts to.
 
-    Tells all that is wrong with its line. Of a file that is good: where frames and prisms are with all joints at zero, a
-    drawing of the chain, the reach, the radii that `rigcal plan` keeps clear of, and which parameters the fixes of poses
-    all over the joint limits determine.
+    Tells all that is wrong with its line. Of a file that is good: where frames and prisms are with all joints at zero,
+    a drawing of the chain, the reach, the radii that `rigcal plan` keeps clear of, and which parameters the fixes of
+    poses all over the joint limits determine.
     """
     from calibration.design.rig_check import check_rig
     from calibration.rig.description import read_rig
@@ -110,7 +110,9 @@ def rig_import(
     made = draft.rig()
     write_file(out, draft.text().encode("utf-8"))
     if not as_json:
-        echo(f"{out}: {len(made.rows)} rows, joints {', '.join(made.joint_names)}, prisms {', '.join(made.prism_names)}")
+        echo(
+            f"{out}: {len(made.rows)} rows, joints {', '.join(made.joint_names)}, prisms {', '.join(made.prism_names)}"
+        )
         echo_list("Please note", draft.notes)
         echo(f"`rigcal rig check {out}` shows it.")
     return {
@@ -122,6 +124,40 @@ def rig_import(
         "masses": len(made.masses),
         "notes": draft.notes,
     }
+
+
+@rig.command("export", cls=Command)
+@click.argument("path", metavar="FILE")
+@click.option(
+    "--out",
+    type=click.Path(dir_okay=False, path_type=Path),
+    required=True,
+    metavar="OUT",
+    help="Ends in .urdf, .xacro, or .csv for a Denavit-Hartenberg table.",
+)
+@json_option
+def rig_export(path: str, out: Path, *, as_json: bool) -> dict[str, Any]:
+    """Write a rig file (or a shipped rig) as URDF, xacro or a Denavit-Hartenberg table: the machine by its drawings.
+
+    `rigcal model export` writes what a calibration found.
+    """
+    import numpy as np
+
+    from calibration.evaluation.writers.dh_table import dh_text
+    from calibration.evaluation.writers.urdf_text import urdf_text, xacro_text
+    from calibration.kinematics.chain import Chain, Placement
+    from daemon.config import load_rig
+
+    writers = {".urdf": urdf_text, ".xacro": xacro_text, ".csv": dh_text}
+    if out.suffix not in writers:
+        raise click.UsageError(f"--out ends in one of {', '.join(writers)}, and {out.name} does not")
+    rig = load_rig(path).rig
+    chain = Chain(rig, {"": Placement.identity()})
+    text = writers[out.suffix](chain, np.zeros(len(chain)), [f"Made by `rigcal rig export` from {Path(path).name}."])
+    write_file(out, text.encode("utf-8"))
+    if not as_json:
+        echo(str(out))
+    return {"rig": rig.name, "out": str(out)}
 
 
 def _show(found: RigCheck) -> None:

@@ -21,7 +21,9 @@ _MOST_POSES = 100_000
 @rig_option
 @click.option("--poses", type=click.IntRange(1, _MOST_POSES), required=True, metavar="N", help="How many poses.")
 @seed_option
-@click.option("--plan", type=FILE, metavar="CSV", help="Take the poses of a plan; random ones in the limits by default.")
+@click.option(
+    "--plan", type=FILE, metavar="CSV", help="Take the poses of a plan; random ones in the limits by default."
+)
 @click.option(
     "--effect",
     "effects",
