@@ -25,8 +25,8 @@ class RigError(CalibrationError):
     """
 
     def __init__(self, source: str, where: str, reason: str, line: int | None = None) -> None:
-        place = source if line is None else f"{source}, line {line}"
-        super().__init__(f"{place}: {where}: {reason}" if where else f"{place}: {reason}")
+        at = "" if line is None else f" (line {line})"
+        super().__init__(f"{source}: {where}: {reason}{at}" if where else f"{source}: {reason}{at}")
         self.source, self.where, self.reason, self.line = source, where, reason, line
 
 

@@ -9,27 +9,26 @@ from collections.abc import Sequence
 
 from calibration.kinematics.chain import ROW_ORDER, Chain
 from calibration.observations import Floats
-from calibration.rig.exchange.from_table import BEFORE, CONSTANTS, DRIVES, PRISM
-
-_JOINT = ("joint", "kind", "lower", "upper", "max_rate")
-
+from calibration.rig.exchange.from_table import BEFORE, CONSTANTS, DRIVES, JOINT, PRISM
 
 def dh_text(chain: Chain, x: Floats, remarks: Sequence[str]) -> str:
     """Return a rig at parameters `x` (p,) as a table, mm and deg, with remarks in comments at its head.
 
-    A line for each row of the kinematic table in the rig file's convention, and one for each prism.
+    A line for each joint, for each row of the kinematic table in the rig file's convention, and for each prism.
     """
     rig, out = chain.rig, io.StringIO()
     names = [name for name, _ in ROW_ORDER[rig.convention]]
     header = [
         "after", *BEFORE, *(f"{name}_{CONSTANTS[name]}" for name in names), *(f"{name}_drive" for name in DRIVES),
-        "identify", *_JOINT, *PRISM,
+        "identify", *JOINT, *PRISM,
     ]  # fmt: skip
     out.writelines(f"# {line}\n" for remark in remarks for line in remark.split("\n"))
     out.write(f"# convention: {rig.convention}\n")
     writer = csv.DictWriter(out, header, lineterminator="\n")
     writer.writeheader()
-    told: set[str] = set()
+    for joint in rig.joints:
+        limits = (_number(value) for value in (*joint.limits, joint.max_rate))
+        writer.writerow(dict(zip(JOINT, (joint.name, joint.kind, *limits), strict=True)))
     corrections = {parameter.name: float(value) for parameter, value in zip(chain.parameters, x, strict=True)}
     for number, row in enumerate(rig.rows, 1):
         cells: dict[str, object] = {"after": (0, *rig.path(number))[-2]}
@@ -43,11 +42,6 @@ def dh_text(chain: Chain, x: Floats, remarks: Sequence[str]) -> str:
             cells[f"{driven}_drive"] = " ".join(
                 f"{'-' if c < 0.0 else '+'} {_number(abs(c))}*{name}" for name, c in terms.items()
             ).removeprefix("+ ")
-        new = next((j for j in rig.joints if j.name not in told and any(j.name in t for t in row.drive.values())), None)
-        if new is not None:
-            told.add(new.name)
-            limits = (_number(limit) for limit in (*new.limits, new.max_rate))
-            cells |= dict(zip(_JOINT, (new.name, new.kind, *limits), strict=True))
         cells["identify"] = " ".join(row.identify) or "-"
         writer.writerow(cells)
     for prism, offsets in zip(rig.prisms, chain.prism_ops, strict=True):

@@ -18,7 +18,8 @@ from calibration.rig.parts import NEARLY_PARALLEL
 
 Floats = NDArray[np.float64]
 
-_COAXIAL_MM = 1e-6
+_COAXIAL_MM = 1e-10
+_NOTHING = 1e-15  # rounding of a cosine
 _SNAP = 1e-12  # of deg and mm: rounding of the arithmetic and not of the file
 
 
@@ -122,7 +123,8 @@ def angles_zyx(rotation: Floats) -> tuple[float, float, float]:
 
     Pitch and roll are those that go with the yaw chosen, so that nothing is lost near a pitch of 90 degrees.
     """
-    yaw = math.atan2(rotation[1, 0], rotation[0, 0]) if abs(rotation[2, 0]) < 1.0 - 1e-14 else 0.0
+    level = rotation[1, 0], rotation[0, 0]
+    yaw = math.atan2(*level) if math.hypot(*level) > _NOTHING else 0.0
     c, s = math.cos(yaw), math.sin(yaw)
     rest = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ rotation
     return yaw, math.atan2(-rest[2, 0], rest[0, 0]), math.atan2(-rest[1, 2], rest[1, 1])

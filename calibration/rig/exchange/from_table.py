@@ -3,10 +3,10 @@
 The columns are those of a row of a rig file, in any order and with other units where the name says so: `alpha_deg` or
 `alpha_rad`, `a_mm` or `a_m`, likewise `d`, `theta`, `beta` and `b`. A joint is named by `joint`, with `kind`
 (`revolute` by default), `lower` and `upper` in deg or mm, and `max_rate`. A row that several joints drive, or one that
-drives `a`, says so in `theta_drive`, `d_drive` or `a_drive`: `0.5*q1 - q2`. `after`, `x_mm` ... `rx_deg` and
-`identify` are those of a rig file. A line with `prism` is no row but a prism on the frame `frame` (the last row's by
-default), with its place `prism_x_mm` and so on. A comment `# convention: NAME` in front of the header says how the
-constants are meant.
+drives `a`, says so in `theta_drive`, `d_drive` or `a_drive`: `0.5*q1 - q2`; where there are such columns, a line with
+nothing but a joint's cells is no row and describes the joint alone. `after`, `x_mm` ... `rx_deg` and `identify` are
+those of a rig file. A line with `prism` is no row but a prism on the frame `frame` (the last row's by default), with
+its place `prism_x_mm` and so on. A comment `# convention: NAME` says how the constants are meant.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ CONSTANTS = {"alpha": "deg", "a": "mm", "d": "mm", "theta": "deg", "beta": "deg"
 BEFORE = ("x_mm", "y_mm", "z_mm", "rz_deg", "ry_deg", "rx_deg")
 DRIVES = ("theta", "d", "a")
 PRISM = ("prism", "frame", "prism_x_mm", "prism_y_mm", "prism_z_mm")
-_JOINT = ("joint", "kind", "lower", "upper", "max_rate")
+JOINT = ("joint", "kind", "lower", "upper", "max_rate")
 _SCALES = {"deg": 1.0, "rad": math.degrees(1.0), "mm": 1.0, "m": 1e3}
 _OTHER = {"deg": "rad", "mm": "m"}
 _KNOWN = frozenset(
@@ -36,7 +36,7 @@ _KNOWN = frozenset(
         *(f"{driven}_drive" for driven in DRIVES),
         *BEFORE,
         *PRISM,
-        *_JOINT,
+        *JOINT,
         "row",
         "after",
         "identify",
@@ -76,18 +76,22 @@ class _Table:
         self._draft = Draft(source.rpartition(".")[0] or source, self._convention, source)
         self._lines = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and line[:1] != "#"]
         self._kinds: dict[str, str] = {}
+        self._has_drives = False
 
     def draft(self) -> Draft:
         draft, rows = self._draft, list(self._rows())
         if not rows:
             raise RigError(self._source, "", "it has no rows below its header")
         continued = set()
-        for number, (line, cells) in enumerate(rows, 1):
+        for line, cells in rows:
             if "prism" in cells:
                 self._add_prism(line, cells)
+            elif self._has_drives and cells and set(cells) <= set(JOINT):
+                self._add_joint(line, cells, self._kind(line, cells))
             else:
                 self._add_row(line, cells)
-                continued.add(int(self._number(line, cells, "after", number - 1)))
+                row = len(draft.sections["row"])
+                continued.add(int(self._number(line, cells, "after", row - 1)))
         if not draft.sections["joint"]:
             raise RigError(self._source, "", "no row names a joint, in a column `joint` or `theta_drive`")
         if not draft.sections["prism"]:
@@ -110,6 +114,7 @@ class _Table:
         if unknown or len(set(names)) < len(names):
             what = f"unknown column {unknown[0]!r}" if unknown else "two columns have one name"
             raise RigError(self._source, "header", f"{what}; there are {', '.join(sorted(_KNOWN))}", first)
+        self._has_drives = any(f"{driven}_drive" in names for driven in DRIVES)
         for number, line in lines:
             cells = [cell.strip() for cell in next(csv.reader(io.StringIO(line)))]
             if len(cells) != len(names):
