@@ -11,6 +11,7 @@ from calibration.kinematics.chain import ROW_ORDER, Chain
 from calibration.observations import Floats
 from calibration.rig.exchange.from_table import BEFORE, CONSTANTS, DRIVES, JOINT, PRISM
 
+
 def dh_text(chain: Chain, x: Floats, remarks: Sequence[str]) -> str:
     """Return a rig at parameters `x` (p,) as a table, mm and deg, with remarks in comments at its head.
 

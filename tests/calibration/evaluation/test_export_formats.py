@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
+from calibration.design.visibility import Bodies
 from calibration.effects.context import EffectContext
 from calibration.effects.fitted import Choice
 from calibration.effects.library import library, parse_effects
@@ -18,6 +19,7 @@ from calibration.evaluation.correction_grid import Machine, trained_ranges
 from calibration.evaluation.export import chosen_formats, export_files
 from calibration.evaluation.export.c_header import written_effects
 from calibration.evaluation.exports import Export, without_parts
+from calibration.kinematics.chain import Chain, Placement
 from calibration.model.model import CalibratedModel
 from calibration.rig.exchange.from_table import draft_of_table
 from tests.calibration.conftest import Session
@@ -37,13 +39,13 @@ int main(void)
     struct timespec begin, end;
     const int prism = RIGCAL_PRISMS - 1;
     const int n = (int)fread(q, sizeof q[0], MOST, stdin);
-    double worst_us = 1e9, closure = 0.0;
+    double least_us = 1e9, closure = 0.0;
     int missed = 0;
     for (int round = 0; round < 5; round++) {
-        clock_gettime(CLOCK_MONOTONIC, &begin);
+        clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &begin);
         for (int i = 0; i < n; i++) rigcal_forward(q[i], NULL, place[i]);
-        clock_gettime(CLOCK_MONOTONIC, &end);
-        worst_us = fmin(worst_us, elapsed_us(begin, end) / n);
+        clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &end);
+        least_us = fmin(least_us, elapsed_us(begin, end) / n);
     }
     fwrite(place, sizeof place[0], n, stdout);
     for (int i = 0; i < n; i++) {
@@ -53,7 +55,7 @@ int main(void)
         rigcal_forward(back, NULL, again);
         for (int k = 0; k < 3; k++) closure = fmax(closure, fabs(again[prism][k] - place[i][prism][k]));
     }
-    fprintf(stderr, "%.17g %.17g %d\n", worst_us, closure, missed);
+    fprintf(stderr, "%.17g %.17g %d\n", least_us, closure, missed);
     return 0;
 }
 """
@@ -141,7 +143,10 @@ def test_c_of_ten_thousand_poses_is_the_model_in_a_few_us(session: Session, tmp_
         ("gravity_flip_play@theta4", 0),
         ("gravity_flip_play@theta8", -1),
         ("transducer_scale@L2,transducer_quadratic@L3,transducer_index_jump@L2,zero_step@theta5", 0),
-        ("angle_scale@theta3,encoder_harmonic@theta6,joint_error_map@theta7,backlash@theta4,thermal_expansion@boom", -1),
+        (
+            "angle_scale@theta3,encoder_harmonic@theta6,joint_error_map@theta7,backlash@theta4,thermal_expansion@boom",
+            -1,
+        ),
     ],
 )
 def test_every_effect_that_c_has_is_the_models(session: Session, tmp_path: Path, effects: str, variant: int) -> None:
@@ -156,10 +161,10 @@ def test_a_part_of_the_data_is_a_condition_in_c(session: Session, tmp_path: Path
 
 
 def test_what_c_leaves_out_is_said_with_its_error(session: Session, tmp_path: Path) -> None:
-    model = with_effects(session.model, "angle_scale@theta3,leak_down@L2,solar_bow@theta4,station_scale@station", 0)
+    model = with_effects(session.model, "angle_scale@theta3,leak_down@theta4,solar_bow@theta4,station_scale@station", 0)
     (form,) = chosen_formats(["c-header"])
     left_out = form.left_out(Export(model, "0" * 64))
-    assert left_out.parts == ("leak_down@L2", "solar_bow@theta4")
+    assert left_out.parts == ("leak_down@theta4", "solar_bow@theta4")
     assert "station_scale@station moves fixes or the base" in left_out.not_measured[0]
     text = form.content(Export(model, "0" * 64)).decode()
     assert all(sentence in " ".join(text.split()) for sentence in left_out.sentences)
@@ -211,9 +216,6 @@ def test_the_table_is_the_same_machine_when_it_is_imported(session: Session) -> 
     rig = draft_of_table(text, "dh.csv").rig()
     assert (rig.joint_names, rig.prism_names) == (session.rig.joint_names, session.rig.prism_names)
     poses = poses_of(session.model, 20)
-    from calibration.design.visibility import Bodies
-    from calibration.kinematics.chain import Chain, Placement
-
     chain = Chain(rig, {"": Placement.identity()})
     found = Bodies.of(chain, np.zeros(len(chain)), poses).prisms_mm
     np.testing.assert_allclose(found, kinematics_mm(session.model, poses), rtol=0.0, atol=EXACT_MM)

@@ -144,7 +144,9 @@ FORMAT = Format("parameters-txt", "parameters.txt", content, is_default=True)
 def test_a_new_format_is_one_new_file(session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "parameters_txt.py").write_text(PARAMETERS_TXT)
     monkeypatch.setattr(folder, "__path__", [*folder.__path__, str(tmp_path)])
-    assert {"c-header", "dh-csv", "grid", "json", "matlab", "parameters-txt", "parquet", "urdf", "xacro"} == {*formats()}
+    assert {"c-header", "dh-csv", "grid", "json", "matlab", "parameters-txt", "parquet", "urdf", "xacro"} == {
+        *formats()
+    }
     files = export_files(Export(session.model, "0" * 64, ("r",), 512))
     assert {*files} == {"calibration.json", "corrections.csv", "parameters.txt"}
     assert files["parameters.txt"].decode().split("\n") == [p.name for p in session.model.parameters]
