@@ -46,6 +46,8 @@ class LeftOut:
     def _sentences(self) -> Iterator[str]:
         if not self.parts:
             yield "It leaves nothing of the model out that depends on the joints alone."
+        elif self.max_mm == 0.0:
+            yield f"It leaves out {', '.join(self.parts)}, which at joint values alone do nothing."
         else:
             yield (
                 f"It leaves out {', '.join(self.parts)}. For that its positions are wrong by {self.rms_mm:.3g} mm RMS "

@@ -77,6 +77,8 @@ def run(
 
     A replay keeps its store in a directory of its own, beside the configured one's.
     """
+    if rig is not None and not sim:
+        raise click.UsageError("--rig goes with --sim; a configuration names its rig itself")
     from daemon.composition import live, replayed, simulated
     from daemon.config import load_rig, parse_config, read_config
     from daemon.service import Daemon, stop_on_signals
@@ -87,8 +89,6 @@ def run(
         logging.getLogger("can").setLevel(logging.WARNING)  # python-can tells of every socket that it makes
     if bool(files) != is_replay or (sim and is_replay):
         raise click.UsageError("give either --sim, or --replay FILE..., or neither")
-    if rig is not None and not sim:
-        raise click.UsageError("--rig goes with --sim; a configuration names its rig itself")
     if config is not None:
         settings = read_config(config)
     elif sim:

@@ -33,7 +33,10 @@ MAIN = r"""
 #include "rigcal_model.h"
 #define MOST 10000
 static double q[MOST][RIGCAL_JOINTS], place[MOST][RIGCAL_PRISMS][3];
-static double elapsed_us(struct timespec a, struct timespec b) { return (b.tv_sec - a.tv_sec) * 1e6 + (b.tv_nsec - a.tv_nsec) / 1e3; }
+static double elapsed_us(struct timespec a, struct timespec b)
+{
+    return (b.tv_sec - a.tv_sec) * 1e6 + (b.tv_nsec - a.tv_nsec) / 1e3;
+}
 int main(void)
 {
     struct timespec begin, end;
@@ -50,7 +53,8 @@ int main(void)
     fwrite(place, sizeof place[0], n, stdout);
     for (int i = 0; i < n; i++) {
         double back[RIGCAL_JOINTS], again[RIGCAL_PRISMS][3];
-        for (int j = 0; j < RIGCAL_JOINTS; j++) back[j] = q[i][j] + (j % 2 ? -0.002 : 0.002) * (rigcal_upper[j] - rigcal_lower[j]);
+        for (int j = 0; j < RIGCAL_JOINTS; j++)
+            back[j] = q[i][j] + (j % 2 ? -0.002 : 0.002) * (rigcal_upper[j] - rigcal_lower[j]);
         if (rigcal_inverse(1, &prism, place[i][prism], NULL, back) < 0) { missed++; continue; }
         rigcal_forward(back, NULL, again);
         for (int k = 0; k < 3; k++) closure = fmax(closure, fabs(again[prism][k] - place[i][prism][k]));
@@ -69,6 +73,7 @@ def with_effects(
     rng = np.random.default_rng(5)
     rows = Machine(model, 0).rows(model.rig.prism_names[-1], rng.uniform(low, high, (60, len(low))))
     extra = {"time_s": np.arange(60) * 10.0, "temperature_degC": np.linspace(5.0, 20.0, 60)}
+    extra |= {"dwell_s": np.linspace(1.0, 300.0, 60)}
     context = EffectContext(model.chain, model.values, replace(rows, extra=extra))
     found = []
     for name, where in parse_effects(effects, model.rig):
@@ -166,6 +171,7 @@ def test_what_c_leaves_out_is_said_with_its_error(session: Session, tmp_path: Pa
     left_out = form.left_out(Export(model, "0" * 64))
     assert left_out.parts == ("leak_down@theta4", "solar_bow@theta4")
     assert "station_scale@station moves fixes or the base" in left_out.not_measured[0]
+    assert any("leak_down@theta4 does is not measured here" in sentence for sentence in left_out.sentences)
     text = form.content(Export(model, "0" * 64)).decode()
     assert all(sentence in " ".join(text.split()) for sentence in left_out.sentences)
     assert c_error_mm(model, tmp_path) <= EXACT_MM

@@ -79,12 +79,12 @@ def test_a_radius_of_a_row_is_what_plan_keeps_clear_of(tmp_path: Path) -> None:
 
 def test_check_tells_every_fault_with_its_line(tmp_path: Path) -> None:
     lines = load_rig("ur10").text.splitlines()
-    lines[lines.index("d_mm = 127.3")] = "d_mm = true"
+    lines[lines.index("d_mm = 127.3")] = "d_mm = 'x'"
     lines[lines.index('name = "tmac"')] = 'nam = "tmac"'
     (tmp_path / "bad.toml").write_text("\n".join(lines), encoding="utf-8")
     done = rigcal("rig", "check", tmp_path / "bad.toml")
     assert done.exit_code == 2
-    for key, line in (("row.1.d_mm", lines.index("d_mm = true")), ("prism.1.nam", lines.index('nam = "tmac"'))):
+    for key, line in (("row.1.d_mm", lines.index("d_mm = 'x'")), ("prism.1.nam", lines.index('nam = "tmac"'))):
         assert any(key in told and f"(line {line + 1})" in told for told in done.stderr.splitlines()), done.stderr
 
 
