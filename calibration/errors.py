@@ -21,11 +21,13 @@ class RigError(CalibrationError):
         source: name of the file.
         where: key in it; empty for the whole file.
         reason: the fault, and what is allowed.
+        line: number of the line, from 1, where it is known.
     """
 
-    def __init__(self, source: str, where: str, reason: str) -> None:
-        super().__init__(f"{source}: {where}: {reason}" if where else f"{source}: {reason}")
-        self.source, self.where, self.reason = source, where, reason
+    def __init__(self, source: str, where: str, reason: str, line: int | None = None) -> None:
+        at = "" if line is None else f" (line {line})"
+        super().__init__(f"{source}: {where}: {reason}{at}" if where else f"{source}: {reason}{at}")
+        self.source, self.where, self.reason, self.line = source, where, reason, line
 
 
 class DataError(CalibrationError):

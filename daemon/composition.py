@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from calibration.rig.channels import Cia404Analogue, Cia406Encoder, Cia406Linear
-from calibration.rig.description import Rig
+from calibration.rig.description import Rig, parse_rig
 from daemon.acquisition.channels import decoder_factories, node_setups
 from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_inputs
+from daemon.acquisition.simulated_channels import with_simulated_channels
 from daemon.acquisition.simulated_rig import SimulatedRig, SimulationError
 from daemon.commands import CommandError
 from daemon.config import CanSection, Config, ConfigError, RigSource
@@ -31,7 +32,8 @@ from drivers.readings import Decoder, LinkLoop
 from drivers.stations.decoder import StationDecoder
 from drivers.stations.link import StationLink
 from drivers.stations.serial_port import SerialConfig
-from simulators.plan import stops_of
+from simulators.campaign import Campaign, simulate_campaign
+from simulators.plan import plan_rows, stops_of
 from simulators.replay import ReplayLink
 
 SIMULATED_SYNC_MS = 200
@@ -110,6 +112,7 @@ def simulated(
         secret: directory in which the simulator names one more, which it draws; none by default.
         dwell_s: how long the boom stands at each pose, simulated seconds.
     """
+    source, config = _with_devices(source, config)
     now = SystemClock().now()
     clock = ScaledClock(rate, Stamp(now.utc_ns, now.monotonic_ns, f"simulated-{uuid.uuid4()}"))
     ports = config.state_directory / "ports"
@@ -148,6 +151,31 @@ def simulated(
         yield parts
     finally:
         simulation.close()
+
+
+def _with_devices(source: RigSource, config: Config) -> tuple[RigSource, Config]:
+    """Give every joint that the rig file reads from nowhere a simulated device, in a rig file of the simulation."""
+    text = with_simulated_channels(source.rig, source.text)
+    if text == source.text:
+        return source, config
+    path = config.state_directory / "simulated-rig.toml"
+    path.write_text(text, encoding="utf-8")
+    return RigSource(parse_rig(text, path.name), text, source.directory), config.model_copy(update={"rig": str(path)})
+
+
+def simulated_campaign(
+    rig: Rig, poses: int, seed: int, *, plan: Path | None, effects: str, noise_mm: float | None, recording: int
+) -> Campaign:
+    """Simulate a measuring campaign; arguments as for `simulators.campaign.simulate_campaign`, the plan as a file.
+
+    Raises:
+        ConfigError: effects that there are not or that the rig has no place for; a file that is no plan of the rig.
+    """
+    try:
+        rows = [] if plan is None else plan_rows(plan, rig)
+        return simulate_campaign(rig, poses, seed, plan=rows, effects=effects, noise_mm=noise_mm, recording=recording)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
 
 
 def _aim(simulation: SimulatedRig, target: str) -> None:

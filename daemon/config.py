@@ -401,6 +401,19 @@ def load_rig(name_or_path: str, signals: Sequence[str] = ()) -> RigSource:
     Raises:
         RigError: no such rig or file, or the file is malformed.
     """
+    text, name, directory = read_rig_text(name_or_path)
+    rig = parse_rig(text, name)
+    if signals:
+        rig = rig.with_signals(*signals)
+    return RigSource(rig, rig.text, directory)
+
+
+def read_rig_text(name_or_path: str) -> tuple[str, str, Path]:
+    """Read a rig's text, unchecked; returns it with the file's name and directory.
+
+    Raises:
+        RigError: no such rig or file, or it cannot be read.
+    """
     if name_or_path in shipped_rigs():
         directory = Path(str(resources.files("calibration").joinpath("rigs")))
         path = directory / f"{name_or_path}.toml"
@@ -411,11 +424,7 @@ def load_rig(name_or_path: str, signals: Sequence[str] = ()) -> RigSource:
             shipped = ", ".join(shipped_rigs())
             raise RigError(name_or_path, "", f"neither a shipped rig ({shipped}) nor a rig file")
     try:
-        text = read_text(path, LONGEST)
+        return read_text(path, LONGEST), path.name, directory
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise RigError(str(path), "", f"cannot be read: {reason}") from error
-    rig = parse_rig(text, path.name)
-    if signals:
-        rig = rig.with_signals(*signals)
-    return RigSource(rig, rig.text, directory)

@@ -144,23 +144,25 @@ class Model:
         return evaluate(self.data, observations)
 
     def export(self, directory: str | Path, format_name: str | None = None) -> tuple[Path, ...]:
-        """Write the model for other programs: `calibration_json`, `corrections_csv`.
+        """Write the model for other programs.
 
         Args:
             directory: where to; it is made where it is missing.
-            format_name: one format; all by default.
+            format_name: one of `json`, `grid`, `urdf`, `xacro`, `dh-csv`, `matlab`, `c-header`, `parquet`; `json` and
+                `grid` by default.
 
         Returns:
             The files that were written.
 
         Raises:
-            DataError: an unknown format.
+            DataError: an unknown format, or one that needs a library that is not installed.
             OSError: the file system refuses.
         """
         out = Path(directory)
         out.mkdir(parents=True, exist_ok=True)
         manifest = model_to_files(self.data)[MANIFEST]
-        files = export_files(Export(self.data, hashlib.sha256(manifest).hexdigest()), format_name)
+        export = Export(self.data, hashlib.sha256(manifest).hexdigest())
+        files = export_files(export, () if format_name is None else (format_name,))
         for name, data in files.items():
             write_file(out / name, data)
         return tuple(out / name for name in files)

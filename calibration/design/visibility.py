@@ -1,8 +1,8 @@
 """Reachable poses and prisms in view of the station, by plain rules: links are capsules.
 
 A rig file knows frames and no shapes. So every link is the straight line between the origins of two frames that follow
-each other, with a radius of 1.2 % of the reach, and a pedestal stands between the base and the floor. Everything here
-is in the base frame.
+each other, with its row's `radius_mm`, or else an assumed 1.2 % of the reach, and a pedestal stands between the base
+and the floor. Everything here is in the base frame.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ STEEPEST_DEG = 60.0  # above and below the horizon
 _RADIUS = 0.012  # of the reach: half the width of a boom
 _FLOOR = 0.15  # of the reach, below the base
 _SURFACE = 0.7  # a prism stands on its link, which is no thicker than this share of its distance from the line
-_NEIGHBOURS = 4.0  # radii along the chain; links nearer than that are joined by a bracket
+_NEIGHBOURS = 2.0  # of two links' radii together, along the chain; nearer ones are joined by a bracket
 _BUILT_SO = 0.5  # share of poses; links closer than two radii in more of them are not as straight as drawn here
 _LEAST_LINK_MM = 1.0
 _SPREAD_POSES = 256
@@ -45,6 +45,7 @@ class Site:
         up: (3,) unit vector against gravity.
         reach_mm: the farthest a frame or prism comes from the base.
         floor_mm: height of the floor over the base's origin, along `up`.
+        radii_mm: (row number, radius) of the links whose rows give one.
         apart: pairs of links that must not touch, by the numbers of their rows; 0 for the pedestal.
     """
 
@@ -52,20 +53,27 @@ class Site:
     up: Floats
     reach_mm: float
     floor_mm: float
+    radii_mm: tuple[tuple[int, float], ...] = ()
     apart: tuple[tuple[int, int], ...] = ()
 
     @property
-    def radius_mm(self) -> float:
-        """Radius of every link."""
+    def assumed_radius_mm(self) -> float:
+        """Radius of the pedestal and of the links whose rows give none."""
         return _RADIUS * self.reach_mm
+
+    def radius_mm(self, number: int) -> float:
+        """Return the radius of the link of a row, or of the pedestal, 0."""
+        return dict(self.radii_mm).get(number, self.assumed_radius_mm)
 
     @property
     def rules(self) -> tuple[str, ...]:
         """The rules for reachable and in view, in sentences."""
+        given = ", ".join(f"{radius:g} mm of row {number}" for number, radius in self.radii_mm)
+        radii = f"an assumed radius of {self.assumed_radius_mm:.0f} mm{f', but {given}' if given else ''}"
         return (
             f"reachable: inside the joint limits, nothing lower than the floor at {self.floor_mm:.0f} mm over the "
-            f"base's origin, links (straight between their frames, {self.radius_mm:.0f} mm in radius) clear of each "
-            f"other and of the base",
+            f"base's origin, links (straight between their frames, with {radii}; a row's radius_mm sets it) clear of "
+            f"each other and of the base",
             f"in view: the line from the station passes no link, {NEAREST_MM / 1e3:g} .. {FARTHEST_MM / 1e3:g} m away "
             f"and within {STEEPEST_DEG:g} deg of the horizon",
         )
@@ -125,6 +133,10 @@ class Bodies:
         """(n, 3) both ends of the link of a row."""
         return self.frames_mm[:, self._parents[number - 1]], self.frames_mm[:, number]
 
+    def length_mm(self, number: int) -> float:
+        """Return the mean length of the link of a row."""
+        return float(self._lengths_mm[number - 1])
+
     def between_mm(self, one: int, other: int) -> float:
         """Mean length of the machine between two links, along the chain; 0 where they share a frame.
 
@@ -174,7 +186,8 @@ def site(
     bodies = Bodies.of(chain, x, spread_poses(chain.rig))
     reach = float(np.linalg.norm(bodies.everything_mm, axis=2).max())
     floor = -_FLOOR * reach if floor_mm is None else floor_mm
-    at = Site(np.zeros(3), up, reach, floor)
+    radii = tuple((n, row.radius_mm) for n, row in enumerate(chain.rig.rows, 1) if row.radius_mm is not None)
+    at = Site(np.zeros(3), up, reach, floor, radii)
     if setup is not None:
         base = chain.base(x, setup)
         at = replace(
@@ -216,7 +229,7 @@ def is_reachable(bodies: Bodies, at: Site) -> Flags:
     """(n,) poses in which nothing is below the floor and no link touches another or the pedestal."""
     good: Flags = np.all(bodies.everything_mm @ at.up >= at.floor_mm, axis=1)
     for one, other in at.apart:
-        good &= _gap_mm(bodies, at, one, other) >= 2.0 * at.radius_mm
+        good &= _gap_mm(bodies, at, one, other) >= at.radius_mm(one) + at.radius_mm(other)
     return good
 
 
@@ -225,8 +238,9 @@ def _apart(bodies: Bodies, at: Site) -> tuple[tuple[int, int], ...]:
     found = []
     for i, one in enumerate((0, *bodies.links)):
         for other in bodies.links[i:]:
-            if bodies.between_mm(one, other) > _NEIGHBOURS * at.radius_mm:
-                touches = _gap_mm(bodies, at, one, other) < 2.0 * at.radius_mm
+            width = at.radius_mm(one) + at.radius_mm(other)
+            if bodies.between_mm(one, other) > _NEIGHBOURS * width:
+                touches = _gap_mm(bodies, at, one, other) < width
                 if touches.mean() < _BUILT_SO:
                     found.append((one, other))
     return tuple(found)
@@ -242,7 +256,8 @@ def in_view(bodies: Bodies, at: Site) -> Flags:
     """(n, prisms) prisms that the station sees."""
     n = len(bodies)
     station = np.broadcast_to(at.station_mm, (n, 3))
-    obstacles = [bodies.link_mm(number) for number in bodies.links] + [_pedestal(at, n)]
+    obstacles = [(at.radius_mm(number), bodies.link_mm(number)) for number in bodies.links]
+    obstacles.append((at.assumed_radius_mm, _pedestal(at, n)))
     seen = np.ones((n, len(bodies.rig.prisms)), dtype=bool)
     for prism in range(seen.shape[1]):
         target = bodies.prisms_mm[:, prism]
@@ -250,9 +265,9 @@ def in_view(bodies: Bodies, at: Site) -> Flags:
         range_mm = np.linalg.norm(sight, axis=1)
         steep = np.abs(sight @ at.up) > math.sin(math.radians(STEEPEST_DEG)) * range_mm
         seen[:, prism] = (range_mm >= NEAREST_MM) & (range_mm <= FARTHEST_MM) & ~steep
-        for ends in obstacles:
+        for radius_mm, ends in obstacles:
             on_it = _SURFACE * segment_distance(*ends, target, target)
-            seen[:, prism] &= segment_distance(*ends, station, target) >= np.minimum(at.radius_mm, on_it)
+            seen[:, prism] &= segment_distance(*ends, station, target) >= np.minimum(radius_mm, on_it)
     return seen
 
 

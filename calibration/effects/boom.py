@@ -78,7 +78,8 @@ class Boom:
     joint: str
 
     @cached_property
-    def _root(self) -> int:
+    def root(self) -> int:
+        """Number of the frame in whose origin its root is."""
         path = self.context.rig.path(self.row)
         return path[-2] if len(path) > 1 else 0
 
@@ -91,7 +92,7 @@ class Boom:
     @cached_property
     def root_mm(self) -> Floats:
         """(n, 3) place of its root."""
-        return self.context.located.frames_mm[:, self._root]
+        return self.context.located.frames_mm[:, self.root]
 
     @cached_property
     def tip_mm(self) -> Floats:
@@ -143,7 +144,7 @@ class Boom:
     @cached_property
     def own(self) -> NDArray[np.bool_]:
         """(points,) mask of the weights that are fixed to the boom's root section."""
-        own: NDArray[np.bool_] = self.context.loads.point_frame == self._root
+        own: NDArray[np.bool_] = self.context.loads.point_frame == self.root
         return own
 
     @cached_property

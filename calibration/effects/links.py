@@ -158,7 +158,7 @@ class LinkFamily(OfUncertainLoad, PrismFamily):
         most, volume = _greatest(context, link.row), Link(context.work_volume, link.row)
         if most == 0.0 or not link.carries_prism.any() or np.abs(self._loads(volume)).max() < _LEAST_SHARE * most:
             return ()
-        return load_variants(self._shapes(context, where), _SIGMA_RAD / most)
+        return load_variants(self.shapes(context, where), _SIGMA_RAD / most)
 
     def names(self, settings: Settings) -> tuple[str, ...]:
         return (_LINEAR, *part_names(settings))
@@ -173,7 +173,7 @@ class LinkFamily(OfUncertainLoad, PrismFamily):
         if not context.rig.masses:
             return np.zeros((n, 3, len(self.names(settings))))
         loads = load_columns(
-            self._loads(link), settings, lambda: self._shapes(context, where), lambda: self._parts(link)
+            self._loads(link), settings, lambda: self.shapes(context, where), lambda: self._parts(link)
         )
         turns = loads.reshape(n, 3, -1).transpose(0, 2, 1)
         arm_mm = (context.located.prism_mm - link.place_mm) * link.carries_prism[:, None]
@@ -188,7 +188,7 @@ class LinkFamily(OfUncertainLoad, PrismFamily):
         parts = self.given_way_to(link.axis, link.parts_newton_m)
         return parts.reshape(-1, parts.shape[2])
 
-    def _shapes(self, context: EffectContext, where: str) -> LoadShapes:
+    def shapes(self, context: EffectContext, where: str) -> LoadShapes:
         """Return the shapes by which uncertain weights change that over the poses."""
 
         def in_volume(volume: EffectContext) -> tuple[Floats, Floats]:

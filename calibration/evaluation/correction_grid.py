@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -32,6 +32,8 @@ _CURVATURE_STEP = 0.05  # of a joint's range
 _PROOF_POSES = 500
 _LEAST_RANGE = 1.0  # deg or mm, of a joint that stood still in training
 _CHUNK = 10_000
+FINE_SHARE = 0.1  # of the corrections: what interpolation may leave of them
+_FIRST_POSES, _FINER = 64, 2  # nodes that are tried first, and by what factor there are more then
 _LATER_S = 1e12  # `time_s` of the grid, after any training: what has jumped then has jumped
 
 
@@ -63,8 +65,8 @@ class CorrectionGrid:
 
     @property
     def is_coarse(self) -> bool:
-        """True if interpolating leaves more than half of the error that the grid is there to take away."""
-        return self.rms_mm > 0.5 * self.correction_rms_mm
+        """True if interpolating leaves more than a tenth of the error that the grid is there to take away."""
+        return self.rms_mm > FINE_SHARE * self.correction_rms_mm
 
 
 @one_blas_thread()
@@ -73,7 +75,8 @@ def correction_grid(
 ) -> CorrectionGrid:
     """Compute corrections over the joint values that the model was trained on, with more nodes where they bend more.
 
-    Elsewhere a model says what its kinematics say, and a grid that reached there would be coarser everywhere.
+    Elsewhere a model says what its kinematics say, and a grid that reached there would be coarser everywhere. There are
+    as many nodes as bring the error of interpolation under a tenth of the corrections, if `most_poses` allow it.
 
     Args:
         model: the model. Effects and residual are taken as for data that have joint values and nothing else, measured
@@ -93,17 +96,25 @@ def correction_grid(
     least = 2 ** len(joints)
     if most_poses < least:
         raise DataError("grid", f"two values for each of {len(joints)} joints make {least} poses; allow so many")
-    machine = _Machine(model, setup_of(model))
-    low, high = np.array([_range(model, joint) for joint in joints]).T
-    counts = _counts(_curvature_mm(machine, prisms, low, high, rng), most_poses)
-    nodes = {joint.name: np.linspace(*ends) for joint, *ends in zip(joints, low, high, counts, strict=True)}
-    readings = np.stack(np.meshgrid(*nodes.values(), indexing="ij"), axis=-1).reshape(-1, len(joints))
-    nominal_mm = {prism: machine.nominal_mm(prism, readings) for prism in prisms}
-    corrected_mm = {prism: machine.corrected_mm(prism, readings) for prism in prisms}
+    machine = Machine(model, setup_of(model))
+    low, high = trained_ranges(model)
+    bends_mm = _curvature_mm(machine, prisms, low, high, rng)
     poses = rng.uniform(low, high, (_PROOF_POSES, len(joints)))
     wanted_mm = np.concatenate([machine.correction_mm(prism, poses) for prism in prisms])
-    given_mm = np.concatenate([interpolated(nodes, corrected_mm[prism] - nominal_mm[prism], poses) for prism in prisms])
-    off_mm = np.linalg.norm(given_mm - wanted_mm, axis=1)
+    correction_rms_mm = float(np.sqrt((wanted_mm**2).sum(axis=1).mean()))
+    most = min(max(least, _FIRST_POSES), most_poses)
+    while True:
+        counts = _counts(bends_mm, most)
+        nodes = {joint.name: np.linspace(*ends) for joint, *ends in zip(joints, low, high, counts, strict=True)}
+        readings = np.stack(np.meshgrid(*nodes.values(), indexing="ij"), axis=-1).reshape(-1, len(joints))
+        nominal_mm = {prism: machine.nominal_mm(prism, readings) for prism in prisms}
+        corrected_mm = {prism: machine.corrected_mm(prism, readings) for prism in prisms}
+        given_mm = [interpolated(nodes, corrected_mm[prism] - nominal_mm[prism], poses) for prism in prisms]
+        off_mm = np.linalg.norm(np.concatenate(given_mm) - wanted_mm, axis=1)
+        rms_mm = float(np.sqrt((off_mm**2).mean()))
+        if rms_mm <= FINE_SHARE * correction_rms_mm or most == most_poses:
+            break
+        most = min(_FINER * most, most_poses)
     return CorrectionGrid(
         nodes,
         readings,
@@ -111,11 +122,21 @@ def correction_grid(
         corrected_mm,
         machine.reachable(readings),
         machine.left_out(prisms[0], readings[:1]),
-        rms_mm=float(np.sqrt((off_mm**2).mean())),
+        rms_mm=rms_mm,
         p95_mm=float(np.quantile(off_mm, 0.95)),
         max_mm=float(off_mm.max()),
-        correction_rms_mm=float(np.sqrt((wanted_mm**2).sum(axis=1).mean())),
+        correction_rms_mm=correction_rms_mm,
     )
+
+
+def trained_ranges(model: CalibratedModel) -> tuple[Floats, Floats]:
+    """Return (joints,) least and greatest values of the joints in training, inside their limits, deg or mm.
+
+    Raises:
+        DataError: a joint that was trained beyond its limits alone.
+    """
+    low, high = np.array([_range(model, joint) for joint in model.rig.joints]).T
+    return low, high
 
 
 def interpolated(nodes: Mapping[str, Floats], values: Floats, readings: Floats) -> Floats:
@@ -150,37 +171,46 @@ def _range(model: CalibratedModel, joint: Joint) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class _Machine:
+class Machine:
     """Places of prisms in the base frame at joint values (n, joints), by the drawings and by the model."""
 
     model: CalibratedModel
     setup: int
 
     def nominal_mm(self, prism: str, readings: Floats) -> Floats:
+        """(n, 3) by the drawings."""
         model = self.model
         base = model.chain.base(model.nominal_values, self.setup)
-        nominal_mm = Predictor.of(model).nominal_mm(self._rows(prism, readings))
+        nominal_mm = Predictor.of(model).nominal_mm(self.rows(prism, readings))
         turned: Floats = (nominal_mm - base.translation_mm) @ base.rotation
         return turned
 
-    def corrected_mm(self, prism: str, readings: Floats) -> Floats:
-        return _in_chunks(lambda some: Predictor.of(self.model).base_mm(self._rows(prism, some)), readings)
+    def corrected_mm(self, prism: str, readings: Floats, extra: Mapping[str, Floats] | None = None) -> Floats:
+        """(n, 3) by the model; `extra` are further columns of the observations."""
+        if extra is not None:
+            rows = self.rows(prism, readings)
+            return Predictor.of(self.model).base_mm(replace(rows, extra={**rows.extra, **extra}))
+        return _in_chunks(lambda some: Predictor.of(self.model).base_mm(self.rows(prism, some)), readings)
 
     def correction_mm(self, prism: str, readings: Floats) -> Floats:
+        """(n, 3) the difference."""
         difference: Floats = self.corrected_mm(prism, readings) - self.nominal_mm(prism, readings)
         return difference
 
     def reachable(self, readings: Floats) -> Flags:
+        """(n,) True where the rig touches neither itself nor the floor."""
         chain, values = self.model.chain, self.model.values
         at = site(chain, values, setup=self.setup)
         return _in_chunks(lambda some: is_reachable(Bodies.of(chain, values, some), at), readings)
 
     def left_out(self, prism: str, readings: Floats) -> tuple[str, ...]:
+        """Sentences on effects that need more than joint values."""
         model = self.model
         of_machine = [effect for effect in model.effects if library()[effect.family].moves_machine]
-        return left_out(of_machine, Predictor.of(model).context(self._rows(prism, readings)))
+        return left_out(of_machine, Predictor.of(model).context(self.rows(prism, readings)))
 
-    def _rows(self, prism: str, readings: Floats) -> Observations:
+    def rows(self, prism: str, readings: Floats) -> Observations:
+        """Return observations of a prism at these joint values, not measured yet."""
         n = len(readings)
         return Observations(
             prism=np.full(n, prism),
@@ -199,7 +229,7 @@ def _in_chunks(function: Callable[[Floats], NDArray[T]], readings: Floats) -> ND
 
 
 def _curvature_mm(
-    machine: _Machine, prisms: Sequence[str], low: Floats, high: Floats, rng: np.random.Generator
+    machine: Machine, prisms: Sequence[str], low: Floats, high: Floats, rng: np.random.Generator
 ) -> Floats:
     """(joints,) RMS error of interpolating the corrections linearly between the ends of each joint's range, mm.
 

@@ -1,18 +1,71 @@
-"""A model to be exported: the correction grid and the summary that export formats share."""
+"""A model to be exported: what formats share, and the error of what each of them leaves out."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from calibration.evaluation.correction_grid import CorrectionGrid, correction_grid
+from calibration.design.knowledge import setup_of
+from calibration.effects.fitted import FittedEffect
+from calibration.effects.library import library
+from calibration.evaluation.correction_grid import CorrectionGrid, Machine, correction_grid, trained_ranges
 from calibration.model.model import CalibratedModel
 
 GRID_FILE = "corrections.csv"
+_POSES = 1000
+_SEED = 0
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """What an export lacks of its model, and what that costs.
+
+    Attributes:
+        parts: phrases, such as `joint_compliance@q2`; none where it lacks nothing.
+        not_measured: phrases on parts whose error is none of the joint values' alone.
+        rms_mm, p95_mm, max_mm: by what the export is wrong for that, over the work volume, all prisms together.
+        correction_rms_mm: how large the model's whole correction of the drawings is there.
+    """
+
+    parts: tuple[str, ...]
+    not_measured: tuple[str, ...] = ()
+    rms_mm: float = 0.0
+    p95_mm: float = 0.0
+    max_mm: float = 0.0
+    correction_rms_mm: float = 0.0
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """Sentences for the file and for people."""
+        return tuple(self._sentences())
+
+    def _sentences(self) -> Iterator[str]:
+        if not self.parts:
+            yield "It leaves nothing of the model out that depends on the joints alone."
+        elif self.max_mm == 0.0:
+            yield f"It leaves out {', '.join(self.parts)}, which at joint values alone do nothing."
+        else:
+            yield (
+                f"It leaves out {', '.join(self.parts)}. For that its positions are wrong by {self.rms_mm:.3g} mm RMS "
+                f"over the work volume (95 % within {self.p95_mm:.3g} mm, {self.max_mm:.3g} mm at most), of a "
+                f"correction of {self.correction_rms_mm:.3g} mm RMS."
+            )
+        yield from self.not_measured
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the JSON object of `rigcal model export`."""
+        return {
+            "left_out": list(self.parts),
+            "not_measured": list(self.not_measured),
+            "rms_mm": self.rms_mm,
+            "p95_mm": self.p95_mm,
+            "max_mm": self.max_mm,
+            "correction_rms_mm": self.correction_rms_mm,
+        }
 
 
 @dataclass(frozen=True)
@@ -39,7 +92,7 @@ class Export:
             DataError: as `correction_grid`.
         """
         prisms = self.prisms or self.model.rig.prism_names
-        return correction_grid(self.model, prisms, self.most_poses, np.random.default_rng(0))
+        return correction_grid(self.model, prisms, self.most_poses, np.random.default_rng(_SEED))
 
     @cached_property
     def summary(self) -> Mapping[str, Any]:
@@ -56,18 +109,105 @@ class Export:
             "warnings": list(_warnings(grid)),
         }
 
+    @cached_property
+    def setup(self) -> int:
+        """Index of the set-up whose base is known best; gravity is taken from there."""
+        return setup_of(self.model)
+
+    def heading(self, left_out: LeftOut) -> tuple[str, ...]:
+        """Return the lines at the head of an export that is text."""
+        model = self.model
+        return (
+            f"Made by `rigcal model export` from the model of rig {model.rig.name} with manifest SHA-256 "
+            f"{self.manifest_sha256 or 'unknown'}.",
+            "Its base frame is the rig file's; where the base stands at a station set-up is not in it.",
+            *left_out.sentences,
+        )
+
+    @cached_property
+    def kinematics_alone(self) -> LeftOut:
+        """What a format leaves out that has the identified kinematics and nothing else."""
+        return self.without(lambda _: False)
+
+    def without(self, keeps: Callable[[FittedEffect], bool]) -> LeftOut:
+        """Measure what leaving out the residual, and effects that are not kept, costs over the work volume.
+
+        Args:
+            keeps: True for an effect that stays.
+        """
+        model = self.model
+        of_machine = [effect for effect in model.effects if library()[effect.family].moves_machine]
+        lost = [effect for effect in of_machine if not keeps(effect)]
+        parts = [f"{effect.family}@{effect.where}" for effect in lost]
+        parts += [f"the learned residual ({model.residual.learner.kind})"] if model.residual is not None else []
+        told = [
+            f"{effect.family}@{effect.where} moves fixes or the base and is no part of any export."
+            for effect in model.effects
+            if effect not in of_machine
+        ]
+        lacking = [e for e in lost if (need := _needs(e)) and not need.endswith("_dir")]
+        told += [f"What {e.family}@{e.where} does is not measured here: it needs {_needs(e)}." for e in lacking]
+        if not parts:
+            return LeftOut((), tuple(told))
+        kept = [effect for effect in model.effects if effect not in lost]
+        whole, rest = Machine(model, self.setup), Machine(without_parts(model, kept), self.setup)
+        low, high = trained_ranges(model)
+        rng = np.random.default_rng(_SEED)
+        poses = rng.uniform(low, high, (_POSES, len(low)))
+        extra = {f"{name}_dir": rng.choice([-1.0, 1.0], _POSES) for name in model.rig.joint_names}
+        off, correction = [], []
+        for prism in model.rig.prism_names:
+            place_mm = whole.corrected_mm(prism, poses, extra)
+            off.append(place_mm - rest.corrected_mm(prism, poses, extra))
+            correction.append(place_mm - whole.nominal_mm(prism, poses))
+        size = np.linalg.norm(np.concatenate(off), axis=1)
+        return LeftOut(
+            tuple(parts),
+            tuple(told),
+            float(np.sqrt((size**2).mean())),
+            float(np.quantile(size, 0.95)),
+            float(size.max()),
+            float(np.sqrt((np.concatenate(correction) ** 2).sum(axis=1).mean())),
+        )
+
+
+def without_parts(model: CalibratedModel, effects: Sequence[FittedEffect]) -> CalibratedModel:
+    """Return a model with some of its effects and without a residual."""
+    kept = [np.arange(len(model.values))]
+    first = len(model.values)
+    for effect in model.effects:
+        last = first + len(effect.coefficients)
+        if effect in effects:
+            kept.append(np.arange(first, last))
+        first = last
+    own = np.concatenate(kept)
+    effects = tuple(effect for effect in model.effects if effect in effects)
+    return replace(model, effects=effects, residual=None, covariance=model.covariance[np.ix_(own, own)])
+
 
 @dataclass(frozen=True)
 class Format:
     """One format.
 
     Attributes:
+        name: as `--format` has it.
         file: name of the file that it writes.
         content: makes its content.
+        left_out: says what it lacks of the model, and what that costs.
+        is_default: True if it is written when no format is asked for.
     """
 
+    name: str
     file: str
     content: Callable[[Export], bytes]
+    left_out: Callable[[Export], LeftOut] = lambda _: LeftOut(())
+    is_default: bool = False
+
+
+def _needs(effect: FittedEffect) -> str:
+    """Return the column that an effect needs; empty for none."""
+    column = library()[effect.family].column
+    return column.format(where=effect.where)
 
 
 def _warnings(grid: CorrectionGrid) -> Iterator[str]:
@@ -75,6 +215,6 @@ def _warnings(grid: CorrectionGrid) -> Iterator[str]:
     if grid.is_coarse:
         yield (
             f"between the nodes of {GRID_FILE}, interpolated corrections are wrong by {grid.rms_mm:.2g} mm RMS, more "
-            f"than half of the {grid.correction_rms_mm:.2g} mm that they are: the table mends little; allow more rows "
-            "(--rows), or use `rigcal predict`"
+            f"than a tenth of the {grid.correction_rms_mm:.2g} mm that they are; allow more rows (--rows), or use "
+            "`rigcal predict` or the C header"
         )

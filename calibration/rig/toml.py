@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Sequence
 from typing import Any
 
 LONGEST = 1 << 19  # characters; the largest rig that is known has 6,000
 _PARTS_MAX = 100  # of the dotted keys of a line
 _PART = re.compile(r"""[\w"'-][ \t]*\.(?=[ \t]*[\w"'-])""")
 _INTEGER_MAX = 1 << 63
+_HEADER = re.compile(r"\s*\[\[?\s*([\w.-]+)\s*\]\]?\s*(#.*)?")
+_KEY = re.compile(r"\s*\"?([\w-]+)\"?\s*[.=]")
 
 
 def parse_toml(text: str) -> dict[str, Any]:
@@ -44,3 +47,28 @@ def _check_integers(document: dict[str, Any]) -> None:
             waiting += [(key, item) for item in value]
         elif isinstance(value, int) and not -_INTEGER_MAX <= value < _INTEGER_MAX:
             raise ValueError(f"{key}: a whole number beyond 64 bits")
+
+
+def line_of(text: str, where: Sequence[str | int]) -> int | None:
+    """Return the line of a key, from 1; of its table where the key is missing, None where that is missing too.
+
+    Args:
+        text: a TOML document whose tables have a line of their own each: `[name]` and `[[name]]`.
+        where: names of tables and keys; a number after the name of an array counts its tables from 1.
+    """
+    if not where:
+        return None
+    table, *rest = where
+    wanted = rest.pop(0) if rest and isinstance(rest[0], int) else 1
+    key = str(rest[0]) if rest else ""
+    count, inside, found, top = 0, False, None, True
+    for number, line in enumerate(text.splitlines(), 1):
+        header, entry = _HEADER.fullmatch(line), _KEY.match(line)
+        if header:
+            top, inside = False, header[1] == table
+            count += inside
+            inside = inside and count == wanted
+            found = number if inside else found
+        elif entry and ((inside and entry[1] == key) or (top and entry[1] == table)):
+            return number
+    return found

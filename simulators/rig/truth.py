@@ -120,6 +120,11 @@ class RigTruth:
         """(3,) true place of a prism in its frame; KeyError if there is no such prism."""
         return self._prisms[name][1]
 
+    @property
+    def masses(self) -> tuple[PointMass, ...]:
+        """The true weights."""
+        return self._masses
+
     def placement(self, setup: str = "") -> Placement:
         """Pose of the machine in the frame of a station set-up: a few metres away, swinging away from it."""
         if setup not in self._placements:

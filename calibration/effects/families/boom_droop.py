@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -74,16 +75,31 @@ class BoomDroop(OfUncertainLoad, BoomFamily):
         boom, (_, *shaped) = boom_in(context), self.names(settings)
         if boom is None or not context.rig.masses:
             return np.zeros((len(context), 3, 1 + len(shaped)))
-        loads = _whole(boom)
-        if shaped:
-            shapes = _shapes(context)
-            if len(shapes) != len(shaped):
-                raise ModelError(
-                    f"the model has {len(shaped)} shapes of a droop that has {len(shapes)}; calibrate again"
-                )
-            loads = np.hstack([loads, (_parts(boom) - loads * shapes.share) @ shapes.mixing])
+        loads = load_factors(boom, self.names(settings))
         moved = _moved_mm(boom, context.located.prism_mm - boom.tip_mm, loads)
         return context.to_station(moved * boom.carries_prism[:, None, None])
+
+
+def load_factors(boom: Boom, names: Sequence[str]) -> Floats:
+    """Return the factors on each weight for every coefficient.
+
+    Args:
+        boom: the boom.
+        names: (k,) of the coefficients.
+
+    Returns:
+        (4 * points, k): at the tip, for its moment, for its centre's moment, and along the boom.
+
+    Raises:
+        ModelError: the coefficients are of other shapes of the load, made by another version of this program.
+    """
+    loads, shaped = _whole(boom), names[1:]
+    if not shaped:
+        return loads
+    shapes = _shapes(boom.context)
+    if len(shapes) != len(shaped):
+        raise ModelError(f"the model has {len(shaped)} shapes of a droop that has {len(shapes)}; calibrate again")
+    return np.hstack([loads, (_parts(boom) - loads * shapes.share) @ shapes.mixing])
 
 
 def _greatest_mm(context: EffectContext) -> float:

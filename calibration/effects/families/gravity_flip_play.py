@@ -109,12 +109,9 @@ class GravityFlipPlay(TorqueFamily):
             sharp: Floats = np.degrees(0.5) * known * np.sign(load)[:, None]
             return sharp
         shapes = gravity_shapes(context, where, constant=True)
-        at = [settings[_shape(number)] for number in range(len(settings) - 2)]
-        if len(at) > len(shapes):
-            raise ModelError(f"the model has {len(at)} shapes of a load that has {len(shapes)}; calibrate again")
+        at, open_to = places_and_spreads(settings, len(shapes))
         change = shapes(load, context.torque_parts(where))
-        open_to = np.where(np.arange(len(shapes)) < len(at), settings[_SPREAD], 1.0)
-        wide = np.sqrt(((change * open_to) ** 2).sum(axis=1) + settings[_OTHER] ** 2)
+        wide = np.sqrt(((change * open_to) ** 2).sum(axis=1) + other_newton_m(settings) ** 2)
         u = ndtr((load + change[:, : len(at)] @ at) / wide)
         terms = np.arange(1, _TERMS + 1)
         about = math.sqrt(8.0) / (np.pi * terms) * np.sin(np.pi * terms * u[:, None])
@@ -124,6 +121,23 @@ class GravityFlipPlay(TorqueFamily):
     def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
         del plausible, settings
         return float(np.degrees(0.5 * values[0])) ** 2
+
+
+def places_and_spreads(settings: Settings, shapes: int) -> tuple[list[float], Floats]:
+    """Return where the first shapes of the load are, in sigmas, and (shapes,) what is open of each.
+
+    Raises:
+        ModelError: the load has fewer shapes than the settings.
+    """
+    at = [settings[_shape(number)] for number in range(len(settings) - 2)]
+    if len(at) > shapes:
+        raise ModelError(f"the model has {len(at)} shapes of a load that has {shapes}; calibrate again")
+    return at, np.where(np.arange(shapes) < len(at), settings[_SPREAD], 1.0)
+
+
+def other_newton_m(settings: Settings) -> float:
+    """Return what is open of the load beside its shapes, N m."""
+    return settings[_OTHER]
 
 
 def _shape(number: int) -> str:

@@ -151,15 +151,15 @@ def _curves(torque: Floats, settings: Settings) -> Floats:
 
 def _straightened(s: Floats, knot_power: float | None) -> Floats:
     """Return the splines (n, knots) at loads between -1 and 1, symmetric ones where the knots have a power."""
-    knots, line = _shape(knot_power)
+    knots, line = shape_of_curve(knot_power)
     out = np.empty((len(s), _KNOTS))
     _bent(np.ascontiguousarray(s), knots, line, knot_power is not None, out)
     return out
 
 
 @cache
-def _shape(knot_power: float | None) -> tuple[Floats, Floats]:
-    """Return the knots, and (2, knots) the straight lines that fit the splines best between -1 and 1."""
+def shape_of_curve(knot_power: float | None) -> tuple[Floats, Floats]:
+    """Return the knots and (2, inner knots) the straight lines that fit the splines best between -1 and 1."""
     spread = np.linspace(0.0, 1.0, _KNOTS + 2)
     knots = 2.0 * spread - 1.0 if knot_power is None else spread**knot_power
     whole = np.linspace(-1.0, 1.0, 201)

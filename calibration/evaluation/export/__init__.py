@@ -4,33 +4,44 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from calibration.errors import DataError
 from calibration.evaluation.exports import Export, Format
 
 
 def formats() -> Mapping[str, Format]:
-    """Return the formats by the names of their modules, in alphabetical order."""
-    names = sorted(module.name for module in pkgutil.iter_modules(__path__))
-    return {name: importlib.import_module(f"{__name__}.{name}").FORMAT for name in names}
+    """Return the formats by their names, in alphabetical order."""
+    modules = sorted(module.name for module in pkgutil.iter_modules(__path__))
+    found = [importlib.import_module(f"{__name__}.{name}").FORMAT for name in modules]
+    return {made.name: made for made in sorted(found, key=lambda made: str(made.name))}
 
 
-def export_files(export: Export, name: str | None = None) -> dict[str, bytes]:
+def chosen_formats(names: Sequence[str] = ()) -> tuple[Format, ...]:
+    """Return the formats of these names, or those that are written when none is asked for.
+
+    Raises:
+        DataError: an unknown format.
+    """
+    found = formats()
+    unknown = next((name for name in names if name not in found), None)
+    if unknown is not None:
+        raise DataError("format", f"{unknown!r} is unknown; there are {', '.join(found)}")
+    return tuple(made for made in found.values() if (made.name in names if names else made.is_default))
+
+
+def export_files(export: Export, names: Sequence[str] = ()) -> dict[str, bytes]:
     """Make the files of an export.
 
     Args:
         export: the model and what is asked.
-        name: one format; all of them by default.
+        names: of formats; those that are written by default when empty.
 
     Returns:
         File name -> content.
 
     Raises:
-        DataError: an unknown format; a prism that the rig lacks, too few poses, or a joint trained beyond its limits.
+        DataError: an unknown format; a prism that the rig lacks, too few poses, a joint trained beyond its limits, or a
+            library that the format needs and that is not installed.
     """
-    found = formats()
-    if name is not None and name not in found:
-        raise DataError("format", f"{name!r} is unknown; there are {', '.join(found)}")
-    chosen = found.values() if name is None else [found[name]]
-    return {made.file: made.content(export) for made in chosen}
+    return {made.file: made.content(export) for made in chosen_formats(names)}

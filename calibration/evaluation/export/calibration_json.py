@@ -8,7 +8,7 @@ import numpy as np
 
 from calibration.design.accuracy import expected_accuracy
 from calibration.errors import UnsafeError
-from calibration.evaluation.exports import GRID_FILE, Export, Format
+from calibration.evaluation.exports import Export, Format, LeftOut
 from calibration.model.model import CalibratedModel
 
 
@@ -61,9 +61,14 @@ def document(model: CalibratedModel) -> dict[str, object]:
 def _content(export: Export) -> bytes:
     about = document(export.model) | {
         "manifest_sha256": export.manifest_sha256,
-        "grid": {"file": GRID_FILE, **export.summary},
+        "leaves_out": _left_out(export).as_dict(),
     }
     return (json.dumps(about, indent=1, allow_nan=False) + "\n").encode()
 
 
-FORMAT = Format("calibration.json", _content)
+def _left_out(export: Export) -> LeftOut:
+    """Return what stands in it by name alone: the numbers of effects are in it, those of a learned residual are not."""
+    return export.without(lambda _: True)
+
+
+FORMAT = Format("json", "calibration.json", _content, _left_out, is_default=True)

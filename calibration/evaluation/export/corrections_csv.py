@@ -10,7 +10,7 @@ import io
 
 import numpy as np
 
-from calibration.evaluation.exports import GRID_FILE, Export, Format
+from calibration.evaluation.exports import GRID_FILE, Export, Format, LeftOut
 
 _DECIMALS = 4  # of mm
 
@@ -32,4 +32,12 @@ def _content(export: Export) -> bytes:
     return out.getvalue().encode()
 
 
-FORMAT = Format(GRID_FILE, _content)
+def grid_left_out(export: Export) -> LeftOut:
+    """Return the error of interpolating between the nodes, and the effects that need more than joint values."""
+    grid = export.grid
+    parts = (f"what lies between the nodes of {len(grid.readings)} poses",)
+    told = tuple(f"{sentence}." for sentence in grid.left_out)
+    return LeftOut(parts, told, grid.rms_mm, grid.p95_mm, grid.max_mm, grid.correction_rms_mm)
+
+
+FORMAT = Format("grid", GRID_FILE, _content, grid_left_out, is_default=True)

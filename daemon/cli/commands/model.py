@@ -16,6 +16,9 @@ from daemon.control.protocol import request
 from daemon.host.safe_output import write_file
 from daemon.warm_up import prepare
 
+_FORMATS = ("c-header", "dh-csv", "grid", "json", "matlab", "parquet", "urdf", "xacro")
+_GRIDS = ("grid", "parquet")
+
 
 @click.group()
 def model() -> None:
@@ -84,6 +87,13 @@ def model_zeros_checked(operator: str, **where: Any) -> Any:
 @click.argument("number", type=int, required=False)
 @click.option("--model", "directory", type=click.Path(path_type=Path), metavar="DIR", help="A model's directory.")
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True, help="Where to write.")
+@click.option(
+    "--format",
+    "names",
+    type=click.Choice(_FORMATS),
+    multiple=True,
+    help="What to write: json and grid when not given. May be given again.",
+)
 @click.option("--prism", "prisms", multiple=True, help="Prisms of the grid; all when not given. May be repeated.")
 @click.option(
     "--rows",
@@ -97,6 +107,7 @@ def model_export(
     number: int | None,
     directory: Path | None,
     out: Path,
+    names: tuple[str, ...],
     prisms: tuple[str, ...],
     rows: int,
     socket: Path | None,
@@ -104,12 +115,22 @@ def model_export(
     *,
     as_json: bool,
 ) -> Any:
-    """Write a model for other programs: calibration.json and corrections.csv.
+    r"""Write a model for other programs, and say what each form leaves out and what that costs.
 
     With --model no daemon is needed; else model NUMBER of the running daemon is taken, the live one by default.
-    calibration.json holds parameters with units and standard errors, effects, bases, accuracy and provenance;
-    corrections.csv holds, at the nodes of a grid of joint values, where each prism is nominally and by the model, in
-    the base frame. Between nodes the difference is meant to be interpolated linearly.
+
+    \b
+    json      parameters with units and standard errors, effects, bases, accuracy, provenance
+    grid      CSV: at the nodes of a grid of joint values, where each prism is nominally and by the model
+    parquet   the same table as Parquet
+    urdf      the identified kinematics for ROS, pinocchio and others
+    xacro     the same with a prefix that the caller gives
+    dh-csv    the identified Denavit-Hartenberg constants
+    matlab    the identified kinematics as a .mat file
+    c-header  forward kinematics with effects, and the inverse, as one C99 file
+
+    docs/models.md says how to use each. The error of what is left out is measured over the joint values of
+    the training.
     """
     if directory is not None and number is not None:
         raise click.UsageError("give either a model's NUMBER or --model DIR")
@@ -117,25 +138,31 @@ def model_export(
         found = request(socket_of(socket, config), "model.show", {} if number is None else {"id": number})
         directory = Path(found["path"])
     prepare()
-    from calibration.evaluation.export import export_files
+    from calibration.evaluation.export import chosen_formats
     from calibration.evaluation.exports import Export
     from daemon.models.model_files import model_sha256, read_model
 
     export = Export(read_model(directory), model_sha256(directory), prisms, rows)
-    files, summary = export_files(export), export.summary
+    chosen = chosen_formats(names)
+    contents = {made.file: made.content(export) for made in chosen}
     out.mkdir(parents=True, exist_ok=True)
-    for name, data in files.items():
+    for name, data in contents.items():
         write_file(out / name, data)
-    result = {"model": str(directory), "files": [str(out / name) for name in files], **summary}
+    left_out = {made.file: made.left_out(export) for made in chosen}
+    result: dict[str, Any] = {
+        "model": str(directory),
+        "files": [str(out / name) for name in contents],
+        "leaves_out": {file: left.as_dict() for file, left in left_out.items()},
+    }
+    has_grid = any(made.name in _GRIDS for made in chosen)
+    warnings: Sequence[str] = export.summary["warnings"] if has_grid else ()
+    result |= export.summary if has_grid else {}
     if not as_json:
-        for file in result["files"]:
-            echo(file)
-        echo(
-            f"{summary['rows']} rows; interpolated between them, corrections of {summary['correction_rms_mm']:.2g} mm "
-            f"RMS are within {summary['p95_mm']:.2g} mm of the model's in 95 % of random poses "
-            f"({summary['max_mm']:.2g} mm at most)"
-        )
-        for sentence in summary["warnings"]:
+        for made in chosen:
+            echo(str(out / made.file), bold=True)
+            for sentence in left_out[made.file].sentences:
+                echo(f"  {sentence}")
+        for sentence in warnings:
             echo_error(f"Warning: {sentence}", logging.WARNING)
     return result
 

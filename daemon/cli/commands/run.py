@@ -37,6 +37,7 @@ _DWELL = click.FloatRange(1, 600)
 @click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[FILE]...")
 @click.option("--config", type=click.Path(path_type=Path), help="Configuration file (TOML); --sim has one of its own.")
 @click.option("--sim", is_flag=True, help="A simulated rig in place of the configured links.")
+@click.option("--rig", metavar="RIG", help="With --sim: any shipped rig or rig file; joints without a channel get one.")
 @click.option("--replay", "is_replay", is_flag=True, help="The captured logs FILE... in place of the configured links.")
 @click.option("--rate", type=_RATE, default=1.0, show_default=True, help="Speed of the simulation or replay.")
 @click.option("--seed", type=int, default=1, show_default=True, help="Which simulated machine.")
@@ -60,6 +61,7 @@ _DWELL = click.FloatRange(1, 600)
 def run(
     files: tuple[Path, ...],
     config: Path | None,
+    rig: str | None,
     rate: float,
     seed: int,
     effects: tuple[str, ...],
@@ -75,6 +77,8 @@ def run(
 
     A replay keeps its store in a directory of its own, beside the configured one's.
     """
+    if rig is not None and not sim:
+        raise click.UsageError("--rig goes with --sim; a configuration names its rig itself")
     from daemon.composition import live, replayed, simulated
     from daemon.config import load_rig, parse_config, read_config
     from daemon.service import Daemon, stop_on_signals
@@ -91,6 +95,8 @@ def run(
         settings = parse_config(SIMULATED_CONFIG, Path("simulated").resolve())
     else:
         raise click.UsageError("give --config FILE (only --sim runs without one)")
+    if rig is not None:
+        settings = settings.model_copy(update={"rig": rig})
     source = load_rig(settings.rig)
     if is_replay:
         settings = _apart(settings)
@@ -102,8 +108,10 @@ def run(
             # The store first: its lock keeps a second daemon from touching anything of the first one's.
             store = stack.enter_context(contextlib.closing(Store(settings.store_path)))
             if sim:
-                rig = simulated(settings, source, rate=rate, seed=seed, effects=effects, secret=secret, dwell_s=dwell_s)
-                parts = stack.enter_context(rig)
+                machine = simulated(
+                    settings, source, rate=rate, seed=seed, effects=effects, secret=secret, dwell_s=dwell_s
+                )
+                parts = stack.enter_context(machine)
             elif is_replay:
                 parts = replayed(settings, source, files, rate)
             else:

@@ -102,8 +102,19 @@ def test_nodes_span_what_the_model_was_trained_on_and_joints_that_matter_get_mor
     for name, nodes in grid.nodes.items():
         assert (nodes[0], nodes[-1]) == session.model.coverage.ranges[name]
         assert (np.diff(nodes) > 0).all()
-    assert {name for name, nodes in grid.nodes.items() if len(nodes) > 2} == {"theta1", "theta3"}, "all that moves w"
+    finer = {name for name, nodes in grid.nodes.items() if len(nodes) > 2}
+    assert finer, "more than the ends alone"
+    assert finer <= {"theta1", "theta3"}, "all that moves w"
     assert 0.5 < grid.reachable.mean() <= 1.0
+
+
+def test_a_grid_has_no_more_nodes_than_bring_its_error_under_a_tenth(session: Session) -> None:
+    grid = correction_grid(session.model, ("w",), 20_000, np.random.default_rng(0))
+    assert grid.rms_mm <= 0.1 * grid.correction_rms_mm
+    assert not grid.is_coarse
+    assert len(grid.readings) < 2_000
+    few = correction_grid(session.model, ("r",), 512, np.random.default_rng(0))
+    assert few.is_coarse, "the nine joints of r need more"
 
 
 def test_a_joint_that_stood_still_in_training_has_nodes_around_its_place(session: Session) -> None:
@@ -122,17 +133,23 @@ def test_what_makes_no_grid_is_refused(session: Session) -> None:
 PARAMETERS_TXT = """
 from calibration.evaluation.exports import Export, Format
 
-FORMAT = Format("parameters.txt", lambda export: "\\n".join(p.name for p in export.model.parameters).encode())
+def content(export: Export) -> bytes:
+    return "\\n".join(p.name for p in export.model.parameters).encode()
+
+
+FORMAT = Format("parameters-txt", "parameters.txt", content, is_default=True)
 """
 
 
 def test_a_new_format_is_one_new_file(session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "parameters_txt.py").write_text(PARAMETERS_TXT)
     monkeypatch.setattr(folder, "__path__", [*folder.__path__, str(tmp_path)])
-    assert list(formats()) == ["calibration_json", "corrections_csv", "parameters_txt"]
+    assert {"c-header", "dh-csv", "grid", "json", "matlab", "parameters-txt", "parquet", "urdf", "xacro"} == {
+        *formats()
+    }
     files = export_files(Export(session.model, "0" * 64, ("r",), 512))
-    assert list(files) == ["calibration.json", "corrections.csv", "parameters.txt"]
+    assert {*files} == {"calibration.json", "corrections.csv", "parameters.txt"}
     assert files["parameters.txt"].decode().split("\n") == [p.name for p in session.model.parameters]
-    assert export_files(Export(session.model, ""), "parameters_txt") == {"parameters.txt": files["parameters.txt"]}
-    with pytest.raises(DataError, match="'parquet' is unknown; there are calibration_json"):
-        export_files(Export(session.model, ""), "parquet")
+    assert export_files(Export(session.model, ""), ["parameters-txt"]) == {"parameters.txt": files["parameters.txt"]}
+    with pytest.raises(DataError, match="'stl' is unknown; there are c-header, dh-csv"):
+        export_files(Export(session.model, ""), ["stl"])

@@ -1,0 +1,162 @@
+"""What a rig file amounts to: places at the zero pose, reach, links, and the parameters that data can show."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibration.design.visibility import Bodies, Site, is_reachable, limits, placement, site, spread_poses
+from calibration.identification.identifiability import Identifiability, identifiability
+from calibration.identification.samples import averaged
+from calibration.kinematics.chain import Chain, Placement
+from calibration.observations import Floats, Observations
+from calibration.rig.description import Rig
+
+POSES = 100  # at which the parameters are looked for
+_POSES_EACH = 2.0  # poses for each parameter where 100 are too few
+
+
+@dataclass(frozen=True)
+class LinkRadius:
+    """The link of a row.
+
+    Attributes:
+        row: its number.
+        length_mm: its mean length over the work volume.
+        radius_mm: what `plan` keeps clear of.
+        is_assumed: True where the row gives none.
+    """
+
+    row: int
+    length_mm: float
+    radius_mm: float
+    is_assumed: bool
+
+
+@dataclass(frozen=True)
+class RigCheck:
+    """A rig as its file has it.
+
+    Attributes:
+        rig: the rig.
+        zero: in one pose, all joints at zero.
+        middle: in one pose, all joints in the middle of their limits.
+        at: floor, station and reach.
+        links: those that have a length.
+        free_share: share of the poses inside the limits in which links touch neither each other nor the floor.
+        poses: how many poses `seen` is for.
+        seen: what fixes of all prisms in as many poses, spread evenly, show of the parameters.
+    """
+
+    rig: Rig
+    zero: Bodies
+    middle: Bodies
+    at: Site
+    links: tuple[LinkRadius, ...]
+    free_share: float
+    poses: int
+    seen: Identifiability
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences on what the file may have forgotten."""
+        return tuple(self._warnings())
+
+    def _warnings(self) -> Iterator[str]:
+        assumed = [link for link in self.links if link.is_assumed]
+        if assumed:
+            yield (
+                f"`rigcal plan` assumes a radius of {assumed[0].radius_mm:.0f} mm (1.2 % of the reach) for the links "
+                f"of {len(assumed)} of {len(self.links)} rows; give them radius_mm"
+            )
+        outside = [j for j in self.rig.joints if not j.limits[0] <= 0.0 <= j.limits[1]]
+        if outside:
+            yield (
+                f"the zero pose is beyond the limits of {', '.join(j.name for j in outside)}: the drawing shows a pose "
+                "that the machine does not take"
+            )
+        if self.free_share < 0.5:
+            yield (
+                f"in {1.0 - self.free_share:.0%} of the poses inside the limits, links as thick as that touch each "
+                "other, the base or the floor"
+            )
+        if not self.rig.masses:
+            yield "there are no masses: effects of gravity need measured torques (`<joint>_Nm`)"
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the JSON object of `rigcal rig check`."""
+        frames, prisms = self.zero.frames_mm[0], self.zero.prisms_mm[0]
+        return {
+            "rig": self.rig.name,
+            "joints": [j.name for j in self.rig.joints],
+            "rows": len(self.rig.rows),
+            "zero_pose": {
+                "frames_mm": [[round(x, 6) + 0.0 for x in place] for place in frames.tolist()],
+                "prisms_mm": {
+                    name: [round(x, 6) + 0.0 for x in place]
+                    for name, place in zip(self.rig.prism_names, prisms.tolist(), strict=True)
+                },
+            },
+            "reach_mm": self.at.reach_mm,
+            "floor_mm": self.at.floor_mm,
+            "links": [
+                {"row": k.row, "length_mm": k.length_mm, "radius_mm": k.radius_mm, "assumed": k.is_assumed}
+                for k in self.links
+            ],
+            "free_share": self.free_share,
+            "poses": self.poses,
+            "identifiability": self.seen.as_dict(),
+            "warnings": list(self.warnings),
+        }
+
+
+def check_rig(rig: Rig) -> RigCheck:
+    """Work out what a rig file amounts to.
+
+    Args:
+        rig: the rig.
+
+    Raises:
+        CalibrationError: numbers that no machine has.
+    """
+    chain = Chain(rig, {"": Placement.identity()})
+    x = np.zeros(len(chain))
+    at = site(chain, x)
+    n = max(POSES, int(_POSES_EACH * len(chain) / len(rig.prisms)))
+    bodies = Bodies.of(chain, x, spread_poses(rig, n))
+    low, high = limits(rig)
+    links = tuple(
+        LinkRadius(k, bodies.length_mm(k), at.radius_mm(k), rig.rows[k - 1].radius_mm is None) for k in bodies.links
+    )
+    return RigCheck(
+        rig,
+        Bodies.of(chain, x, np.zeros((1, len(rig.joints)))),
+        Bodies.of(chain, x, (low + high)[None] / 2.0),
+        at,
+        links,
+        float(is_reachable(bodies, at).mean()),
+        n,
+        _seen(rig, spread_poses(rig, n), at),
+    )
+
+
+def _seen(rig: Rig, readings: Floats, at: Site) -> Identifiability:
+    """Look which parameters fixes of all prisms show, from the station of `at`."""
+    chain = Chain(rig, {"": placement(at)})
+    n, prisms = len(readings), len(rig.prisms)
+    rows = n * prisms
+    label = np.full(rows, "")
+    observations = Observations(
+        prism=np.tile(rig.prism_names, n),
+        joints=dict(zip(rig.joint_names, np.repeat(readings, prisms, axis=0).T, strict=True)),
+        position_mm=np.zeros((rows, 3)),
+        sigma_mm=np.full((rows, 3), np.nan),
+        setup=label,
+        session=label,
+        pose=np.repeat(np.arange(n), prisms).astype(np.str_),
+    )
+    x = np.zeros(len(chain))
+    observations.position_mm[:] = chain.positions_mm(x, chain.bind(observations))
+    return identifiability(chain, averaged(chain, observations), x, 0.0)

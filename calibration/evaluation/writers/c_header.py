@@ -1,0 +1,127 @@
+"""A model as one C99 header: forward kinematics with effects, and the inverse; no library but the standard one."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Sequence
+from importlib import resources
+
+import numpy as np
+
+from calibration.effects.fitted import FittedEffect
+from calibration.evaluation.writers.c_effects import EffectCode, EffectWriter
+from calibration.evaluation.writers.motions import MotionTree
+from calibration.observations import Floats
+from calibration.rig.description import Rig
+
+_ENGINE = "engine.h"
+_SLOT = "/*EFFECTS*/"
+_USE = """\
+   Call rigcal_forward(q, in, places) for the prisms' places in the base frame, mm, at the readings q of the joints, and
+   rigcal_inverse(count, prism, target, in, q) for the commands that bring prisms to targets. C99, no memory is taken,
+   nothing is kept between calls: any number of threads may call. Joints, in the order of q:
+"""
+
+
+def c_header(
+    writer: EffectWriter,
+    down: Floats,
+    effects: Sequence[FittedEffect],
+    remarks: Sequence[str],
+) -> str:
+    """Return the header.
+
+    Args:
+        writer: of the model's effects; gives the rig and its motions.
+        down: (3,) unit vector of gravity in the base frame.
+        effects: those to write; `EffectWriter.can_write` is True of each.
+        remarks: for the comment at its head.
+    """
+    rig, tree = writer.context.rig, writer.tree
+    code = writer.code(dict(enumerate(effects, 1)))
+    engine = resources.files("calibration.evaluation.writers").joinpath(_ENGINE).read_text(encoding="utf-8")
+    joints = "".join(
+        f"     {i}  {j.name}, {j.unit}, {j.limits[0]:g} .. {j.limits[1]:g}\n" for i, j in enumerate(rig.joints)
+    )
+    prisms = "".join(f"     {i}  {name}\n" for i, name in enumerate(rig.prism_names))
+    told = "\n   ".join(line for remark in remarks for line in remark.split("\n")).replace("*/", "* /")
+    head = (
+        f"/* {told}\n\n{_USE}{joints}   Prisms, in the order of the places:\n{prisms}*/\n\n"
+        "#ifndef RIGCAL_MODEL_H\n#define RIGCAL_MODEL_H\n\n#include <math.h>\n#include <stddef.h>\n\n"
+    )
+    return (
+        head
+        + _sizes(rig, tree)
+        + _inputs(code)
+        + "\n".join(_tables(rig, tree, down, code))
+        + "\n\n"
+        + _with_effects(engine, code)
+    )
+
+
+def _with_effects(engine: str, code: EffectCode) -> str:
+    lines = [f"    {line}" for line in code.lines]
+    if code.needs_pose:
+        lines = [
+            "    rigcal_frame_t at[RIGCAL_MOTIONS];",
+            "    double prism_mm[RIGCAL_PRISMS][3];",
+            "    rigcal_pose(q, at);",
+            "    for (int p = 0; p < RIGCAL_PRISMS; p++) {",
+            "        rigcal_place(at, rigcal_prism_frame[p], rigcal_prism_place[p], prism_mm[p]);",
+            "    }",
+            "    (void)prism_mm;",
+            *lines,
+        ]
+    return engine.replace(_SLOT, "\n".join(lines))
+
+
+def _inputs(code: EffectCode) -> str:
+    fields = {
+        "direction": "    double direction[RIGCAL_JOINTS]; /* last direction of motion: -1, 1, or 0 for not known */\n",
+        "temperature_degC": "    double temperature_degC;          /* of the machine; NAN for not known */\n",
+    }
+    used = "".join(text for name, text in fields.items() if name in code.inputs)
+    nothing = "    int unused; /* this model needs nothing beside the joints */\n"
+    return f"typedef struct {{\n{used or nothing}}} rigcal_inputs;\n\n"
+
+
+def _sizes(rig: Rig, tree: MotionTree) -> str:
+    sizes = {"JOINTS": len(rig.joints), "PRISMS": len(rig.prisms), "MOTIONS": len(tree.motions)}
+    sizes["FRAMES"] = len(tree.frames)
+    return "".join(f"#define RIGCAL_{name} {number}\n" for name, number in sizes.items()) + "\n"
+
+
+def _tables(rig: Rig, tree: MotionTree, down: Floats, code: EffectCode) -> Iterable[str]:
+    motions, prisms = tree.motions, list(tree.prisms.values())
+    drives = [drive for motion in motions for drive in motion.drive]
+    kinds = [0 if not motion.drive else 1 if motion.rotates else 2 for motion in motions]
+    first = [0, *itertools.accumulate(len(motion.drive) for motion in motions)]
+    unit = [np.degrees(1.0) / 1e3 if joint.kind == "revolute" else 1.0 for joint in rig.joints]
+    low, high = zip(*(joint.limits for joint in rig.joints), strict=True)
+    yield from (
+        _table("int", "parent", "RIGCAL_MOTIONS", (motion.parent for motion in motions)),
+        _table("int", "kind", "RIGCAL_MOTIONS", kinds),
+        _table("int", "axis", "RIGCAL_MOTIONS", (motion.axis for motion in motions)),
+        _table("int", "first_drive", "RIGCAL_MOTIONS + 1", first),
+        _table("int", "drive_joint", str(len(drives)), (joint for joint, _ in drives)),
+        _table("double", "drive_size", str(len(drives)), (size for _, size in drives)),
+        _rows("fixed", "RIGCAL_MOTIONS][12", [motion.fixed[:3].reshape(-1) for motion in motions]),
+        _table("int", "frame_motion", "RIGCAL_FRAMES", tree.frames),
+        _table("int", "prism_frame", "RIGCAL_PRISMS", (frame for frame, _ in prisms)),
+        _rows("prism_place", "RIGCAL_PRISMS][3", [place for _, place in prisms]),
+        _table("double", "lower", "RIGCAL_JOINTS", low),
+        _table("double", "upper", "RIGCAL_JOINTS", high),
+        _table("double", "load_unit", "RIGCAL_JOINTS", unit),
+        _table("double", "down", "3", down.tolist()),
+        *code.tables,
+    )
+
+
+def _table(kind: str, name: str, size: str, values: Iterable[float]) -> str:
+    numbers = ", ".join(repr(int(v) if kind == "int" else float(v)) for v in values)
+    return f"static const {kind} rigcal_{name}[{size}] = {{{numbers}}};"
+
+
+def _rows(name: str, size: str, rows: Sequence[Floats]) -> str:
+    lines = ",\n    ".join("{" + ", ".join(repr(float(v)) for v in row) + "}" for row in rows)
+    return f"static const double rigcal_{name}[{size}] = {{\n    {lines}}};"

@@ -1,0 +1,429 @@
+/* ---- the program: the same for every rig ------------------------------------------------------------------------ */
+
+typedef struct { double r[3][3]; double t[3]; } rigcal_frame_t;   /* axes as columns; origin, mm */
+
+/* Places of all motions at joint values q, deg and mm. */
+static inline void rigcal_pose(const double q[RIGCAL_JOINTS], rigcal_frame_t at[RIGCAL_MOTIONS])
+{
+    for (int k = 0; k < RIGCAL_MOTIONS; k++) {
+        const double *f = rigcal_fixed[k];
+        rigcal_frame_t *out = &at[k];
+        if (rigcal_parent[k] < 0) {
+            for (int i = 0; i < 3; i++) {
+                for (int j = 0; j < 3; j++) out->r[i][j] = f[4 * i + j];
+                out->t[i] = f[4 * i + 3];
+            }
+        } else {
+            const rigcal_frame_t *p = &at[rigcal_parent[k]];
+            for (int i = 0; i < 3; i++) {
+                for (int j = 0; j < 3; j++)
+                    out->r[i][j] = p->r[i][0] * f[j] + p->r[i][1] * f[4 + j] + p->r[i][2] * f[8 + j];
+                out->t[i] = p->r[i][0] * f[3] + p->r[i][1] * f[7] + p->r[i][2] * f[11] + p->t[i];
+            }
+        }
+        if (rigcal_kind[k] == 0) continue;
+        double size = 0.0;
+        for (int d = rigcal_first_drive[k]; d < rigcal_first_drive[k + 1]; d++)
+            size += rigcal_drive_size[d] * q[rigcal_drive_joint[d]];
+        const int a = rigcal_axis[k], u = (a + 1) % 3, v = (a + 2) % 3;
+        if (rigcal_kind[k] == 2) {
+            for (int i = 0; i < 3; i++) out->t[i] += size * out->r[i][a];
+        } else {
+            const double c = cos(size), s = sin(size);
+            for (int i = 0; i < 3; i++) {
+                const double x = out->r[i][u], y = out->r[i][v];
+                out->r[i][u] = c * x + s * y;
+                out->r[i][v] = c * y - s * x;
+            }
+        }
+    }
+}
+
+/* Place of a point that is fixed to a frame, mm. */
+static inline void rigcal_place(const rigcal_frame_t at[], int frame, const double point[3], double out[3])
+{
+    const int k = rigcal_frame_motion[frame];
+    for (int i = 0; i < 3; i++)
+        out[i] = k < 0 ? point[i]
+                       : at[k].r[i][0] * point[0] + at[k].r[i][1] * point[1] + at[k].r[i][2] * point[2] + at[k].t[i];
+}
+
+static inline int rigcal_carries(int motion, int frame)
+{
+    for (int k = rigcal_frame_motion[frame]; k >= motion; k = rigcal_parent[k])
+        if (k == motion) return 1;
+    return 0;
+}
+
+/* Derivative of a point's place by the size of a motion, mm per rad or mm. */
+static inline void rigcal_slope(const rigcal_frame_t *at, int kind, int axis, const double point[3], double out[3])
+{
+    const double a[3] = {at->r[0][axis], at->r[1][axis], at->r[2][axis]};
+    if (kind == 2) {
+        for (int i = 0; i < 3; i++) out[i] = a[i];
+        return;
+    }
+    const double w[3] = {point[0] - at->t[0], point[1] - at->t[1], point[2] - at->t[2]};
+    out[0] = a[1] * w[2] - a[2] * w[1];
+    out[1] = a[2] * w[0] - a[0] * w[2];
+    out[2] = a[0] * w[1] - a[1] * w[0];
+}
+
+/* Weight beyond every motion (N) and its moment about the base's origin (N mm); a table has N and N mm by frame. */
+static inline void rigcal_hang(const rigcal_frame_t at[], const double table[RIGCAL_FRAMES][4],
+                               double sum[RIGCAL_MOTIONS][4])
+{
+    for (int k = 0; k < RIGCAL_MOTIONS; k++)
+        for (int i = 0; i < 4; i++) sum[k][i] = 0.0;
+    for (int f = 1; f < RIGCAL_FRAMES; f++) {
+        const int k = rigcal_frame_motion[f];
+        const double *m = table[f];
+        sum[k][0] += m[0];
+        for (int i = 0; i < 3; i++)
+            sum[k][1 + i] += at[k].r[i][0] * m[1] + at[k].r[i][1] * m[2] + at[k].r[i][2] * m[3] + m[0] * at[k].t[i];
+    }
+    for (int k = RIGCAL_MOTIONS - 1; k >= 0; k--)
+        if (rigcal_parent[k] >= 0)
+            for (int i = 0; i < 4; i++) sum[rigcal_parent[k]][i] += sum[k][i];
+}
+
+/* Moment about a motion's origin of the weights beyond it, N m. */
+static inline void rigcal_moment(const rigcal_frame_t *at, const double sum[4], double out[3])
+{
+    double arm[3];
+    for (int i = 0; i < 3; i++) arm[i] = (sum[1 + i] - sum[0] * at->t[i]) / 1e3;
+    out[0] = arm[1] * rigcal_down[2] - arm[2] * rigcal_down[1];
+    out[1] = arm[2] * rigcal_down[0] - arm[0] * rigcal_down[2];
+    out[2] = arm[0] * rigcal_down[1] - arm[1] * rigcal_down[0];
+}
+
+/* Gravity's load on a joint, N m or N; positive drives its value up. */
+static inline double rigcal_load(const rigcal_frame_t at[], const double table[RIGCAL_FRAMES][4], int joint)
+{
+    double sum[RIGCAL_MOTIONS][4], load = 0.0;
+    rigcal_hang(at, table, sum);
+    for (int k = 0; k < RIGCAL_MOTIONS; k++)
+        for (int d = rigcal_first_drive[k]; d < rigcal_first_drive[k + 1]; d++) {
+            if (rigcal_drive_joint[d] != joint) continue;
+            const int a = rigcal_axis[k];
+            double m[3], part = 0.0;
+            if (rigcal_kind[k] == 1) {
+                rigcal_moment(&at[k], sum[k], m);
+                for (int i = 0; i < 3; i++) part += at[k].r[i][a] * m[i];
+                part *= 1e3;
+            } else {
+                for (int i = 0; i < 3; i++) part += at[k].r[i][a] * rigcal_down[i] * sum[k][0];
+            }
+            load += rigcal_drive_size[d] * part;
+        }
+    return load * rigcal_load_unit[joint];
+}
+
+/* A link that turns about its joint's place in proportion to a moment: the shift of the prisms, mm.
+   `along` is 1 for the part of the moment along the axis, 0 for that across it. */
+static inline void rigcal_bend(const rigcal_frame_t at[], const double table[RIGCAL_FRAMES][4], int motion, int along,
+                               double amount, double shift[RIGCAL_PRISMS][3], double prism_mm[RIGCAL_PRISMS][3])
+{
+    double sum[RIGCAL_MOTIONS][4], m[3], turn[3], about = 0.0;
+    const int a = rigcal_axis[motion];
+    rigcal_hang(at, table, sum);
+    rigcal_moment(&at[motion], sum[motion], m);
+    for (int i = 0; i < 3; i++) about += at[motion].r[i][a] * m[i];
+    for (int i = 0; i < 3; i++) {
+        const double on_axis = at[motion].r[i][a] * about;
+        turn[i] = amount * (along ? on_axis : m[i] - on_axis);
+    }
+    for (int p = 0; p < RIGCAL_PRISMS; p++) {
+        if (!rigcal_carries(motion, rigcal_prism_frame[p])) continue;
+        const double w[3] = {prism_mm[p][0] - at[motion].t[0], prism_mm[p][1] - at[motion].t[1],
+                             prism_mm[p][2] - at[motion].t[2]};
+        shift[p][0] += turn[1] * w[2] - turn[2] * w[1];
+        shift[p][1] += turn[2] * w[0] - turn[0] * w[2];
+        shift[p][2] += turn[0] * w[1] - turn[1] * w[0];
+    }
+}
+
+/* A boom from the origin of one frame to that of another: its length, mm, its axis, and how a point at `arm` from a
+   place on it moves as it turns down about its level axis, per rad times the cosine of its elevation. */
+static inline double rigcal_boom(const rigcal_frame_t at[], int root, int tip, double from[3], double to[3],
+                                 double axis[3])
+{
+    const double origin[3] = {0.0, 0.0, 0.0};
+    double length = 0.0;
+    rigcal_place(at, root, origin, from);
+    rigcal_place(at, tip, origin, to);
+    for (int i = 0; i < 3; i++) length += (to[i] - from[i]) * (to[i] - from[i]);
+    length = sqrt(length);
+    for (int i = 0; i < 3; i++) axis[i] = (to[i] - from[i]) / fmax(length, 1e-6);
+    return length;
+}
+
+static inline double rigcal_dot(const double a[3], const double b[3])
+{
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+static inline void rigcal_cross(const double a[3], const double b[3], double out[3])
+{
+    out[0] = a[1] * b[2] - a[2] * b[1];
+    out[1] = a[2] * b[0] - a[0] * b[2];
+    out[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* A beam that bends: `tip_newton` at its tip with the moment of a table's weights about it, `own_newton` along it, in
+   units of its flexibility. */
+static inline void rigcal_droop(const rigcal_frame_t at[], int root, int tip, const double table[RIGCAL_FRAMES][4],
+                                double tip_newton, double own_newton, double shift[RIGCAL_PRISMS][3],
+                                double prism_mm[RIGCAL_PRISMS][3])
+{
+    double from[3], to[3], e[3], first[3] = {0.0, 0.0, 0.0}, moment[3];
+    const double *g = rigcal_down, length = rigcal_boom(at, root, tip, from, to, e) / 1e3, rise = rigcal_dot(e, g);
+    for (int f = 1; f < RIGCAL_FRAMES; f++) {
+        double place[3];
+        const double *m = table[f];
+        const int k = rigcal_frame_motion[f];
+        for (int i = 0; i < 3; i++) {
+            place[i] = at[k].r[i][0] * m[1] + at[k].r[i][1] * m[2] + at[k].r[i][2] * m[3] + m[0] * at[k].t[i];
+            first[i] += (place[i] - m[0] * to[i]) / 1e3;
+        }
+    }
+    rigcal_cross(first, g, moment);
+    for (int p = 0; p < RIGCAL_PRISMS; p++) {
+        double s[3], lever[3], by_moment[3], twist[3];
+        if (!rigcal_carries(rigcal_frame_motion[tip], rigcal_prism_frame[p])) continue;
+        for (int i = 0; i < 3; i++) s[i] = (prism_mm[p][i] - to[i]) / 1e3;
+        for (int i = 0; i < 3; i++) lever[i] = e[i] * length * length / 2.0 + s[i] * length;
+        const double along = rigcal_dot(e, s), below = rigcal_dot(g, s), on_axis = rigcal_dot(moment, e);
+        rigcal_cross(moment, lever, by_moment);
+        rigcal_cross(e, s, twist);
+        for (int i = 0; i < 3; i++) {
+            const double across = (g[i] - rise * e[i]) * length * length * length;
+            const double turning = (along * g[i] - below * e[i]) * length * length;
+            shift[p][i] += 1e3 * (by_moment[i] - on_axis * twist[i] * length
+                                  + tip_newton * (across / 3.0 + turning / 2.0)
+                                  + own_newton * (across / 8.0 + turning / 6.0));
+        }
+    }
+}
+
+/* The inner section of a boom tilts about the mouth of the outer one until its pads touch. */
+static inline void rigcal_pads(const rigcal_frame_t at[], int root, int tip, const double table[RIGCAL_FRAMES][4],
+                               double outer_mm, double overlap_mm, double clearance_mm,
+                               double shift[RIGCAL_PRISMS][3], double prism_mm[RIGCAL_PRISMS][3])
+{
+    double from[3], to[3], e[3], mouth[3], about[3] = {0.0, 0.0, 0.0};
+    rigcal_boom(at, root, tip, from, to, e);
+    for (int i = 0; i < 3; i++) mouth[i] = from[i] + outer_mm * e[i];
+    for (int f = 1; f < RIGCAL_FRAMES; f++) {
+        const double *m = table[f];
+        const int k = rigcal_frame_motion[f];
+        for (int i = 0; i < 3; i++)
+            about[i] += at[k].r[i][0] * m[1] + at[k].r[i][1] * m[2] + at[k].r[i][2] * m[3]
+                        + m[0] * (at[k].t[i] - mouth[i]);
+    }
+    const double rise = rigcal_dot(e, rigcal_down), level = sqrt(fmax(1.0 - rise * rise, 0.0));
+    const double side = rigcal_dot(about, e) - rigcal_dot(about, rigcal_down) * rise;
+    if (level <= 1e-6) return;
+    const double tilt = clearance_mm * ((side > 0.0) - (side < 0.0)) / (overlap_mm * level);
+    for (int p = 0; p < RIGCAL_PRISMS; p++) {
+        double s[3];
+        if (!rigcal_carries(rigcal_frame_motion[tip], rigcal_prism_frame[p])) continue;
+        for (int i = 0; i < 3; i++) s[i] = prism_mm[p][i] - mouth[i];
+        const double along = rigcal_dot(e, s), below = rigcal_dot(rigcal_down, s);
+        for (int i = 0; i < 3; i++) shift[p][i] += tilt * (along * rigcal_down[i] - below * e[i]);
+    }
+}
+
+/* The term of one drive alone, `amount` further of its joint, deg or mm: the shift of the prisms, mm. */
+static inline void rigcal_follow(const rigcal_frame_t at[], int motion, int drive, double amount,
+                                 double shift[RIGCAL_PRISMS][3], double prism_mm[RIGCAL_PRISMS][3])
+{
+    for (int p = 0; p < RIGCAL_PRISMS; p++) {
+        double s[3];
+        if (!rigcal_carries(motion, rigcal_prism_frame[p])) continue;
+        rigcal_slope(&at[motion], rigcal_kind[motion], rigcal_axis[motion], prism_mm[p], s);
+        for (int i = 0; i < 3; i++) shift[p][i] += rigcal_drive_size[drive] * amount * s[i];
+    }
+}
+
+static inline double rigcal_triangle(double s, double left, double middle, double right)
+{
+    const double a = fabs(s - left), b = fabs(s - middle), c = fabs(s - right);
+    return ((c * c * c - b * b * b) / (right - middle) - (b * b * b - a * a * a) / (middle - left))
+           / (6.0 * (right - left));
+}
+
+/* Cubic splines whose slope changes about inner knots, less a straight line each, times their weights. */
+static inline double rigcal_curve(double s, int count, const double knots[], const double line[2][16],
+                                  const double weight[], int symmetric)
+{
+    double out = 0.0;
+    for (int k = 0; k < count; k++) {
+        double value = rigcal_triangle(s, knots[k], knots[k + 1], knots[k + 2]);
+        if (symmetric) value -= rigcal_triangle(-s, knots[k], knots[k + 1], knots[k + 2]);
+        out += weight[k] * (value - line[0][k] - s * line[1][k]);
+    }
+    return out;
+}
+
+/* Even cubic B-splines over a range or a turn. */
+static inline double rigcal_splines(double deg, double low, double high, int pieces, int is_turn, int count,
+                                    const double weight[])
+{
+    double at = (deg - low) / (high - low);
+    at = pieces * (is_turn ? at - floor(at) : fmin(1.0, fmax(0.0, at)));
+    int piece = (int)at;
+    if (piece > pieces - 1) piece = pieces - 1;
+    const double u = at - piece, v = 1.0 - u;
+    return v * v * v / 6.0 * weight[piece % count]
+           + (4.0 + 3.0 * u * u * (u - 2.0)) / 6.0 * weight[(piece + 1) % count]
+           + (4.0 + 3.0 * v * v * (v - 2.0)) / 6.0 * weight[(piece + 2) % count]
+           + u * u * u / 6.0 * weight[(piece + 3) % count];
+}
+
+static inline double rigcal_sign(double x) { return (x > 0.0) - (x < 0.0); }
+
+/* ---- effects of this model -------------------------------------------------------------------------------------- */
+
+static inline void rigcal_effects(const double q[RIGCAL_JOINTS], const rigcal_inputs *in,
+                                  double change[RIGCAL_JOINTS], double shift[RIGCAL_PRISMS][3])
+{
+    for (int j = 0; j < RIGCAL_JOINTS; j++) change[j] = 0.0;
+    for (int p = 0; p < RIGCAL_PRISMS; p++)
+        for (int i = 0; i < 3; i++) shift[p][i] = 0.0;
+    (void)q;
+    (void)in;
+/*EFFECTS*/
+}
+
+static inline void rigcal_solve_pose(const double q[RIGCAL_JOINTS], const rigcal_inputs *in,
+                                     rigcal_frame_t at[RIGCAL_MOTIONS], double out_mm[RIGCAL_PRISMS][3])
+{
+    double change[RIGCAL_JOINTS], shift[RIGCAL_PRISMS][3], moved[RIGCAL_JOINTS];
+    rigcal_effects(q, in, change, shift);
+    for (int j = 0; j < RIGCAL_JOINTS; j++) moved[j] = q[j] + change[j];
+    rigcal_pose(moved, at);
+    for (int p = 0; p < RIGCAL_PRISMS; p++) {
+        rigcal_place(at, rigcal_prism_frame[p], rigcal_prism_place[p], out_mm[p]);
+        for (int i = 0; i < 3; i++) out_mm[p][i] += shift[p][i];
+    }
+}
+
+/* ---- what to call ----------------------------------------------------------------------------------------------- */
+
+/* Places of all prisms in the base frame, mm, at joint readings q, deg and mm. `in` may be NULL: nothing is known. */
+static inline void rigcal_forward(const double q[RIGCAL_JOINTS], const rigcal_inputs *in,
+                                  double out_mm[RIGCAL_PRISMS][3])
+{
+    rigcal_frame_t at[RIGCAL_MOTIONS];
+    rigcal_solve_pose(q, in, at, out_mm);
+}
+
+/* The joint commands that bring `count` prisms to their targets (x, y, z of each, base frame, mm), near to those in q
+   on entry and inside the joints' limits. Returns the number of steps taken, or -1 where a target stays farther than
+   RIGCAL_CLOSE_MM; q is then as near as it came. */
+#define RIGCAL_CLOSE_MM 1e-9
+static inline int rigcal_inverse(int count, const int prism[], const double *target_mm, const rigcal_inputs *in,
+                                 double q[RIGCAL_JOINTS])
+{
+    enum { MOST = 3 * RIGCAL_PRISMS };
+    double damping = 0.0, best = HUGE_VAL, kept[RIGCAL_JOINTS], error[MOST], slope[MOST][RIGCAL_JOINTS];
+    double range[RIGCAL_JOINTS];
+    int held[RIGCAL_JOINTS] = {0}, idle = 0;
+    const int rows = 3 * count;
+    for (int j = 0; j < RIGCAL_JOINTS; j++) {
+        range[j] = rigcal_upper[j] - rigcal_lower[j];
+        q[j] = fmin(fmax(q[j], rigcal_lower[j]), rigcal_upper[j]);
+        kept[j] = q[j];
+    }
+    for (int step = 0; step < 200; step++) {
+        rigcal_frame_t at[RIGCAL_MOTIONS];
+        double place[RIGCAL_PRISMS][3], off = 0.0;
+        rigcal_solve_pose(q, in, at, place);
+        for (int c = 0; c < count; c++)
+            for (int i = 0; i < 3; i++) {
+                const double e = target_mm[3 * c + i] - place[prism[c]][i];
+                off += e * e;
+            }
+        off = sqrt(off);
+        if (off < best) {
+            idle = off < 0.5 * best ? 0 : idle + 1;
+            best = off;
+            damping *= 0.1;
+            if (damping < 1e-12) damping = 0.0;
+            for (int j = 0; j < RIGCAL_JOINTS; j++) kept[j] = q[j];
+            if (off <= RIGCAL_CLOSE_MM) return step;
+            for (int c = 0; c < count; c++) {
+                for (int i = 0; i < 3; i++) error[3 * c + i] = target_mm[3 * c + i] - place[prism[c]][i];
+                for (int i = 0; i < 3; i++)
+                    for (int j = 0; j < RIGCAL_JOINTS; j++) slope[3 * c + i][j] = 0.0;
+                for (int k = rigcal_frame_motion[rigcal_prism_frame[prism[c]]]; k >= 0; k = rigcal_parent[k]) {
+                    double s[3];
+                    if (rigcal_kind[k] == 0) continue;
+                    rigcal_slope(&at[k], rigcal_kind[k], rigcal_axis[k], place[prism[c]], s);
+                    for (int d = rigcal_first_drive[k]; d < rigcal_first_drive[k + 1]; d++)
+                        for (int i = 0; i < 3; i++)
+                            slope[3 * c + i][rigcal_drive_joint[d]] +=
+                                rigcal_drive_size[d] * s[i] * range[rigcal_drive_joint[d]];
+                }
+            }
+            for (int j = 0; j < RIGCAL_JOINTS; j++) held[j] = 0;
+        } else {
+            damping = damping > 0.0 ? 10.0 * damping : 1e-6;
+            idle++;
+        }
+        if (idle > 40) break;
+        /* Least change of the joints, in ranges, that closes the error: dq = J' (J J' + damping)^-1 error; joints at a
+           limit that it would cross are held. */
+        for (int round = 0; round <= RIGCAL_JOINTS; round++) {
+            double a[MOST][MOST + 1], most = 0.0;
+            int crossed = 0;
+            for (int r = 0; r < rows; r++) {
+                for (int s = 0; s < rows; s++) {
+                    a[r][s] = 0.0;
+                    for (int j = 0; j < RIGCAL_JOINTS; j++)
+                        if (!held[j]) a[r][s] += slope[r][j] * slope[s][j];
+                }
+                most = fmax(most, a[r][r]);
+                a[r][rows] = error[r];
+            }
+            for (int r = 0; r < rows; r++) a[r][r] += (damping + 1e-13) * most + 1e-30;
+            for (int r = 0; r < rows; r++) {
+                int p = r;
+                for (int s = r + 1; s < rows; s++)
+                    if (fabs(a[s][r]) > fabs(a[p][r])) p = s;
+                for (int c = 0; c <= rows; c++) {
+                    const double x = a[r][c];
+                    a[r][c] = a[p][c];
+                    a[p][c] = x;
+                }
+                for (int s = r + 1; s < rows; s++) {
+                    const double f = a[s][r] / a[r][r];
+                    for (int c = r; c <= rows; c++) a[s][c] -= f * a[r][c];
+                }
+            }
+            for (int r = rows - 1; r >= 0; r--) {
+                for (int c = r + 1; c < rows; c++) a[r][rows] -= a[r][c] * a[c][rows];
+                a[r][rows] /= a[r][r];
+            }
+            double longest = 0.0, dq[RIGCAL_JOINTS];
+            for (int j = 0; j < RIGCAL_JOINTS; j++) {
+                dq[j] = 0.0;
+                for (int r = 0; r < rows && !held[j]; r++) dq[j] += slope[r][j] * a[r][rows];
+                longest = fmax(longest, fabs(dq[j]));
+            }
+            const double scale = longest > 0.2 ? 0.2 / longest : 1.0;
+            for (int j = 0; j < RIGCAL_JOINTS; j++) {
+                const double wanted = kept[j] + scale * dq[j] * range[j];
+                q[j] = fmin(fmax(wanted, rigcal_lower[j]), rigcal_upper[j]);
+                if (!held[j] && q[j] != wanted && (kept[j] <= rigcal_lower[j] || kept[j] >= rigcal_upper[j]))
+                    held[j] = crossed = 1;
+            }
+            if (!crossed) break;
+        }
+    }
+    for (int j = 0; j < RIGCAL_JOINTS; j++) q[j] = kept[j];
+    return -1;
+}
+
+#endif

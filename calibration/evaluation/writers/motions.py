@@ -1,0 +1,91 @@
+"""A chain at its parameters as fixed transforms and single motions, the form that URDF, C and MATLAB share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibration.kinematics.chain import Chain, Op, rotation_about
+from calibration.observations import Floats
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A fixed transform and, after it, at most one motion.
+
+    Attributes:
+        name: of the frame that follows, `row3.theta`; `frame3` where a row ends.
+        parent: index of the motion before; -1 for the base.
+        fixed: (4, 4) mm.
+        rotates: True where it turns about its axis, False where it slides along it.
+        axis: 0, 1, 2 for x, y, z.
+        drive: (joint index, rad or mm per deg or mm of its reading); empty where nothing moves.
+    """
+
+    name: str
+    parent: int
+    fixed: Floats
+    rotates: bool = False
+    axis: int = 2
+    drive: tuple[tuple[int, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class MotionTree:
+    """All motions of a rig, parents first.
+
+    Attributes:
+        motions: see there.
+        frames: index of the motion that ends in frame 0, 1, ...; -1 for frame 0.
+        turning: row number -> index of the motion of its driven theta.
+        prisms: name -> (frame, (3,) place in it, mm).
+    """
+
+    motions: tuple[Motion, ...]
+    frames: tuple[int, ...]
+    turning: dict[int, int]
+    prisms: dict[str, tuple[int, Floats]]
+
+
+def motion_tree(chain: Chain, x: Floats) -> MotionTree:
+    """Return a chain at parameters `x` (p,), mm and rad, as motions."""
+    motions: list[Motion] = []
+    frames, turning = [-1], dict[int, int]()
+    for number, ops in enumerate(chain.row_ops, 1):
+        at = frames[(0, *chain.rig.path(number))[-2]]
+        for motion in _of_row(number, ops, x, at, len(motions)):
+            if motion.rotates and motion.drive:
+                turning[number] = len(motions)
+            motions.append(motion)
+        frames.append(len(motions) - 1)
+    prisms = {
+        prism.name: (prism.frame, np.array([op.constant + _at(x, op) for op in ops]))
+        for prism, ops in zip(chain.rig.prisms, chain.prism_ops, strict=True)
+    }
+    return MotionTree(tuple(motions), tuple(frames), turning, prisms)
+
+
+def _of_row(number: int, ops: list[Op], x: Floats, parent: int, count: int) -> Iterator[Motion]:
+    fixed = np.eye(4)
+    for op in ops:
+        fixed = fixed @ _elementary(op, op.constant + _at(x, op))
+        if op.drive:
+            kind = "theta" if op.rotates else "xyz"[op.axis]
+            yield Motion(f"row{number}.{kind}", parent, fixed, op.rotates, op.axis, op.drive)
+            parent, fixed, count = count, np.eye(4), count + 1
+    yield Motion(f"frame{number}", parent, fixed)
+
+
+def _at(x: Floats, op: Op) -> float:
+    return float(x[op.parameter]) if op.parameter >= 0 else 0.0
+
+
+def _elementary(op: Op, size: float) -> Floats:
+    out = np.eye(4)
+    if op.rotates:
+        out[:3, :3] = rotation_about(op.axis, size)
+    else:
+        out[op.axis, 3] = size
+    return out

@@ -1,0 +1,196 @@
+"""A rig as URDF: joints, couplings as mimic joints, prisms as links, masses; lengths m, angles rad."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from xml.sax.saxutils import escape, quoteattr
+
+import numpy as np
+
+from calibration.evaluation.writers.motions import Motion, MotionTree, motion_tree
+from calibration.kinematics.chain import Chain
+from calibration.observations import Floats
+from calibration.rig.description import Joint, Rig
+from calibration.rig.exchange.frames import angles_zyx
+
+BASE = "base"
+_AXES = ("1 0 0", "0 1 0", "0 0 1")
+_OWN = 1e-12  # a coefficient that near to 1 is the joint itself
+
+
+def urdf_text(chain: Chain, x: Floats, remarks: Sequence[str]) -> str:
+    """Return a rig at parameters `x` (p,) as a URDF document, with remarks in a comment at its head."""
+    body = "\n".join(f"  {line}" for line in urdf_elements(chain, x))
+    return f'<?xml version="1.0"?>\n{_comment(remarks)}<robot name={quoteattr(chain.rig.name)}>\n{body}\n</robot>\n'
+
+
+def xacro_text(chain: Chain, x: Floats, remarks: Sequence[str]) -> str:
+    """Return the same as a xacro document: a macro with a prefix of all names and a parent link, used once."""
+    macro = "rigcal_rig"
+    body = "\n".join(f"    {line}" for line in urdf_elements(chain, x, "${prefix}"))
+    return (
+        f'<?xml version="1.0"?>\n{_comment(remarks)}'
+        f'<robot name={quoteattr(chain.rig.name)} xmlns:xacro="http://www.ros.org/wiki/xacro">\n'
+        f'  <xacro:macro name="{macro}" params="prefix">\n{body}\n  </xacro:macro>\n'
+        f'  <xacro:arg name="prefix" default=""/>\n  <xacro:{macro} prefix="$(arg prefix)"/>\n</robot>\n'
+    )
+
+
+def urdf_elements(chain: Chain, x: Floats, prefix: str = "") -> Iterator[str]:
+    """Yield the links and joints of a rig, one element a line.
+
+    Args:
+        chain: kinematics.
+        x: (p,) parameters, mm and rad.
+        prefix: in front of every name.
+    """
+    return iter(_Elements(chain.rig, motion_tree(chain, x), prefix).lines)
+
+
+def _comment(remarks: Sequence[str]) -> str:
+    text = "\n".join(remarks).replace("--", "- -")  # ends a comment in XML
+    return f"<!--\n{text}\n-->\n" if remarks else ""
+
+
+class _Elements:
+    """Collects the elements; every term of a drive is a URDF joint of its own.
+
+    A joint of the rig has the URDF joint of its name where it moves something one to one, or else one that moves an
+    empty link; all further motions follow it as mimic joints.
+    """
+
+    def __init__(self, rig: Rig, tree: MotionTree, prefix: str) -> None:
+        self._rig, self._prefix = rig, prefix
+        self.lines: list[str] = []
+        self._owners = self._first_motions(tree)
+        self._link(BASE)
+        for joint in range(len(rig.joints)):
+            if joint not in self._owners:
+                self._empty_joint(joint)
+        links = {-1: BASE}
+        for index, motion in enumerate(tree.motions):
+            links[index] = self._add(motion, index, links[motion.parent])
+        for name, (frame, place_mm) in tree.prisms.items():
+            self._fixed(f"prism_{name}", links[tree.frames[frame]], name, _at(place_mm))
+            self._link(name)
+        self._masses(tree, links)
+
+    def _first_motions(self, tree: MotionTree) -> dict[int, tuple[int, int]]:
+        """Return for joints that move something one to one: the motion and which of its terms it is."""
+        found: dict[int, tuple[int, int]] = {}
+        for index, motion in enumerate(tree.motions):
+            for term, (joint, _) in enumerate(motion.drive):
+                rated = self._ratio(motion, term)
+                same_kind = motion.rotates == (self._rig.joints[joint].kind == "revolute")
+                if joint not in found and same_kind and abs(abs(rated) - 1.0) < _OWN:
+                    found[joint] = (index, term)
+        return found
+
+    def _ratio(self, motion: Motion, term: int) -> float:
+        """Return m or rad of a motion for each m or rad of the joint of one of its terms."""
+        joint, coefficient = motion.drive[term]
+        own = math.degrees(1.0) if self._rig.joints[joint].kind == "revolute" else 1e3
+        return coefficient * own * (1.0 if motion.rotates else 1e-3)
+
+    def _add(self, motion: Motion, index: int, parent: str) -> str:
+        """Add a motion; returns the link behind it."""
+        name = motion.name.replace(".", "_")
+        if not motion.drive:
+            self._fixed(f"to_{name}", parent, name, motion.fixed)
+            self._link(name)
+            return name
+        for term, (joint, _) in enumerate(motion.drive):
+            link = name if len(motion.drive) == 1 else f"{name}_{self._rig.joints[joint].name}"
+            origin = motion.fixed if term == 0 else np.eye(4)
+            ratio = self._ratio(motion, term)
+            own = self._owners.get(joint) == (index, term)
+            axis = _AXES[motion.axis]
+            if own:
+                axis = axis.replace("1", "-1") if ratio < 0.0 else axis
+            self._moving(joint, parent, link, origin, axis, motion.rotates, None if own else ratio, name)
+            self._link(link)
+            parent = link
+        return parent
+
+    def _empty_joint(self, joint: int) -> None:
+        """Add a joint that moves nothing, for others to follow."""
+        own = self._rig.joints[joint]
+        self._moving(joint, BASE, f"{own.name}_alone", np.eye(4), _AXES[2], own.kind == "revolute", None, "")
+        self._link(f"{own.name}_alone")
+
+    def _moving(
+        self,
+        joint: int,
+        parent: str,
+        child: str,
+        origin: Floats,
+        axis: str,
+        rotates: bool,
+        ratio: float | None,
+        place: str,
+    ) -> None:
+        own: Joint = self._rig.joints[joint]
+        name = own.name if ratio is None else f"{own.name}_at_{place}"
+        low, high = sorted((1.0 if ratio is None else ratio) * _si(own, limit) for limit in own.limits)
+        rate = abs(1.0 if ratio is None else ratio) * _si(own, own.max_rate)
+        kind = "revolute" if rotates else "prismatic"
+        follows = ""
+        if ratio is not None:
+            follows = f'<mimic joint="{self._prefix}{own.name}" multiplier="{_number(ratio)}" offset="0"/>'
+        self.lines.append(
+            f'<joint name="{self._prefix}{name}" type="{kind}">{self._between(parent, child)}{_origin(origin)}'
+            f'<axis xyz="{axis}"/><limit lower="{_number(low)}" upper="{_number(high)}" effort="0" '
+            f'velocity="{_number(rate)}"/>{follows}</joint>'
+        )
+
+    def _fixed(self, name: str, parent: str, child: str, origin: Floats) -> None:
+        self.lines.append(
+            f'<joint name="{self._prefix}{name}" type="fixed">{self._between(parent, child)}{_origin(origin)}</joint>'
+        )
+
+    def _between(self, parent: str, child: str) -> str:
+        return f'<parent link="{self._prefix}{parent}"/><child link="{self._prefix}{child}"/>'
+
+    def _link(self, name: str, inside: str = "") -> None:
+        self.lines.append(f'<link name="{self._prefix}{name}">{inside}</link>')
+
+    def _masses(self, tree: MotionTree, links: dict[int, str]) -> None:
+        for number, mass in enumerate(self._rig.masses, 1):
+            shares = [(mass.frame, np.array(mass.centre_mm or (0.0, 0.0, 0.0)), mass.kg)]
+            if mass.midway:  # half of it at either end has the same weight and moment
+                shares = [(frame, np.zeros(3), mass.kg / 2.0) for frame in (mass.frame, mass.frame + 1)]
+            for part, (frame, centre_mm, kg) in enumerate(shares):
+                if kg == 0.0:
+                    continue
+                name = f"mass{number}" + (f"_{part + 1}" if mass.midway else "")
+                tensor = mass.inertia_kg_m2 or (0.0,) * 6
+                keys = zip(("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), tensor, strict=True)
+                inertia = " ".join(f'{key}="{_number(value)}"' for key, value in keys)
+                self.lines.append(f"<!-- {name}: {escape(mass.name.replace('--', '- -'))} -->")
+                self._fixed(f"to_{name}", links[tree.frames[frame]], name, np.eye(4))
+                self._link(
+                    name,
+                    f'<inertial>{_origin(_at(centre_mm))}<mass value="{_number(kg)}"/><inertia {inertia}/></inertial>',
+                )
+
+
+def _si(joint: Joint, value: float) -> float:
+    """Return deg or mm of a joint in rad or m."""
+    return math.radians(value) if joint.kind == "revolute" else value / 1e3
+
+
+def _at(place_mm: Floats) -> Floats:
+    out = np.eye(4)
+    out[:3, 3] = place_mm
+    return out
+
+
+def _origin(transform: Floats) -> str:
+    yaw, pitch, roll = angles_zyx(transform[:3, :3])
+    xyz = " ".join(_number(x / 1e3) for x in transform[:3, 3].tolist())
+    return f'<origin xyz="{xyz}" rpy="{_number(roll)} {_number(pitch)} {_number(yaw)}"/>'
+
+
+def _number(value: float) -> str:
+    return repr(float(value) + 0.0).removesuffix(".0")

@@ -1,0 +1,106 @@
+"""A rig file in the making: sections with their remarks, written as TOML."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from calibration.rig.description import Convention, Rig, parse_rig
+
+_ASSUMED = """\
+[tolerances]            # assumed, 1 sigma: how far the machine may be from these numbers
+length_mm = 1.0
+angle_deg = 0.2
+beta_deg = 0.1
+prism_mm = 3.0
+
+[station]               # assumed: random errors of the instrument
+angle_sigma_arcsec = 1.0
+distance_sigma_mm = 0.1
+distance_sigma_ppm = 1.0
+"""
+SIGMA = {"revolute": 0.002, "prismatic": 0.02}  # deg and mm; assumed of encoders that a description says nothing of
+
+
+@dataclass(frozen=True)
+class Section:
+    """A table of an array: its keys in order, and a remark on its first line."""
+
+    keys: Mapping[str, object]
+    remark: str = ""
+
+
+@dataclass
+class Draft:
+    """A rig file without tolerances and station, which no other description has.
+
+    Attributes:
+        name: of the machine.
+        convention: of its rows.
+        source: what it was made from, for the file's first line.
+        notes: sentences on what was assumed and left out.
+        sections: `joint`, `row`, `prism` and `mass` -> tables.
+    """
+
+    name: str
+    convention: Convention
+    source: str
+    notes: list[str] = field(default_factory=list)
+    sections: dict[str, list[Section]] = field(
+        default_factory=lambda: {name: [] for name in ("joint", "row", "prism", "mass")}
+    )
+
+    def add(self, section: str, keys: Mapping[str, object], remark: str = "") -> None:
+        """Add a table to `[[section]]`."""
+        self.sections[section].append(Section(keys, remark))
+
+    def text(self) -> str:
+        """Return the TOML."""
+        return "\n".join(self._lines()) + "\n"
+
+    def rig(self) -> Rig:
+        """Return the rig that the text describes; RigError where the parts do not fit."""
+        return parse_rig(self.text(), self.name)
+
+    def _lines(self) -> Iterator[str]:
+        yield f"# Made by `rigcal rig import` from {self.source}."
+        yield from (f"# {note}" for note in self.notes)
+        yield ""
+        yield f"name = {_value(self.name)}"
+        yield f'convention = "{self.convention}"'
+        yield "gravity = [0, 0, -1]    # assumed: the base's z is up"
+        yield ""
+        yield _ASSUMED
+        for name, tables in self.sections.items():
+            for number, table in enumerate(tables, 1):
+                remark = f"{number}: {table.remark}".removesuffix(": ") if name == "row" else table.remark
+                yield f"[[{name}]]" + (f"  # {remark}" if remark else "")
+                yield from (f"{key} = {_value(value)}" for key, value in table.keys.items())
+                yield ""
+
+
+def free_name(wanted: str, taken: Collection[str]) -> str:
+    """Return a rig file's name (letters, digits, underscores) for any name, one that is not taken."""
+    plain = re.sub(r"[^A-Za-z0-9]+", "_", wanted).strip("_")
+    plain = plain if plain[:1].isalpha() else f"n_{plain}".rstrip("_")
+    number, name = 2, plain
+    while name in taken:
+        name, number = f"{plain}_{number}", number + 1
+    return name
+
+
+def _value(value: object) -> str:
+    """Return a value as TOML has it; control characters of a foreign name are escaped as in JSON."""
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{key} = {_value(item)}" for key, item in value.items()) + " }"
+    if isinstance(value, str):
+        return json.dumps(value)
+    if isinstance(value, Sequence):
+        return "[" + ", ".join(_value(item) for item in value) + "]"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return repr(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
+    return str(value)

@@ -1,0 +1,294 @@
+"""URDF documents, read into links and joints; lengths mm, angles rad, and the transforms at zero joint values.
+
+Source: the URDF specification of ROS (wiki.ros.org/urdf/XML). Geometry, transmissions, friction and safety limits are
+passed over.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.errors import RigError
+
+Floats = NDArray[np.float64]
+
+LONGEST = 1 << 24  # characters; a humanoid with its meshes' names has some 200,000
+_MOST_ELEMENTS = 20_000
+_TURNING, _SLIDING, _FREE = ("revolute", "continuous"), ("prismatic",), ("floating", "planar")
+
+
+@dataclass(frozen=True)
+class Inertial:
+    """A link's mass.
+
+    Attributes:
+        kg: mass.
+        centre_mm: (3,) centre of gravity in the link's frame.
+        inertia_kg_m2: (3, 3) about the centre, along the link's axes.
+    """
+
+    kg: float
+    centre_mm: Floats
+    inertia_kg_m2: Floats
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """A joint that follows another one: value = multiplier * value of `joint` + offset, rad and mm."""
+
+    joint: str
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True)
+class UrdfJoint:
+    """A joint.
+
+    Attributes:
+        name: its own.
+        kind: `revolute`, `prismatic` or `fixed`; None for one that moves in several directions (floating, planar).
+        parent, child: names of links.
+        origin: (4, 4) of the child's frame in the parent's, at zero.
+        axis: (3,) unit vector in the child's frame.
+        limits: rad or mm; None where it has none (continuous, or the file says nothing).
+        max_rate: rad/s or mm/s; None where the file says nothing.
+        mimic: what it follows.
+    """
+
+    name: str
+    kind: str | None
+    parent: str
+    child: str
+    origin: Floats
+    axis: Floats
+    limits: tuple[float, float] | None
+    max_rate: float | None
+    mimic: Mimic | None
+
+    @property
+    def moves(self) -> bool:
+        """True unless it is fixed, or locked by equal limits."""
+        return self.kind in ("revolute", "prismatic") and (self.limits is None or self.limits[0] < self.limits[1])
+
+
+@dataclass(frozen=True)
+class Urdf:
+    """A robot description.
+
+    Attributes:
+        name: of the robot.
+        links: name -> inertial; None where a link has none.
+        joints: by the name of their child link.
+    """
+
+    name: str
+    links: Mapping[str, Inertial | None]
+    joints: Mapping[str, UrdfJoint]
+
+    @property
+    def root(self) -> str:
+        """The link that is no joint's child."""
+        return next(link for link in self.links if link not in self.joints)
+
+    def way(self, link: str) -> list[UrdfJoint]:
+        """Return the joints from the root to a link."""
+        way: list[UrdfJoint] = []
+        while link in self.joints:
+            way.append(self.joints[link])
+            link = self.joints[link].parent
+        return way[::-1]
+
+    def place(self, link: str) -> Floats:
+        """Return the (4, 4) frame of a link in the root's at zero."""
+        out = np.eye(4)
+        for joint in self.way(link):
+            out = out @ joint.origin
+        return out
+
+
+def parse_urdf(text: str, source: str) -> Urdf:
+    """Read a URDF document.
+
+    Args:
+        text: XML.
+        source: file name for messages.
+
+    Raises:
+        RigError: malformed XML, xacro that was not expanded, numbers that are none, links that form no tree.
+    """
+    if len(text) > LONGEST:
+        raise RigError(source, "", f"it has {len(text):,} characters, {LONGEST:,} at most are read")
+    if "<!DOCTYPE" in text:
+        raise RigError(source, "", "it declares a document type, which no URDF needs and rigcal does not read")
+    try:
+        root = ET.fromstring(text)
+    except ET.ParseError as error:
+        raise RigError(source, f"line {error.position[0]}", f"no XML: {error}") from error
+    return _Reader(source).robot(root)
+
+
+class _Reader:
+    def __init__(self, source: str) -> None:
+        self._source = source
+
+    def robot(self, root: ET.Element) -> Urdf:
+        elements = list(root.iter())
+        if root.tag != "robot" or len(elements) > _MOST_ELEMENTS:
+            raise self._fault("", f"no URDF: the outermost element is <{_plain(root.tag)}>, not <robot>")
+        raw = next((e for e in elements if "xacro" in e.tag), None)
+        if raw is not None:
+            raise self._fault(
+                f"<{_plain(raw.tag)}>", "xacro that was not expanded; run `xacro FILE > ROBOT.urdf`, and import that"
+            )
+        links = {self._name(e): self._inertial(e) for e in root.findall("link")}
+        joints = [self._joint(e) for e in root.findall("joint")]
+        by_child = {joint.child: joint for joint in joints}
+        self._check_tree(links, joints, by_child)
+        return Urdf(root.get("name") or "robot", links, by_child)
+
+    def _check_tree(self, links: Iterable[str], joints: list[UrdfJoint], by_child: Mapping[str, UrdfJoint]) -> None:
+        known, names = set(links), {joint.name: joint for joint in joints}
+        if len(names) < len(joints):
+            raise self._fault("joint", "two joints have one name")
+        for joint in joints:
+            for link in (joint.parent, joint.child):
+                if link not in known:
+                    raise self._fault(f"joint {joint.name!r}", f"there is no link {link!r}")
+            if by_child[joint.child] is not joint:
+                raise self._fault(f"link {joint.child!r}", "it is the child of two joints; a rig is a tree")
+            if joint.mimic is not None and joint.mimic.joint not in names:
+                raise self._fault(f"joint {joint.name!r}", f"it mimics {joint.mimic.joint!r}, which is no joint")
+        roots = [link for link in links if link not in by_child]
+        if len(roots) != 1:
+            raise self._fault("link", f"{len(roots)} links are no joint's child; a rig has one base")
+        for start in by_child:
+            link, steps = start, 0
+            while link in by_child:
+                link, steps = by_child[link].parent, steps + 1
+                if steps > len(by_child):
+                    raise self._fault(f"link {start!r}", "its joints go round in a circle")
+
+    def _joint(self, element: ET.Element) -> UrdfJoint:
+        name = self._name(element)
+        where = f"joint {name!r}"
+        kind = element.get("type", "")
+        if kind not in (*_TURNING, *_SLIDING, *_FREE, "fixed"):
+            raise self._fault(where, f"no type of joint: {kind!r}")
+        slides = kind in _SLIDING
+        axis = self._vector(element.find("axis"), "xyz", where, (1.0, 0.0, 0.0))
+        length = float(np.linalg.norm(axis))
+        if length == 0.0 and kind in (*_TURNING, *_SLIDING):
+            raise self._fault(where, "its axis has no direction")
+        limit = element.find("limit")
+        scale = 1e3 if slides else 1.0
+        limits = max_rate = None
+        if limit is not None and kind != "continuous":
+            low, high = (self._number(limit, key, where, 0.0) * scale for key in ("lower", "upper"))
+            if low > high:
+                raise self._fault(where, f"its limits fall: {low:g} .. {high:g}")
+            stated = "lower" in limit.attrib or "upper" in limit.attrib
+            limits = (low, high) if stated else None
+        if limit is not None and (rate := self._number(limit, "velocity", where, 0.0)) > 0.0:
+            max_rate = rate * scale
+        return UrdfJoint(
+            name,
+            "revolute" if kind in _TURNING else "prismatic" if slides else "fixed" if kind == "fixed" else None,
+            self._link_of(element, "parent", where),
+            self._link_of(element, "child", where),
+            self._origin(element.find("origin"), where),
+            axis / (length or 1.0),
+            limits,
+            max_rate,
+            self._mimic(element, where, scale),
+        )
+
+    def _mimic(self, element: ET.Element, where: str, scale: float) -> Mimic | None:
+        found = element.find("mimic")
+        if found is None:
+            return None
+        multiplier = self._number(found, "multiplier", where, 1.0)
+        return Mimic(found.get("joint", ""), multiplier, self._number(found, "offset", where, 0.0) * scale)
+
+    def _inertial(self, element: ET.Element) -> Inertial | None:
+        found, where = element.find("inertial"), f"link {element.get('name')!r}"
+        mass = None if found is None else found.find("mass")
+        if found is None or mass is None:
+            return None
+        kg = self._number(mass, "value", where, 0.0)
+        if kg < 0.0:
+            raise self._fault(where, f"a mass of {kg:g} kg")
+        origin = self._origin(found.find("origin"), where)
+        tensor, inertia = found.find("inertia"), np.zeros((3, 3))
+        if tensor is not None:
+            for i, j, key in ((0, 0, "ixx"), (1, 1, "iyy"), (2, 2, "izz"), (0, 1, "ixy"), (0, 2, "ixz"), (1, 2, "iyz")):
+                inertia[i, j] = inertia[j, i] = self._number(tensor, key, where, 0.0)
+        turned: Floats = origin[:3, :3] @ inertia @ origin[:3, :3].T
+        return Inertial(kg, origin[:3, 3], turned)
+
+    def _origin(self, element: ET.Element | None, where: str) -> Floats:
+        out = np.eye(4)
+        out[:3, 3] = 1e3 * self._vector(element, "xyz", where, (0.0, 0.0, 0.0))
+        out[:3, :3] = rotation_of_rpy(*self._vector(element, "rpy", where, (0.0, 0.0, 0.0)))
+        return out
+
+    def _vector(self, element: ET.Element | None, key: str, where: str, default: tuple[float, float, float]) -> Floats:
+        text = None if element is None else element.get(key)
+        if text is None:
+            return np.array(default)
+        try:
+            numbers = [float(part) for part in text.split()]
+        except ValueError:
+            numbers = []
+        if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
+            raise self._fault(where, f"{key}={text!r} is not three numbers")
+        return np.array(numbers)
+
+    def _number(self, element: ET.Element, key: str, where: str, default: float) -> float:
+        text = element.get(key)
+        try:
+            number = default if text is None else float(text)
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number):
+            raise self._fault(where, f"{key}={text!r} is not a number")
+        return number
+
+    def _link_of(self, element: ET.Element, role: str, where: str) -> str:
+        found = element.find(role)
+        link = None if found is None else found.get("link")
+        if not link:
+            raise self._fault(where, f"it has no <{role} link=...>")
+        return link
+
+    def _name(self, element: ET.Element) -> str:
+        name = element.get("name")
+        if not name:
+            raise self._fault(f"<{element.tag}>", "it has no name")
+        return name
+
+    def _fault(self, where: str, reason: str) -> RigError:
+        return RigError(self._source, where, reason)
+
+
+def rotation_of_rpy(roll: float, pitch: float, yaw: float) -> Floats:
+    """Return Rot(z, yaw) Rot(y, pitch) Rot(x, roll), (3, 3)."""
+    (a, b, c), (x, y, z) = np.cos([yaw, pitch, roll]), np.sin([yaw, pitch, roll])
+    return np.array(
+        [
+            [a * b, a * y * z - x * c, a * y * c + x * z],
+            [x * b, x * y * z + a * c, x * y * c - a * z],
+            [-y, b * z, b * c],
+        ]
+    )
+
+
+def _plain(tag: str) -> str:
+    """Return an element's name without the address of its namespace."""
+    return tag.rpartition("}")[2]

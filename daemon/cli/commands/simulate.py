@@ -1,0 +1,105 @@
+"""`rigcal simulate`: observations of a simulated machine of any rig."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from daemon.cli.command import Command, json_option
+from daemon.cli.offline import FILE, rig_option, seed_option
+from daemon.cli.terminal import echo
+from daemon.host.safe_output import write_file
+from daemon.report.words import number
+
+_MOST_POSES = 100_000
+
+
+@click.command(cls=Command)
+@rig_option
+@click.option("--poses", type=click.IntRange(1, _MOST_POSES), required=True, metavar="N", help="How many poses.")
+@seed_option
+@click.option(
+    "--plan", type=FILE, metavar="CSV", help="Take the poses of a plan; random ones in the limits by default."
+)
+@click.option(
+    "--effect",
+    "effects",
+    multiple=True,
+    metavar="FAMILY@WHERE[:NAME=VALUE...]",
+    help="A hidden effect of the machine, which else has build errors alone; `rigcal effects` lists them. May be given "
+    "again.",
+)
+@click.option(
+    "--noise",
+    "noise_mm",
+    type=click.FloatRange(min=0.0, min_open=True),
+    metavar="MM",
+    help="Standard deviation of each coordinate of a fix, also stated in the data; the rig file's station by default.",
+)
+@click.option(
+    "--recording",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    metavar="K",
+    help="Another number measures the same machine in other poses: data to hold out.",
+)
+@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), required=True, metavar="CSV")
+@click.option(
+    "--truth",
+    "truth_out",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="JSON",
+    help="Write what the machine really is, to hold a calibration against.",
+)
+@json_option
+def simulate(
+    rig: str,
+    poses: int,
+    seed: int,
+    plan: Path | None,
+    effects: tuple[str, ...],
+    noise_mm: float | None,
+    recording: int,
+    out: Path,
+    truth_out: Path | None,
+    *,
+    as_json: bool,
+) -> dict[str, Any]:
+    """Simulate a machine of a rig and measure it: observations for `rigcal calibrate`, without any hardware.
+
+    The machine is built within the tolerances of the rig file, by the seed, and has the effects that are asked for. It
+    stands still in each pose and all prisms are measured, with the random errors of station and encoders. Its physics
+    share no code with the analysis.
+    """
+    from daemon.composition import simulated_campaign
+    from daemon.config import load_rig
+
+    source = load_rig(rig)
+    campaign = simulated_campaign(
+        source.rig, poses, seed, plan=plan, effects=",".join(effects), noise_mm=noise_mm, recording=recording
+    )
+    observed = campaign.observations
+    write_file(out, observed.csv_text().encode("utf-8"))
+    result: dict[str, Any] = {
+        "rig": source.rig.name,
+        "poses": poses,
+        "fixes": len(observed),
+        "noise_rms_mm": observed.noise_rms_mm,
+        "effects": list(effects),
+        "out": str(out),
+    }
+    if truth_out is not None:
+        write_file(truth_out, (json.dumps(campaign.truth_as_dict(), indent=1) + "\n").encode("utf-8"))
+        result["truth"] = str(truth_out)
+    if not as_json:
+        echo(
+            f"{out}: {len(observed)} fixes in {poses} poses; no model can be nearer to them than "
+            f"{number(observed.noise_rms_mm)} mm RMS, the noise of station and encoders"
+        )
+        if truth_out is not None:
+            echo(f"What the machine really is: {truth_out}")
+    return result

@@ -1,0 +1,83 @@
+"""Public robots from URDF to a calibrated model and out again: `python -m tests.bench.robots [--only NAME]`.
+
+Each robot of `tests.robots` is imported, checked, simulated, calibrated, judged on other poses of the same machine, and
+exported, all by the commands of `rigcal`; the exported URDF is compared with the model by pinocchio.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.evaluation.correction_grid import Machine, trained_ranges
+from calibration.evaluation.exports import Export, without_parts
+from daemon.models.model_files import read_model
+from tests.robots import ROBOTS, Pinocchio, Robot
+
+POSES, HELD_OUT, COMPARED = 300, 200, 50
+RATIO_BAR, EXACT_MM = 1.06, 1e-9
+
+
+def rigcal(*arguments: str) -> dict[str, Any]:
+    """The JSON object of a command."""
+    command = [sys.executable, "-m", "daemon.cli.main", *arguments, "--json"]
+    found: dict[str, Any] = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout)
+    return found
+
+
+def run(name: str, robot: Robot, directory: Path, seed: int) -> bool:
+    """Print the line of a robot; True if it is within the bars."""
+    rig, model = str(directory / f"{name}.toml"), str(directory / name)
+    train, test = (str(directory / f"{name}-{part}.csv") for part in ("train", "test"))
+    rigcal("rig", "import", str(robot.path), *robot.options, "--out", rig)
+    checked = rigcal("rig", "check", rig)["identifiability"]
+    machine = ["simulate", "--rig", rig, "--seed", str(seed)]
+    rigcal(*machine, "--poses", str(POSES), "--out", train)
+    noise_mm = rigcal(*machine, "--poses", str(HELD_OUT), "--recording", "1", "--out", test)["noise_rms_mm"]
+    plain = ["--effects", "none", "--residual", "none"]
+    found = rigcal("calibrate", "--rig", rig, "--data", train, *plain, "--out", model)
+    stages = {s["stage"]: s["rms_mm"] for s in rigcal("evaluate", "--model", model, "--data", test)["stages"]}
+    rigcal("model", "export", "--model", model, "--format", "urdf", "--out", model)
+    off_mm = _against_pinocchio(Path(model))
+    ratio = stages["geometric"] / noise_mm
+    print(
+        f"{name:10} {checked['rank']:3} of {checked['parameters']:3} parameters, nominal {stages['nominal']:6.3f}, "
+        f"held out {stages['geometric']:.4f} mm, over the noise {ratio:.4f}, pinocchio {off_mm:.1e} mm, "
+        f"{found['seconds']:.0f} s",
+        flush=True,
+    )
+    return ratio <= RATIO_BAR and off_mm <= EXACT_MM
+
+
+def _against_pinocchio(directory: Path) -> float:
+    """Greatest difference of the exported URDF by pinocchio and the model's kinematics, mm."""
+    model = read_model(directory)
+    text = (directory / "model.urdf").read_text(encoding="utf-8")
+    low, high = trained_ranges(model)
+    poses = np.random.default_rng(0).uniform(low, high, (COMPARED, len(low)))
+    machine = Machine(without_parts(model, ()), Export(model, "").setup)
+    wanted = np.stack([machine.corrected_mm(prism, poses) for prism in model.rig.prism_names], axis=1)
+    return float(np.abs(Pinocchio(text, model.rig.joints).places_mm(model.rig.prism_names, poses) - wanted).max())
+
+
+def main() -> int:
+    """Run all robots, or one."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", choices=tuple(ROBOTS))
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    chosen = {options.only: ROBOTS[options.only]} if options.only else ROBOTS
+    with tempfile.TemporaryDirectory() as directory:
+        good = [run(name, robot, Path(directory), options.seed) for name, robot in chosen.items()]
+    return 0 if all(good) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

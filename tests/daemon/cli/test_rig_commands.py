@@ -1,0 +1,195 @@
+"""`rigcal rig`, `rigcal simulate` and the rig of `rigcal run --sim`, as a user has them."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from calibration.rig.description import parse_rig
+from daemon.acquisition.channels import decoder_factories
+from daemon.acquisition.simulated_channels import with_simulated_channels
+from daemon.cli.main import main
+from daemon.config import load_rig
+from drivers.readings import Reading
+from simulators.rig.truth import RigTruth
+from simulators.rig_simulator import RigSimulator
+from tests.robots import ROBOTS
+
+
+def rigcal(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(main, [*map(str, arguments)])
+
+
+def told(*arguments: str | Path) -> dict[str, Any]:
+    done = rigcal(*arguments, "--json")
+    assert done.exit_code == 0, done.stderr
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def panda(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A rig file of a robot with a joint that mimics another one."""
+    path = tmp_path_factory.mktemp("rigs") / "panda.toml"
+    told("rig", "import", ROBOTS["panda"].path, "--out", path)
+    return path
+
+
+# ---- check and import ------------------------------------------------------------------------------------------------
+
+
+def test_check_shows_places_reach_radii_and_what_data_can_show(tmp_path: Path) -> None:
+    found = told("rig", "check", "ur10", "--svg", tmp_path / "ur10.svg")
+    places = found["zero_pose"]
+    np.testing.assert_allclose(places["prisms_mm"]["tmac"], [-1184.3, -256.141, 11.6], atol=1e-6)
+    assert len(places["frames_mm"]) == found["rows"] + 1
+    assert 1184.3 < found["reach_mm"] < 1500.0
+    assert {link["assumed"] for link in found["links"]} == {True}
+    assert found["identifiability"]["rank"] < found["identifiability"]["parameters"]
+    assert "assumes a radius" in found["warnings"][0]
+    assert (tmp_path / "ur10.svg").read_text(encoding="utf-8").count("<path") > 20
+
+
+def test_check_draws_the_chain_for_people() -> None:
+    shown = rigcal("rig", "check", "swdt82").stdout
+    assert "swdt82: good: 9 rows, 9 joints, 4 prisms" in shown
+    side = shown.split("From the side")[1].split("From above")[0]
+    assert side.count("*") >= 3
+    assert "#" in side
+
+
+def test_a_radius_of_a_row_is_what_plan_keeps_clear_of(tmp_path: Path) -> None:
+    text = load_rig("ur10").text.replace("a_mm = -612", "a_mm = -612\nradius_mm = 75")
+    (tmp_path / "thick.toml").write_text(text, encoding="utf-8")
+    links = {link["row"]: link for link in told("rig", "check", tmp_path / "thick.toml")["links"]}
+    assert (links[2]["radius_mm"], links[2]["assumed"]) == (75.0, False)
+    assert links[3]["assumed"]
+    planned = told("plan", "--rig", tmp_path / "thick.toml", "--poses", "3")
+    assert any("75 mm of row 2" in sentence for sentence in planned["assumptions"])
+
+
+def test_check_tells_every_fault_with_its_line(tmp_path: Path) -> None:
+    lines = load_rig("ur10").text.splitlines()
+    lines[lines.index("d_mm = 127.3")] = "d_mm = 'x'"
+    lines[lines.index('name = "tmac"')] = 'nam = "tmac"'
+    (tmp_path / "bad.toml").write_text("\n".join(lines), encoding="utf-8")
+    done = rigcal("rig", "check", tmp_path / "bad.toml")
+    assert done.exit_code == 2
+    for key, line in (("row.1.d_mm", lines.index("d_mm = 'x'")), ("prism.1.nam", lines.index('nam = "tmac"'))):
+        assert any(key in told and f"(line {line + 1})" in told for told in done.stderr.splitlines()), done.stderr
+
+
+def test_a_rig_survives_the_way_out_and_in(panda: Path, tmp_path: Path) -> None:
+    for name in ("panda.urdf", "panda.csv"):
+        told("rig", "export", panda, "--out", tmp_path / name)
+        tips = [] if name.endswith("csv") else ["--tip", "panda_leftfinger", "--tip", "panda_rightfinger"]
+        again = told("rig", "import", tmp_path / name, *tips, "--out", tmp_path / "again.toml")
+        assert again["joints"] == [joint.name for joint in load_rig(str(panda)).rig.joints]
+        wanted, found = (told("rig", "check", path)["zero_pose"] for path in (panda, tmp_path / "again.toml"))
+        for prism, place in wanted["prisms_mm"].items():
+            np.testing.assert_allclose(found["prisms_mm"][prism], place, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (("rig", "import", "{csv}", "--tip", "x", "--out", "o"), "name links of a URDF"),
+        (("rig", "import", "{urdf}", "--convention", "dh", "--out", "o"), "is for a table"),
+        (("rig", "export", "ur10", "--out", "o.stl"), "ends in one of"),
+        (("rig", "check", "nowhere.toml"), "neither a shipped rig"),
+        (("run", "--rig", "ur10"), "--rig goes with --sim"),
+        (("simulate", "--rig", "ur10", "--poses", "3", "--effect", "nix@q1", "--out", "o"), "unknown effect"),
+        (("simulate", "--rig", "ur10", "--poses", "3", "--effect", "backlash@q9", "--out", "o"), "it acts at"),
+    ],
+)
+def test_wrong_use_is_refused(tmp_path: Path, arguments: tuple[str, ...], reason: str) -> None:
+    (tmp_path / "t.csv").write_text("joint,a_mm\nq1,1\n", encoding="utf-8")
+    places = {"{csv}": str(tmp_path / "t.csv"), "{urdf}": str(ROBOTS["ur5"].path)}
+    done = rigcal(*(places.get(word, word) for word in arguments))
+    assert (done.exit_code, reason in done.stderr) == (2, True), done.stderr
+
+
+# ---- simulate --------------------------------------------------------------------------------------------------------
+
+
+def test_a_seed_is_a_machine_and_a_recording_its_poses(tmp_path: Path) -> None:
+    out, truth = tmp_path / "a.csv", tmp_path / "truth.json"
+    machine = ("simulate", "--rig", "ur10", "--poses", "20", "--seed", "4", "--truth", truth)
+    first = told(*machine, "--out", out)
+    built, text = json.loads(truth.read_text(encoding="utf-8")), out.read_text(encoding="utf-8")
+    assert first["fixes"] == len(rows_of(out)) == 20
+    told(*machine, "--out", out)
+    assert out.read_text(encoding="utf-8") == text
+    told(*machine, "--recording", "1", "--out", out)
+    other = json.loads(truth.read_text(encoding="utf-8"))
+    assert out.read_text(encoding="utf-8") != text
+    assert (other["rows"], other["prisms"], other["base"]) == (built["rows"], built["prisms"], built["base"])
+    off = np.array([row["a_mm"] for row in built["rows"]]) - [row.a_mm for row in load_rig("ur10").rig.rows]
+    assert 0.1 < np.abs(off).max() < 5.0, "within the tolerance of 1 mm, and not the drawings"
+
+
+def test_noise_is_stated_and_an_effect_moves_what_is_measured(tmp_path: Path) -> None:
+    plain, bent = tmp_path / "plain.csv", tmp_path / "bent.csv"
+    machine = ("simulate", "--rig", "swdt82", "--poses", "10", "--noise", "0.5")
+    assert told(*machine, "--out", plain)["noise_rms_mm"] > 0.5
+    told(*machine, "--effect", "angle_scale@theta3:scale=1e-3", "--out", bent)
+    one, other = rows_of(plain), rows_of(bent)
+    assert {row["sigma_x_mm"] for row in one} == {"0.5"}
+    moved = [
+        float(np.linalg.norm([float(a[f"{k}_mm"]) - float(b[f"{k}_mm"]) for k in "xyz"]))
+        for a, b in zip(one, other, strict=True)
+    ]
+    assert max(moved) > 5.0
+
+
+def test_a_plan_is_visited_pose_by_pose(tmp_path: Path) -> None:
+    plan, out = tmp_path / "plan.csv", tmp_path / "out.csv"
+    columns = [joint.column for joint in load_rig("ur10").rig.joints]
+    lines = [",".join(["pose", *columns, "q1_dir"]), "1,10,20,30,40,50,60,1", "2,-10,-20,-30,-40,-50,-60,-1"]
+    plan.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    told("simulate", "--rig", "ur10", "--poses", "4", "--plan", plan, "--out", out)
+    rows = rows_of(out)
+    np.testing.assert_allclose([float(row["q2_deg"]) for row in rows], [20, -20, 20, -20], atol=0.01)
+    assert [row["q1_dir"] for row in rows] == ["1.0", "-1.0", "1.0", "-1.0"]
+    plan.write_text("\n".join(lines[:1]) + "\n1,10,20,30,40,50,900\n", encoding="utf-8")
+    assert (
+        "line 2: q6 = 900 deg is beyond its limits"
+        in rigcal("simulate", "--rig", "ur10", "--poses", "4", "--plan", plan, "--out", out).stderr
+    )
+
+
+# ---- run --sim --rig -------------------------------------------------------------------------------------------------
+
+
+def test_joints_without_a_channel_are_read_from_simulated_devices(panda: Path) -> None:
+    """All joints of a robot arrive at the decoders as they are, over the simulated bus."""
+    source = load_rig(str(panda))
+    rig = parse_rig(with_simulated_channels(source.rig, source.text), "panda")
+    assert [channel.name for channel in rig.channels] == list(rig.joint_names)
+    simulator = RigSimulator(RigTruth(rig, 1), 1)
+    decoders = [factory() for factory in decoder_factories(rig, source.directory, "boom")]
+    found: dict[str, float] = {}
+    for step in range(1, 40):
+        for frame in simulator.poll(step * 0.05).frames:
+            for decoder in decoders:
+                found |= {r.channel: r.value for r in _readings(decoder, frame) if r.value is not None}
+    middle = {joint.name: sum(joint.limits) / 2.0 for joint in rig.joints}
+    assert found == pytest.approx(middle, abs=0.05)
+    assert with_simulated_channels(rig, rig.text) == rig.text, "who has channels keeps them"
+
+
+def _readings(decoder: Any, frame: Any) -> list[Reading]:
+    from drivers.clock import Stamp
+
+    if frame.arbitration_id != decoder.arbitration_id:
+        return []
+    return [record for record in decoder.decode(Stamp(0, 0, "b"), frame.data) if isinstance(record, Reading)]
