@@ -92,7 +92,7 @@ def stops_of(rig: Rig, rows: Iterable[Mapping[str, Any]], dwell_s: float) -> lis
 
 
 def _row(rig: Rig, row: Mapping[str, Any]) -> PlanRow:
-    asked = f"a pose has a finite number for each of {', '.join(j.column for j in rig.joints)}"
+    asked = f"a pose has a number for each of {', '.join(j.column for j in rig.joints)}"
     try:
         joints = {joint.name: float(row[joint.column]) for joint in rig.joints}
     except (KeyError, TypeError, ValueError) as error:
