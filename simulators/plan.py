@@ -69,7 +69,7 @@ def stops_of(rig: Rig, rows: Iterable[Mapping[str, Any]], dwell_s: float) -> lis
                 raise ValueError("not finite")
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(
-                f"a pose has a finite number for each of {', '.join(j.column for j in rig.joints)}"
+                f"a pose has a number for each of {', '.join(j.column for j in rig.joints)}"
             ) from error
         before = {
             joint.name: min(
