@@ -3,7 +3,7 @@
 A job is a run for each prism and one for the check; a run is a session. Its state follows from the request and the
 events alone, so a guide that is read from the store goes on where it was. Events and their details:
 
-    opened    {session}                      the run's session is open; the station is not on the prism yet
+    opened    {session, last}                the run's session is open; the station is not on the prism yet
     planned   {poses: [{joint: number}]}     the poses of the run
     shot      {point, misclosure_mm}         the control point of this step was measured
     aimed     {}                             the station is on the prism: fixes count from now on
@@ -124,7 +124,7 @@ class Run:
         most: poses that are planned at most.
         poses: None until they are chosen.
         session: "" until it is open.
-        last: number of the newest observation of the standstill that was measured last.
+        last: number of the newest observation of the standstill that was measured last, or before the session.
         label: of that standstill.
         enough: why it is enough; "" while it is not.
         least: poses that must be done before the stop rule is asked again.
@@ -185,10 +185,10 @@ class Job:
     @classmethod
     def of(cls, request: Request) -> Job:
         """A job of which nothing is done."""
-        runs = [_run(prism, "static_poses", request.poses, request) for prism in request.prisms]
+        wanted = [(prism, "static_poses", request.poses) for prism in request.prisms]
         if request.check_poses:
-            runs.append(_run(request.prisms[-1], CHECK, request.check_poses, request))
-        return cls(request, tuple(runs))
+            wanted.append((request.prisms[-1], CHECK, request.check_poses))
+        return cls(request, tuple(_run(number, *one, request) for number, one in enumerate(wanted)))
 
     @property
     def at(self) -> int:
@@ -247,7 +247,7 @@ class Job:
         run = job.run
         match kind:
             case "opened":
-                return job._with(replace(run, session=str(details["session"])))
+                return job._with(replace(run, session=str(details["session"]), last=int(details["last"])))
             case "planned":
                 return job._with(replace(run, poses=tuple(PlannedPose(pose) for pose in details["poses"])))
             case "shot":
@@ -298,8 +298,9 @@ class Job:
         return replace(self, runs=runs, state="finished" if is_over else "open")
 
 
-def _run(prism: str, kind: str, most: int, request: Request) -> Run:
-    points = request.control_points
+def _run(number: int, prism: str, kind: str, most: int, request: Request) -> Run:
+    # There and back: the point that a session ends with is the one that the next begins with.
+    points = request.control_points[:: -1 if number % 2 else 1]
     planned = request.planned(prism) if kind != CHECK else None
     return Run(
         prism,
@@ -380,7 +381,7 @@ def stop_reason(forecast: Forecast, target_mm: float | None, done: int, least: i
     if target_mm is not None and max(forecast.now_mm, forecast.prism_mm) <= target_mm:
         return f"the expected error, {forecast.prism_mm:.2g} mm, has reached the target of {target_mm:g} mm"
     gain = 1.0 - forecast.prism_after_5_mm / forecast.prism_mm
-    if target_mm is None and gain < WORTHWHILE:
+    if gain < WORTHWHILE:
         return f"five more poses would lower the expected error of {forecast.prism_mm:.2g} mm by {gain:.0%} only"
     return ""
 
