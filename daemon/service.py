@@ -248,7 +248,14 @@ class Daemon:
         """Stop all parts within `STOP_S`, side by side, so that no one's stop delays what was captured."""
         budget = TimeBudget(STOP_S)
         stops = [server.close for server in self._servers]
-        stops += [self._guide.stop, self._live_model.stop, self._jobs.stop, self._watch.stop, self._notices.stop, self._housekeeping.stop]
+        stops += [
+            self._guide.stop,
+            self._live_model.stop,
+            self._jobs.stop,
+            self._watch.stop,
+            self._notices.stop,
+            self._housekeeping.stop,
+        ]
         stops += [part.stop for part in (self._sender, self._metrics) if part is not None]
         others = [threading.Thread(target=_stop_part, args=(stop,), daemon=True) for stop in stops]
         for thread in others:

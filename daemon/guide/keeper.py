@@ -263,7 +263,11 @@ class GuideKeeper:
     def _measured_here(self) -> None:
         """Take the standstill at which the boom is for the pose, wherever that is."""
         found, boom = self._standstill, self._watch.boom()
-        here = found is not None and boom.stands_s is not None and is_there(self._rig, boom.values, _pose(self._rig, found))
+        here = (
+            found is not None
+            and boom.stands_s is not None
+            and is_there(self._rig, boom.values, _pose(self._rig, found))
+        )
         if found is None or not here or found.fixes < NEEDED_FIXES:
             raise CommandError(
                 f"{found.fixes if found is not None and here else 0} of {NEEDED_FIXES} fixes count at this standstill; "
@@ -428,8 +432,7 @@ class GuideKeeper:
         """The control point that comes after the poses; "" where it is another step's turn."""
         if job.step is None or job.step.kind != "poses" or not job.is_enough:
             return ""
-        after = job.run.steps[(job.run.next_step or 0) + 1]
-        return after.point
+        return "" if job.run.following is None else job.run.following.point
 
     # ---- the gain meter ----------------------------------------------------------------------------------------------
 
@@ -494,7 +497,13 @@ class GuideKeeper:
                 "computed_at_utc_ns": self._clock.now().utc_ns,
             }
             is_same = now.state == "open" and now.run.session == job.run.session and now.run.kind != CHECK
-            if not is_same or found["prism_mm"] is None or now.is_enough or now.step is None or now.step.kind != "poses":
+            if (
+                not is_same
+                or found["prism_mm"] is None
+                or now.is_enough
+                or now.step is None
+                or now.step.kind != "poses"
+            ):
                 return
             forecast = Forecast(found["now_mm"], found["prism_mm"], found["prism_after_5_mm"])
             reason = stop_reason(forecast, job.request.target_mm, job.run.done, now.run.least)

@@ -1,4 +1,4 @@
-"""A simulated operator who does what a guide says: drives the boom, aims the station, presses the button where one must.
+"""A simulated operator who does what a guide says: drives, aims, and presses the button where one must.
 
 The daemon runs with `--sim --by-hand`: boom and station move only as they are told here.
 """
@@ -63,7 +63,9 @@ class GuidedOperator:
             case "go_to_pose" | "hold":
                 self._say("simulation.visit", poses=[self._pose(state["joints"])])
             case "enough":
-                ends = [row for row in state["steps"] if row["kind"] == "shoot_control_point" and row["state"] == "to do"]
+                ends = [
+                    row for row in state["steps"] if row["kind"] == "shoot_control_point" and row["state"] == "to do"
+                ]
                 if step["is_detected"] and ends:
                     self._say("simulation.aim", target=ends[0]["title"].split()[2].rstrip(","))
                 else:
