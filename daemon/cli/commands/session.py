@@ -199,7 +199,7 @@ def session_guide(socket: Path | None, config: Path | None, as_json: bool, **giv
         if about or (not is_open and not as_json):
             state = say("guide.start", operator=given["operator"], **about)
         if not as_json:
-            state = {"guide": lead(say)}
+            return {"guide": lead(say)}
     if not as_json:
         summary(state)
     return state
