@@ -49,6 +49,8 @@ class GuidedOperator:
 
     def _obey(self, state: Mapping[str, Any]) -> None:
         step = state["step"]
+        if any("confirm-prism" in message["text"] for message in state["messages"]):
+            self._say("session.confirm-prism", operator="Ada")  # an operator looks, and it is the prism
         if step["is_busy"] or step["id"] == self._obeyed:
             return
         self._obeyed = step["id"]
