@@ -28,8 +28,9 @@ from daemon.commands import (
     mapping_argument,
     text_argument,
 )
-from daemon.guide.job import Forecast, Job, Request, stop_reason
-from daemon.guide.meter_link import Answer, MeterLink, Place
+from daemon.guide.advisor import Advisor, accuracy_view
+from daemon.guide.job import Job, Pose, Request
+from daemon.guide.meter_link import Place
 from daemon.guide.position import PositionWatch, is_there
 from daemon.guide.request import request_of, whole_argument
 from daemon.guide.view import Around, headline, state_of
@@ -82,7 +83,7 @@ class GuideKeeper:
         has_aim: bool,
     ) -> None:
         self._rig, self._store, self._sessions, self._setups, self._clock = rig, store, sessions, setups, clock
-        self._meter_place, self._model, self._settle_s, self._has_aim = meter_place, model, settle_s, has_aim
+        self._model, self._settle_s, self._has_aim = model, settle_s, has_aim
         self._table, self._session_table = GuideTable(store, rig.name), SessionTable(store, rig.name)
         self._watch = PositionWatch(rig, joiner, clock)
         self._turn = threading.RLock()
@@ -93,10 +94,7 @@ class GuideKeeper:
         self._busy = ""  # step that is carried out
         self._cancelled = threading.Event()
         self._standstill: Standstill | None = None
-        self._accuracy: dict[str, Any] | None = None
-        self._coverage: dict[str, Any] | None = None
-        self._meter: MeterLink | None = None
-        self._meter_trouble = ""
+        self._advisor = Advisor(meter_place, self._training, clock, self._take_enough)
         self._is_choosing = False
         self._try_again = 0.0  # real monotonic seconds
         self._stopping = threading.Event()
@@ -113,7 +111,7 @@ class GuideKeeper:
         self._cancelled.set()
         if self._thread.is_alive():
             self._thread.join(timeout=_CANCEL_S)
-        self._close_meter()
+        self._advisor.close()
 
     @property
     def is_open(self) -> bool:
@@ -168,9 +166,10 @@ class GuideKeeper:
                 request = request_of(arguments, self._rig, self._setups.control_point_names(setup_id))
             self._table.open(self._clock.now(), setup_id, operator, request.as_dict(), **caller_columns())
             self._row, self._job = self._table.newest(), Job.of(request)
-            self._taps, self._accuracy, self._coverage, self._standstill = 1, None, None, None
-            self._wanted, self._try_again, self._is_choosing = "", 0.0, False
-            self._start_meter()
+            self._taps, self._standstill, self._wanted, self._try_again = 1, None, "", 0.0
+            self._watch.forget_fixes()
+            self._advisor.forget()
+            self._start_advisor()
             return self._state()
 
     def state_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -303,7 +302,7 @@ class GuideKeeper:
         if job.state != "open":
             log.info("guide %d is %s", self._row.id if self._row else 0, job.state)
             self._row = self._table.newest()
-            self._close_meter()
+            self._advisor.close()
             return
         on_prism = job.step is not None and job.step.kind == "poses"
         was_on_prism = before.step is not None and before.step.kind == "poses"
@@ -340,8 +339,8 @@ class GuideKeeper:
             job = self._job
             if job is None or job.step is None:
                 return
-            if self._meter is None or not self._meter.is_alive:
-                self._start_meter()
+            if not self._advisor.is_alive:
+                self._start_advisor()
             run, step, step_id = job.run, job.step, job.step_id
             if run.session and run.poses is None and not self._is_choosing:
                 self._choose(run.most)
@@ -439,113 +438,57 @@ class GuideKeeper:
             return ""
         return "" if job.run.following is None else job.run.following.point
 
-    # ---- the gain meter ----------------------------------------------------------------------------------------------
+    # ---- what is still to gain ---------------------------------------------------------------------------------------
 
-    def _start_meter(self) -> None:
-        self._close_meter()
-        try:
-            self._meter = MeterLink(self._meter_place())
-        except OSError as error:
-            self._meter_trouble = f"the gain meter cannot be started: {error}"
-            self._try_again = time.monotonic() + RETRY_S
-            return
+    def _start_advisor(self) -> None:
+        self._advisor.start()
         self._is_choosing = False
+        if not self._advisor.is_alive:
+            self._try_again = time.monotonic() + RETRY_S
         self._assess()
 
-    def _close_meter(self) -> None:
-        meter, self._meter = self._meter, None
-        if meter is not None:
-            meter.close()
-
-    def _training(self, job: Job) -> list[str]:
-        """Sessions that the next model will be trained on, with the open one."""
-        used = [session["id"] for session in self._session_table.used() if session["kind"] != CHECK]
-        own = job.run.session
-        return used if job.run.kind == CHECK or not own or own in used else [*used, own]
-
-    def _question(self, job: Job) -> dict[str, Any]:
-        run = job.run
-        return {
-            "sessions": self._training(job),
-            "setup": self._row.setup_id if self._row else "",
-            "session": run.session,
-            "prism": run.prism,
-        }
+    def _training(self) -> list[str]:
+        """Sessions that the next model will be trained on, without the open one."""
+        return [session["id"] for session in self._session_table.used() if session["kind"] != CHECK]
 
     def _assess(self) -> None:
-        """Ask what to expect; of a check nothing is learned, so nothing changes."""
-        job = self._job
-        if job is None or self._meter is None or job.state != "open" or not job.run.session:
-            return
-        if job.run.kind == CHECK and self._accuracy is not None:
-            return
-        prisms = list(dict.fromkeys([run.prism for run in job.runs[: job.at + 1] if run.session]))
-        question = self._question(job) | {"do": "assess", "prisms": prisms, "next": job.run.upcoming(5)}
-        self._meter.ask(question, partial(self._take_assessment, job, prisms))
+        if self._job is not None and self._row is not None:
+            self._advisor.assess(self._job, self._row.setup_id)
 
-    def _take_assessment(self, job: Job, prisms: list[str], answer: Answer) -> None:
+    def _take_enough(self, session: str, reason: str) -> None:
+        """The stop rule says stop: it counts while poses of that session are measured."""
         with self._turn:
-            now = self._job
-            if now is None or self._row is None:
+            job = self._job
+            if job is None or job.run.session != session or job.step is None:
                 return
-            if "error" in answer:
-                self._meter_trouble = str(answer["error"])
-                return
-            self._meter_trouble = ""
-            found = dict(answer["result"])
-            self._coverage = found.pop("coverage")
-            self._accuracy = found | {
-                "target_mm": job.request.target_mm,
-                "prisms": prisms,
-                "for_poses": job.run.done,
-                "session": job.run.session,
-                "computed_at_utc_ns": self._clock.now().utc_ns,
-            }
-            is_same = now.state == "open" and now.run.session == job.run.session and now.run.kind != CHECK
-            if (
-                not is_same
-                or found["prism_mm"] is None
-                or now.is_enough
-                or now.step is None
-                or now.step.kind != "poses"
-            ):
-                return
-            forecast = Forecast(found["now_mm"], found["prism_mm"], found["prism_after_5_mm"])
-            reason = stop_reason(forecast, job.request.target_mm, job.run.done, now.run.least)
-            if reason:
+            if job.step.kind == "poses" and not job.is_enough and job.run.done >= job.run.least:
                 self._happen("enough", {"reason": reason})
 
     def _choose(self, count: int, *, as_more: bool = False) -> None:
         """Ask for poses of the run."""
-        job = self._job
-        if job is None or self._meter is None:
+        job, row = self._job, self._row
+        if job is None or row is None:
             return
-        self._is_choosing = True
-        question = self._question(job) | {
-            "do": "choose",
-            "count": count,
-            "seed": 1000 * (self._row.id if self._row else 0) + 100 * job.at + len(job.run.poses or ()),
-            "evenly": job.run.kind == CHECK,
-        }
+        seed = 1000 * row.id + 100 * job.at + len(job.run.poses or ())
         caller = current_caller() if as_more else None
-        self._meter.ask(question, partial(self._take_poses, job.run.session, caller, as_more=as_more))
+        take = partial(self._take_poses, caller, as_more=as_more)
+        self._is_choosing = self._advisor.choose(job, row.setup_id, count, seed, take)
 
-    def _take_poses(self, session: str, caller: Caller | None, answer: Answer, *, as_more: bool) -> None:
+    def _take_poses(
+        self, caller: Caller | None, session: str, poses: list[Pose], trouble: str, *, as_more: bool
+    ) -> None:
         with self._turn, acting_for(caller):
             self._is_choosing = False
+            self._advisor.trouble = trouble
             job = self._job
             if job is None or job.state != "open" or job.run.session != session:
                 return
-            if "error" in answer or not answer["result"]["poses"]:
-                self._meter_trouble = f"no poses could be chosen: {answer.get('error', 'none is in view')}"
+            if trouble:
                 self._try_again = time.monotonic() + RETRY_S
-                return
-            poses = {"poses": answer["result"]["poses"]}
-            self._meter_trouble = ""
-            if as_more and job.step is not None and job.step.kind == "poses":
-                self._happen("more", poses)
+            elif as_more and job.step is not None and job.step.kind == "poses":
+                self._happen("more", {"poses": poses})
             elif not as_more and job.run.poses is None:
-                self._happen("planned", poses)
+                self._happen("planned", {"poses": poses})
 
     # ---- state -------------------------------------------------------------------------------------------------------
 
@@ -559,8 +502,8 @@ class GuideKeeper:
             around = Around(
                 boom=self._watch.boom(),
                 standstill=self._standstill,
-                accuracy=self._accuracy,
-                coverage=self._coverage,
+                accuracy=accuracy_view(job, self._advisor.accuracy),
+                coverage=self._advisor.coverage,
                 taps=self._taps,
                 is_busy=self._is_busy(job),
                 is_detected=self._has_aim or (bool(point) and self._point_mm(point) is not None),
@@ -581,8 +524,8 @@ class GuideKeeper:
         found = [job.trouble] if job.trouble else []
         if job.state == "open":
             found += [f"{s.reason}; {s.remedy}" for s in self._sessions.prism_suspicions()]
-        if self._meter_trouble and job.state == "open":
-            found.append(self._meter_trouble)
+        if self._advisor.trouble and job.state == "open":
+            found.append(self._advisor.trouble)
         return found
 
     # ---- after a restart ---------------------------------------------------------------------------------------------
@@ -616,7 +559,7 @@ class GuideKeeper:
                 away = event.at
         if away is not None:
             self._sessions.look_away(away)
-        self._start_meter()
+        self._start_advisor()
 
 
 def _left_prism(before: Job, after: Job) -> bool:
