@@ -1,7 +1,7 @@
 """A guided job with the whole daemon: `python -m tests.bench.guided_daemon`.
 
 Four prisms and a check on a simulated rig that is moved as by hand, then the jobs, then the acceptance. Prints the
-commands that it took, and how long after each pose the gain meter knew of it.
+commands it took, and how long after each pose the gain meter knew of it.
 """
 
 from __future__ import annotations
