@@ -23,24 +23,24 @@ from daemon.commands import (
     CommandError,
     Handler,
     acting_for,
-    caller_columns,
     current_caller,
     mapping_argument,
     text_argument,
 )
 from daemon.guide.advisor import Advisor, accuracy_view
-from daemon.guide.job import Job, Pose, Request
+from daemon.guide.job import Job, Pose
 from daemon.guide.meter_link import Place
 from daemon.guide.position import PositionWatch, is_there
+from daemon.guide.record import GuideRecord, is_on_prism
 from daemon.guide.request import request_of, whole_argument
 from daemon.guide.view import Around, headline, state_of
 from daemon.sessions.manager import SessionKeeper
 from daemon.sessions.station_setups import SetupBook
-from daemon.store.guides import GuideRow, GuideTable, Standstill
+from daemon.store.guides import Standstill
 from daemon.store.sessions import SessionTable
 from daemon.store.setups import control_points
 from daemon.store.store import Store
-from drivers.clock import Clock, Stamp
+from drivers.clock import Clock
 from drivers.readings import Record
 
 log = logging.getLogger(__name__)
@@ -84,12 +84,8 @@ class GuideKeeper:
     ) -> None:
         self._rig, self._store, self._sessions, self._setups, self._clock = rig, store, sessions, setups, clock
         self._model, self._settle_s, self._has_aim = model, settle_s, has_aim
-        self._table, self._session_table = GuideTable(store, rig.name), SessionTable(store, rig.name)
+        self._record, self._session_table = GuideRecord(store, rig.name, clock), SessionTable(store, rig.name)
         self._watch = PositionWatch(rig, joiner, clock)
-        self._turn = threading.RLock()
-        self._row: GuideRow | None = None
-        self._job: Job | None = None
-        self._taps = 0
         self._wanted = ""  # step whose button was pressed, to be carried out by the thread
         self._busy = ""  # step that is carried out
         self._cancelled = threading.Event()
@@ -113,26 +109,22 @@ class GuideKeeper:
             self._thread.join(timeout=_CANCEL_S)
         self._advisor.close()
 
-    @property
-    def is_open(self) -> bool:
-        """Return True while a guide is open."""
-        job = self._job
-        return job is not None and job.state == "open"
-
     def on_records(self, records: Sequence[Record]) -> None:
         """Note where boom and station are; costs nothing while no guide is open."""
-        if self.is_open:
+        if self._record.is_open:
             self._watch.on_records(records)
 
     def guarding(self, name: str, handler: Handler) -> Handler:
         """Return a command that is refused while a guide is open, which holds its sessions itself."""
 
         def guarded(arguments: Mapping[str, Any]) -> Any:
-            with self._turn:
-                if self._row is not None and self._job is not None and self.is_open:
+            with self._record.turn:
+                opened = self._record.opened()
+                if opened is not None:
+                    row, job = opened
                     raise CommandError(
-                        f"{name} is not carried out: guide {self._row.id} is open and opens, shoots in and closes its "
-                        f"sessions itself; next: {headline(self._job)} (`rigcal session guide` leads, and "
+                        f"{name} is not carried out: guide {row.id} is open and opens, shoots in and closes its "
+                        f"sessions itself; next: {headline(job)} (`rigcal session guide` leads, and "
                         "`rigcal session guide --stop REASON` abandons it)",
                         REFUSED,
                     )
@@ -144,10 +136,11 @@ class GuideKeeper:
 
     def start_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Open a guide."""
-        with self._turn:
-            if self._row is not None and self._job is not None and self.is_open:
+        with self._record.turn:
+            guide = self._record.opened()
+            if guide is not None:
                 raise CommandError(
-                    f"guide {self._row.id} is open: {headline(self._job)}; `rigcal session guide` goes on with it, and "
+                    f"guide {guide[0].id} is open: {headline(guide[1])}; `rigcal session guide` goes on with it, and "
                     "`rigcal session guide --stop REASON` abandons it",
                     REFUSED,
                 )
@@ -164,9 +157,8 @@ class GuideKeeper:
             else:
                 setup_id = self._setups.usable(arguments.get("setup"))
                 request = request_of(arguments, self._rig, self._setups.control_point_names(setup_id))
-            self._table.open(self._clock.now(), setup_id, operator, request.as_dict(), **caller_columns())
-            self._row, self._job = self._table.newest(), Job.of(request)
-            self._taps, self._standstill, self._wanted, self._try_again = 1, None, "", 0.0
+            self._record.open(request, setup_id, operator)
+            self._standstill, self._wanted, self._try_again = None, "", 0.0
             self._watch.forget_fixes()
             self._advisor.forget()
             self._start_advisor()
@@ -178,8 +170,8 @@ class GuideKeeper:
 
     def done_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Take the operator's word that the step is carried out."""
-        with self._turn:
-            job, step_id = self._needs_step(arguments)
+        with self._record.turn:
+            job, step_id = self._record.needs_step(arguments)
             step, run = job.step, job.run
             assert step is not None
             if self._busy == step_id or not run.session:
@@ -194,7 +186,7 @@ class GuideKeeper:
                 self._measured_here()
             else:
                 raise CommandError(f"this step ends by itself: {headline(job)}", REFUSED)
-            self._tapped()
+            self._record.tapped()
             return self._state()
 
     def skip_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -202,15 +194,15 @@ class GuideKeeper:
         reason, rest = _reason(arguments), arguments.get("rest", False)
         if not isinstance(rest, bool):
             raise CommandError(f"rest must be true or false, not {rest!r:.80}")
-        self._needs_step(arguments)
+        self._record.needs_step(arguments)
         self._give_up_work()
-        with self._turn:
-            job, _ = self._needs_step(arguments)
+        with self._record.turn:
+            job, _ = self._record.needs_step(arguments)
             step = job.step
             assert step is not None
             if step.kind == "close" or (rest and step.kind != "poses"):
                 raise CommandError(f"this step cannot be skipped: {headline(job)}", REFUSED)
-            self._tapped()
+            self._record.tapped()
             if step.kind == "change_prism" and self._sessions.open_session() is not None:
                 self._sessions.abort_command({})
             self._happen("skipped", {"reason": reason, "rest": rest})
@@ -219,12 +211,12 @@ class GuideKeeper:
     def more_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Measure more poses of this prism although it is enough."""
         count = whole_argument(arguments, "poses", MORE_POSES, 1, 100)
-        with self._turn:
-            job, _ = self._needs_step(arguments)
+        with self._record.turn:
+            job, _ = self._record.needs_step(arguments)
             step, run = job.step, job.run
             if step is None or step.kind != "poses" or not job.is_enough:
                 raise CommandError(f"more poses are for when there are enough; now: {headline(job)}", REFUSED)
-            self._tapped()
+            self._record.tapped()
             left = len(run.upcoming(count))
             if left < count:
                 self._choose(count - left, as_more=True)
@@ -235,11 +227,11 @@ class GuideKeeper:
     def stop_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Abandon the guide; its open session is closed if it has poses, else aborted."""
         reason = _reason(arguments)
-        self._needs_step({})
+        self._record.needs_step({})
         self._give_up_work()
-        with self._turn:
-            self._needs_step({})
-            self._tapped()
+        with self._record.turn:
+            self._record.needs_step({})
+            self._record.tapped()
             opened = self._sessions.open_session()
             if opened is not None and opened["poses"]:
                 self._sessions.stop_command({})
@@ -247,22 +239,6 @@ class GuideKeeper:
                 self._sessions.abort_command({})
             self._happen("stopped", {"reason": reason})
             return self._state()
-
-    def _needs_step(self, arguments: Mapping[str, Any]) -> tuple[Job, str]:
-        """Return the job and its step; CommandError without an open guide, or where another step is meant."""
-        job = self._job
-        if job is None or job.state != "open":
-            raise CommandError("no guide is open; `rigcal session guide --prisms w,b,r,s` starts one")
-        meant = arguments.get("step")
-        if meant is not None and meant != job.step_id:
-            raise CommandError(f"another step is on by now: {headline(job)}", REFUSED)
-        return job, job.step_id
-
-    def _tapped(self) -> None:
-        """Count a command that was given to the guide."""
-        self._taps += 1
-        if self._row is not None:
-            self._table.count_taps(self._row.id, self._taps)
 
     def _measured_here(self) -> None:
         """Take the standstill at which the boom is for the pose, wherever that is."""
@@ -284,28 +260,18 @@ class GuideKeeper:
 
     def _happen(self, kind: str, details: Mapping[str, Any], *, only_at: str = "") -> bool:
         """Store an event and go on; False where another step than `only_at` is on by now."""
-        with self._turn:
-            row, before = self._row, self._job
-            if row is None or before is None or before.state != "open" or only_at not in ("", before.step_id):
-                return False
-            job, at = before.after(kind, details), self._clock.now()
-            with self._store.transaction():
-                self._table.add(row.id, kind, details, at, **caller_columns())
-                if job.state != "open":
-                    self._table.end(row.id, job.state, at)
-            self._job = job
-            self._followed(before, job)
-            return True
+        with self._record.turn:
+            changed = self._record.happen(kind, details, only_at)
+            if changed is not None:
+                self._followed(*changed)
+            return changed is not None
 
     def _followed(self, before: Job, job: Job) -> None:
         """Do what follows from an event by itself."""
         if job.state != "open":
-            log.info("guide %d is %s", self._row.id if self._row else 0, job.state)
-            self._row = self._table.newest()
             self._advisor.close()
             return
-        on_prism = job.step is not None and job.step.kind == "poses"
-        was_on_prism = before.step is not None and before.step.kind == "poses"
+        on_prism, was_on_prism = is_on_prism(job), is_on_prism(before)
         if was_on_prism and not on_prism:
             self._sessions.look_away()
         if job.at != before.at:
@@ -314,9 +280,9 @@ class GuideKeeper:
             self._assess()
 
     def _aimed(self) -> None:
-        with self._turn:
+        with self._record.turn:
             self._watch.forget_fixes()
-            self._sessions.look_back(self._row.operator if self._row else "")
+            self._sessions.look_back(self._record.row.operator if self._record.row else "")
             self._happen("aimed", {})
 
     # ---- the thread --------------------------------------------------------------------------------------------------
@@ -325,7 +291,7 @@ class GuideKeeper:
         told = ""
         while not self._stopping.wait(TICK_S):
             try:
-                if self.is_open and time.monotonic() >= self._try_again:
+                if self._record.is_open and time.monotonic() >= self._try_again:
                     self._look()
                 told = ""
             except Exception as error:
@@ -335,8 +301,8 @@ class GuideKeeper:
                 told = str(error)
 
     def _look(self) -> None:
-        with self._turn:
-            job = self._job
+        with self._record.turn:
+            job = self._record.job
             if job is None or job.step is None:
                 return
             if not self._advisor.is_alive:
@@ -365,7 +331,7 @@ class GuideKeeper:
     def _look_at_pose(self, job: Job) -> None:
         """See whether the pose is reached and measured."""
         run, number = job.run, job.run.next_pose
-        found = self._table.standstill(run.session, run.last)
+        found = self._record.table.standstill(run.session, run.last)
         self._standstill = found = None if found is None or found.pose == run.label else found
         if number is None or run.poses is None or found is None or found.fixes < NEEDED_FIXES:
             return
@@ -387,10 +353,10 @@ class GuideKeeper:
             self._busy = ""
 
     def _open_session(self) -> None:
-        job, row = self._job, self._row
+        job, row = self._record.job, self._record.row
         if job is None or row is None:
             return
-        last, opened = self._table.newest_observation(), self._sessions.open_session()
+        last, opened = self._record.table.newest_observation(), self._sessions.open_session()
         if opened is None or opened["prism"] != job.run.prism:  # else it was opened just before the daemon ended
             arguments = {
                 "prism": job.run.prism,
@@ -403,7 +369,7 @@ class GuideKeeper:
         self._happen("opened", {"session": opened["id"], "last": last})
 
     def _close_session(self) -> None:
-        job = self._job
+        job = self._record.job
         if job is None:
             return
         opened = self._sessions.open_session()
@@ -427,9 +393,9 @@ class GuideKeeper:
 
     def _point_mm(self, name: str) -> tuple[float, float, float] | None:
         """Where a control point of the set-up is; None where that is not known."""
-        if self._row is None:
+        if self._record.row is None:
             return None
-        known = control_points(self._store, self._row.setup_id)
+        known = control_points(self._store, self._record.row.setup_id)
         return next(((p["x_mm"], p["y_mm"], p["z_mm"]) for p in known if p["name"] == name), None)
 
     def _next_point(self, job: Job) -> str:
@@ -452,13 +418,13 @@ class GuideKeeper:
         return [session["id"] for session in self._session_table.used() if session["kind"] != CHECK]
 
     def _assess(self) -> None:
-        if self._job is not None and self._row is not None:
-            self._advisor.assess(self._job, self._row.setup_id)
+        if self._record.job is not None and self._record.row is not None:
+            self._advisor.assess(self._record.job, self._record.row.setup_id)
 
     def _take_enough(self, session: str, reason: str) -> None:
         """The stop rule says stop: it counts while poses of that session are measured."""
-        with self._turn:
-            job = self._job
+        with self._record.turn:
+            job = self._record.job
             if job is None or job.run.session != session or job.step is None:
                 return
             if job.step.kind == "poses" and not job.is_enough and job.run.done >= job.run.least:
@@ -466,7 +432,7 @@ class GuideKeeper:
 
     def _choose(self, count: int, *, as_more: bool = False) -> None:
         """Ask for poses of the run."""
-        job, row = self._job, self._row
+        job, row = self._record.job, self._record.row
         if job is None or row is None:
             return
         seed = 1000 * row.id + 100 * job.at + len(job.run.poses or ())
@@ -477,10 +443,10 @@ class GuideKeeper:
     def _take_poses(
         self, caller: Caller | None, session: str, poses: list[Pose], trouble: str, *, as_more: bool
     ) -> None:
-        with self._turn, acting_for(caller):
+        with self._record.turn, acting_for(caller):
             self._is_choosing = False
             self._advisor.trouble = trouble
-            job = self._job
+            job = self._record.job
             if job is None or job.state != "open" or job.run.session != session:
                 return
             if trouble:
@@ -493,8 +459,8 @@ class GuideKeeper:
     # ---- state -------------------------------------------------------------------------------------------------------
 
     def _state(self) -> dict[str, Any]:
-        with self._turn:
-            row, job = self._row, self._job
+        with self._record.turn:
+            row, job = self._record.row, self._record.job
             if row is None or job is None:
                 return {"guide": None}
             step = job.step
@@ -504,7 +470,7 @@ class GuideKeeper:
                 standstill=self._standstill,
                 accuracy=accuracy_view(job, self._advisor.accuracy),
                 coverage=self._advisor.coverage,
-                taps=self._taps,
+                taps=self._record.taps,
                 is_busy=self._is_busy(job),
                 is_detected=self._has_aim or (bool(point) and self._point_mm(point) is not None),
                 has_aim=self._has_aim,
@@ -528,43 +494,14 @@ class GuideKeeper:
             found.append(self._advisor.trouble)
         return found
 
-    # ---- after a restart ---------------------------------------------------------------------------------------------
-
     def _restore(self) -> None:
         """Go on with the guide that an earlier run left."""
-        row = self._table.newest()
-        if row is None:
-            return
-        job, events = Job.of(Request.of(row.request)), self._table.events(row.id)
-        for event in events:
-            job = job.after(event.kind, event.details)
-        self._row, self._job = row, job
-        self._taps = row.taps
-        if job.state != "open":
-            return
-        log.warning("guide %d was open when rigcal last ended; it goes on: %s", row.id, headline(job))
-        if not job.run.session:
-            return
+        self._record.restore()
         # Fixes that were captured and are not decoded yet must not count where the station was on no prism.
-        away: Stamp | None = None
-        current = Job.of(job.request)
-        for event in events:
-            before, current = current, current.after(event.kind, event.details)
-            if event.kind == "opened" and current.at == job.at:
-                away = event.at
-            elif current.at == job.at and event.kind == "aimed":
-                self._sessions.look_away(away, event.at)
-                away = None
-            elif current.at == job.at and _left_prism(before, current):
-                away = event.at
-        if away is not None:
-            self._sessions.look_away(away)
-        self._start_advisor()
-
-
-def _left_prism(before: Job, after: Job) -> bool:
-    was = before.step is not None and before.step.kind == "poses"
-    return was and (after.step is None or after.step.kind != "poses")
+        for since, until in self._record.times_away():
+            self._sessions.look_away(since, until)
+        if self._record.is_open:
+            self._start_advisor()
 
 
 def _reason(arguments: Mapping[str, Any]) -> str:

@@ -66,8 +66,8 @@ def main() -> None:
             end = GuidedOperator(daemon.say).follow(lag.look, limit_s=3000.0)
             print(f"{end['state']} in {time.monotonic() - began:.0f} s; commands to the guide: {end['taps']}")
             print(
-                f"the meter knew of a pose after {np.median(lag.seconds):.2f} s in the median, {max(lag.seconds):.2f} s "
-                f"at most, {np.mean(np.array(lag.seconds) <= 1.0):.0%} within 1 s, of {len(lag.seconds)} poses"
+                f"the meter knew a pose after {np.median(lag.seconds):.2f} s in the median, {max(lag.seconds):.2f} "
+                f"s at most, {np.mean(np.array(lag.seconds) <= 1.0):.0%} within 1 s, of {len(lag.seconds)} poses"
             )
             if options.no_jobs:
                 return
