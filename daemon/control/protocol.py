@@ -35,6 +35,7 @@ READING = frozenset(
         "model.show",
         "tip",
         "alarms.list",
+        "guide.state",
     }
 )
 
