@@ -52,6 +52,7 @@ class Overview:
     def command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Return the state of everything; a part of the store that is damaged hides no other."""
         unreadable: dict[str, str] = {}
+        clock = self.parts.clock
 
         def stored(part: str, read: Callable[[], T]) -> T | None:
             try:
@@ -65,6 +66,7 @@ class Overview:
             "rig": self.parts.rig.name,
             "mode": self.parts.mode,
             "version": importlib.metadata.version("rigcal"),
+            "clock": {"utc_ns": clock.now().utc_ns, "real_s_per_s": clock.real_seconds(1.0)},
             "alarms": self.alarms.status(),
             "notices": self.notices.status(),
             "acquisition": asdict(self.acquisition()),

@@ -254,6 +254,7 @@ class Daemon:
         sessions, jobs, models = self._sessions, self._jobs, self._models
         commands: dict[str, Handler] = {
             "status": self._overview.command,
+            "rig.show": self._show_rig,
             "setup.new": self._setups.new_command,
             "setup.list": self._setups.list_command,
             "session.start": self._start_session,
@@ -293,6 +294,10 @@ class Daemon:
         if health.state in ("missing", "replaced"):
             raise CommandError(f"no session is started: {health.text}", REFUSED)
         return self._sessions.start_command(arguments)
+
+    def _show_rig(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the rig's name and the text of the file that describes it."""
+        return {"rig": self._parts.rig.name, "text": self._parts.rig_text}
 
     def _visit(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Send the simulated boom to the rows of a pose plan; `left` tells how many stops are to come."""
