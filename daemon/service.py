@@ -271,6 +271,7 @@ class Daemon:
             "model.list": models.list_command,
             "model.show": models.show_command,
             "model.accept": models.accept_command,
+            "model.reject": models.reject_command,
             "model.rollback": models.rollback_command,
             "model.zeros-checked": models.zeros_checked_command,
             "model.compare": models.compare_command,
