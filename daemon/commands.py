@@ -87,8 +87,8 @@ def go_on_for_caller() -> None:
 
 
 @contextlib.contextmanager
-def acting_for(caller: Caller, has_left: Callable[[], bool] = lambda: False) -> Iterator[None]:
-    """Make `caller` the current one of this thread; `has_left` tells when it no longer waits for the answer."""
+def acting_for(caller: Caller | None, has_left: Callable[[], bool] = lambda: False) -> Iterator[None]:
+    """Make `caller` the current one of this thread, None for nobody; `has_left` tells when it waits no longer."""
     token, left_token = _current.set(caller), _has_left.set(has_left)
     try:
         yield

@@ -58,6 +58,7 @@ class Parts:
         can_links: those that can be asked for active set-up.
         visit: drives the boom to the rows of a pose plan, and tells how many stops are to come; None where only an
             operator does.
+        turn: turns the simulated station as an operator's hand would; None where it turns by itself, or is real.
         is_over: True when a replay has ended.
     """
 
@@ -70,6 +71,7 @@ class Parts:
     joiner: ObservationJoiner
     aim: Callable[[str], None] | None = None
     visit: Callable[[Sequence[Mapping[str, Any]]], int] | None = None
+    turn: Callable[[str], None] | None = None
     can_links: Sequence[CanLink] = ()
     is_over: Callable[[], bool] = _never
 
@@ -98,6 +100,7 @@ def simulated(
     effects: tuple[str, ...],
     secret: Path | None = None,
     dwell_s: float,
+    is_by_hand: bool = False,
 ) -> Iterator[Parts]:
     """Compose a simulated rig behind real protocols, in a process of its own, on the configured links' names.
 
@@ -109,6 +112,7 @@ def simulated(
         effects: hidden effects, as the simulator spells them.
         secret: directory in which the simulator names one more, which it draws; none by default.
         dwell_s: how long the boom stands at each pose, simulated seconds.
+        is_by_hand: boom and station move only as they are told, as by an operator's hands.
     """
     now = SystemClock().now()
     clock = ScaledClock(rate, Stamp(now.utc_ns, now.monotonic_ns, f"simulated-{uuid.uuid4()}"))
@@ -142,9 +146,11 @@ def simulated(
         can = tuple(section.model_copy(update=bus) for section in config.can)
         station = tuple(section.model_copy(update={"serial": line}) for section in config.station)
         rewired = config.model_copy(update={"can": can, "station": station})
-        parts = _parts("simulated", rewired, source, clock, aim=partial(_aim, simulation))
-        parts = replace(parts, visit=partial(_visit, simulation, source.rig, dwell_s))
-        simulation.drive_around(dwell_s)
+        turn = partial(_aim, simulation)
+        parts = _parts("simulated", rewired, source, clock, aim=None if is_by_hand else turn)
+        visit = partial(_visit, simulation, source.rig, dwell_s)
+        parts = replace(parts, visit=visit, turn=turn if is_by_hand else None)
+        simulation.drive_around(dwell_s, is_by_hand=is_by_hand)
         yield parts
     finally:
         simulation.close()

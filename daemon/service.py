@@ -19,11 +19,21 @@ from daemon.acquisition.redecoding import redecode_command
 from daemon.acquisition.thinning import Thinning
 from daemon.alarms.board import AlarmBoard
 from daemon.alarms.evidence import Gatherer
-from daemon.commands import FAILED, REFUSED, CommandError, Handler, go_on_for_caller, reading_socket
+from daemon.commands import (
+    FAILED,
+    REFUSED,
+    CommandError,
+    Handler,
+    go_on_for_caller,
+    reading_socket,
+    text_argument,
+)
 from daemon.composition import Parts, motion_limits
 from daemon.config import Config
 from daemon.control.protocol import reading_only
 from daemon.control.server import ControlServer
+from daemon.guide.keeper import GuideKeeper
+from daemon.guide.meter_link import Place
 from daemon.host.systemd import Notifier
 from daemon.jobs.runner import JobRunner
 from daemon.models.live_model import LiveModel
@@ -51,6 +61,7 @@ from drivers.readings import Record
 
 log = logging.getLogger(__name__)
 
+GUARDED = ("setup.new", "session.start", "session.stop", "session.abort", "session.shoot")  # a guide does them itself
 BEAT_S = 1.0
 STOP_S = 20.0  # real seconds for all parts together, well within the unit's TimeoutStopSec
 STORE_END_S = 3.0  # of them for the store's last commits
@@ -131,6 +142,18 @@ class Daemon:
         evidence = Gatherer(parts.clock, before, self._evidence())
         self._alarms = AlarmBoard(alarms, evidence, parts.clock, tell=self._notices.take)
         self._models = ModelRegistry(models, parts.rig.name, self._live_model, compare=self._jobs.compare)
+        self._guide = GuideKeeper(
+            parts.rig,
+            store,
+            self._sessions,
+            self._setups,
+            parts.joiner,
+            parts.clock,
+            meter_place=lambda: Place.of(store, parts.rig_text, models.live()),
+            model=self._awaiting_model,
+            settle_s=config.sessions.settle_s,
+            has_aim=parts.aim is not None,
+        )
         self._overview = Overview(
             parts,
             store,
@@ -198,6 +221,7 @@ class Daemon:
                 self._sender.start()
             if self._config.jobs.enabled:
                 self._jobs.start()
+            self._guide.start()
             notifier.send("READY=1", f"STATUS=acquiring rig {self._parts.rig.name}")
             log.info("acquiring rig %s; control socket %s", self._parts.rig.name, self._config.socket_path)
             while not stop.wait(beat_s):
@@ -224,7 +248,14 @@ class Daemon:
         """Stop all parts within `STOP_S`, side by side, so that no one's stop delays what was captured."""
         budget = TimeBudget(STOP_S)
         stops = [server.close for server in self._servers]
-        stops += [self._live_model.stop, self._jobs.stop, self._watch.stop, self._notices.stop, self._housekeeping.stop]
+        stops += [
+            self._guide.stop,
+            self._live_model.stop,
+            self._jobs.stop,
+            self._watch.stop,
+            self._notices.stop,
+            self._housekeeping.stop,
+        ]
         stops += [part.stop for part in (self._sender, self._metrics) if part is not None]
         others = [threading.Thread(target=_stop_part, args=(stop,), daemon=True) for stop in stops]
         for thread in others:
@@ -249,6 +280,7 @@ class Daemon:
             self._sessions.on_records(records)  # feeds the joiner, which the tip looks at
         finally:
             self._tip.on_records(records)  # also when an observation cannot be stored: an encoder may have jumped
+            self._guide.on_records(records)
 
     def _commands(self) -> Mapping[str, Handler]:
         sessions, jobs, models = self._sessions, self._jobs, self._models
@@ -281,8 +313,16 @@ class Daemon:
             "devices.configure": self._configure_devices,
             "store.prune": self._prune,
             "store.redecode": self._redecode,
+            "guide.start": self._start_guide,
+            "guide.state": self._guide.state_command,
+            "guide.done": self._guide.done_command,
+            "guide.skip": self._guide.skip_command,
+            "guide.more": self._guide.more_command,
+            "guide.stop": self._guide.stop_command,
             **({} if self._parts.visit is None else {"simulation.visit": self._visit}),
+            **({} if self._parts.turn is None else {"simulation.aim": self._turn}),
         }
+        commands |= {name: self._guide.guarding(name, commands[name]) for name in GUARDED}
         return {name: partial(self._carry_out, handler) for name, handler in commands.items()}
 
     def _carry_out(self, handler: Handler, arguments: Mapping[str, Any]) -> Any:
@@ -299,6 +339,30 @@ class Daemon:
     def _show_rig(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Return the rig's name and the text of the file that describes it."""
         return {"rig": self._parts.rig.name, "text": self._parts.rig_text}
+
+    def _start_guide(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Open a guide, unless its store would be lost when the daemon stops."""
+        health = self._watch.health
+        if health.state in ("missing", "replaced"):
+            raise CommandError(f"no guide is started: {health.text}", REFUSED)
+        return self._guide.start_command(arguments)
+
+    def _awaiting_model(self) -> dict[str, Any]:
+        """Return the candidate that awaits for a guide that is finished, and how many jobs are still at work."""
+        waiting = self._models.status()["candidate"]
+        about = dict.fromkeys(("id", "is_acceptable", "refused_because", "sentence"))
+        if waiting is not None:
+            compared = waiting["comparison"]
+            about = {key: waiting[key] for key in ("id", "is_acceptable", "refused_because")}
+            about["sentence"] = compared and compared["sentence"]
+        return about | {"jobs": len(self._job_table.unfinished())}
+
+    def _turn(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Turn the simulated station to a prism or a control point."""
+        target = text_argument(arguments, "target")
+        assert self._parts.turn is not None  # else there is no such command
+        self._parts.turn(target)
+        return {"target": target}
 
     def _visit(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Send the simulated boom to the rows of a pose plan; `left` tells how many stops are to come."""

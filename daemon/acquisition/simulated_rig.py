@@ -26,6 +26,7 @@ log = logging.getLogger(__name__)
 
 BOOM_SPEED = 0.45  # of the joints' greatest rates
 _REFUSES = 2  # exit status of a simulator that was asked for what there is not
+_HAND_S = 0.02  # how often, in real time, it is looked whether the operator wants the boom elsewhere
 POSES_AHEAD = 30  # drawn at a time, and visited by the short way
 
 
@@ -115,9 +116,13 @@ class SimulatedRig:
         self._stops.extend(stops)
         return len(self._stops)
 
-    def drive_around(self, dwell_s: float) -> None:
-        """Keep moving from one random pose to the next, standing `dwell_s` at each, until closed."""
-        self._autopilot = threading.Thread(target=self._drive, args=(dwell_s,), name="autopilot", daemon=True)
+    def drive_around(self, dwell_s: float, *, is_by_hand: bool = False) -> None:
+        """Keep moving from one random pose to the next, standing `dwell_s` at each, until closed.
+
+        Where it `is_by_hand`, the boom goes to the poses of `visit` alone, and stands in between.
+        """
+        drive = self._follow if is_by_hand else partial(self._drive, dwell_s)
+        self._autopilot = threading.Thread(target=drive, name="autopilot", daemon=True)
         self._autopilot.start()
 
     def close(self) -> None:
@@ -154,6 +159,19 @@ class SimulatedRig:
                         return
                     if self._stops and self._stops[0][0] is here:
                         self._stops.popleft()
+        except SimulationError as error:
+            if not self._stopping.is_set():
+                log.error("the simulated boom stands still: %s", error)
+
+    def _follow(self) -> None:
+        """Go to the poses of `visit`, and stand at the last one until there is another."""
+        try:
+            while not self._stopping.wait(_HAND_S):
+                if self._stops:
+                    pose, stand_s = self._stops.popleft()
+                    self.move(pose)
+                    if self._stops and stand_s > 0.0 and self._clock.wait(self._stopping, stand_s):
+                        return
         except SimulationError as error:
             if not self._stopping.is_set():
                 log.error("the simulated boom stands still: %s", error)

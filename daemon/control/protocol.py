@@ -36,6 +36,7 @@ READING = frozenset(
         "tip",
         "alarms.list",
         "rig.show",
+        "guide.state",
     }
 )
 

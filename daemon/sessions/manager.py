@@ -219,8 +219,8 @@ class SessionKeeper:
 
     # ---- sessions ----------------------------------------------------------------------------------------------------
 
-    def start_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Open a session: from now on good fixes become its observations."""
+    def start_command(self, arguments: Mapping[str, Any], *, is_aimed: bool = True) -> dict[str, Any]:
+        """Open a session: from now on good fixes become its observations; from `look_back` on where not `is_aimed`."""
         with self._commands:
             if self._open is not None:
                 raise CommandError(f"session {self._open.id!r} is open; stop or abort it first")
@@ -253,7 +253,10 @@ class SessionKeeper:
             }
             self._table.start(now, **row)
             order = self._store.order
-            self._open = session = OpenSession(session_id, setup_id, prism, kind, order, now, control_points=points)
+            session = OpenSession(session_id, setup_id, prism, kind, order, now, control_points=points)
+            if not is_aimed:
+                session.shots.append(Shot(0, now))
+            self._open = session
             if self._aim is not None:
                 self._prisms.turned(session, now)
             return {
@@ -354,6 +357,26 @@ class SessionKeeper:
                 log.warning("station not aimed at prism %s again: %s", session.prism, error)
             finally:
                 self._commands.release()
+
+    # ---- for a guide -------------------------------------------------------------------------------------------------
+
+    def look_away(self, since: Stamp | None = None, until: Stamp | None = None) -> None:
+        """Count no fix of the open session from an instant on, now by default: the station is not on its prism.
+
+        Args:
+            since: when it was turned away.
+            until: when it was back, where that is over already.
+        """
+        session = self._open
+        if session is not None:
+            session.shots.append(Shot(0, since or self._clock.now(), until))
+
+    def look_back(self, operator: str) -> None:
+        """Count the fixes of the open session again, on an operator's word that the station is on its prism."""
+        session = self._needs_open()
+        self._prisms.confirm(session, operator)
+        for shot in session.shots:
+            shot.until = shot.until or self._clock.now()
 
     def prism_suspicions(self) -> list[Suspicion]:
         """Stations that may be on another prism than that of the open session; from any thread."""

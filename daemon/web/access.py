@@ -164,7 +164,9 @@ class TokenBook:
             raise CommandError(f"{self.path}: not a file of tokens ({first}); remove it and add them anew") from error
         for entry in entries:
             if entry.role not in ROLE_NAMES:
-                raise CommandError(f"{self.path}: {entry.name!r} has role {entry.role!r}; roles: {', '.join(ROLE_NAMES)}")
+                raise CommandError(
+                    f"{self.path}: {entry.name!r} has role {entry.role!r}; roles: {', '.join(ROLE_NAMES)}"
+                )
         return entries
 
     def _write(self, entries: tuple[_Entry, ...]) -> None:

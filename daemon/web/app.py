@@ -107,7 +107,9 @@ class Page:
         address = request.client.host if request.client else ""
         wait_s = self._wrong.wait_s(address)
         if wait_s:
-            raise Refused(429, f"too many wrong tokens; try again in {wait_s:.0f} s", **{"Retry-After": f"{wait_s:.0f}"})
+            raise Refused(
+                429, f"too many wrong tokens; try again in {wait_s:.0f} s", **{"Retry-After": f"{wait_s:.0f}"}
+            )
         person = self._tokens.find(token) if len(token) <= _TOKEN_CHARACTERS else None
         if person is None:
             self._wrong.note(address)
@@ -135,9 +137,7 @@ class Page:
         if person is None:
             return JSONResponse({"name": "", "role": None, "by_token": False, "local_user": local})
         by_token = bool(person.name)
-        return JSONResponse(
-            {"name": person.name, "role": person.role.word, "by_token": by_token, "local_user": local}
-        )
+        return JSONResponse({"name": person.name, "role": person.role.word, "by_token": by_token, "local_user": local})
 
     async def _login(self, request: Request) -> Response:
         token = (await _object(request)).get("token")
@@ -145,16 +145,19 @@ class Page:
         if person is None or not isinstance(token, str):
             raise Refused(401, "this token is not known here; was it removed?")
         answer = JSONResponse({"name": person.name, "role": person.role.word})
-        about: dict[str, Any] = {"httponly": True, "samesite": "strict", "path": "/", "secure": self._settings.is_secure}
+        about: dict[str, Any] = {
+            "httponly": True,
+            "samesite": "strict",
+            "path": "/",
+            "secure": self._settings.is_secure,
+        }
         answer.set_cookie(self._cookie, token.strip(), max_age=_COOKIE_S, **about)
         return answer
 
     async def _logout(self, request: Request) -> Response:
         del request
         answer = JSONResponse({})
-        answer.delete_cookie(
-            self._cookie, path="/", secure=self._settings.is_secure, httponly=True, samesite="strict"
-        )
+        answer.delete_cookie(self._cookie, path="/", secure=self._settings.is_secure, httponly=True, samesite="strict")
         return answer
 
     # ---- the page and its state --------------------------------------------------------------------------------------
@@ -169,7 +172,9 @@ class Page:
         try:
             first = await anext(events)
         except Full:
-            raise Refused(503, "so many browsers look already that no more are taken", **{"Retry-After": "10"}) from None
+            raise Refused(
+                503, "so many browsers look already that no more are taken", **{"Retry-After": "10"}
+            ) from None
 
         async def all_events() -> Any:
             try:

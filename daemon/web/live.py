@@ -101,12 +101,7 @@ class LiveFeed:
         """Return the state for the page; `daemon` says why there is none, None where there is."""
         try:
             status = await connection.ask("status", timeout_s=ANSWER_S)
-            try:  # TEMPORARY until the guide's commands are merged
-                guide = (await connection.ask("guide.state", timeout_s=ANSWER_S))["guide"]
-            except CommandError as error:
-                if "unknown command" not in str(error):
-                    raise
-                guide = None
+            guide = (await connection.ask("guide.state", timeout_s=ANSWER_S))["guide"]
         except CommandError as error:
             silent_s = None
             if self._answered_ns is not None:

@@ -55,6 +55,12 @@ _DWELL = click.FloatRange(1, 600)
     help="Hide one more effect, which the simulated machine draws and names in a file there.",
 )
 @click.option("--dwell", "dwell_s", type=_DWELL, default=4.0, show_default=True, help="Simulated stand at a pose, s.")
+@click.option(
+    "--by-hand",
+    "is_by_hand",
+    is_flag=True,
+    help="Boom and station of the simulated rig move only as the commands simulation.visit and simulation.aim say.",
+)
 @click.option("-v", "--verbose", is_flag=True, help="Log more.")
 @json_option
 def run(
@@ -67,6 +73,7 @@ def run(
     dwell_s: float,
     *,
     sim: bool,
+    is_by_hand: bool,
     is_replay: bool,
     verbose: bool,
     as_json: bool,
@@ -83,6 +90,8 @@ def run(
     set_up_logging(level=logging.DEBUG if verbose else logging.INFO)
     if not verbose:
         logging.getLogger("can").setLevel(logging.WARNING)  # python-can tells of every socket that it makes
+    if is_by_hand and not sim:
+        raise click.UsageError("--by-hand is for a simulated rig: give --sim as well")
     if bool(files) != is_replay or (sim and is_replay):
         raise click.UsageError("give either --sim, or --replay FILE..., or neither")
     if config is not None:
@@ -102,7 +111,16 @@ def run(
             # The store first: its lock keeps a second daemon from touching anything of the first one's.
             store = stack.enter_context(contextlib.closing(Store(settings.store_path)))
             if sim:
-                rig = simulated(settings, source, rate=rate, seed=seed, effects=effects, secret=secret, dwell_s=dwell_s)
+                rig = simulated(
+                    settings,
+                    source,
+                    rate=rate,
+                    seed=seed,
+                    effects=effects,
+                    secret=secret,
+                    dwell_s=dwell_s,
+                    is_by_hand=is_by_hand,
+                )
                 parts = stack.enter_context(rig)
             elif is_replay:
                 parts = replayed(settings, source, files, rate)

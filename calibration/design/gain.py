@@ -1,0 +1,181 @@
+"""The accuracy to expect from what was measured so far, and what the next poses will bring.
+
+The measured rows are fitted as for a model without effects. The covariance of that fit, with the noise that it found,
+gives the expected accuracy over the work volume; the Jacobians of poses that are not measured yet give what they bring.
+Before there are enough rows for a model, build tolerances hold what the rows do not show.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from calibration.design.accuracy import ExpectedAccuracy, predicted_accuracy
+from calibration.design.candidates import Candidates, draw, work_volume
+from calibration.design.exchange import covariance_of
+from calibration.design.knowledge import Knowledge
+from calibration.design.poses import plan, whitened
+from calibration.design.visibility import Bodies, Site, in_view, site
+from calibration.identification.refinement import refine
+from calibration.identification.solve import place
+from calibration.kinematics.chain import Chain, Placement
+from calibration.numerics.matrices import root_of
+from calibration.observations import Floats, Observations
+from calibration.rig.description import Rig
+
+LEAST_POSES = 4  # fewer do not tell where the station stands
+FORECAST = 5  # poses that the meter looks ahead
+VOLUME = 400  # poses of the work volume; a larger sample changes the RMS by less than 2 %
+_CANDIDATES = 3000
+_CHUNK = 10  # poses that are ordered for short motion among themselves: the most telling ones come first
+_SEED = 0
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What is known of a rig from rows that were measured, before a model is made of them.
+
+    Attributes:
+        knowledge: parameters and covariance of the fit, at the set-up in question; of the build tolerances where
+            `is_placed` is False.
+        at: what stands around the rig.
+        is_placed: whether the rows tell where the station stands.
+        lacking: scale of the errors of joints that the model is known to leave, as `joint_error_scale` gives it.
+        fixes: of a prism at a standstill, on average.
+    """
+
+    knowledge: Knowledge
+    at: Site
+    is_placed: bool
+    lacking: float = 0.0
+    fixes: float = 1.0
+
+    @property
+    def rig(self) -> Rig:
+        """The rig description."""
+        return self.knowledge.chain.rig
+
+    @cached_property
+    def volume(self) -> Floats:
+        """(v, joints) poses of the work volume, always the same."""
+        return work_volume(self.knowledge, self.at, np.random.default_rng(_SEED), VOLUME)
+
+    def accuracy(self, root: Floats | None = None) -> ExpectedAccuracy:
+        """Expected accuracy over the work volume; `root` of the covariance where it is another than that of now."""
+        root = self.knowledge.root if root is None else root
+        return predicted_accuracy(self.knowledge, root, self.volume, joint_error_scale=self.lacking)
+
+    def after(self, readings: Floats, prism: str) -> Floats:
+        """Root of the covariance once a prism is measured in more poses (n, joints)."""
+        seen = np.zeros((len(readings), len(self.rig.prisms)), dtype=bool)
+        seen[:, self.rig.prism_names.index(prism)] = True
+        poses = Candidates(readings, {"fixes": np.full(len(readings), self.fixes)}, seen)
+        with threadpool_limits(1, user_api="blas"):
+            return np.asarray(self.knowledge.root @ root_of(covariance_of(whitened(self.knowledge, poses))))
+
+
+def from_rows(rig: Rig, observations: Observations | None, setup: str, *, lacking: float = 0.0) -> Measured:
+    """Say what rows tell of a rig and of a station's place.
+
+    Args:
+        rig: the rig description.
+        observations: rows measured so far, at any set-ups; None where there are none.
+        setup: the set-up whose station measures now.
+        lacking: as in `Measured`.
+
+    Raises:
+        UnsafeError: rows at the set-up that cannot place its base (all on a line), or those of another machine.
+    """
+    poses = 0 if observations is None else len(_standstills(observations.select(observations.setup == setup)))
+    if observations is None or poses < LEAST_POSES:
+        return _nominal(rig, lacking)
+    # A set-up with too few rows to place its base tells nothing.
+    placed = [s for s in np.unique(observations.setup) if (observations.setup == s).sum() >= LEAST_POSES]
+    rows = observations.select(np.isin(observations.setup, placed))
+    with threadpool_limits(1, user_api="blas"):
+        chain, samples, start = place(rig, rows)
+        nominal = refine(chain, samples, start.x, free=np.isinf(chain.prior_sigma))
+        fit = refine(chain, samples, nominal.x)
+    excess = fit.excess_variance + samples.repeat_variance
+    knowledge = Knowledge(chain, fit.x, chain.setups.index(setup), root_of(fit.covariance), excess)
+    at = site(chain, fit.x, setup=knowledge.setup)
+    return Measured(knowledge, at, True, lacking, len(rows) / max(1, len(_standstills(rows))))
+
+
+def _nominal(rig: Rig, lacking: float) -> Measured:
+    """What the rig file alone tells, with the station assumed where it sees most."""
+    blank = Chain(rig, {"": Placement.identity()})
+    at = site(blank, np.zeros(len(blank)))
+    from calibration.design.visibility import placement
+
+    chain = Chain(rig, {"": placement(at)})
+    return Measured(Knowledge.of_rig(chain), at, False, lacking)
+
+
+def _standstills(observations: Observations) -> set[tuple[str, str, str]]:
+    return set(
+        zip(observations.session.tolist(), observations.pose.tolist(), observations.prism.tolist(), strict=True)
+    )
+
+
+def chosen_poses(measured: Measured, prism: str, count: int, seed: int) -> Floats:
+    """Choose poses that lower the expected error over the work volume most, the most telling ones first.
+
+    Args:
+        measured: what is known.
+        prism: the one to measure; it is in view in all poses.
+        count: how many poses.
+        seed: of the candidates.
+
+    Returns:
+        (n, joints) poses, n <= count, each ten in the order of a short motion.
+    """
+    rng = np.random.default_rng([_SEED, seed])
+    knowledge = measured.knowledge
+    index = knowledge.chain.rig.prism_names.index(prism)
+    drawn = draw(knowledge, measured.at, rng, _CANDIDATES)
+    drawn = drawn.select(np.flatnonzero(drawn.seen[:, index]))
+    alone = np.zeros_like(drawn.seen)
+    alone[:, index] = True
+    candidates = replace(drawn, conditions={}, seen=alone)
+    found = np.empty((0, len(knowledge.chain.rig.joints)))
+    while len(found) < count and len(candidates) > _CHUNK:
+        part = plan(knowledge, candidates, min(_CHUNK, count - len(found)), volume=measured.volume)
+        found = np.concatenate([found, part.poses.readings])
+        knowledge = replace(knowledge, root=part.root)
+        taken = (candidates.readings[:, None, :] == part.poses.readings[None, :, :]).all(axis=2).any(axis=1)
+        candidates = candidates.select(np.flatnonzero(~taken))
+    return found
+
+
+def random_poses(measured: Measured, prism: str, count: int, seed: int) -> Floats:
+    """Draw poses (n, joints), n <= count, evenly among those in which a prism is in view."""
+    knowledge = measured.knowledge
+    drawn = work_volume(knowledge, measured.at, np.random.default_rng([_SEED, 1, seed]), 20 * count)
+    seen = in_view(Bodies.of(knowledge.chain, knowledge.x, drawn), measured.at)
+    found: Floats = drawn[seen[:, knowledge.chain.rig.prism_names.index(prism)]][:count]
+    return found
+
+
+def reached(rig: Rig, readings: Floats) -> dict[str, tuple[float, float]]:
+    """Joint -> lowest and highest reading of poses (n, joints), n > 0."""
+    low, high = readings.min(axis=0), readings.max(axis=0)
+    return {name: (float(low[i]), float(high[i])) for i, name in enumerate(rig.joint_names)}
+
+
+def volume_share(volume: Floats, ranges: Mapping[str, tuple[float, float]]) -> float:
+    """Share of the work volume's poses (v, joints) that lie inside all ranges, given in the order of the joints."""
+    edges = np.array(list(ranges.values()))
+    inside = ((volume >= edges[:, 0]) & (volume <= edges[:, 1])).all(axis=1)
+    return float(inside.mean())
+
+
+def rms_mm(accuracy: ExpectedAccuracy, prisms: tuple[str, ...]) -> float:
+    """Expected RMS 3-D error over the work volume of some of the prisms."""
+    which = [accuracy.rig.prism_names.index(prism) for prism in prisms]
+    return math.sqrt(float(np.mean(accuracy.rms_3d_mm[:, which] ** 2)))

@@ -1,0 +1,395 @@
+"""The job of a guide as a pure state machine: what it was asked for, what has happened, what is to be done next.
+
+A job is a run for each prism and one for the check; a run is a session. Its state follows from the request and the
+events alone, so a guide that is read from the store goes on where it was. Events and their details:
+
+    opened    {session, last}                the run's session is open; the station is not on the prism yet
+    planned   {poses: [{joint: number}]}     the poses of the run
+    shot      {point, misclosure_mm}         the control point of this step was measured
+    aimed     {}                             the station is on the prism: fixes count from now on
+    measured  {pose, last}                   the pose is done: label and newest observation of its standstill
+    enough    {reason}                       the stop rule says stop
+    more      {poses: [{joint: number}]}     measure these as well
+    left      {}                             on to the control points at the session's end
+    closed    {session}                      the session is closed
+    skipped   {reason, rest}                 this step, or all poses of the run that are left
+    failed    {text}                         a shot or a session's start failed; the step stays
+    stopped   {reason}                       abandoned
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+from daemon.commands import CHECK
+
+Pose = Mapping[str, float]
+"""Joint -> value, deg or mm."""
+
+StepKind = Literal["shoot_control_point", "change_prism", "poses", "close"]
+State = Literal["to do", "done", "skipped"]
+
+
+@dataclass(frozen=True)
+class Request:
+    """The job that a guide was asked for.
+
+    Attributes:
+        control_points: to shoot at the start and at the end of every session.
+        prisms: to measure, in this order.
+        poses: most poses of a prism.
+        check_poses: poses of the check, 0 for none.
+        target_mm: expected error at which it is enough; None where none was given.
+        plan: poses with the prisms in view; None where they are chosen on the spot.
+    """
+
+    control_points: tuple[str, ...]
+    prisms: tuple[str, ...]
+    poses: int
+    check_poses: int
+    target_mm: float | None = None
+    plan: tuple[tuple[Pose, tuple[str, ...]], ...] | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """For the store."""
+        plan = None if self.plan is None else [{"joints": dict(p), "prisms": list(seen)} for p, seen in self.plan]
+        return {
+            "control_points": list(self.control_points),
+            "prisms": list(self.prisms),
+            "poses": self.poses,
+            "check_poses": self.check_poses,
+            "target_mm": self.target_mm,
+            "plan": plan,
+        }
+
+    @classmethod
+    def of(cls, stored: Mapping[str, Any]) -> Request:
+        """Read what `as_dict` made."""
+        plan = stored["plan"]
+        return cls(
+            tuple(stored["control_points"]),
+            tuple(stored["prisms"]),
+            stored["poses"],
+            stored["check_poses"],
+            stored["target_mm"],
+            None if plan is None else tuple((row["joints"], tuple(row["prisms"])) for row in plan),
+        )
+
+    def planned(self, prism: str) -> tuple[Pose, ...] | None:
+        """Poses of the plan in which a prism is in view; None without a plan."""
+        return None if self.plan is None else tuple(pose for pose, seen in self.plan if prism in seen)
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of a run.
+
+    Attributes:
+        kind: what is to be done.
+        point, phase: the control point, and `start` or `end` of the session; "" for others.
+        state: whether it is done.
+        reason: why it was skipped.
+    """
+
+    kind: StepKind
+    point: str = ""
+    phase: str = ""
+    state: State = "to do"
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class PlannedPose:
+    """A pose of a run.
+
+    Attributes:
+        joints: where to go; empty where it is not known yet.
+        state, reason: as of a step.
+    """
+
+    joints: Pose
+    state: State = "to do"
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Run:
+    """The session of one prism.
+
+    Attributes:
+        prism, kind: of the session.
+        steps: in their order.
+        most: poses that are planned at most.
+        poses: None until they are chosen.
+        session: "" until it is open.
+        last: number of the newest observation of the standstill that was measured last, or before the session.
+        label: of that standstill.
+        enough: why it is enough; "" while it is not.
+        least: poses that must be done before the stop rule is asked again.
+    """
+
+    prism: str
+    kind: str
+    steps: tuple[Step, ...]
+    most: int
+    poses: tuple[PlannedPose, ...] | None = None
+    session: str = ""
+    last: int = 0
+    label: str = ""
+    enough: str = ""
+    least: int = 0
+
+    @property
+    def next_step(self) -> int | None:
+        """Index of the step to do; None at the end."""
+        return next((i for i, step in enumerate(self.steps) if step.state == "to do"), None)
+
+    @property
+    def next_pose(self) -> int | None:
+        """Index of the pose to go to; None where none is left or they are not chosen."""
+        return next((i for i, pose in enumerate(self.poses or ()) if pose.state == "to do"), None)
+
+    @property
+    def done(self) -> int:
+        """Number of poses that are measured."""
+        return sum(pose.state == "done" for pose in self.poses or ())
+
+    def upcoming(self, count: int) -> list[Pose]:
+        """The next poses to measure."""
+        return [pose.joints for pose in self.poses or () if pose.state == "to do"][:count]
+
+
+@dataclass(frozen=True)
+class Job:
+    """The state of a guide.
+
+    Attributes:
+        request: what it was asked for.
+        runs: in their order.
+        state: open, finished or abandoned.
+        misclosure_mm: of the newest shot.
+        shots: number of shots so far.
+        trouble: why the last attempt at this step failed; "" after it went on.
+        ended_because: why it was abandoned.
+    """
+
+    request: Request
+    runs: tuple[Run, ...]
+    state: Literal["open", "finished", "abandoned"] = "open"
+    misclosure_mm: float | None = None
+    trouble: str = ""
+    ended_because: str = ""
+
+    @classmethod
+    def of(cls, request: Request) -> Job:
+        """A job of which nothing is done."""
+        wanted = [(prism, "static_poses", request.poses) for prism in request.prisms]
+        if request.check_poses:
+            wanted.append((request.prisms[-1], CHECK, request.check_poses))
+        return cls(request, tuple(_run(number, *one, request) for number, one in enumerate(wanted)))
+
+    @property
+    def at(self) -> int:
+        """Index of the run that is on; the last one where all are over."""
+        left = (i for i, run in enumerate(self.runs) if run.next_step is not None)
+        return next(left, len(self.runs) - 1)
+
+    @property
+    def run(self) -> Run:
+        """The run that is on."""
+        return self.runs[self.at]
+
+    @property
+    def step(self) -> Step | None:
+        """The step to do; None where the job is over."""
+        number = self.run.next_step if self.state == "open" else None
+        return None if number is None else self.run.steps[number]
+
+    @property
+    def step_id(self) -> str:
+        """Another text for every step, and for every pose."""
+        run = self.run
+        if self.state != "open" or run.next_step is None:
+            return self.state
+        if run.steps[run.next_step].kind != "poses":
+            return f"{self.at + 1}.{run.next_step + 1}"
+        pose = "enough" if self.is_enough else len(run.poses or ()) if run.next_pose is None else run.next_pose + 1
+        return f"{self.at + 1}.{run.next_step + 1}.{pose}"
+
+    @property
+    def is_enough(self) -> bool:
+        """Return True if no pose is to be measured: the stop rule says so, or none is left."""
+        run = self.run
+        return bool(run.enough) or (run.poses is not None and run.next_pose is None)
+
+    @property
+    def sessions(self) -> tuple[str, ...]:
+        """Sessions of its runs, oldest first."""
+        return tuple(run.session for run in self.runs if run.session)
+
+    # ---- events ------------------------------------------------------------------------------------------------------
+
+    def after(self, kind: str, details: Mapping[str, Any]) -> Job:
+        """Return the state after an event.
+
+        Raises:
+            ValueError: it cannot have happened in this state.
+        """
+        if self.state != "open":
+            raise ValueError(f"{kind}: the guide is {self.state}")
+        if kind == "failed":
+            return replace(self, trouble=str(details["text"]))
+        if kind == "stopped":
+            return replace(self, state="abandoned", ended_because=str(details["reason"]))
+        job = replace(self, trouble="")
+        run = job.run
+        match kind:
+            case "opened":
+                return job._with(replace(run, session=str(details["session"]), last=int(details["last"])))
+            case "planned":
+                return job._with(replace(run, poses=tuple(PlannedPose(pose) for pose in details["poses"])))
+            case "shot":
+                job._require("shoot_control_point", kind)
+                return replace(job, misclosure_mm=details["misclosure_mm"])._with(_stepped(run, "done"))
+            case "aimed":
+                job._require("change_prism", kind)
+                return job._with(_stepped(run, "done"))
+            case "measured":
+                job._require("poses", kind)
+                done = _posed(run, "done")
+                return job._with(replace(done, last=int(details["last"]), label=str(details["pose"])))
+            case "enough":
+                return job._with(replace(run, enough=str(details["reason"])))
+            case "more":
+                job._require("poses", kind)
+                return job._with(_extended(run, details["poses"]))
+            case "left":
+                job._require("poses", kind)
+                return job._with(_stepped(_rest_skipped(run, run.enough or "enough"), "done"))
+            case "closed":
+                return job._with(_stepped(run, "done"))
+            case "skipped":
+                return job._skipped(str(details["reason"]), rest=bool(details.get("rest")))
+        raise ValueError(f"there is no event {kind!r}")
+
+    def _require(self, wanted: StepKind, kind: str) -> None:
+        if self.step is None or self.step.kind != wanted:
+            raise ValueError(f"{kind}: the step is {self.step and self.step.kind}, not {wanted}")
+
+    def _skipped(self, reason: str, *, rest: bool) -> Job:
+        run, step = self.run, self.step
+        assert step is not None
+        if step.kind == "change_prism":  # without its prism the session has nothing
+            steps = tuple(replace(s, state="skipped", reason=reason) if s.state == "to do" else s for s in run.steps)
+            return self._with(replace(run, steps=steps))
+        if step.kind != "poses":
+            return self._with(_stepped(run, "skipped", reason))
+        if rest or self.is_enough:
+            return self._with(_stepped(_rest_skipped(run, reason), "done" if run.done else "skipped", reason))
+        return self._with(_posed(run, "skipped", reason))
+
+    def _with(self, run: Run) -> Job:
+        """Return the job with its present run changed; finished when that was the last thing to do."""
+        at = self.at
+        runs = (*self.runs[:at], run, *self.runs[at + 1 :])
+        is_over = all(r.next_step is None for r in runs)
+        return replace(self, runs=runs, state="finished" if is_over else "open")
+
+
+def _run(number: int, prism: str, kind: str, most: int, request: Request) -> Run:
+    # There and back: the point that a session ends with is the one that the next begins with.
+    points = request.control_points[:: -1 if number % 2 else 1]
+    planned = request.planned(prism) if kind != CHECK else None
+    return Run(
+        prism,
+        kind,
+        (
+            *(Step("shoot_control_point", point, "start") for point in points),
+            Step("change_prism"),
+            Step("poses"),
+            *(Step("shoot_control_point", point, "end") for point in points),
+            Step("close"),
+        ),
+        most if planned is None else len(planned),
+        None if planned is None else tuple(PlannedPose(pose) for pose in planned),
+    )
+
+
+def _stepped(run: Run, state: State, reason: str = "") -> Run:
+    number = run.next_step
+    assert number is not None
+    step = replace(run.steps[number], state=state, reason=reason)
+    return replace(run, steps=(*run.steps[:number], step, *run.steps[number + 1 :]))
+
+
+def _posed(run: Run, state: State, reason: str = "") -> Run:
+    number = run.next_pose
+    if number is None or run.poses is None:
+        raise ValueError("no pose is left")
+    pose = replace(run.poses[number], state=state, reason=reason)
+    return replace(run, poses=(*run.poses[:number], pose, *run.poses[number + 1 :]))
+
+
+def _rest_skipped(run: Run, reason: str) -> Run:
+    poses = tuple(
+        replace(pose, state="skipped", reason=reason) if pose.state == "to do" else pose for pose in run.poses or ()
+    )
+    return replace(run, poses=poses)
+
+
+def _extended(run: Run, poses: Sequence[Pose]) -> Run:
+    """Measure more poses: those that are left first, and then new ones; the stop rule is not asked until then."""
+    more = tuple(PlannedPose(pose) for pose in poses)
+    return replace(
+        run, poses=(*(run.poses or ()), *more), enough="", least=run.done + len(run.upcoming(10**6)) + len(more)
+    )
+
+
+# ---- the stop rule ---------------------------------------------------------------------------------------------------
+
+LEAST_POSES = 6  # of a prism
+WORTHWHILE = 0.05  # five more poses must lower the expected error by this share
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Expected RMS 3-D error over the work volume, mm.
+
+    Attributes:
+        now_mm: of all prisms measured so far.
+        prism_mm, prism_after_5_mm: of the prism that is measured, now and after five more poses.
+        poses: of the run that it knows of.
+    """
+
+    now_mm: float
+    prism_mm: float
+    prism_after_5_mm: float
+    poses: int = field(compare=False, default=0)
+
+
+def stop_reason(forecast: Forecast, target_mm: float | None, done: int, least: int = 0) -> str:
+    """Return why it is enough, a sentence; "" where more poses are worthwhile.
+
+    Args:
+        forecast: what is expected.
+        target_mm: at which it is enough; None where none was given.
+        done: poses of the prism.
+        least: poses that the operator wants in any case.
+    """
+    if done < max(LEAST_POSES, least):
+        return ""
+    if target_mm is not None and max(forecast.now_mm, forecast.prism_mm) <= target_mm:
+        return f"the expected error, {forecast.prism_mm:.2g} mm, has reached the target of {target_mm:g} mm"
+    gain = 1.0 - forecast.prism_after_5_mm / forecast.prism_mm
+    if gain < WORTHWHILE:
+        return f"five more poses would lower the expected error of {forecast.prism_mm:.2g} mm by {gain:.0%} only"
+    return ""
+
+
+def pose_reasons(run: Run) -> Iterator[dict[str, Any]]:
+    """Yield number and reason of the poses that were skipped."""
+    for number, pose in enumerate(run.poses or (), start=1):
+        if pose.state == "skipped":
+            yield {"pose": number, "reason": pose.reason}

@@ -1,0 +1,631 @@
+"""Keeps the one open guide: takes the operator's commands, sees what is done, opens, shoots in and closes sessions.
+
+What the job is and what comes next is `job`; this module makes its events. One thread looks ten times a second at boom,
+fixes and observations, and carries out what takes time (a shot). Every event is stored before it counts. Methods named
+`*_command` are called by the control socket's threads, `on_records` by the writer's.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from calibration.rig.description import Rig
+from daemon.acquisition.joiner import ObservationJoiner
+from daemon.commands import (
+    CHECK,
+    REFUSED,
+    Caller,
+    CommandError,
+    Handler,
+    acting_for,
+    caller_columns,
+    current_caller,
+    mapping_argument,
+    text_argument,
+)
+from daemon.guide.job import Forecast, Job, Request, stop_reason
+from daemon.guide.meter_link import Answer, MeterLink, Place
+from daemon.guide.position import PositionWatch, is_there
+from daemon.guide.request import request_of, whole_argument
+from daemon.guide.view import Around, headline, state_of
+from daemon.sessions.manager import SessionKeeper
+from daemon.sessions.station_setups import SetupBook
+from daemon.store.guides import GuideRow, GuideTable, Standstill
+from daemon.store.sessions import SessionTable
+from daemon.store.setups import control_points
+from daemon.store.store import Store
+from drivers.clock import Clock, Stamp
+from drivers.readings import Record
+
+log = logging.getLogger(__name__)
+
+TICK_S = 0.1
+RETRY_S = 5.0  # after something failed that is tried again by itself
+NEEDED_FIXES = 5  # at a pose
+MORE_POSES = 5
+_CANCEL_S = 5.0
+
+
+class GuideKeeper:
+    """Keeps the one open guide of a rig.
+
+    Args:
+        rig: the machine.
+        store: where everything is kept.
+        sessions: opens, shoots in and closes sessions.
+        setups: the station set-ups.
+        joiner: what is known of the joints.
+        clock: time.
+        meter_place: tells where the gain meter finds everything.
+        model: the candidate that awaits, for a guide that is finished.
+        settle_s: how long the boom must stand at a pose.
+        has_aim: something turns the station without an operator.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        store: Store,
+        sessions: SessionKeeper,
+        setups: SetupBook,
+        joiner: ObservationJoiner,
+        clock: Clock,
+        *,
+        meter_place: Callable[[], Place],
+        model: Callable[[], Mapping[str, Any]],
+        settle_s: float,
+        has_aim: bool,
+    ) -> None:
+        self._rig, self._store, self._sessions, self._setups, self._clock = rig, store, sessions, setups, clock
+        self._meter_place, self._model, self._settle_s, self._has_aim = meter_place, model, settle_s, has_aim
+        self._table, self._session_table = GuideTable(store, rig.name), SessionTable(store, rig.name)
+        self._watch = PositionWatch(rig, joiner, clock)
+        self._turn = threading.RLock()
+        self._row: GuideRow | None = None
+        self._job: Job | None = None
+        self._taps = 0
+        self._wanted = ""  # step whose button was pressed, to be carried out by the thread
+        self._busy = ""  # step that is carried out
+        self._cancelled = threading.Event()
+        self._standstill: Standstill | None = None
+        self._accuracy: dict[str, Any] | None = None
+        self._coverage: dict[str, Any] | None = None
+        self._meter: MeterLink | None = None
+        self._meter_trouble = ""
+        self._is_choosing = False
+        self._try_again = 0.0  # real monotonic seconds
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="guide", daemon=True)
+        store.unless_damaged(self._restore, None)
+
+    def start(self) -> None:
+        """Begin to look."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Look no more; an open guide goes on with the next start of the daemon."""
+        self._stopping.set()
+        self._cancelled.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=_CANCEL_S)
+        self._close_meter()
+
+    @property
+    def is_open(self) -> bool:
+        """Return True while a guide is open."""
+        job = self._job
+        return job is not None and job.state == "open"
+
+    def on_records(self, records: Sequence[Record]) -> None:
+        """Note where boom and station are; costs nothing while no guide is open."""
+        if self.is_open:
+            self._watch.on_records(records)
+
+    def guarding(self, name: str, handler: Handler) -> Handler:
+        """Return a command that is refused while a guide is open, which holds its sessions itself."""
+
+        def guarded(arguments: Mapping[str, Any]) -> Any:
+            with self._turn:
+                if self._row is not None and self._job is not None and self.is_open:
+                    raise CommandError(
+                        f"{name} is not carried out: guide {self._row.id} is open and opens, shoots in and closes its "
+                        f"sessions itself; next: {headline(self._job)} (`rigcal session guide` leads, and "
+                        "`rigcal session guide --stop REASON` abandons it)",
+                        REFUSED,
+                    )
+            return handler(arguments)
+
+        return guarded
+
+    # ---- commands ----------------------------------------------------------------------------------------------------
+
+    def start_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Open a guide."""
+        with self._turn:
+            if self._row is not None and self._job is not None and self.is_open:
+                raise CommandError(
+                    f"guide {self._row.id} is open: {headline(self._job)}; `rigcal session guide` goes on with it, and "
+                    "`rigcal session guide --stop REASON` abandons it",
+                    REFUSED,
+                )
+            opened = self._sessions.open_session()
+            if opened is not None:
+                raise CommandError(f"session {opened['id']!r} is open; stop or abort it first", REFUSED)
+            described = mapping_argument(arguments, "new_setup")
+            operator = text_argument(arguments, "operator")
+            if described and arguments.get("setup") is not None:
+                raise CommandError("give a set-up that exists or describe a new one, not both")
+            if described:
+                request = request_of(arguments, self._rig, list(mapping_argument(described, "control_points")))
+                setup_id = str(self._setups.new_command(described)["id"])
+            else:
+                setup_id = self._setups.usable(arguments.get("setup"))
+                request = request_of(arguments, self._rig, self._setups.control_point_names(setup_id))
+            self._table.open(self._clock.now(), setup_id, operator, request.as_dict(), **caller_columns())
+            self._row, self._job = self._table.newest(), Job.of(request)
+            self._taps, self._accuracy, self._coverage, self._standstill = 1, None, None, None
+            self._wanted, self._try_again, self._is_choosing = "", 0.0, False
+            self._start_meter()
+            return self._state()
+
+    def state_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """The newest guide, open or not."""
+        return self._state()
+
+    def done_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Take the operator's word that the step is carried out."""
+        with self._turn:
+            job, step_id = self._needs_step(arguments)
+            step, run = job.step, job.run
+            assert step is not None
+            if self._busy == step_id or not run.session:
+                raise CommandError(f"the daemon is at work on it: {headline(job)}", REFUSED)
+            self._taps += 1
+            if step.kind == "shoot_control_point":
+                self._wanted = step_id  # measured by the guide's own thread: the state shows how it goes
+            elif step.kind == "change_prism":
+                self._aimed()
+            elif step.kind == "poses" and job.is_enough:
+                self._happen("left", {})
+            elif step.kind == "poses" and run.next_pose is not None:
+                self._measured_here()
+            else:
+                self._taps -= 1
+                raise CommandError(f"this step ends by itself: {headline(job)}", REFUSED)
+            return self._state()
+
+    def skip_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Leave out the step, or all poses of the prism that are left, for a reason that is kept."""
+        reason, rest = _reason(arguments), arguments.get("rest", False)
+        if not isinstance(rest, bool):
+            raise CommandError(f"rest must be true or false, not {rest!r:.80}")
+        self._needs_step(arguments)
+        self._give_up_work()
+        with self._turn:
+            job, _ = self._needs_step(arguments)
+            step = job.step
+            assert step is not None
+            if step.kind == "close" or (rest and step.kind != "poses"):
+                raise CommandError(f"this step cannot be skipped: {headline(job)}", REFUSED)
+            self._taps += 1
+            if step.kind == "change_prism" and self._sessions.open_session() is not None:
+                self._sessions.abort_command({})
+            self._happen("skipped", {"reason": reason, "rest": rest})
+            return self._state()
+
+    def more_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Measure more poses of this prism although it is enough."""
+        count = whole_argument(arguments, "poses", MORE_POSES, 1, 100)
+        with self._turn:
+            job, _ = self._needs_step(arguments)
+            step, run = job.step, job.run
+            if step is None or step.kind != "poses" or not job.is_enough:
+                raise CommandError(f"more poses are for when there are enough; now: {headline(job)}", REFUSED)
+            self._taps += 1
+            left = len(run.upcoming(count))
+            if left < count:
+                self._choose(count - left, as_more=True)
+            else:
+                self._happen("more", {"poses": []})
+            return self._state()
+
+    def stop_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Abandon the guide; its open session is closed if it has poses, else aborted."""
+        reason = _reason(arguments)
+        self._needs_step({})
+        self._give_up_work()
+        with self._turn:
+            self._needs_step({})
+            self._taps += 1
+            opened = self._sessions.open_session()
+            if opened is not None and opened["poses"]:
+                self._sessions.stop_command({})
+            elif opened is not None:
+                self._sessions.abort_command({})
+            self._happen("stopped", {"reason": reason})
+            return self._state()
+
+    def _needs_step(self, arguments: Mapping[str, Any]) -> tuple[Job, str]:
+        """Return the job and its step; CommandError without an open guide, or where another step is meant."""
+        job = self._job
+        if job is None or job.state != "open":
+            raise CommandError("no guide is open; `rigcal session guide --prisms w,b,r,s` starts one")
+        meant = arguments.get("step")
+        if meant is not None and meant != job.step_id:
+            raise CommandError(f"another step is on by now: {headline(job)}", REFUSED)
+        return job, job.step_id
+
+    def _measured_here(self) -> None:
+        """Take the standstill at which the boom is for the pose, wherever that is."""
+        found, boom = self._standstill, self._watch.boom()
+        here = (
+            found is not None
+            and boom.stands_s is not None
+            and is_there(self._rig, boom.values, _pose(self._rig, found))
+        )
+        if found is None or not here or found.fixes < NEEDED_FIXES:
+            raise CommandError(
+                f"{found.fixes if found is not None and here else 0} of {NEEDED_FIXES} fixes count at this standstill; "
+                "let the boom stand, with the station on the prism",
+                REFUSED,
+            )
+        self._happen("measured", {"pose": found.pose, "last": found.last})
+
+    # ---- events ------------------------------------------------------------------------------------------------------
+
+    def _happen(self, kind: str, details: Mapping[str, Any], *, only_at: str = "") -> bool:
+        """Store an event and go on; False where another step than `only_at` is on by now."""
+        with self._turn:
+            row, before = self._row, self._job
+            if row is None or before is None or before.state != "open" or only_at not in ("", before.step_id):
+                return False
+            job, at = before.after(kind, details), self._clock.now()
+            with self._store.transaction():
+                self._table.add(row.id, kind, details, at, **caller_columns())
+                if job.state != "open":
+                    self._table.end(row.id, job.state, at)
+            self._job = job
+            self._followed(before, job)
+            return True
+
+    def _followed(self, before: Job, job: Job) -> None:
+        """Do what follows from an event by itself."""
+        if job.state != "open":
+            log.info("guide %d is %s", self._row.id if self._row else 0, job.state)
+            self._row = self._table.newest()
+            self._close_meter()
+            return
+        on_prism = job.step is not None and job.step.kind == "poses"
+        was_on_prism = before.step is not None and before.step.kind == "poses"
+        if was_on_prism and not on_prism:
+            self._sessions.look_away()
+        if job.at != before.at:
+            self._standstill = None
+        if on_prism and (job.run.done != before.run.done or job.run.poses != before.run.poses or not was_on_prism):
+            self._assess()
+
+    def _aimed(self) -> None:
+        with self._turn:
+            self._watch.forget_fixes()
+            self._sessions.look_back(self._row.operator if self._row else "")
+            self._happen("aimed", {})
+
+    # ---- the thread --------------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        told = ""
+        while not self._stopping.wait(TICK_S):
+            try:
+                if self.is_open and time.monotonic() >= self._try_again:
+                    self._look()
+                told = ""
+            except Exception as error:
+                self._try_again = time.monotonic() + RETRY_S
+                if str(error) != told:
+                    log.exception("the guide has failed; it goes on")
+                told = str(error)
+
+    def _look(self) -> None:
+        with self._turn:
+            job = self._job
+            if job is None or job.step is None:
+                return
+            if self._meter is None or not self._meter.is_alive:
+                self._start_meter()
+            run, step, step_id = job.run, job.step, job.step_id
+            if run.session and run.poses is None and not self._is_choosing:
+                self._choose(run.most)
+            point_mm = self._point_mm(step.point or self._next_point(job))
+            is_at_point = not self._has_aim and self._watch.is_at(point_mm)
+        with acting_for(None, self._cancelled.is_set):
+            if not run.session:
+                self._try(self._open_session)
+            elif step.kind == "close":
+                self._try(self._close_session)
+            elif step.kind == "shoot_control_point":
+                if self._has_aim or is_at_point or self._wanted == step_id:
+                    self._try(partial(self._shoot, step.point, step_id), step_id)
+            elif step.kind == "change_prism":
+                if self._has_aim:
+                    self._aimed()
+            elif job.is_enough and (self._has_aim or is_at_point or run.kind == CHECK):
+                self._happen("left", {}, only_at=step_id)
+            elif not job.is_enough:
+                self._look_at_pose(job)
+
+    def _look_at_pose(self, job: Job) -> None:
+        """See whether the pose is reached and measured."""
+        run, number = job.run, job.run.next_pose
+        found = self._table.standstill(run.session, run.last)
+        self._standstill = found = None if found is None or found.pose == run.label else found
+        if number is None or run.poses is None or found is None or found.fixes < NEEDED_FIXES:
+            return
+        if is_there(self._rig, _pose(self._rig, found), run.poses[number].joints):
+            self._happen("measured", {"pose": found.pose, "last": found.last}, only_at=job.step_id)
+
+    def _try(self, work: Callable[[], None], step_id: str = "") -> None:
+        """Do something that an operator may have to put right; it is tried again after a while, a shot when asked."""
+        self._busy = step_id or "session"
+        try:
+            work()
+        except CommandError as error:
+            if not self._cancelled.is_set():
+                self._happen("failed", {"text": str(error)})
+                self._try_again = time.monotonic() + RETRY_S
+        finally:
+            if step_id:
+                self._wanted = ""
+            self._busy = ""
+
+    def _open_session(self) -> None:
+        job, row = self._job, self._row
+        if job is None or row is None:
+            return
+        last, opened = self._table.newest_observation(), self._sessions.open_session()
+        if opened is None or opened["prism"] != job.run.prism:  # else it was opened just before the daemon ended
+            arguments = {
+                "prism": job.run.prism,
+                "kind": job.run.kind,
+                "setup": row.setup_id,
+                "operator": row.operator,
+                "note": f"guide {row.id}",
+            }
+            opened = self._sessions.start_command(arguments, is_aimed=False)
+        self._happen("opened", {"session": opened["id"], "last": last})
+
+    def _close_session(self) -> None:
+        job = self._job
+        if job is None:
+            return
+        opened = self._sessions.open_session()
+        if opened is not None and opened["id"] == job.run.session:
+            self._sessions.stop_command({})
+        self._happen("closed", {"session": job.run.session})
+
+    def _shoot(self, point: str, step_id: str) -> None:
+        shot = self._sessions.shoot_command({"point": point})
+        self._happen("shot", {"point": point, "misclosure_mm": shot["misclosure_mm"]}, only_at=step_id)
+
+    def _give_up_work(self) -> None:
+        """End a shot that is being measured."""
+        if not self._busy:
+            return
+        self._cancelled.set()
+        deadline = time.monotonic() + _CANCEL_S
+        while self._busy and time.monotonic() < deadline:
+            time.sleep(TICK_S / 2)
+        self._cancelled.clear()
+
+    def _point_mm(self, name: str) -> tuple[float, float, float] | None:
+        """Where a control point of the set-up is; None where that is not known."""
+        if self._row is None:
+            return None
+        known = control_points(self._store, self._row.setup_id)
+        return next(((p["x_mm"], p["y_mm"], p["z_mm"]) for p in known if p["name"] == name), None)
+
+    def _next_point(self, job: Job) -> str:
+        """The control point that comes after the poses; "" where it is another step's turn."""
+        if job.step is None or job.step.kind != "poses" or not job.is_enough:
+            return ""
+        after = job.run.steps[(job.run.next_step or 0) + 1]
+        return after.point
+
+    # ---- the gain meter ----------------------------------------------------------------------------------------------
+
+    def _start_meter(self) -> None:
+        self._close_meter()
+        try:
+            self._meter = MeterLink(self._meter_place())
+        except OSError as error:
+            self._meter_trouble = f"the gain meter cannot be started: {error}"
+            self._try_again = time.monotonic() + RETRY_S
+            return
+        self._is_choosing = False
+        self._assess()
+
+    def _close_meter(self) -> None:
+        meter, self._meter = self._meter, None
+        if meter is not None:
+            meter.close()
+
+    def _training(self, job: Job) -> list[str]:
+        """Sessions that the next model will be trained on, with the open one."""
+        used = [session["id"] for session in self._session_table.used() if session["kind"] != CHECK]
+        own = job.run.session
+        return used if job.run.kind == CHECK or not own or own in used else [*used, own]
+
+    def _question(self, job: Job) -> dict[str, Any]:
+        run = job.run
+        return {
+            "sessions": self._training(job),
+            "setup": self._row.setup_id if self._row else "",
+            "session": run.session,
+            "prism": run.prism,
+        }
+
+    def _assess(self) -> None:
+        """Ask what to expect; of a check nothing is learned, so nothing changes."""
+        job = self._job
+        if job is None or self._meter is None or job.state != "open" or not job.run.session:
+            return
+        if job.run.kind == CHECK and self._accuracy is not None:
+            return
+        prisms = list(dict.fromkeys([run.prism for run in job.runs[: job.at + 1] if run.session]))
+        question = self._question(job) | {"do": "assess", "prisms": prisms, "next": job.run.upcoming(5)}
+        self._meter.ask(question, partial(self._take_assessment, job, prisms))
+
+    def _take_assessment(self, job: Job, prisms: list[str], answer: Answer) -> None:
+        with self._turn:
+            now = self._job
+            if now is None or self._row is None:
+                return
+            if "error" in answer:
+                self._meter_trouble = str(answer["error"])
+                return
+            self._meter_trouble = ""
+            found = dict(answer["result"])
+            self._coverage = found.pop("coverage")
+            self._accuracy = found | {
+                "target_mm": job.request.target_mm,
+                "prisms": prisms,
+                "for_poses": job.run.done,
+                "session": job.run.session,
+                "computed_at_utc_ns": self._clock.now().utc_ns,
+            }
+            is_same = now.state == "open" and now.run.session == job.run.session and now.run.kind != CHECK
+            if (
+                not is_same
+                or found["prism_mm"] is None
+                or now.is_enough
+                or now.step is None
+                or now.step.kind != "poses"
+            ):
+                return
+            forecast = Forecast(found["now_mm"], found["prism_mm"], found["prism_after_5_mm"])
+            reason = stop_reason(forecast, job.request.target_mm, job.run.done, now.run.least)
+            if reason:
+                self._happen("enough", {"reason": reason})
+
+    def _choose(self, count: int, *, as_more: bool = False) -> None:
+        """Ask for poses of the run."""
+        job = self._job
+        if job is None or self._meter is None:
+            return
+        self._is_choosing = True
+        question = self._question(job) | {
+            "do": "choose",
+            "count": count,
+            "seed": 1000 * (self._row.id if self._row else 0) + 100 * job.at + len(job.run.poses or ()),
+            "evenly": job.run.kind == CHECK,
+        }
+        caller = current_caller() if as_more else None
+        self._meter.ask(question, partial(self._take_poses, job.run.session, caller, as_more=as_more))
+
+    def _take_poses(self, session: str, caller: Caller | None, answer: Answer, *, as_more: bool) -> None:
+        with self._turn, acting_for(caller):
+            self._is_choosing = False
+            job = self._job
+            if job is None or job.state != "open" or job.run.session != session:
+                return
+            if "error" in answer or not answer["result"]["poses"]:
+                self._meter_trouble = f"no poses could be chosen: {answer.get('error', 'none is in view')}"
+                self._try_again = time.monotonic() + RETRY_S
+                return
+            poses = {"poses": answer["result"]["poses"]}
+            self._meter_trouble = ""
+            if as_more and job.step is not None and job.step.kind == "poses":
+                self._happen("more", poses)
+            elif not as_more and job.run.poses is None:
+                self._happen("planned", poses)
+
+    # ---- state -------------------------------------------------------------------------------------------------------
+
+    def _state(self) -> dict[str, Any]:
+        with self._turn:
+            row, job = self._row, self._job
+            if row is None or job is None:
+                return {"guide": None}
+            step = job.step
+            point = "" if step is None else step.point or self._next_point(job)
+            around = Around(
+                boom=self._watch.boom(),
+                standstill=self._standstill,
+                accuracy=self._accuracy,
+                coverage=self._coverage,
+                taps=self._taps,
+                is_busy=self._is_busy(job),
+                is_detected=self._has_aim or (bool(point) and self._point_mm(point) is not None),
+                has_aim=self._has_aim,
+                settle_s=self._settle_s,
+                needed_fixes=NEEDED_FIXES,
+                warnings=self._warnings(job),
+                model=self._model() if job.state == "finished" else None,
+            )
+            return {"guide": state_of(self._rig, row, job, around)}
+
+    def _is_busy(self, job: Job) -> bool:
+        if job.state != "open":
+            return False
+        return job.step_id in (self._busy, self._wanted) or not job.run.session
+
+    def _warnings(self, job: Job) -> list[str]:
+        found = [job.trouble] if job.trouble else []
+        if job.state == "open":
+            found += [f"{s.reason}; {s.remedy}" for s in self._sessions.prism_suspicions()]
+        if self._meter_trouble and job.state == "open":
+            found.append(self._meter_trouble)
+        return found
+
+    # ---- after a restart ---------------------------------------------------------------------------------------------
+
+    def _restore(self) -> None:
+        """Go on with the guide that an earlier run left."""
+        row = self._table.newest()
+        if row is None:
+            return
+        job, events = Job.of(Request.of(row.request)), self._table.events(row.id)
+        for event in events:
+            job = job.after(event.kind, event.details)
+        self._row, self._job = row, job
+        self._taps = 1 + sum(event.is_command for event in events)
+        if job.state != "open":
+            return
+        log.warning("guide %d was open when rigcal last ended; it goes on: %s", row.id, headline(job))
+        if not job.run.session:
+            return
+        # Fixes that were captured and are not decoded yet must not count where the station was on no prism.
+        away: Stamp | None = None
+        current = Job.of(job.request)
+        for event in events:
+            before, current = current, current.after(event.kind, event.details)
+            if event.kind == "opened" and current.at == job.at:
+                away = event.at
+            elif current.at == job.at and event.kind == "aimed":
+                self._sessions.look_away(away, event.at)
+                away = None
+            elif current.at == job.at and _left_prism(before, current):
+                away = event.at
+        if away is not None:
+            self._sessions.look_away(away)
+        self._start_meter()
+
+
+def _left_prism(before: Job, after: Job) -> bool:
+    was = before.step is not None and before.step.kind == "poses"
+    return was and (after.step is None or after.step.kind != "poses")
+
+
+def _reason(arguments: Mapping[str, Any]) -> str:
+    reason = text_argument(arguments, "reason").strip()
+    if not reason:
+        raise CommandError("say why: a reason is kept with what is left out")
+    return reason
+
+
+def _pose(rig: Rig, standstill: Standstill) -> dict[str, float]:
+    return {joint.name: float(standstill.values[joint.column]) for joint in rig.joints}

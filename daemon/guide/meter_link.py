@@ -1,0 +1,147 @@
+"""The gain meter's process, seen from the daemon: started with the guide, asked, ended with it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from daemon.host.systemd import parse_line
+from daemon.store.models import ModelRow
+from daemon.store.store import Store
+
+log = logging.getLogger(__name__)
+
+# -P keeps the current directory off the process's path: what lies there is no code of ours.
+METER_COMMAND = (sys.executable, "-P", "-m", "daemon.guide.meter")
+NICE = 5  # acquisition comes first, then the meter, then jobs
+MAX_LOGGED_BYTES = 4096
+
+Answer = Mapping[str, Any]
+"""`{"result": {...}}` or `{"error": "one sentence"}`."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the meter finds everything.
+
+    Attributes:
+        store: the database.
+        store_file: device and inode of the store that the daemon has open.
+        rig_text: the rig file.
+        live_model, live_sha256: directory and manifest of the live model; None without one.
+    """
+
+    store: str
+    store_file: tuple[int, int] | None
+    rig_text: str
+    live_model: str | None = None
+    live_sha256: str | None = None
+
+    def to_line(self) -> bytes:
+        """Return the line that the process reads first."""
+        return json.dumps(asdict(self)).encode() + b"\n"
+
+    @classmethod
+    def from_line(cls, line: str) -> Place:
+        """Return the place in a line that `to_line` made."""
+        place = json.loads(line)
+        return cls(**place | {"store_file": place["store_file"] and tuple(place["store_file"])})
+
+    @classmethod
+    def of(cls, store: Store, rig_text: str, live: ModelRow | None) -> Place:
+        """The place of a store that the daemon has open."""
+        file = store.files.database
+        return cls(
+            str(store.path),
+            (file.device, file.inode) if file else None,
+            rig_text,
+            None if live is None else str(live.path),
+            None if live is None else live.manifest_sha256,
+        )
+
+
+class MeterLink:
+    """The process that says what is still to gain; one question at a time, of two alike that wait the newer one.
+
+    Args:
+        place: where it finds everything.
+
+    Attributes:
+        pid: of the process.
+
+    Raises:
+        OSError: it cannot be started.
+    """
+
+    def __init__(self, place: Place) -> None:
+        self._process = subprocess.Popen(
+            METER_COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+        )
+        self.pid = self._process.pid
+        with contextlib.suppress(ProcessLookupError):  # it has ended already
+            os.setpriority(os.PRIO_PROCESS, self.pid, max(NICE, os.getpriority(os.PRIO_PROCESS, 0)))
+        self._waiting: dict[str, tuple[Mapping[str, Any], Callable[[Answer], None]]] = {}
+        self._asked = threading.Condition()
+        self._is_closing = False
+        self._order = place.to_line()
+        threading.Thread(target=self._work, name="gain-meter", daemon=True).start()
+        threading.Thread(target=self._log, name="gain-meter-log", daemon=True).start()
+
+    def ask(self, question: Mapping[str, Any], take: Callable[[Answer], None]) -> None:
+        """Ask; `take` is called with the answer in another thread. A like question that waits is given up for it."""
+        with self._asked:
+            self._waiting[question["do"]] = question, take
+            self._asked.notify_all()
+
+    def close(self) -> None:
+        """End the process; an answer that is under way is not waited for."""
+        with self._asked:
+            self._is_closing = True
+            self._asked.notify_all()
+        self._process.kill()
+        self._process.wait()
+
+    @property
+    def is_alive(self) -> bool:
+        """Return True while the process runs."""
+        return self._process.poll() is None
+
+    def _work(self) -> None:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        # What breaks a pipe is the end of the process: `is_alive` tells, and the guide starts another one.
+        with contextlib.suppress(OSError), self._process.stdout as answers, self._process.stdin as questions:
+            questions.write(self._order)
+            questions.flush()
+            while (asked := self._next()) is not None:
+                question, take = asked
+                questions.write(json.dumps(question).encode() + b"\n")
+                questions.flush()
+                answer = answers.readline()
+                if self._is_closing:
+                    return
+                if not answer:
+                    take({"error": "the process of the gain meter has ended; it is started again"})
+                    return
+                take(json.loads(answer))
+
+    def _next(self) -> tuple[Mapping[str, Any], Callable[[Answer], None]] | None:
+        """Wait for a question; None when there will be none."""
+        with self._asked:
+            self._asked.wait_for(lambda: self._waiting or self._is_closing)
+            return None if self._is_closing else self._waiting.pop(next(iter(self._waiting)))
+
+    def _log(self) -> None:
+        assert self._process.stderr is not None
+        with self._process.stderr as errors:
+            while line := errors.readline(MAX_LOGGED_BYTES):
+                level, text = parse_line(line.rstrip().decode("utf-8", "replace"))
+                log.log(level, "gain meter: %s", text)

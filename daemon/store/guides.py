@@ -1,0 +1,127 @@
+"""The tables of guided sessions: guides, and what has happened in them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from daemon.store.connection import Connection
+from drivers.clock import Stamp
+
+# The newest standstill whose observations count. Asked ten times a second: by number, not by all rows of the session.
+_STANDSTILL = """SELECT pose, count(*) AS fixes, max(id) AS last FROM observations NOT INDEXED
+    WHERE session_id = ? AND id > ? AND excluded IS NULL AND pose IS NOT NULL
+    GROUP BY pose ORDER BY last DESC LIMIT 1"""
+
+
+@dataclass(frozen=True)
+class GuideRow:
+    """A guide.
+
+    Attributes:
+        id: its number.
+        state: open, finished or abandoned.
+        setup_id: set-up of its station.
+        operator: who is responsible.
+        request: what it was asked for.
+        started: when.
+    """
+
+    id: int
+    state: str
+    setup_id: str
+    operator: str
+    request: Mapping[str, Any]
+    started: Stamp
+
+
+@dataclass(frozen=True)
+class EventRow:
+    """Something that has happened in a guide.
+
+    Attributes:
+        kind, details: see `daemon.guide.job`.
+        at: when.
+        is_command: an operator said so.
+    """
+
+    kind: str
+    details: Mapping[str, Any]
+    at: Stamp
+    is_command: bool
+
+
+@dataclass(frozen=True)
+class Standstill:
+    """A standstill of the open session whose observations count.
+
+    Attributes:
+        pose: its label.
+        fixes: how many count.
+        last: number of the newest observation.
+        values: observations column -> number, of that one.
+    """
+
+    pose: str
+    fixes: int
+    last: int
+    values: Mapping[str, float]
+
+
+class GuideTable:
+    """The guides of a rig.
+
+    Args:
+        store: the database.
+        rig_name: whose guides they are.
+    """
+
+    def __init__(self, store: Connection, rig_name: str) -> None:
+        self._store, self._rig = store, rig_name
+
+    def newest(self) -> GuideRow | None:
+        """The newest guide; None before the first."""
+        rows = self._store.rows("SELECT * FROM guides WHERE rig = ? ORDER BY id DESC LIMIT 1", (self._rig,))
+        if not rows:
+            return None
+        row = rows[0]
+        request, started = json.loads(row["request_json"]), self._store.stamp(row, "started_")
+        return GuideRow(row["id"], row["state"], row["setup_id"], row["operator"], request, started)
+
+    def open(self, started: Stamp, setup_id: str, operator: str, request: Mapping[str, Any], **caller: object) -> int:
+        """Add an open guide; its number."""
+        row = {"rig": self._rig, "state": "open", "setup_id": setup_id, "operator": operator, "request_json": request}
+        return self._store.insert("guides", {**row, **caller, **self._store.instant(started, "started_")})
+
+    def end(self, guide_id: int, state: str, ended: Stamp) -> None:
+        """Note that a guide is finished or abandoned."""
+        self._store.update("guides", {"id": guide_id}, {"state": state, **self._store.instant(ended, "ended_")})
+
+    def add(self, guide_id: int, kind: str, details: Mapping[str, Any], at: Stamp, **caller: object) -> None:
+        """Add something that has happened."""
+        row = {"guide_id": guide_id, "kind": kind, "details_json": details, **caller}
+        self._store.insert("guide_events", {**row, **self._store.instant(at)})
+
+    def events(self, guide_id: int) -> list[EventRow]:
+        """All that has happened in a guide, oldest first."""
+        rows = self._store.rows("SELECT * FROM guide_events WHERE guide_id = ? ORDER BY id", (guide_id,))
+        return [
+            EventRow(
+                row["kind"], json.loads(row["details_json"]), self._store.stamp(row), row["caller_pid"] is not None
+            )
+            for row in rows
+        ]
+
+    def newest_observation(self) -> int:
+        """Number of the newest observation of all; 0 before the first."""
+        return self._store.number("SELECT coalesce(max(id), 0) FROM observations", ()) or 0
+
+    def standstill(self, session_id: str, after: int) -> Standstill | None:
+        """The newest standstill of a session with observations that count and are newer than number `after`."""
+        rows = self._store.rows(_STANDSTILL, (session_id, after))
+        if not rows:
+            return None
+        (values,) = self._store.rows("SELECT values_json FROM observations WHERE id = ?", (rows[0]["last"],))
+        return Standstill(**rows[0], values=json.loads(values["values_json"]))
