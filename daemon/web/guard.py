@@ -80,10 +80,12 @@ class Guard:
         length = headers.get("content-length", "0")
         if not length.isdecimal() or int(length) > BODY_BYTES:
             return 413, _TOO_LARGE
-        if method in _SAFE_METHODS:
-            return None
+        return None if method in _SAFE_METHODS else self._foreign(hosts[0], headers)
+
+    def _foreign(self, host: str, headers: Headers) -> tuple[int, str] | None:
+        """Return status and sentence of a request that changes something and is not the page's own; else None."""
         scheme = "https" if self._settings.is_secure else "http"
-        if headers.get("origin") != f"{scheme}://{hosts[0]}":
+        if headers.get("origin") != f"{scheme}://{host}":
             return 403, "what changes something must come from the page itself; reload it"
         if headers.get("content-type", "").partition(";")[0].strip() != "application/json":
             return 415, "a command is JSON"

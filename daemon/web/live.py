@@ -70,14 +70,18 @@ class LiveFeed:
         seen = self._newest[0]
         try:
             while True:
-                async with self._told:
-                    await self._told.wait_for(lambda: self._newest[0] > seen)
-                    seen, message = self._newest
+                seen, message = await self._newer(seen)
                 yield message
         finally:
             self._clients -= 1
             if not self._clients and self._reader is not None:
                 self._reader.cancel()
+
+    async def _newer(self, seen: int) -> tuple[int, bytes]:
+        """Wait for a state that is newer than the one of number `seen`."""
+        async with self._told:
+            await self._told.wait_for(lambda: self._newest[0] > seen)
+            return self._newest
 
     async def _read(self) -> None:
         """Read the state again and again."""

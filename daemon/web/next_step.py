@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
@@ -60,30 +61,39 @@ def _next_step(status: Mapping[str, Any], guide: Mapping[str, Any] | None) -> Ne
         what = f"Session {session['id']} on prism {session['prism']}: {session['poses']} poses"
         step = "Stand still at each pose until it counts; shoot the control points first and last."
         return NextStep(what, "busy", step, "Open the session", screen="session")
+    if any(job["state"] in ("running", "queued") for job in jobs):
+        return _of_jobs(jobs)
+    drift = (status["gap"] or {}).get("drift")
+    return _of_models(
+        models or {"candidate": None, "live": None}, is_drifting=bool(drift and drift["alarm"] == "worse")
+    )
+
+
+def _of_jobs(jobs: Sequence[Mapping[str, Any]]) -> NextStep:
     running = next((job for job in jobs if job["state"] == "running"), None)
+    doing = "jobs are queued"
     if running is not None:
-        doing = _JOBS.get(running["kind"], running["kind"])
-        what = f"Calibrating: {doing}, {100 * running['progress']:.0f} %"
-        return NextStep(what, "wait", "Nothing to do; the boom may move.", "See the jobs", screen="health")
-    if any(job["state"] == "queued" for job in jobs):
-        return NextStep("Calibrating: jobs are queued", "wait", "Nothing to do; the boom may move.")
-    candidate, live = (models["candidate"], models["live"]) if models else (None, None)
+        doing = f"{_JOBS.get(running['kind'], running['kind'])}, {math.floor(100 * running['progress'])} %"
+    step = "Nothing to do; the boom may move."
+    return NextStep(f"Calibrating: {doing}", "wait", step, "See the jobs", screen="health")
+
+
+def _of_models(models: Mapping[str, Any], *, is_drifting: bool) -> NextStep:
+    candidate, live = models["candidate"], models["live"]
     if candidate is not None and candidate["is_acceptable"]:
         what = f"Model {candidate['id']} is better and waits for you"
         return NextStep(what, "good", "Look at what it changes, then accept it.", "Review the model", screen="models")
-    start = "Start a guided session"
+    tone: Tone = "warning"
     if candidate is not None:
-        step = f"It would be refused now: {candidate['refused_because']}"
-        return NextStep(f"Model {candidate['id']} waits for a check", "warning", step, start, screen="guide")
-    drift = (status["gap"] or {}).get("drift") if live else None
-    if live is not None and drift is not None and drift["alarm"] == "worse":
-        what = f"Model {live['id']} is live, and check shots drift from it"
-        return NextStep(what, "warning", "Measure again; the machine has changed.", start, screen="guide")
-    if live is not None:
-        step = "Check shots now and then show whether the model still holds."
-        return NextStep(f"Ready: model {live['id']} is live", "good", step, start, screen="guide")
-    step = "A guided session leads through four prisms and a check to a first model."
-    return NextStep("No model is live yet", "warning", step, start, screen="guide")
+        what, step = f"Model {candidate['id']} waits", f"It would be refused now: {candidate['refused_because']}"
+    elif live is None:
+        what, step = "No model is live yet", "A guided session leads through all prisms and a check to a first model."
+    elif is_drifting:
+        what, step = f"Model {live['id']} is live, and check shots drift from it", "The machine has changed: measure."
+    else:
+        what, step = f"Ready: model {live['id']} is live", "Check shots now and then show whether it still holds."
+        tone = "good"
+    return NextStep(what, tone, step, "Start a guided session", screen="guide")
 
 
 def _of_guide(guide: Mapping[str, Any]) -> NextStep:

@@ -27,6 +27,7 @@ class WebSettings:
         names: further names by which browsers may call this computer.
         loopback_role: what somebody may do who comes by the loopback interface without a token; by the rights of this
             process when None.
+        user: who runs this process.
     """
 
     socket: Path
@@ -37,7 +38,7 @@ class WebSettings:
     key: Path | None = None
     names: tuple[str, ...] = ()
     loopback_role: Role | None = None
-    user: str = field(default_factory=lambda: login_name())
+    user: str = field(default_factory=getpass.getuser)
 
     def check(self) -> None:
         """Raise CommandError where the page must not be served so."""
@@ -101,10 +102,3 @@ def _may_use(path: Path) -> bool:
     if path.exists():
         return os.access(path, os.W_OK)
     return not reading_socket(path).exists()
-
-
-def login_name() -> str:
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):
-        return ""

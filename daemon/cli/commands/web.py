@@ -34,13 +34,13 @@ _FILE = click.Path(dir_okay=False, path_type=Path)
     type=_ROLES,
     help="Most that anyone may do who opens the page on this computer without a token.  [default: what you may do]",
 )
-@click.pass_context
-def web(ctx: click.Context, **options: Any) -> None:
+def web(**options: Any) -> None:
     """Serve the operator's page until stopped; `rigcal web token` lets people in from elsewhere.
 
     On a loopback address the page needs no token: who opens it may do what the user may who started it. Any other
     address needs TLS, and everybody a token (docs/web.md).
     """
+    ctx = click.get_current_context()
     if ctx.invoked_subcommand is None:
         with click.Context(_serve, parent=ctx, info_name="serve") as own:
             own.params = options

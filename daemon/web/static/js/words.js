@@ -16,9 +16,9 @@ export const fixed = (value, digits) =>
   value === null || value === undefined || !Number.isFinite(value) ? "\u2013" : value.toFixed(digits).replace("-", MINUS);
 
 /** A value of a joint, with the decimals that its unit deserves. */
-export const measured = (value, unit) => fixed(value, unit === "mm" ? 0 : unit === "deg" ? 1 : 2);
+export const measured = (value, unit) => fixed(value, unit === "mm" ? 0 : 1);
 
-export const unitName = (unit) => (unit === "deg" ? "\u00b0" : ` ${unit}`);
+export const unitName = (unit) => ({ deg: "\u00b0", degC: " \u00b0C" }[unit] ?? ` ${unit}`);
 
 export const percent = (share) => (share === null || share === undefined ? "\u2013" : `${(100 * share).toFixed(0)} %`);
 

@@ -50,10 +50,10 @@ export function mount(root, app) {
     }
     const { session, fixes } = found;
     fill(head, [session, app.me.role], () => summary(session, app));
-    say(note, fixes.note || (fixes.model !== null ? `Measured less what model ${fixes.model} predicts.` : ""));
     const size = (fix) => (fix.residual_mm ? Math.hypot(...fix.residual_mm) : null);
     const spread = spreads(fixes.fixes);
     const isModel = fixes.fixes.some((fix) => fix.residual_mm);
+    say(note, [fixes.note, isModel ? `Measured less what model ${fixes.model} predicts.` : "Until then: how far each fix lies from the mean of its pose."].filter(Boolean).join(" "));
     const value = (fix) => (isModel ? size(fix) : spread.get(fix.id) ?? null);
     chart.box.setAttribute("aria-label", isModel ? "Distance of each fix from the live model's prediction over time" : "Distance of each fix from the mean of its pose over time");
     chart.show([fixes.fixes.map((fix) => fix.utc_ns / 1e9),
@@ -97,6 +97,23 @@ function poseTable(fixes, spread, size) {
   return rows.length ? table("The newest poses first", [["at", true], ["fixes used", false], ["spread, mm", false], ["residual, mm", false], ["excluded because", true]], rows) : h("p", { class: "empty" }, "No fix has come yet.");
 }
 
+/** What an operator does in a session that no guide leads. */
+function byHand(session, app) {
+  const points = [...new Set(session.control_shots.map((shot) => shot.point))];
+  const stop = async () => {
+    const go = await app.confirm(`End session ${session.id}?`, ["Its jobs follow by themselves.", "Shoot the control points before: without them the session is not used."], "End the session");
+    if (go !== null) await app.run("session.stop", {}, "The session is ended");
+  };
+  const abort = async () => {
+    const go = await app.confirm(`Abort session ${session.id}?`, ["It is kept and never calibrated with."], "Abort the session", { kind: "danger" });
+    if (go !== null) await app.run("session.abort", {}, "The session is aborted");
+  };
+  return [
+    (points.length ? points : ["cp1"]).map((point) => app.button(`Shoot ${point}`, "operate", () => app.run("session.shoot", { point }, `${point} is shot`))),
+    app.button("End the session", "operate", stop, "main"), app.button("Abort", "operate", abort, "danger"),
+  ];
+}
+
 function summary(session, app) {
   const state = session.state === "open" ? ["open", "tag good"] : session.not_used ? ["not used", "tag bad"] : [session.state, "tag"];
   const shots = session.control_shots.map((shot) => `${shot.point} at the ${shot.phase}: ${shot.misclosure_mm === null ? "defined" : `${fixed(shot.misclosure_mm, 1)} mm off`}`);
@@ -106,6 +123,7 @@ function summary(session, app) {
   };
   return [
     h("div", { class: "row" }, h("h2", null, `${session.id}: prism ${session.prism}${session.kind === "check" ? ", a check" : ""}`), h("span", { class: state[1] }, state[0])),
+    session.state === "open" && !app.live.state.guide?.session ? h("div", { class: "row" }, byHand(session, app)) : null,
     h("dl", { class: "tiles" }, tile("Poses", String(session.poses)), tile("Fixes", String(session.observations)), tile("Set-up", session.setup ?? "\u2013"), tile("Started", utc(session.started_utc_ns).slice(11), "", utc(session.started_utc_ns).slice(0, 10))),
     Object.keys(session.excluded).length ? h("div", null, h("h3", null, "Excluded"), h("ul", null, Object.entries(session.excluded).map(([reason, n]) => h("li", null, `${plural(n, "fix", "fixes")}: ${reason}`)))) : null,
     shots.length ? h("div", null, h("h3", null, "Control points"), h("ul", null, shots.map((shot) => h("li", null, shot)))) : h("p", { class: "doubtful" }, "No control point was shot yet."),
