@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
@@ -85,6 +86,7 @@ class Page:
         ]
         errors = {
             Refused: _refused,
+            HTTPException: _http_error,
             CommandError: _command_error,
             StoreError: _store_error,
             sqlite3.Error: _store_error,
@@ -258,6 +260,10 @@ async def _object(request: Request) -> dict[str, Any]:
 
 async def _refused(_request: Request, error: Refused) -> Response:
     return JSONResponse({"error": str(error)}, error.status, error.headers)
+
+
+async def _http_error(_request: Request, error: HTTPException) -> Response:
+    return JSONResponse({"error": error.detail}, error.status_code, error.headers)
 
 
 async def _command_error(_request: Request, error: CommandError) -> Response:

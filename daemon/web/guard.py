@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -65,10 +66,7 @@ class Guard:
             status, sentence = refusal
             await JSONResponse({"error": sentence}, status)(scope, receive, send_guarded)
             return
-        try:
-            await self._app(scope, _bounded(receive), send_guarded)
-        except _TooLargeError:
-            await JSONResponse({"error": _TOO_LARGE}, 413)(scope, receive, send_guarded)
+        await self._app(scope, _bounded(receive), send_guarded)
 
     def _refusal(self, method: str, path: str, headers: Headers) -> tuple[int, str] | None:
         """Return status and sentence of a request that is refused; None of one that is not."""
@@ -92,14 +90,11 @@ class Guard:
         return None
 
 
-class _TooLargeError(Exception):
-    """A body that did not say how long it is turned out too long."""
-
-
 _TOO_LARGE = f"a request holds at most {BODY_BYTES} bytes"
 
 
 def _bounded(receive: Receive) -> Receive:
+    """Return a source of the same messages that ends a body which did not say how long it is."""
     taken = 0
 
     async def bounded() -> Message:
@@ -107,7 +102,7 @@ def _bounded(receive: Receive) -> Receive:
         message = await receive()
         taken += len(message.get("body", b""))
         if taken > BODY_BYTES:
-            raise _TooLargeError
+            raise HTTPException(413, _TOO_LARGE)
         return message
 
     return bounded

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import signal
 import socket
 from collections.abc import Callable
 
@@ -57,6 +58,9 @@ def serve(settings: WebSettings, say: Callable[[str], None], notifier: Notifier)
     scheme = "https" if settings.is_secure else "http"
     say(f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/")
     notifier.send("READY=1", f"STATUS=serving the page at {scheme}://{host}:{port}")
+    # uvicorn stops on SIGTERM and raises it again afterwards: the end is in order by then.
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: None)
     with listener:
         uvicorn.Server(config).run(sockets=[listener])
 

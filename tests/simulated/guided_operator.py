@@ -63,7 +63,9 @@ class GuidedOperator:
             case "go_to_pose" | "hold":
                 self._say("simulation.visit", poses=[self._pose(state["joints"])])
             case "enough":
-                ends = [row for row in state["steps"] if row["kind"] == "shoot_control_point" and row["state"] == "to do"]
+                ends = [
+                    row for row in state["steps"] if row["kind"] == "shoot_control_point" and row["state"] == "to do"
+                ]
                 if step["is_detected"] and ends:
                     self._say("simulation.aim", target=ends[0]["title"].split()[2].rstrip(","))
                 else:

@@ -54,6 +54,7 @@ def _serve(**options: Any) -> None:
     from daemon.web.server import serve
 
     set_up_logging(level=logging.INFO)
+    logging.getLogger("uvicorn").setLevel(logging.WARNING)
     serve(_settings(**options), lambda address: echo(f"the page is at {address}"), Notifier())
 
 

@@ -15,11 +15,12 @@ export function alarmList(now, app) {
     h("h2", { id: "alarms-title" }, active.length ? `Alarms (${active.length})` : "No alarms"),
     late ? h("p", { class: "bad" }, `The daemon is held up: alarms were last looked at ${duration(looked)} ago.`) : null,
     Object.entries(now.unreadable).map(([part, why]) => h("p", { class: "bad" }, `${words(part)} cannot be read from the store: ${why}`)),
-    active.length ? h("ul", { class: "alarms" }, active.map((alarm) => shown(alarm, app))) : h("p", { class: "soft" }, "Everything that rigcal watches is well."),
+    active.length ? h("ul", { class: "alarms" }, active.map((alarm) => alarmItem(alarm, app))) : h("p", { class: "soft" }, "Everything that rigcal watches is well."),
   ];
 }
 
-function shown(alarm, app) {
+/** One alarm, as an entry of a list. */
+export function alarmItem(alarm, app) {
   const action = ACTIONS[alarm.kind];
   return h("li", { class: `alarm ${alarm.severity}`, "data-kind": alarm.kind },
     h("h3", null, `${alarm.severity === "critical" ? "Critical" : "Warning"}: ${words(alarm.kind)}, ${alarm.subject}`),

@@ -88,7 +88,7 @@ export class Boom {
 
   #view(title, project) {
     const flat = this.cloud.map(project);
-    const [x0, x1] = extent(flat.map((p) => p[0])), [y0, y1] = extent(flat.map((p) => p[1]));
+    const [x0, x1] = extent(flat, 0), [y0, y1] = extent(flat, 1);
     const scale = Math.min((WIDTH - 2 * MARGIN) / (x1 - x0), (HEIGHT - 2 * MARGIN) / (y1 - y0));
     const left = (WIDTH - scale * (x1 - x0)) / 2, low = (HEIGHT - scale * (y1 - y0)) / 2;
     const at = (p) => { const [x, y] = project(p); return [left + scale * (x - x0), HEIGHT - low - scale * (y - y0)]; };
@@ -118,8 +118,9 @@ export class Boom {
   }
 }
 
-function extent(values) {
-  let [low, high] = [Infinity, -Infinity];
-  for (const value of values) { low = Math.min(low, value); high = Math.max(high, value); }
-  return [low, high];
+/** Range of a coordinate that holds the base and nearly all places that the boom reaches. */
+function extent(points, coordinate) {
+  const sorted = points.map((p) => p[coordinate]).toSorted((a, b) => a - b);
+  const at = (share) => sorted[Math.round(share * (sorted.length - 1))];
+  return [Math.min(at(0.01), 0), Math.max(at(0.99), 0)];
 }

@@ -2,6 +2,7 @@
 
 import { get } from "../api.js";
 import { Boom } from "../boom.js";
+import { alarmItem } from "../alarms.js";
 import { bar, fill, h, say, tile } from "../dom.js";
 import { startForm } from "../guide_start.js";
 import { duration, measured, millimetres, percent, plural, unitName, words } from "../words.js";
@@ -24,7 +25,7 @@ export function mount(root, app) {
         open = which === "start" ? null : openGuide(app);
         page.replaceChildren(open ? open.element : startPage(app, now));
       }
-      open?.update(guide);
+      open?.update(guide, now.alarms.active.filter((alarm) => alarm.severity === "critical"));
     },
   };
 }
@@ -44,6 +45,7 @@ function openGuide(app) {
   const instruction = h("p", { class: "instruction", id: "instruction" });
   const why = h("p", { class: "soft" });
   const messages = h("div");
+  const alarms = h("ul", { class: "alarms", "aria-label": "Critical alarms" });
   const hold = h("div");
   const main = h("div", { id: "guide-action" });
   const others = h("div", { class: "row" });
@@ -59,24 +61,25 @@ function openGuide(app) {
 
   const element = h("div", { class: "guide" },
     h("div", { class: "stack" },
-      h("section", { class: "card stack", "aria-labelledby": "guide-title" }, title, instruction, hold, main, messages, why, others),
-      h("section", { class: "card stack", "aria-labelledby": "boom-title" }, h("h2", { id: "boom-title" }, "The boom"),
-        h("p", { class: "key" }, h("span", null, "where it is"), h("span", null, "where to go")), views)),
+      h("section", { class: "card stack", "aria-labelledby": "guide-title" }, title, instruction, hold, main, alarms, messages, why, others),
+      h("section", { class: "card", "aria-labelledby": "joints-title" }, h("h2", { id: "joints-title" }, "Joint by joint"), joints)),
     h("div", { class: "stack" },
-      h("section", { class: "card", "aria-labelledby": "joints-title" }, h("h2", { id: "joints-title" }, "Joint by joint"), joints),
+      h("section", { class: "card stack", "aria-labelledby": "boom-title" }, h("h2", { id: "boom-title" }, "The boom"),
+        h("p", { class: "key" }, h("span", null, "where it is"), h("span", null, "where to go")), views),
       h("section", { class: "card", "aria-labelledby": "gain-title" }, h("h2", { id: "gain-title" }, "What there is to gain"), gain),
       h("section", { class: "card", "aria-labelledby": "coverage-title" }, h("h2", { id: "coverage-title" }, "Coverage"), coverage),
       h("section", { class: "card", "aria-labelledby": "steps-title" }, h("h2", { id: "steps-title" }, "The whole job"), steps)));
 
   return {
     element,
-    update(guide) {
+    update(guide, critical) {
       const { step } = guide;
       say(title, step.title);
       say(instruction, step.instruction);
       say(why, step.why ?? "");
       fill(main, [step.id, step.button, step.is_busy, app.me.role], () => mainButton(app, step));
       fill(others, [step.id, step.others, step.can_skip, step.kind, app.me.role], () => otherButtons(app, guide));
+      fill(alarms, critical.map((alarm) => [alarm.kind, alarm.subject, alarm.text]), () => critical.map((alarm) => alarmItem(alarm, app)));
       fill(messages, guide.messages, () => guide.messages.map((each) =>
         h("p", { class: each.severity === "warning" ? "alarm" : "soft" }, each.text)));
       fill(hold, guide.hold, () => holding(guide.hold));
@@ -149,6 +152,7 @@ function showJoints(list, rows, joints, app) {
     say(row.name, joint.label || joint.name);
     app.aged(row.move, move(joint), joint.is_fresh ? Math.min(app.live.ageOf(joint.age_s) ?? 0, Math.max(app.live.age, 0)) : app.live.ageOf(joint.age_s));
     row.line.classList.toggle("there", joint.is_there === true);
+    row.line.classList.toggle("to-go", joint.is_there === false);
     const unit = unitName(joint.unit);
     const target = joint.target === null ? "" : `, to ${measured(joint.target, joint.unit)}${unit} \u00b1 ${measured(joint.tolerance, joint.unit)}${unit}`;
     say(row.figures, `reads ${measured(joint.now, joint.unit)}${joint.now === null ? "" : unit}${target}`);

@@ -72,6 +72,7 @@ function card(model, jobs, now, app) {
     h("div", { class: "row" },
       candidate?.is_acceptable ? app.button(`Accept model ${model.id}`, "approve", () => accept(model, compared, now, app), "main") : null,
       model.state === "candidate" ? app.button("Reject", "approve", () => reject(model, app), "danger") : null,
+      model.state === "retired" && model.history.some((change) => change.state === "live") ? app.button(`Put model ${model.id} back`, "approve", () => putBack(model, now, app)) : null,
       model.state === "live" ? app.button("Roll back", "approve", () => rollBack(model, now, app), "danger") : null,
       model.state === "candidate" ? app.button("Compare again", "operate", () => app.run("model.compare", { id: model.id })) : null,
       report ? h("a", { class: "button", href: `/report/${report.id}`, target: "_blank", rel: "noopener" }, "Open its report") : null),
@@ -110,6 +111,19 @@ async function rollBack(model, now, app) {
   ];
   if (await app.confirm(`Roll back to model ${before}?`, reasons, `Put model ${before} back`, { kind: "danger" }) !== null) {
     await app.run("model.rollback", {}, `Model ${before} is live again`);
+  }
+}
+
+async function putBack(model, now, app) {
+  const live = now.models.live;
+  const left = model.history.findLast((change) => change.state === "retired");
+  const reasons = [
+    live ? `It takes the place of model ${live.id}, which is retired and can be put back too.` : "No model is live now.",
+    `Model ${model.id} left ${utc(left.utc_ns)}: ${left.reason}.`,
+    model.metrics.comparison ? `When it was compared: ${model.metrics.comparison.sentence}.` : "It was never compared with held-out check shots.",
+  ];
+  if (await app.confirm(`Put model ${model.id} back?`, reasons, `Put model ${model.id} back`, { kind: "danger" }) !== null) {
+    await app.run("model.rollback", { id: model.id }, `Model ${model.id} is live again`);
   }
 }
 
