@@ -41,7 +41,7 @@ function startPage(app, now) {
 }
 
 function openGuide(app) {
-  const title = h("h2", { role: "status", "aria-live": "polite", id: "guide-title" });
+  const title = h("span", { role: "status", "aria-live": "polite" });
   const instruction = h("p", { class: "instruction", id: "instruction" });
   const why = h("p", { class: "soft" });
   const messages = h("div");
@@ -61,7 +61,7 @@ function openGuide(app) {
 
   const element = h("div", { class: "guide" },
     h("div", { class: "stack" },
-      h("section", { class: "card stack", "aria-labelledby": "guide-title" }, title, instruction, hold, main, alarms, messages, why, others),
+      h("section", { class: "card stack", "aria-labelledby": "guide-title" }, h("h2", { id: "guide-title" }, title), instruction, hold, main, alarms, messages, why, others),
       h("section", { class: "card", "aria-labelledby": "joints-title" }, h("h2", { id: "joints-title" }, "Joint by joint"), joints)),
     h("div", { class: "stack" },
       h("section", { class: "card stack", "aria-labelledby": "boom-title" }, h("h2", { id: "boom-title" }, "The boom"),

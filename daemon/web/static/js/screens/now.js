@@ -5,10 +5,10 @@ import { alarmList } from "../alarms.js";
 import { fixed, millimetres, percent, plural } from "../words.js";
 
 export function mount(root, app) {
-  const state = h("h2", { id: "state", role: "status", "aria-live": "polite" });
+  const state = h("span", { role: "status", "aria-live": "polite" });
   const step = h("p", { id: "step" });
   const action = h("div", { id: "action" });
-  const card = h("section", { class: "card state", "aria-label": "State and next step" }, state, step, action);
+  const card = h("section", { class: "card state", "aria-label": "State and next step" }, h("h2", { id: "state" }, state), step, action);
   const tiles = h("dl", { class: "tiles", "aria-label": "Figures" });
   const alarms = h("section", { class: "card", "aria-labelledby": "alarms-title" });
   root.append(card, tiles, alarms);
