@@ -10,13 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from calibration.design.accuracy import ExpectedAccuracy, predicted_accuracy
-from calibration.design.candidates import Candidates, draw, work_volume
+from calibration.design.candidates import Candidates, draw, near, work_volume
 from calibration.design.exchange import covariance_of
 from calibration.design.knowledge import Knowledge
 from calibration.design.poses import plan, whitened
@@ -118,9 +118,7 @@ def _nominal(rig: Rig, lacking: float) -> Measured:
 
 
 def _standstills(observations: Observations) -> set[tuple[str, str, str]]:
-    return set(
-        zip(observations.session.tolist(), observations.pose.tolist(), observations.prism.tolist(), strict=True)
-    )
+    return set(zip(observations.session.tolist(), observations.pose.tolist(), observations.prism.tolist(), strict=True))
 
 
 def chosen_poses(measured: Measured, prism: str, count: int, seed: int) -> Floats:
@@ -136,20 +134,19 @@ def chosen_poses(measured: Measured, prism: str, count: int, seed: int) -> Float
         (n, joints) poses, n <= count, each ten in the order of a short motion.
     """
     rng = np.random.default_rng([_SEED, seed])
-    knowledge = measured.knowledge
+    knowledge, at = measured.knowledge, measured.at
     index = knowledge.chain.rig.prism_names.index(prism)
-    drawn = draw(knowledge, measured.at, rng, _CANDIDATES)
+    drawn = draw(knowledge, at, rng, _CANDIDATES)
     drawn = drawn.select(np.flatnonzero(drawn.seen[:, index]))
     alone = np.zeros_like(drawn.seen)
     alone[:, index] = True
-    candidates = replace(drawn, conditions={}, seen=alone)
+    candidates = Candidates(drawn.readings, {"fixes": np.full(len(drawn), measured.fixes)}, alone)
     found = np.empty((0, len(knowledge.chain.rig.joints)))
     while len(found) < count and len(candidates) > _CHUNK:
-        part = plan(knowledge, candidates, min(_CHUNK, count - len(found)), volume=measured.volume)
+        nearby = partial(near, knowledge, at, rng)
+        part = plan(knowledge, candidates, min(_CHUNK, count - len(found)), volume=measured.volume, nearby=nearby)
         found = np.concatenate([found, part.poses.readings])
         knowledge = replace(knowledge, root=part.root)
-        taken = (candidates.readings[:, None, :] == part.poses.readings[None, :, :]).all(axis=2).any(axis=1)
-        candidates = candidates.select(np.flatnonzero(~taken))
     return found
 
 

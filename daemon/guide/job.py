@@ -19,7 +19,7 @@ events alone, so a guide that is read from the store goes on where it was. Event
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -147,6 +147,12 @@ class Run:
         return next((i for i, step in enumerate(self.steps) if step.state == "to do"), None)
 
     @property
+    def following(self) -> Step | None:
+        """The step after the one to do; None where there is none."""
+        number = self.next_step
+        return None if number is None or number + 1 >= len(self.steps) else self.steps[number + 1]
+
+    @property
     def next_pose(self) -> int | None:
         """Index of the pose to go to; None where none is left or they are not chosen."""
         return next((i for i, pose in enumerate(self.poses or ()) if pose.state == "to do"), None)
@@ -170,7 +176,6 @@ class Job:
         runs: in their order.
         state: open, finished or abandoned.
         misclosure_mm: of the newest shot.
-        shots: number of shots so far.
         trouble: why the last attempt at this step failed; "" after it went on.
         ended_because: why it was abandoned.
     """
@@ -239,48 +244,18 @@ class Job:
         """
         if self.state != "open":
             raise ValueError(f"{kind}: the guide is {self.state}")
-        if kind == "failed":
-            return replace(self, trouble=str(details["text"]))
-        if kind == "stopped":
-            return replace(self, state="abandoned", ended_because=str(details["reason"]))
-        job = replace(self, trouble="")
-        run = job.run
-        match kind:
-            case "opened":
-                return job._with(replace(run, session=str(details["session"]), last=int(details["last"])))
-            case "planned":
-                return job._with(replace(run, poses=tuple(PlannedPose(pose) for pose in details["poses"])))
-            case "shot":
-                job._require("shoot_control_point", kind)
-                return replace(job, misclosure_mm=details["misclosure_mm"])._with(_stepped(run, "done"))
-            case "aimed":
-                job._require("change_prism", kind)
-                return job._with(_stepped(run, "done"))
-            case "measured":
-                job._require("poses", kind)
-                done = _posed(run, "done")
-                return job._with(replace(done, last=int(details["last"]), label=str(details["pose"])))
-            case "enough":
-                return job._with(replace(run, enough=str(details["reason"])))
-            case "more":
-                job._require("poses", kind)
-                return job._with(_extended(run, details["poses"]))
-            case "left":
-                job._require("poses", kind)
-                return job._with(_stepped(_rest_skipped(run, run.enough or "enough"), "done"))
-            case "closed":
-                return job._with(_stepped(run, "done"))
-            case "skipped":
-                return job._skipped(str(details["reason"]), rest=bool(details.get("rest")))
-        raise ValueError(f"there is no event {kind!r}")
-
-    def _require(self, wanted: StepKind, kind: str) -> None:
-        if self.step is None or self.step.kind != wanted:
+        if kind not in _EVENTS:
+            raise ValueError(f"there is no event {kind!r}")
+        wanted = _STEP_OF.get(kind)
+        if wanted is not None and (self.step is None or self.step.kind != wanted):
             raise ValueError(f"{kind}: the step is {self.step and self.step.kind}, not {wanted}")
+        return _EVENTS[kind](replace(self, trouble=""), details)
 
-    def _skipped(self, reason: str, *, rest: bool) -> Job:
+    def skipped(self, reason: str, *, rest: bool) -> Job:
+        """Return the state without this step, or without all poses of the run that are left."""
         run, step = self.run, self.step
-        assert step is not None
+        if step is None:
+            raise ValueError("there is no step to skip")
         if step.kind == "change_prism":  # without its prism the session has nothing
             steps = tuple(replace(s, state="skipped", reason=reason) if s.state == "to do" else s for s in run.steps)
             return self._with(replace(run, steps=steps))
@@ -289,6 +264,14 @@ class Job:
         if rest or self.is_enough:
             return self._with(_stepped(_rest_skipped(run, reason), "done" if run.done else "skipped", reason))
         return self._with(_posed(run, "skipped", reason))
+
+    def changed(self, **changes: Any) -> Job:
+        """Return the state with other attributes of the run that is on."""
+        return self._with(replace(self.run, **changes))
+
+    def stepped(self) -> Job:
+        """Return the state with this step done."""
+        return self._with(_stepped(self.run, "done"))
 
     def _with(self, run: Run) -> Job:
         """Return the job with its present run changed; finished when that was the last thing to do."""
@@ -339,12 +322,45 @@ def _rest_skipped(run: Run, reason: str) -> Run:
     return replace(run, poses=poses)
 
 
-def _extended(run: Run, poses: Sequence[Pose]) -> Run:
-    """Measure more poses: those that are left first, and then new ones; the stop rule is not asked until then."""
-    more = tuple(PlannedPose(pose) for pose in poses)
-    return replace(
-        run, poses=(*(run.poses or ()), *more), enough="", least=run.done + len(run.upcoming(10**6)) + len(more)
-    )
+def _measured(job: Job, details: Mapping[str, Any]) -> Job:
+    posed = _posed(job.run, "done")
+    return job.changed(poses=posed.poses, last=int(details["last"]), label=str(details["pose"]))
+
+
+def _more(job: Job, details: Mapping[str, Any]) -> Job:
+    """Measure the poses that are left and new ones; the stop rule is not asked until they are done."""
+    poses = (*(job.run.poses or ()), *(PlannedPose(pose) for pose in details["poses"]))
+    least = sum(pose.state != "skipped" for pose in poses)
+    return job.changed(poses=poses, enough="", least=least)
+
+
+def _left(job: Job) -> Job:
+    rest = _rest_skipped(job.run, job.run.enough or "enough")
+    return job.changed(poses=rest.poses).stepped()
+
+
+_STEP_OF: Mapping[str, StepKind] = {
+    "shot": "shoot_control_point",
+    "aimed": "change_prism",
+    "measured": "poses",
+    "more": "poses",
+    "left": "poses",
+    "closed": "close",
+}
+_EVENTS: Mapping[str, Callable[[Job, Mapping[str, Any]], Job]] = {
+    "opened": lambda job, d: job.changed(session=str(d["session"]), last=int(d["last"])),
+    "planned": lambda job, d: job.changed(poses=tuple(PlannedPose(pose) for pose in d["poses"])),
+    "shot": lambda job, d: replace(job, misclosure_mm=d["misclosure_mm"]).stepped(),
+    "aimed": lambda job, _: job.stepped(),
+    "measured": _measured,
+    "enough": lambda job, d: job.changed(enough=str(d["reason"])),
+    "more": _more,
+    "left": lambda job, _: _left(job),
+    "closed": lambda job, _: job.stepped(),
+    "skipped": lambda job, d: job.skipped(str(d["reason"]), rest=bool(d.get("rest"))),
+    "failed": lambda job, d: replace(job, trouble=str(d["text"])),
+    "stopped": lambda job, d: replace(job, state="abandoned", ended_because=str(d["reason"])),
+}
 
 
 # ---- the stop rule ---------------------------------------------------------------------------------------------------

@@ -185,7 +185,6 @@ class GuideKeeper:
             assert step is not None
             if self._busy == step_id or not run.session:
                 raise CommandError(f"the daemon is at work on it: {headline(job)}", REFUSED)
-            self._taps += 1
             if step.kind == "shoot_control_point":
                 self._wanted = step_id  # measured by the guide's own thread: the state shows how it goes
             elif step.kind == "change_prism":
@@ -195,8 +194,8 @@ class GuideKeeper:
             elif step.kind == "poses" and run.next_pose is not None:
                 self._measured_here()
             else:
-                self._taps -= 1
                 raise CommandError(f"this step ends by itself: {headline(job)}", REFUSED)
+            self._tapped()
             return self._state()
 
     def skip_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -212,7 +211,7 @@ class GuideKeeper:
             assert step is not None
             if step.kind == "close" or (rest and step.kind != "poses"):
                 raise CommandError(f"this step cannot be skipped: {headline(job)}", REFUSED)
-            self._taps += 1
+            self._tapped()
             if step.kind == "change_prism" and self._sessions.open_session() is not None:
                 self._sessions.abort_command({})
             self._happen("skipped", {"reason": reason, "rest": rest})
@@ -226,7 +225,7 @@ class GuideKeeper:
             step, run = job.step, job.run
             if step is None or step.kind != "poses" or not job.is_enough:
                 raise CommandError(f"more poses are for when there are enough; now: {headline(job)}", REFUSED)
-            self._taps += 1
+            self._tapped()
             left = len(run.upcoming(count))
             if left < count:
                 self._choose(count - left, as_more=True)
@@ -241,7 +240,7 @@ class GuideKeeper:
         self._give_up_work()
         with self._turn:
             self._needs_step({})
-            self._taps += 1
+            self._tapped()
             opened = self._sessions.open_session()
             if opened is not None and opened["poses"]:
                 self._sessions.stop_command({})
@@ -259,6 +258,12 @@ class GuideKeeper:
         if meant is not None and meant != job.step_id:
             raise CommandError(f"another step is on by now: {headline(job)}", REFUSED)
         return job, job.step_id
+
+    def _tapped(self) -> None:
+        """Count a command that was given to the guide."""
+        self._taps += 1
+        if self._row is not None:
+            self._table.count_taps(self._row.id, self._taps)
 
     def _measured_here(self) -> None:
         """Take the standstill at which the boom is for the pose, wherever that is."""
@@ -432,8 +437,7 @@ class GuideKeeper:
         """The control point that comes after the poses; "" where it is another step's turn."""
         if job.step is None or job.step.kind != "poses" or not job.is_enough:
             return ""
-        after = job.run.steps[(job.run.next_step or 0) + 1]
-        return after.point
+        return "" if job.run.following is None else job.run.following.point
 
     # ---- the gain meter ----------------------------------------------------------------------------------------------
 
@@ -592,7 +596,7 @@ class GuideKeeper:
         for event in events:
             job = job.after(event.kind, event.details)
         self._row, self._job = row, job
-        self._taps = 1 + sum(event.is_command for event in events)
+        self._taps = row.taps
         if job.state != "open":
             return
         log.warning("guide %d was open when rigcal last ended; it goes on: %s", row.id, headline(job))

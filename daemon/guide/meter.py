@@ -3,11 +3,11 @@
 Standard input carries questions, one JSON object a line, and standard output the answers; when the input closes, the
 daemon is gone and so goes the process. The first line is a `Place`. A question is
 
-    {"do": "assess", "sessions": [...], "setup": NAME, "session": ID, "prism": NAME, "prisms": [...], "next": [pose, ...]}
-    {"do": "choose", "sessions": [...], "setup": NAME, "prism": NAME, "count": 20, "seed": 3, "evenly": false}
+    {"do": "assess", ..., "prisms": [NAME, ...], "next": [pose, ...]}
+    {"do": "choose", ..., "count": 20, "seed": 3, "evenly": false}
 
-with poses as joint -> number; an answer is {"result": {...}} or {"error": "one sentence"}. Only the daemon writes to the
-store.
+each with `sessions` to use, the one of them that is still open (`session`), `setup` and `prism`, and poses as joint ->
+number; an answer is {"result": {...}} or {"error": "one sentence"}. Only the daemon writes to the store.
 """
 
 from __future__ import annotations
@@ -164,7 +164,7 @@ class Meter:
                     self._kept[name] = rows
                 if rows is not None:
                     found.append(rows)
-        return _joined(found) if found else None
+        return joined(found) if found else None
 
     def _read(self, reader: Reader, session: str) -> Observations | None:
         data = sessions_csv(reader, self._rig, [session])
@@ -179,7 +179,7 @@ class Meter:
         return {name: round(float(readings[i]), _DIGITS) for i, name in enumerate(self._rig.joint_names)}
 
 
-def _joined(parts: Sequence[Observations]) -> Observations:
+def joined(parts: Sequence[Observations]) -> Observations:
     """Rows of several sessions after each other, with the optional columns that all of them have."""
     columns = set.intersection(*(set(part.extra) for part in parts))
 

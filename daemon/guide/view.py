@@ -94,10 +94,8 @@ def _target(job: Job) -> PlannedPose | None:
 
 def _kind(rig: Rig, job: Job, around: Around) -> str:
     step = job.step
-    if step is None:
-        return job.state
-    if step.kind != "poses":
-        return step.kind
+    if step is None or step.kind != "poses":
+        return job.state if step is None else step.kind
     if job.run.poses is None:
         return "planning"
     target = _target(job)
@@ -148,20 +146,20 @@ def _number(job: Job) -> int:
 
 def _title(job: Job) -> str:
     step, run = job.step, job.run
+    is_check = run.kind == CHECK
     if step is None:
-        return {"finished": "All is measured", "abandoned": "The guide was abandoned"}.get(job.state, "")
-    if step.kind == "shoot_control_point":
-        return f"Shoot control point {step.point}"
-    if step.kind == "change_prism":
-        return f"Aim at prism {run.prism}" + (" for the check" if run.kind == CHECK else "")
-    if step.kind == "close":
-        return "Closing the session"
+        return "All is measured" if job.state == "finished" else "The guide was abandoned"
+    if step.kind != "poses":
+        return {
+            "shoot_control_point": f"Shoot control point {step.point}",
+            "change_prism": f"Aim at prism {run.prism}{' for the check' if is_check else ''}",
+            "close": "Closing the session",
+        }[step.kind]
     if run.poses is None:
         return "Choosing the poses"
     if job.is_enough or run.next_pose is None:
-        return f"Enough poses of prism {run.prism}"
-    check = "check " if run.kind == CHECK else ""
-    return f"Go to {check}pose {run.next_pose + 1} of {len(run.poses)}"
+        return f"Enough poses of {'the check' if is_check else f'prism {run.prism}'}"
+    return f"Go to {'check ' if is_check else ''}pose {run.next_pose + 1} of {len(run.poses)}"
 
 
 def _words(job: Job, kind: str, around: Around) -> tuple[str, str]:
@@ -201,8 +199,8 @@ def _words(job: Job, kind: str, around: Around) -> tuple[str, str]:
 
 
 def _after_enough(job: Job, around: Around) -> str:
-    step = job.run.steps[(job.run.next_step or 0) + 1]
-    if step.kind != "shoot_control_point":
+    step = job.run.following
+    if step is None or step.kind != "shoot_control_point":
         return "Go on."
     if around.is_detected:
         return f"Aim the station at control point {step.point}; it is measured by itself. Or measure five more poses."

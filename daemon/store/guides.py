@@ -26,6 +26,7 @@ class GuideRow:
         setup_id: set-up of its station.
         operator: who is responsible.
         request: what it was asked for.
+        taps: number of commands that were given to it.
         started: when.
     """
 
@@ -34,6 +35,7 @@ class GuideRow:
     setup_id: str
     operator: str
     request: Mapping[str, Any]
+    taps: int
     started: Stamp
 
 
@@ -44,13 +46,11 @@ class EventRow:
     Attributes:
         kind, details: see `daemon.guide.job`.
         at: when.
-        is_command: an operator said so.
     """
 
     kind: str
     details: Mapping[str, Any]
     at: Stamp
-    is_command: bool
 
 
 @dataclass(frozen=True)
@@ -88,12 +88,23 @@ class GuideTable:
             return None
         row = rows[0]
         request, started = json.loads(row["request_json"]), self._store.stamp(row, "started_")
-        return GuideRow(row["id"], row["state"], row["setup_id"], row["operator"], request, started)
+        return GuideRow(row["id"], row["state"], row["setup_id"], row["operator"], request, row["taps"], started)
 
     def open(self, started: Stamp, setup_id: str, operator: str, request: Mapping[str, Any], **caller: object) -> int:
         """Add an open guide; its number."""
-        row = {"rig": self._rig, "state": "open", "setup_id": setup_id, "operator": operator, "request_json": request}
+        row = {
+            "rig": self._rig,
+            "state": "open",
+            "setup_id": setup_id,
+            "operator": operator,
+            "request_json": request,
+            "taps": 1,
+        }
         return self._store.insert("guides", {**row, **caller, **self._store.instant(started, "started_")})
+
+    def count_taps(self, guide_id: int, taps: int) -> None:
+        """Note how many commands were given to a guide."""
+        self._store.update("guides", {"id": guide_id}, {"taps": taps})
 
     def end(self, guide_id: int, state: str, ended: Stamp) -> None:
         """Note that a guide is finished or abandoned."""
@@ -107,12 +118,7 @@ class GuideTable:
     def events(self, guide_id: int) -> list[EventRow]:
         """All that has happened in a guide, oldest first."""
         rows = self._store.rows("SELECT * FROM guide_events WHERE guide_id = ? ORDER BY id", (guide_id,))
-        return [
-            EventRow(
-                row["kind"], json.loads(row["details_json"]), self._store.stamp(row), row["caller_pid"] is not None
-            )
-            for row in rows
-        ]
+        return [EventRow(row["kind"], json.loads(row["details_json"]), self._store.stamp(row)) for row in rows]
 
     def newest_observation(self) -> int:
         """Number of the newest observation of all; 0 before the first."""

@@ -1,4 +1,4 @@
-"""A simulated operator who does what a guide says: drives the boom, aims the station, presses the button where one must.
+"""A simulated operator who does what a guide says: drives, aims, and presses the button where one must.
 
 The daemon runs with `--sim --by-hand`: boom and station move only as they are told here.
 """
@@ -49,6 +49,8 @@ class GuidedOperator:
 
     def _obey(self, state: Mapping[str, Any]) -> None:
         step = state["step"]
+        if any("confirm-prism" in message["text"] for message in state["messages"]):
+            self._say("session.confirm-prism", operator="Ada")  # an operator looks, and it is the prism
         if step["is_busy"] or step["id"] == self._obeyed:
             return
         self._obeyed = step["id"]

@@ -8,11 +8,12 @@ from typing import Any
 
 import click
 
-from daemon.cli.client import ask, client_options, operator_option, who
+from daemon.cli.client import ask, client_options, operator_option, socket_of, who
 from daemon.cli.command import Command, json_option
 from daemon.cli.state_lines import job_line, show_session
 from daemon.cli.terminal import echo, echo_error, echo_table
 from daemon.commands import SESSION_KINDS
+from daemon.control.protocol import request
 
 SHOT_TIMEOUT_S = 600.0
 
@@ -140,6 +141,82 @@ def session_export(name: str, config: Path, out: Path, can_format: Any, *, as_js
         for file in files:
             echo(file)
     return {"files": [str(file) for file in files]}
+
+
+@session.command(cls=Command, name="guide")
+@click.option("--setup", help="Station set-up that exists; the newest when not given.")
+@click.option("--new-setup", metavar="NAME", help="Describe a new set-up of that name instead.")
+@click.option("--instrument", help="Of the new set-up.")
+@click.option("--tilt-arcsec", type=float, help="Of the new set-up.")
+@click.option("--ppm", type=float, help="Of the new set-up.")
+@click.option("--control-points", metavar="NAME,...", help="Shot at both ends of every session; cp1 for a new set-up.")
+@click.option("--prisms", metavar="NAME,...", help="To measure, in this order; all of the rig when not given.")
+@click.option(
+    "--plan", type=click.Path(path_type=Path, dir_okay=False), metavar="CSV", help="Poses as `rigcal plan` wrote them."
+)
+@click.option("--poses", type=int, help="Most poses of a prism, where they are chosen on the spot.  [default: 20]")
+@click.option("--check-poses", type=int, help="Poses of the check, 3 to 5; 0 for no check.  [default: 4]")
+@click.option("--target", "target_mm", type=float, metavar="MM", help="Expected error at which it is enough.")
+@click.option("--done", is_flag=True, help="The present step is carried out.")
+@click.option("--skip", metavar="REASON", help="Leave the present step out.")
+@click.option("--rest", metavar="REASON", help="Leave out all poses of this prism that are left.")
+@click.option("--more", type=int, metavar="N", help="Measure N more poses although it is enough.")
+@click.option("--stop", metavar="REASON", help="Abandon the guide.")
+@click.option("--state", is_flag=True, help="Show the present step once.")
+@operator_option
+@client_options
+def session_guide(socket: Path | None, config: Path | None, as_json: bool, **given: Any) -> Any:
+    """Lead through a whole calibration: a session for each prism, then a check.
+
+    Goes on with the guide that is open, else starts one. On a terminal Enter says that the step is done, s skips it and
+    Ctrl-C leaves the guide open. With --json the state is printed once.
+    """
+    from daemon.cli.guide_terminal import lead, summary
+
+    at = socket_of(socket, config)
+
+    def say(command: str, **arguments: Any) -> Any:
+        return request(at, command, {key: value for key, value in arguments.items() if value is not None})
+
+    about = _guide_arguments(given)
+    told = [
+        ("guide.done", {}) if given["done"] else None,
+        ("guide.skip", {"reason": given["skip"]}) if given["skip"] is not None else None,
+        ("guide.skip", {"reason": given["rest"], "rest": True}) if given["rest"] is not None else None,
+        ("guide.more", {"poses": given["more"]}) if given["more"] is not None else None,
+        ("guide.stop", {"reason": given["stop"]}) if given["stop"] is not None else None,
+        ("guide.state", {}) if given["state"] else None,
+    ]
+    commands = [command for command in told if command is not None]
+    if len(commands) > 1 or (commands and about):
+        raise click.UsageError("give one of --done, --skip, --rest, --more, --stop and --state, and nothing beside it")
+    if commands:
+        command, arguments = commands[0]
+        state = say(command, **arguments)
+    else:
+        state = say("guide.state")
+        is_open = state["guide"] is not None and state["guide"]["state"] == "open"
+        if about or (not is_open and not as_json):
+            state = say("guide.start", operator=given["operator"], **about)
+        if not as_json:
+            return {"guide": lead(say)}
+    if not as_json:
+        summary(state)
+    return state
+
+
+def _guide_arguments(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of `guide.start` that were given."""
+    from daemon.cli.guide_terminal import names, plan_rows
+
+    described = {key: given[key] for key in ("instrument", "tilt_arcsec", "ppm") if given[key] is not None}
+    if described and given["new_setup"] is None:
+        raise click.UsageError("--instrument, --tilt-arcsec and --ppm describe a new set-up: give --new-setup NAME")
+    about = {key: given[key] for key in ("setup", "poses", "check_poses", "target_mm")}
+    about |= {"control_points": names(given["control_points"]), "prisms": names(given["prisms"])}
+    about["new_setup"] = None if given["new_setup"] is None else {"id": given["new_setup"], **described}
+    about["plan"] = None if given["plan"] is None else plan_rows(given["plan"])
+    return {key: value for key, value in about.items() if value is not None}
 
 
 def _advise(result: Mapping[str, Any]) -> None:

@@ -1,0 +1,273 @@
+"""`rigcal session guide` on a terminal: live lines and keys; plain lines where nobody is watching."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import select
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from daemon.cli.terminal import echo
+from daemon.commands import WRONG_USE, CommandError
+from daemon.host.safe_output import shown
+
+LOOK_S = 0.2
+GO_ON = "`rigcal session guide` goes on with it"
+_BAR = 20  # characters
+
+Say = Callable[..., Mapping[str, Any]]
+"""Sends a `guide.*` command with its arguments; returns the guide's state."""
+
+
+def plan_rows(path: Path) -> list[dict[str, Any]]:
+    """Read a plan as `rigcal plan --out` writes it, for `guide.start`.
+
+    Raises:
+        CommandError: the file cannot be read, or a cell is no number.
+    """
+    rows: list[dict[str, Any]] = []
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            for line, row in enumerate(csv.DictReader(file, strict=True), start=2):
+                try:
+                    numbers = {
+                        key: float(cell) for key, cell in row.items() if key and cell and key.endswith(("_deg", "_mm"))
+                    }
+                except ValueError as error:
+                    raise CommandError(f"{path}, line {line}: {error}", WRONG_USE) from None
+                seen = {"prisms": row["prisms"].split()} if row.get("prisms") else {}
+                rows.append(numbers | seen)
+    except OSError as error:
+        raise CommandError(f"{path}: {error.strerror}", WRONG_USE) from None
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise CommandError(f"{path}: {error}", WRONG_USE) from None
+    if not rows:
+        raise CommandError(f"{path}: no poses; `rigcal plan --out CSV` writes a plan", WRONG_USE)
+    return rows
+
+
+# ---- leading ---------------------------------------------------------------------------------------------------------
+
+
+def lead(say: Say) -> Mapping[str, Any]:
+    """Show step after step until the guide is over, and do what keys say; returns the last state.
+
+    Ctrl-C leaves the guide open.
+    """
+    try:
+        if sys.stdin.isatty() and sys.stdout.isatty():
+            return _lead_watched(say)
+        return _lead_in_lines(say)
+    except KeyboardInterrupt:
+        echo()
+        echo(f"the guide stays open; {GO_ON}")
+        raise click.exceptions.Exit(0) from None
+
+
+def _lead_in_lines(say: Say) -> Mapping[str, Any]:
+    """Print a line for every step and every message, once."""
+    told: list[str] = []
+    while True:
+        guide = _guide(say("guide.state"))
+        step = guide["step"]
+        lines = [f"{step['title']}: {step['instruction']}"]
+        lines += [f"  {message['severity']}: {message['text']}" for message in guide["messages"]]
+        for line in lines:
+            if line not in told:
+                echo(line)
+        told = lines
+        if guide["state"] != "open":
+            return guide
+        time.sleep(LOOK_S)
+
+
+def _lead_watched(say: Say) -> Mapping[str, Any]:
+    """Redraw the present step five times a second."""
+    height, note = 0, ""
+    with _keys() as key:
+        while True:
+            guide = _guide(say("guide.state"))
+            lines = screen(guide, shutil.get_terminal_size().columns)
+            if note:
+                lines.append(note)
+            click.echo(f"\x1b[{height}A\x1b[J" if height else "", nl=False)
+            for line in lines:
+                click.echo(line)
+            height = len(lines)
+            if guide["state"] != "open":
+                return guide
+            pressed = key(LOOK_S)
+            if pressed:
+                note = _obey(pressed, guide["step"], say)
+
+
+def _obey(pressed: str, step: Mapping[str, Any], say: Say) -> str:
+    """Do what a key says; returns what there is to tell."""
+    try:
+        if pressed in "\r\n d":
+            say("guide.done", step=step["id"])
+        elif pressed == "s":
+            return _with_reason(say, step, rest=False)
+        elif pressed == "e":
+            return _with_reason(say, step, rest=True)
+        elif pressed == "m":
+            say("guide.more")
+        elif pressed == "q":
+            raise KeyboardInterrupt
+    except CommandError as error:
+        return shown(str(error))
+    return ""
+
+
+def _with_reason(say: Say, step: Mapping[str, Any], *, rest: bool) -> str:
+    reason = ""
+    with _line_mode():
+        with contextlib.suppress(click.Abort):
+            reason = click.prompt("why", default="", show_default=False)
+        click.echo("\x1b[1A\x1b[J", nl=False)
+    if not reason.strip():
+        return "nothing was skipped: a reason is needed"
+    say("guide.skip", step=step["id"], reason=reason, rest=rest)
+    return ""
+
+
+# ---- what is shown ---------------------------------------------------------------------------------------------------
+
+
+def screen(guide: Mapping[str, Any], width: int) -> list[str]:
+    """Return the lines of a guide's present step, none longer than the terminal is wide."""
+    step = guide["step"]
+    lines = [f"Guide {guide['id']}, step {step['number']} of {step['of']}: {step['title']}", step["instruction"]]
+    lines.append(step["why"])
+    if guide["hold"] is not None:
+        lines += [*map(_joint_line, guide["joints"]), _hold_line(guide)]
+    lines += _gain_lines(guide)
+    lines += [f"{message['severity']}: {message['text']}" for message in guide["messages"]]
+    lines.append(_keys_line(step))
+    return [shown(line)[: max(20, width - 1)] for line in lines if line]
+
+
+def _joint_line(joint: Mapping[str, Any]) -> str:
+    if joint["now"] is None:
+        return f"  {joint['name']:8} not read"
+    arrow = "there" if joint["is_there"] else f"{joint['difference']:+8.1f} to go"
+    stale = "" if joint["is_fresh"] else "  (old)"
+    return f"  {joint['name']:8} {joint['now']:8.1f} -> {joint['target']:8.1f} {joint['unit']:3}  {arrow}{stale}"
+
+
+def _hold_line(guide: Mapping[str, Any]) -> str:
+    hold, poses = guide["hold"], guide["poses"]
+    stands = "moves" if hold["since_s"] is None else f"stands for {hold['since_s']:.0f} s"
+    return (
+        f"The boom {stands}; {hold['fixes']} of {hold['needed_fixes']} fixes; {poses['done']} of {poses['planned']} "
+        f"poses of prism {guide['prism']}"
+    )
+
+
+def _gain_lines(guide: Mapping[str, Any]) -> Iterator[str]:
+    accuracy, coverage = guide["accuracy"], guide["coverage"]
+    if accuracy is None:
+        return
+    if accuracy["now_mm"] is None:
+        yield f"Expected accuracy: {accuracy['why']}"
+    else:
+        target = f", target {accuracy['target_mm']:g} mm" if accuracy["target_mm"] is not None else ""
+        yield (
+            f"Expected error over the work volume: {accuracy['now_mm']:.2f} mm, after 5 more poses "
+            f"{accuracy['after_5_mm']:.2f} mm{target}"
+        )
+    if coverage is not None:
+        share = coverage["prism_volume_share"]
+        filled = round(_BAR * share)
+        yield f"Work volume enclosed by prism {guide['prism'] or ''}: [{'#' * filled:{_BAR}}] {share:.0%}"
+
+
+def _keys_line(step: Mapping[str, Any]) -> str:
+    keys = []
+    if step["button"]:
+        keys.append(f"Enter: {step['button']}")
+    if step["can_skip"]:
+        keys.append("s: skip with a reason")
+    commands = [(other["command"], other["button"]) for other in step["others"]]
+    keys += [f"{'m' if command == 'guide.more' else 'e'}: {button}" for command, button in commands]
+    keys.append("Ctrl-C: leave it open")
+    return " | ".join(keys)
+
+
+def summary(state: Mapping[str, Any]) -> None:
+    """Print a state once."""
+    guide = state["guide"]
+    if guide is None:
+        echo("no guide yet; `rigcal session guide --prisms w,b,r,s` starts one")
+        return
+    for line in screen(guide, 10_000)[:-1]:
+        echo(line)
+    skipped = [(row["title"], row["reason"]) for row in guide["steps"] if row["state"] == "skipped"]
+    skipped += [
+        (f"{row['title']}, pose {one['pose']}", one["reason"])
+        for row in guide["steps"]
+        for one in (row["poses"] or {"skipped": ()})["skipped"]
+        if row["state"] != "skipped"
+    ]
+    for title, reason in skipped:
+        echo(f"  skipped: {title} ({reason})")
+
+
+def _guide(state: Mapping[str, Any]) -> Mapping[str, Any]:
+    guide = state["guide"]
+    if guide is None:
+        raise CommandError("no guide is open; `rigcal session guide --prisms w,b,r,s` starts one")
+    return dict(guide)
+
+
+# ---- keys ------------------------------------------------------------------------------------------------------------
+
+_saved: list[list[Any]] = []  # of the terminal, while keys are read one by one
+
+
+@contextlib.contextmanager
+def _keys() -> Iterator[Callable[[float], str]]:
+    """Read keys without waiting for Enter; yields what waits for one so long and returns it, "" where there is none."""
+    import termios
+    import tty
+
+    descriptor = sys.stdin.fileno()
+    before = termios.tcgetattr(descriptor)
+    _saved.append(before)
+
+    def key(timeout_s: float) -> str:
+        ready, _, _ = select.select([descriptor], [], [], timeout_s)
+        return sys.stdin.read(1) if ready else ""
+
+    try:
+        tty.setcbreak(descriptor)
+        yield key
+    finally:
+        _saved.pop()
+        termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
+
+
+@contextlib.contextmanager
+def _line_mode() -> Iterator[None]:
+    """Let a whole line be typed meanwhile."""
+    import termios
+    import tty
+
+    descriptor = sys.stdin.fileno()
+    termios.tcsetattr(descriptor, termios.TCSADRAIN, _saved[-1])
+    try:
+        yield
+    finally:
+        tty.setcbreak(descriptor)
+
+
+def names(text: str | None) -> Sequence[str] | None:
+    """Return the names in a list with commas; None where none is given."""
+    return None if text is None else [name.strip() for name in text.split(",") if name.strip()]

@@ -1,0 +1,209 @@
+"""Guided sessions with the whole daemon: real sockets and processes, a simulated rig that is moved as by hand."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon.commands import REFUSED, CommandError
+from tests.daemon.daemon_process import DaemonProcess
+from tests.simulated.guided_operator import GuidedOperator
+
+SIM = ("--sim", "--by-hand", "--rate", "10", "--seed", "3")
+
+
+def ready(directory: Path) -> DaemonProcess:
+    daemon = DaemonProcess(directory, *SIM, jobs=False)
+    daemon.wait("an answer", daemon.answers)
+    daemon.say("simulation.aim", target="r")
+    daemon.wait("a fix", daemon.has_fix)
+    return daemon
+
+
+def state(daemon: DaemonProcess) -> dict[str, Any]:
+    return dict(daemon.say("guide.state")["guide"])
+
+
+def rigcal(daemon: DaemonProcess, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "daemon.cli.main", "session", "guide", "--socket", str(daemon.socket), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.slow
+def test_a_whole_guide_survives_a_kill_and_ends_with_sessions_that_are_used(tmp_path: Path) -> None:
+    daemon = ready(tmp_path)
+    try:
+        assert daemon.say("guide.state") == {"guide": None}
+        started = daemon.say(
+            "guide.start", new_setup={"id": "S1"}, prisms=["r", "s"], poses=6, check_poses=3, operator="Ada"
+        )["guide"]
+        assert (started["state"], started["prism"], started["step"]["point"]) == ("open", "r", "cp1")
+        operator = GuidedOperator(daemon.say)
+        operator.follow(lambda s: s["step"]["kind"] in ("go_to_pose", "hold"))
+        skipped = daemon.say("guide.skip", reason="a wall is in the way")["guide"]
+        assert skipped["steps"][2]["poses"]["skipped"] == [{"pose": 1, "reason": "a wall is in the way"}]
+        before = operator.follow(lambda s: s["poses"]["done"] == 2 and s["prism"] == "r")
+        daemon.kill()
+
+        daemon = ready(tmp_path)
+        after = state(daemon)
+        for key in ("id", "state", "prism", "session", "poses", "operator", "steps"):
+            assert after[key] == before[key], key
+        assert after["step"]["id"] == before["step"]["id"]
+        assert after["taps"] == before["taps"] == 1 + operator.taps + 1  # the start, the buttons, the skipped pose
+        # The boom of the new simulation stands elsewhere: no fix counts until the operator says that it is the prism.
+        operator = GuidedOperator(daemon.say)
+        done = operator.follow(lambda s: s["accuracy"] is not None and s["accuracy"]["for_poses"] >= 4)
+        accuracy = done["accuracy"]
+        assert accuracy["prism_mm"] > accuracy["prism_after_5_mm"] > 0.0
+        assert accuracy["prisms"] == ["r"]
+        end = operator.follow(lambda s: s["state"] != "open")
+        assert end["state"] == "finished", end
+        assert operator.taps == 2  # the station is on prism s, for its session and for the check: all else by itself
+        assert end["accuracy"]["prisms"] == ["r", "s"]
+        assert 0.0 < end["coverage"]["volume_share"] <= 1.0
+        sessions = daemon.say("session.list")
+        assert [(s["prism"], s["kind"], s["state"], s["not_used"]) for s in sessions] == [
+            ("r", "static_poses", "closed", None),
+            ("s", "static_poses", "closed", None),
+            ("s", "check", "closed", None),
+        ]
+        assert [s["poses"] for s in sessions] == [5, 6, 3]
+        assert end["misclosure_mm"] < 5.0
+        # The sessions are the operator's again.
+        assert daemon.say("session.start", prism="r")["id"]
+        daemon.say("session.abort")
+    finally:
+        assert daemon.stop() == 0, daemon.log_text()
+
+
+@pytest.fixture(scope="module")
+def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DaemonProcess]:
+    made = ready(tmp_path_factory.mktemp("rig"))
+    made.say("setup.new", id="S1")
+    yield made
+    assert made.stop() == 0, made.log_text()
+
+
+@pytest.fixture
+def guide(daemon: DaemonProcess) -> Iterator[dict[str, Any]]:
+    """A guide at its first step, and no guide afterwards."""
+    yield daemon.say("guide.start", prisms=["r"], poses=6, check_poses=0, operator="Ada")["guide"]
+    if state(daemon)["state"] == "open":
+        daemon.say("guide.stop", reason="the test is over")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("guide")
+def test_commands_that_a_guide_gives_itself_are_refused_with_the_next_step(daemon: DaemonProcess) -> None:
+    daemon.wait("the session", lambda: state(daemon)["session"])
+    for command, arguments in (
+        ("session.start", {"prism": "r"}),
+        ("session.stop", {}),
+        ("session.abort", {}),
+        ("session.shoot", {"point": "cp1"}),
+        ("setup.new", {"id": "S2"}),
+        ("guide.start", {}),
+    ):
+        with pytest.raises(CommandError, match="Shoot control point cp1") as refused:
+            daemon.say(command, **arguments)
+        assert refused.value.status == REFUSED, command
+    with pytest.raises(CommandError, match="another step is on by now") as refused:
+        daemon.say("guide.done", step="1.9")
+    assert refused.value.status == REFUSED
+    with pytest.raises(CommandError, match="say why"):
+        daemon.say("guide.skip", reason=" ")
+    assert daemon.say("session.list")[-1]["state"] == "open"
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("guide")
+def test_skipped_control_points_are_kept_and_the_session_is_not_used(daemon: DaemonProcess) -> None:
+    daemon.wait("the session", lambda: not state(daemon)["step"]["is_busy"])
+    daemon.say("guide.skip", reason="fog")
+    operator = GuidedOperator(daemon.say)
+    reached = operator.follow(lambda s: s["step"]["kind"] == "go_to_pose")
+    assert "fog" in reached["messages"][-1]["text"]
+    with pytest.raises(CommandError, match="fixes count at this standstill"):
+        daemon.say("guide.done")
+    operator.follow(lambda s: s["poses"]["done"] == 1)
+    ended = daemon.say("guide.stop", reason="rain")["guide"]
+    assert (ended["state"], ended["step"]["kind"]) == ("abandoned", "abandoned")
+    assert "rain" in ended["step"]["instruction"]
+    session = daemon.say("session.list")[-1]
+    assert session["state"] == "closed"
+    assert "control point" in session["not_used"]
+    assert daemon.say("session.start", prism="r")["id"]  # the sessions are the operator's again
+    daemon.say("session.abort")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("guide")
+def test_enough_goes_on_when_told_and_takes_more_poses_when_asked(daemon: DaemonProcess) -> None:
+    operator = GuidedOperator(daemon.say)
+    operator.follow(lambda s: s["poses"]["done"] == 1 and s["step"]["kind"] == "go_to_pose")
+    enough = daemon.say("guide.skip", reason="dinner", rest=True)["guide"]
+    assert enough["step"]["phase"] == "end"
+    assert [one["reason"] for one in enough["steps"][2]["poses"]["skipped"]] == ["dinner"] * 5
+    ended = operator.follow(lambda s: s["state"] != "open")
+    assert ended["state"] == "finished"
+    assert ended["model"] == {
+        "id": None, "is_acceptable": None, "refused_because": None, "sentence": None, "jobs": 0
+    }  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("guide")
+def test_the_terminal_leads_and_scripts_may_answer(daemon: DaemonProcess) -> None:
+    daemon.wait("the session", lambda: not state(daemon)["step"]["is_busy"])
+    shown = rigcal(daemon, "--json")
+    assert json.loads(shown.stdout)["guide"]["step"]["kind"] == "shoot_control_point"
+    text = rigcal(daemon, "--state").stdout
+    assert "Shoot control point cp1" in text
+    assert rigcal(daemon, "--done", "--state").returncode == 2
+    skipped = rigcal(daemon, "--skip", "fog")
+    assert skipped.returncode == 0
+    assert "Aim at prism r" in skipped.stdout
+
+    ours, theirs = pty.openpty()
+    command = [sys.executable, "-m", "daemon.cli.main", "session", "guide", "--socket", str(daemon.socket)]
+    leading = subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True)
+    os.close(theirs)
+    try:
+        daemon.say("simulation.aim", target="r")
+        said = read_until(ours, "Aim at prism r")
+        os.write(ours, b"\n")
+        said = read_until(ours, "to go")
+        assert "theta1" in said
+        os.write(ours, b"s")
+        read_until(ours, "why")
+        os.write(ours, b"a wall\n")
+        daemon.wait("the skipped pose", lambda: state(daemon)["poses"]["skipped"])
+        os.write(ours, b"q")
+        said = read_until(ours, "stays open")
+        assert leading.wait(timeout=30) == 0
+    finally:
+        leading.kill()
+        leading.wait()
+        os.close(ours)
+    assert state(daemon)["steps"][2]["poses"]["skipped"] == [{"pose": 1, "reason": "a wall"}]
+
+
+def read_until(descriptor: int, text: str) -> str:
+    said, deadline = "", time.monotonic() + 60.0
+    while text not in said:
+        assert time.monotonic() < deadline, said
+        try:
+            said += os.read(descriptor, 65536).decode("utf-8", "replace")
+        except OSError:
+            pytest.fail(f"it ended: {said}")
+    return said
