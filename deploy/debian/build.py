@@ -45,6 +45,7 @@ BUILD_ONLY = {"pip", "setuptools"}
 # Of deploy/: where a package has it. Those of /etc are edited by the site, and kept.
 FILES = {
     "rigcal.service": "usr/lib/systemd/system/rigcal.service",
+    "rigcal-web.service": "usr/lib/systemd/system/rigcal-web.service",
     "rigcal.sysusers": "usr/lib/sysusers.d/rigcal.conf",
     "rigcal.modules-load": "usr/lib/modules-load.d/rigcal.conf",
     "rigcal.sysctl": "usr/lib/sysctl.d/60-rigcal.conf",
@@ -155,10 +156,11 @@ def build_package(source: Source, wheel: Path, release: int, out: Path) -> Path:
         _fill_environment(root / HOME, source, wheel, python)
         for name, place in FILES.items():
             _put(root / place, (source.tree / "deploy" / name).read_bytes())
-        unit = root / FILES["rigcal.service"]
-        unit.write_text(
-            unit.read_text(encoding="utf-8").replace("/opt/rigcal/venv/bin/", "/usr/bin/"), encoding="utf-8"
-        )
+        for name in ("rigcal.service", "rigcal-web.service"):
+            unit = root / FILES[name]
+            unit.write_text(
+                unit.read_text(encoding="utf-8").replace("/opt/rigcal/venv/bin/", "/usr/bin/"), encoding="utf-8"
+            )
         _link(root / "usr/bin/rigcal", "../lib/rigcal/bin/rigcal")
         documents = root / "usr/share/doc/rigcal"
         _put(documents / "changelog.Debian.gz", _gzipped(_changelog(version, source.epoch)))

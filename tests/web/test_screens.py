@@ -49,8 +49,7 @@ def test_every_screen_is_usable_by_everyone(
     for screen in SCREENS:
         open_live(page, f"{web.address}/{screen}")
         expect(page.locator("main")).to_contain_text(SHOWN[screen])
-        for closed in page.locator("details:not([open]) > summary").all():
-            closed.click()
+        page.evaluate("for (const each of document.querySelectorAll('details')) each.open = true")
         page.wait_for_timeout(150)  # charts and unfolded parts are drawn with the next frames
         found += [f"{screen}: {line}" for line in violations(page)]
         found += [f"{screen}: too small for gloves: {line}" for line in page.evaluate(SMALL_JS, TOUCHED)]
