@@ -56,4 +56,4 @@ def open_live(page: Page, address: str) -> None:
     """Open an address and wait until what is shown is live."""
     page.goto(address)
     page.wait_for_selector("body[data-live=yes]", timeout=DEADLINE_MS)
-    page.wait_for_selector("#screen > *", timeout=DEADLINE_MS)
+    page.wait_for_selector("#screen > *", state="attached", timeout=DEADLINE_MS)

@@ -19,7 +19,7 @@ export function mount(root, app) {
     part("links-title", "Links and stations", scroll("Links", links, ["link", "state", "per second", "waiting", "lost"])),
     part("jobs-title", "Jobs", jobs),
     h("div", { class: "pair" },
-      part("channels-title", "Joints and signals", scroll("Joints and signals", channels, ["channel", "state", "value", "age"])),
+      part("channels-title", "Joints and signals", scroll("Readings of joints and signals", channels, ["channel", "state", "value", "age"])),
       h("div", { class: "stack" }, part("gaps-title", "Gaps", gaps), part("events-title", "What happened", events))));
 
   let all = [], seen = "", closed = false;

@@ -39,13 +39,13 @@ export function mount(root) {
     closure.show([at(misclosures), misclosures.map((shot) => shot.misclosure_mm)]);
     const empty = "No check session was held against a live model yet; a guided session ends with one.";
     fill(sentence, gap?.drift ?? empty, () => h("span", null, gap?.drift?.checks ? driftSentence(gap.drift) : empty));
-    fill(driftTable, checks, () => table("The newest first", [["when", true], ["session", true], ["model", false], ["fixes", false], ["error by expected", false], ["verdict", true]],
+    fill(driftTable, checks, () => table("Check sessions, the newest first", [["when", true], ["session", true], ["model", false], ["fixes", false], ["error by expected", false], ["verdict", true]],
       checks.toReversed().map((check) => [utc(check.utc_ns), check.session, String(check.model), String(check.fixes), fixed(check.ratio, 2), check.reason || { none: "as expected", worse: "worse", better: "better" }[check.alarm]])));
-    fill(closureTable, misclosures, () => table("The newest first", [["when", true], ["point", true], ["set-up", true], ["session", true], ["misclosure, mm", false]],
+    fill(closureTable, misclosures, () => table("Shots of control points, the newest first", [["when", true], ["point", true], ["set-up", true], ["session", true], ["misclosure, mm", false]],
       misclosures.toReversed().map((shot) => [utc(shot.utc_ns), shot.point, shot.setup, `${shot.session}, ${shot.phase}`, fixed(shot.misclosure_mm, 1)])));
-    fill(changes, changed, () => changed.length ? table("The newest first", [["when", true], ["model", false], ["state", true], ["by", true], ["why", true]],
+    fill(changes, changed, () => changed.length ? table("Changes of models, the newest first", [["when", true], ["model", false], ["state", true], ["by", true], ["why", true]],
       changed.toReversed().map((change) => [utc(change.utc_ns), String(change.model), change.state, change.operator || change.user || "rigcal", change.reason])) : h("p", { class: "empty" }, "No model was made yet."));
-    fill(alarms, past, () => past.length ? table("The newest first", [["from", true], ["for", false], ["alarm", true]],
+    fill(alarms, past, () => past.length ? table("Alarms that are over, the newest first", [["from", true], ["for", false], ["alarm", true]],
       past.slice(0, 50).map((alarm) => [utc(alarm.since_utc_ns), duration((alarm.cleared_utc_ns - alarm.since_utc_ns) / 1e9), `${words(alarm.kind)}, ${alarm.subject}: ${alarm.text}`])) : h("p", { class: "empty" }, "None yet."));
   }
 

@@ -79,7 +79,7 @@ function card(model, jobs, now, app) {
     !app.may("approve") && candidate?.is_acceptable ? h("p", { class: "soft" }, "Someone with the role approve can accept it.") : null,
     h("details", null, h("summary", null, "Where it comes from"),
       h("p", null, `Made ${utc(model.created_utc_ns)} from ${model.sessions.join(", ") || "no session"}.`),
-      table("Changes of its state", [["when", true], ["state", true], ["by", true], ["why", true]], model.history.map((change) => [utc(change.utc_ns), change.state, change.operator || change.user || "rigcal", change.reason]))));
+      table(`Changes of model ${model.id}`, [["when", true], ["state", true], ["by", true], ["why", true]], model.history.map((change) => [utc(change.utc_ns), change.state, change.operator || change.user || "rigcal", change.reason]))));
 }
 
 async function accept(model, compared, now, app) {
