@@ -6,6 +6,12 @@ let library = null;
 const loaded = () => (library ??= import("/static/vendor/uplot/uPlot.esm.js").then((module) => module.default));
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 
+/** Instants of a time axis, in UTC: days where the ticks are days apart, else times. */
+const times = (_plot, ticks, _axis, _space, apart) => ticks.map((tick) => {
+  const text = new Date(tick * 1e3).toISOString();
+  return apart >= 86400 ? text.slice(0, 10) : text.slice(11, apart >= 60 ? 16 : 19);
+});
+
 /**
  * A chart of points over time.
  * @param label what it shows, for those who cannot see it
@@ -49,13 +55,14 @@ export class Chart {
     const UPlot = await loaded();
     this.plot?.destroy();
     fill(this.box, [], () => []);
-    const axis = { stroke: colour("soft"), grid: { stroke: colour("line"), width: 1 }, ticks: { stroke: colour("line") }, font: "13px system-ui, sans-serif" };
+    const axis = { space: 84, stroke: colour("soft"), grid: { stroke: colour("line"), width: 1 }, ticks: { stroke: colour("line") }, font: "13px system-ui, sans-serif" };
     this.plot = new UPlot({
       ...this.#size(),
       cursor: { show: false },
       legend: { show: this.series.length > 1, live: false },
       scales: { y: this.options.log ? { distr: 3 } : { range: (_, low, high) => [this.options.zero ? Math.min(0, low) : low, (high || 1) * 1.1] } },
-      axes: [axis, { ...axis, size: 60, values: (_, ticks) => ticks.map((tick) => (tick === null ? "" : `${tick} ${this.options.unit}`.trim())) }],
+      tzDate: (seconds) => UPlot.tzDate(new Date(seconds * 1e3), "Etc/UTC"),
+      axes: [{ ...axis, values: times }, { ...axis, space: 30, size: 76, values: (_, ticks) => ticks.map((tick) => (tick === null ? "" : `${tick} ${this.options.unit}`.trim())) }],
       series: [{ label: "time" }, ...this.series.map((each) => ({
         label: each.label,
         stroke: colour(each.colour),

@@ -39,3 +39,6 @@ export const words = (name) => String(name).replaceAll("_", " ").replaceAll("-",
 export const plural = (n, one, more = `${one}s`) => `${n} ${n === 1 ? one : more}`;
 
 export const JOBS = { gap: "Identification", residual: "Learning what remains", report: "Report", comparison: "Comparison", drift: "Drift of checks" };
+
+/** A clause as the begin of a sentence. */
+export const sentence = (clause) => clause.charAt(0).toUpperCase() + clause.slice(1);

@@ -11,7 +11,7 @@ export function mount(root) {
   const drift = new Chart("Error of check shots divided by what the live model expects, over time", "", [{ label: "check session", colour: "blue" }, { label: "as expected", colour: "control", line: true, dash: [6, 5] }]);
   const sums = new Chart("Sum that shows a lasting drift, over time, with the value at which it is one", "", [{ label: "worse than expected", colour: "critical", line: true, dots: true }, { label: "drift", colour: "control", line: true, dash: [6, 5] }]);
   const closure = new Chart("Misclosure of control points over time", "mm", [{ label: "misclosure", colour: "blue" }]);
-  const part = (id, title, about, chart, rest) => h("section", { class: "card stack", "aria-labelledby": id }, h("h2", { id }, title), h("p", { class: "soft" }, about), chart?.element, rest);
+  const part = (id, title, about, chart, rest) => h("section", { class: "card stack", "aria-labelledby": id }, h("h2", { id }, title), about ? h("p", { class: "soft" }, about) : null, chart?.element ?? "", rest ?? "");
   const driftTable = h("div"), closureTable = h("div"), changes = h("div"), alarms = h("div"), sentence = h("p");
   root.append(
     part("drift-title", "Does the model still hold?", "Each dot is a check session: the error of its fixes, divided by what the model that was live then expects. 1 is as expected.", drift, h("div", { class: "stack" }, sentence, h("details", null, h("summary", null, "Check by check"), driftTable))),

@@ -2,7 +2,7 @@
 
 import { command } from "../api.js";
 import { fill, h, s, table } from "../dom.js";
-import { millimetres, plural, utc, words } from "../words.js";
+import { millimetres, plural, sentence, utc, words } from "../words.js";
 
 const STAGES = { nominal: "drawings", geometric: "geometry", effects: "named effects", hybrid: "learned rest" };
 
@@ -66,7 +66,7 @@ function card(model, jobs, now, app) {
   return h("section", { class: `card stack model ${model.state}`, "data-model": model.id, "aria-labelledby": `model-${model.id}` },
     h("div", { class: "row" }, h("h2", { id: `model-${model.id}` }, `Model ${model.id}`), h("span", { class: state[1] }, state[0]), h("span", { class: "soft" }, STAGES[model.stage] ?? words(model.stage))),
     compared?.before_mm !== undefined ? h("p", null, h("strong", null, `${millimetres(compared.before_mm)} mm before, ${millimetres(compared.after_mm)} mm after`), ` on ${plural(compared.fixes, "fix", "fixes")} that it was not trained on.`) : null,
-    compared ? h("p", { class: compared.is_better ? "good" : "doubtful" }, `${compared.sentence}.`) : h("p", { class: "doubtful" }, "It was not compared with held-out check shots yet."),
+    compared ? h("p", { class: compared.is_better ? "good" : "doubtful" }, `${sentence(compared.sentence)}.`) : h("p", { class: "doubtful" }, "It was not compared with held-out check shots yet."),
     candidate?.refused_because ? h("p", { class: "alarm" }, `It would be refused now: ${candidate.refused_because}`) : null,
     errors(model),
     h("div", { class: "row" },
@@ -85,7 +85,7 @@ function card(model, jobs, now, app) {
 async function accept(model, compared, now, app) {
   const live = now.models.live;
   const reasons = [
-    `${compared.sentence}.`,
+    `${sentence(compared.sentence)}.`,
     live ? `Model ${live.id} is live now; it is retired, and can be put back at any time.` : "No model is live now; this is the first.",
     "From then on every corrected position comes from this model.",
   ];
@@ -143,13 +143,13 @@ function errors(model) {
   const ticks = [];
   for (let k = Math.ceil(low); k <= high; k++) ticks.push(10 ** k);
   const label = lines.map(([name, each]) => `${name} ${each.map(millimetres).join(" to ")} mm`).join(", ");
-  return h("figure", null, s("svg", { class: "errors", viewBox: `0 0 720 ${bottom + 30}`, role: "img", "aria-label": `RMS error: ${label}; noise ${millimetres(noise)} mm` },
+  return h("figure", null, s("svg", { class: "errors", viewBox: `0 0 780 ${bottom + 30}`, role: "img", "aria-label": `RMS error: ${label}; noise ${millimetres(noise)} mm` },
     ticks.map((tick) => [s("line", { class: "axis", x1: x(tick), x2: x(tick), y1: 6, y2: bottom }), s("text", { class: "soft", x: x(tick), y: bottom + 20, "text-anchor": "middle" }, `${tick} mm`)]),
     noise > 0 ? [s("line", { class: "noise", x1: x(noise), x2: x(noise), y1: 6, y2: bottom }), s("text", { class: "soft", x: x(noise) + 5, y: 14 }, "noise")] : null,
     lines.map(([name, each], i) => {
       const y = 34 + step * i;
       return [s("text", { x: 0, y: y + 5 }, name), s("line", { class: "axis", x1: left, x2: right, y1: y, y2: y }),
         each.length === 2 ? [s("circle", { class: "before", cx: x(each[0]), cy: y, r: 6 }), s("circle", { class: "dot", cx: x(each[1]), cy: y, r: 7 })] : s("circle", { class: "dot", cx: x(each[0]), cy: y, r: 7 }),
-        s("text", { x: right + 10, y: y + 5 }, `${millimetres(each.at(-1))} mm`)];
+        s("text", { x: right + 10, y: y + 5 }, `${each.map(millimetres).join(" \u2192 ")} mm`)];
     })));
 }
