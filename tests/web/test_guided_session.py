@@ -17,11 +17,11 @@ from tests.simulated.guided_operator import GuidedOperator
 from tests.web.browser import open_live, violations
 from tests.web.conftest import NewPage
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(2000)]
 
 TARGET_MM = "6"
 MOST_TAPS = 12
-JOBS_S = 600.0
+GUIDE_S, JOBS_S = 900.0, 900.0  # a busy computer is slow; a quiet one needs two minutes and one
 
 
 def with_a_model_of_last_year(directory: Path) -> None:
@@ -40,7 +40,7 @@ def with_a_model_of_last_year(directory: Path) -> None:
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[DaemonProcess]:
     with_a_model_of_last_year(tmp_path)
-    daemon = DaemonProcess(tmp_path, "--sim", "--by-hand", "--rate", "15", "--seed", "1")
+    daemon = DaemonProcess(tmp_path, "--sim", "--by-hand", "--rate", "10", "--seed", "1")
     try:
         daemon.wait("a fix", daemon.has_fix)
         yield daemon
@@ -94,7 +94,7 @@ def test_a_guided_session_ends_with_an_accepted_model_and_goes_back(new_page: Ne
         page.get_by_role("button", name="Start", exact=True).click()
         expect(page.locator("#guide-title")).to_contain_text("Shoot control point")
         operator = OperatorAtThePage(page, rig)
-        guide = operator.follow(lambda state: state["state"] != "open", limit_s=280.0)
+        guide = operator.follow(lambda state: state["state"] != "open", limit_s=GUIDE_S)
         assert guide["state"] == "finished", guide
         assert operator.looked
         assert 1 + operator.taps + 3 <= MOST_TAPS, "with the start, the review, the acceptance and its confirmation"

@@ -1,7 +1,9 @@
 """Every screen as people meet it: in light and dark, by tablet, phone and keyboard, and with the connection lost."""
 
 import contextlib
+import os
 import re
+import signal
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,8 +19,9 @@ from daemon.control.server import ControlServer
 from daemon.web.access import Role, TokenBook
 from tests.daemon.idle_daemon import idle_daemon
 from tests.daemon.web.web_support import WebProcess
-from tests.web.browser import PHONE, TABLET, open_live, violations
+from tests.web.browser import DEADLINE_MS, PHONE, TABLET, open_live, violations
 from tests.web.conftest import NewPage
+from tests.web.scene import served
 
 pytestmark = pytest.mark.browser
 
@@ -143,20 +146,29 @@ def test_each_alarm_is_shown_with_what_to_do(new_page: NewPage, months: Config, 
 # ---- lost connections ------------------------------------------------------------------------------------------------
 
 
-def age_of(page: Page) -> str:
-    return str(page.locator("#banner").text_content())
-
-
-def test_a_lost_network_is_said_at_once_and_ends_by_itself(new_page: NewPage, web: WebProcess) -> None:
+def test_a_lost_connection_is_said_at_once_and_ends_by_itself(new_page: NewPage, months: Config) -> None:
+    web = WebProcess(months.state_directory / "rigcal.toml")
     page = new_page()
-    open_live(page, f"{web.address}/health")
-    page.context.set_offline(True)
-    expect(page.locator("#banner")).to_be_visible(timeout=3000)
-    expect(page.locator("#connection-text")).to_have_text("Not live")
-    expect(page.locator("#banner")).to_contain_text(re.compile(r"what is shown is \d"), timeout=5000)
-    page.context.set_offline(False)
-    page.wait_for_selector("body[data-live=yes]", timeout=10_000)
-    expect(page.locator("#banner")).to_be_hidden()
+    try:
+        open_live(page, f"{web.address}/health")
+        os.kill(
+            web.process.pid, signal.SIGSTOP
+        )  # as when a tablet leaves the network: nothing comes, and no word of it
+        expect(page.locator("#banner")).to_be_visible(timeout=4000)
+        expect(page.locator("#connection-text")).to_have_text("Not live")
+        expect(page.locator("#banner")).to_contain_text(re.compile(r"what is shown is \d"), timeout=5000)
+        os.kill(web.process.pid, signal.SIGCONT)
+        page.wait_for_selector("body[data-live=yes]", timeout=30_000)
+        expect(page.locator("#banner")).to_be_hidden()
+    finally:
+        os.kill(web.process.pid, signal.SIGCONT)
+        assert web.stop() == 0
+    expect(page.locator("#banner")).to_contain_text("The connection to the rig is lost", timeout=5000)
+    web = WebProcess(months.state_directory / "rigcal.toml", "--port", str(web.port))
+    try:
+        page.wait_for_selector("body[data-live=yes]", timeout=30_000)
+    finally:
+        assert web.stop() == 0
 
 
 def test_a_daemon_that_is_gone_is_said_at_once_and_comes_back(new_page: NewPage, tmp_path: Path) -> None:
@@ -189,6 +201,38 @@ def test_a_daemon_that_is_gone_is_said_at_once_and_comes_back(new_page: NewPage,
     finally:
         over.set()
         assert web.stop() == 0
+
+
+# ---- models ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_model_is_accepted_rejected_and_rolled_back_behind_a_confirmation(new_page: NewPage, tmp_path: Path) -> None:
+    with served(tmp_path) as config:
+        web = WebProcess(tmp_path / "rigcal.toml")
+        try:
+            page = new_page()
+            open_live(page, f"{web.address}/models")
+            page.get_by_role("button", name="Accept model 3").click()
+            dialog = page.get_by_role("dialog")
+            expect(dialog).to_contain_text("better beyond chance")
+            dialog.get_by_role("button", name="Back").click()
+            assert live(config) == 2, "nothing is done without the confirmation"
+            page.get_by_role("button", name="Accept model 3").click()
+            dialog.get_by_role("button", name="Accept model 3").click()
+            expect(page.locator("[data-model='3'] .tag")).to_have_text("live", timeout=DEADLINE_MS)
+            page.get_by_role("button", name="Roll back").click()
+            expect(dialog).to_contain_text("Model 2 takes the place of model 3")
+            dialog.get_by_role("button", name="Put model 2 back").click()
+            expect(page.locator("[data-model='2'] .tag")).to_have_text("live", timeout=DEADLINE_MS)
+            assert live(config) == 2
+            history = request(config.socket_path, "model.show", {"id": 2})["history"]
+            assert history[-1]["operator"].endswith("(page, approve)")
+        finally:
+            assert web.stop() == 0
+
+
+def live(config: Config) -> int:
+    return int(request(config.socket_path, "status")["models"]["live"]["id"])
 
 
 # ---- roles -----------------------------------------------------------------------------------------------------------

@@ -33,7 +33,7 @@ class WebProcess:
     """`rigcal web` on a port of its own, for the daemon of a configuration; options as on the command line."""
 
     def __init__(self, config: Path, *options: str) -> None:
-        command = [sys.executable, "-m", "daemon.cli.main", "web", "--config", str(config), "--port", "0", *options]
+        command = [sys.executable, "-m", "daemon.cli.main", "web", "--port", "0", "--config", str(config), *options]
         self._log = config.with_name("web.log").open("a", encoding="utf-8")
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=self._log, text=True)
         assert self.process.stdout is not None

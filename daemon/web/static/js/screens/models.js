@@ -138,17 +138,19 @@ function errors(model) {
   const values = [...rows.map((row) => row[1]), ...held, noise].filter((value) => value > 0);
   const low = Math.floor(Math.log10(Math.min(...values)) * 2) / 2, high = Math.ceil(Math.log10(Math.max(...values)) * 2 + 0.01) / 2;
   const lines = [...rows.map(([name, value]) => [name, [value]]), ...(held.length ? [["held-out checks", held]] : [])];
-  const left = 150, right = 620, step = 30, bottom = 24 + step * lines.length;
+  // As wide as the screen lets it be, so that its letters are as large as others; on a phone names stand above their lines.
+  const width = Math.min(Math.max(innerWidth - 90, 260), 760), isNarrow = width < 560;
+  const left = isNarrow ? 8 : 150, right = width - 140, step = isNarrow ? 48 : 30, bottom = 24 + step * lines.length;
   const x = (value) => left + ((right - left) * (Math.log10(value) - low)) / (high - low || 1);
   const ticks = [];
   for (let k = Math.ceil(low); k <= high; k++) ticks.push(10 ** k);
   const label = lines.map(([name, each]) => `${name} ${each.map(millimetres).join(" to ")} mm`).join(", ");
-  return h("figure", null, s("svg", { class: "errors", viewBox: `0 0 780 ${bottom + 30}`, role: "img", "aria-label": `RMS error: ${label}; noise ${millimetres(noise)} mm` },
+  return h("figure", null, s("svg", { class: "errors", viewBox: `0 0 ${width} ${bottom + 30}`, role: "img", "aria-label": `RMS error: ${label}; noise ${millimetres(noise)} mm` },
     ticks.map((tick) => [s("line", { class: "axis", x1: x(tick), x2: x(tick), y1: 6, y2: bottom }), s("text", { class: "soft", x: x(tick), y: bottom + 20, "text-anchor": "middle" }, `${tick} mm`)]),
     noise > 0 ? [s("line", { class: "noise", x1: x(noise), x2: x(noise), y1: 6, y2: bottom }), s("text", { class: "soft", x: x(noise) + 5, y: 14 }, "noise")] : null,
     lines.map(([name, each], i) => {
-      const y = 34 + step * i;
-      return [s("text", { x: 0, y: y + 5 }, name), s("line", { class: "axis", x1: left, x2: right, y1: y, y2: y }),
+      const y = 34 + step * i + (isNarrow ? 16 : 0);
+      return [s("text", { x: 0, y: y + (isNarrow ? -14 : 5) }, name), s("line", { class: "axis", x1: left, x2: right, y1: y, y2: y }),
         each.length === 2 ? [s("circle", { class: "before", cx: x(each[0]), cy: y, r: 6 }), s("circle", { class: "dot", cx: x(each[1]), cy: y, r: 7 })] : s("circle", { class: "dot", cx: x(each[0]), cy: y, r: 7 }),
         s("text", { x: right + 10, y: y + 5 }, `${each.map(millimetres).join(" \u2192 ")} mm`)];
     })));

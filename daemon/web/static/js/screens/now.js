@@ -16,7 +16,7 @@ export function mount(root, app) {
   return {
     update(now) {
       const { next } = now;
-      card.className = `card state ${next.tone}`;
+      card.className = `card state tone-${next.tone}`;
       say(state, next.state);
       say(step, next.step);
       fill(action, [next.button, next.command, next.arguments, next.screen, app.me.role], () => button(app, next));

@@ -53,7 +53,7 @@ export function mount(root, app) {
     const size = (fix) => (fix.residual_mm ? Math.hypot(...fix.residual_mm) : null);
     const spread = spreads(fixes.fixes);
     const isModel = fixes.fixes.some((fix) => fix.residual_mm);
-    say(note, [fixes.note, isModel ? `Measured less what model ${fixes.model} predicts.` : "Until then: how far each fix lies from the mean of its pose."].filter(Boolean).join(" "));
+    say(note, !fixes.fixes.length ? "No fix has come yet." : [fixes.note, isModel ? `Measured less what model ${fixes.model} predicts.` : "Shown is how far each fix lies from the mean of its pose."].filter(Boolean).join(" "));
     const value = (fix) => (isModel ? size(fix) : spread.get(fix.id) ?? null);
     chart.box.setAttribute("aria-label", isModel ? "Distance of each fix from the live model's prediction over time" : "Distance of each fix from the mean of its pose over time");
     chart.show([fixes.fixes.map((fix) => fix.utc_ns / 1e9),
