@@ -14,7 +14,7 @@ export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 # The tests start a hundred processes: each would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help environment setup demo deb debtest wheel check test long lint style types imports quick blind bench soak fuzz lock check-deps clean
+.PHONY: help environment setup demo deb debtest wheel check test long webtest lint style types imports quick blind bench soak fuzz lock check-deps clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -46,7 +46,7 @@ debtest: environment ## the packages in fresh Debian 12 and 13 roots without a n
 # must be reached by its own tests almost line by line.
 test: ## the test suite; needs no hardware
 	@$(BOOTSTRAP) -t systemd-analyze=systemd -t udevadm=udev .venv requirements-dev.lock
-	$(BIN)/python -m pytest -m "not long" -n auto --dist loadfile --no-loadscope-reorder --gates --cov=drivers --cov=daemon.store --cov=calibration --cov-report=term-missing:skip-covered
+	$(BIN)/python -m pytest -m "not long and not browser" -n auto --dist loadfile --no-loadscope-reorder --gates --cov=drivers --cov=daemon.store --cov=calibration --cov-report=term-missing:skip-covered
 
 long: setup ## tests that take a quarter of an hour, if what they test has changed since they passed
 	$(BIN)/python -m tests.long
@@ -71,6 +71,9 @@ quick: environment
 
 check: ## lint and a quick part of the tests, in a minute: before each commit
 	@$(MAKE) --no-print-directory -j2 --output-sync=target types quick imports style
+
+webtest: setup ## the operator's page in headless Chromium, if what it tests has changed since it passed; five minutes
+	$(BIN)/python -m tests.web
 
 blind: setup ## a few blind cases of every kind for the gap workflow; two minutes on two cores
 	$(BIN)/rigcal bench gap --short

@@ -223,6 +223,30 @@ class NotifySection(_Section):
         return self
 
 
+class WebSection(_Section):
+    """The operator's page, served by `rigcal web`.
+
+    Attributes:
+        host: address that it is served at; any but a loopback one needs a certificate and tokens.
+        port: where.
+        certificate, key: PEM files for TLS; both or neither.
+        names: names by which browsers call this computer, beside its host name.
+        tokens: file of the tokens; `web-tokens.json` in the state directory when absent.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = Field(default=8370, ge=0, le=65535)
+    certificate: Path | None = None
+    key: Path | None = None
+    names: tuple[str, ...] = ()
+    tokens: Path | None = None
+
+    def beside(self, base: Path) -> WebSection:
+        """Return the same with paths that are relative to the configuration's directory."""
+        paths = {name: getattr(self, name) for name in ("certificate", "key", "tokens")}
+        return self.model_copy(update={name: path and base / path for name, path in paths.items()})
+
+
 class Config(_Section):
     """Everything `rigcal run` needs to know.
 
@@ -234,6 +258,7 @@ class Config(_Section):
             control socket; no one when absent.
         metrics: where metrics are served; nowhere when absent.
         notify: where notices of alarms go; nowhere when absent.
+        web: where the page is served, which `rigcal web` does.
     """
 
     rig: str
@@ -249,6 +274,7 @@ class Config(_Section):
     tip: TipSection | None = None
     metrics: MetricsSection | None = None
     notify: NotifySection | None = None
+    web: WebSection = WebSection()
 
     @model_validator(mode="after")
     def _names_differ(self) -> Config:
@@ -279,6 +305,11 @@ class Config(_Section):
     def store_path(self) -> Path:
         """Path of the store."""
         return self.state_directory / "rigcal.sqlite"
+
+    @property
+    def tokens_path(self) -> Path:
+        """Path of the page's tokens."""
+        return self.web.tokens or self.state_directory / "web-tokens.json"
 
     @property
     def models_directory(self) -> Path:
@@ -318,6 +349,7 @@ def parse_config(text: str, source: Path) -> Config:
             "rig": rig,
             "state_directory": base / config.state_directory,
             "socket": base / config.socket if config.socket else None,
+            "web": config.web.beside(base),
             "store": config.store.model_copy(
                 update={
                     "backup_directory": base / config.store.backup_directory if config.store.backup_directory else None

@@ -60,6 +60,7 @@ class Overview:
     def command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Return the state of everything; a part of the store that is damaged hides no other."""
         unreadable: dict[str, str] = {}
+        clock = self.parts.clock
 
         setups = SetupTable(self.store)
 
@@ -75,6 +76,7 @@ class Overview:
             "rig": self.parts.rig.name,
             "mode": self.parts.mode,
             "version": importlib.metadata.version("rigcal"),
+            "clock": {"utc_ns": clock.now().utc_ns, "real_s_per_s": clock.real_seconds(1.0)},
             "alarms": self.alarms.status(),
             "notices": self.notices.status(),
             "acquisition": asdict(self.acquisition()),

@@ -306,6 +306,7 @@ class Daemon:
         sessions, jobs, models = self._sessions, self._jobs, self._models
         commands: dict[str, Handler] = {
             "status": self._overview.command,
+            "rig.show": self._show_rig,
             "setup.new": self._setups.new_command,
             "setup.list": self._setups.list_command,
             "session.start": self._start_session,
@@ -322,6 +323,7 @@ class Daemon:
             "model.list": models.list_command,
             "model.show": models.show_command,
             "model.accept": models.accept_command,
+            "model.reject": models.reject_command,
             "model.rollback": models.rollback_command,
             "model.zeros-checked": models.zeros_checked_command,
             "model.compare": models.compare_command,
@@ -353,6 +355,10 @@ class Daemon:
         if health.state in ("missing", "replaced"):
             raise CommandError(f"no session is started: {health.text}", REFUSED)
         return self._sessions.start_command(arguments)
+
+    def _show_rig(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the rig's name and the text of the file that describes it."""
+        return {"rig": self._parts.rig.name, "text": self._parts.rig_text}
 
     def _start_guide(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Open a guide, unless its store would be lost when the daemon stops."""

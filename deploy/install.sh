@@ -40,6 +40,7 @@ place_files() {
     place rigcal-clock@.service /etc/systemd/system/rigcal-clock@.service
     place system-rigcaljobs.slice /etc/systemd/system/system-rigcaljobs.slice
     place network.conf /opt/rigcal/network.conf
+    place rigcal-web.service /etc/systemd/system/rigcal-web.service
     place rigcal.sysusers /etc/sysusers.d/rigcal.conf
     place rigcal.modules-load /etc/modules-load.d/rigcal.conf
     place rigcal.sysctl /etc/sysctl.d/60-rigcal.conf
@@ -84,6 +85,7 @@ if [ -n "$booted" ]; then
     systemctl restart systemd-modules-load.service systemd-sysctl.service
     udevadm control --reload
     udevadm trigger --subsystem-match=tty
+    systemctl try-restart rigcal-web.service
 fi
 
 cat <<'NEXT'
@@ -92,4 +94,5 @@ rigcal is installed. Then, in this order (deploy/README.md says more):
   2. edit /etc/udev/rules.d/99-rigcal-station.rules: the serial number of the station's adapter
   3. edit /etc/systemd/network/80-can0.network: the bus's bit rate;   systemctl enable --now systemd-networkd
   4. systemctl enable --now rigcal
+  5. the operator's page, if it is wanted (docs/web.md):    systemctl enable --now rigcal-web
 NEXT

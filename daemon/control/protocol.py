@@ -35,6 +35,7 @@ READING = frozenset(
         "model.show",
         "tip",
         "alarms.list",
+        "rig.show",
         "guide.state",
     }
 )
@@ -147,7 +148,7 @@ def request(path: Path, command: str, arguments: Mapping[str, Any] | None = None
     Raises:
         CommandError: no daemon is listening, it refused, or it did not answer within `timeout_s`.
     """
-    message = json.dumps({"command": command, "arguments": dict(arguments or {})}).encode() + b"\n"
+    message = request_line(command, arguments)
     try:
         try:
             line = _exchange(path, message, timeout_s)
@@ -156,17 +157,40 @@ def request(path: Path, command: str, arguments: Mapping[str, Any] | None = None
     except TimeoutError:
         raise CommandError(f"the daemon at {path} did not answer within {timeout_s:g} s", FAILED) from None
     except OSError as error:
-        raise CommandError(
-            f"no daemon is listening at {path} ({error.strerror or error}); start one with `rigcal run`, "
-            "or name its socket with --socket",
-            FAILED,
-        ) from None
+        raise unreachable(path, error) from None
+    return result_of(line, path)
+
+
+def request_line(command: str, arguments: Mapping[str, Any] | None = None) -> bytes:
+    """Return a request as it is sent."""
+    return json.dumps({"command": command, "arguments": dict(arguments or {})}).encode() + b"\n"
+
+
+def result_of(line: bytes, path: Path) -> Any:
+    """Return the result in an answer.
+
+    Args:
+        line: the answer; b"" where the connection was closed without one.
+        path: the socket, for messages.
+
+    Raises:
+        CommandError: there is no whole answer, or the daemon refused.
+    """
     if not line.endswith(b"\n"):
         raise CommandError(f"the daemon at {path} closed the connection without an answer; see its log", FAILED)
     answer = json.loads(line)
     if not answer["ok"]:
         raise CommandError(answer["error"], answer["status"])
     return answer["result"]
+
+
+def unreachable(path: Path, error: OSError) -> CommandError:
+    """Return the error of a client that finds no daemon at a socket."""
+    return CommandError(
+        f"no daemon is listening at {path} ({error.strerror or error}); start one with `rigcal run`, "
+        "or name its socket with --socket",
+        FAILED,
+    )
 
 
 def _exchange_reading(control_path: Path, message: bytes, timeout_s: float) -> bytes:

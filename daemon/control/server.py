@@ -19,9 +19,11 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from daemon.commands import FAILED, WRONG_USE, Caller, CommandError, Handler, acting_for
 from daemon.control.protocol import MAX_LINE_BYTES, READING, answer_line, parse_request, refusal_line
+from daemon.host.safe_output import shown
 from daemon.store.errors import LACKING, NotInStoreError, StoreError
 from drivers.clock import NS_PER_S, SystemClock
 
@@ -300,7 +302,7 @@ class ControlServer:
             if handler is None:
                 raise CommandError(f"unknown command {command!r:.80}; known: {', '.join(sorted(self._handlers))}")
             if command not in READING:
-                log.info("%s, asked for by %s", command, caller)
+                log.info("%s, asked for by %s%s", command, caller, _on_behalf(arguments))
             with acting_for(caller, has_left):
                 return answer_line(handler(arguments))
         except CommandError as error:
@@ -313,6 +315,12 @@ class ControlServer:
         except Exception as error:  # a fault in one command must not end the daemon
             log.exception("command %s failed", command)
             return refusal_line(f"{command} failed inside the daemon: {error}; see its log", FAILED)
+
+
+def _on_behalf(arguments: Mapping[str, Any]) -> str:
+    """Return the operator whom a command names, as the end of a line of the log."""
+    operator = arguments.get("operator")
+    return f" for {shown(operator, 100)}" if isinstance(operator, str) and operator else ""
 
 
 def _hang_up(client: _Client) -> None:

@@ -65,12 +65,27 @@ class ModelRegistry:
         """Make a candidate the live model, if it has shown on held-out sessions that it is better."""
         model = self._own(self._table.get(arguments.get("id")))
         if model.state != "candidate":
-            also = f"; `rigcal model rollback {model.id}` puts it back" if model.state == "retired" else ""
+            is_back = model.state == "retired" and self._table.was_live(model)
+            also = f"; `rigcal model rollback {model.id}` puts it back" if is_back else ""
             raise CommandError(f"model {model.id} is {model.state}; only a candidate can be accepted{also}")
         live = self._table.live()
         reason = _reason_to_accept(model, live)
         self._make_live(model, live, arguments, f"accepted: {reason}")
         return self._changed(model, live) | {"reason": reason}
+
+    def reject_command(self, arguments: Mapping[str, Any]) -> str:
+        """Retire a candidate, so that nobody accepts it by mistake; the reason is kept."""
+        model = self._own(self._table.get(arguments.get("id")))
+        reason = text_argument(arguments, "reason").strip()
+        if not reason:
+            raise CommandError(f"say why model {model.id} is rejected: the reason is kept with it")
+        operator = text_argument(arguments, "operator")
+        if model.state != "candidate" or not self._table.reject(
+            model, f"rejected: {reason}", operator=operator, **caller_columns()
+        ):
+            raise CommandError(f"model {model.id} is {self._table.get(model.id).state}; only a candidate is rejected")
+        log.warning("model %d is rejected (%s), by %s", model.id, reason, operator or "an operator without a name")
+        return f"model {model.id} is rejected"
 
     def rollback_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Put back the model that the live one replaced, or any other that was live."""
@@ -85,8 +100,12 @@ class ModelRegistry:
                     f"model {live.id} is the first that went live; name another with `rigcal model rollback ID`"
                 )
         model = self._own(self._table.get(wanted))
-        if model.state != "retired":
-            why = "is live already" if model.state == "live" else "was never live; `rigcal model accept` makes it so"
+        if model.state != "retired" or not self._table.was_live(model):
+            why = {
+                "live": "is live already",
+                "candidate": "was never live; `rigcal model accept` makes it so",
+                "retired": "was rejected, and never live",
+            }[model.state]
             raise CommandError(f"model {model.id} {why}")
         self._make_live(model, live, arguments, "put back")
         return self._changed(model, live)

@@ -231,6 +231,28 @@ class ModelTable:
             self._note_state(model.id, "live", reason, replaced_id=replaced_id, after_session=after_session, **by)
         return True
 
+    def reject(self, model: ModelRow, reason: str, **by: object) -> bool:
+        """Retire a candidate that an operator does not want; it never goes live.
+
+        Args:
+            model: as it was when the decision was made.
+            reason: why, a clause.
+            by: as of `go_live`.
+
+        Returns:
+            False, with nothing changed, if it is no candidate any more.
+        """
+        with self._store.transaction():
+            if self.get(model.id).state != "candidate":
+                return False
+            self._store.update("models", {"id": model.id}, {"state": "retired"})
+            self._note_state(model.id, "retired", reason, **by)
+        return True
+
+    def was_live(self, model: ModelRow) -> bool:
+        """True if a model was ever the live one."""
+        return any(change["state"] == "live" for change in self.history(model))
+
     def note_zeros_checked(self, model: ModelRow, through: int, **by: object) -> None:
         """Note that an operator has made sure that the joints' zeros are those that the live model was trained with.
 

@@ -51,6 +51,7 @@ FILES = {
     "rigcal-clock@.service": "usr/lib/systemd/system/rigcal-clock@.service",
     "system-rigcaljobs.slice": "usr/lib/systemd/system/system-rigcaljobs.slice",
     "network.conf": "usr/share/doc/rigcal/network.conf",
+    "rigcal-web.service": "usr/lib/systemd/system/rigcal-web.service",
     "rigcal.sysusers": "usr/lib/sysusers.d/rigcal.conf",
     "rigcal.modules-load": "usr/lib/modules-load.d/rigcal.conf",
     "rigcal.sysctl": "usr/lib/sysctl.d/60-rigcal.conf",

@@ -66,6 +66,16 @@ def model_accept(number: int, operator: str, **where: Any) -> Any:
     return ask(where, "model.accept", _changed, id=number, operator=operator)
 
 
+@model.command(cls=Command, name="reject")
+@click.argument("number", type=int)
+@click.option("--reason", required=True, help="Why; kept with the model.")
+@operator_option
+@client_options
+def model_reject(number: int, reason: str, operator: str, **where: Any) -> Any:
+    """Retire candidate NUMBER for good, so that nobody accepts it by mistake. It never goes live."""
+    return ask(where, "model.reject", echo, id=number, reason=reason, operator=operator)
+
+
 @model.command(cls=Command, name="rollback")
 @click.argument("number", type=int, required=False)
 @operator_option

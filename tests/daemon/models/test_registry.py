@@ -449,3 +449,21 @@ def test_a_load_that_a_stop_cuts_short_is_no_defect_of_the_model(
     live._thread.join()
     assert not caplog.records
     assert live.now() == Missing("the live model is being loaded")
+
+
+def test_a_rejected_candidate_never_goes_live(rig: ModelRig) -> None:
+    live = rig.accepted()
+    model = rig.compared(rig.candidate(), live=live)
+    assert "say why" in refusal(rig.registry.reject_command, WRONG_USE, id=model)
+    assert rig.registry.reject_command({"id": model, "reason": "measured in a storm", "operator": "Ada"})
+    change = rig.registry.show_command({"id": model})["history"][-1]
+    assert (change["state"], change["reason"], change["operator"]) == (
+        "retired",
+        "rejected: measured in a storm",
+        "Ada",
+    )
+    assert rig.registry.status()["candidate"] is None
+    assert "only a candidate" in refusal(rig.registry.accept_command, WRONG_USE, id=model)
+    assert "was rejected" in refusal(rig.registry.rollback_command, WRONG_USE, id=model)
+    assert "only a candidate" in refusal(rig.registry.reject_command, WRONG_USE, id=model, reason="again")
+    assert "only a candidate" in refusal(rig.registry.reject_command, WRONG_USE, id=live, reason="no")

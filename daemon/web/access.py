@@ -1,0 +1,221 @@
+"""Who may do what on the page: roles, tokens and a limit on wrong ones.
+
+A token is 256 random bits, shown once when it is made; the file keeps its SHA-256, the name of its owner and the role.
+So much randomness needs no slow hash. The browser keeps the token in a cookie that no script can read, so a token that
+is removed from the file ends at once what is done with it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import secrets
+import threading
+from collections import deque
+from dataclasses import dataclass
+from enum import IntEnum
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from daemon.commands import FAILED, CommandError
+from daemon.host.safe_output import write_file
+from drivers.clock import NS_PER_S, Clock, SystemClock
+from drivers.files import read_text
+
+PREFIX = "rigcal_"  # so that scanners for secrets, and people, know one when they see it
+NAME_CHARACTERS = 60
+_FILE_BYTES = 1 << 20
+_WINDOW_S = 60.0
+_WRONG_PER_ADDRESS = 10
+_WRONG_IN_ALL = 100
+_ADDRESSES = 1000
+
+
+class Role(IntEnum):
+    """A role; each may do all that the ones before it may."""
+
+    READ = 1
+    OPERATE = 2
+    APPROVE = 3
+
+    @classmethod
+    def named(cls, name: str) -> Role:
+        """Return the role of a name, as the command line and the file have it."""
+        return cls[name.upper()]
+
+    @property
+    def word(self) -> str:
+        """Its name for people and files."""
+        return self.name.lower()
+
+
+ROLE_NAMES = tuple(role.word for role in Role)
+
+
+@dataclass(frozen=True)
+class Person:
+    """Someone at a browser.
+
+    Attributes:
+        name: of the token's owner; "" for one who reached the page on the loopback interface without a token.
+        role: what this person may do.
+    """
+
+    name: str
+    role: Role
+
+
+class _Entry(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str
+    role: str
+    sha256: str
+    created_utc_ns: int
+
+
+class _File(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    tokens: tuple[_Entry, ...] = ()
+
+
+class TokenBook:
+    """The tokens of a page, in a JSON file that is read again whenever it has changed.
+
+    Args:
+        path: of the file; it need not exist.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._state: tuple[int, int, int] | None = None
+        self._entries: tuple[_Entry, ...] = ()
+        self._turn = threading.Lock()
+
+    def add(self, name: str, role: Role, created_utc_ns: int) -> str:
+        """Make a token and keep its hash.
+
+        Returns:
+            The token, which nobody can tell again.
+
+        Raises:
+            CommandError: the name is taken or none, or the file cannot be read or written.
+        """
+        if not 1 <= len(name) <= NAME_CHARACTERS or not name.isprintable() or not name.strip():
+            raise CommandError(f"a token's name is 1 to {NAME_CHARACTERS} printable characters, not {name!r:.80}")
+        entries = self.entries()
+        if any(entry.name == name for entry in entries):
+            raise CommandError(f"{name!r} has a token already; remove it first, or choose another name")
+        token = PREFIX + secrets.token_urlsafe(32)
+        entry = _Entry(name=name, role=role.word, sha256=_digest(token), created_utc_ns=created_utc_ns)
+        self._write((*entries, entry))
+        return token
+
+    def remove(self, name: str) -> None:
+        """Remove a token: whoever uses it is refused from now on.
+
+        Raises:
+            CommandError: there is none of that name, or the file cannot be read or written.
+        """
+        entries = self.entries()
+        kept = tuple(entry for entry in entries if entry.name != name)
+        if len(kept) == len(entries):
+            known = ", ".join(entry.name for entry in entries) or "none"
+            raise CommandError(f"there is no token of {name!r}; there are: {known}")
+        self._write(kept)
+
+    def entries(self) -> tuple[_Entry, ...]:
+        """Return all tokens' names, roles and hashes.
+
+        Raises:
+            CommandError: the file cannot be read.
+        """
+        with self._turn:
+            try:
+                found = os.stat(self.path)
+            except FileNotFoundError:
+                self._state, self._entries = None, ()
+                return ()
+            except OSError as error:
+                raise CommandError(f"{self.path}: cannot be read: {error.strerror}", FAILED) from error
+            state = found.st_ino, found.st_mtime_ns, found.st_size
+            if state != self._state:
+                self._entries, self._state = self._read(), state
+            return self._entries
+
+    def find(self, token: str) -> Person | None:
+        """Return whose token it is; None of one that is unknown."""
+        digest = _digest(token)
+        for entry in self.entries():
+            if secrets.compare_digest(entry.sha256, digest):
+                return Person(entry.name, Role.named(entry.role))
+        return None
+
+    def _read(self) -> tuple[_Entry, ...]:
+        try:
+            entries = _File.model_validate_json(read_text(self.path, _FILE_BYTES)).tokens
+        except OSError as error:
+            raise CommandError(f"{self.path}: cannot be read: {error.strerror}", FAILED) from error
+        except (ValidationError, ValueError) as error:
+            first = str(error).splitlines()[0]
+            raise CommandError(f"{self.path}: not a file of tokens ({first}); remove it and add them anew") from error
+        for entry in entries:
+            if entry.role not in ROLE_NAMES:
+                raise CommandError(
+                    f"{self.path}: {entry.name!r} has role {entry.role!r}; roles: {', '.join(ROLE_NAMES)}"
+                )
+        return entries
+
+    def _write(self, entries: tuple[_Entry, ...]) -> None:
+        """Write the file for its owner and, to be read, for the group of its directory."""
+        text = json.dumps({"tokens": [entry.model_dump() for entry in entries]}, indent=1) + "\n"
+        try:
+            write_file(self.path, text.encode())
+            os.chown(self.path, -1, self.path.parent.stat().st_gid)
+            self.path.chmod(0o640)
+        except OSError as error:
+            raise CommandError(f"{self.path}: cannot be written: {error.strerror}", FAILED) from error
+
+
+class AttemptLimit:
+    """Counts wrong tokens: so many a minute from one address, and so many from all of them.
+
+    Args:
+        clock: of the computer.
+    """
+
+    def __init__(self, clock: Clock | None = None) -> None:
+        self._clock = clock or SystemClock()
+        self._wrong: dict[str, deque[int]] = {}
+        self._all: deque[int] = deque(maxlen=_WRONG_IN_ALL)
+
+    def note(self, address: str) -> None:
+        """Count a wrong token."""
+        now_ns = self._clock.monotonic_ns()
+        if address not in self._wrong and len(self._wrong) >= _ADDRESSES:
+            self._wrong.pop(next(iter(self._wrong)))
+        self._wrong.setdefault(address, deque(maxlen=_WRONG_PER_ADDRESS)).append(now_ns)
+        self._all.append(now_ns)
+
+    def wait_s(self, address: str) -> float:
+        """Return how long this address must wait before another token is looked at; 0 where it need not."""
+        own = self._wrong.get(address)
+        return max(self._left_s(own, _WRONG_PER_ADDRESS) if own else 0.0, self._left_s(self._all, _WRONG_IN_ALL))
+
+    def _left_s(self, times: deque[int], most: int) -> float:
+        if len(times) < most:
+            return 0.0
+        return max(_WINDOW_S - (self._clock.monotonic_ns() - times[0]) / NS_PER_S, 0.0)
+
+
+def role_refusal(person: Person, needed: Role) -> str:
+    """Say that a person may not do what needs a higher role."""
+    who = f"the token of {person.name}" if person.name else "this page, opened without a token,"
+    return f"this needs the role {needed.word}, and {who} has the role {person.role.word}"
+
+
+def _digest(token: str) -> str:
+    return hashlib.sha256(token.encode("utf-8", "replace")).hexdigest()

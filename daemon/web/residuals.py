@@ -1,0 +1,92 @@
+"""A session's fixes beside what the live model predicts for them."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+from daemon.store.history import session_fixes
+from daemon.store.reader import Reader
+
+_Key = tuple[str, int, str]
+
+
+class SessionFixes:
+    """Reads a session's fixes with their residuals; one reading at a time, each kept until something is new.
+
+    Nothing heavy is imported before the first residual is asked for.
+    """
+
+    def __init__(self) -> None:
+        self._turn = threading.Lock()
+        self._model: tuple[str, Any] | None = None
+        self._kept: tuple[_Key, dict[str, Any]] | None = None
+
+    def read(self, store: Path, session_id: str, model: dict[str, Any] | None) -> dict[str, Any]:
+        """Return the fixes of a session, oldest first.
+
+        Args:
+            store: the database.
+            session_id: which session.
+            model: the live one, as `model.show` tells it; None without one.
+
+        Returns:
+            `fixes`: id, pose, utc_ns, x_mm, y_mm, z_mm, dwell_s, excluded of each, and residual_mm: [x, y, z] measured
+            less predicted, None where nothing predicts it; `model`: number of the model; `note`: why there are no
+            residuals, or what they rest on, a sentence; "" where there is nothing to say.
+
+        Raises:
+            StoreError: the store cannot be read.
+        """
+        sha256 = "" if model is None else str(model["manifest_sha256"])
+        with self._turn, Reader(store) as reader, reader.snapshot():
+            fixes = session_fixes(reader, session_id)
+            key = session_id, hash(tuple((fix["id"], fix["excluded"]) for fix in fixes)), sha256
+            if self._kept is None or self._kept[0] != key:
+                self._kept = key, self._beside(reader, session_id, fixes, model)
+            return self._kept[1]
+
+    def _beside(
+        self, reader: Reader, session_id: str, fixes: list[dict[str, Any]], model: dict[str, Any] | None
+    ) -> dict[str, Any]:
+        residuals: dict[int, list[float]] = {}
+        note = "No model is live: residuals appear once one is."
+        if model is not None:
+            used = [fix["id"] for fix in fixes if fix["excluded"] is None]
+            residuals, note = self._residuals(reader, session_id, used, model) if used else ({}, "")
+        shown = [fix | {"residual_mm": residuals.get(fix["id"])} for fix in fixes]
+        return {"fixes": shown, "model": None if model is None else model["id"], "note": note}
+
+    def _residuals(
+        self, reader: Reader, session_id: str, used: list[int], model: dict[str, Any]
+    ) -> tuple[dict[int, list[float]], str]:
+        """Return number of a used fix -> residual, mm, and what to say about them."""
+        import numpy as np
+
+        from calibration.errors import CalibrationError
+        from calibration.model.prediction import Predictor
+        from calibration.model.rebase import with_refitted_base
+        from calibration.observations import parse_observations
+        from daemon.sessions.session_data import sessions_csv
+
+        try:
+            live = self._loaded(model)
+            rows = parse_observations(sessions_csv(reader, live.rig, [session_id]), live.rig, f"session {session_id}")
+            note = ""
+            if not set(rows.setup.tolist()) <= set(live.placements):
+                live = with_refitted_base(live, rows)
+                note = "The live model does not know this set-up: its base is fitted on these very fixes."
+            errors_mm = rows.position_mm - Predictor.of(live).predict(rows).position_mm
+        except (CalibrationError, OSError) as error:
+            return {}, f"No residuals: {error}"
+        # The newest of the session's used fixes, in the same order.
+        return dict(zip(used, np.round(errors_mm[-len(used) :], 3).tolist(), strict=True)), note
+
+    def _loaded(self, model: dict[str, Any]) -> Any:
+        from daemon.models.model_files import read_model
+
+        sha256 = str(model["manifest_sha256"])
+        if self._model is None or self._model[0] != sha256:
+            self._model = sha256, read_model(Path(str(model["path"])), sha256)
+        return self._model[1]

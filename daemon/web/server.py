@@ -1,0 +1,80 @@
+"""Serves the page until it is told to stop."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import signal
+import socket
+from collections.abc import Callable
+
+import uvicorn
+
+from daemon.commands import FAILED, CommandError
+from daemon.host.systemd import Notifier
+from daemon.web.app import make_app
+from daemon.web.live import STALLED_S
+from daemon.web.settings import WebSettings
+
+log = logging.getLogger(__name__)
+
+CONNECTIONS = 200
+KEEP_ALIVE_S = 15
+STOP_S = 2
+
+
+def serve(settings: WebSettings, say: Callable[[str], None], notifier: Notifier) -> None:
+    """Serve the page until SIGTERM or Ctrl-C.
+
+    Args:
+        settings: where and how.
+        say: told the page's address once it can be opened.
+        notifier: of the service manager.
+
+    Raises:
+        CommandError: it must not be served so, or cannot.
+    """
+    settings.check()
+    listener = _listener(settings)
+    config = uvicorn.Config(
+        make_app(settings),
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        proxy_headers=False,
+        lifespan="off",
+        limit_concurrency=CONNECTIONS,
+        timeout_keep_alive=KEEP_ALIVE_S,
+        timeout_graceful_shutdown=STOP_S,
+        h11_max_incomplete_event_size=16 << 10,
+        ssl_certfile=settings.certificate,
+        ssl_keyfile=settings.key,
+    )
+    try:
+        config.load()
+    except OSError as error:  # ssl.SSLError is one
+        raise CommandError(f"{settings.certificate}, {settings.key}: no certificate with its key: {error}") from error
+    host, port = listener.getsockname()[:2]
+    scheme = "https" if settings.is_secure else "http"
+    say(f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/")
+    notifier.send("READY=1", f"STATUS=serving the page at {scheme}://{host}:{port}")
+    # uvicorn stops on SIGTERM and raises it again afterwards: the end is in order by then.
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: None)
+    with listener:
+        uvicorn.Server(config).run(sockets=[listener])
+
+
+def _listener(settings: WebSettings) -> socket.socket:
+    """Return the listening socket; a client that takes nothing for long is closed by the kernel."""
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    try:
+        listener = socket.create_server((settings.host, settings.port), family=family, backlog=CONNECTIONS)
+    except OSError as error:
+        what = "another program listens there already" if error.errno == errno.EADDRINUSE else error.strerror
+        raise CommandError(
+            f"{settings.host} port {settings.port}: the page cannot be served there: {what}; choose another --port",
+            FAILED,
+        ) from error
+    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(STALLED_S * 1000))
+    return listener
