@@ -4,8 +4,9 @@
     {"id": 2, "ask": "status", "arguments": {}}    -> {"id": 2, "answer": {...}, ...}
     {"id": 3, "write": "/etc/x", "text": "..."}    -> {"id": 3, ...}
 
-Every answer has `began_s` and `ended_s`, instants of the machine's own monotonic clock. It runs with the system's Python
-and its standard library only, and starts nothing where a command is for the daemon: processes are dear in emulation.
+Every answer has `began_s` and `ended_s`, instants of the machine's own monotonic clock. It runs with the system's
+Python and its standard library only, and starts nothing where a command is for the daemon: processes are dear in
+emulation.
 """
 
 import json

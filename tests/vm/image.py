@@ -1,7 +1,8 @@
-"""The virtual machine's image: a Debian 12 with the project's own package in it, kept in `.cache/vm` by what it is made of.
+"""The virtual machine's image: a Debian 12 with the project's own package in it.
 
-Everything comes from Debian's packages and from the package that `make deb` builds of the last commit, which is installed
-without a network. The kernel is Debian's, and only the modules that a rig or a fault needs are taken.
+It is kept in `.cache/vm` by what it is made of. Everything comes from Debian's packages and from the package that
+`make deb` builds of the last commit, which is installed without a network. The kernel is Debian's, and only the modules
+that a rig or a fault needs are taken.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ HERE = Path(__file__).parent
 SUITE = "bookworm"
 RELEASE = 12
 SIZE = "6G"  # sparse
-PACKAGES = "systemd,systemd-sysv,dbus,udev,kmod,iproute2,can-utils,e2fsprogs,python3,libgomp1,passwd,util-linux,ca-certificates"
+PACKAGES = "systemd,systemd-sysv,dbus,udev,kmod,iproute2,can-utils,e2fsprogs,python3,libgomp1,passwd,"
+PACKAGES += "util-linux,ca-certificates"
 # With what each of them needs. linux-image-cloud-amd64 has no CAN.
 MODULES = """virtio_blk virtio_pci virtio_console virtio_rng ext4 9p 9pnet_virtio softdog autofs4 loop
     can can-raw vcan sja1000 kvaser_pci uhci-hcd usbserial ftdi_sio"""
@@ -81,7 +83,7 @@ def image(say: Callable[[str], None], cpu_of: Callable[[Image], dict[str, str]])
         cpu_of: boots an image, and returns the name and the features that numba sees of its processor.
     """
     base = _base(say)
-    place = CACHE / f"image-{_digest(base.name, _packaged(), _text(HERE / 'guest_agent.py'))}"
+    place = CACHE / f"image-{_digest(base.name, _packaged(), _text(Path(__file__)), _text(HERE / 'guest_agent.py'))}"
     made = Image(place / "root.img", base / "vmlinuz", base / "initrd.img", place / "next.deb")
     if place.exists():
         return made
@@ -137,8 +139,8 @@ def _packaged() -> str:
 
 def _base(say: Callable[[str], None]) -> Path:
     """Return the directory of kernel, initrd and a Debian without the package."""
-    packages = run("apt-cache", "policy", "linux-image-amd64").partition("Candidate:")[2].split()[0]
-    place = CACHE / f"base-{_digest(PACKAGES, MODULES, INITRD_MODULES, INIT, MASKED, AGENT_UNIT, packages)}"
+    kernel = run("apt-cache", "policy", "linux-image-amd64").partition("Candidate:")[2].split()[0]
+    place = CACHE / f"base-{_digest(PACKAGES, MODULES, INITRD_MODULES, INIT, kernel)}"
     if place.exists():
         return place
     CACHE.mkdir(parents=True, exist_ok=True)

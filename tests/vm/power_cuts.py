@@ -1,8 +1,9 @@
 """Power cuts of the service while it records, at any instant: no row that was committed may be missing.
 
-The service records a simulated rig on a disk whose every write QEMU logs. A witness asks it how many captures are stored,
-and writes each answer past all caches to a sector of the same disk, so that the log itself says what was promised before
-any cut. Then the disk is rebuilt as many cuts would have left it, and the store on it is opened as the service opens it.
+The service records a simulated rig on a disk whose every write QEMU logs. A witness asks it how many captures are
+stored, and writes each answer past all caches to a sector of the same disk, so that the log itself says what was
+promised before any cut. Then the disk is rebuilt as many cuts would have left it, and the store on it is opened as the
+service opens it.
 
 The control is the same service with SQLite's `synchronous = OFF`: it must lose rows, or the test would see nothing.
 """

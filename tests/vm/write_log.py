@@ -1,8 +1,8 @@
 """QEMU's log of every write and flush of a disk, and the disk as a power cut would have left it at any of them.
 
-The format is that of dm-log-writes, as QEMU's driver `blklogwrites` writes it. What was flushed before the cut is on the
-disk; of what was written after the last flush, a volatile cache has put down a part at random, in sectors, so that writes
-are torn as well.
+The format is that of dm-log-writes, as QEMU's driver `blklogwrites` writes it. What was flushed before the cut is on
+the disk; of what was written after the last flush, a volatile cache has put down a part at random, in sectors, so that
+writes are torn as well.
 """
 
 from __future__ import annotations
