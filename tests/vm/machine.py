@@ -23,6 +23,9 @@ from tests.vm.image import Image
 
 ADAPTER = "RIG-4711"  # serial number of the station's adapter
 BOOT_S = 900.0
+# The machine's clocks count its instructions, 1 ns each, and go on by themselves only while it idles: how long something
+# takes there does not depend on what else this computer does. One processor: several would have to take turns.
+CLOCK = ("-smp", "1", "-icount", "shift=0,sleep=on")
 OPTIONS = "console=ttyS0,115200 quiet loglevel=4 net.ifnames=0 mitigations=off nokaslr no_timer_check audit=0 panic=-1"
 
 
@@ -209,7 +212,7 @@ class _Qmp:
 def _command(image: Image, directory: Path, disk: Path) -> list[str]:
     device = ["-device"]
     line = directory / "line"  # from ttyS1 to the adapter
-    command = ["qemu-system-x86_64", "-M", "pc", "-accel", "tcg,thread=multi", "-cpu", "max", "-smp", "2", "-m", "2048"]
+    command = ["qemu-system-x86_64", "-M", "pc", "-accel", "tcg,thread=single", "-cpu", "max", "-m", "2048", *CLOCK]
     command += ["-nodefaults", "-no-user-config", "-display", "none", "-no-reboot"]
     command += ["-kernel", str(image.kernel), "-initrd", str(image.initrd), "-append", OPTIONS]
     # First and explicit, so that it is /dev/vda whatever disks are added.

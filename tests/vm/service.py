@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import random
 import shlex
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -91,6 +90,19 @@ class Service:
         self.machine.tried("systemctl stop rig")
         self._wiring = ""
 
+    def pause_rig(self) -> int:
+        """Let the simulated rig send nothing, and return how many of the bus's captures are stored once all are."""
+        self.machine.run("systemctl kill -s STOP rig")
+        seen = -1
+        while seen != (now := self.stored()):
+            seen = now
+            self.machine.run("sleep 1")
+        return seen
+
+    def resume_rig(self) -> None:
+        """Let it go on; it sends what it would have sent meanwhile."""
+        self.machine.run("systemctl kill -s CONT rig")
+
     def aim(self, target: str) -> None:
         """Turn the station by hand."""
         line = json.dumps({"do": "aim", "target": target})
@@ -171,14 +183,6 @@ class Service:
     def command_line(self, user: str, *words: str) -> Answer:
         """Give a command as a user types it."""
         return self.machine.tried(f"runuser -u {user} -- rigcal {shlex.join(words)}", 300.0)
-
-    def settled(self, link: str = BUS) -> int:
-        """Return how many captures are stored once there come no more."""
-        seen = -1
-        while seen != (now := self.stored(link)):
-            seen = now
-            time.sleep(1.0)
-        return seen
 
 
 def expect(holds: object, said: object) -> None:

@@ -65,6 +65,7 @@ class WriteLog:
         head = self._file.read(_SUPER.size)
         magic, version, count, sector = _SUPER.unpack(head) if len(head) == _SUPER.size else (0, 0, 0, 0)
         if magic != _MAGIC or version != _VERSION:
+            self._file.close()
             raise ValueError(f"{path}: no log of writes")
         self.entries: list[Entry] = []
         place = sector

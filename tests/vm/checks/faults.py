@@ -51,33 +51,29 @@ def a_suspended_computer_goes_on(service: Service) -> str:
 def two_spinning_processes_cost_no_frame(service: Service) -> str:
     """Two processes that would take both processors, at a higher priority than the service, cost no frame."""
     service.on("cards")
-    service.stop_rig()
-    before, counted = service.settled(), service.counted("can0")
-    service.start_rig("can1")
+    before, counted = service.pause_rig(), service.counted("can0")
+    service.resume_rig()
     spin = "systemd-run -q --collect --unit=spin@{} -p Nice=-5 -p RuntimeMaxSec={} sh -c 'while :; do :; done'"
     for name in "ab":
         service.machine.run(spin.format(name, SPIN_S))
     service.wait("the two to end", lambda: service.machine.tried("systemctl is-active 'spin@*'").status != 0, 600.0)
-    service.stop_rig()
-    stored, sent = service.settled() - before, service.counted("can0") - counted
+    stored, sent = service.pause_rig() - before, service.counted("can0") - counted
+    service.resume_rig()
     dropped = service.link()["dropped"]
-    expect(stored == sent and dropped == 0, f"{sent} frames came in, {stored} are stored, {dropped} dropped")
-    service.on("cards")
+    expect(stored == sent > 0 and dropped == 0, f"{sent} frames came in, {stored} are stored, {dropped} dropped")
     return f"0 of {sent} frames lost in {SPIN_S} s"
 
 
 def a_process_that_was_held_up_catches_up(service: Service) -> str:
     """A service that is stopped for some seconds and goes on has lost nothing: the kernel has kept it."""
     service.on("cards")
-    service.stop_rig()
-    before, counted = service.settled(), service.counted("can0")
-    service.start_rig("can1")
+    before, counted = service.pause_rig(), service.counted("can0")
+    service.resume_rig()
     pid = service.property("MainPID")
-    time.sleep(3.0)
     gone_on = service.machine.tried(f"kill -STOP {pid}; sleep {HELD_S}; kill -CONT {pid}")
     figure = recovered(service, gone_on.ended_s)
-    service.stop_rig()
-    stored, sent = service.settled() - before, service.counted("can0") - counted
+    stored, sent = service.pause_rig() - before, service.counted("can0") - counted
+    service.resume_rig()
     expect(stored == sent > 0, f"{sent} frames came in, {stored} are stored")
     return f"0 of {sent} frames lost, {figure}"
 
@@ -112,13 +108,13 @@ def a_killed_service_is_restarted(service: Service) -> str:
 def a_full_disk_is_told_and_nothing_is_lost(service: Service) -> str:
     """A disk without room is an alarm; what comes meanwhile waits, and is stored when there is room."""
     service.on("vcan")
-    service.stop_rig()
+    service.pause_rig()
     service.machine.run(f"truncate -s 200M {FULL} && mke2fs -q -m 0 {FULL} && systemctl stop rigcal")
     service.machine.run(f"mount -o loop {FULL} /var/lib/rigcal && chown rigcal:rigcal /var/lib/rigcal", 120.0)
     try:
         service.machine.run("systemctl start rigcal", 900.0)
         counted = service.counted("vcan0")
-        service.start_rig("vcan0")
+        service.resume_rig()
         service.wait_until_well()
         service.machine.tried("dd if=/dev/zero of=/var/lib/rigcal/filler bs=64k 2>/dev/null; sync")
         alarm = service.wait_for_alarm("not_storing", within_s=300.0)
@@ -126,8 +122,7 @@ def a_full_disk_is_told_and_nothing_is_lost(service: Service) -> str:
         freed_s = service.machine.tried("rm /var/lib/rigcal/filler").ended_s
         service.wait_for_alarm("not_storing", stands=False)
         figure = recovered(service, freed_s)
-        service.stop_rig()
-        stored, sent = service.settled(), service.counted("vcan0") - counted
+        stored, sent = service.pause_rig(), service.counted("vcan0") - counted
         expect(stored == sent, f"{sent} frames came in, {stored} are stored")
     finally:
         service.stop_rig()

@@ -7,6 +7,7 @@ import time
 from tests.vm.service import BUS, STATION, Service, expect
 
 RECOVERY_S = 2.0
+TRAFFIC_S = 20
 BUS_OFF = "20000040#0000000000000000"  # an error frame of CAN_ERR_BUSOFF
 
 
@@ -20,14 +21,11 @@ def recovered(service: Service, since_s: float, link: str = BUS) -> str:
 def all_sent_is_stored(service: Service, wiring: str, heard: str) -> str:
     """Send for a while, stop, and compare what the kernel has counted with what the store has more."""
     service.on(wiring)
-    service.stop_rig()
-    before, counted = service.settled(), service.counted(heard)
-    service.start_rig({"vcan": "vcan0", "cards": "can1"}[wiring])
-    service.wait_until_well()
-    began_s = service.machine.now_s()
-    service.wait("20 s of traffic", lambda: service.machine.now_s() > began_s + 20.0)
-    service.stop_rig()
-    stored, sent = service.settled() - before, service.counted(heard) - counted
+    before, counted = service.pause_rig(), service.counted(heard)
+    service.resume_rig()
+    service.machine.run(f"sleep {TRAFFIC_S}")
+    stored, sent = service.pause_rig() - before, service.counted(heard) - counted
+    service.resume_rig()
     expect(stored == sent > 500, f"{sent} frames came in, {stored} are stored")
     return f"{stored} of {sent} frames stored"
 
@@ -48,12 +46,11 @@ def all_that_is_sent_between_cards_is_stored(service: Service) -> str:
 def a_bus_off_alarms_and_ends(service: Service) -> str:
     """The error frame of a bus-off is an alarm that says what to do, and ends when the bus is heard."""
     service.on("vcan")
-    service.stop_rig()
-    service.settled()
+    service.pause_rig()
     service.machine.run(f"cansend vcan0 {BUS_OFF}")
     alarm = service.wait_for_alarm("bus_off")
     expect("termination" in alarm["remedy"], alarm)
-    service.start_rig("vcan0")
+    service.resume_rig()
     service.wait_for_alarm("bus_off", stands=False)
     service.wait_until_well()
     return f"alarm: {alarm['text'][:60]}"
