@@ -108,7 +108,7 @@ def system_directories(place: Path) -> Iterator[None]:
 
 def package_of(release: int, out: Path) -> Path:
     """Build the package twice, which must be the same bytes."""
-    built = []
+    built: list[Path] = []
     for name in ("first", "second"):
         run(sys.executable, BUILD, "deb", "--release", str(release), "--out", out / name)
         built += (out / name).glob("*.deb")

@@ -23,7 +23,7 @@ from tests.vm.image import Image
 
 ADAPTER = "RIG-4711"  # serial number of the station's adapter
 BOOT_S = 900.0
-# The machine's clocks count its instructions, 1 ns each, and go on by themselves only while it idles: how long something
+# The machine's clocks count its instructions, 1 ns each, and go on by themselves only where it idles: how long a thing
 # takes there does not depend on what else this computer does. One processor: several would have to take turns.
 CLOCK = ("-smp", "1", "-icount", "shift=0,sleep=on")
 OPTIONS = "console=ttyS0,115200 quiet loglevel=4 net.ifnames=0 mitigations=off nokaslr no_timer_check audit=0 panic=-1"
@@ -125,9 +125,16 @@ class Machine:
         timeout_s = 600.0
         return Answer(self._send({"ask": command, "arguments": arguments, "timeout_s": timeout_s}, timeout_s))
 
+    def query(self, sql: str, store: str) -> list[Any]:
+        """Return the rows of a query of a database; MachineError where it cannot be read."""
+        answer = Answer(self._send({"query": sql, "store": store}, 120.0))
+        if answer.error:
+            raise MachineError(f"{sql}: {answer.error}")
+        return list(answer.answer or [])
+
     def now_s(self) -> float:
         """Its monotonic clock."""
-        return self.tried("true").ended_s
+        return Answer(self._send({"tell": "now"}, 60.0)).ended_s
 
     def _send(self, message: dict[str, Any], timeout_s: float) -> dict[str, Any]:
         with self._arrived:
@@ -249,7 +256,7 @@ def _tail(path: Path) -> str:
 
 
 def wait_for(
-    machine: Machine, what: str, look: Callable[[], Any], within_s: float = 120.0, pause_s: float = 0.1
+    machine: Machine, what: str, look: Callable[[], Any], within_s: float = 120.0, pause_s: float = 0.5
 ) -> Any:
     """Return the first thing that `look` finds; MachineError after `within_s` seconds of the machine's own time."""
     until_s = machine.now_s() + within_s

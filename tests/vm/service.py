@@ -34,9 +34,6 @@ serial.path = "/dev/rigcal-station"
 fixes_per_shot = 3
 """
 POSES, STAND_S = 60, 6.0
-QUERY = """import json, sqlite3, sys
-store = sqlite3.connect("file:" + sys.argv[1] + "?mode=ro", uri=True)
-print(json.dumps(store.execute(sys.argv[2]).fetchall()))"""
 
 
 class Service:
@@ -139,9 +136,9 @@ class Service:
         what = f"alarm {kind} to {'stand' if stands else 'end'}"
         return self.wait(what, lambda: (self.alarm(kind) is not None) == stands, within_s) and self.alarm(kind)
 
-    def wait(self, what: str, look: Callable[[], Any], within_s: float = 120.0) -> Any:
-        """Return the first thing that `look` finds."""
-        return wait_for(self.machine, what, look, within_s)
+    def wait(self, what: str, look: Callable[[], Any], within_s: float = 120.0, pause_s: float = 0.5) -> Any:
+        """Return the first thing that `look` finds, looking every `pause_s` seconds of this computer's time."""
+        return wait_for(self.machine, what, look, within_s, pause_s)
 
     def wait_until_well(self, within_s: float = 300.0) -> None:
         """Wait until all channels are read and the station is locked."""
@@ -158,8 +155,7 @@ class Service:
 
     def query(self, sql: str, store: str = STORE) -> list[Any]:
         """Return the rows of a query of the store."""
-        command = f"python3 -I -c {shlex.quote(QUERY)} {store} {shlex.quote(sql)}"
-        return list(json.loads(self.machine.run(command)))
+        return self.machine.query(sql, store)
 
     def first_capture_s(self, since_s: float, link: str = BUS) -> float:
         """Return when the first capture of a link after an instant was made; waits until it is stored."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 
 from tests.vm.checks.links import recovered
 from tests.vm.service import STATION, Service, expect
@@ -23,7 +24,7 @@ def a_clock_that_was_set_is_noticed(service: Service) -> str:
         service.machine.run(f"date -s '@'$(($(date +%s) + {step_s}))")
         sql = f"""SELECT code FROM device_events WHERE kind = 'clock_step' AND code {"<>"[step_s > 0]} 0
             AND monotonic_ns > {round(since_s * 1e9)}"""
-        found = service.wait("the event", lambda sql=sql: service.query(sql))
+        found = service.wait("the event", partial(service.query, sql))
         expect(abs(found[-1][0] / 1e3 - step_s) < 2.0, f"a step of {step_s} s is stored as {found} ms")
     alarm = service.wait_for_alarm("clock_stepped")
     expect(alarm["remedy"], alarm)

@@ -9,7 +9,7 @@ from tests.vm.service import Service, expect
 
 TRAINING_POSES, CHECK_POSES = 14, 5
 SESSION_S, JOBS_S = 600.0, 3600.0
-LEAST = 3  # poses between the shots of a control point
+POLL_S = 5.0  # each question costs the machine
 
 
 def a_session_ends_in_an_accepted_model(service: Service) -> str:
@@ -20,7 +20,7 @@ def a_session_ends_in_an_accepted_model(service: Service) -> str:
     _hold(service, "check", CHECK_POSES)
     before = service.link()
     began_s = service.machine.now_s()
-    service.wait("the jobs", lambda: _have_ended(service), JOBS_S)
+    service.wait("the jobs", lambda: _have_ended(service), JOBS_S, POLL_S)
     took_s = service.machine.now_s() - began_s
     jobs = service.ask("jobs.list")
     expect(all(job["state"] == "done" for job in jobs), [(j["kind"], j["state"], j["error"]) for j in jobs])
@@ -45,7 +45,7 @@ def _hold(service: Service, kind: str, poses: int) -> None:
         return int(service.ask("session.show", id=session)["poses"])
 
     before = recorded()
-    service.wait(f"{poses} poses", lambda: recorded() - before >= poses, SESSION_S)
+    service.wait(f"{poses} poses", lambda: recorded() - before >= poses, SESSION_S, POLL_S)
     _shoot(service)
     closed = service.ask("session.stop")
     expect(closed["not_used"] is None, closed)
@@ -59,7 +59,6 @@ def _shoot(service: Service) -> None:
 
 
 def _have_ended(service: Service) -> bool:
-    time.sleep(2.0)
     jobs = service.ask("jobs.list")
     kinds = {job["kind"] for job in jobs if job["state"] not in ("queued", "running")}
     return {"gap", "residual", "report", "comparison"} <= kinds or any(job["state"] == "failed" for job in jobs)
