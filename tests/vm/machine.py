@@ -23,6 +23,7 @@ from tests.vm.image import Image
 
 ADAPTER = "RIG-4711"  # serial number of the station's adapter
 BOOT_S = 900.0
+SLOWEST = 30  # how much longer a busy computer may take than the machine thinks
 # The machine's clocks count its instructions, 1 ns each, and go on by themselves only where it idles: how long a thing
 # takes there does not depend on what else this computer does. One processor: several would have to take turns.
 CLOCK = ("-smp", "1", "-icount", "shift=0,sleep=on")
@@ -141,7 +142,7 @@ class Machine:
             self._number += 1
             number = self._number
             self._agent.sendall(json.dumps(message | {"id": number}).encode() + b"\n")
-        return self._answer(number, 4 * timeout_s + 60.0, str(message)[:200])
+        return self._answer(number, SLOWEST * timeout_s, str(message)[:200])
 
     def _answer(self, number: int, timeout_s: float, what: str) -> dict[str, Any]:
         deadline = time.monotonic() + timeout_s

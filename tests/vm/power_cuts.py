@@ -54,7 +54,7 @@ with socket.socket(socket.AF_UNIX) as connection:
         seen = sum(link["captures"] for link in links)
         page[:12] = b"%012d" % seen
         os.pwritev(disk, [page], int(sys.argv[4]))
-        time.sleep(0.05)
+        time.sleep(0.2)
 print(seen)
 """
 
