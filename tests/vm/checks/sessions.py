@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 from tests.vm.image import OPERATOR
 from tests.vm.service import Service, expect
 
@@ -42,6 +40,8 @@ def _hold(service: Service, kind: str, poses: int) -> None:
     _shoot(service)
 
     def recorded() -> int:
+        if service.ask("status")["session"]["prism_suspicions"]:  # it was far away when the station was back
+            service.ask("session.confirm-prism", operator=OPERATOR)
         return int(service.ask("session.show", id=session)["poses"])
 
     before = recorded()
@@ -53,7 +53,7 @@ def _hold(service: Service, kind: str, poses: int) -> None:
 
 def _shoot(service: Service) -> None:
     service.aim("cp1")
-    time.sleep(0.5)
+    service.machine.run("sleep 1.5")  # until the last fix of the prism has come
     service.ask("session.shoot", point="cp1")
     service.aim("tip")
 
