@@ -59,6 +59,10 @@ SERVICE = ("runuser", "-u", "rigcal", "--")
 PYTHON = "/usr/lib/rigcal/bin/python"
 
 
+class NoDebianError(Exception):
+    """Debian's packages cannot be fetched; the message says why."""
+
+
 @dataclass(frozen=True)
 class Image:
     """Files of a machine.
@@ -81,8 +85,14 @@ def image(say: Callable[[str], None], cpu_of: Callable[[Image], dict[str, str]])
     Args:
         say: told what is done.
         cpu_of: boots an image, and returns the name and the features that numba sees of its processor.
+
+    Raises:
+        NoDebianError: there is no Debian to begin with.
     """
-    base = _base(say)
+    try:
+        base = _base(say)
+    except SystemExit as error:  # a command said why
+        raise NoDebianError(str(error)[-300:]) from error
     place = CACHE / f"image-{_digest(base.name, _packaged(), _text(Path(__file__)), _text(HERE / 'guest_agent.py'))}"
     made = Image(place / "root.img", base / "vmlinuz", base / "initrd.img", place / "next.deb")
     if place.exists():
@@ -139,7 +149,10 @@ def _packaged() -> str:
 
 def _base(say: Callable[[str], None]) -> Path:
     """Return the directory of kernel, initrd and a Debian without the package."""
-    kernel = run("apt-cache", "policy", "linux-image-amd64").partition("Candidate:")[2].split()[0]
+    depends = run("apt-cache", "depends", "linux-image-amd64")
+    kernel = next((line.split()[1] for line in depends.splitlines() if "Depends: linux-image-" in line), "")
+    if not kernel:
+        raise SystemExit("apt knows no linux-image-amd64: is this a Debian?")
     place = CACHE / f"base-{_digest(PACKAGES, MODULES, INITRD_MODULES, INIT, kernel)}"
     if place.exists():
         return place
@@ -149,21 +162,21 @@ def _base(say: Callable[[str], None]) -> Path:
     say(f"fetching Debian {RELEASE} and its kernel")
     scratch = Path(tempfile.mkdtemp(dir=CACHE, prefix="base-new-"))
     scratch.chmod(0o755)
-    _kernel(scratch)
+    _kernel(scratch, kernel)
     run("mmdebstrap", "--quiet", "--variant=apt", f"--include={PACKAGES}", SUITE, scratch / "root.tar")
     scratch.rename(place)
     return place
 
 
-def _kernel(place: Path) -> None:
+def _kernel(place: Path, name: str) -> None:
     """Unpack Debian's kernel: installing it would bring an initrd of its own and 400 MB of modules."""
     fetched = place / "fetched"
     fetched.mkdir(mode=0o777)
     fetched.chmod(0o777)  # apt fetches as a user of its own
-    depends = run("apt-cache", "depends", "linux-image-amd64")
-    name = next(line.split()[1] for line in depends.splitlines() if "Depends: linux-image-" in line)
-    subprocess.run(["apt-get", "download", "-q", name], cwd=fetched, check=True, stdout=subprocess.DEVNULL)
-    (package,) = fetched.glob("*.deb")
+    subprocess.run(["apt-get", "download", "-q", name], cwd=fetched, check=False, stdout=subprocess.DEVNULL)
+    package = next(fetched.glob("*.deb"), None)
+    if package is None:
+        raise SystemExit(f"{name} cannot be fetched")
     unpacked = place / "unpacked"
     run("dpkg-deb", "-x", package, unpacked)
     (modules,) = (unpacked / "lib/modules").iterdir()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import random
 import shlex
@@ -72,6 +73,14 @@ class Service:
         self.start_rig(sent)
         self.wait_until_well()
         self._wiring = wiring
+
+    def mend(self) -> None:
+        """Put back what a check that failed may have left as it was, so that the next one has a chance."""
+        self._wiring = ""
+        self.machine.tried("ip link add dev vcan0 type vcan; ip link set vcan0 up")
+        self.machine.tried("ip link set can0 up; ip link set can1 up; systemctl reset-failed")
+        with contextlib.suppress(MachineError):  # it is plugged in
+            self.machine.plug_adapter()
 
     def start_rig(self, channel: str) -> None:
         """Let the simulated rig drive its plan again and again; its station follows the prism."""
