@@ -14,7 +14,7 @@ export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 # The tests start a hundred processes: each would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help environment setup demo deb debtest wheel check test long webtest lint style types imports quick blind bench soak fuzz lock check-deps clean
+.PHONY: help environment setup demo deb debtest vmtest wheel check test long webtest lint style types imports quick blind bench soak fuzz lock check-deps clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -41,6 +41,9 @@ deb: environment ## Debian packages of the last commit, for Debian 12 and 13, in
 
 debtest: environment ## the packages in fresh Debian 12 and 13 roots without a network; root, ten minutes
 	@$(BIN)/python -m tests.deploy.packages
+
+vmtest: environment ## the package on an emulated Debian, if what it tests has changed since it passed; root (VM="--only session")
+	$(BIN)/python -m tests.vm $(VM)
 
 # The deployment tests ask systemd's own tools about the files in deploy/. What reads devices and what keeps their data
 # must be reached by its own tests almost line by line.

@@ -91,18 +91,25 @@ def fresh_root(release: int) -> Iterator[Root]:
         place = Path(directory) / "root"
         place.mkdir()
         run("tar", "-x", "--numeric-owner", "--exclude=./dev/*", "-f", archive, "-C", place)
-        for system in ("proc", "dev"):
-            run("mount", "--rbind", f"/{system}", place / system)
-        try:
+        with system_directories(place):
             yield Root(place)
-        finally:
-            for system in ("dev", "proc"):
-                subprocess.run(["umount", "--recursive", "--lazy", str(place / system)], check=True)
+
+
+@contextlib.contextmanager
+def system_directories(place: Path) -> Iterator[None]:
+    """What a Debian in a directory needs of the kernel, as long as programs run in it."""
+    for system in ("proc", "dev"):
+        run("mount", "--rbind", f"/{system}", place / system)
+    try:
+        yield
+    finally:
+        for system in ("dev", "proc"):
+            subprocess.run(["umount", "--recursive", "--lazy", str(place / system)], check=True)
 
 
 def package_of(release: int, out: Path) -> Path:
     """Build the package twice, which must be the same bytes."""
-    built = []
+    built: list[Path] = []
     for name in ("first", "second"):
         run(sys.executable, BUILD, "deb", "--release", str(release), "--out", out / name)
         built += (out / name).glob("*.deb")

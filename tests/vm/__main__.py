@@ -1,0 +1,138 @@
+"""The package on a real Debian 12 in QEMU, without KVM: `make vmtest`, `python -m tests.vm --only NAME`.
+
+Boots the image once for all checks, and once more for power cuts. Prints a line for each with its figure, and ends with
+status 1 where one failed. Where the sources are those of tests/vm.passed there is nothing to show.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+from tests.passed import Passed
+from tests.vm.checks import CHECKS, LONG, Check
+from tests.vm.image import CACHE, PYTHON, Image, NoDebianError, image, missing, packaged_changes
+from tests.vm.machine import Machine, MachineError
+from tests.vm.power_cuts import power_cuts
+from tests.vm.service import Service
+
+PASSED = Passed("vm.passed", ("deploy", "drivers", "daemon", "requirements.lock", "tests/vm", "tests/passed.py"))
+HOST_PACKAGES = ("qemu-system-x86", "qemu-utils", "mmdebstrap", "e2fsprogs", "kmod", "cpio", "busybox-static")
+CUTS = 60
+POWER_CUTS = "power_cuts_lose_no_committed_row"
+PROCESSOR = """import llvmlite.binding as llvm
+print(llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten())"""
+
+
+class Table:
+    """Lines with a name, what came of it, how long it took here, and a figure.
+
+    Attributes:
+        failed: names of those that failed.
+    """
+
+    def __init__(self) -> None:
+        self.failed: list[str] = []
+
+    def show(self, name: str, work: Callable[[], str]) -> bool:
+        """Do something that is a line; returns whether it succeeded."""
+        began = time.monotonic()
+        try:
+            verdict, figure = "ok", work()
+        except (MachineError, LookupError, TypeError, ValueError, OSError, subprocess.SubprocessError) as error:
+            verdict, figure = "FAILED", f"{type(error).__name__}: {error}"
+            self.failed.append(name)
+        print(f"{name.replace('_', ' '):<55} {verdict:<6} {time.monotonic() - began:5.0f} s  {figure}", flush=True)
+        return verdict == "ok"
+
+
+def say(what: str) -> None:
+    """Tell what is done."""
+    print(f"  {what}", flush=True)
+
+
+def processor_of(made: Image) -> dict[str, str]:
+    """Return the processor's name and features, as numba sees them in the machine."""
+    with tempfile.TemporaryDirectory(dir=CACHE) as scratch, Machine(made, Path(scratch)) as machine:
+        name, _, features = machine.run(f"{PYTHON} -I -c '{PROCESSOR}'", 600.0).strip().partition(" ")
+    return {"name": name, "features": features}
+
+
+def show_all(made: Image, checks: Sequence[Check], cuts: int, table: Table) -> None:
+    """Boot, and show everything."""
+    with tempfile.TemporaryDirectory(dir=CACHE, prefix="run-") as scratch:
+        if checks:
+            with Machine(made, Path(scratch) / "checks") as machine:
+                say(f"booted in {machine.booted_s:.0f} s")
+                service = Service(machine)
+                service.install()
+                for check in checks:
+                    if not table.show(check.__name__, partial(check, service)):
+                        service.mend()
+                if table.failed:
+                    print(machine.tried("journalctl -b -u rigcal -n 60 --no-pager -o short-monotonic").output)
+        if cuts:
+            table.show(POWER_CUTS, lambda: _cuts(made, Path(scratch) / "power", cuts))
+
+
+def _cuts(made: Image, scratch: Path, cuts: int) -> str:
+    ours, control = power_cuts(made, scratch, cuts, say)
+    figure = f"{ours.bad} of {ours.tried} bad, {ours.promised} rows; control: {control.bad} of {control.tried} bad"
+    if ours.bad or ours.tried < cuts:
+        raise MachineError(f"{figure}; {ours.first_fault}")
+    if not control.bad:
+        raise MachineError(f"{figure}: without synchronous writes none was lost, so the test sees nothing")
+    return f"{figure}, at most {control.most_lost} rows lost"
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m tests.vm", description=__doc__)
+    parser.add_argument("--only", action="append", metavar="NAME", default=[], help="checks whose name has this in it")
+    parser.add_argument("--short", action="store_true", help="without what takes long: a calibration, an upgrade")
+    parser.add_argument("--cuts", type=int, metavar="N", help=f"power cuts ({CUTS})")
+    return parser.parse_args()
+
+
+def main() -> int:
+    """Command line."""
+    options = _options()
+    is_all = not options.only and not options.short
+    if not options.only and options.cuts is None and PASSED.holds():
+        print("The tests in a virtual machine passed in this state of the sources (tests/vm.passed).")
+        return 0
+    if missing() and os.geteuid() == 0:
+        subprocess.run(["apt-get", "update", "-qq"], check=False)
+        subprocess.run(["apt-get", "install", "-y", "-qq", *HOST_PACKAGES], check=False, stdout=subprocess.DEVNULL)
+    if lacking := missing():
+        print(f"skipped: the tests in a virtual machine need {', '.join(lacking)}")
+        return 0
+    if changed := packaged_changes():
+        print(f"The package is made of the last commit; commit first:\n{changed}", file=sys.stderr)
+        return 2
+    began = time.monotonic()
+    wanted = [name.replace(" ", "_") for name in options.only] or [""]
+    checks = [check for check in CHECKS if any(word in check.__name__ for word in wanted)]
+    checks = [check for check in checks if not (options.short and check in LONG)]
+    cuts = (options.cuts or CUTS) if any(word in POWER_CUTS for word in wanted) else 0
+    table = Table()
+    try:
+        made = image(say, processor_of)
+    except NoDebianError as error:
+        print(f"skipped: the tests in a virtual machine need a Debian: {error}")
+        return 0
+    show_all(made, checks, cuts, table)
+    print(f"{len(table.failed)} failed, in {(time.monotonic() - began) / 60:.0f} min", flush=True)
+    if is_all and not table.failed:
+        PASSED.note()
+    return 1 if table.failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
