@@ -136,10 +136,8 @@ def main() -> int:
         print(f"skipped: the tests in a virtual machine need a Debian: {error}")
         return 0
     show_all(made, checks, cuts, table)
-    print(
-        f"{len(table.failed)} failed, {table.left_out} left out for want of time, in {(time.monotonic() - began) / 60:.0f} min",
-        flush=True,
-    )
+    took_min = (time.monotonic() - began) / 60
+    print(f"{len(table.failed)} failed, {table.left_out} left out for want of time, in {took_min:.0f} min", flush=True)
     if not options.only and not table.failed and not table.left_out:
         PASSED.note()
     return 1 if table.failed else 0
