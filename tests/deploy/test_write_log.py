@@ -1,4 +1,4 @@
-"""The disk that a power cut leaves is made of QEMU's log of writes: nothing flushed is missing, nothing later is there."""
+"""The disk that a power cut leaves, of QEMU's log of writes: nothing flushed is missing, nothing later is there."""
 
 import io
 import random

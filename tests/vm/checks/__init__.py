@@ -31,5 +31,3 @@ CHECKS: tuple[Check, ...] = (
     upgrade.an_upgrade_keeps_the_data,
     links.the_listening_card_has_sent_nothing,
 )
-
-LONG = frozenset({sessions.a_session_ends_in_an_accepted_model, upgrade.an_upgrade_keeps_the_data})
