@@ -345,7 +345,9 @@ class GuideKeeper:
             work()
         except CommandError as error:
             if not self._cancelled.is_set():
-                self._happen("failed", {"text": str(error)})
+                job = self._record.job
+                if job is not None and job.trouble != str(error):  # it is tried again and again
+                    self._happen("failed", {"text": str(error)})
                 self._try_again = time.monotonic() + RETRY_S
         finally:
             if step_id:

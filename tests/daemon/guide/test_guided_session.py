@@ -201,7 +201,7 @@ def test_the_terminal_leads_and_scripts_may_answer(daemon: DaemonProcess) -> Non
 
 
 def read_until(descriptor: int, text: str) -> str:
-    said, deadline = "", time.monotonic() + 60.0
+    said, deadline = "", time.monotonic() + 200.0
     while text not in said:
         assert time.monotonic() < deadline, said
         try:
