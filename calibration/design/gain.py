@@ -20,7 +20,7 @@ from calibration.design.candidates import Candidates, draw, near, work_volume
 from calibration.design.exchange import covariance_of
 from calibration.design.knowledge import Knowledge
 from calibration.design.poses import plan, whitened
-from calibration.design.visibility import Bodies, Site, in_view, site
+from calibration.design.visibility import Bodies, Site, in_view, placement, site
 from calibration.identification.refinement import refine
 from calibration.identification.solve import place
 from calibration.kinematics.chain import Chain, Placement
@@ -82,6 +82,9 @@ class Measured:
 def from_rows(rig: Rig, observations: Observations | None, setup: str, *, lacking: float = 0.0) -> Measured:
     """Say what rows tell of a rig and of a station's place.
 
+    Before the set-up has enough poses, the rows of others tell of the machine, and the station is assumed where it sees
+    most.
+
     Args:
         rig: the rig description.
         observations: rows measured so far, at any set-ups; None where there are none.
@@ -89,32 +92,37 @@ def from_rows(rig: Rig, observations: Observations | None, setup: str, *, lackin
         lacking: as in `Measured`.
 
     Raises:
-        UnsafeError: rows at the set-up that cannot place its base (all on a line), or those of another machine.
+        UnsafeError: rows that cannot place a base (all on a line).
     """
-    poses = 0 if observations is None else len(_standstills(observations.select(observations.setup == setup)))
-    if observations is None or poses < LEAST_POSES:
-        return _nominal(rig, lacking)
-    # A set-up with too few rows to place its base tells nothing.
-    placed = [s for s in np.unique(observations.setup) if (observations.setup == s).sum() >= LEAST_POSES]
+    placed = [] if observations is None else _placed(observations)
+    if observations is None or not placed:
+        blank = Chain(rig, {"": Placement.identity()})
+        at = site(blank, np.zeros(len(blank)))
+        return Measured(Knowledge.of_rig(Chain(rig, {setup: placement(at)})), at, is_placed=False, lacking=lacking)
     rows = observations.select(np.isin(observations.setup, placed))
     with threadpool_limits(1, user_api="blas"):
         chain, samples, start = place(rig, rows)
         nominal = refine(chain, samples, start.x, free=np.isinf(chain.prior_sigma))
         fit = refine(chain, samples, nominal.x)
     excess = fit.excess_variance + samples.repeat_variance
-    knowledge = Knowledge(chain, fit.x, chain.setups.index(setup), root_of(fit.covariance), excess)
-    at = site(chain, fit.x, setup=knowledge.setup)
-    return Measured(knowledge, at, True, lacking, len(rows) / max(1, len(_standstills(rows))))
-
-
-def _nominal(rig: Rig, lacking: float) -> Measured:
-    """What the rig file alone tells, with the station assumed where it sees most."""
+    fixes = len(rows) / max(1, len(_standstills(rows)))
+    if setup in placed:
+        known = Knowledge(chain, fit.x, chain.setups.index(setup), root_of(fit.covariance), excess)
+        at = site(chain, fit.x, setup=known.setup)
+        return Measured(known, at, is_placed=True, lacking=lacking, fixes=fixes)
     blank = Chain(rig, {"": Placement.identity()})
-    at = site(blank, np.zeros(len(blank)))
-    from calibration.design.visibility import placement
+    x = np.zeros(len(blank))
+    x[: blank.base_start] = fit.x[: blank.base_start]
+    at = site(blank, x)
+    elsewhere = Knowledge(chain, fit.x, 0, root_of(fit.covariance), excess)
+    here = elsewhere.at_new_setup(Chain(rig, {setup: placement(at)}))
+    return Measured(here, at, is_placed=False, lacking=lacking, fixes=fixes)
 
-    chain = Chain(rig, {"": placement(at)})
-    return Measured(Knowledge.of_rig(chain), at, False, lacking)
+
+def _placed(observations: Observations) -> list[str]:
+    """Set-ups with enough poses to tell where their station stands."""
+    setups = np.unique(observations.setup).tolist()
+    return [s for s in setups if len(_standstills(observations.select(observations.setup == s))) >= LEAST_POSES]
 
 
 def _standstills(observations: Observations) -> set[tuple[str, str, str]]:

@@ -23,23 +23,24 @@ from daemon.commands import (
     CommandError,
     Handler,
     acting_for,
-    caller_columns,
     current_caller,
     mapping_argument,
     text_argument,
 )
-from daemon.guide.job import Forecast, Job, Request, stop_reason
-from daemon.guide.meter_link import Answer, MeterLink, Place
+from daemon.guide.advisor import Advisor, accuracy_view
+from daemon.guide.job import Job, Pose
+from daemon.guide.meter_link import Place
 from daemon.guide.position import PositionWatch, is_there
+from daemon.guide.record import GuideRecord, is_on_prism
 from daemon.guide.request import request_of, whole_argument
 from daemon.guide.view import Around, headline, state_of
 from daemon.sessions.manager import SessionKeeper
 from daemon.sessions.station_setups import SetupBook
-from daemon.store.guides import GuideRow, GuideTable, Standstill
+from daemon.store.guides import Standstill
 from daemon.store.sessions import SessionTable
 from daemon.store.setups import control_points
 from daemon.store.store import Store
-from drivers.clock import Clock, Stamp
+from drivers.clock import Clock
 from drivers.readings import Record
 
 log = logging.getLogger(__name__)
@@ -82,21 +83,14 @@ class GuideKeeper:
         has_aim: bool,
     ) -> None:
         self._rig, self._store, self._sessions, self._setups, self._clock = rig, store, sessions, setups, clock
-        self._meter_place, self._model, self._settle_s, self._has_aim = meter_place, model, settle_s, has_aim
-        self._table, self._session_table = GuideTable(store, rig.name), SessionTable(store, rig.name)
+        self._model, self._settle_s, self._has_aim = model, settle_s, has_aim
+        self._record, self._session_table = GuideRecord(store, rig.name, clock), SessionTable(store, rig.name)
         self._watch = PositionWatch(rig, joiner, clock)
-        self._turn = threading.RLock()
-        self._row: GuideRow | None = None
-        self._job: Job | None = None
-        self._taps = 0
         self._wanted = ""  # step whose button was pressed, to be carried out by the thread
         self._busy = ""  # step that is carried out
         self._cancelled = threading.Event()
         self._standstill: Standstill | None = None
-        self._accuracy: dict[str, Any] | None = None
-        self._coverage: dict[str, Any] | None = None
-        self._meter: MeterLink | None = None
-        self._meter_trouble = ""
+        self._advisor = Advisor(meter_place, self._training, clock, self._take_enough)
         self._is_choosing = False
         self._try_again = 0.0  # real monotonic seconds
         self._stopping = threading.Event()
@@ -113,28 +107,24 @@ class GuideKeeper:
         self._cancelled.set()
         if self._thread.is_alive():
             self._thread.join(timeout=_CANCEL_S)
-        self._close_meter()
-
-    @property
-    def is_open(self) -> bool:
-        """Return True while a guide is open."""
-        job = self._job
-        return job is not None and job.state == "open"
+        self._advisor.close()
 
     def on_records(self, records: Sequence[Record]) -> None:
         """Note where boom and station are; costs nothing while no guide is open."""
-        if self.is_open:
+        if self._record.is_open:
             self._watch.on_records(records)
 
     def guarding(self, name: str, handler: Handler) -> Handler:
         """Return a command that is refused while a guide is open, which holds its sessions itself."""
 
         def guarded(arguments: Mapping[str, Any]) -> Any:
-            with self._turn:
-                if self._row is not None and self._job is not None and self.is_open:
+            with self._record.turn:
+                opened = self._record.opened()
+                if opened is not None:
+                    row, job = opened
                     raise CommandError(
-                        f"{name} is not carried out: guide {self._row.id} is open and opens, shoots in and closes its "
-                        f"sessions itself; next: {headline(self._job)} (`rigcal session guide` leads, and "
+                        f"{name} is not carried out: guide {row.id} is open and opens, shoots in and closes its "
+                        f"sessions itself; next: {headline(job)} (`rigcal session guide` leads, and "
                         "`rigcal session guide --stop REASON` abandons it)",
                         REFUSED,
                     )
@@ -146,10 +136,11 @@ class GuideKeeper:
 
     def start_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Open a guide."""
-        with self._turn:
-            if self._row is not None and self._job is not None and self.is_open:
+        with self._record.turn:
+            guide = self._record.opened()
+            if guide is not None:
                 raise CommandError(
-                    f"guide {self._row.id} is open: {headline(self._job)}; `rigcal session guide` goes on with it, and "
+                    f"guide {guide[0].id} is open: {headline(guide[1])}; `rigcal session guide` goes on with it, and "
                     "`rigcal session guide --stop REASON` abandons it",
                     REFUSED,
                 )
@@ -166,11 +157,11 @@ class GuideKeeper:
             else:
                 setup_id = self._setups.usable(arguments.get("setup"))
                 request = request_of(arguments, self._rig, self._setups.control_point_names(setup_id))
-            self._table.open(self._clock.now(), setup_id, operator, request.as_dict(), **caller_columns())
-            self._row, self._job = self._table.newest(), Job.of(request)
-            self._taps, self._accuracy, self._coverage, self._standstill = 1, None, None, None
-            self._wanted, self._try_again, self._is_choosing = "", 0.0, False
-            self._start_meter()
+            self._record.open(request, setup_id, operator)
+            self._standstill, self._wanted, self._try_again = None, "", 0.0
+            self._watch.forget_fixes()
+            self._advisor.forget()
+            self._start_advisor()
             return self._state()
 
     def state_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -179,8 +170,8 @@ class GuideKeeper:
 
     def done_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Take the operator's word that the step is carried out."""
-        with self._turn:
-            job, step_id = self._needs_step(arguments)
+        with self._record.turn:
+            job, step_id = self._record.needs_step(arguments)
             step, run = job.step, job.run
             assert step is not None
             if self._busy == step_id or not run.session:
@@ -195,7 +186,7 @@ class GuideKeeper:
                 self._measured_here()
             else:
                 raise CommandError(f"this step ends by itself: {headline(job)}", REFUSED)
-            self._tapped()
+            self._record.tapped()
             return self._state()
 
     def skip_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -203,15 +194,15 @@ class GuideKeeper:
         reason, rest = _reason(arguments), arguments.get("rest", False)
         if not isinstance(rest, bool):
             raise CommandError(f"rest must be true or false, not {rest!r:.80}")
-        self._needs_step(arguments)
+        self._record.needs_step(arguments)
         self._give_up_work()
-        with self._turn:
-            job, _ = self._needs_step(arguments)
+        with self._record.turn:
+            job, _ = self._record.needs_step(arguments)
             step = job.step
             assert step is not None
             if step.kind == "close" or (rest and step.kind != "poses"):
                 raise CommandError(f"this step cannot be skipped: {headline(job)}", REFUSED)
-            self._tapped()
+            self._record.tapped()
             if step.kind == "change_prism" and self._sessions.open_session() is not None:
                 self._sessions.abort_command({})
             self._happen("skipped", {"reason": reason, "rest": rest})
@@ -220,12 +211,12 @@ class GuideKeeper:
     def more_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Measure more poses of this prism although it is enough."""
         count = whole_argument(arguments, "poses", MORE_POSES, 1, 100)
-        with self._turn:
-            job, _ = self._needs_step(arguments)
+        with self._record.turn:
+            job, _ = self._record.needs_step(arguments)
             step, run = job.step, job.run
             if step is None or step.kind != "poses" or not job.is_enough:
                 raise CommandError(f"more poses are for when there are enough; now: {headline(job)}", REFUSED)
-            self._tapped()
+            self._record.tapped()
             left = len(run.upcoming(count))
             if left < count:
                 self._choose(count - left, as_more=True)
@@ -236,11 +227,11 @@ class GuideKeeper:
     def stop_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Abandon the guide; its open session is closed if it has poses, else aborted."""
         reason = _reason(arguments)
-        self._needs_step({})
+        self._record.needs_step({})
         self._give_up_work()
-        with self._turn:
-            self._needs_step({})
-            self._tapped()
+        with self._record.turn:
+            self._record.needs_step({})
+            self._record.tapped()
             opened = self._sessions.open_session()
             if opened is not None and opened["poses"]:
                 self._sessions.stop_command({})
@@ -248,22 +239,6 @@ class GuideKeeper:
                 self._sessions.abort_command({})
             self._happen("stopped", {"reason": reason})
             return self._state()
-
-    def _needs_step(self, arguments: Mapping[str, Any]) -> tuple[Job, str]:
-        """Return the job and its step; CommandError without an open guide, or where another step is meant."""
-        job = self._job
-        if job is None or job.state != "open":
-            raise CommandError("no guide is open; `rigcal session guide --prisms w,b,r,s` starts one")
-        meant = arguments.get("step")
-        if meant is not None and meant != job.step_id:
-            raise CommandError(f"another step is on by now: {headline(job)}", REFUSED)
-        return job, job.step_id
-
-    def _tapped(self) -> None:
-        """Count a command that was given to the guide."""
-        self._taps += 1
-        if self._row is not None:
-            self._table.count_taps(self._row.id, self._taps)
 
     def _measured_here(self) -> None:
         """Take the standstill at which the boom is for the pose, wherever that is."""
@@ -285,28 +260,18 @@ class GuideKeeper:
 
     def _happen(self, kind: str, details: Mapping[str, Any], *, only_at: str = "") -> bool:
         """Store an event and go on; False where another step than `only_at` is on by now."""
-        with self._turn:
-            row, before = self._row, self._job
-            if row is None or before is None or before.state != "open" or only_at not in ("", before.step_id):
-                return False
-            job, at = before.after(kind, details), self._clock.now()
-            with self._store.transaction():
-                self._table.add(row.id, kind, details, at, **caller_columns())
-                if job.state != "open":
-                    self._table.end(row.id, job.state, at)
-            self._job = job
-            self._followed(before, job)
-            return True
+        with self._record.turn:
+            changed = self._record.happen(kind, details, only_at)
+            if changed is not None:
+                self._followed(*changed)
+            return changed is not None
 
     def _followed(self, before: Job, job: Job) -> None:
         """Do what follows from an event by itself."""
         if job.state != "open":
-            log.info("guide %d is %s", self._row.id if self._row else 0, job.state)
-            self._row = self._table.newest()
-            self._close_meter()
+            self._advisor.close()
             return
-        on_prism = job.step is not None and job.step.kind == "poses"
-        was_on_prism = before.step is not None and before.step.kind == "poses"
+        on_prism, was_on_prism = is_on_prism(job), is_on_prism(before)
         if was_on_prism and not on_prism:
             self._sessions.look_away()
         if job.at != before.at:
@@ -315,9 +280,9 @@ class GuideKeeper:
             self._assess()
 
     def _aimed(self) -> None:
-        with self._turn:
+        with self._record.turn:
             self._watch.forget_fixes()
-            self._sessions.look_back(self._row.operator if self._row else "")
+            self._sessions.look_back(self._record.row.operator if self._record.row else "")
             self._happen("aimed", {})
 
     # ---- the thread --------------------------------------------------------------------------------------------------
@@ -326,7 +291,7 @@ class GuideKeeper:
         told = ""
         while not self._stopping.wait(TICK_S):
             try:
-                if self.is_open and time.monotonic() >= self._try_again:
+                if self._record.is_open and time.monotonic() >= self._try_again:
                     self._look()
                 told = ""
             except Exception as error:
@@ -336,12 +301,12 @@ class GuideKeeper:
                 told = str(error)
 
     def _look(self) -> None:
-        with self._turn:
-            job = self._job
+        with self._record.turn:
+            job = self._record.job
             if job is None or job.step is None:
                 return
-            if self._meter is None or not self._meter.is_alive:
-                self._start_meter()
+            if not self._advisor.is_alive:
+                self._start_advisor()
             run, step, step_id = job.run, job.step, job.step_id
             if run.session and run.poses is None and not self._is_choosing:
                 self._choose(run.most)
@@ -366,7 +331,7 @@ class GuideKeeper:
     def _look_at_pose(self, job: Job) -> None:
         """See whether the pose is reached and measured."""
         run, number = job.run, job.run.next_pose
-        found = self._table.standstill(run.session, run.last)
+        found = self._record.table.standstill(run.session, run.last)
         self._standstill = found = None if found is None or found.pose == run.label else found
         if number is None or run.poses is None or found is None or found.fixes < NEEDED_FIXES:
             return
@@ -388,10 +353,10 @@ class GuideKeeper:
             self._busy = ""
 
     def _open_session(self) -> None:
-        job, row = self._job, self._row
+        job, row = self._record.job, self._record.row
         if job is None or row is None:
             return
-        last, opened = self._table.newest_observation(), self._sessions.open_session()
+        last, opened = self._record.table.newest_observation(), self._sessions.open_session()
         if opened is None or opened["prism"] != job.run.prism:  # else it was opened just before the daemon ended
             arguments = {
                 "prism": job.run.prism,
@@ -404,7 +369,7 @@ class GuideKeeper:
         self._happen("opened", {"session": opened["id"], "last": last})
 
     def _close_session(self) -> None:
-        job = self._job
+        job = self._record.job
         if job is None:
             return
         opened = self._sessions.open_session()
@@ -428,9 +393,9 @@ class GuideKeeper:
 
     def _point_mm(self, name: str) -> tuple[float, float, float] | None:
         """Where a control point of the set-up is; None where that is not known."""
-        if self._row is None:
+        if self._record.row is None:
             return None
-        known = control_points(self._store, self._row.setup_id)
+        known = control_points(self._store, self._record.row.setup_id)
         return next(((p["x_mm"], p["y_mm"], p["z_mm"]) for p in known if p["name"] == name), None)
 
     def _next_point(self, job: Job) -> str:
@@ -439,119 +404,63 @@ class GuideKeeper:
             return ""
         return "" if job.run.following is None else job.run.following.point
 
-    # ---- the gain meter ----------------------------------------------------------------------------------------------
+    # ---- what is still to gain ---------------------------------------------------------------------------------------
 
-    def _start_meter(self) -> None:
-        self._close_meter()
-        try:
-            self._meter = MeterLink(self._meter_place())
-        except OSError as error:
-            self._meter_trouble = f"the gain meter cannot be started: {error}"
-            self._try_again = time.monotonic() + RETRY_S
-            return
+    def _start_advisor(self) -> None:
+        self._advisor.start()
         self._is_choosing = False
+        if not self._advisor.is_alive:
+            self._try_again = time.monotonic() + RETRY_S
         self._assess()
 
-    def _close_meter(self) -> None:
-        meter, self._meter = self._meter, None
-        if meter is not None:
-            meter.close()
-
-    def _training(self, job: Job) -> list[str]:
-        """Sessions that the next model will be trained on, with the open one."""
-        used = [session["id"] for session in self._session_table.used() if session["kind"] != CHECK]
-        own = job.run.session
-        return used if job.run.kind == CHECK or not own or own in used else [*used, own]
-
-    def _question(self, job: Job) -> dict[str, Any]:
-        run = job.run
-        return {
-            "sessions": self._training(job),
-            "setup": self._row.setup_id if self._row else "",
-            "session": run.session,
-            "prism": run.prism,
-        }
+    def _training(self) -> list[str]:
+        """Sessions that the next model will be trained on, without the open one."""
+        return [session["id"] for session in self._session_table.used() if session["kind"] != CHECK]
 
     def _assess(self) -> None:
-        """Ask what to expect; of a check nothing is learned, so nothing changes."""
-        job = self._job
-        if job is None or self._meter is None or job.state != "open" or not job.run.session:
-            return
-        if job.run.kind == CHECK and self._accuracy is not None:
-            return
-        prisms = list(dict.fromkeys([run.prism for run in job.runs[: job.at + 1] if run.session]))
-        question = self._question(job) | {"do": "assess", "prisms": prisms, "next": job.run.upcoming(5)}
-        self._meter.ask(question, partial(self._take_assessment, job, prisms))
+        if self._record.job is not None and self._record.row is not None:
+            self._advisor.assess(self._record.job, self._record.row.setup_id)
 
-    def _take_assessment(self, job: Job, prisms: list[str], answer: Answer) -> None:
-        with self._turn:
-            now = self._job
-            if now is None or self._row is None:
+    def _take_enough(self, session: str, reason: str) -> None:
+        """The stop rule says stop: it counts while poses of that session are measured."""
+        with self._record.turn:
+            job = self._record.job
+            if job is None or job.run.session != session or job.step is None:
                 return
-            if "error" in answer:
-                self._meter_trouble = str(answer["error"])
-                return
-            self._meter_trouble = ""
-            found = dict(answer["result"])
-            self._coverage = found.pop("coverage")
-            self._accuracy = found | {
-                "target_mm": job.request.target_mm,
-                "prisms": prisms,
-                "for_poses": job.run.done,
-                "session": job.run.session,
-                "computed_at_utc_ns": self._clock.now().utc_ns,
-            }
-            is_same = now.state == "open" and now.run.session == job.run.session and now.run.kind != CHECK
-            if (
-                not is_same
-                or found["prism_mm"] is None
-                or now.is_enough
-                or now.step is None
-                or now.step.kind != "poses"
-            ):
-                return
-            forecast = Forecast(found["now_mm"], found["prism_mm"], found["prism_after_5_mm"])
-            reason = stop_reason(forecast, job.request.target_mm, job.run.done, now.run.least)
-            if reason:
+            if job.step.kind == "poses" and not job.is_enough and job.run.done >= job.run.least:
                 self._happen("enough", {"reason": reason})
 
     def _choose(self, count: int, *, as_more: bool = False) -> None:
         """Ask for poses of the run."""
-        job = self._job
-        if job is None or self._meter is None:
+        job, row = self._record.job, self._record.row
+        if job is None or row is None:
             return
-        self._is_choosing = True
-        question = self._question(job) | {
-            "do": "choose",
-            "count": count,
-            "seed": 1000 * (self._row.id if self._row else 0) + 100 * job.at + len(job.run.poses or ()),
-            "evenly": job.run.kind == CHECK,
-        }
+        seed = 1000 * row.id + 100 * job.at + len(job.run.poses or ())
         caller = current_caller() if as_more else None
-        self._meter.ask(question, partial(self._take_poses, job.run.session, caller, as_more=as_more))
+        take = partial(self._take_poses, caller, as_more=as_more)
+        self._is_choosing = self._advisor.choose(job, row.setup_id, count, seed, take)
 
-    def _take_poses(self, session: str, caller: Caller | None, answer: Answer, *, as_more: bool) -> None:
-        with self._turn, acting_for(caller):
+    def _take_poses(
+        self, caller: Caller | None, session: str, poses: list[Pose], trouble: str, *, as_more: bool
+    ) -> None:
+        with self._record.turn, acting_for(caller):
             self._is_choosing = False
-            job = self._job
+            self._advisor.trouble = trouble
+            job = self._record.job
             if job is None or job.state != "open" or job.run.session != session:
                 return
-            if "error" in answer or not answer["result"]["poses"]:
-                self._meter_trouble = f"no poses could be chosen: {answer.get('error', 'none is in view')}"
+            if trouble:
                 self._try_again = time.monotonic() + RETRY_S
-                return
-            poses = {"poses": answer["result"]["poses"]}
-            self._meter_trouble = ""
-            if as_more and job.step is not None and job.step.kind == "poses":
-                self._happen("more", poses)
+            elif as_more and job.step is not None and job.step.kind == "poses":
+                self._happen("more", {"poses": poses})
             elif not as_more and job.run.poses is None:
-                self._happen("planned", poses)
+                self._happen("planned", {"poses": poses})
 
     # ---- state -------------------------------------------------------------------------------------------------------
 
     def _state(self) -> dict[str, Any]:
-        with self._turn:
-            row, job = self._row, self._job
+        with self._record.turn:
+            row, job = self._record.row, self._record.job
             if row is None or job is None:
                 return {"guide": None}
             step = job.step
@@ -559,9 +468,9 @@ class GuideKeeper:
             around = Around(
                 boom=self._watch.boom(),
                 standstill=self._standstill,
-                accuracy=self._accuracy,
-                coverage=self._coverage,
-                taps=self._taps,
+                accuracy=accuracy_view(job, self._advisor.accuracy),
+                coverage=self._advisor.coverage,
+                taps=self._record.taps,
                 is_busy=self._is_busy(job),
                 is_detected=self._has_aim or (bool(point) and self._point_mm(point) is not None),
                 has_aim=self._has_aim,
@@ -581,47 +490,18 @@ class GuideKeeper:
         found = [job.trouble] if job.trouble else []
         if job.state == "open":
             found += [f"{s.reason}; {s.remedy}" for s in self._sessions.prism_suspicions()]
-        if self._meter_trouble and job.state == "open":
-            found.append(self._meter_trouble)
+        if self._advisor.trouble and job.state == "open":
+            found.append(self._advisor.trouble)
         return found
-
-    # ---- after a restart ---------------------------------------------------------------------------------------------
 
     def _restore(self) -> None:
         """Go on with the guide that an earlier run left."""
-        row = self._table.newest()
-        if row is None:
-            return
-        job, events = Job.of(Request.of(row.request)), self._table.events(row.id)
-        for event in events:
-            job = job.after(event.kind, event.details)
-        self._row, self._job = row, job
-        self._taps = row.taps
-        if job.state != "open":
-            return
-        log.warning("guide %d was open when rigcal last ended; it goes on: %s", row.id, headline(job))
-        if not job.run.session:
-            return
+        self._record.restore()
         # Fixes that were captured and are not decoded yet must not count where the station was on no prism.
-        away: Stamp | None = None
-        current = Job.of(job.request)
-        for event in events:
-            before, current = current, current.after(event.kind, event.details)
-            if event.kind == "opened" and current.at == job.at:
-                away = event.at
-            elif current.at == job.at and event.kind == "aimed":
-                self._sessions.look_away(away, event.at)
-                away = None
-            elif current.at == job.at and _left_prism(before, current):
-                away = event.at
-        if away is not None:
-            self._sessions.look_away(away)
-        self._start_meter()
-
-
-def _left_prism(before: Job, after: Job) -> bool:
-    was = before.step is not None and before.step.kind == "poses"
-    return was and (after.step is None or after.step.kind != "poses")
+        for since, until in self._record.times_away():
+            self._sessions.look_away(since, until)
+        if self._record.is_open:
+            self._start_advisor()
 
 
 def _reason(arguments: Mapping[str, Any]) -> str:

@@ -49,6 +49,7 @@ from daemon.warm_up import prepare
 
 log = logging.getLogger(__name__)
 
+MOST_FIXES = 20  # of a standstill: its readings' errors, common to all, are then most of what is left
 _DIGITS = 3  # of joints in a pose
 
 
@@ -82,8 +83,14 @@ class Meter:
         Raises:
             CalibrationError, StoreError: in a sentence, why not.
         """
-        rows = self._rows(question["sessions"], question.get("session", ""))
-        measured = from_rows(self._rig, rows, question["setup"], lacking=self._lacking)
+        rows = self._rows(question["sessions"], question["session"])
+        try:
+            measured = from_rows(self._rig, rows, question["setup"], lacking=self._lacking)
+        except CalibrationError as error:
+            if question["do"] != "choose":
+                raise
+            log.warning("poses are chosen from the rig file alone: %s", error)
+            measured = from_rows(self._rig, None, question["setup"], lacking=self._lacking)
         if question["do"] == "choose":
             return self._chosen(measured, question)
         return self._assessed(measured, rows, question)
@@ -170,13 +177,23 @@ class Meter:
         data = sessions_csv(reader, self._rig, [session])
         if data.count(b"\n") < 2:  # a header alone
             return None
-        return parse_observations(data, self._rig, f"session {session}")
+        return thinned(parse_observations(data, self._rig, f"session {session}"))
 
     def _identity(self) -> FileIdentity | None:
         return None if self._place.store_file is None else FileIdentity(*self._place.store_file)
 
     def _as_pose(self, readings: Floats) -> dict[str, float]:
         return {name: round(float(readings[i]), _DIGITS) for i, name in enumerate(self._rig.joint_names)}
+
+
+def thinned(rows: Observations) -> Observations:
+    """Keep as many fixes of every standstill as tell nearly all, spread over it: the meter must not slow down."""
+    _, standstill = np.unique(rows.pose, return_inverse=True)
+    kept = np.zeros(len(rows), dtype=bool)
+    for number in range(standstill.max(initial=-1) + 1):
+        at = np.flatnonzero(standstill == number)
+        kept[at[np.unique(np.linspace(0, len(at) - 1, MOST_FIXES).round().astype(int))]] = True
+    return rows.select(kept)
 
 
 def joined(parts: Sequence[Observations]) -> Observations:

@@ -65,7 +65,7 @@ def state_of(rig: Rig, row: GuideRow, job: Job, around: Around) -> dict[str, Any
         "joints": joint_rows(rig, around.boom, None if pose is None else pose.joints),
         "hold": None if pose is None else _hold(rig, pose, around),
         "poses": None if run is None else _counts(run),
-        "accuracy": _accuracy(job, around),
+        "accuracy": around.accuracy,
         "coverage": around.coverage,
         "misclosure_mm": job.misclosure_mm,
         "steps": _steps(job),
@@ -240,26 +240,6 @@ def _counts(run: Run) -> dict[str, int]:
         "done": run.done,
         "skipped": sum(pose.state == "skipped" for pose in poses or ()),
         "planned": run.most if poses is None else len(poses),
-    }
-
-
-def _accuracy(job: Job, around: Around) -> dict[str, Any] | None:
-    found = around.accuracy
-    if found is None:
-        return None
-    run, target_mm = job.run, job.request.target_mm
-    is_own = found["session"] == run.session
-    is_enough = bool(run.enough) and is_own
-    why = found["why"]
-    if not why and found["prism_mm"] is not None:
-        gain = 1.0 - found["prism_after_5_mm"] / found["prism_mm"]
-        why = run.enough or f"five more poses would lower the expected error of this prism by {gain:.0%}"
-        why = f"{why[:1].upper()}{why[1:]}."
-    return {key: value for key, value in found.items() if key not in ("session", "why")} | {
-        "why": why,
-        "is_target_reached": target_mm is not None and found["now_mm"] is not None and found["now_mm"] <= target_mm,
-        "is_enough": is_enough,
-        "for_poses": found["for_poses"] if is_own else 0,
     }
 
 

@@ -376,13 +376,14 @@ def m024_guides(db: Database) -> None:
     caller = "caller_user TEXT, caller_uid INTEGER, caller_pid INTEGER"
     _create(
         db,
+        # taps: number of commands that were given to it.
         f"""CREATE TABLE guides (id INTEGER PRIMARY KEY, rig TEXT NOT NULL,
             {_one_of("state", "open", "finished", "abandoned")},
             setup_id TEXT NOT NULL REFERENCES station_setups(id),
             operator TEXT NOT NULL, request_json TEXT NOT NULL, taps INTEGER NOT NULL, {_instant("started_")},
             {_instant("ended_", optional=True)}, {caller}) STRICT""",
         "CREATE UNIQUE INDEX guides_one_open ON guides(rig) WHERE state = 'open'",
-        # taps (above): commands that were given to it. kind, details_json: see daemon/guide/job.py. caller_: NULL where the guide went on by itself.
+        # kind, details_json: see daemon/guide/job.py. caller_: NULL where the guide went on by itself.
         f"""CREATE TABLE guide_events (id INTEGER PRIMARY KEY, guide_id INTEGER NOT NULL REFERENCES guides(id),
             kind TEXT NOT NULL, details_json TEXT NOT NULL, {_instant()}, {caller}) STRICT""",
         "CREATE INDEX guide_events_by_guide ON guide_events(guide_id)",

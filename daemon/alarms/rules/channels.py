@@ -18,6 +18,7 @@ _WHY = {
     Status.OUT_OF_RANGE: "the value is beyond what the device can measure",
     Status.DEVICE_ALARM: "the device reports an alarm that makes its value void",
     Status.MALFORMED: "the value cannot be decoded",
+    Status.TIME_DOUBTFUL: "it is not known when the value was measured",
 }
 
 

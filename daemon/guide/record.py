@@ -1,0 +1,130 @@
+"""The newest guide of a rig as the store has it: every event is stored before it counts."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from daemon.commands import REFUSED, CommandError, caller_columns
+from daemon.guide.job import Job, Request
+from daemon.guide.view import headline
+from daemon.store.guides import EventRow, GuideRow, GuideTable
+from daemon.store.store import Store
+from drivers.clock import Clock, Stamp
+
+log = logging.getLogger(__name__)
+
+
+class GuideRecord:
+    """The newest guide, open or not.
+
+    Args:
+        store: where guides are kept.
+        rig_name: whose guides they are.
+        clock: for when something happened.
+
+    Attributes:
+        turn: held by whoever reads or changes several things at once.
+        row, job: of the newest guide; None before the first.
+        table: of all guides.
+    """
+
+    def __init__(self, store: Store, rig_name: str, clock: Clock) -> None:
+        self.turn = threading.RLock()
+        self.row: GuideRow | None = None
+        self.job: Job | None = None
+        self.taps = 0
+        self.table = GuideTable(store, rig_name)
+        self._store, self._clock = store, clock
+
+    @property
+    def is_open(self) -> bool:
+        """Return True while a guide is open."""
+        job = self.job
+        return job is not None and job.state == "open"
+
+    def opened(self) -> tuple[GuideRow, Job] | None:
+        """The open guide; None without one."""
+        row, job = self.row, self.job
+        return (row, job) if row is not None and job is not None and job.state == "open" else None
+
+    def needs_step(self, arguments: Mapping[str, Any]) -> tuple[Job, str]:
+        """Return the job and its step; CommandError without an open guide, or where another `step` is meant."""
+        job = self.job
+        if job is None or job.state != "open":
+            raise CommandError("no guide is open; `rigcal session guide --prisms w,b,r,s` starts one")
+        meant = arguments.get("step")
+        if meant is not None and meant != job.step_id:
+            raise CommandError(f"another step is on by now: {headline(job)}", REFUSED)
+        return job, job.step_id
+
+    def open(self, request: Request, setup_id: str, operator: str) -> None:
+        """Begin a guide."""
+        self.table.open(self._clock.now(), setup_id, operator, request.as_dict(), **caller_columns())
+        self.row, self.job, self.taps = self.table.newest(), Job.of(request), 1
+
+    def tapped(self) -> None:
+        """Count a command that was given to the guide."""
+        self.taps += 1
+        if self.row is not None:
+            self.table.count_taps(self.row.id, self.taps)
+
+    def happen(self, kind: str, details: Mapping[str, Any], only_at: str = "") -> tuple[Job, Job] | None:
+        """Store an event; returns the states before and after, None where another step than `only_at` is on by now."""
+        row, before = self.row, self.job
+        if row is None or before is None or before.state != "open" or only_at not in ("", before.step_id):
+            return None
+        job, at = before.after(kind, details), self._clock.now()
+        with self._store.transaction():
+            self.table.add(row.id, kind, details, at, **caller_columns())
+            if job.state != "open":
+                self.table.end(row.id, job.state, at)
+        self.job = job
+        if job.state != "open":
+            log.info("guide %d is %s", row.id, job.state)
+            self.row = self.table.newest()
+        return before, job
+
+    def restore(self) -> None:
+        """Read the guide that an earlier run of the daemon left."""
+        row = self.table.newest()
+        if row is None:
+            return
+        job = Job.of(Request.of(row.request))
+        for event in self.table.events(row.id):
+            job = job.after(event.kind, event.details)
+        self.row, self.job, self.taps = row, job, row.taps
+        if job.state == "open":
+            log.warning("guide %d was open when rigcal last ended; it goes on: %s", row.id, headline(job))
+
+    def times_away(self) -> Iterator[tuple[Stamp, Stamp | None]]:
+        """When the station was on no prism in the session that is on: since, and until where that is over."""
+        opened = self.opened()
+        if opened is None or not opened[1].run.session:
+            return
+        row, job = opened
+        away: Stamp | None = None
+        state = Job.of(job.request)
+        for event in self.table.events(row.id):
+            was_on_prism = is_on_prism(state)
+            state = state.after(event.kind, event.details)
+            if state.at != job.at:
+                continue
+            if _turns_away(event, was_on_prism, state):
+                away = event.at
+            elif event.kind == "aimed" and away is not None:
+                yield away, event.at
+                away = None
+        if away is not None:
+            yield away, None
+
+
+def is_on_prism(job: Job) -> bool:
+    """Return True while the station is on the prism of the session."""
+    return job.step is not None and job.step.kind == "poses"
+
+
+def _turns_away(event: EventRow, was_on_prism: bool, after: Job) -> bool:
+    return event.kind == "opened" or (was_on_prism and not is_on_prism(after))

@@ -1,0 +1,65 @@
+"""What `rigcal session guide` reads and shows, without a daemon."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from calibration.rig.description import shipped_rig
+from daemon.cli.guide_terminal import plan_rows, screen
+from daemon.commands import WRONG_USE, CommandError
+from daemon.guide.job import Job, Request
+from daemon.guide.position import BoomPosition
+from daemon.guide.request import request_of
+from daemon.guide.view import Around, state_of
+from daemon.models.gap_files import poses_csv
+from daemon.store.guides import GuideRow
+from drivers.clock import Stamp
+
+RIG = shipped_rig("swdt82")
+MIDDLE = {joint.name: sum(joint.limits) / 2 for joint in RIG.joints}
+POSE = {joint.column: MIDDLE[joint.name] for joint in RIG.joints}
+
+
+def test_a_plan_is_read_as_rigcal_plan_writes_it(tmp_path: Path) -> None:
+    file = tmp_path / "plan.csv"
+    rows = [{"pose": n, **POSE, "theta4_dir": 1, "prisms": ["r", "w"]} for n in (1, 2)]
+    file.write_text(poses_csv(rows), encoding="utf-8")
+    request = request_of({"plan": plan_rows(file), "prisms": ["r"]}, RIG, [])
+    assert request.planned("r") == (MIDDLE, MIDDLE)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("", "no poses"), ("theta1_deg\nx\n", "line 2: could not convert"), (None, "No such file")],
+)
+def test_a_file_that_is_no_plan_is_refused_with_its_place(tmp_path: Path, text: str | None, message: str) -> None:
+    file = tmp_path / "plan.csv"
+    if text is not None:
+        file.write_text(text, encoding="utf-8")
+    with pytest.raises(CommandError, match=message) as refused:
+        plan_rows(file)
+    assert refused.value.status == WRONG_USE
+
+
+def test_the_screen_fits_a_narrow_terminal_and_says_what_is_old() -> None:
+    job = Job.of(Request(("cp1",), ("r",), 1, 0, plan=((MIDDLE, ("r",)),)))
+    for kind, details in (
+        ("opened", {"session": "s001-r", "last": 0}),
+        ("shot", {"point": "cp1", "misclosure_mm": None}),
+        ("aimed", {}),
+    ):
+        job = job.after(kind, details)
+    row = GuideRow(1, "open", "S1", "Ada", {}, 3, Stamp(0, 0, "boot"))
+    boom = BoomPosition(MIDDLE | {"theta1": 0.0}, 30.0, None, is_fresh=False, missing="the joints were read 30 s ago")
+    around = Around(boom, None, None, None, 3, False, False, False, 1.0, 5, [], None)
+    guide = state_of(RIG, row, job, around)
+    assert guide["step"]["kind"] == "go_to_pose"
+    lines = screen(guide, 60)
+    assert max(map(len, lines)) < 60
+    joint = next(line for line in lines if "theta1" in line)
+    assert "+22.5 to go  (old)" in joint
+    assert "theta3" in "".join(lines)
+    assert any("30 s ago" in line for line in lines)
+    assert "Enter: Measure here" in lines[-1]
