@@ -49,7 +49,7 @@ def test_systemd_has_nothing_to_say_about_the_unit(installed: Path) -> None:
 
 def test_the_page_is_exposed_little() -> None:
     analyze = program("systemd-analyze", "systemd")
-    result = run(analyze, "security", "--no-pager", "--offline=true", "--threshold=22", UNIT)
+    result = run(analyze, "security", "--no-pager", "--offline=true", "--threshold=15", UNIT)
     assert result.returncode == 0, result.stdout
 
 

@@ -140,7 +140,7 @@ function errors(model) {
   const lines = [...rows.map(([name, value]) => [name, [value]]), ...(held.length ? [["held-out checks", held]] : [])];
   // As wide as the screen lets it be, so that its letters are as large as others; on a phone names stand above their lines.
   const width = Math.min(Math.max(innerWidth - 90, 260), 760), isNarrow = width < 560;
-  const left = isNarrow ? 8 : 150, right = width - 140, step = isNarrow ? 48 : 30, bottom = 24 + step * lines.length;
+  const left = isNarrow ? 24 : 150, right = width - 140, step = isNarrow ? 48 : 30, bottom = 24 + step * lines.length;
   const x = (value) => left + ((right - left) * (Math.log10(value) - low)) / (high - low || 1);
   const ticks = [];
   for (let k = Math.ceil(low); k <= high; k++) ticks.push(10 ** k);
