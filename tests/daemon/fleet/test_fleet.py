@@ -162,6 +162,7 @@ def test_the_command_writes_a_page_and_a_table(directory: Path, tmp_path: Path) 
     assert 1.0 < float(noise.iloc[0]) < 4.0
 
 
+@pytest.mark.slow
 def test_a_fleet_with_the_gap_workflow(directory: Path) -> None:
     (source,) = find_rigs([directory / "rig0000"], None, None)
     found = assess(source.task(FleetSettings(gap=True)))
