@@ -27,6 +27,7 @@ _BISECTIONS = 200
 _GRID = 200  # spreads that are averaged over
 _REACH = 3.0  # standard deviations of the values: larger spreads are out of the question
 _MAD = 1.4826  # of a normal distribution: sigma over MAD
+_LEAST_PRECISION = 1e-9  # of a direction, over that of its parameters: none is left but rounding
 _LEAST_GAIN = 0.19  # of the posterior's precision must be the data's own: sigma below 0.9 of the prior's
 
 
@@ -163,11 +164,34 @@ def _two_sided(deviation: Floats | float, degrees: int) -> Floats:
     return np.asarray(2.0 * stdtr(max(degrees, 1), -np.abs(deviation)), dtype=np.float64)
 
 
+def widened_prior(value: Floats, covariance: Floats, prior_sigma: Floats, factor: float) -> tuple[Floats, Floats]:
+    """Return the posterior of parameters as it would be with a wider prior about 0.
+
+    Parameters that are known together only share what the prior says of one of them: a constant that is far from its
+    drawing pulls others along. With the whole covariance that is undone.
+
+    Args:
+        value: (p,) posterior means.
+        covariance: (p, p) of them.
+        prior_sigma: (p,) of the prior that they were fitted with; infinity for none.
+        factor: by which it is widened.
+
+    Returns:
+        (p,) means and (p,) standard errors.
+    """
+    scale = np.sqrt(np.diag(covariance))
+    own = np.linalg.inv(covariance / np.outer(scale, scale))
+    taken = (scale / prior_sigma) ** 2 * (1.0 - factor**-2)
+    size, axes = np.linalg.eigh(0.5 * (own + own.T) - np.diag(taken))
+    wide = (axes / np.maximum(size, _LEAST_PRECISION)) @ axes.T
+    return scale * (wide @ own @ (value / scale)), scale * np.sqrt(np.diag(wide))
+
+
 def without_prior(value: Floats, sigma: Floats, prior_sigma: Floats) -> tuple[Floats, Floats]:
     """Return what data alone say of parameters whose posterior has a prior about 0.
 
-    Rigs that share a prior are no independent witnesses of what it says. Correlations are passed over: of a parameter
-    that is known only together with others, the marginal posterior counts.
+    Rigs that share a prior are no independent witnesses of what it says. Correlations are passed over, so the prior is
+    to be wide (`widened_prior`): of a parameter that is known only together with others, the marginal posterior counts.
 
     Args:
         value: (n,) posterior mean.

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from calibration.rig.description import Rig
     from calibration.run import Run
 
+_WIDER = 10.0  # than the build tolerances: the prior that rigs are compared by
 FORM = 1  # of the answer; a later one is not read for an earlier one
 
 
@@ -75,7 +76,7 @@ def assess(task: RigTask) -> dict[str, Any]:
     Returns:
         JSON: `name`, `source`, `sha256`, `rig`, and either `error` and `kind`, or `fixes`, `sessions`, `noise_mm`,
         `stages` (stage -> RMS, mm), `expected_rms_mm`, `verdict`, `effects`, `parameters` (`name`, `unit`, `value`,
-        `sigma`, `prior_sigma`), `unidentifiable`, `drift` (`session`, `ratio`, `alarm`) or None, and `warnings`.
+        `sigma`, and `prior_sigma` by which they are held), `unidentifiable`, `drift` (`session`, `ratio`, `alarm`) or None, and `warnings`.
     """
     prepare()
     from calibration.errors import CalibrationError
@@ -125,16 +126,22 @@ def _assessed(task: RigTask, rig: Rig, pool: Executor) -> dict[str, Any]:
 
 
 def _parameters(model: CalibratedModel) -> list[dict[str, Any]]:
-    """Return the constants of the machine; where it stands is nothing that rigs have in common."""
+    """Return the constants of the machine, held by a wide prior; where it stands rigs do not have in common."""
+    from calibration.fleet.hierarchical import widened_prior
+
+    known = model.parameters
+    prior = np.array([parameter.prior_sigma for parameter in known])
+    covariance = model.covariance[: len(known), : len(known)]
+    value, sigma = widened_prior(model.values, covariance, prior, _WIDER)
     return [
         {
             "name": parameter.name,
             "unit": parameter.unit,
-            "value": parameter.value,
-            "sigma": parameter.standard_error,
-            "prior_sigma": parameter.prior_sigma if np.isfinite(parameter.prior_sigma) else None,
+            "value": float(value[n]),
+            "sigma": float(sigma[n]),
+            "prior_sigma": _WIDER * parameter.prior_sigma if np.isfinite(parameter.prior_sigma) else None,
         }
-        for parameter in model.parameters
+        for n, parameter in enumerate(known)
         if parameter.kind != "base"
     ]
 

@@ -8,7 +8,9 @@ memory does not grow with the fleet.
 from __future__ import annotations
 
 import json
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -83,6 +85,31 @@ class Cluster:
                 continue
             fill()
             yield future.result() if error is None else _failed(task.name, task.source, error)
+
+
+@contextmanager
+def local_workers(count: int) -> Iterator[Client]:
+    """Yield a client of worker processes on this computer; one that is gone is started anew.
+
+    Raises:
+        ImportError: `distributed` is not installed.
+    """
+    from distributed import Client, LocalCluster
+
+    with (
+        tempfile.TemporaryDirectory() as scratch,
+        LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address="127.0.0.1:0",
+            local_directory=scratch,
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        # The nanny of a worker that does not start in time gives up: without this the cluster would stay empty.
+        cluster.adapt(minimum=count, maximum=count)
+        yield client
 
 
 def assess_all(

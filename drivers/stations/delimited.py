@@ -103,7 +103,10 @@ def cells_of(line: str, separator: str) -> list[str]:
     """Return the cells of a line."""
     if separator == " ":
         return line.split()
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
+    try:
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
+    except csv.Error:  # a field of more characters than any that means something
+        return []
 
 
 def number_of(cell: str, decimal: str) -> float | None:

@@ -19,14 +19,13 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from daemon.fleet.assess import FleetSettings
 from daemon.fleet.comparison import compare
-from daemon.fleet.run import RESULTS, Answer, Cluster, Told, assess_all
+from daemon.fleet.run import RESULTS, Answer, Cluster, Told, assess_all, local_workers
 from daemon.fleet.sources import find_rigs
 from daemon.fleet.table import write_table
 from daemon.warm_up import prepare
@@ -34,21 +33,6 @@ from tests.simulated.fleet import COMMON, ODD, simulated_rig, write_rig
 
 BAR = 1.8
 KILL_EVERY = 25  # answers
-
-
-@contextmanager
-def workers(count: int) -> Iterator[Any]:
-    """Yield a client of worker processes, which have loaded what they need."""
-    from distributed import Client, LocalCluster
-
-    with (
-        tempfile.TemporaryDirectory() as scratch,
-        LocalCluster(
-            n_workers=count, threads_per_worker=1, processes=True, dashboard_address=None, local_directory=scratch
-        ) as cluster,
-        Client(cluster) as client,
-    ):
-        yield client
 
 
 def run(
@@ -92,7 +76,7 @@ def scaling(directories: Sequence[Path], scratch: Path, settings: FleetSettings,
     is_same = True
     for turn in range(rounds):
         for count in (1, 2):
-            with workers(count) as client:
+            with local_workers(count) as client:
                 run(directories[: 2 * count], scratch / f"warm-{turn}-{count}", client, settings)
                 answers, took = run(directories, scratch / f"{turn}-{count}", client, settings)
             seconds[count].append(took)
@@ -105,7 +89,7 @@ def scaling(directories: Sequence[Path], scratch: Path, settings: FleetSettings,
             )
     ratio = min(seconds[1]) / min(seconds[2])
     print(f"two workers do {ratio:.2f} times the work of one, bar {BAR}")
-    with workers(2) as client:
+    with local_workers(2) as client:
         killer = Killer(client)
         answers, took = run(directories, scratch / "killed", client, settings, killer)
     is_same = is_same and plain(answers) == first
@@ -117,7 +101,7 @@ def scaling(directories: Sequence[Path], scratch: Path, settings: FleetSettings,
 def whole(directories: Sequence[Path], odd: set[str], out: Path, settings: FleetSettings) -> bool:
     """Do the whole fleet; returns whether what is common and who is odd were found."""
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with workers(2) as client:
+    with local_workers(2) as client:
         answers, took = run(directories, out, client, settings)
     rate = 3600 * len(answers) / took
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024

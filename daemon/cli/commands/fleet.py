@@ -106,27 +106,24 @@ def fleet(
 @contextlib.contextmanager
 def _engine(workers: int | None, scheduler: str | None) -> Iterator[Engine]:
     """Yield where the work is done: this process, worker processes of its own, or a cluster."""
-    from daemon.fleet.run import Cluster, Here
+    from daemon.fleet.run import Cluster, Here, local_workers
 
-    if workers is None and scheduler is None:
-        yield Here()
-        return
     try:
-        from distributed import Client, LocalCluster
+        if scheduler is not None:
+            from distributed import Client
+
+            try:
+                client = Client(scheduler, timeout=CONNECT_TIMEOUT_S)
+            except (OSError, ValueError) as error:
+                raise click.BadParameter(
+                    f"no dask scheduler at {scheduler}: {error}", param_hint="--scheduler"
+                ) from error
+            with client:
+                yield Cluster(client)
+        elif workers is not None:
+            with local_workers(workers) as client:
+                yield Cluster(client)
+        else:
+            yield Here()
     except ImportError as error:
         raise click.UsageError("the `dask` extra is not installed: pip install 'rigcal[dask]'") from error
-    if scheduler is not None:
-        try:
-            client = Client(scheduler, timeout=CONNECT_TIMEOUT_S)
-        except (OSError, ValueError) as error:
-            raise click.BadParameter(f"no dask scheduler at {scheduler}: {error}", param_hint="--scheduler") from error
-        with client:
-            yield Cluster(client)
-        return
-    with (
-        LocalCluster(
-            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
-        ) as cluster,
-        Client(cluster) as client,
-    ):
-        yield Cluster(client)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.fleet.hierarchical import false_discovery_threshold, fleet_estimate, without_prior
+from calibration.fleet.hierarchical import false_discovery_threshold, fleet_estimate, widened_prior, without_prior
 
 
 def simulated(rigs: int, mean: float, spread: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -90,6 +90,25 @@ def test_a_prior_is_taken_out() -> None:
     np.testing.assert_allclose((value[0], error[0]), (own, sigma))
     assert np.isnan(value[1])
     assert (value[2], error[2]) == pytest.approx((3.0, 0.5))
+
+
+def test_what_a_prior_says_of_one_parameter_is_undone_in_those_that_are_known_with_it() -> None:
+    rng = np.random.default_rng(0)
+    design = rng.normal(size=(12, 3))
+    design[:, 1] = design[:, 0] + 0.2 * design[:, 1]
+    truth, prior = np.array([12.0, -3.0, 1.0]), np.array([2.0, 5.0, np.inf])
+    data = design @ truth
+
+    def posterior(sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        covariance = np.linalg.inv(design.T @ design + np.diag(1.0 / sigma**2))
+        return covariance @ design.T @ data, covariance
+
+    value, covariance = posterior(prior)
+    wide, expected = posterior(10.0 * prior)
+    found, sigma = widened_prior(value, covariance, prior, 10.0)
+    np.testing.assert_allclose(found, wide)
+    np.testing.assert_allclose(sigma, np.sqrt(np.diag(expected)))
+    assert abs(found[1] - truth[1]) < 0.1 * abs(value[1] - truth[1])
 
 
 def test_false_discoveries_are_a_small_share() -> None:

@@ -13,13 +13,13 @@ from typing import Any
 import pandas as pd
 import pytest
 from click.testing import CliRunner
-from distributed import Client, LocalCluster
+from distributed import Client
 
 from calibration.errors import DataError
 from daemon.cli.main import main
 from daemon.fleet.assess import FleetSettings, RigTask, assess
 from daemon.fleet.comparison import compare, gains
-from daemon.fleet.run import RESULTS, Cluster, Here, assess_all
+from daemon.fleet.run import RESULTS, Cluster, Here, assess_all, local_workers
 from daemon.fleet.sources import find_rigs
 from daemon.store import Store
 from daemon.store.sessions import SessionTable
@@ -47,17 +47,8 @@ def answers(directory: Path, tmp_path_factory: pytest.TempPathFactory) -> list[d
 
 
 @pytest.fixture
-def client(tmp_path: Path) -> Iterator[Client]:
-    with (
-        LocalCluster(
-            n_workers=2,
-            threads_per_worker=1,
-            processes=True,
-            dashboard_address="127.0.0.1:0",
-            local_directory=str(tmp_path / "dask"),
-        ) as cluster,
-        Client(cluster) as client,
-    ):
+def client() -> Iterator[Client]:
+    with local_workers(2) as client:
         yield client
 
 
@@ -171,6 +162,7 @@ def test_the_command_writes_a_page_and_a_table(directory: Path, tmp_path: Path) 
     assert 1.0 < float(noise.iloc[0]) < 4.0
 
 
+@pytest.mark.slow
 def test_a_fleet_with_the_gap_workflow(directory: Path) -> None:
     (source,) = find_rigs([directory / "rig0000"], None, None)
     found = assess(source.task(FleetSettings(gap=True)))

@@ -6,6 +6,7 @@ where RIGCAL_GTS229 names it (`sample_data/topcon_gts_229` of the repository tot
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 from pathlib import Path
@@ -191,3 +192,17 @@ def test_bad_tables_are_refused_whole(text: str, said: str) -> None:
 
 def test_an_empty_file_is_of_no_format() -> None:
     assert "the format is not known" in refused("\n")
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_hostile_files_are_read_or_refused(seed: int) -> None:
+    samples = [gts_download(), SDR_HEAD + sdr("08TP", "1", 1.0, 2.0, 3.0), LEICA, FARO, VICON, ANGLES]
+    rng = np.random.default_rng(seed)
+    for _ in range(150):
+        text = list(samples[seed])
+        for _ in range(int(rng.integers(1, 6))):
+            place = int(rng.integers(len(text)))
+            text[place : place + int(rng.integers(0, 9))] = chr(int(rng.choice([0, 10, 34, 44, 57, 59, 95, 955])))
+        with contextlib.suppress(DescriptionError):
+            known = format_of("".join(text), "file")
+            known.read("".join(text), known.guess("".join(text), "file").map, "file")
