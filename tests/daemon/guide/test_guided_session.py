@@ -135,8 +135,6 @@ def test_skipped_control_points_are_kept_and_the_session_is_not_used(daemon: Dae
     operator = GuidedOperator(daemon.say)
     reached = operator.follow(lambda s: s["step"]["kind"] == "go_to_pose")
     assert "fog" in reached["messages"][-1]["text"]
-    with pytest.raises(CommandError, match="fixes count at this standstill"):
-        daemon.say("guide.done")
     operator.follow(lambda s: s["poses"]["done"] == 1)
     ended = daemon.say("guide.stop", reason="rain")["guide"]
     assert (ended["state"], ended["step"]["kind"]) == ("abandoned", "abandoned")
