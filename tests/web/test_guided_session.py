@@ -107,6 +107,7 @@ def test_a_guided_session_ends_with_an_accepted_model_and_goes_back(new_page: Ne
         page.goto(f"{web.address}/now")
         review = page.get_by_role("button", name="Review the model")
         while not review.is_visible():
+            assert rig.process.poll() is None, f"the daemon ended: {rig.log_text()[-3000:]}"
             failed = [job for job in rig.say("jobs.list") if job["state"] == "failed"]
             assert not failed, failed
             assert time.monotonic() < deadline, rig.say("jobs.list")

@@ -56,7 +56,7 @@ class App {
     this.screen = mount(root, this);
     this.name = wanted;
     this.update();
-    if (focus) { scrollTo(0, 0); $("main").focus({ preventScroll: true }); }
+    if (focus) { $("main").scrollTop = 0; $("main").focus({ preventScroll: true }); }
   }
 
   /** Go to a screen, as a tap on its name does. */
