@@ -76,7 +76,8 @@ def assess(task: RigTask) -> dict[str, Any]:
     Returns:
         JSON: `name`, `source`, `sha256`, `rig`, and either `error` and `kind`, or `fixes`, `sessions`, `noise_mm`,
         `stages` (stage -> RMS, mm), `expected_rms_mm`, `verdict`, `effects`, `parameters` (`name`, `unit`, `value`,
-        `sigma`, and `prior_sigma` by which they are held), `unidentifiable`, `drift` (`session`, `ratio`, `alarm`) or None, and `warnings`.
+        `sigma`, and `prior_sigma` by which they are held), `unidentifiable`, `drift` (`session`, `ratio`, `alarm`) or
+        None, and `warnings`.
     """
     prepare()
     from calibration.errors import CalibrationError

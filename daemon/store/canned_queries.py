@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from daemon.store.views import Channel, iso
+from daemon.store.views import Channel, in_session, iso
 
 
 @dataclass(frozen=True)
@@ -29,12 +29,6 @@ class Query:
     description: str
     sql: str
     parameters: tuple[str, ...] = ()
-
-
-_IN_SESSION = """FROM calibration_sessions AS session CROSS JOIN {table} AS row
-WHERE session.id = :session
-    AND (row.boot_id, row.monotonic_ns) >= (session.started_boot_id, session.started_monotonic_ns)
-    AND (row.boot_id, row.monotonic_ns) <= (session.ended_boot_id, session.ended_monotonic_ns)"""
 
 
 def canned_queries(channels: Iterable[Channel]) -> tuple[Query, ...]:
@@ -82,12 +76,12 @@ GROUP BY pose, prism ORDER BY min(id)""",
             "joints_of_session",
             "Joints in a session, second by second",
             "Mean reading of each joint in each second of a session that has ended.",
-            f"""WITH means AS (SELECT row.boot_id AS boot, row.monotonic_ns / 1000000000 AS second, row.channel_id,
+            f"""WITH means AS (SELECT boot.id AS boot_id, row.monotonic_ns / 1000000000 AS second, row.channel_id,
         min(row.utc_ns) AS utc_ns, avg(row.value) AS value
-    {_IN_SESSION.format(table="joint_samples")}
-    GROUP BY boot, second, row.channel_id)
+    {in_session("joint_samples")}
+    GROUP BY boot.id, second, row.channel_id)
 SELECT {iso("min(utc_ns)")} AS time{_joint_values(joints)}
-FROM means JOIN channels ON channels.id = channel_id GROUP BY boot, second ORDER BY boot, second""",
+FROM means JOIN channels ON channels.id = channel_id GROUP BY boot_id, second ORDER BY boot_id, second""",
             ("session",),
         ),
         Query(
@@ -97,10 +91,7 @@ FROM means JOIN channels ON channels.id = channel_id GROUP BY boot, second ORDER
             f"""SELECT row.id AS fix, station, {iso("row.utc_ns")} AS time, row.status, lock,
     hz_angle_rad * 57.29577951308232 AS hz_angle_deg, zenith_angle_rad * 57.29577951308232 AS zenith_angle_deg,
     slope_distance_m, reason
-FROM calibration_sessions AS session CROSS JOIN links CROSS JOIN fixes AS row
-WHERE session.id = :session AND row.station = links.name
-    AND (row.boot_id, row.monotonic_ns) >= (session.started_boot_id, session.started_monotonic_ns)
-    AND (row.boot_id, row.monotonic_ns) <= (session.ended_boot_id, session.ended_monotonic_ns)
+{in_session("links CROSS JOIN fixes")} AND row.station = links.name
 ORDER BY row.id""",
             ("session",),
         ),

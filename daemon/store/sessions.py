@@ -12,6 +12,7 @@ from daemon.host.time_service import ClockState
 from daemon.store.connection import Connection
 from daemon.store.errors import NotInStoreError
 from daemon.store.rows import RowSource
+from daemon.store.views import in_session
 from drivers.clock import NS_PER_S, Stamp
 
 BEFORE_NS = 60 * NS_PER_S  # dwell and direction of a session's first fixes come from motion before it
@@ -98,11 +99,9 @@ _UNTRAINED = """SELECT id, excluded FROM calibration_sessions
 _SESSION = """SELECT calibration_sessions.*, rig_files.text AS rig_text FROM calibration_sessions
     LEFT JOIN rig_files ON rig_files.sha256 = rig_sha256 WHERE id = ?"""
 # What was measured from a session's start to its end; the index of the table behind the view finds it.
-_MEASURED = """SELECT row.* FROM calibration_sessions AS session CROSS JOIN {} AS row WHERE session.id = ?
-    AND (row.boot_id, row.monotonic_ns) >= (session.started_boot_id, session.started_monotonic_ns)
-    AND (row.boot_id, row.monotonic_ns) <= (session.ended_boot_id, session.ended_monotonic_ns)"""
-_FIXES_MEASURED = _MEASURED.format("links CROSS JOIN v_fixes") + " AND row.station = links.name ORDER BY row.id"
-_JOINTS_MEASURED = _MEASURED.format("v_joints") + " ORDER BY row.boot_id, row.monotonic_ns"
+_FIXES_MEASURED = f"""SELECT row.* {in_session("links CROSS JOIN v_fixes")} AND row.station = links.name
+    ORDER BY row.id"""
+_JOINTS_MEASURED = f"SELECT row.* {in_session('v_joints')} ORDER BY row.boot_id, row.monotonic_ns"
 _OPEN = """SELECT id, started_utc_ns, started_monotonic_ns, started_boot_id FROM calibration_sessions
     WHERE rig = ? AND state = 'open' ORDER BY rowid DESC LIMIT 1"""
 

@@ -44,6 +44,19 @@ def iso(column: str) -> str:
     )
 
 
+def in_session(table: str) -> str:
+    """SQL of FROM and WHERE: the rows of `table`, as `row`, from a session's start to its end.
+
+    Boot by boot, because SQLite searches an index by the first column alone where two are compared at once. The
+    session's name is the parameter `:session`.
+    """
+    return f"""FROM calibration_sessions AS session CROSS JOIN boots AS boot CROSS JOIN {table} AS row
+WHERE session.id = :session AND boot.id BETWEEN session.started_boot_id AND session.ended_boot_id
+    AND row.boot_id = boot.id
+    AND row.monotonic_ns >= iif(boot.id = session.started_boot_id, session.started_monotonic_ns, {-(2**63)})
+    AND row.monotonic_ns <= iif(boot.id = session.ended_boot_id, session.ended_monotonic_ns, {2**63 - 1})"""
+
+
 def channels_of(db: Database) -> list[Channel]:
     """Return the channels that a store knows, joints first."""
     return [Channel(name, unit, kind == "joint") for name, unit, kind in db.execute(_CHANNELS).fetchall()]
