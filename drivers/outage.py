@@ -8,7 +8,7 @@ from drivers.clock import Stamp
 from drivers.readings import DeviceEvent, EventKind, Gap, GapReason, LinkItem
 
 BACKOFF_FIRST_S = 0.5
-BACKOFF_MAX_S = 2.0  # a device that is back is found within this, even where nothing tells that it is
+BACKOFF_MAX_S = 1.5  # a device that is back is read within 2 s, even where nothing tells that it is
 
 
 class Backoff:

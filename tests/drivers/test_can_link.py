@@ -230,7 +230,7 @@ def test_sync_is_sent_at_its_period_without_drift_and_captured_as_sent() -> None
 def test_waiting_times_double_to_a_limit_and_are_the_same_every_time() -> None:
     backoff = Backoff()
     waits = [backoff.next_s() for _ in range(5)]
-    assert waits == [0.5, 1.0, 2.0, 2.0, 2.0]
+    assert waits == [0.5, 1.0, 1.5, 1.5, 1.5]
     backoff.reset()
     assert backoff.next_s() == 0.5
 
