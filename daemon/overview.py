@@ -76,7 +76,7 @@ class Overview:
             "rig": self.parts.rig.name,
             "mode": self.parts.mode,
             "version": importlib.metadata.version("rigcal"),
-            "clock": {"utc_ns": clock.now().utc_ns, "real_s_per_s": clock.real_seconds(1.0)},
+            "time": {"utc_ns": clock.now().utc_ns, "real_s_per_s": clock.real_seconds(1.0)},
             "alarms": self.alarms.status(),
             "notices": self.notices.status(),
             "acquisition": asdict(self.acquisition()),

@@ -28,8 +28,8 @@ STALLED_S = 20.0
 # Of acquisition's status: what the page shows. The rest is for metrics and `rigcal status`.
 _ACQUISITION = ("links", "channels", "stations", "decoding", "gaps", "writer_lag_p99_s", "error", "is_behind")
 _STATUS = (
-    *("rig", "mode", "version", "clock", "alarms", "notices", "session", "control_shots", "jobs", "models", "gap"),
-    *("events", "store_health", "unreadable"),
+    *("rig", "mode", "version", "time", "clock", "alarms", "notices", "session", "control_shots", "jobs", "models"),
+    *("gap", "events", "store_health", "unreadable"),
 )
 
 

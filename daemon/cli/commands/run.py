@@ -84,8 +84,8 @@ def run(
 
     A replay keeps its store in a directory of its own, beside the configured one's.
     """
-    if rig is not None and not sim:
-        raise click.UsageError("--rig goes with --sim; a configuration names its rig itself")
+    if not sim and (is_by_hand or rig is not None):
+        raise click.UsageError("--rig and --by-hand are for a simulated rig: give --sim as well")
     from daemon.composition import live, replayed, simulated
     from daemon.config import load_rig, parse_config, read_config
     from daemon.service import Daemon, stop_on_signals
@@ -94,8 +94,6 @@ def run(
     set_up_logging(level=logging.DEBUG if verbose else logging.INFO)
     if not verbose:
         logging.getLogger("can").setLevel(logging.WARNING)  # python-can tells of every socket that it makes
-    if is_by_hand and not sim:
-        raise click.UsageError("--by-hand is for a simulated rig: give --sim as well")
     if bool(files) != is_replay or (sim and is_replay):
         raise click.UsageError("give either --sim, or --replay FILE..., or neither")
     if config is not None:

@@ -10,7 +10,7 @@ const ACTIONS = {
 
 export function alarmList(now, app) {
   const { active, looked_age_s: looked } = now.alarms;
-  const late = looked * (now.clock.real_s_per_s || 1) > 30;
+  const late = looked * (now.time.real_s_per_s || 1) > 30;
   return [
     h("h2", { id: "alarms-title" }, active.length ? `Alarms (${active.length})` : "No alarms"),
     late ? h("p", { class: "bad" }, `The daemon is held up: alarms were last looked at ${duration(looked)} ago.`) : null,

@@ -70,6 +70,6 @@ export class Live {
   /** Real seconds since something that was `age` seconds old, on the daemon's clock, when the state was made. */
   ageOf(age) {
     if (age === null || age === undefined) return null;
-    return age * (this.state?.clock.real_s_per_s || 1) + this.age;
+    return age * (this.state?.time.real_s_per_s || 1) + this.age;
   }
 }

@@ -56,7 +56,7 @@ export function mount(root, app) {
 function figuresOf(now, app) {
   const health = now.store_health;
   const disk = health.free_bytes === null ? "\u2013" : fixed(health.free_bytes / 2 ** 30, health.free_bytes < 2 ** 33 ? 1 : 0);
-  const clock = new Date(now.clock.utc_ns / 1e6).toISOString();
+  const clock = new Date(now.time.utc_ns / 1e6).toISOString();
   return [
     ["Clock of the rig", clock.slice(11, 16), "UTC", clock.slice(0, 10)],
     ["Free disk", disk, "GiB", health.is_low ? "nearly full" : ""],
