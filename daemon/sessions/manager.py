@@ -25,9 +25,9 @@ from daemon.commands import (
     text_argument,
 )
 from daemon.config import SessionsSection
+from daemon.host.time_service import ClockState
 from daemon.sessions.advice import SessionAdvice, after_a_move
 from daemon.sessions.control_shot import Shot
-from daemon.host.time_service import ClockState
 from daemon.sessions.lifecycle import SessionLifecycle
 from daemon.sessions.open_session import OpenSession
 from daemon.sessions.prism_guard import MotionLimit, Suspicion

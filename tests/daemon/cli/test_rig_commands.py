@@ -106,7 +106,7 @@ def test_a_rig_survives_the_way_out_and_in(panda: Path, tmp_path: Path) -> None:
         (("rig", "import", "{urdf}", "--convention", "dh", "--out", "o"), "is for a table"),
         (("rig", "export", "ur10", "--out", "o.stl"), "ends in one of"),
         (("rig", "check", "nowhere.toml"), "neither a shipped rig"),
-        (("run", "--rig", "ur10"), "--rig goes with --sim"),
+        (("run", "--rig", "ur10"), "--rig and --by-hand are for a simulated rig"),
         (("simulate", "--rig", "ur10", "--poses", "3", "--effect", "nix@q1", "--out", "o"), "unknown effect"),
         (("simulate", "--rig", "ur10", "--poses", "3", "--effect", "backlash@q9", "--out", "o"), "it acts at"),
     ],
