@@ -14,7 +14,7 @@ from typing import Any
 
 import click
 
-from daemon.cli.terminal import echo
+from daemon.cli.terminal import begin_screen, draw_screen, echo, end_screen
 from daemon.commands import WRONG_USE, CommandError
 from daemon.host.safe_output import shown
 
@@ -90,22 +90,24 @@ def _lead_in_lines(say: Say) -> Mapping[str, Any]:
 
 def _lead_watched(say: Say) -> Mapping[str, Any]:
     """Redraw the present step five times a second."""
-    height, note = 0, ""
-    with _keys() as key:
-        while True:
-            guide = _guide(say("guide.state"))
-            lines = screen(guide, shutil.get_terminal_size().columns)
-            if note:
-                lines.append(note)
-            click.echo(f"\x1b[{height}A\x1b[J" if height else "", nl=False)
-            for line in lines:
-                click.echo(line)
-            height = len(lines)
-            if guide["state"] != "open":
-                return guide
-            pressed = key(LOOK_S)
-            if pressed:
-                note = _obey(pressed, guide["step"], say)
+    note = ""
+    begin_screen()
+    try:
+        with _keys() as key:
+            while True:
+                guide = _guide(say("guide.state"))
+                lines = [*screen(guide, shutil.get_terminal_size().columns), *([note] if note else [])]
+                draw_screen([(line, {}) for line in lines])
+                if guide["state"] != "open":
+                    break
+                pressed = key(LOOK_S)
+                if pressed:
+                    note = _obey(pressed, guide["step"], say)
+    finally:
+        end_screen()
+    for line in lines:
+        echo(line)
+    return guide
 
 
 def _obey(pressed: str, step: Mapping[str, Any], say: Say) -> str:
@@ -131,7 +133,6 @@ def _with_reason(say: Say, step: Mapping[str, Any], *, rest: bool) -> str:
     with _line_mode():
         with contextlib.suppress(click.Abort):
             reason = click.prompt("why", default="", show_default=False)
-        click.echo("\x1b[1A\x1b[J", nl=False)
     if not reason.strip():
         return "nothing was skipped: a reason is needed"
     say("guide.skip", step=step["id"], reason=reason, rest=rest)

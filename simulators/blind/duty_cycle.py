@@ -8,7 +8,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
 
 from calibration.rig.description import Rig
 from simulators.hydraulics import CURRENT_DITHER_MA, PRESSURE_NOISE_BAR, motion_columns
@@ -221,6 +220,8 @@ def _path(rig: Rig, n: int, rng: np.random.Generator) -> dict[str, Floats]:
     """Poses at even steps along a path through random way points; no joint goes beyond the way points' own values."""
     way_points = max(3, 1 + -(-n // _POSES_A_WAY_POINT))
     at, steps = np.arange(float(way_points)), np.linspace(0.0, way_points - 1.0, n)
+    from scipy.interpolate import PchipInterpolator
+
     return {k: PchipInterpolator(at, v)(steps) for k, v in random_poses(rig, way_points, rng).items()}
 
 

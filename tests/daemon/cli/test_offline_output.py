@@ -88,7 +88,7 @@ def test_long_work_tells_on_standard_error_what_it_does(monkeypatch: pytest.Monk
     with progress_display(as_json=True) as progress:
         progress(0.5, "fitting")
         assert told.wait(60.0)
-    assert said[-1].endswith("s: fitting (50%)")
+    assert said[-1].endswith("s: fitting (50 %)")
 
 
 def test_traceback_is_shown_only_on_request(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -253,7 +253,7 @@ def test_the_state_comes_five_times_a_second_and_says_what_is_next(page: WebProc
     first = wait_for("a state", events, lambda event: event["daemon"] is None)
     assert (first["rig"], first["guide"]) == ("swdt82", None)
     assert first["next"]["button"]
-    assert first["clock"]["real_s_per_s"] == 1.0
+    assert first["time"]["real_s_per_s"] == 1.0
     began = time.monotonic()
     numbers = [next(events)["number"] for _ in range(20)]
     assert numbers == sorted(set(numbers))
