@@ -130,9 +130,8 @@ def _obey(pressed: str, step: Mapping[str, Any], say: Say) -> str:
 
 def _with_reason(say: Say, step: Mapping[str, Any], *, rest: bool) -> str:
     reason = ""
-    with _line_mode():
-        with contextlib.suppress(click.Abort):
-            reason = click.prompt("why", default="", show_default=False)
+    with _line_mode(), contextlib.suppress(click.Abort):
+        reason = click.prompt("why", default="", show_default=False)
     if not reason.strip():
         return "nothing was skipped: a reason is needed"
     say("guide.skip", step=step["id"], reason=reason, rest=rest)
