@@ -81,7 +81,7 @@ webtest: setup ## the operator's page in headless Chromium, if what it tests has
 blind: setup ## a few blind cases of every kind for the gap workflow; two minutes on two cores
 	$(BIN)/rigcal bench gap --short
 
-BENCHES := acquisition socketcan store_growth year_store store_queries kernels refinement evolution peers far_starts design ur10 table4 zhou2022 prediction gate promotion drift residual gap gap_cases
+BENCHES := acquisition socketcan store_growth year_store store_queries kernels refinement evolution peers far_starts design ur10 table4 zhou2022 prediction many_rows gate promotion drift residual gap gap_cases
 
 bench: setup ## speed and accuracy beside the peers', as ratios; an hour on two cores
 	@for name in $(BENCHES); do echo "== $$name"; $(BIN)/python -m tests.bench.$$name || exit 1; done
