@@ -169,6 +169,7 @@ class Daemon:
             model=self._awaiting_model,
             settle_s=config.sessions.settle_s,
             has_aim=parts.aim is not None,
+            drive=parts.visit if parts.aim is not None else None,  # by hand, commands move both
         )
         self._overview = Overview(
             parts,

@@ -40,7 +40,7 @@ from daemon.store.guides import Standstill
 from daemon.store.sessions import SessionTable
 from daemon.store.setups import control_points
 from daemon.store.store import Store
-from drivers.clock import Clock
+from drivers.clock import NS_PER_S, Clock
 from drivers.readings import Record
 
 log = logging.getLogger(__name__)
@@ -50,6 +50,8 @@ RETRY_S = 5.0  # after something failed that is tried again by itself
 NEEDED_FIXES = 5  # at a pose
 MORE_POSES = 5
 _CANCEL_S = 5.0
+_STANDS_S = 20.0  # of a simulated boom at a pose that it was sent to
+_SENT_AGAIN_S = 120.0
 
 
 class GuideKeeper:
@@ -66,6 +68,8 @@ class GuideKeeper:
         model: the candidate that awaits, for a guide that is finished.
         settle_s: how long the boom must stand at a pose.
         has_aim: something turns the station without an operator.
+        drive: has the boom go to the rows of a pose plan, where something can without an operator; None where nothing
+            can.
     """
 
     def __init__(
@@ -81,7 +85,9 @@ class GuideKeeper:
         model: Callable[[], Mapping[str, Any]],
         settle_s: float,
         has_aim: bool,
+        drive: Callable[[Sequence[Mapping[str, Any]]], int] | None = None,
     ) -> None:
+        self._drive, self._driven = drive, ("", 0)  # step whose pose the boom was sent to, and when
         self._rig, self._store, self._sessions, self._setups, self._clock = rig, store, sessions, setups, clock
         self._model, self._settle_s, self._has_aim = model, settle_s, has_aim
         self._record, self._session_table = GuideRecord(store, rig.name, clock), SessionTable(store, rig.name)
@@ -326,7 +332,20 @@ class GuideKeeper:
             elif job.is_enough and (self._has_aim or is_at_point or run.kind == CHECK):
                 self._happen("left", {}, only_at=step_id)
             elif not job.is_enough:
+                self._send_boom(job)
                 self._look_at_pose(job)
+
+    def _send_boom(self, job: Job) -> None:
+        """Have the boom go to the next pose where no operator is at its levers, and again if it was not measured."""
+        run, number, now_ns = job.run, job.run.next_pose, self._clock.now().monotonic_ns
+        step_id, sent_ns = self._driven
+        if self._drive is None or number is None or run.poses is None:
+            return
+        if step_id == job.step_id and now_ns - sent_ns < _SENT_AGAIN_S * NS_PER_S:
+            return
+        self._driven = job.step_id, now_ns
+        joints = run.poses[number].joints
+        self._drive([{"dwell_s": _STANDS_S} | {joint.column: joints[joint.name] for joint in self._rig.joints}])
 
     def _look_at_pose(self, job: Job) -> None:
         """See whether the pose is reached and measured."""
