@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -12,6 +13,7 @@ from daemon.guide.meter_link import Answer, MeterLink, Place
 from drivers.clock import Clock
 
 AHEAD = 5  # poses that the meter looks ahead
+_MORE_THAN_NEEDED = 1.25  # poses, of those without which a calibration is refused
 
 Take = Callable[[str, list[Pose], str], None]
 """Takes a session, the poses chosen for it, and why there are none ("" where there are)."""
@@ -96,7 +98,7 @@ class Advisor:
             self.trouble = str(answer["error"])
             return
         found = dict(answer["result"])
-        self.trouble, self.coverage = "", found.pop("coverage")
+        self.trouble, self.coverage, needed = "", found.pop("coverage"), int(found.pop("least_poses"))
         self.accuracy = found | {
             "target_mm": job.request.target_mm,
             "prisms": list(prisms),
@@ -106,7 +108,9 @@ class Advisor:
         }
         if found["prism_mm"] is not None and job.run.kind != CHECK:
             forecast = Forecast(found["now_mm"], found["prism_mm"], found["prism_after_5_mm"])
-            reason = stop_reason(forecast, job.request.target_mm, job.run.done, job.run.least)
+            # The sessions of a guide are calibrated with together.
+            least = math.ceil(_MORE_THAN_NEEDED * needed / sum(run.kind != CHECK for run in job.runs))
+            reason = stop_reason(forecast, job.request.target_mm, job.run.done, max(least, job.run.least))
             if reason:
                 self._enough(job.run.session, reason)
 

@@ -392,7 +392,7 @@ def stop_reason(forecast: Forecast, target_mm: float | None, done: int, least: i
         forecast: what is expected.
         target_mm: at which it is enough; None where none was given.
         done: poses of the prism.
-        least: poses that the operator wants in any case.
+        least: poses that a calibration needs, or the operator wants, in any case.
     """
     if done < max(LEAST_POSES, least):
         return ""

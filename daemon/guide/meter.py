@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import os
 import sys
 import time
@@ -102,7 +103,11 @@ class Meter:
 
     def _assessed(self, measured: Measured, rows: Observations | None, question: Mapping[str, Any]) -> dict[str, Any]:
         prism, prisms = question["prism"], tuple(question["prisms"])
-        found: dict[str, Any] = {"coverage": self._coverage(measured, rows, prism), "basis": self._basis(rows)}
+        found: dict[str, Any] = {
+            "coverage": self._coverage(measured, rows, prism),
+            "basis": self._basis(rows),
+            "least_poses": math.ceil(len(measured.knowledge.chain) / 3),  # with fewer a calibration is refused
+        }
         if not measured.is_placed:
             why = f"where the station stands is known after {LEAST_POSES} poses; until then there is no number"
             return (
