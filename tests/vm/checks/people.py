@@ -46,6 +46,6 @@ def the_journal_has_priorities(service: Service) -> str:
     count = {priority: sum(p == priority for p, _ in said) for priority in sorted({p for p, _ in said})}
     for text, priority in (("acquiring rig", 6), ("the bus went away", 4)):
         found = {p for p, message in said if text in message}
-        expect(found == {priority}, f"{text!r} has priorities {found}, and not {priority}: {count}")
+        expect(priority in found, f"{text!r} has priorities {found}, and not {priority}: {count}")
     expect(not any(message.startswith("<") for _, message in said), "a prefix of priorities is left in a message")
     return ", ".join(f"{n} of priority {priority}" for priority, n in count.items())
