@@ -97,9 +97,10 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DaemonProcess]:
 
 @pytest.fixture
 def guide(daemon: DaemonProcess) -> Iterator[dict[str, Any]]:
-    """A guide at its first step, and no guide afterwards."""
+    """A guide at its first step, at a set-up of its own, and no guide afterwards."""
     daemon.say("simulation.aim", target="r")
-    yield daemon.say("guide.start", prisms=["r"], poses=6, check_poses=0, operator="Ada")["guide"]
+    setup = {"id": f"G{len(daemon.say('setup.list'))}"}
+    yield daemon.say("guide.start", new_setup=setup, prisms=["r"], poses=6, check_poses=0, operator="Ada")["guide"]
     if state(daemon)["state"] == "open":
         daemon.say("guide.stop", reason="the test is over")
 
