@@ -22,6 +22,10 @@ COUNTED = (
     "tests/drivers/",
     "tests/golden/",
     "tests/daemon/store/",
+    "tests/daemon/acquisition/test_redecoding.py",
+    "tests/daemon/models/test_registry.py",
+    "tests/daemon/sessions/test_session_store_order.py",
+    "tests/daemon/sessions/test_sessions.py",
     *(
         f"tests/calibration/{folder}/"
         for folder in ("design", "evaluation", "experiments", "identification", "model", "published", "rig")
