@@ -88,8 +88,8 @@ def calibrate(
     from daemon.config import load_rig
     from daemon.jobs.checkpoint import FileCheckpoint
     from daemon.models import model_files
-    from daemon.report.calibration import calibration_report
-    from daemon.report.from_model import facts_of, report_input
+    from daemon.report.calibration.from_model import facts_of, report_input
+    from daemon.report.calibration.page import calibration_report
 
     source = load_rig(rig, signals)
     _check_effects(effects, method, source.rig)

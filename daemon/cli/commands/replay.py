@@ -61,8 +61,8 @@ def replay(
     """
     from daemon.cli.log_replay import replay_logs, whole_session
     from daemon.config import load_rig, read_config
+    from daemon.sessions.export.session_file import read_session_file
     from daemon.sessions.replay import stored_readings
-    from daemon.sessions.session_file import read_session_file
     from daemon.store.reader import Reader
 
     settings = read_config(config)

@@ -161,7 +161,7 @@ def rig_export(path: str, out: Path, *, as_json: bool) -> dict[str, Any]:
 
 
 def _show(found: RigCheck) -> None:
-    from daemon.cli.sketch import sketch
+    from daemon.cli.lines.sketch import sketch
     from daemon.report.drawing import forward_axis
 
     rig, seen = found.rig, found.seen

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from sqlite_utils import Database
 
-from daemon.store.canned_queries import Query, canned_queries
 from daemon.store.describe.words import TABLES, VIEWS, Words, channel_meaning
 from daemon.store.errors import StoreError
+from daemon.store.queries.canned_queries import Query, canned_queries
 from daemon.store.store import Store
 from daemon.store.views import Channel, channels_of
 

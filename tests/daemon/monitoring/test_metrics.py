@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from daemon.acquisition.status_board import StatusBoard
+from daemon.acquisition.status.board import StatusBoard
 from daemon.composition import live
 from daemon.config import ConfigError, load_rig, parse_config
 from daemon.control.protocol import request

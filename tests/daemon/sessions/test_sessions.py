@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from calibration.observations import parse_observations
-from daemon.acquisition.present_state import expected_of
-from daemon.cli.state_lines import show_session
+from daemon.acquisition.status.present import expected_of
+from daemon.cli.lines.state import show_session
 from daemon.commands import CommandError
 from daemon.config import Config, SessionsSection, load_rig
 from daemon.control.server import ControlServer
