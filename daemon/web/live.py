@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from daemon.commands import CommandError
+from daemon.next_step import next_for_page
 from daemon.web.daemon_client import DaemonConnection
-from daemon.web.next_step import next_step
 from drivers.clock import NS_PER_S, SystemClock
 
 PERIOD_S = 0.15  # between two readings of the state
@@ -123,5 +123,6 @@ def shown_state(status: Mapping[str, Any], guide: dict[str, Any] | None) -> dict
         **{key: status[key] for key in _STATUS},
         "acquisition": {key: acquisition[key] for key in _ACQUISITION},
         "guide": guide,
-        "next": next_step(status, guide),
+        # Of the guide as it is shown, which may be a step further than the status.
+        "next": next_for_page({**status, "guide": guide if guide and guide["state"] == "open" else None}),
     }
