@@ -100,7 +100,7 @@ class JobsSection(_Section):
 
 
 class StoreSection(_Section):
-    """What the store keeps, and its backups. Sessions, what was captured in them, and models are always kept.
+    """Contents of the store that are kept, and its backups. Sessions, their captures, and models are always kept.
 
     Attributes:
         keep_days: captures and readings outside sessions that are older are deleted; kept while there is room when

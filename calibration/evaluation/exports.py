@@ -22,7 +22,7 @@ _SEED = 0
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What an export lacks of its model, and what that costs.
+    """The parts of its model that an export lacks, and what that costs.
 
     Attributes:
         parts: phrases, such as `joint_compliance@q2`; none where it lacks nothing.
@@ -126,7 +126,7 @@ class Export:
 
     @cached_property
     def kinematics_alone(self) -> LeftOut:
-        """What a format leaves out that has the identified kinematics and nothing else."""
+        """Return what a format leaves out that has the identified kinematics and nothing else."""
         return self.without(lambda _: False)
 
     def without(self, keeps: Callable[[FittedEffect], bool]) -> LeftOut:

@@ -1,4 +1,4 @@
-"""What `rigcal doctor` looks at: the computer, the configuration, and what a running daemon knows.
+"""Findings of `rigcal doctor` on the computer, the configuration, and a running daemon.
 
 Nothing is sent to any bus, instrument or server, no device is opened, and nothing is changed.
 """

@@ -1,4 +1,4 @@
-"""Where the rigs of a fleet are found: stores of daemons, and directories of observations."""
+"""Sources of a fleet's rigs: stores of daemons, and directories of observations."""
 
 from __future__ import annotations
 
