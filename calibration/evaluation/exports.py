@@ -192,6 +192,7 @@ class Format:
     Attributes:
         name: as `--format` has it.
         file: name of the file that it writes.
+        about: what the file is, a phrase for the command's help.
         content: makes its content.
         left_out: says what it lacks of the model, and what that costs.
         is_default: True if it is written when no format is asked for.
@@ -199,6 +200,7 @@ class Format:
 
     name: str
     file: str
+    about: str
     content: Callable[[Export], bytes]
     left_out: Callable[[Export], LeftOut] = lambda _: LeftOut(())
     is_default: bool = False
