@@ -15,7 +15,6 @@ from typing import Any
 import pytest
 
 from daemon.commands import REFUSED, CommandError
-from daemon.next_step import next_line
 from tests.daemon.daemon_process import DaemonProcess
 from tests.simulated.guided_operator import GuidedOperator
 
@@ -110,7 +109,7 @@ def guide(daemon: DaemonProcess) -> Iterator[dict[str, Any]]:
 @pytest.mark.usefixtures("guide")
 def test_commands_that_a_guide_gives_itself_are_refused_with_the_next_step(daemon: DaemonProcess) -> None:
     daemon.wait("the session", lambda: state(daemon)["session"])
-    assert next_line(daemon.say("status")).startswith("aim the station at control point cp1")
+    assert daemon.say("status")["guide"]["step"]["title"] == "Shoot control point cp1"
     for command, arguments in (
         ("session.start", {"prism": "r"}),
         ("session.stop", {}),
