@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 from daemon.acquisition.status.snapshot import AcquisitionStatus
 from daemon.alarms.board import AlarmBoard
 from daemon.composition import Parts
+from daemon.guide.keeper import GuideKeeper
 from daemon.models.drift import gap_status
 from daemon.models.registry import ModelRegistry
 from daemon.monitoring.notices import Notices
@@ -42,7 +43,7 @@ class Overview:
         store: open for writing.
         store_health, acquisition: tell of the store and of acquisition.
         clock: tells of the computer's clock; None where it is not known, or is another one.
-        alarms, notices, sessions, jobs, models, model_table: the parts.
+        alarms, notices, sessions, guide, jobs, models, model_table: the parts.
     """
 
     parts: Parts
@@ -53,6 +54,7 @@ class Overview:
     alarms: AlarmBoard
     notices: Notices
     sessions: SessionKeeper
+    guide: GuideKeeper
     jobs: JobTable
     models: ModelRegistry
     model_table: ModelTable
@@ -82,6 +84,7 @@ class Overview:
             "acquisition": asdict(self.acquisition()),
             "clock": self.clock(),
             "session": stored("session", self.sessions.open_session),
+            "guide": self.guide.now(),
             "setup": stored("setup", lambda: _setup(setups.newest())),
             "control_shots": stored("control_shots", setups.newest_shots) or [],
             "jobs": stored("jobs", self.jobs.unfinished) or [],

@@ -7,7 +7,7 @@ import os
 import signal
 import sqlite3
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,24 +15,14 @@ from typing import Any
 from calibration.rig.description import Rig
 from daemon.acquisition.acquisition import Acquisition
 from daemon.acquisition.clock_watch import ClockWatch
-from daemon.acquisition.redecoding import redecode_command
 from daemon.acquisition.status.present import expected_of
 from daemon.acquisition.thinning import Thinning
 from daemon.alarms.board import AlarmBoard
 from daemon.alarms.evidence import Gatherer
-from daemon.commands import (
-    FAILED,
-    REFUSED,
-    CommandError,
-    Handler,
-    go_on_for_caller,
-    reading_socket,
-    text_argument,
-)
 from daemon.composition import Parts, motion_limits
 from daemon.config import Config
-from daemon.control.protocol import reading_only
 from daemon.control.server import ControlServer
+from daemon.control_commands import Commands, control_servers
 from daemon.guide.keeper import GuideKeeper
 from daemon.guide.meter_link import Place
 from daemon.host.systemd import Notifier
@@ -49,7 +39,7 @@ from daemon.monitoring.time_watch import TimeWatch
 from daemon.overview import Overview
 from daemon.sessions.manager import SessionKeeper
 from daemon.sessions.station_setups import SetupBook
-from daemon.store.errors import storage_errors, storage_sentence, unwritable_errors
+from daemon.store.errors import storage_errors, storage_sentence
 from daemon.store.health import StoreHealth, StoreWatch
 from daemon.store.queries.alarms import AlarmTable
 from daemon.store.queries.jobs import JobTable
@@ -60,12 +50,10 @@ from daemon.store.queries.setups import SetupTable
 from daemon.store.store import Store
 from daemon.store.upkeep.housekeeping import Housekeeping, Keeping
 from drivers.clock import NS_PER_S, TimeBudget
-from drivers.errors import DeviceError, TransmitForbiddenError
 from drivers.readings import Record
 
 log = logging.getLogger(__name__)
 
-GUARDED = ("setup.new", "session.start", "session.stop", "session.abort", "session.shoot")  # a guide does them itself
 BEAT_S = 1.0
 STOP_S = 20.0  # real seconds for all parts together, well within the unit's TimeoutStopSec
 STORE_END_S = 3.0  # of them for the store's last commits
@@ -180,11 +168,27 @@ class Daemon:
             self._alarms,
             self._notices,
             self._sessions,
+            self._guide,
             self._job_table,
             self._models,
             self._model_table,
         )
-        self._servers, self._unserved = control_servers(config, self._commands())
+        commands = Commands(
+            parts,
+            store,
+            lambda: self._watch.health,
+            self._housekeeping,
+            self._setups,
+            self._sessions,
+            self._jobs,
+            self._models,
+            self._tip,
+            self._alarms,
+            self._notices,
+            self._guide,
+            self._overview,
+        )
+        self._servers, self._unserved = control_servers(config, commands.handlers())
         metrics = config.metrics
         self._metrics = None if metrics is None else MetricsServer(metrics.port, lambda: self._overview.command({}))
 
@@ -296,78 +300,6 @@ class Daemon:
         except sqlite3.Error as error:
             log.error("the end of this run could not be stored: %s", storage_sentence(self._store.path, error))
 
-    def _on_records(self, records: Sequence[Record]) -> None:
-        try:
-            self._sessions.on_records(records)  # feeds the joiner, which the tip looks at
-        finally:
-            self._tip.on_records(records)  # also when an observation cannot be stored: an encoder may have jumped
-            self._guide.on_records(records)
-
-    def _commands(self) -> Mapping[str, Handler]:
-        sessions, jobs, models = self._sessions, self._jobs, self._models
-        commands: dict[str, Handler] = {
-            "status": self._overview.command,
-            "rig.show": self._show_rig,
-            "setup.new": self._setups.new_command,
-            "setup.list": self._setups.list_command,
-            "session.start": self._start_session,
-            "session.stop": sessions.stop_command,
-            "session.abort": sessions.abort_command,
-            "session.shoot": sessions.shoot_command,
-            "session.confirm-prism": sessions.confirm_prism_command,
-            "session.accept": sessions.accept_command,
-            "session.list": sessions.list_command,
-            "session.show": sessions.show_command,
-            "jobs.list": jobs.list_command,
-            "jobs.cancel": jobs.cancel_command,
-            "jobs.retry": jobs.retry_command,
-            "model.list": models.list_command,
-            "model.show": models.show_command,
-            "model.accept": models.accept_command,
-            "model.reject": models.reject_command,
-            "model.rollback": models.rollback_command,
-            "model.zeros-checked": models.zeros_checked_command,
-            "model.compare": models.compare_command,
-            "tip": self._tip.tip_command,
-            "alarms.list": self._alarms.list_command,
-            "alarms.test-notice": self._notices.try_command,
-            "devices.configure": self._configure_devices,
-            "store.prune": self._prune,
-            "store.redecode": self._redecode,
-            "guide.start": self._start_guide,
-            "guide.state": self._guide.state_command,
-            "guide.done": self._guide.done_command,
-            "guide.skip": self._guide.skip_command,
-            "guide.more": self._guide.more_command,
-            "guide.stop": self._guide.stop_command,
-            **({} if self._parts.visit is None else {"simulation.visit": self._visit}),
-            **({} if self._parts.turn is None else {"simulation.aim": self._turn}),
-        }
-        commands |= {name: self._guide.guarding(name, commands[name]) for name in GUARDED}
-        return {name: partial(self._carry_out, handler) for name, handler in commands.items()}
-
-    def _carry_out(self, handler: Handler, arguments: Mapping[str, Any]) -> Any:
-        with unwritable_errors(self._store.path):
-            return handler(arguments)
-
-    def _start_session(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Open a session, unless its store would be lost when the daemon stops."""
-        health = self._watch.health
-        if health.state in ("missing", "replaced"):
-            raise CommandError(f"no session is started: {health.text}", REFUSED)
-        return self._sessions.start_command(arguments)
-
-    def _show_rig(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the rig's name and the text of the file that describes it."""
-        return {"rig": self._parts.rig.name, "text": self._parts.rig_text}
-
-    def _start_guide(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Open a guide, unless its store would be lost when the daemon stops."""
-        health = self._watch.health
-        if health.state in ("missing", "replaced"):
-            raise CommandError(f"no guide is started: {health.text}", REFUSED)
-        return self._guide.start_command(arguments)
-
     def _awaiting_model(self) -> dict[str, Any]:
         """Return the candidate that awaits for a guide that is finished, and how many jobs are still at work."""
         waiting = self._models.status()["candidate"]
@@ -378,52 +310,12 @@ class Daemon:
             about["sentence"] = compared and compared["sentence"]
         return about | {"jobs": len(self._job_table.unfinished())}
 
-    def _turn(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Turn the simulated station to a prism or a control point."""
-        target = text_argument(arguments, "target")
-        assert self._parts.turn is not None  # else there is no such command
-        self._parts.turn(target)
-        return {"target": target}
-
-    def _visit(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Send the simulated boom to the rows of a pose plan; `left` tells how many stops are to come."""
-        rows = arguments.get("poses", [])
-        if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-            raise CommandError("poses: the rows of a plan, as `rigcal plan --json` prints them")
-        assert self._parts.visit is not None  # else there is no such command
-        return {"left": self._parts.visit(rows)}
-
-    def _prune(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Delete captures and readings outside sessions that are older than so many days."""
-        return self._housekeeping.prune_command(arguments, go_on_for_caller)
-
-    def _redecode(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Make all readings and fixes of a session, or of some time, again from raw captures."""
-        return redecode_command(self._store, self._parts.decoders, arguments, go_on_for_caller)
-
-    def _configure_devices(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Set up CANopen devices, if the operator says that the machine is parked."""
-        if arguments.get("machine_is_parked") is not True:
-            raise CommandError(
-                "say that the machine is parked and locked out (--machine-is-parked): set-up writes to devices"
-            )
-        links = [link for link in self._parts.can_links if link.has_setups]
-        if not links:
-            raise CommandError("no CAN link of this rig has CANopen nodes to set up")
+    def _on_records(self, records: Sequence[Record]) -> None:
         try:
-            for link in links:
-                link.check_setup()  # all before any: nothing is half done
-            for link in links:
-                link.request_setup()
-        except TransmitForbiddenError as error:
-            raise CommandError(f"{error}; set-up needs allow_transmit = true and transmit_nodes", REFUSED) from error
-        except DeviceError as error:
-            raise CommandError(str(error), FAILED) from error
-        names = ", ".join(link.name for link in links)
-        return {
-            "links": names,
-            "text": f"the nodes on {names} are being set up; `rigcal status` shows what comes of it",
-        }
+            self._sessions.on_records(records)  # feeds the joiner, which the tip looks at
+        finally:
+            self._tip.on_records(records)  # also when an observation cannot be stored: an encoder may have jumped
+            self._guide.on_records(records)
 
 
 def _stop_part(stop: Callable[[], None]) -> None:
@@ -444,25 +336,6 @@ def tip_sender(config: Config, parts: Parts, tip: LiveTip) -> TipSender | None:
         return None
     link = next((link for link in parts.can_links if link.name == config.tip.can.link), None)
     return None if link is None else TipSender(tip, config.tip, config.tip.can, link)
-
-
-def control_servers(config: Config, commands: Mapping[str, Handler]) -> tuple[list[ControlServer], dict[str, str]]:
-    """Start the control socket, and the one for those who may only look where a group of them is configured.
-
-    Returns:
-        The servers, and the name of a socket that could not be made -> why.
-
-    Raises:
-        CommandError: the control socket cannot be made.
-    """
-    servers, unserved = [ControlServer(config.socket_path, commands)], {}
-    if config.read_group is not None:
-        path = reading_socket(config.socket_path)
-        try:
-            servers.append(ControlServer(path, reading_only(commands, config.socket_path), group=config.read_group))
-        except CommandError as error:
-            unserved[path.name] = f"members of read_group {config.read_group} cannot look: {error}"
-    return servers, unserved
 
 
 def is_store_new(jobs: JobTable, models: Path) -> bool:

@@ -38,7 +38,7 @@ _SEED = 0
 
 @dataclass(frozen=True)
 class Measured:
-    """What is known of a rig from rows that were measured, before a model is made of them.
+    """Knowledge of a rig from rows that were measured, before a model is made of them.
 
     Attributes:
         knowledge: parameters and covariance of the fit, at the set-up in question; of the build tolerances where

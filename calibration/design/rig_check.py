@@ -1,4 +1,4 @@
-"""What a rig file amounts to: places at the zero pose, reach, links, and the parameters that data can show."""
+"""Check of a rig file: places at the zero pose, reach, links, and the parameters that data can show."""
 
 from __future__ import annotations
 

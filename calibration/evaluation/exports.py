@@ -22,7 +22,7 @@ _SEED = 0
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What an export lacks of its model, and what that costs.
+    """The parts of its model that an export lacks, and what that costs.
 
     Attributes:
         parts: phrases, such as `joint_compliance@q2`; none where it lacks nothing.
@@ -126,7 +126,7 @@ class Export:
 
     @cached_property
     def kinematics_alone(self) -> LeftOut:
-        """What a format leaves out that has the identified kinematics and nothing else."""
+        """Return what a format leaves out that has the identified kinematics and nothing else."""
         return self.without(lambda _: False)
 
     def without(self, keeps: Callable[[FittedEffect], bool]) -> LeftOut:
@@ -192,6 +192,7 @@ class Format:
     Attributes:
         name: as `--format` has it.
         file: name of the file that it writes.
+        about: what the file is, a phrase for the command's help.
         content: makes its content.
         left_out: says what it lacks of the model, and what that costs.
         is_default: True if it is written when no format is asked for.
@@ -199,6 +200,7 @@ class Format:
 
     name: str
     file: str
+    about: str
     content: Callable[[Export], bytes]
     left_out: Callable[[Export], LeftOut] = lambda _: LeftOut(())
     is_default: bool = False

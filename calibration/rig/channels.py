@@ -36,7 +36,7 @@ class Signal(_Quantity):
 
 
 class AnyChannel(_Quantity):
-    """What a joint's reading, or a signal, comes from on the machine's buses; `device` says how it is read.
+    """Source of a joint's reading, or of a signal, on the machine's buses; `device` says how it is read.
 
     Attributes:
         name: the joint it reads, or the name of a signal (`boom_valve`).

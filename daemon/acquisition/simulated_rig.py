@@ -26,6 +26,7 @@ log = logging.getLogger(__name__)
 
 BOOM_SPEED = 0.45  # of the joints' greatest rates
 _REFUSES = 2  # exit status of a simulator that was asked for what there is not
+_ANSWER_S = 60.0
 _HAND_S = 0.02  # how often, in real time, it is looked whether the operator wants the boom elsewhere
 POSES_AHEAD = 30  # drawn at a time, and visited by the short way
 
@@ -190,15 +191,15 @@ class SimulatedRig:
                 raise SimulationError(f"the simulated rig has ended: {error}") from error
             return self._expect(answer, "error")
 
-    def _expect(self, *wanted: str, timeout_s: float = 60.0) -> dict[str, Any]:
+    def _expect(self, *wanted: str) -> dict[str, Any]:
         """Return the next event of the process that is one of `wanted`; other events keep their order."""
 
         def found() -> dict[str, Any] | None:
             return next((e for e in self._events if e["event"] in {*wanted, "ended"}), None)
 
         with self._arrived:
-            if not self._arrived.wait_for(lambda: found() is not None, timeout_s):
-                raise SimulationError(f"the simulated rig did not say {wanted[0]!r} within {timeout_s:g} s")
+            if not self._arrived.wait_for(lambda: found() is not None, _ANSWER_S):
+                raise SimulationError(f"the simulated rig did not say {wanted[0]!r} within {_ANSWER_S:g} s")
             answer = found()
             assert answer is not None
             if answer["event"] != "ended":

@@ -1,4 +1,4 @@
-"""What `rigcal doctor` looks at: the computer, the configuration, and what a running daemon knows.
+"""Findings of `rigcal doctor` on the computer, the configuration, and a running daemon.
 
 Nothing is sent to any bus, instrument or server, no device is opened, and nothing is changed.
 """
@@ -110,7 +110,8 @@ def read_configuration(path: Path) -> tuple[Config | None, Finding]:
     from calibration.errors import RigError
     from daemon.commands import CommandError
     from daemon.composition import decoders
-    from daemon.config import load_rig, read_config
+    from daemon.config import read_config
+    from daemon.rig_files import load_rig
     from drivers.errors import DescriptionError
 
     config = None

@@ -29,7 +29,7 @@ FORM = 1  # of the answer; a later one is not read for an earlier one
 
 @dataclass(frozen=True)
 class FleetSettings:
-    """What is done with each rig.
+    """Work on each rig.
 
     Attributes:
         gap: look for missing effects; kinematics alone without.

@@ -145,7 +145,7 @@ def _group(rig: str, answers: list[Answer]) -> Group:
 
 @dataclass(frozen=True)
 class Gain:
-    """What a rig would gain from an action.
+    """Gain of a rig from an action.
 
     Attributes:
         action: calibrate, effects, poses, recalibrate, resolve or look.

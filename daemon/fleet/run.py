@@ -34,7 +34,7 @@ Told = Callable[[int, int, str], None]
 
 
 class Engine(Protocol):
-    """Where the work is done."""
+    """Place where the work is done: this process, worker processes, or a cluster."""
 
     def answers(self, tasks: Iterator[RigTask]) -> Iterator[Answer]:
         """Yield the answer to each task, in any order."""

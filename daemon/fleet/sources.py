@@ -1,4 +1,4 @@
-"""Where the rigs of a fleet are found: stores of daemons, and directories of observations."""
+"""Sources of a fleet's rigs: stores of daemons, and directories of observations."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 from calibration.errors import DataError
 from calibration.rig.description import parse_rig
 from calibration.rig.toml import LONGEST
-from daemon.config import load_rig
 from daemon.fleet.assess import FleetSettings, RigTask
+from daemon.rig_files import load_rig
 from daemon.sessions.export.session_file import read_session_file
 from daemon.sessions.session_data import sessions_csv
 from daemon.store.queries.sessions import session, sessions_of_use

@@ -1,19 +1,18 @@
-"""What a guide knows of what is still to gain: it asks the gain meter's process and keeps the newest answer."""
+"""Advice on what is still to gain: asks the gain meter's process and keeps the newest answer."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
 from daemon.commands import CHECK
-from daemon.guide.job import Forecast, Job, Pose, stop_reason
+from daemon.guide.job import Job, Pose
 from daemon.guide.meter_link import Answer, MeterLink, Place
+from daemon.guide.stop_rule import Forecast, least_poses, stop_reason
 from drivers.clock import Clock
 
 AHEAD = 5  # poses that the meter looks ahead
-_MORE_THAN_NEEDED = 1.25  # poses, of those without which a calibration is refused
 
 Take = Callable[[str, list[Pose], str], None]
 """Takes a session, the poses chosen for it, and why there are none ("" where there are)."""
@@ -108,9 +107,7 @@ class Advisor:
         }
         if found["prism_mm"] is not None and job.run.kind != CHECK:
             forecast = Forecast(found["now_mm"], found["prism_mm"], found["prism_after_5_mm"])
-            # The sessions of a guide are calibrated with together.
-            least = math.ceil(_MORE_THAN_NEEDED * needed / sum(run.kind != CHECK for run in job.runs))
-            reason = stop_reason(forecast, job.request.target_mm, job.run.done, max(least, job.run.least))
+            reason = stop_reason(forecast, job.request.target_mm, job.run.done, least_poses(job, needed))
             if reason:
                 self._enough(job.run.session, reason)
 

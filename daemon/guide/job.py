@@ -20,7 +20,7 @@ events alone, so a guide that is read from the store goes on where it was. Event
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from daemon.commands import CHECK
@@ -361,47 +361,6 @@ _EVENTS: Mapping[str, Callable[[Job, Mapping[str, Any]], Job]] = {
     "failed": lambda job, d: replace(job, trouble=str(d["text"])),
     "stopped": lambda job, d: replace(job, state="abandoned", ended_because=str(d["reason"])),
 }
-
-
-# ---- the stop rule ---------------------------------------------------------------------------------------------------
-
-LEAST_POSES = 6  # of a prism
-WORTHWHILE = 0.05  # five more poses must lower the expected error by this share
-
-
-@dataclass(frozen=True)
-class Forecast:
-    """Expected RMS 3-D error over the work volume, mm.
-
-    Attributes:
-        now_mm: of all prisms measured so far.
-        prism_mm, prism_after_5_mm: of the prism that is measured, now and after five more poses.
-        poses: of the run that it knows of.
-    """
-
-    now_mm: float
-    prism_mm: float
-    prism_after_5_mm: float
-    poses: int = field(compare=False, default=0)
-
-
-def stop_reason(forecast: Forecast, target_mm: float | None, done: int, least: int = 0) -> str:
-    """Return why it is enough, a sentence; "" where more poses are worthwhile.
-
-    Args:
-        forecast: what is expected.
-        target_mm: at which it is enough; None where none was given.
-        done: poses of the prism.
-        least: poses that a calibration needs, or the operator wants, in any case.
-    """
-    if done < max(LEAST_POSES, least):
-        return ""
-    if target_mm is not None and max(forecast.now_mm, forecast.prism_mm) <= target_mm:
-        return f"the expected error, {forecast.prism_mm:.2g} mm, has reached the target of {target_mm:g} mm"
-    gain = 1.0 - forecast.prism_after_5_mm / forecast.prism_mm
-    if gain < WORTHWHILE:
-        return f"five more poses would lower the expected error of {forecast.prism_mm:.2g} mm by {gain:.0%} only"
-    return ""
 
 
 def pose_reasons(run: Run) -> Iterator[dict[str, Any]]:

@@ -30,7 +30,7 @@ Answer = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Place:
-    """Where the meter finds everything.
+    """Place where the meter finds everything.
 
     Attributes:
         store: the database.

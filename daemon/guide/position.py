@@ -1,4 +1,4 @@
-"""Where boom and station are, as a guide sees it: the joints against a pose, the last fixes against control points."""
+"""Positions of boom and station, as a guide sees them: joints against a pose, last fixes against control points."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from daemon.acquisition.joiner import MachineState, ObservationJoiner
 from daemon.guide.job import Pose
 from daemon.sessions.open_session import CONTROL_POINT_RADIUS_MM
 from daemon.sessions.station_setups import Place
+from daemon.store.queries.guides import Standstill
 from drivers.clock import NS_PER_S, Clock
 from drivers.readings import Fix, Record
 from drivers.stations.survey import position_mm
@@ -107,6 +108,11 @@ def tolerance(low: float, high: float) -> float:
 def is_there(rig: Rig, values: Mapping[str, float], pose: Pose) -> bool:
     """Return True if every joint is within its tolerance of a pose."""
     return all(abs(pose[j.name] - values[j.name]) <= tolerance(*j.limits) for j in rig.joints)
+
+
+def joints_of(rig: Rig, standstill: Standstill) -> dict[str, float]:
+    """Return the joints of a standstill, deg or mm."""
+    return {joint.name: float(standstill.values[joint.column]) for joint in rig.joints}
 
 
 def joint_rows(rig: Rig, boom: BoomPosition, pose: Pose | None) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""What an operator asks of a guide: the arguments of `guide.start`, checked."""
+"""Request of an operator for a guide: the arguments of `guide.start`, checked."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from typing import Any
 from calibration.rig.description import Rig
 from daemon.commands import CHECK
 from daemon.guide.job import Job, PlannedPose, Run, Step, pose_reasons
-from daemon.guide.position import BoomPosition, is_there, joint_rows
+from daemon.guide.position import BoomPosition, is_there, joint_rows, joints_of
 from daemon.store.queries.guides import GuideRow, Standstill
 
 _MORE = {"button": "Measure 5 more poses", "command": "guide.more", "arguments": {"poses": 5}}
@@ -17,7 +17,7 @@ _MORE = {"button": "Measure 5 more poses", "command": "guide.more", "arguments":
 
 @dataclass(frozen=True)
 class Around:
-    """What a guide's state needs beside the job itself.
+    """A guide's surroundings: its state beside the job itself.
 
     Attributes:
         boom: the joints now.
@@ -224,8 +224,7 @@ def _after_all(model: Mapping[str, Any] | None) -> str:
 def _hold(rig: Rig, pose: PlannedPose, around: Around) -> dict[str, Any]:
     """Progress at a pose; fixes of a standstill elsewhere are none of its."""
     found = around.standstill
-    at = None if found is None else {j.name: float(found.values[j.column]) for j in rig.joints}
-    fixes = found.fixes if found is not None and at is not None and is_there(rig, at, pose.joints) else 0
+    fixes = found.fixes if found is not None and is_there(rig, joints_of(rig, found), pose.joints) else 0
     return {
         "since_s": around.boom.stands_s,
         "needed_s": around.settle_s,

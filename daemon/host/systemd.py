@@ -79,13 +79,13 @@ def _log_thread_end(end: threading.ExceptHookArgs) -> None:
         log.critical("thread %s has ended", name, exc_info=end.exc_value)
 
 
-def is_journal(stream: TextIO, environ: Mapping[str, str] = os.environ) -> bool:
+def is_journal(stream: TextIO) -> bool:
     """Return whether a stream goes to the journal: it is what JOURNAL_STREAM names (systemd.exec(5))."""
     try:
         found = os.fstat(stream.fileno())
     except (OSError, ValueError, AttributeError):
         return False
-    return environ.get("JOURNAL_STREAM") == f"{found.st_dev}:{found.st_ino}"
+    return os.environ.get("JOURNAL_STREAM") == f"{found.st_dev}:{found.st_ino}"
 
 
 def priority_prefix(level: int) -> str:

@@ -23,6 +23,10 @@ from drivers.clock import NS_PER_S, Stamp
 CHECKS = (JobKind.REPORT, JobKind.COMPARISON)
 CHAIN = (JobKind.GAP, JobKind.RESIDUAL, *CHECKS)
 DRIFT = (JobKind.DRIFT,)
+_QUIET_S = 2.0  # after a session's end: its jobs wait for a next session to begin
+# An interrupted job waits this long times its attempts and interruptions, so that one that kills the daemon or the
+# computer does not do so without pause.
+_RETRY_AFTER_S = 5.0
 # A job is not to blame for power cuts; one that exhausts the computer until it restarts must end all the same.
 MAX_INTERRUPTIONS = 20
 
@@ -87,17 +91,12 @@ class DueComparison:
 Due = DueChain | DueRetry | DueComparison
 
 
-def due_jobs(
-    state: State, now: Stamp, *, quiet_s: float = 2.0, retry_after_s: float = 5.0, max_attempts: int = 3
-) -> list[Due]:
+def due_jobs(state: State, now: Stamp, *, max_attempts: int = 3) -> list[Due]:
     """Return all that should be queued now.
 
     Args:
         state: what the store holds.
         now: the present instant; durations are taken on the monotonic clock, within one boot.
-        quiet_s: how long after a session's end its jobs wait for a next session to begin.
-        retry_after_s: an interrupted job waits this long times its attempts and interruptions, so that one that kills
-            the daemon or the computer does not do so without pause.
         max_attempts: an interrupted job that was started this often is not offered again.
     """
     if _is_open(state):
@@ -107,10 +106,10 @@ def due_jobs(
         for job in state.jobs
         if job.state == "interrupted"
         and not _is_spent(job, max_attempts)
-        and _passed(job.ended, now, retry_after_s * (job.attempts + job.interruptions))
+        and _passed(job.ended, now, _RETRY_AFTER_S * (job.attempts + job.interruptions))
     ]
     closed = [s for s in state.sessions if s.state == "closed"]
-    if not closed or not _passed(closed[-1].ended, now, quiet_s):
+    if not closed or not _passed(closed[-1].ended, now, _QUIET_S):
         return due
     training = [s for s in closed if s.kind != CHECK]
     checks = [s for s in closed if s.kind == CHECK]

@@ -1,1 +1,1 @@
-"""What leaves the daemon for people who are elsewhere: metrics, and notices of alarms."""
+"""Metrics, and notices of alarms, for people who are elsewhere."""

@@ -47,7 +47,7 @@ class Notice:
         return shown(f"{first} {self.kind} {self.subject}")
 
     def line(self) -> str:
-        """All of it, in one line for people."""
+        """The whole notice in one line for people."""
         at = datetime.fromtimestamp(self.at.utc_ns / NS_PER_S, UTC)
         if self.event == "cleared":
             what = f"{self.text} (over after {duration(self.at.since(self.raised) / NS_PER_S)})"
@@ -71,7 +71,7 @@ class Notice:
 
 @dataclass(frozen=True)
 class Message:
-    """What is delivered at a time.
+    """Notices that are delivered together.
 
     Attributes:
         subject: one line.

@@ -1,4 +1,4 @@
-"""What one target is to be told: kept in memory and in the store, until it was delivered.
+"""Notices for one target: kept in memory and in the store until they were delivered.
 
 A notice shows that it waits although the store cannot be written: it is sent all the same, and its row is written once
 it can be.
@@ -26,7 +26,7 @@ WAITING_MAX = 1000  # in memory; older ones are counted
 
 @dataclass(frozen=True)
 class Pace:
-    """How often a target is told, in real time.
+    """Pace at which a target is told, in real time.
 
     Attributes:
         gather_s: what is to be told is gathered for so long: one fault often raises several alarms.

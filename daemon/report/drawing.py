@@ -92,11 +92,11 @@ def styled() -> AbstractContextManager[None]:
     return matplotlib.rc_context(_STYLE)
 
 
-def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
+def new_figure(height_in: float) -> Figure:
     """Return an empty figure that belongs to no window."""
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width_in, height_in), layout="constrained")
+    return Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
 
 
 def picture(figure: Figure, description: str, caption: str) -> str:

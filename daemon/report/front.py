@@ -22,7 +22,7 @@ Outcome = Literal["passed", "failed", "not judged"]
 
 @dataclass(frozen=True)
 class Facts:
-    """What a report is of; what nobody has said is `not given`.
+    """The subject of a report; what nobody has said is `not given`.
 
     Attributes:
         rig: its name.
@@ -71,7 +71,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether an error is within the tolerance.
+    """Judgement of an error against the tolerance.
 
     Attributes:
         tolerance_mm: that was stated.

@@ -357,7 +357,7 @@ def m015_large_chunks(db: Database) -> None:
 
 @MIGRATIONS()
 def m020_notices(db: Database) -> None:
-    """What was told of alarms to people elsewhere, and what is still to be told."""
+    """Notices of alarms to people elsewhere: those told, and those still to be told."""
     _create(
         db,
         # target: way out of the machine. utc_ns ..: when the alarm was raised or cleared, or a test asked for; raised_:
@@ -394,7 +394,7 @@ def m024_guides(db: Database) -> None:
 
 @MIGRATIONS()
 def m028_session_clocks(db: Database) -> None:
-    """How the computer's clock was when a session began and ended, as its time service told."""
+    """State of the computer's clock when a session began and ended, as its time service told."""
     _create(
         db,
         # synchronized: NULL where nothing told. offset_s: by how much the clock was ahead; NULL where nothing told.

@@ -1,4 +1,4 @@
-"""What may be asked of the daemon from the page, and which role each command needs.
+"""Commands of the daemon that the page may give, and the role that each needs.
 
 What is not named here cannot be done from a browser: setting up devices, deleting from the store, decoding it again,
 driving a simulated boom.

@@ -1,4 +1,4 @@
-"""What every request must fulfil before anything looks at it, and what every answer carries.
+"""Requirements of every request, checked before anything looks at it, and headers of every answer.
 
 A request names this computer by one of its own names (else it comes from a page whose name was pointed at it, DNS
 rebinding); one that may change something comes from the page itself, by its Origin, and holds JSON, which no form of

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from daemon.commands import CommandError
+from daemon.next_step import next_for_page
 from daemon.web.daemon_client import DaemonConnection
-from daemon.web.next_step import next_step
 from drivers.clock import NS_PER_S, SystemClock
 
 PERIOD_S = 0.15  # between two readings of the state
@@ -42,11 +42,10 @@ class LiveFeed:
 
     Args:
         socket: the daemon's control socket.
-        period_s: between two readings.
     """
 
-    def __init__(self, socket: Path, period_s: float = PERIOD_S) -> None:
-        self._socket, self._period_s = socket, period_s
+    def __init__(self, socket: Path) -> None:
+        self._socket = socket
         self._clock = SystemClock()
         self._number = itertools.count(1)
         self._newest: tuple[int, bytes] = (0, b"")
@@ -96,7 +95,7 @@ class LiveFeed:
                     self._newest = number, f"id: {number}\ndata: {text}\n\n".encode()
                     self._told.notify_all()
                 taken_s = (self._clock.monotonic_ns() - began_ns) / NS_PER_S
-                pause_s = self._period_s if state["daemon"] is None else RETRY_S
+                pause_s = PERIOD_S if state["daemon"] is None else RETRY_S
                 await asyncio.sleep(max(pause_s - taken_s, 0.02))
         finally:
             connection.close()
@@ -123,5 +122,6 @@ def shown_state(status: Mapping[str, Any], guide: dict[str, Any] | None) -> dict
         **{key: status[key] for key in _STATUS},
         "acquisition": {key: acquisition[key] for key in _ACQUISITION},
         "guide": guide,
-        "next": next_step(status, guide),
+        # Of the guide as it is shown, which may be a step further than the status.
+        "next": next_for_page({**status, "guide": guide if guide and guide["state"] == "open" else None}),
     }

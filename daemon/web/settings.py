@@ -1,4 +1,4 @@
-"""Where and how the page is served, checked before anything listens."""
+"""Settings of the page's server, checked before anything listens."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 
 @dataclass(frozen=True)
 class WebSettings:
-    """Where and how the page is served.
+    """Settings of the page's server: addresses, certificate, tokens.
 
     Attributes:
         socket: the daemon's control socket.

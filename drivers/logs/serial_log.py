@@ -73,20 +73,12 @@ class SerialLogWriter:
         self._stream.write(f"{seconds}.{nanoseconds:09d} {stamp.monotonic_ns} {direction} {capture.data.hex()}\n")
 
 
-def read_serial_log_header(path: Path) -> SerialLogHeader:
-    """Read the header of a captured file.
-
-    Raises:
-        DescriptionError: it cannot be read, or is no captured serial link; the message names file and line.
-    """
-    return _header(path, _lines(path))
-
-
 def read_serial_log(path: Path) -> Iterator[SerialCapture]:
     """Yield the captures of a file, in its order.
 
     Raises:
-        DescriptionError: it cannot be read, or a line is malformed; the message names file and line.
+        DescriptionError: it cannot be read, is no captured serial link, or a line is malformed; the message names file
+            and line.
     """
     lines = _lines(path)
     link = _header(path, lines).link

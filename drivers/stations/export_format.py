@@ -1,4 +1,4 @@
-"""What a file that an instrument or its office program wrote holds: fixes, and how its columns were understood.
+"""Files that an instrument or its office program wrote: their fixes, and how their columns were understood.
 
 A new format is one new file in `drivers/stations/exports`, with its `FORMAT`.
 """
@@ -24,7 +24,7 @@ RAD_PER: dict[str, float] = {"deg": math.pi / 180, "gon": math.pi / 200, "rad": 
 
 
 class ColumnMap(BaseModel):
-    """How a file is read: guessed from it, written beside the result, and given again with `--map`.
+    """Map of a file's columns: guessed from it, written beside the result, and given again with `--map`.
 
     Attributes:
         format: name of the format.
@@ -77,7 +77,7 @@ class ExportedFix:
 
 @dataclass(frozen=True)
 class Guess:
-    """How a file would be read.
+    """Conclusions on how a file is to be read.
 
     Attributes:
         map: the columns.

@@ -186,19 +186,15 @@ class RigTruth:
         loose = replace_effects(self, ()) if self.effects else self
         return loose._solve(joints, columns or {}, setup).torque(joint)
 
-    def row_moment(
-        self, row: int, joints: Mapping[str, Floats], columns: Mapping[str, Floats] | None = None, *, setup: str = ""
-    ) -> Floats:
+    def row_moment(self, row: int, joints: Mapping[str, Floats]) -> Floats:
         """(n, 3) moment of all weights that turn with a row about the place where it turns, N m, in the base frame.
 
         Args:
             row: its number; `theta` of it is driven.
             joints: as for `gravity_load`.
-            columns: as for `gravity_load`.
-            setup: as for `gravity_load`.
         """
         loose = replace_effects(self, ()) if self.effects else self
-        return loose._solve(joints, columns or {}, setup).turning(row).moment_newton_m
+        return loose._solve(joints, {}, "").turning(row).moment_newton_m
 
     def _solve(self, joints: Mapping[str, Floats], columns: Mapping[str, Floats], setup: str | None) -> LoadedBody:
         read = {}

@@ -26,12 +26,13 @@ from calibration.model.prediction import Predictor
 from calibration.observations import Floats, Observations, parse_observations
 from calibration.pipeline.calibrate import calibrate
 from calibration.rig.description import Rig
-from daemon.config import RigSource, load_rig
-from daemon.guide.job import Forecast, Job, Request, stop_reason
-from daemon.guide.keeper import NEEDED_FIXES
+from daemon.guide.job import Job, Request
 from daemon.guide.meter import Meter, joined
 from daemon.guide.meter_link import Place
 from daemon.guide.position import tolerance
+from daemon.guide.stop_rule import Forecast, least_poses, stop_reason
+from daemon.guide.worker import NEEDED_FIXES
+from daemon.rig_files import RigSource, load_rig
 from simulators.effects.library import parse_effects
 from simulators.rig.truth import RigTruth
 from tests.simulated.observations import simulate_observations
@@ -100,7 +101,7 @@ def guided(source: RigSource, truth: RigTruth, seed: int, most: int, target_mm: 
             slowest_s = max(slowest_s, time.perf_counter() - began)
             if shown["prism_mm"] is not None and not job.is_enough:
                 forecast = Forecast(shown["now_mm"], shown["prism_mm"], shown["prism_after_5_mm"])
-                reason = stop_reason(forecast, target_mm, job.run.done)
+                reason = stop_reason(forecast, target_mm, job.run.done, least_poses(job, shown["least_poses"]))
                 job = job.after("enough", {"reason": reason}) if reason else job
     return Guided(job, joined(meter.rows), shown["now_mm"], slowest_s)
 

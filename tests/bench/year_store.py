@@ -23,8 +23,9 @@ from pathlib import Path
 from daemon.acquisition.link_decoders import LinkDecoders
 from daemon.commands import CommandError
 from daemon.composition import decoders
-from daemon.config import load_rig, parse_config
+from daemon.config import parse_config
 from daemon.control.protocol import request
+from daemon.rig_files import load_rig
 from daemon.service import declare_channels
 from daemon.sessions.export.captured_logs import export_session
 from daemon.store import Reader, Store

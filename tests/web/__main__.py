@@ -18,6 +18,7 @@ PASSED = Passed(
         "daemon/web",
         "daemon/guide",
         "daemon/cli/commands/web.py",
+        "daemon/next_step.py",
         "daemon/store/queries/history.py",
         "tests/web",
         "tests/daemon/web",

@@ -49,4 +49,10 @@ def _content(export: Export) -> bytes:
     return c_header(_writer(export), down, written_effects(export), remarks).encode()
 
 
-FORMAT = Format("c-header", "rigcal_model.h", _content, _left_out)
+FORMAT = Format(
+    "c-header",
+    "rigcal_model.h",
+    "forward kinematics with effects, and the inverse, as one C99 file",
+    _content,
+    _left_out,
+)

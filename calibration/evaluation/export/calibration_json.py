@@ -71,4 +71,11 @@ def _left_out(export: Export) -> LeftOut:
     return export.without(lambda _: True)
 
 
-FORMAT = Format("json", "calibration.json", _content, _left_out, is_default=True)
+FORMAT = Format(
+    "json",
+    "calibration.json",
+    "parameters with units and standard errors, effects, bases, accuracy, provenance",
+    _content,
+    _left_out,
+    is_default=True,
+)

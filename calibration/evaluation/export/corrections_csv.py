@@ -40,4 +40,11 @@ def grid_left_out(export: Export) -> LeftOut:
     return LeftOut(parts, told, grid.rms_mm, grid.p95_mm, grid.max_mm, grid.correction_rms_mm)
 
 
-FORMAT = Format("grid", GRID_FILE, _content, grid_left_out, is_default=True)
+FORMAT = Format(
+    "grid",
+    GRID_FILE,
+    "CSV: at the nodes of a grid of joint values, where each prism is nominally and by the model",
+    _content,
+    grid_left_out,
+    is_default=True,
+)

@@ -11,4 +11,6 @@ def _content(export: Export) -> bytes:
     return dh_text(model.chain, model.values, export.heading(export.kinematics_alone)).encode()
 
 
-FORMAT = Format("dh-csv", "dh.csv", _content, lambda export: export.kinematics_alone)
+FORMAT = Format(
+    "dh-csv", "dh.csv", "the identified Denavit-Hartenberg constants", _content, lambda export: export.kinematics_alone
+)

@@ -56,4 +56,6 @@ def _content(export: Export) -> bytes:
     return out.getvalue()
 
 
-FORMAT = Format("matlab", "model.mat", _content, lambda export: export.kinematics_alone)
+FORMAT = Format(
+    "matlab", "model.mat", "the identified kinematics as a .mat file", _content, lambda export: export.kinematics_alone
+)

@@ -34,4 +34,4 @@ def _content(export: Export) -> bytes:
     return out.getvalue()
 
 
-FORMAT = Format("parquet", "corrections.parquet", _content, grid_left_out)
+FORMAT = Format("parquet", "corrections.parquet", "the grid's table as Parquet", _content, grid_left_out)

@@ -11,4 +11,10 @@ def _content(export: Export) -> bytes:
     return urdf_text(model.chain, model.values, export.heading(export.kinematics_alone)).encode()
 
 
-FORMAT = Format("urdf", "model.urdf", _content, lambda export: export.kinematics_alone)
+FORMAT = Format(
+    "urdf",
+    "model.urdf",
+    "the identified kinematics for ROS, pinocchio and others",
+    _content,
+    lambda export: export.kinematics_alone,
+)

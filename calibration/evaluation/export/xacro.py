@@ -11,4 +11,10 @@ def _content(export: Export) -> bytes:
     return xacro_text(model.chain, model.values, export.heading(export.kinematics_alone)).encode()
 
 
-FORMAT = Format("xacro", "model.xacro", _content, lambda export: export.kinematics_alone)
+FORMAT = Format(
+    "xacro",
+    "model.xacro",
+    "the same with a prefix that the caller gives",
+    _content,
+    lambda export: export.kinematics_alone,
+)

@@ -162,7 +162,7 @@ class StatusBoard:
         *,
         is_behind: bool = False,
     ) -> AcquisitionStatus:
-        """All of it, now.
+        """Return the state of acquisition at this moment.
 
         Args:
             intakes: of all links.

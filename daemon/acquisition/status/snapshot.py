@@ -178,7 +178,7 @@ class GapCount:
 
 @dataclass(frozen=True)
 class EventCount:
-    """Return the number of events of a kind that a device or link had since the start.
+    """The events of one kind that a device or link had since the start.
 
     Attributes:
         device, kind: as of `EventStatus`.

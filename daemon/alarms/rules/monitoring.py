@@ -1,4 +1,4 @@
-"""What leaves the daemon for people who are elsewhere."""
+"""Metrics and notices for people who are elsewhere."""
 
 from __future__ import annotations
 

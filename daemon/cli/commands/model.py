@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -16,7 +16,9 @@ from daemon.control.protocol import request
 from daemon.host.safe_output import write_file
 from daemon.warm_up import prepare
 
-_FORMATS = ("c-header", "dh-csv", "grid", "json", "matlab", "parquet", "urdf", "xacro")
+if TYPE_CHECKING:
+    from calibration.evaluation.exports import Format
+
 _GRIDS = ("grid", "parquet")
 
 
@@ -93,15 +95,34 @@ def model_zeros_checked(operator: str, **where: Any) -> Any:
     return ask(where, "model.zeros-checked", echo, operator=operator)
 
 
-@model.command(cls=Command, name="export")
+class _ExportCommand(Command):
+    """A command whose help lists the export formats, which are found in their folder."""
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 - click's
+        with formatter.section("Formats"):
+            formatter.write_dl([(made.name, made.about) for made in _formats().values()])
+
+
+def _formats() -> Mapping[str, Format]:
+    from calibration.evaluation.export import formats
+
+    return formats()
+
+
+def _completed(_ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
+    return [name for name in _formats() if name.startswith(incomplete)]
+
+
+@model.command(cls=_ExportCommand, name="export")
 @click.argument("number", type=int, required=False)
 @click.option("--model", "directory", type=click.Path(path_type=Path), metavar="DIR", help="A model's directory.")
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True, help="Where to write.")
 @click.option(
     "--format",
     "names",
-    type=click.Choice(_FORMATS),
     multiple=True,
+    shell_complete=_completed,
+    metavar="FORMAT",
     help="What to write: json and grid when not given. May be given again.",
 )
 @click.option("--prism", "prisms", multiple=True, help="Prisms of the grid; all when not given. May be repeated.")
@@ -125,35 +146,26 @@ def model_export(
     *,
     as_json: bool,
 ) -> Any:
-    r"""Write a model for other programs, and say what each form leaves out and what that costs.
+    """Write a model for other programs, and say what each form leaves out and what that costs.
 
     With --model no daemon is needed; else model NUMBER of the running daemon is taken, the live one by default.
-
-    \b
-    json      parameters with units and standard errors, effects, bases, accuracy, provenance
-    grid      CSV: at the nodes of a grid of joint values, where each prism is nominally and by the model
-    parquet   the same table as Parquet
-    urdf      the identified kinematics for ROS, pinocchio and others
-    xacro     the same with a prefix that the caller gives
-    dh-csv    the identified Denavit-Hartenberg constants
-    matlab    the identified kinematics as a .mat file
-    c-header  forward kinematics with effects, and the inverse, as one C99 file
 
     docs/models.md says how to use each. The error of what is left out is measured over the joint values of
     the training.
     """
     if directory is not None and number is not None:
         raise click.UsageError("give either a model's NUMBER or --model DIR")
+    prepare()
+    from calibration.evaluation.export import chosen_formats
+
+    chosen = chosen_formats(names)
     if directory is None:
         found = request(socket_of(socket, config), "model.show", {} if number is None else {"id": number})
         directory = Path(found["path"])
-    prepare()
-    from calibration.evaluation.export import chosen_formats
     from calibration.evaluation.exports import Export
     from daemon.models.model_files import model_sha256, read_model
 
     export = Export(read_model(directory), model_sha256(directory), prisms, rows)
-    chosen = chosen_formats(names)
     contents = {made.file: made.content(export) for made in chosen}
     out.mkdir(parents=True, exist_ok=True)
     for name, data in contents.items():

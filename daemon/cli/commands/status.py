@@ -24,8 +24,9 @@ from daemon.cli.lines.state import (
     station_line,
     store_lines,
 )
-from daemon.cli.lines.summary import next_step, state_sentence, summary
+from daemon.cli.lines.summary import state_sentence, summary
 from daemon.cli.terminal import Coloured, echo, echo_table
+from daemon.next_step import next_line
 
 WIDTH = 100  # where the terminal's is not known
 
@@ -38,7 +39,7 @@ def status(everything: bool, frames: bool, **where: Any) -> Any:
     """Show on one screen what the rig is doing, what is wrong, and what to do next."""
     show = partial(_show_all, frames=frames) if everything or frames else _show
     told = ask(where, "status", show)
-    return told | {"summary": {"state": state_sentence(told), "next": next_step(told)}}
+    return told | {"summary": {"state": state_sentence(told), "next": next_line(told)}}
 
 
 def _show(status: Mapping[str, Any]) -> None:

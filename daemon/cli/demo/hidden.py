@@ -19,7 +19,7 @@ from typing import Any, Literal
 from calibration.rig.description import Rig
 from daemon.cli.demo.operator import DEADLINE_S, PRISMS, RIG, Advance, DemoError, Operator
 from daemon.cli.terminal import echo, echo_error, echo_table
-from daemon.config import load_rig
+from daemon.rig_files import load_rig
 from daemon.sessions.session_data import sessions_csv
 from daemon.store.queries.sessions import first_observation_ns
 from daemon.store.reader import Reader

@@ -8,14 +8,12 @@ from typing import Any, NamedTuple
 
 from daemon.cli.lines.jobs import job_line
 from daemon.cli.lines.state import alarm_line, decoding_lines, gap_state_lines, model_lines, notice_lines, store_lines
-from daemon.commands import CHECK
 from daemon.host.safe_output import duration, shown
+from daemon.next_step import next_line
 from daemon.report.words import number
 
 LINES = 23  # one of a terminal's 24 is the prompt's
 NARROWEST = 60
-ENOUGH_POSES = {CHECK: 5}  # of one session, by its kind
-_ENOUGH_POSES = 25
 _LABEL = 10  # characters
 _NAMES_SHOWN = 6
 _REASONS_SHOWN = 2
@@ -30,9 +28,6 @@ class Line(NamedTuple):
     style: Mapping[str, Any] = {}
 
 
-# ---- one sentence each -----------------------------------------------------------------------------------------------
-
-
 def state_sentence(status: Mapping[str, Any]) -> str:
     """Say in one sentence what the rig is doing."""
     session, jobs, models = status["session"], status["jobs"], status["models"] or {}
@@ -41,6 +36,8 @@ def state_sentence(status: Mapping[str, Any]) -> str:
     if session is not None:
         counted = f"{session['poses']} poses, {session['observations']} observations"
         return f"recording session {session['id']} ({session['kind']}, prism {session['prism']}): {counted}"
+    if (guide := status.get("guide")) is not None:
+        return f"guide {guide['id']} is open, no session is open"
     if any(job["state"] == "running" for job in jobs):
         return "calibrating: a job runs, no session is open"
     links = status["acquisition"]["links"]
@@ -48,65 +45,6 @@ def state_sentence(status: Mapping[str, Any]) -> str:
         return "not connected: no link is open"
     live = models.get("live")
     return f"ready, {'no model' if live is None else 'model ' + str(live['id'])} is live, no session is open"
-
-
-def next_step(status: Mapping[str, Any]) -> str:
-    """Say in one sentence what to do next."""
-    alarms = status["alarms"]["active"]
-    critical = next((alarm for alarm in alarms if alarm["severity"] == "critical"), None)
-    if critical is not None:
-        return f"{critical['subject']}: {critical['remedy']}"
-    if status["session"] is not None:
-        return _in_session(status["session"])
-    if status["jobs"]:
-        return "wait for the jobs; `rigcal watch` follows them, `rigcal jobs list` has their results"
-    return next(_between_sessions(status, alarms))
-
-
-def _in_session(session: Mapping[str, Any]) -> str:
-    points = {
-        phase: {s["point"] for s in session["control_shots"] if s["phase"] == phase} for phase in ("start", "end")
-    }
-    enough = ENOUGH_POSES.get(session["kind"], _ENOUGH_POSES)
-    if suspicions := session.get("prism_suspicions"):
-        return str(suspicions[0]["remedy"])
-    if session["setup_moved"]:
-        return "the station has moved: `rigcal session stop`, then describe where it stands with `rigcal setup new`"
-    if not points["start"] and not points["end"]:
-        return "aim the station at a control point and shoot it: `rigcal session shoot NAME`"
-    if session["poses"] < enough:
-        more = enough - session["poses"]
-        return f"stand still at {more} more pose{'s' if more > 1 else ''}, spread over the ranges of all joints"
-    if missing := sorted(points["start"] - points["end"]):
-        return f"enough poses: shoot the control points again, `rigcal session shoot {missing[0]}`"
-    return "enough poses: `rigcal session stop`; identification, effects, residual and report follow by themselves"
-
-
-def _between_sessions(status: Mapping[str, Any], alarms: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield what there is to do, the most important first."""
-    setup, models, gap = status.get("setup"), status["models"] or {}, status["gap"] or {}
-    live, candidate = models.get("live"), models.get("candidate")
-    if candidate is not None and candidate["is_acceptable"]:
-        yield f"`rigcal model accept {candidate['id']}` makes the better model live"
-    if setup is None or setup["state"] != "ok":
-        yield "describe where the station stands: `rigcal setup new NAME --instrument TYPE`"
-    if gap.get("failed") is not None:
-        yield f"job {gap['failed']['job']} failed: do what it says, or hold another session, `rigcal session start`"
-    if candidate is not None and candidate["comparison"] is None:
-        yield "hold a check session, to compare the new model with: `rigcal session start --kind check --prism NAME`"
-    verdict = gap.get("verdict")
-    if verdict is not None and verdict["verdict"] == "indistinguishable" and verdict["experiments"]:
-        yield f"measure what tells the causes apart: {verdict['experiments'][0]}"
-    if alarms:
-        yield f"{alarms[0]['subject']}: {alarms[0]['remedy']}"
-    if candidate is not None:
-        yield "the new model is no better yet: hold sessions of other prisms or poses, then another check session"
-    if live is None:
-        yield "hold a calibration session: `rigcal session start --prism NAME`; `rigcal plan` proposes poses"
-    yield "nothing needs doing; a check session now and then shows whether the live model still holds"
-
-
-# ---- the screen ------------------------------------------------------------------------------------------------------
 
 
 def summary(status: Mapping[str, Any], width: int, lines: int = LINES, *, with_joints: bool = False) -> list[Line]:
@@ -125,7 +63,7 @@ def summary(status: Mapping[str, Any], width: int, lines: int = LINES, *, with_j
     if with_joints:
         head += _joints(status["acquisition"]["channels"], width)
     body = [line for label, texts in _body(status) for line in _labelled(label, texts, width)]
-    end = _labelled("next", [next_step(status)], width, bold=True)
+    end = _labelled("next", [next_line(status)], width, bold=True)
     room = max(lines - len(head) - len(end) - len(body), 3)
     alarms = _alarms(status["alarms"]["active"], width, room)
     left = max(lines - len(head) - len(end) - len(alarms), 1)

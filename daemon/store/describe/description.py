@@ -11,7 +11,9 @@ from pathlib import Path
 
 from sqlite_utils import Database
 
-from daemon.store.describe.words import TABLES, VIEWS, Words, channel_meaning
+from daemon.store.describe.table_words import TABLES
+from daemon.store.describe.view_words import VIEWS, channel_meaning
+from daemon.store.describe.words import Words
 from daemon.store.errors import StoreError
 from daemon.store.queries.canned_queries import Query, canned_queries
 from daemon.store.store import Store

@@ -1,4 +1,4 @@
-"""What the page draws over time: a session's fixes, drift of the live models, control points, changes of models."""
+"""Histories that the page draws: a session's fixes, drift of the live models, control points, changes of models."""
 
 from __future__ import annotations
 

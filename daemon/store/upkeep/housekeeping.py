@@ -44,7 +44,7 @@ class _StoppedError(Exception):
 
 @dataclass(frozen=True)
 class Keeping:
-    """What the store keeps.
+    """Limits of what the store keeps.
 
     Attributes:
         keep_days: older captures outside sessions go; None for no such limit.
@@ -63,7 +63,7 @@ class Keeping:
 
 @dataclass(frozen=True)
 class KeepingState:
-    """How it goes.
+    """State of housekeeping.
 
     Attributes:
         is_short: there is less room than there should be.

@@ -22,32 +22,32 @@ def pack(channel: RawSignal, value: float) -> bytes:
     return (counts << 64 - first - channel.length_bits & (1 << 64) - 1).to_bytes(8, "big")
 
 
+_PERIOD_S = 0.02
+
+
 class RawSignals:
     """Sends every frame that the channels name, each at the same period.
 
     Args:
         channels: the signals; those of one frame share it.
         sources: channel name -> its value and rate at an instant in simulated seconds.
-        period_s: cycle of all frames.
     """
 
     def __init__(
         self,
         channels: Sequence[RawSignal],
         sources: Mapping[str, Callable[[float], tuple[float, float]]],
-        *,
-        period_s: float = 0.02,
     ) -> None:
         self._frames: dict[tuple[int, bool], list[RawSignal]] = {}
         for channel in channels:
             self._frames.setdefault((channel.arbitration_id, channel.is_extended), []).append(channel)
-        self._sources, self._period_s, self._next_s = sources, period_s, 0.0
+        self._sources, self._next_s = sources, 0.0
 
     def poll(self, now_s: float) -> list[Frame]:
         """Return the frames that are due."""
         if now_s < self._next_s:
             return []
-        self._next_s = now_s + self._period_s
+        self._next_s = now_s + _PERIOD_S
         frames = []
         for (identifier, is_extended), channels in self._frames.items():
             total = 0

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from calibration.effects.context import EffectContext
 from calibration.effects.fitted import Choice
@@ -20,6 +21,7 @@ from calibration.kinematics.chain import Chain, Placement
 from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor
 from calibration.observations import Observations
+from daemon.cli.main import main
 from tests.calibration.conftest import Session, rms
 
 
@@ -137,7 +139,7 @@ def content(export: Export) -> bytes:
     return "\\n".join(p.name for p in export.model.parameters).encode()
 
 
-FORMAT = Format("parameters-txt", "parameters.txt", content, is_default=True)
+FORMAT = Format("parameters-txt", "parameters.txt", "the names of all parameters", content, is_default=True)
 """
 
 
@@ -147,6 +149,7 @@ def test_a_new_format_is_one_new_file(session: Session, tmp_path: Path, monkeypa
     assert {"c-header", "dh-csv", "grid", "json", "matlab", "parameters-txt", "parquet", "urdf", "xacro"} == {
         *formats()
     }
+    assert "the names of all parameters" in CliRunner().invoke(main, ["model", "export", "--help"]).stdout
     files = export_files(Export(session.model, "0" * 64, ("r",), 512))
     assert {*files} == {"calibration.json", "corrections.csv", "parameters.txt"}
     assert files["parameters.txt"].decode().split("\n") == [p.name for p in session.model.parameters]

@@ -109,6 +109,7 @@ def guide(daemon: DaemonProcess) -> Iterator[dict[str, Any]]:
 @pytest.mark.usefixtures("guide")
 def test_commands_that_a_guide_gives_itself_are_refused_with_the_next_step(daemon: DaemonProcess) -> None:
     daemon.wait("the session", lambda: state(daemon)["session"])
+    assert daemon.say("status")["guide"]["step"]["title"] == "Shoot control point cp1"
     for command, arguments in (
         ("session.start", {"prism": "r"}),
         ("session.stop", {}),

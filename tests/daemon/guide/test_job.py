@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from daemon.guide.job import LEAST_POSES, Forecast, Job, Request, stop_reason
+from daemon.guide.job import Job, Request
+from daemon.guide.stop_rule import LEAST_POSES, Forecast, least_poses, stop_reason
 
 POSES = [{"theta1": float(n)} for n in range(3)]
 REQUEST = Request(("cp1", "cp2"), ("r", "s"), 3, 3)
@@ -161,6 +162,12 @@ def test_a_plan_gives_each_prism_the_poses_in_which_it_is_in_view() -> None:
     runs = Job.of(Request(("cp1",), ("r", "s"), 20, 4, plan=plan)).runs
     assert [run.most for run in runs] == [2, 1, 4]
     assert [run.poses is None for run in runs] == [False, False, True]
+
+
+def test_the_prisms_of_a_guide_share_the_poses_that_a_calibration_needs() -> None:
+    job = Job.of(Request(("cp1",), ("r", "s"), 20, 4))
+    assert least_poses(job, 0) == LEAST_POSES
+    assert least_poses(job, 40) == 25
 
 
 def test_it_is_enough_when_the_target_is_reached_or_little_is_to_gain() -> None:

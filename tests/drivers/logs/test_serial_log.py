@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from drivers.clock import Stamp
 from drivers.errors import DescriptionError
-from drivers.logs.serial_log import SerialLogHeader, SerialLogWriter, read_serial_log, read_serial_log_header
+from drivers.logs.serial_log import SerialLogHeader, SerialLogWriter, read_serial_log
 from drivers.readings import SerialCapture
 
 HEADER = SerialLogHeader("station", 9600, "topcon_gts8")
@@ -35,7 +35,6 @@ def written(path: Path, captures: list[SerialCapture]) -> Path:
 def test_a_file_reads_as_its_captures(tmp_path: Path) -> None:
     path = tmp_path / "log"
     path.write_text(TEXT, encoding="utf-8")
-    assert read_serial_log_header(path) == HEADER
     assert list(read_serial_log(path)) == [
         SerialCapture("station", Stamp(1_700_000_000_123_456_789, 1_000_000_000, "first"), b"Q0"),
         SerialCapture("station", Stamp(1_700_000_000_223_456_789, 1_100_000_000, "first"), b"C1", is_transmitted=True),
@@ -89,7 +88,7 @@ def test_an_empty_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "log"
     path.write_text("", encoding="utf-8")
     with pytest.raises(DescriptionError, match=r"line 1: .*not a captured serial link"):
-        read_serial_log_header(path)
+        list(read_serial_log(path))
 
 
 def test_bytes_that_are_no_text_are_refused_with_their_line(tmp_path: Path) -> None:

@@ -14,8 +14,9 @@ from daemon.acquisition.status.decode_failures import KINDS_MAX, FailureCounter
 from daemon.acquisition.status.present import Expected, ExpectedChannel, ExpectedStation, expected_of
 from daemon.acquisition.status.snapshot import AcquisitionStatus
 from daemon.cli.lines.state import decoding_lines, gap_state_lines, station_line
-from daemon.config import Config, load_rig
+from daemon.config import Config
 from daemon.host.safe_output import duration
+from daemon.rig_files import load_rig
 from daemon.store import Store
 from drivers.clock import NS_PER_S, ManualClock
 from drivers.readings import Capture, DecodeFailure, DeviceEvent, EventKind, Gap, GapReason, LinkItem, Record

@@ -15,8 +15,9 @@ import pytest
 from click.testing import CliRunner
 
 from daemon.cli.lines.jobs import job_line, percent
-from daemon.cli.lines.summary import LINES, next_step, state_sentence, summary
+from daemon.cli.lines.summary import LINES, state_sentence, summary
 from daemon.cli.main import main
+from daemon.next_step import next_line
 from tests.daemon.idle_daemon import idle_daemon
 
 TERMINAL = (100, 24)
@@ -79,6 +80,7 @@ def status(**changes: Any) -> dict[str, Any]:
             "is_behind": False,
         },
         "session": None,
+        "guide": None,
         "setup": {"id": "S1", "state": "ok"},
         "jobs": [],
         "models": {"live": None, "candidate": None},
@@ -122,6 +124,19 @@ CANDIDATE = {
 }
 
 
+GUIDE = {
+    "id": 1,
+    "prisms": ["r"],
+    "step": {
+        "id": "1.2",
+        "title": "Aim at prism r",
+        "instruction": "Aim the station at prism r and say so.",
+        "button": "Station is on prism r",
+        "is_busy": False,
+    },
+}
+
+
 @pytest.mark.parametrize(
     ("told", "step"),
     [
@@ -139,10 +154,14 @@ CANDIDATE = {
         (status(jobs=WORST["jobs"]), "`rigcal watch`"),
         (status(models={"live": None, "candidate": CANDIDATE}), "`rigcal model accept 2`"),
         (status(models={"live": {"id": 1}, "candidate": None}), "nothing needs doing"),
+        (status(guide=GUIDE, session=session()), "aim the station at prism r and say so: `rigcal session guide`"),
+        (status(guide=GUIDE, alarms={"active": [alarm(1, "warning")], "looked_age_s": 0.5}), "aim the station"),
+        (status(guide=GUIDE, alarms={"active": [alarm(1)], "looked_age_s": 0.5}), "theta1: Check the encoder's power"),
+        (status(alarms={"active": [alarm(1, "warning")], "looked_age_s": 0.5}), "theta1: Check the encoder's power"),
     ],
 )
 def test_the_next_step_is_a_command_or_an_act(told: dict[str, Any], step: str) -> None:
-    assert step in next_step(told)
+    assert step in next_line(told)
 
 
 def test_the_state_is_one_sentence() -> None:

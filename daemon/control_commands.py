@@ -1,0 +1,186 @@
+"""Commands of the control socket: each name with the part that carries it out, and the sockets that take them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from daemon.acquisition.redecoding import redecode_command
+from daemon.alarms.board import AlarmBoard
+from daemon.commands import FAILED, REFUSED, CommandError, Handler, go_on_for_caller, reading_socket, text_argument
+from daemon.composition import Parts
+from daemon.config import Config
+from daemon.control.protocol import reading_only
+from daemon.control.server import ControlServer
+from daemon.guide.keeper import GuideKeeper
+from daemon.jobs.runner import JobRunner
+from daemon.models.live_tip import LiveTip
+from daemon.models.registry import ModelRegistry
+from daemon.monitoring.notices import Notices
+from daemon.overview import Overview
+from daemon.sessions.manager import SessionKeeper
+from daemon.sessions.station_setups import SetupBook
+from daemon.store.errors import unwritable_errors
+from daemon.store.health import StoreHealth
+from daemon.store.store import Store
+from daemon.store.upkeep.housekeeping import Housekeeping
+from drivers.errors import DeviceError, TransmitForbiddenError
+
+GUARDED = ("setup.new", "session.start", "session.stop", "session.abort", "session.shoot")  # a guide does them itself
+
+
+@dataclass(frozen=True)
+class Commands:
+    """Every command of a running daemon.
+
+    Attributes:
+        parts: links, decoders and hands of the rig.
+        store: open for writing.
+        store_health: tells of the store.
+        housekeeping, setups, sessions, jobs, models, tip, alarms, notices, guide, overview: carry the commands out.
+    """
+
+    parts: Parts
+    store: Store
+    store_health: Callable[[], StoreHealth]
+    housekeeping: Housekeeping
+    setups: SetupBook
+    sessions: SessionKeeper
+    jobs: JobRunner
+    models: ModelRegistry
+    tip: LiveTip
+    alarms: AlarmBoard
+    notices: Notices
+    guide: GuideKeeper
+    overview: Overview
+
+    def handlers(self) -> Mapping[str, Handler]:
+        """Return every command's name and what carries it out."""
+        sessions, jobs, models = self.sessions, self.jobs, self.models
+        commands: dict[str, Handler] = {
+            "status": self.overview.command,
+            "rig.show": self._show_rig,
+            "setup.new": self.setups.new_command,
+            "setup.list": self.setups.list_command,
+            "session.start": self._if_kept("session", sessions.start_command),
+            "session.stop": sessions.stop_command,
+            "session.abort": sessions.abort_command,
+            "session.shoot": sessions.shoot_command,
+            "session.confirm-prism": sessions.confirm_prism_command,
+            "session.accept": sessions.accept_command,
+            "session.list": sessions.list_command,
+            "session.show": sessions.show_command,
+            "jobs.list": jobs.list_command,
+            "jobs.cancel": jobs.cancel_command,
+            "jobs.retry": jobs.retry_command,
+            "model.list": models.list_command,
+            "model.show": models.show_command,
+            "model.accept": models.accept_command,
+            "model.reject": models.reject_command,
+            "model.rollback": models.rollback_command,
+            "model.zeros-checked": models.zeros_checked_command,
+            "model.compare": models.compare_command,
+            "tip": self.tip.tip_command,
+            "alarms.list": self.alarms.list_command,
+            "alarms.test-notice": self.notices.try_command,
+            "devices.configure": self._configure_devices,
+            "store.prune": self._prune,
+            "store.redecode": self._redecode,
+            "guide.start": self._if_kept("guide", self.guide.start_command),
+            "guide.state": self.guide.state_command,
+            "guide.done": self.guide.done_command,
+            "guide.skip": self.guide.skip_command,
+            "guide.more": self.guide.more_command,
+            "guide.stop": self.guide.stop_command,
+            **({} if self.parts.visit is None else {"simulation.visit": self._visit}),
+            **({} if self.parts.turn is None else {"simulation.aim": self._turn}),
+        }
+        commands |= {name: self.guide.guarding(name, commands[name]) for name in GUARDED}
+        return {name: partial(self._carry_out, handler) for name, handler in commands.items()}
+
+    def _carry_out(self, handler: Handler, arguments: Mapping[str, Any]) -> Any:
+        with unwritable_errors(self.store.path):
+            return handler(arguments)
+
+    def _if_kept(self, what: str, handler: Handler) -> Handler:
+        """Return a command that is refused where its store would be lost when the daemon stops."""
+
+        def kept(arguments: Mapping[str, Any]) -> Any:
+            health = self.store_health()
+            if health.state in ("missing", "replaced"):
+                raise CommandError(f"no {what} is started: {health.text}", REFUSED)
+            return handler(arguments)
+
+        return kept
+
+    def _show_rig(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the rig's name and the text of the file that describes it."""
+        return {"rig": self.parts.rig.name, "text": self.parts.rig_text}
+
+    def _turn(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Turn the simulated station to a prism or a control point."""
+        target = text_argument(arguments, "target")
+        assert self.parts.turn is not None  # else there is no such command
+        self.parts.turn(target)
+        return {"target": target}
+
+    def _visit(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Send the simulated boom to the rows of a pose plan; `left` tells how many stops are to come."""
+        rows = arguments.get("poses", [])
+        if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+            raise CommandError("poses: the rows of a plan, as `rigcal plan --json` prints them")
+        assert self.parts.visit is not None  # else there is no such command
+        return {"left": self.parts.visit(rows)}
+
+    def _prune(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Delete captures and readings outside sessions that are older than so many days."""
+        return self.housekeeping.prune_command(arguments, go_on_for_caller)
+
+    def _redecode(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Make all readings and fixes of a session, or of some time, again from raw captures."""
+        return redecode_command(self.store, self.parts.decoders, arguments, go_on_for_caller)
+
+    def _configure_devices(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Set up CANopen devices, if the operator says that the machine is parked."""
+        if arguments.get("machine_is_parked") is not True:
+            raise CommandError(
+                "say that the machine is parked and locked out (--machine-is-parked): set-up writes to devices"
+            )
+        links = [link for link in self.parts.can_links if link.has_setups]
+        if not links:
+            raise CommandError("no CAN link of this rig has CANopen nodes to set up")
+        try:
+            for link in links:
+                link.check_setup()  # all before any: nothing is half done
+            for link in links:
+                link.request_setup()
+        except TransmitForbiddenError as error:
+            raise CommandError(f"{error}; set-up needs allow_transmit = true and transmit_nodes", REFUSED) from error
+        except DeviceError as error:
+            raise CommandError(str(error), FAILED) from error
+        names = ", ".join(link.name for link in links)
+        return {
+            "links": names,
+            "text": f"the nodes on {names} are being set up; `rigcal status` shows what comes of it",
+        }
+
+
+def control_servers(config: Config, commands: Mapping[str, Handler]) -> tuple[list[ControlServer], dict[str, str]]:
+    """Start the control socket, and the one for those who may only look where a group of them is configured.
+
+    Returns:
+        The servers, and the name of a socket that could not be made -> why.
+
+    Raises:
+        CommandError: the control socket cannot be made.
+    """
+    servers, unserved = [ControlServer(config.socket_path, commands)], {}
+    if config.read_group is not None:
+        path = reading_socket(config.socket_path)
+        try:
+            servers.append(ControlServer(path, reading_only(commands, config.socket_path), group=config.read_group))
+        except CommandError as error:
+            unserved[path.name] = f"members of read_group {config.read_group} cannot look: {error}"
+    return servers, unserved

@@ -1,0 +1,189 @@
+"""The guide's own thread: sees ten times a second what is done, and does by itself what needs no operator.
+
+It opens, shoots in and closes sessions, and has a simulated boom go to the poses.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from calibration.rig.description import Rig
+from daemon.commands import CHECK, CommandError, acting_for
+from daemon.guide.course import Course
+from daemon.guide.job import Job
+from daemon.guide.position import is_there, joints_of
+from daemon.sessions.manager import SessionKeeper
+from drivers.clock import NS_PER_S, Clock
+
+log = logging.getLogger(__name__)
+
+TICK_S = 0.1
+NEEDED_FIXES = 5  # at a pose
+_CANCEL_S = 5.0
+_STANDS_S = 20.0  # of a simulated boom at a pose that it was sent to
+_SENT_AGAIN_S = 120.0
+
+Drive = Callable[[Sequence[Mapping[str, Any]]], int]
+"""Has the boom go to the rows of a pose plan; returns how many stops are to come."""
+
+
+class GuideWorker:
+    """Carries the open guide on.
+
+    Args:
+        rig: the machine.
+        course: of the guide.
+        sessions: opens, shoots in and closes sessions.
+        clock: time.
+        has_aim: something turns the station without an operator.
+        drive: where something drives the boom without an operator; None where nothing does.
+
+    Attributes:
+        wanted: step whose button was pressed, to be carried out; "" for none.
+        busy: step that is carried out; "" for none.
+    """
+
+    def __init__(
+        self, rig: Rig, course: Course, sessions: SessionKeeper, clock: Clock, *, has_aim: bool, drive: Drive | None
+    ) -> None:
+        self.wanted = self.busy = ""
+        self._rig, self._course, self._sessions, self._clock = rig, course, sessions, clock
+        self._has_aim, self._drive = has_aim, drive
+        self._driven = ("", 0)  # step whose pose the boom was sent to, and when
+        self._cancelled, self._stopping = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="guide", daemon=True)
+
+    def start(self) -> None:
+        """Begin to look."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Look no more."""
+        self._stopping.set()
+        self._cancelled.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=_CANCEL_S)
+
+    def give_up(self) -> None:
+        """End a shot that is being measured."""
+        if not self.busy:
+            return
+        self._cancelled.set()
+        deadline = time.monotonic() + _CANCEL_S
+        while self.busy and time.monotonic() < deadline:
+            time.sleep(TICK_S / 2)
+        self._cancelled.clear()
+
+    def _run(self) -> None:
+        told = ""
+        while not self._stopping.wait(TICK_S):
+            try:
+                if self._course.record.is_open and not self._course.is_waiting:
+                    self._look()
+                told = ""
+            except Exception as error:
+                self._course.wait()
+                if str(error) != told:
+                    log.exception("the guide has failed; it goes on")
+                told = str(error)
+
+    def _look(self) -> None:
+        course = self._course
+        with course.record.turn:
+            job = course.record.job
+            if job is None or job.step is None:
+                return
+            if not course.advisor.is_alive:
+                course.start_advisor()
+            run, step, step_id = job.run, job.step, job.step_id
+            if run.session and run.poses is None:
+                course.choose(run.most)
+            is_at_point = not self._has_aim and course.watch.is_at(course.point_mm(course.point(job)))
+        with acting_for(None, self._cancelled.is_set):
+            if not run.session:
+                self._try(self._open_session)
+            elif step.kind == "close":
+                self._try(self._close_session)
+            elif step.kind == "shoot_control_point":
+                if self._has_aim or is_at_point or self.wanted == step_id:
+                    self._try(partial(self._shoot, step.point, step_id), step_id)
+            elif step.kind == "change_prism":
+                if self._has_aim:
+                    course.aimed()
+            elif job.is_enough and (self._has_aim or is_at_point or run.kind == CHECK):
+                course.happen("left", {}, only_at=step_id)
+            elif not job.is_enough:
+                self._send_boom(job)
+                self._look_at_pose(job)
+
+    def _send_boom(self, job: Job) -> None:
+        """Have the boom go to the next pose where no operator is at its levers, and again if it was not measured."""
+        run, number, now_ns = job.run, job.run.next_pose, self._clock.now().monotonic_ns
+        step_id, sent_ns = self._driven
+        if self._drive is None or number is None or run.poses is None:
+            return
+        if step_id == job.step_id and now_ns - sent_ns < _SENT_AGAIN_S * NS_PER_S:
+            return
+        self._driven = job.step_id, now_ns
+        joints = run.poses[number].joints
+        self._drive([{"dwell_s": _STANDS_S} | {joint.column: joints[joint.name] for joint in self._rig.joints}])
+
+    def _look_at_pose(self, job: Job) -> None:
+        """See whether the pose is reached and measured."""
+        run, number = job.run, job.run.next_pose
+        found = self._course.record.table.standstill(run.session, run.last)
+        self._course.standstill = found = None if found is None or found.pose == run.label else found
+        if number is None or run.poses is None or found is None or found.fixes < NEEDED_FIXES:
+            return
+        if is_there(self._rig, joints_of(self._rig, found), run.poses[number].joints):
+            self._course.happen("measured", {"pose": found.pose, "last": found.last}, only_at=job.step_id)
+
+    def _try(self, work: Callable[[], None], step_id: str = "") -> None:
+        """Do something that an operator may have to put right; it is tried again after a while, a shot when asked."""
+        self.busy = step_id or "session"
+        try:
+            work()
+        except CommandError as error:
+            if not self._cancelled.is_set():
+                job = self._course.record.job
+                if job is not None and job.trouble != str(error):  # it is tried again and again
+                    self._course.happen("failed", {"text": str(error)})
+                self._course.wait()
+        finally:
+            if step_id:
+                self.wanted = ""
+            self.busy = ""
+
+    def _open_session(self) -> None:
+        job, row = self._course.record.job, self._course.record.row
+        if job is None or row is None:
+            return
+        last, opened = self._course.record.table.newest_observation(), self._sessions.open_session()
+        if opened is None or opened["prism"] != job.run.prism:  # else it was opened just before the daemon ended
+            arguments = {
+                "prism": job.run.prism,
+                "kind": job.run.kind,
+                "setup": row.setup_id,
+                "operator": row.operator,
+                "note": f"guide {row.id}",
+            }
+            opened = self._sessions.start_command(arguments, is_aimed=False)
+        self._course.happen("opened", {"session": opened["id"], "last": last})
+
+    def _close_session(self) -> None:
+        job = self._course.record.job
+        if job is None:
+            return
+        opened = self._sessions.open_session()
+        if opened is not None and opened["id"] == job.run.session:
+            self._sessions.stop_command({})
+        self._course.happen("closed", {"session": job.run.session})
+
+    def _shoot(self, point: str, step_id: str) -> None:
+        shot = self._sessions.shoot_command({"point": point})
+        self._course.happen("shot", {"point": point, "misclosure_mm": shot["misclosure_mm"]}, only_at=step_id)

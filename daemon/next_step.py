@@ -1,0 +1,188 @@
+"""The next step: what the rig is doing and what to do now, in words for the page and for the terminal.
+
+Both are told of the daemon's status, whose `guide` has the step of a guide that is open.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from daemon.commands import CHECK
+
+Tone = Literal["good", "busy", "wait", "warning", "critical"]
+
+_JOBS: Mapping[str, str] = {
+    "gap": "identifying the model",
+    "residual": "learning what remains",
+    "report": "writing the report",
+    "comparison": "comparing models",
+    "drift": "holding check shots against the live model",
+}
+_ENOUGH_POSES = {CHECK: 5}  # of one session, by its kind
+_ENOUGH_USUALLY = 25
+_NEW_SESSION = "`rigcal session guide --prisms NAMES`, or `rigcal session start --prism NAME`"
+
+
+@dataclass(frozen=True)
+class NextStep:
+    """A state with the step that follows from it.
+
+    Attributes:
+        state: what is going on, in a few words.
+        tone: how urgent the page makes it look.
+        step: what to do next, a sentence without its full stop.
+        how: commands of the terminal that do it; "" where it needs none.
+        button: the page's; None where nothing is to be pressed.
+        command: what the button sends to the daemon; None where it opens a screen.
+        arguments: of the command.
+        screen: what the button opens; None where it sends a command.
+        is_pressing: an alarm that is not critical does not come before it.
+    """
+
+    state: str
+    tone: Tone
+    step: str
+    how: str = ""
+    button: str | None = None
+    command: str | None = None
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+    screen: str | None = None
+    is_pressing: bool = True
+
+
+def next_for_page(status: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the next step as the page shows it large; it lists the alarms itself, and takes their colour."""
+    found = _next_step(status)
+    is_critical = any(alarm["severity"] == "critical" for alarm in status["alarms"]["active"])
+    return {
+        "state": found.state,
+        "tone": "critical" if is_critical else found.tone,
+        "step": found.step[:1].upper() + found.step[1:] + ("" if found.step.endswith(".") else "."),
+        "button": found.button,
+        "command": found.command,
+        "arguments": dict(found.arguments),
+        "screen": found.screen,
+    }
+
+
+def next_line(status: Mapping[str, Any]) -> str:
+    """Return the next step in one line of the terminal: the remedy of an alarm, or what to do with its command."""
+    found, alarms = _next_step(status), status["alarms"]["active"]
+    critical = [alarm for alarm in alarms if alarm["severity"] == "critical"]
+    for alarm in critical or ([] if found.is_pressing else alarms):
+        return f"{alarm['subject']}: {alarm['remedy']}"
+    return f"{found.step}: {found.how}" if found.how else found.step
+
+
+def _next_step(status: Mapping[str, Any]) -> NextStep:
+    guide = status.get("guide")  # a daemon of 0.1, which may run on after an upgrade, tells neither it nor `setup`
+    if guide is not None:
+        return _of_guide(guide["step"])
+    if status["session"] is not None:
+        return _in_session(status["session"])
+    if status["jobs"]:
+        return _of_jobs(status["jobs"])
+    return _between_sessions(status)
+
+
+def _of_guide(step: Mapping[str, Any]) -> NextStep:
+    does = step["instruction"].removesuffix(".")
+    does, how = f"{does[:1].lower()}{does[1:]}", "`rigcal session guide`"
+    if step["is_busy"] or step["button"] is None:
+        return NextStep(step["title"], "wait" if step["is_busy"] else "busy", does, how, screen="guide")
+    return NextStep(step["title"], "busy", does, how, step["button"], "guide.done", {"step": step["id"]})
+
+
+def _in_session(session: Mapping[str, Any]) -> NextStep:
+    what = f"Session {session['id']} on prism {session['prism']}: {session['poses']} poses"
+    step, how = _of_session(session)
+    return NextStep(what, "busy", step, how, "Open the session", screen="session")
+
+
+def _of_session(session: Mapping[str, Any]) -> tuple[str, str]:
+    """Return what to do in a session, and with which command."""
+    points = {
+        phase: {s["point"] for s in session["control_shots"] if s["phase"] == phase} for phase in ("start", "end")
+    }
+    enough = _ENOUGH_POSES.get(session["kind"], _ENOUGH_USUALLY)
+    if suspicions := session.get("prism_suspicions"):
+        return str(suspicions[0]["remedy"]), ""
+    if session["setup_moved"]:
+        how = "`rigcal session stop`, then `rigcal setup new`"
+        return "the station has moved: stop the session, then describe where it stands", how
+    if not points["start"] and not points["end"]:
+        return "aim the station at a control point and shoot it", "`rigcal session shoot NAME`"
+    if session["poses"] < enough:
+        more = enough - session["poses"]
+        return f"stand still at {more} more pose{'s' if more > 1 else ''}, spread over the ranges of all joints", ""
+    if missing := sorted(points["start"] - points["end"]):
+        return "enough poses: shoot the control points again", f"`rigcal session shoot {missing[0]}`"
+    step = "enough poses: stop the session; identification, effects, residual and report follow by themselves"
+    return step, "`rigcal session stop`"
+
+
+def _of_jobs(jobs: Sequence[Mapping[str, Any]]) -> NextStep:
+    running = next((job for job in jobs if job["state"] == "running"), None)
+    doing = "jobs are queued"
+    if running is not None:
+        doing = f"{_JOBS.get(running['kind'], running['kind'])}, {math.floor(100 * running['progress'])} %"
+    step, how = "wait for the jobs; the boom may move", "`rigcal watch` follows them, `rigcal jobs list` has results"
+    return NextStep(f"Calibrating: {doing}", "wait", step, how, "See the jobs", screen="health")
+
+
+def _between_sessions(status: Mapping[str, Any]) -> NextStep:
+    models, drift = status["models"] or {}, (status["gap"] or {}).get("drift")
+    live, candidate = models.get("live"), models.get("candidate")
+    if candidate is not None and candidate["is_acceptable"]:
+        what = f"Model {candidate['id']} is better and waits for you"
+        how = f"`rigcal model show {candidate['id']}`, `rigcal model accept {candidate['id']}`"
+        step = "look at what it changes, then accept it"
+        return NextStep(what, "good", step, how, "Review the model", screen="models")
+    is_drifting = drift is not None and drift["alarm"] == "worse"
+    tone: Tone = "warning"
+    if candidate is not None:
+        what = f"Model {candidate['id']} waits"
+    elif live is None:
+        what = "No model is live yet"
+    elif is_drifting:
+        what = f"Model {live['id']} is live, and check shots drift from it"
+    else:
+        what, tone = f"Ready: model {live['id']} is live", "good"
+    pressing = next(_pressing(status, candidate), None)
+    step, how = pressing or _to_improve(live, candidate, is_drifting=is_drifting)
+    button = "Start a guided session"
+    return NextStep(what, tone, step, how, button, screen="guide", is_pressing=pressing is not None)
+
+
+def _pressing(status: Mapping[str, Any], candidate: Mapping[str, Any] | None) -> Iterator[tuple[str, str]]:
+    """Yield what keeps the next model from being made or judged, the most important first."""
+    setup, gap = status.get("setup"), status["gap"] or {}
+    if setup is None or setup["state"] != "ok":
+        yield "describe where the station stands", "`rigcal setup new NAME --instrument TYPE`"
+    if gap.get("failed") is not None:
+        how = "`rigcal jobs list`, `rigcal session start`"
+        yield f"job {gap['failed']['job']} failed: do what it says, or hold another session", how
+    if candidate is not None and candidate["comparison"] is None:
+        how = "`rigcal session start --kind check --prism NAME`"
+        yield "hold a check session, to compare the new model with", how
+    verdict = gap.get("verdict")
+    if verdict is not None and verdict["verdict"] == "indistinguishable" and verdict["experiments"]:
+        yield f"measure what tells the causes apart: {verdict['experiments'][0]}", ""
+
+
+def _to_improve(
+    live: Mapping[str, Any] | None, candidate: Mapping[str, Any] | None, *, is_drifting: bool
+) -> tuple[str, str]:
+    """Return what makes the first model, or a better one."""
+    if candidate is not None:
+        refused = f"model {candidate['id']} would be refused: {candidate['refused_because']}"
+        return f"{refused}; hold sessions of other prisms or poses, then another check session", ""
+    if live is None:
+        step = "hold a calibration session; a guided one leads through all prisms and a check to a first model"
+        return step, f"{_NEW_SESSION}; `rigcal plan` proposes poses"
+    if is_drifting:
+        return "the machine has changed: measure it again", _NEW_SESSION
+    return "nothing needs doing; a check session now and then shows whether the live model still holds", ""
