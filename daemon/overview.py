@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import sqlite3
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -21,6 +20,7 @@ from daemon.store.jobs import JobTable
 from daemon.store.models import ModelTable
 from daemon.store.setups import SetupRow, SetupTable
 from daemon.store.store import Store
+from daemon.version import VERSION
 
 T = TypeVar("T")
 
@@ -75,7 +75,7 @@ class Overview:
         return {
             "rig": self.parts.rig.name,
             "mode": self.parts.mode,
-            "version": importlib.metadata.version("rigcal"),
+            "version": VERSION,
             "time": {"utc_ns": clock.now().utc_ns, "real_s_per_s": clock.real_seconds(1.0)},
             "alarms": self.alarms.status(),
             "notices": self.notices.status(),
