@@ -3,6 +3,7 @@
 
 BIN := .venv/bin
 BOOTSTRAP := deploy/bootstrap.sh -e
+PANGO := libpangoft2-1.0.so.0=libpangoft2-1.0-0
 
 # Compiled kernels and font indexes stay in the tree, so that they are found again and no home directory is needed. Each
 # state of the sources has its own: numba does not see that a function which it compiled into another one has changed.
@@ -14,7 +15,7 @@ export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 # The tests start a hundred processes: each would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help environment setup demo deb debtest vmtest wheel check test long webtest lint style types imports quick blind bench soak fuzz lock check-deps clean
+.PHONY: help environment setup demo deb debtest vmtest wheel sdist release check test long webtest lint style types imports quick blind bench soak fuzz lock check-deps clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -34,10 +35,19 @@ demo: setup ## a simulated rig, from bus traffic to a calibrated model and a rep
 	@$(BIN)/rigcal demo
 
 wheel: environment ## the wheel of the last commit, in dist/; the same commit gives the same bytes
-	@$(BIN)/python deploy/debian/build.py wheel
+	@$(BIN)/python -m deploy.release wheel
+
+sdist: environment ## its sdist, which gives the same wheel
+	@$(BIN)/python -m deploy.release sdist
 
 deb: environment ## Debian packages of the last commit, for Debian 12 and 13, in dist/
-	@$(BIN)/python deploy/debian/build.py deb
+	@$(BIN)/python -m deploy.release deb
+
+# Refused before anything is built, where the last commit may not be a release. `make docs` leaves its pages in site/.
+release: environment ## a release of the last commit: wheel, sdist, packages, bills of materials, docs, SHA256SUMS, in dist/
+	@$(BIN)/python -m deploy.release check
+	@SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) $(MAKE) --no-print-directory docs
+	@$(BIN)/python -m deploy.release release --docs site
 
 debtest: environment ## the packages in fresh Debian 12 and 13 roots without a network; root, ten minutes
 	@$(BIN)/python -m tests.deploy.packages
@@ -45,10 +55,10 @@ debtest: environment ## the packages in fresh Debian 12 and 13 roots without a n
 vmtest: environment ## the package on an emulated Debian, if what it tests has changed since it passed; root (VM="--only session")
 	$(BIN)/python -m tests.vm $(VM)
 
-# The deployment tests ask systemd's own tools about the files in deploy/. What reads devices and what keeps their data
+# The deployment tests ask systemd's own tools about the files in deploy/, and reports are printed with Pango. What reads devices and what keeps their data
 # must be reached by its own tests almost line by line.
 test: ## the test suite; needs no hardware
-	@$(BOOTSTRAP) -t systemd-analyze=systemd -t udevadm=udev .venv requirements-dev.lock
+	@$(BOOTSTRAP) -t systemd-analyze=systemd -t udevadm=udev -t $(PANGO) .venv requirements-dev.lock
 	$(BIN)/python -m pytest -m "not long and not browser" -n auto --dist loadfile --no-loadscope-reorder --gates --cov=drivers --cov=daemon.store --cov=calibration --cov-report=term-missing:skip-covered
 
 long: setup ## tests that take a quarter of an hour, if what they test has changed since they passed
@@ -111,6 +121,6 @@ check-deps: environment ## known vulnerabilities of the locked packages, where a
 	@$(BIN)/python -m tests.dependencies
 
 clean: ## remove everything that make has made
-	rm -rf .venv .cache build rigcal-demo rigcal-sim fuzz-faults htmlcov .coverage* *.egg-info
+	rm -rf .venv .cache build dist site rigcal-demo rigcal-sim fuzz-faults htmlcov .coverage* *.egg-info
 	rm -rf .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import sqlite3
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -22,6 +21,7 @@ from daemon.store.queries.jobs import JobTable
 from daemon.store.queries.models import ModelTable
 from daemon.store.queries.setups import SetupRow, SetupTable
 from daemon.store.store import Store
+from daemon.version import VERSION
 
 T = TypeVar("T")
 
@@ -77,7 +77,7 @@ class Overview:
         return {
             "rig": self.parts.rig.name,
             "mode": self.parts.mode,
-            "version": importlib.metadata.version("rigcal"),
+            "version": VERSION,
             "time": {"utc_ns": clock.now().utc_ns, "real_s_per_s": clock.real_seconds(1.0)},
             "alarms": self.alarms.status(),
             "notices": self.notices.status(),

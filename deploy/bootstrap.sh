@@ -1,10 +1,11 @@
 #!/bin/sh
 # Makes a virtual environment that holds the locked packages and this project, and whatever the system lacks for that.
 #
-#   deploy/bootstrap.sh [-e] [-t COMMAND=PACKAGE]... VENV LOCK
+#   deploy/bootstrap.sh [-e] [-t TOOL=PACKAGE]... VENV LOCK
 #
 #   -e                    install the project editable, for work on it; without -e it is copied into the environment
-#   -t COMMAND=PACKAGE    a system tool that is wanted, not needed: installed where that is allowed, otherwise named
+#   -t TOOL=PACKAGE       a command or a library (NAME.so.N) of the system that is wanted, not needed: installed where that
+#                         is allowed, otherwise named
 #
 # What is needed (Python >= 3.11, its venv module, libgomp.so.1) and missing is installed through apt by root or with a
 # sudo that asks for no password; otherwise one sentence says what to do. The interpreter is $PYTHON, or the first of
@@ -30,7 +31,15 @@ sys.exit(sys.version_info < (3, 11))' 2>/dev/null); then
     die "Python 3.11 or newer is needed;${found:- no Python was found;} install one, or name it: make PYTHON=/path/to/python3.11 ..."
 }
 
-has_libgomp() { "$python" -c 'import ctypes; ctypes.CDLL("libgomp.so.1")' 2>/dev/null; }
+has_library() { "$python" -c 'import ctypes, sys; ctypes.CDLL(sys.argv[1])' "$1" 2>/dev/null; }
+
+has_tool() {
+    case $1 in
+    *.so.*) has_library "$1" ;;
+    # Debian keeps some administrators' commands where a user's PATH does not look.
+    *) PATH="$PATH:/usr/sbin:/sbin" command -v "$1" >/dev/null ;;
+    esac
+}
 
 as_root() {
     if [ "$(id -u)" = 0 ]; then "$@"; else sudo -n "$@"; fi
@@ -56,11 +65,11 @@ while getopts et: option; do
     case $option in
     e) editable=yes ;;
     t) tools="$tools $OPTARG" ;;
-    *) die "usage: bootstrap.sh [-e] [-t COMMAND=PACKAGE]... VENV LOCK" ;;
+    *) die "usage: bootstrap.sh [-e] [-t TOOL=PACKAGE]... VENV LOCK" ;;
     esac
 done
 shift $((OPTIND - 1))
-[ $# = 2 ] || die "usage: bootstrap.sh [-e] [-t COMMAND=PACKAGE]... VENV LOCK"
+[ $# = 2 ] || die "usage: bootstrap.sh [-e] [-t TOOL=PACKAGE]... VENV LOCK"
 venv=$1
 lock=$2
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
@@ -70,11 +79,10 @@ find_python
 
 needed=''
 "$python" -c 'import ensurepip, venv' 2>/dev/null || needed="$needed python$version-venv"
-has_libgomp || needed="$needed libgomp1"
+has_library libgomp.so.1 || needed="$needed libgomp1"
 wanted=''
 for tool in $tools; do
-    # Debian keeps some administrators' commands where a user's PATH does not look.
-    PATH="$PATH:/usr/sbin:/sbin" command -v "${tool%%=*}" >/dev/null || wanted="$wanted ${tool#*=}"
+    has_tool "${tool%%=*}" || wanted="$wanted ${tool#*=}"
 done
 
 if [ -n "$needed$wanted" ]; then

@@ -14,8 +14,11 @@ may change without notice; these names follow Semantic Versioning.
 from calibration.errors import CalibrationError, DataError, ModelError, RigError, UnsafeError
 from calibration.observations import Observations
 from calibration.rig.description import Rig
+from daemon.version import VERSION
 from rigcal.calibration_api import Model, calibrate, find_gap, plan
 from rigcal.store_api import Store, open_store
+
+__version__ = VERSION
 
 __all__ = [
     "CalibrationError",
@@ -27,6 +30,7 @@ __all__ = [
     "RigError",
     "Store",
     "UnsafeError",
+    "__version__",
     "calibrate",
     "find_gap",
     "open_store",

@@ -14,6 +14,7 @@ import pkgutil
 import click
 
 from daemon.cli import commands
+from daemon.version import VERSION
 
 
 class _Commands(click.Group):
@@ -32,7 +33,7 @@ class _Commands(click.Group):
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(package_name="rigcal")
+@click.version_option(VERSION, prog_name="rigcal")
 def main() -> None:
     """Make a drilling boom's kinematic model true."""
 

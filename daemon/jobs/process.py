@@ -195,7 +195,8 @@ def _report(order: Order, progress: Progress) -> dict[str, Any]:
     with _store(order) as reader:
         setups = setup_lines(reader, session_ids)
     facts = _facts(order, model, session_ids, directory.name)
-    page = calibration_report(report_input(training, held_out, setups=setups, facts=facts))
+    latencies = _latencies(order, model)
+    page = calibration_report(report_input(training, held_out, setups=setups, facts=facts, latencies=latencies))
     path = directory / REPORT
     write_file(path, page.encode())
     judged = held_out or training
@@ -205,21 +206,23 @@ def _report(order: Order, progress: Progress) -> dict[str, Any]:
         "sessions": list(order.train_ids),
         "held_out": held_out is not None,
         "evaluation": judged.as_dict(0.0),
-        "latency": _latencies(order, model),
+        "latency": {
+            name: asdict(found) if isinstance(found, Latency) else {"reason": found}
+            for name, found in latencies.items()
+        },
     }
 
 
-def _latencies(order: Order, model: CalibratedModel) -> dict[str, dict[str, Any]]:
-    """The latency of each session's fixes against the joints, or the `reason` why it is not known."""
-    found: dict[str, dict[str, Any]] = {}
+def _latencies(order: Order, model: CalibratedModel) -> dict[str, Latency | str]:
+    """The latency of each session's fixes against the joints, or why it is not known."""
+    found: dict[str, Latency | str] = {}
     for name in (*order.train_ids, *order.session_ids):
         try:
             with _store(order) as reader:
                 data = sessions_csv(reader, model.rig, (name,), moving=True)
-            latency = estimate_latency(model, parse_observations(data, model.rig, f"fixes of {name} on the move"))
+            found[name] = estimate_latency(model, parse_observations(data, model.rig, f"fixes of {name} on the move"))
         except CalibrationError as error:
-            latency = str(error)
-        found[name] = asdict(latency) if isinstance(latency, Latency) else {"reason": latency}
+            found[name] = str(error)
     return found
 
 

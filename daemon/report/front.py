@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,6 +10,7 @@ from typing import Literal
 
 from daemon.report import markup
 from daemon.report.words import number
+from daemon.version import VERSION
 from drivers.clock import NS_PER_S
 
 NOT_GIVEN = "not given"
@@ -56,7 +56,7 @@ class Facts:
             "Instrument": _listed(self.instruments),
             "Station set-up": _listed(self.setups),
             "UTC": self._utc(),
-            "Software": f"rigcal {importlib.metadata.version('rigcal')}",
+            "Software": f"rigcal {VERSION}",
         }
 
     def _utc(self) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import logging
 import os
 import sqlite3
@@ -16,6 +15,7 @@ from daemon.store.captures import decode_captures, encode_captures
 from daemon.store.connection import Connection
 from daemon.store.errors import StoreError, is_damage
 from daemon.store.rows import EXCERPT_BYTES, FIX_COLUMNS, SqlRow, counted_failures, fix_row, sample_row, sql_value
+from daemon.version import VERSION
 from drivers.clock import Stamp
 from drivers.readings import Capture, DecodeFailure, DeviceEvent, Fix, Gap, GapReason, Reading, Record
 
@@ -105,7 +105,7 @@ class Store(Connection):
     def _note_run(self, now: Stamp) -> int:
         run = {
             "pid": os.getpid(),
-            "software_version": importlib.metadata.version("rigcal"),
+            "software_version": VERSION,
             "sqlite_version": sqlite3.sqlite_version,
         }
         return self.insert("daemon_runs", run | self.instant(now, "started_") | self.instant(now, "alive_"))

@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 PROJECT = Path(__file__).parents[2]
-BUILD = PROJECT / "deploy" / "debian" / "build.py"
+BUILD = (sys.executable, "-m", "deploy.release", "deb")
 ROOTS = PROJECT / ".cache" / "debian"
 RELEASES = {12: "bookworm", 13: "trixie"}
 IN_ROOT = "python3,libgomp1,systemd,udev,passwd,ca-certificates"  # a usual computer has them
@@ -111,7 +111,7 @@ def package_of(release: int, out: Path) -> Path:
     """Build the package twice, which must be the same bytes."""
     built: list[Path] = []
     for name in ("first", "second"):
-        run(sys.executable, BUILD, "deb", "--release", str(release), "--out", out / name)
+        run(*BUILD, "--release", str(release), "--out", out / name)
         built += (out / name).glob("*.deb")
     first, second = built
     if first.read_bytes() != second.read_bytes():

@@ -112,9 +112,10 @@ def test_root_and_a_sudo_without_password_install_what_is_missing(tree: Tree, ui
 def test_a_tool_that_is_only_wanted_stops_nothing(tree: Tree) -> None:
     tree.user(1000)
     executable(tree.path / "venv/bin/python", "exit 0\n")
-    result = tree.bootstrap("-t", "no-such-tool=its-package", "-t", "sh=dash")
+    libraries = ["-t", "libno-such.so.1=libno-such1", "-t", "libc.so.6=libc6"]
+    result = tree.bootstrap("-t", "no-such-tool=its-package", "-t", "sh=dash", *libraries)
     assert result.returncode == 0, result.stdout
-    assert "until you run: sudo apt-get install its-package\n" in result.stdout
+    assert "until you run: sudo apt-get install its-package libno-such1\n" in result.stdout
 
 
 @pytest.mark.slow

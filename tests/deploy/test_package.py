@@ -1,28 +1,22 @@
 """What goes into the Debian packages; `make debtest` tries whole ones in fresh Debian roots."""
 
-import runpy
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 
+from deploy.release import debian
 from tests.deploy.conftest import DEPLOY, REPOSITORY, run
 
 
-@pytest.fixture(scope="module")
-def build() -> dict[str, Any]:
-    return runpy.run_path(str(DEPLOY / "debian" / "build.py"))
-
-
-def test_every_file_of_the_service_is_packed(build: dict[str, Any]) -> None:
-    ours = {path.name for path in DEPLOY.iterdir() if path.is_file()} - {"bootstrap.sh", "install.sh"}
-    assert ours <= set(build["FILES"])
+def test_every_file_of_the_service_is_packed() -> None:
+    ours = {path.name for path in DEPLOY.iterdir() if path.is_file()} - {"bootstrap.sh", "install.sh", "__init__.py"}
+    assert ours <= set(debian.FILES)
 
 
 @pytest.mark.parametrize(("python", "numpy"), [("3.11", "numpy==2.4."), ("3.13", "numpy==2.5.")])
-def test_each_package_is_locked_for_its_own_python(build: dict[str, Any], python: str, numpy: str) -> None:
-    locked = build["locked_for"](REPOSITORY / "requirements.lock", python)
+def test_each_package_is_locked_for_its_own_python(python: str, numpy: str) -> None:
+    locked = debian.locked_for(REPOSITORY / "requirements.lock", python)
     lines = [line for line in locked.splitlines() if line[:1].isalpha()]
     (found,) = (line for line in lines if line.startswith("numpy=="))
     assert found.startswith(numpy)

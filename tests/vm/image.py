@@ -13,7 +13,6 @@ import os
 import platform
 import shutil
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -101,7 +100,7 @@ def image(say: Callable[[str], None], cpu_of: Callable[[Image], dict[str, str]])
         shutil.rmtree(old)
     scratch = Path(tempfile.mkdtemp(dir=CACHE, prefix="image-new-"))
     say("building the package of the last commit")
-    run(sys.executable, BUILD, "deb", "--release", str(RELEASE), "--out", scratch)
+    run(*BUILD, "--release", str(RELEASE), "--out", scratch)
     (package,) = scratch.glob("*.deb")
     version = run("dpkg-deb", "-f", package, "Version").strip()
     next_package = of_version(package, f"{version}.next", scratch)

@@ -14,7 +14,7 @@ from calibration.evaluation.correction_grid import Machine
 from calibration.evaluation.exports import Export, Format, LeftOut
 from calibration.evaluation.writers.c_effects import EffectWriter
 from calibration.evaluation.writers.c_header import c_header
-from calibration.evaluation.writers.motions import motion_tree
+from calibration.evaluation.writers.motions import carriers, motion_tree
 from calibration.kinematics.torques import GravityModel
 from calibration.model.prediction import Predictor
 
@@ -27,7 +27,7 @@ def _context(export: Export) -> EffectContext:
 
 
 def _writer(export: Export) -> EffectWriter:
-    return EffectWriter(_context(export), motion_tree(export.model.chain, export.model.values))
+    return EffectWriter(_context(export), carriers(motion_tree(export.model.chain, export.model.values)))
 
 
 def written_effects(export: Export) -> tuple[FittedEffect, ...]:

@@ -19,7 +19,7 @@ from calibration.effects.fitted import FittedEffect
 from calibration.effects.library import library
 from calibration.effects.links import LinkFamily
 from calibration.effects.load_shapes import LoadShapes, gravity_shapes, part_names
-from calibration.evaluation.writers.motions import MotionTree
+from calibration.evaluation.writers.motions import Carriers
 from calibration.kinematics.torques import MASS_SIGMA, STANDARD_GRAVITY
 from calibration.observations import Floats
 from calibration.rig.description import Rig
@@ -33,7 +33,7 @@ class EffectCode:
 
     Attributes:
         tables: definitions.
-        lines: statements that add to `change` and `shift`.
+        lines: statements that add to `change` and to the shifts of `points`.
         inputs: fields of the caller's inputs that they use.
         needs_pose: True if they look at the machine's pose.
     """
@@ -50,11 +50,11 @@ class EffectWriter:
 
     Args:
         context: any observations of the model's machine; the shapes of its uncertain loads are found with it.
-        tree: its motions.
+        tree: the motions of its machine.
     """
 
     context: EffectContext
-    tree: MotionTree
+    tree: Carriers
 
     def code(self, effects: Mapping[int, FittedEffect]) -> EffectCode:
         """Return the C of effects that `can_write`, each with its number."""
@@ -162,13 +162,13 @@ class EffectWriter:
         out.needs_pose = True
         links = "mounting_as_it_is" in effect.settings
         yield "if (in && in->temperature_degC == in->temperature_degC)"
-        yield "    for (int p = 0; p < RIGCAL_PRISMS; p++) {"
-        yield "        double grown[3] = {prism_mm[p][0], prism_mm[p][1], prism_mm[p][2]};"
+        yield "    for (int p = 0; p < points->count; p++) {"
+        yield "        double grown[3] = {points->place[p][0], points->place[p][1], points->place[p][2]};"
         if links:
-            yield "        const double origin[3] = {0.0, 0.0, 0.0};"
-            yield "        rigcal_place(at, rigcal_prism_frame[p], origin, grown);"
+            prism = "points->prism[p]"
+            yield f"        rigcal_place(at, rigcal_prism_motion[{prism}], rigcal_prism_mount[{prism}], grown);"
         share = f"{_c(effect.coefficients[0].value)} * (in->temperature_degC - {_c(effect.settings['mean_degC'])})"
-        yield f"        for (int i = 0; i < 3; i++) shift[p][i] += {share} * grown[i];"
+        yield f"        for (int i = 0; i < 3; i++) points->shift[p][i] += {share} * grown[i];"
         yield "    }"
 
     # -- the pose ------------------------------------------------------------------------------------------------------
@@ -182,7 +182,7 @@ class EffectWriter:
             found += [(index, first_drive + i) for i, (driving, _) in enumerate(motion.drive) if driving == joint]
             first_drive += len(motion.drive)
         amount = f"{_c(effect.coefficients[0].value)} * q[{joint}]"
-        yield from (f"rigcal_follow(at, {k}, {drive}, {amount}, shift, prism_mm);" for k, drive in found[1:])
+        yield from (f"rigcal_follow(at, {k}, {drive}, {amount}, points);" for k, drive in found[1:])
 
     def _compliance(self, number: int, effect: FittedEffect, out: EffectCode) -> Iterator[str]:
         settings, values = effect.settings, np.array([c.value for c in effect.coefficients])
@@ -248,7 +248,7 @@ class EffectWriter:
             weights = weights + np.tensordot(values[1:], self._shaped(shapes, self._parts(row)), axes=1)
         table = self._table(f"load{number}", weights, out)
         along = int(effect.family == "passive_compliance")
-        yield f"rigcal_bend(at, {table}, {self.tree.turning[row]}, {along}, 1.0, shift, prism_mm);"
+        yield f"rigcal_bend(at, {table}, {self.tree.turning[row]}, {along}, 1.0, points);"
 
     def _droop(self, number: int, effect: FittedEffect, out: EffectCode) -> Iterator[str]:
         out.needs_pose = True
@@ -263,7 +263,7 @@ class EffectWriter:
             weights[frame, 1:] += force * (of_whole + of_centre) * offset_mm
         table = self._table(f"load{number}", weights, out)
         forces = f"{_c(newton @ tip)}, {_c(newton @ own)}"
-        yield f"rigcal_droop(at, {boom.root}, {boom.row}, {table}, {forces}, shift, prism_mm);"
+        yield f"rigcal_droop(at, {boom.root}, {boom.row}, {table}, {forces}, points);"
 
     def _pads(self, number: int, effect: FittedEffect, out: EffectCode) -> Iterator[str]:
         out.needs_pose = True
@@ -276,7 +276,7 @@ class EffectWriter:
         overlap = f"fmax({_c(high)} - q[{self._joint(boom.joint)}], 0.0) + {_c(left)}"
         yield (
             f"rigcal_pads(at, {boom.root}, {boom.row}, {table}, {_c(boom.outer_mm)}, {overlap}, "
-            f"{_c(effect.coefficients[0].value)}, shift, prism_mm);"
+            f"{_c(effect.coefficients[0].value)}, points);"
         )
 
     def _boom(self) -> Boom:
@@ -299,7 +299,13 @@ class EffectWriter:
         return f"rigcal_load(at, {self._table(name, weights, out)}, {joint})"
 
     def _table(self, name: str, weights: Floats, out: EffectCode) -> str:
-        out.tables.append(f"static const double rigcal_{name}[RIGCAL_FRAMES][4] = {_list(weights)};")
+        """Add a table of (frames, 4) weights, as (motions, 4) of what each motion carries in its own axes."""
+        carried = np.zeros((len(self.tree.motions), 4))
+        for (motion, place), (newton, *moment) in zip(self.tree.frames, weights, strict=True):
+            if motion >= 0:  # what is fixed to the base loads no joint
+                carried[motion, 0] += newton
+                carried[motion, 1:] += place[:3, :3] @ moment + newton * place[:3, 3]
+        out.tables.append(f"static const double rigcal_{name}[RIGCAL_MOTIONS][4] = {_list(carried)};")
         return f"rigcal_{name}"
 
     def _weights(self, mass: int | None = None) -> Floats:

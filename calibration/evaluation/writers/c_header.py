@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.effects.fitted import FittedEffect
 from calibration.evaluation.writers.c_effects import EffectCode, EffectWriter
-from calibration.evaluation.writers.motions import MotionTree
+from calibration.evaluation.writers.motions import Carriers
 from calibration.observations import Floats
 from calibration.rig.description import Rig
 
@@ -63,15 +63,16 @@ def _with_effects(engine: str, code: EffectCode) -> str:
     lines = [f"    {line}" for line in code.lines]
     if code.needs_pose:
         lines = [
-            "    rigcal_frame_t at[RIGCAL_MOTIONS];",
-            "    double prism_mm[RIGCAL_PRISMS][3];",
-            "    rigcal_pose(q, at);",
-            "    for (int p = 0; p < RIGCAL_PRISMS; p++) {",
-            "        rigcal_place(at, rigcal_prism_frame[p], rigcal_prism_place[p], prism_mm[p]);",
+            "    rigcal_pose(q, NULL, at);",
+            "    for (int p = 0; p < points->count; p++) {",
+            "        const int prism = points->prism[p];",
+            "        rigcal_place(at, rigcal_prism_motion[prism], rigcal_prism_place[prism], points->place[p]);",
             "    }",
-            "    (void)prism_mm;",
             *lines,
+            "    return 1;",
         ]
+    else:
+        lines += ["    (void)at;", "    return 0;"]
     return engine.replace(_SLOT, "\n".join(lines))
 
 
@@ -85,16 +86,16 @@ def _inputs(code: EffectCode) -> str:
     return f"typedef struct {{\n{used or nothing}}} rigcal_inputs;\n\n"
 
 
-def _sizes(rig: Rig, tree: MotionTree) -> str:
+def _sizes(rig: Rig, tree: Carriers) -> str:
     sizes = {"JOINTS": len(rig.joints), "PRISMS": len(rig.prisms), "MOTIONS": len(tree.motions)}
     sizes["FRAMES"] = len(tree.frames)
     return "".join(f"#define RIGCAL_{name} {number}\n" for name, number in sizes.items()) + "\n"
 
 
-def _tables(rig: Rig, tree: MotionTree, down: Floats, code: EffectCode) -> Iterable[str]:
+def _tables(rig: Rig, tree: Carriers, down: Floats, code: EffectCode) -> Iterable[str]:
     motions, prisms = tree.motions, list(tree.prisms.values())
     drives = [drive for motion in motions for drive in motion.drive]
-    kinds = [0 if not motion.drive else 1 if motion.rotates else 2 for motion in motions]
+    kinds = [1 if motion.rotates else 2 for motion in motions]
     first = [0, *itertools.accumulate(len(motion.drive) for motion in motions)]
     unit = [np.degrees(1.0) / 1e3 if joint.kind == "revolute" else 1.0 for joint in rig.joints]
     low, high = zip(*(joint.limits for joint in rig.joints), strict=True)
@@ -106,9 +107,13 @@ def _tables(rig: Rig, tree: MotionTree, down: Floats, code: EffectCode) -> Itera
         _table("int", "drive_joint", str(len(drives)), (joint for joint, _ in drives)),
         _table("double", "drive_size", str(len(drives)), (size for _, size in drives)),
         _rows("fixed", "RIGCAL_MOTIONS][12", [motion.fixed[:3].reshape(-1) for motion in motions]),
-        _table("int", "frame_motion", "RIGCAL_FRAMES", tree.frames),
-        _table("int", "prism_frame", "RIGCAL_PRISMS", (frame for frame, _ in prisms)),
+        _rows("beyond", "RIGCAL_MOTIONS][RIGCAL_MOTIONS", [tree.beyond(k) for k in range(len(motions))], kind="int"),
+        _table("int", "frame_motion", "RIGCAL_FRAMES", (motion for motion, _ in tree.frames)),
+        _rows("frame_origin", "RIGCAL_FRAMES][3", [place[:3, 3] for _, place in tree.frames]),
+        _rows("holds", "RIGCAL_FRAMES][RIGCAL_PRISMS", _holds(rig), kind="int"),
+        _table("int", "prism_motion", "RIGCAL_PRISMS", (motion for motion, _ in prisms)),
         _rows("prism_place", "RIGCAL_PRISMS][3", [place for _, place in prisms]),
+        _rows("prism_mount", "RIGCAL_PRISMS][3", [tree.frames[prism.frame][1][:3, 3] for prism in rig.prisms]),
         _table("double", "lower", "RIGCAL_JOINTS", low),
         _table("double", "upper", "RIGCAL_JOINTS", high),
         _table("double", "load_unit", "RIGCAL_JOINTS", unit),
@@ -117,11 +122,20 @@ def _tables(rig: Rig, tree: MotionTree, down: Floats, code: EffectCode) -> Itera
     )
 
 
+def _holds(rig: Rig) -> list[list[bool]]:
+    """Return for each frame which prisms it carries."""
+    paths = [(0, *rig.path(prism.frame)) for prism in rig.prisms]
+    return [[frame in path for path in paths] for frame in range(len(rig.rows) + 1)]
+
+
 def _table(kind: str, name: str, size: str, values: Iterable[float]) -> str:
-    numbers = ", ".join(repr(int(v) if kind == "int" else float(v)) for v in values)
-    return f"static const {kind} rigcal_{name}[{size}] = {{{numbers}}};"
+    return f"static const {kind} rigcal_{name}[{size}] = {{{_numbers(kind, values)}}};"
 
 
-def _rows(name: str, size: str, rows: Sequence[Floats]) -> str:
-    lines = ",\n    ".join("{" + ", ".join(repr(float(v)) for v in row) + "}" for row in rows)
-    return f"static const double rigcal_{name}[{size}] = {{\n    {lines}}};"
+def _rows(name: str, size: str, rows: Sequence[Iterable[float]], kind: str = "double") -> str:
+    lines = ",\n    ".join("{" + _numbers(kind, row) + "}" for row in rows)
+    return f"static const {kind} rigcal_{name}[{size}] = {{\n    {lines}}};"
+
+
+def _numbers(kind: str, values: Iterable[float]) -> str:
+    return ", ".join(repr(int(v) if kind == "int" else float(v)) for v in values)

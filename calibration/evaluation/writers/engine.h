@@ -1,9 +1,28 @@
 /* ---- the program: the same for every rig ------------------------------------------------------------------------ */
 
-typedef struct { double r[3][3]; double t[3]; } rigcal_frame_t;   /* axes as columns; origin, mm */
+/* Axes as columns; origin, mm; the motion's own size, rad or mm, and for a turn its cosine and sine. */
+typedef struct { double r[3][3]; double t[3]; double size, c, s; } rigcal_frame_t;
 
-/* Places of all motions at joint values q, deg and mm. */
-static inline void rigcal_pose(const double q[RIGCAL_JOINTS], rigcal_frame_t at[RIGCAL_MOTIONS])
+/* Cosine and sine of a turn. Beside a turn that is known they come from the difference by their series, whose first term
+   that is left out is below 1e-20 there. */
+static inline void rigcal_turn(double size, const rigcal_frame_t *known, rigcal_frame_t *out)
+{
+    const double d = known ? size - known->size : 1.0, dd = d * d;
+    out->size = size;
+    if (dd > 0.0025) {
+        out->c = cos(size);
+        out->s = sin(size);
+        return;
+    }
+    const double s = d * (1.0 - dd / 6.0 * (1.0 - dd / 20.0 * (1.0 - dd / 42.0 * (1.0 - dd / 72.0))));
+    const double v = dd / 2.0 * (1.0 - dd / 12.0 * (1.0 - dd / 30.0 * (1.0 - dd / 56.0)));   /* 1 - cos(d) */
+    out->c = known->c - (known->c * v + known->s * s);
+    out->s = known->s + (known->c * s - known->s * v);
+}
+
+/* Places of all motions at joint values q, deg and mm; `known` may be those at values close by, or NULL. */
+static inline void rigcal_pose(const double q[RIGCAL_JOINTS], const rigcal_frame_t *known,
+                               rigcal_frame_t at[RIGCAL_MOTIONS])
 {
     for (int k = 0; k < RIGCAL_MOTIONS; k++) {
         const double *f = rigcal_fixed[k];
@@ -21,7 +40,6 @@ static inline void rigcal_pose(const double q[RIGCAL_JOINTS], rigcal_frame_t at[
                 out->t[i] = p->r[i][0] * f[3] + p->r[i][1] * f[7] + p->r[i][2] * f[11] + p->t[i];
             }
         }
-        if (rigcal_kind[k] == 0) continue;
         double size = 0.0;
         for (int d = rigcal_first_drive[k]; d < rigcal_first_drive[k + 1]; d++)
             size += rigcal_drive_size[d] * q[rigcal_drive_joint[d]];
@@ -29,30 +47,28 @@ static inline void rigcal_pose(const double q[RIGCAL_JOINTS], rigcal_frame_t at[
         if (rigcal_kind[k] == 2) {
             for (int i = 0; i < 3; i++) out->t[i] += size * out->r[i][a];
         } else {
-            const double c = cos(size), s = sin(size);
+            rigcal_turn(size, known ? &known[k] : NULL, out);
             for (int i = 0; i < 3; i++) {
                 const double x = out->r[i][u], y = out->r[i][v];
-                out->r[i][u] = c * x + s * y;
-                out->r[i][v] = c * y - s * x;
+                out->r[i][u] = out->c * x + out->s * y;
+                out->r[i][v] = out->c * y - out->s * x;
             }
         }
     }
 }
 
-/* Place of a point that is fixed to a frame, mm. */
-static inline void rigcal_place(const rigcal_frame_t at[], int frame, const double point[3], double out[3])
+/* Place of a point that a motion carries, -1 for the base, mm. */
+static inline void rigcal_place(const rigcal_frame_t at[], int motion, const double point[3], double out[3])
 {
-    const int k = rigcal_frame_motion[frame];
+    const int k = motion;
     for (int i = 0; i < 3; i++)
         out[i] = k < 0 ? point[i]
                        : at[k].r[i][0] * point[0] + at[k].r[i][1] * point[1] + at[k].r[i][2] * point[2] + at[k].t[i];
 }
 
-static inline int rigcal_carries(int motion, int frame)
+static inline int rigcal_carries(int motion, int prism)
 {
-    for (int k = rigcal_frame_motion[frame]; k >= motion; k = rigcal_parent[k])
-        if (k == motion) return 1;
-    return 0;
+    return rigcal_prism_motion[prism] >= 0 && rigcal_beyond[motion][rigcal_prism_motion[prism]];
 }
 
 /* Derivative of a point's place by the size of a motion, mm per rad or mm. */
@@ -69,77 +85,81 @@ static inline void rigcal_slope(const rigcal_frame_t *at, int kind, int axis, co
     out[2] = a[0] * w[1] - a[1] * w[0];
 }
 
-/* Weight beyond every motion (N) and its moment about the base's origin (N mm); a table has N and N mm by frame. */
-static inline void rigcal_hang(const rigcal_frame_t at[], const double table[RIGCAL_FRAMES][4],
-                               double sum[RIGCAL_MOTIONS][4])
+/* Weight of a table beyond a motion, -1 for all (N), and its moment about a point (N mm); a table has N and N mm by motion. */
+static inline void rigcal_hang(const rigcal_frame_t at[], const double table[RIGCAL_MOTIONS][4], int motion,
+                               const double about[3], double sum[4])
 {
-    for (int k = 0; k < RIGCAL_MOTIONS; k++)
-        for (int i = 0; i < 4; i++) sum[k][i] = 0.0;
-    for (int f = 1; f < RIGCAL_FRAMES; f++) {
-        const int k = rigcal_frame_motion[f];
-        const double *m = table[f];
-        sum[k][0] += m[0];
+    for (int i = 0; i < 4; i++) sum[i] = 0.0;
+    for (int k = motion < 0 ? 0 : motion; k < RIGCAL_MOTIONS; k++) {
+        const double *m = table[k];
+        if (motion >= 0 && !rigcal_beyond[motion][k]) continue;
+        if (m[0] == 0.0 && m[1] == 0.0 && m[2] == 0.0 && m[3] == 0.0) continue;
+        sum[0] += m[0];
         for (int i = 0; i < 3; i++)
-            sum[k][1 + i] += at[k].r[i][0] * m[1] + at[k].r[i][1] * m[2] + at[k].r[i][2] * m[3] + m[0] * at[k].t[i];
+            sum[1 + i] += at[k].r[i][0] * m[1] + at[k].r[i][1] * m[2] + at[k].r[i][2] * m[3]
+                          + m[0] * (at[k].t[i] - about[i]);
     }
-    for (int k = RIGCAL_MOTIONS - 1; k >= 0; k--)
-        if (rigcal_parent[k] >= 0)
-            for (int i = 0; i < 4; i++) sum[rigcal_parent[k]][i] += sum[k][i];
 }
 
 /* Moment about a motion's origin of the weights beyond it, N m. */
-static inline void rigcal_moment(const rigcal_frame_t *at, const double sum[4], double out[3])
+static inline void rigcal_moment(const double sum[4], double out[3])
 {
-    double arm[3];
-    for (int i = 0; i < 3; i++) arm[i] = (sum[1 + i] - sum[0] * at->t[i]) / 1e3;
-    out[0] = arm[1] * rigcal_down[2] - arm[2] * rigcal_down[1];
-    out[1] = arm[2] * rigcal_down[0] - arm[0] * rigcal_down[2];
-    out[2] = arm[0] * rigcal_down[1] - arm[1] * rigcal_down[0];
+    const double *g = rigcal_down;
+    out[0] = (sum[2] * g[2] - sum[3] * g[1]) / 1e3;
+    out[1] = (sum[3] * g[0] - sum[1] * g[2]) / 1e3;
+    out[2] = (sum[1] * g[1] - sum[2] * g[0]) / 1e3;
 }
 
 /* Gravity's load on a joint, N m or N; positive drives its value up. */
-static inline double rigcal_load(const rigcal_frame_t at[], const double table[RIGCAL_FRAMES][4], int joint)
+static inline double rigcal_load(const rigcal_frame_t at[], const double table[RIGCAL_MOTIONS][4], int joint)
 {
-    double sum[RIGCAL_MOTIONS][4], load = 0.0;
-    rigcal_hang(at, table, sum);
+    double load = 0.0;
     for (int k = 0; k < RIGCAL_MOTIONS; k++)
         for (int d = rigcal_first_drive[k]; d < rigcal_first_drive[k + 1]; d++) {
             if (rigcal_drive_joint[d] != joint) continue;
             const int a = rigcal_axis[k];
-            double m[3], part = 0.0;
+            double sum[4], m[3], part = 0.0;
+            rigcal_hang(at, table, k, at[k].t, sum);
             if (rigcal_kind[k] == 1) {
-                rigcal_moment(&at[k], sum[k], m);
+                rigcal_moment(sum, m);
                 for (int i = 0; i < 3; i++) part += at[k].r[i][a] * m[i];
                 part *= 1e3;
             } else {
-                for (int i = 0; i < 3; i++) part += at[k].r[i][a] * rigcal_down[i] * sum[k][0];
+                for (int i = 0; i < 3; i++) part += at[k].r[i][a] * rigcal_down[i] * sum[0];
             }
             load += rigcal_drive_size[d] * part;
         }
     return load * rigcal_load_unit[joint];
 }
 
+/* Prisms that are asked for: their numbers, places at the readings and shifts by effects, mm. */
+typedef struct {
+    int count;
+    const int *prism;
+    double place[RIGCAL_PRISMS][3], shift[RIGCAL_PRISMS][3];
+} rigcal_points_t;
+
 /* A link that turns about its joint's place in proportion to a moment: the shift of the prisms, mm.
    `along` is 1 for the part of the moment along the axis, 0 for that across it. */
-static inline void rigcal_bend(const rigcal_frame_t at[], const double table[RIGCAL_FRAMES][4], int motion, int along,
-                               double amount, double shift[RIGCAL_PRISMS][3], double prism_mm[RIGCAL_PRISMS][3])
+static inline void rigcal_bend(const rigcal_frame_t at[], const double table[RIGCAL_MOTIONS][4], int motion, int along,
+                               double amount, rigcal_points_t *points)
 {
-    double sum[RIGCAL_MOTIONS][4], m[3], turn[3], about = 0.0;
+    double sum[4], m[3], turn[3], about = 0.0;
     const int a = rigcal_axis[motion];
-    rigcal_hang(at, table, sum);
-    rigcal_moment(&at[motion], sum[motion], m);
+    rigcal_hang(at, table, motion, at[motion].t, sum);
+    rigcal_moment(sum, m);
     for (int i = 0; i < 3; i++) about += at[motion].r[i][a] * m[i];
     for (int i = 0; i < 3; i++) {
         const double on_axis = at[motion].r[i][a] * about;
         turn[i] = amount * (along ? on_axis : m[i] - on_axis);
     }
-    for (int p = 0; p < RIGCAL_PRISMS; p++) {
-        if (!rigcal_carries(motion, rigcal_prism_frame[p])) continue;
-        const double w[3] = {prism_mm[p][0] - at[motion].t[0], prism_mm[p][1] - at[motion].t[1],
-                             prism_mm[p][2] - at[motion].t[2]};
-        shift[p][0] += turn[1] * w[2] - turn[2] * w[1];
-        shift[p][1] += turn[2] * w[0] - turn[0] * w[2];
-        shift[p][2] += turn[0] * w[1] - turn[1] * w[0];
+    for (int p = 0; p < points->count; p++) {
+        if (!rigcal_carries(motion, points->prism[p])) continue;
+        const double w[3] = {points->place[p][0] - at[motion].t[0], points->place[p][1] - at[motion].t[1],
+                             points->place[p][2] - at[motion].t[2]};
+        points->shift[p][0] += turn[1] * w[2] - turn[2] * w[1];
+        points->shift[p][1] += turn[2] * w[0] - turn[0] * w[2];
+        points->shift[p][2] += turn[0] * w[1] - turn[1] * w[0];
     }
 }
 
@@ -148,10 +168,9 @@ static inline void rigcal_bend(const rigcal_frame_t at[], const double table[RIG
 static inline double rigcal_boom(const rigcal_frame_t at[], int root, int tip, double from[3], double to[3],
                                  double axis[3])
 {
-    const double origin[3] = {0.0, 0.0, 0.0};
     double length = 0.0;
-    rigcal_place(at, root, origin, from);
-    rigcal_place(at, tip, origin, to);
+    rigcal_place(at, rigcal_frame_motion[root], rigcal_frame_origin[root], from);
+    rigcal_place(at, rigcal_frame_motion[tip], rigcal_frame_origin[tip], to);
     for (int i = 0; i < 3; i++) length += (to[i] - from[i]) * (to[i] - from[i]);
     length = sqrt(length);
     for (int i = 0; i < 3; i++) axis[i] = (to[i] - from[i]) / fmax(length, 1e-6);
@@ -172,26 +191,18 @@ static inline void rigcal_cross(const double a[3], const double b[3], double out
 
 /* A beam that bends: `tip_newton` at its tip with the moment of a table's weights about it, `own_newton` along it, in
    units of its flexibility. */
-static inline void rigcal_droop(const rigcal_frame_t at[], int root, int tip, const double table[RIGCAL_FRAMES][4],
-                                double tip_newton, double own_newton, double shift[RIGCAL_PRISMS][3],
-                                double prism_mm[RIGCAL_PRISMS][3])
+static inline void rigcal_droop(const rigcal_frame_t at[], int root, int tip, const double table[RIGCAL_MOTIONS][4],
+                                double tip_newton, double own_newton, rigcal_points_t *points)
 {
-    double from[3], to[3], e[3], first[3] = {0.0, 0.0, 0.0}, moment[3];
+    double from[3], to[3], e[3], hanging[4], first[3], moment[3];
     const double *g = rigcal_down, length = rigcal_boom(at, root, tip, from, to, e) / 1e3, rise = rigcal_dot(e, g);
-    for (int f = 1; f < RIGCAL_FRAMES; f++) {
-        double place[3];
-        const double *m = table[f];
-        const int k = rigcal_frame_motion[f];
-        for (int i = 0; i < 3; i++) {
-            place[i] = at[k].r[i][0] * m[1] + at[k].r[i][1] * m[2] + at[k].r[i][2] * m[3] + m[0] * at[k].t[i];
-            first[i] += (place[i] - m[0] * to[i]) / 1e3;
-        }
-    }
+    rigcal_hang(at, table, -1, to, hanging);
+    for (int i = 0; i < 3; i++) first[i] = hanging[1 + i] / 1e3;
     rigcal_cross(first, g, moment);
-    for (int p = 0; p < RIGCAL_PRISMS; p++) {
+    for (int p = 0; p < points->count; p++) {
         double s[3], lever[3], by_moment[3], twist[3];
-        if (!rigcal_carries(rigcal_frame_motion[tip], rigcal_prism_frame[p])) continue;
-        for (int i = 0; i < 3; i++) s[i] = (prism_mm[p][i] - to[i]) / 1e3;
+        if (!rigcal_holds[tip][points->prism[p]]) continue;
+        for (int i = 0; i < 3; i++) s[i] = (points->place[p][i] - to[i]) / 1e3;
         for (int i = 0; i < 3; i++) lever[i] = e[i] * length * length / 2.0 + s[i] * length;
         const double along = rigcal_dot(e, s), below = rigcal_dot(g, s), on_axis = rigcal_dot(moment, e);
         rigcal_cross(moment, lever, by_moment);
@@ -199,7 +210,7 @@ static inline void rigcal_droop(const rigcal_frame_t at[], int root, int tip, co
         for (int i = 0; i < 3; i++) {
             const double across = (g[i] - rise * e[i]) * length * length * length;
             const double turning = (along * g[i] - below * e[i]) * length * length;
-            shift[p][i] += 1e3 * (by_moment[i] - on_axis * twist[i] * length
+            points->shift[p][i] += 1e3 * (by_moment[i] - on_axis * twist[i] * length
                                   + tip_newton * (across / 3.0 + turning / 2.0)
                                   + own_newton * (across / 8.0 + turning / 6.0));
         }
@@ -207,42 +218,37 @@ static inline void rigcal_droop(const rigcal_frame_t at[], int root, int tip, co
 }
 
 /* The inner section of a boom tilts about the mouth of the outer one until its pads touch. */
-static inline void rigcal_pads(const rigcal_frame_t at[], int root, int tip, const double table[RIGCAL_FRAMES][4],
+static inline void rigcal_pads(const rigcal_frame_t at[], int root, int tip, const double table[RIGCAL_MOTIONS][4],
                                double outer_mm, double overlap_mm, double clearance_mm,
-                               double shift[RIGCAL_PRISMS][3], double prism_mm[RIGCAL_PRISMS][3])
+                               rigcal_points_t *points)
 {
-    double from[3], to[3], e[3], mouth[3], about[3] = {0.0, 0.0, 0.0};
+    double from[3], to[3], e[3], mouth[3], hanging[4], about[3];
     rigcal_boom(at, root, tip, from, to, e);
     for (int i = 0; i < 3; i++) mouth[i] = from[i] + outer_mm * e[i];
-    for (int f = 1; f < RIGCAL_FRAMES; f++) {
-        const double *m = table[f];
-        const int k = rigcal_frame_motion[f];
-        for (int i = 0; i < 3; i++)
-            about[i] += at[k].r[i][0] * m[1] + at[k].r[i][1] * m[2] + at[k].r[i][2] * m[3]
-                        + m[0] * (at[k].t[i] - mouth[i]);
-    }
+    rigcal_hang(at, table, -1, mouth, hanging);
+    for (int i = 0; i < 3; i++) about[i] = hanging[1 + i];
     const double rise = rigcal_dot(e, rigcal_down), level = sqrt(fmax(1.0 - rise * rise, 0.0));
     const double side = rigcal_dot(about, e) - rigcal_dot(about, rigcal_down) * rise;
     if (level <= 1e-6) return;
     const double tilt = clearance_mm * ((side > 0.0) - (side < 0.0)) / (overlap_mm * level);
-    for (int p = 0; p < RIGCAL_PRISMS; p++) {
+    for (int p = 0; p < points->count; p++) {
         double s[3];
-        if (!rigcal_carries(rigcal_frame_motion[tip], rigcal_prism_frame[p])) continue;
-        for (int i = 0; i < 3; i++) s[i] = prism_mm[p][i] - mouth[i];
+        if (!rigcal_holds[tip][points->prism[p]]) continue;
+        for (int i = 0; i < 3; i++) s[i] = points->place[p][i] - mouth[i];
         const double along = rigcal_dot(e, s), below = rigcal_dot(rigcal_down, s);
-        for (int i = 0; i < 3; i++) shift[p][i] += tilt * (along * rigcal_down[i] - below * e[i]);
+        for (int i = 0; i < 3; i++) points->shift[p][i] += tilt * (along * rigcal_down[i] - below * e[i]);
     }
 }
 
 /* The term of one drive alone, `amount` further of its joint, deg or mm: the shift of the prisms, mm. */
 static inline void rigcal_follow(const rigcal_frame_t at[], int motion, int drive, double amount,
-                                 double shift[RIGCAL_PRISMS][3], double prism_mm[RIGCAL_PRISMS][3])
+                                 rigcal_points_t *points)
 {
-    for (int p = 0; p < RIGCAL_PRISMS; p++) {
+    for (int p = 0; p < points->count; p++) {
         double s[3];
-        if (!rigcal_carries(motion, rigcal_prism_frame[p])) continue;
-        rigcal_slope(&at[motion], rigcal_kind[motion], rigcal_axis[motion], prism_mm[p], s);
-        for (int i = 0; i < 3; i++) shift[p][i] += rigcal_drive_size[drive] * amount * s[i];
+        if (!rigcal_carries(motion, points->prism[p])) continue;
+        rigcal_slope(&at[motion], rigcal_kind[motion], rigcal_axis[motion], points->place[p], s);
+        for (int i = 0; i < 3; i++) points->shift[p][i] += rigcal_drive_size[drive] * amount * s[i];
     }
 }
 
@@ -285,68 +291,64 @@ static inline double rigcal_sign(double x) { return (x > 0.0) - (x < 0.0); }
 
 /* ---- effects of this model -------------------------------------------------------------------------------------- */
 
-static inline void rigcal_effects(const double q[RIGCAL_JOINTS], const rigcal_inputs *in,
-                                  double change[RIGCAL_JOINTS], double shift[RIGCAL_PRISMS][3])
+/* What the effects add to the joints' readings and to the prisms' places. Returns 1 where they look at the pose of the
+   readings, which is then in `at`. */
+static inline int rigcal_effects(const double q[RIGCAL_JOINTS], const rigcal_inputs *in,
+                                 rigcal_frame_t at[RIGCAL_MOTIONS], double change[RIGCAL_JOINTS],
+                                 rigcal_points_t *points)
 {
     for (int j = 0; j < RIGCAL_JOINTS; j++) change[j] = 0.0;
-    for (int p = 0; p < RIGCAL_PRISMS; p++)
-        for (int i = 0; i < 3; i++) shift[p][i] = 0.0;
+    for (int p = 0; p < points->count; p++)
+        for (int i = 0; i < 3; i++) points->shift[p][i] = 0.0;
     (void)q;
     (void)in;
 /*EFFECTS*/
 }
 
-static inline void rigcal_solve_pose(const double q[RIGCAL_JOINTS], const rigcal_inputs *in,
-                                     rigcal_frame_t at[RIGCAL_MOTIONS], double out_mm[RIGCAL_PRISMS][3])
+static inline void rigcal_solve_pose(const double q[RIGCAL_JOINTS], const rigcal_inputs *in, int count,
+                                     const int prism[], rigcal_frame_t at[RIGCAL_MOTIONS], double out_mm[][3])
 {
-    double change[RIGCAL_JOINTS], shift[RIGCAL_PRISMS][3], moved[RIGCAL_JOINTS];
-    rigcal_effects(q, in, change, shift);
+    double change[RIGCAL_JOINTS], moved[RIGCAL_JOINTS];
+    rigcal_frame_t read[RIGCAL_MOTIONS];
+    rigcal_points_t points = {.count = count, .prism = prism};
+    const int is_posed = rigcal_effects(q, in, read, change, &points);
     for (int j = 0; j < RIGCAL_JOINTS; j++) moved[j] = q[j] + change[j];
-    rigcal_pose(moved, at);
-    for (int p = 0; p < RIGCAL_PRISMS; p++) {
-        rigcal_place(at, rigcal_prism_frame[p], rigcal_prism_place[p], out_mm[p]);
-        for (int i = 0; i < 3; i++) out_mm[p][i] += shift[p][i];
+    rigcal_pose(moved, is_posed ? read : NULL, at);
+    for (int p = 0; p < count; p++) {
+        rigcal_place(at, rigcal_prism_motion[prism[p]], rigcal_prism_place[prism[p]], out_mm[p]);
+        for (int i = 0; i < 3; i++) out_mm[p][i] += points.shift[p][i];
     }
 }
 
-/* ---- what to call ----------------------------------------------------------------------------------------------- */
+/* ---- the inverse ------------------------------------------------------------------------------------------------ */
 
-/* Places of all prisms in the base frame, mm, at joint readings q, deg and mm. `in` may be NULL: nothing is known. */
-static inline void rigcal_forward(const double q[RIGCAL_JOINTS], const rigcal_inputs *in,
-                                  double out_mm[RIGCAL_PRISMS][3])
-{
-    rigcal_frame_t at[RIGCAL_MOTIONS];
-    rigcal_solve_pose(q, in, at, out_mm);
-}
-
-/* The joint commands that bring `count` prisms to their targets (x, y, z of each, base frame, mm), near to those in q
-   on entry and inside the joints' limits. Returns the number of steps taken, or -1 where a target stays farther than
-   RIGCAL_CLOSE_MM; q is then as near as it came. */
 #define RIGCAL_CLOSE_MM 1e-9
-static inline int rigcal_inverse(int count, const int prism[], const double *target_mm, const rigcal_inputs *in,
-                                 double q[RIGCAL_JOINTS])
+
+/* Steps of Gauss and Newton from q, that of least change of the joints in units of `range`. Returns their number, or -1;
+   q and off_mm are then the nearest place that it came to. */
+static inline int rigcal_approach(int count, const int prism[], const double *target_mm, const rigcal_inputs *in,
+                                  const double range[RIGCAL_JOINTS], double q[RIGCAL_JOINTS], double *off_mm)
 {
     enum { MOST = 3 * RIGCAL_PRISMS };
     double damping = 0.0, best = HUGE_VAL, kept[RIGCAL_JOINTS], error[MOST], slope[MOST][RIGCAL_JOINTS];
-    double range[RIGCAL_JOINTS];
     int held[RIGCAL_JOINTS] = {0}, idle = 0;
     const int rows = 3 * count;
     for (int j = 0; j < RIGCAL_JOINTS; j++) {
-        range[j] = rigcal_upper[j] - rigcal_lower[j];
         q[j] = fmin(fmax(q[j], rigcal_lower[j]), rigcal_upper[j]);
         kept[j] = q[j];
     }
     for (int step = 0; step < 200; step++) {
         rigcal_frame_t at[RIGCAL_MOTIONS];
         double place[RIGCAL_PRISMS][3], off = 0.0;
-        rigcal_solve_pose(q, in, at, place);
+        rigcal_solve_pose(q, in, count, prism, at, place);
         for (int c = 0; c < count; c++)
             for (int i = 0; i < 3; i++) {
-                const double e = target_mm[3 * c + i] - place[prism[c]][i];
+                const double e = target_mm[3 * c + i] - place[c][i];
                 off += e * e;
             }
         off = sqrt(off);
         if (off < best) {
+            const int is_fast = step > 1 && off < 0.01 * best;   /* then the slopes of the step before do */
             idle = off < 0.5 * best ? 0 : idle + 1;
             best = off;
             damping *= 0.1;
@@ -354,13 +356,13 @@ static inline int rigcal_inverse(int count, const int prism[], const double *tar
             for (int j = 0; j < RIGCAL_JOINTS; j++) kept[j] = q[j];
             if (off <= RIGCAL_CLOSE_MM) return step;
             for (int c = 0; c < count; c++) {
-                for (int i = 0; i < 3; i++) error[3 * c + i] = target_mm[3 * c + i] - place[prism[c]][i];
+                for (int i = 0; i < 3; i++) error[3 * c + i] = target_mm[3 * c + i] - place[c][i];
+                if (is_fast) continue;
                 for (int i = 0; i < 3; i++)
                     for (int j = 0; j < RIGCAL_JOINTS; j++) slope[3 * c + i][j] = 0.0;
-                for (int k = rigcal_frame_motion[rigcal_prism_frame[prism[c]]]; k >= 0; k = rigcal_parent[k]) {
+                for (int k = rigcal_prism_motion[prism[c]]; k >= 0; k = rigcal_parent[k]) {
                     double s[3];
-                    if (rigcal_kind[k] == 0) continue;
-                    rigcal_slope(&at[k], rigcal_kind[k], rigcal_axis[k], place[prism[c]], s);
+                    rigcal_slope(&at[k], rigcal_kind[k], rigcal_axis[k], place[c], s);
                     for (int d = rigcal_first_drive[k]; d < rigcal_first_drive[k + 1]; d++)
                         for (int i = 0; i < 3; i++)
                             slope[3 * c + i][rigcal_drive_joint[d]] +=
@@ -379,10 +381,11 @@ static inline int rigcal_inverse(int count, const int prism[], const double *tar
             double a[MOST][MOST + 1], most = 0.0;
             int crossed = 0;
             for (int r = 0; r < rows; r++) {
-                for (int s = 0; s < rows; s++) {
-                    a[r][s] = 0.0;
+                for (int s = 0; s <= r; s++) {
+                    double sum = 0.0;
                     for (int j = 0; j < RIGCAL_JOINTS; j++)
-                        if (!held[j]) a[r][s] += slope[r][j] * slope[s][j];
+                        if (!held[j]) sum += slope[r][j] * slope[s][j];
+                    a[r][s] = a[s][r] = sum;
                 }
                 most = fmax(most, a[r][r]);
                 a[r][rows] = error[r];
@@ -392,7 +395,7 @@ static inline int rigcal_inverse(int count, const int prism[], const double *tar
                 int p = r;
                 for (int s = r + 1; s < rows; s++)
                     if (fabs(a[s][r]) > fabs(a[p][r])) p = s;
-                for (int c = 0; c <= rows; c++) {
+                for (int c = 0; p != r && c <= rows; c++) {
                     const double x = a[r][c];
                     a[r][c] = a[p][c];
                     a[p][c] = x;
@@ -423,6 +426,45 @@ static inline int rigcal_inverse(int count, const int prism[], const double *tar
         }
     }
     for (int j = 0; j < RIGCAL_JOINTS; j++) q[j] = kept[j];
+    *off_mm = best;
+    return -1;
+}
+
+/* ---- what to call ----------------------------------------------------------------------------------------------- */
+
+/* Places of all prisms in the base frame, mm, at joint readings q, deg and mm. `in` may be NULL: nothing is known. */
+static inline void rigcal_forward(const double q[RIGCAL_JOINTS], const rigcal_inputs *in,
+                                  double out_mm[RIGCAL_PRISMS][3])
+{
+    int prism[RIGCAL_PRISMS];
+    rigcal_frame_t at[RIGCAL_MOTIONS];
+    for (int p = 0; p < RIGCAL_PRISMS; p++) prism[p] = p;
+    rigcal_solve_pose(q, in, RIGCAL_PRISMS, prism, at, out_mm);
+}
+
+/* The joint commands that bring `count` prisms to their targets (x, y, z of each, base frame, mm), near to those in q
+   on entry and inside the joints' limits. Returns the number of steps taken, or -1 where a target stays farther than
+   RIGCAL_CLOSE_MM; q is then as near as it came. Where play leaves a gap on the shortest way, one joint after the other
+   is held back, so that the others go round it. */
+static inline int rigcal_inverse(int count, const int prism[], const double *target_mm, const rigcal_inputs *in,
+                                 double q[RIGCAL_JOINTS])
+{
+    double range[RIGCAL_JOINTS], start[RIGCAL_JOINTS], nearest[RIGCAL_JOINTS], best = HUGE_VAL, off = HUGE_VAL;
+    for (int j = 0; j < RIGCAL_JOINTS; j++) {
+        range[j] = rigcal_upper[j] - rigcal_lower[j];
+        start[j] = nearest[j] = q[j];
+    }
+    for (int back = -1; back < RIGCAL_JOINTS; back++) {
+        for (int j = 0; j < RIGCAL_JOINTS; j++) q[j] = start[j];
+        if (back >= 0) range[back] *= 0.1;
+        const int steps = rigcal_approach(count, prism, target_mm, in, range, q, &off);
+        if (steps >= 0) return steps;
+        if (back >= 0) range[back] *= 10.0;
+        if (off >= best) continue;
+        best = off;
+        for (int j = 0; j < RIGCAL_JOINTS; j++) nearest[j] = q[j];
+    }
+    for (int j = 0; j < RIGCAL_JOINTS; j++) q[j] = nearest[j];
     return -1;
 }
 

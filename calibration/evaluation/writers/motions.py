@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,6 +47,52 @@ class MotionTree:
     frames: tuple[int, ...]
     turning: dict[int, int]
     prisms: dict[str, tuple[int, Floats]]
+
+
+@dataclass(frozen=True)
+class Carriers:
+    """The motions of a tree that move, with everything else fixed to them.
+
+    Attributes:
+        motions: parents first; each has a drive.
+        frames: frame number -> (motion that carries it, (4, 4) its place after that motion, mm); -1 for the base.
+        turning: row number -> index of the motion of its driven theta.
+        prisms: name -> (motion that carries it, (3,) place after that motion, mm).
+    """
+
+    motions: tuple[Motion, ...]
+    frames: tuple[tuple[int, Floats], ...]
+    turning: dict[int, int]
+    prisms: dict[str, tuple[int, Floats]]
+
+    def beyond(self, motion: int) -> list[bool]:
+        """Return for each motion whether another one carries it, itself too."""
+        found: list[bool] = []
+        for index, one in enumerate(self.motions):
+            found.append(index == motion or (one.parent >= 0 and found[one.parent]))
+        return found
+
+
+def carriers(tree: MotionTree) -> Carriers:
+    """Return a tree without the transforms that never move: each is part of what comes after it."""
+    motions: list[Motion] = []
+    placed: dict[int, tuple[int, Floats]] = {-1: (-1, np.eye(4))}
+    for index, motion in enumerate(tree.motions):
+        parent, before = placed[motion.parent]
+        fixed = before @ motion.fixed
+        if motion.drive:
+            placed[index] = len(motions), np.eye(4)
+            motions.append(replace(motion, parent=parent, fixed=fixed))
+        else:
+            placed[index] = parent, fixed
+    frames = tuple(placed[index] for index in tree.frames)
+    turning = {row: placed[index][0] for row, index in tree.turning.items()}
+    prisms = {name: (frames[frame][0], _moved(frames[frame][1], at)) for name, (frame, at) in tree.prisms.items()}
+    return Carriers(tuple(motions), frames, turning, prisms)
+
+
+def _moved(transform: Floats, place: Floats) -> Floats:
+    return np.asarray(transform[:3, :3] @ place + transform[:3, 3])
 
 
 def motion_tree(chain: Chain, x: Floats) -> MotionTree:

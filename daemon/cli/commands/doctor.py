@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -17,6 +16,7 @@ from daemon.cli.diagnosis import Finding
 from daemon.cli.terminal import echo
 from daemon.commands import CommandError
 from daemon.control.protocol import request
+from daemon.version import VERSION
 
 CONFIG = Path("/etc/rigcal/rigcal.toml")
 TIMEOUT_S = 10.0
@@ -64,7 +64,7 @@ def _examine(socket: Path | None, path: Path | None) -> Iterator[Finding]:
         # A simulated or replayed rig has the configuration of a real one, and none of its devices.
         for finding in diagnosis.devices(config) if status["mode"] == "live" else ():
             yield _as_the_daemon_has_it(finding, status["acquisition"]["links"])
-    yield from diagnosis.daemon_state(status, importlib.metadata.version("rigcal"))
+    yield from diagnosis.daemon_state(status, VERSION)
 
 
 def _as_the_daemon_has_it(finding: Finding, links: Sequence[dict[str, object]]) -> Finding:

@@ -11,6 +11,7 @@ import numpy as np
 from calibration.effects.base import FittedCoefficient
 from calibration.effects.fitted import AppliedEffects
 from calibration.evaluation.evaluation import Evaluation, instrument_noise_mm
+from calibration.evaluation.latency import Latency
 from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor
 from calibration.observations import Observations
@@ -48,6 +49,7 @@ def report_input(
     made_utc_ns: int | None = None,
     sources: Mapping[str, str] | None = None,
     setups: Sequence[SetupLine] = (),
+    latencies: Mapping[str, Latency | str] | None = None,
     facts: Facts | None = None,
 ) -> ReportInput:
     """Gather the content of a calibration report.
@@ -58,6 +60,7 @@ def report_input(
         made_utc_ns: when the report is made; without it the same model and rows give the same report.
         sources: label -> text: files or sessions that the data came from, and the model's hash.
         setups: station set-ups and control points, where known.
+        latencies: session -> latency of its fixes, or why it is not known, where there are sessions.
         facts: the first lines of the report; by default what the rows say.
     """
     model = training.model
@@ -81,6 +84,7 @@ def report_input(
         ignored_columns=judged.observations.ignored_columns,
         provenance=provenance(model, made_utc_ns, sources or {}),
         setups=setups,
+        latencies=latencies or {},
         effects=list(_effects(training)),
         effects_reason=model.effects_reason,
         expected=judged.expected,

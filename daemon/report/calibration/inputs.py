@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -15,6 +15,7 @@ from daemon.report.front import Facts
 
 if TYPE_CHECKING:  # both bring numba, which `status` and `--help` must not wait for
     from calibration.design.accuracy import ExpectedAccuracy
+    from calibration.evaluation.latency import Latency
     from calibration.identification.sweeps.cross_check import AxisCheck
 
 Floats = NDArray[np.float64]
@@ -182,6 +183,7 @@ class ReportInput:
         warnings: sentences for the operator.
         ignored_columns: columns of the data that rigcal does not know (docs/formats.md).
         setups: station set-ups with their control points, where known.
+        latencies: session -> latency of its fixes against the joints, or why it is not known; empty for data of files.
         provenance: label -> value: data hashes, versions, seed, time.
         expected: how true the model expects itself to be over the work volume, where that is known.
         axes: the model held against single-joint sweeps of the judged rows.
@@ -207,6 +209,7 @@ class ReportInput:
     ignored_columns: Sequence[str]
     provenance: Mapping[str, str]
     setups: Sequence[SetupLine] = ()
+    latencies: Mapping[str, Latency | str] = field(default_factory=dict)
     effects: Sequence[EffectLine] = ()
     effects_reason: str = "switched off"
     expected: ExpectedAccuracy | None = None

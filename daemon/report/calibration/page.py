@@ -12,6 +12,7 @@ from daemon.report.calibration import figures
 from daemon.report.calibration.inputs import STAGES, USUAL, ErrorTable, ReportInput, SetupLine, Stage
 from daemon.report.front import Accuracy, Facts, Verdict, front, judge, signatures
 from daemon.report.plain_names import coefficient_words, constant_words, in_words, joint_words, unit_words
+from daemon.report.timing import timing
 from daemon.report.words import DASH, INTERVAL_SIGMAS, PLUS_MINUS, number, signed
 
 if TYPE_CHECKING:
@@ -48,6 +49,7 @@ def calibration_report(report: ReportInput) -> str:
             _parameters(report),
             _outliers(report),
             _setups(report),
+            timing(report.latencies),
             markup.sources_section(report.provenance, _ignored(report)),
             signatures(),
         ]

@@ -7,7 +7,6 @@ without it was never finished.
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import json
 import os
 import re
@@ -22,6 +21,7 @@ from daemon.host.safe_output import write_file
 from daemon.store.errors import StoreError, storage_errors
 from daemon.store.files import BESIDE, WriterLock
 from daemon.store.upkeep.soundness import Soundness, check_store
+from daemon.version import VERSION
 
 STORE, MODELS, ABOUT = "rigcal.sqlite", "models", "backup.json"
 FORM = 1
@@ -120,7 +120,7 @@ def make_backup(store: Path, models: Path, directory: Path, keep: int, now_utc_n
                 "form": FORM,
                 "made_utc_ns": now_utc_ns,
                 "size_bytes": size,
-                "rigcal": importlib.metadata.version("rigcal"),
+                "rigcal": VERSION,
             }
             write_file(scratch / ABOUT, json.dumps(about).encode() + b"\n")
             _sync_tree(scratch)

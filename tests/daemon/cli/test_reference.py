@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import runpy
 import shutil
 import subprocess
 import sys
@@ -14,6 +13,7 @@ from click.testing import CliRunner
 
 from daemon.cli.main import main
 from daemon.cli.reference import reference
+from deploy.release.debian import completion
 
 REPOSITORY = Path(__file__).parents[3]
 
@@ -46,5 +46,4 @@ def test_the_script_of_a_shell_is_sound_and_is_packed(shell: str) -> None:
     assert "_RIGCAL_COMPLETE" in done.stdout
     if shutil.which(shell):
         assert subprocess.run([shell, "-n"], input=done.stdout, text=True, check=False).returncode == 0
-    packed = runpy.run_path(str(REPOSITORY / "deploy" / "debian" / "build.py"))["completion"](REPOSITORY, shell)
-    assert packed.decode() == done.stdout
+    assert completion(REPOSITORY, shell).decode() == done.stdout

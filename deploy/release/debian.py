@@ -1,16 +1,11 @@
-"""Builds rigcal's wheel and its Debian packages: `make wheel`, `make deb`.
+"""Debian packages: rigcal with all locked packages, for the Python of one Debian release.
 
-Both are made of the last commit, never of what lies in the work tree, and the same commit gives the same bytes:
-instants are those of the commit, owners are root, and no compiled Python is packed.
-
-A Debian package holds rigcal with all locked packages, for the Python of one Debian release: it installs without a
-network, and nothing that Debian updates can change what runs. `python -m deploy.debian.build` is not how it is called:
-it is a program of its own, `python deploy/debian/build.py deb [--release 12|13]... [--out DIRECTORY]`.
+A package installs without a network, and nothing that Debian updates can change what runs (docs/decisions/0025).
+Instants are those of the commit, owners are root, and no compiled Python is packed.
 """
 
 from __future__ import annotations
 
-import argparse
 import gzip
 import hashlib
 import json
@@ -20,10 +15,8 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import tomllib
-import zipfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from datetime import UTC, datetime
 from email.parser import HeaderParser
 from email.utils import formatdate
 from importlib.metadata import distributions
@@ -32,8 +25,8 @@ from typing import Any
 
 from packaging.requirements import Requirement
 
-HERE = Path(__file__).resolve().parent
-ROOT = HERE.parents[1]
+from deploy.release.source import Source, run
+
 HOME = Path("usr/lib/rigcal")  # of the environment
 PYTHONS = {12: "3.11", 13: "3.13"}  # Debian release -> its Python
 # Wheels for these may be installed there: Debian 12 has glibc 2.36.
@@ -88,68 +81,8 @@ Description: calibration of a drilling boom, by its joints and a total station
 """
 
 
-@dataclass(frozen=True)
-class Source:
-    """The last commit, unpacked.
-
-    Attributes:
-        tree: its files.
-        version: of the project; a commit that is no release has its date and number behind it.
-        epoch: when it was made, seconds.
-    """
-
-    tree: Path
-    version: str
-    epoch: int
-
-    @classmethod
-    def of_head(cls, tree: Path) -> Source:
-        """Unpack the last commit into a directory."""
-        tree.mkdir(parents=True)
-        archive = subprocess.run(["git", "-C", ROOT, "archive", "HEAD"], check=True, capture_output=True).stdout
-        subprocess.run(["tar", "-x", "-C", tree], input=archive, check=True)
-        version = tomllib.loads((tree / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
-        epoch, commit, day = _git("log", "-1", "--format=%ct %h %cd", "--date=format:%Y%m%d", "--abbrev=8").split()
-        if f"v{version}" not in _git("tag", "--points-at", "HEAD").split():
-            version += f"+git{day}.{commit}"
-        return cls(tree, version, int(epoch))
-
-
-def build_wheel(source: Source, out: Path) -> Path:
-    """Make the wheel of a commit.
-
-    Returns:
-        Its path in `out`.
-    """
-    with tempfile.TemporaryDirectory() as scratch:
-        command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w", scratch]
-        _run([*command, str(source.tree)], SOURCE_DATE_EPOCH=str(source.epoch))
-        (wheel,) = Path(scratch).glob("rigcal-*.whl")
-        out.mkdir(parents=True, exist_ok=True)
-        target = out / wheel.name
-        _repack(wheel, target, source.epoch)
-    return target
-
-
-def _repack(wheel: Path, target: Path, epoch: int) -> None:
-    """Write a wheel again with entries in the order of their names and rights of one kind."""
-    when = max(epoch, 315_532_800)  # zip knows no time before 1980
-    date = tuple(
-        int(part)
-        for part in subprocess.run(
-            ["date", "-u", "-d", f"@{when}", "+%Y %m %d %H %M %S"], check=True, capture_output=True, text=True
-        ).stdout.split()
-    )
-    with zipfile.ZipFile(wheel) as old, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as new:
-        for name in sorted(old.namelist()):
-            entry = zipfile.ZipInfo(name, date)  # type: ignore[arg-type]
-            entry.external_attr = 0o100644 << 16
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            new.writestr(entry, old.read(name))
-
-
-def build_package(source: Source, wheel: Path, release: int, out: Path) -> Path:
-    """Make the package for a Debian release.
+def build_package(source: Source, wheel: Path, release: int, out: Path) -> tuple[Path, Path]:
+    """Make the package for a Debian release, and its bill of materials beside it.
 
     Args:
         source: the commit.
@@ -158,7 +91,7 @@ def build_package(source: Source, wheel: Path, release: int, out: Path) -> Path:
         out: directory of packages.
 
     Returns:
-        Its path.
+        Paths of package and bill of materials.
     """
     python = PYTHONS[release]
     version = f"{source.version}~deb{release}"
@@ -176,9 +109,13 @@ def build_package(source: Source, wheel: Path, release: int, out: Path) -> Path:
         documents = root / "usr/share/doc/rigcal"
         _put(documents / "changelog.Debian.gz", _gzipped(_changelog(version, source.epoch)))
         _put(documents / "changelog.gz", _gzipped((source.tree / "CHANGELOG.md").read_text(encoding="utf-8")))
-        _put(documents / "sbom.cdx.json", bill_of_materials(root / HOME, source, python).encode())
+        materials = bill_of_materials(root / HOME, source, python).encode()
+        _put(documents / "sbom.cdx.json", materials)
         _write_control(root, source, version, python)
-        return _packed(root, out / f"rigcal_{version}_amd64.deb", source.epoch)
+        package = _packed(root, out / f"rigcal_{version}_amd64.deb", source.epoch)
+        beside = package.with_suffix(".cdx.json")
+        beside.write_bytes(materials)
+        return package, beside
 
 
 def _fill_environment(home: Path, source: Source, wheel: Path, python: str) -> None:
@@ -191,8 +128,8 @@ def _fill_environment(home: Path, source: Source, wheel: Path, python: str) -> N
         where = ["--target", str(site), "--python-version", python, "--implementation", "cp"]
         where += [word for platform in PLATFORMS for word in ("--platform", platform)]
         pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-compile", "--no-deps", "--only-binary", ":all:"]
-        _run([*pip, *where, "--require-hashes", "-r", lock.name])
-        _run([*pip, *where, str(wheel)])
+        run([*pip, *where, "--require-hashes", "-r", lock.name])
+        run([*pip, *where, str(wheel)])
     shutil.rmtree(site / "bin", ignore_errors=True)  # scripts that name this machine's Python
     for record in [*site.glob("*.dist-info/direct_url.json"), *site.glob("*.dist-info/RECORD")]:
         record.unlink()  # where the wheel lay; and lists with the scripts in them
@@ -257,12 +194,7 @@ def bill_of_materials(home: Path, source: Source, python: str) -> str:
         "specVersion": "1.5",
         "version": 1,
         "metadata": {
-            "timestamp": subprocess.run(
-                ["date", "-u", "-d", f"@{source.epoch}", "+%Y-%m-%dT%H:%M:%SZ"],
-                check=True,
-                capture_output=True,
-                text=True,
-            ).stdout.strip(),
+            "timestamp": datetime.fromtimestamp(source.epoch, UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
             "component": {"type": "application", "name": "rigcal", "version": source.version},
         },
         "components": components,
@@ -297,7 +229,7 @@ def _packed(root: Path, target: Path, epoch: int) -> Path:
     target.parent.mkdir(parents=True, exist_ok=True)
     # One thread: with more, the compressed bytes depend on how many there are.
     command = ["dpkg-deb", "--root-owner-group", "--threads-max=1", "-Zxz", "-z2", "--build", str(root), str(target)]
-    _run(command, SOURCE_DATE_EPOCH=str(epoch))
+    run(command, SOURCE_DATE_EPOCH=str(epoch))
     return target
 
 
@@ -323,37 +255,3 @@ def _put(path: Path, data: bytes, mode: int = 0o644) -> None:
 def _link(path: Path, to: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.symlink_to(to)
-
-
-def _run(command: list[str], **environment: str) -> None:
-    quiet = {"PIP_DISABLE_PIP_VERSION_CHECK": "1", "PIP_ROOT_USER_ACTION": "ignore", "PIP_NO_INPUT": "1"}
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env={**os.environ, **quiet, **environment})
-
-
-def _git(*arguments: str) -> str:
-    return subprocess.run(["git", "-C", ROOT, *arguments], check=True, capture_output=True, text=True).stdout.strip()
-
-
-def main() -> int:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("wheel", "deb"))
-    parser.add_argument("--release", type=int, action="append", choices=sorted(PYTHONS), help="Debian release (all)")
-    parser.add_argument("--out", type=Path, default=ROOT / "dist")
-    options = parser.parse_args()
-    os.umask(0o022)
-    with tempfile.TemporaryDirectory() as scratch:
-        source = Source.of_head(Path(scratch) / "source")
-        wheel = build_wheel(source, options.out if options.what == "wheel" else Path(scratch))
-        made = [wheel]
-        if options.what == "deb":
-            made = [
-                build_package(source, wheel, release, options.out) for release in options.release or sorted(PYTHONS)
-            ]
-    for path in made:
-        print(f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,0 +1,1 @@
+"""What a rig's computer gets, and how releases are made."""
