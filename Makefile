@@ -14,7 +14,7 @@ export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 # The tests start a hundred processes: each would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help environment setup demo deb debtest vmtest wheel check test long webtest lint style types imports quick blind bench soak fuzz lock check-deps clean
+.PHONY: help environment setup demo docs deb debtest vmtest wheel check test long webtest lint style types imports quick blind bench soak fuzz lock check-deps clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -32,6 +32,11 @@ $(KERNELS)/warm: | environment
 
 demo: setup ## a simulated rig, from bus traffic to a calibrated model and a report
 	@$(BIN)/rigcal demo
+
+# Pictures first: what a browser is needed for is left out where there is none.
+docs: setup ## the documentation as a site, with its pictures, in build/site
+	$(BIN)/python -m docs.pictures build/pictures
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
 wheel: environment ## the wheel of the last commit, in dist/; the same commit gives the same bytes
 	@$(BIN)/python deploy/debian/build.py wheel

@@ -139,7 +139,7 @@ def model_export(
     matlab    the identified kinematics as a .mat file
     c-header  forward kinematics with effects, and the inverse, as one C99 file
 
-    docs/models.md says how to use each. The error of what is left out is measured over the joint values of
+    docs/how-to/export.md says how to use each. The error of what is left out is measured over the joint values of
     the training.
     """
     if directory is not None and number is not None:
