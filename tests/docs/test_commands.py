@@ -27,7 +27,7 @@ ALONE = ("connect", "import-arm", "import-measurements", "fleet")
 WITH_A_MODEL = ("plan", "export")  # that of `calibrate`
 WITH_A_RIG = ("replay", "store", "back-up", "monitor")  # on which `sessions` has held a session
 LONG = ("docs/tutorial.md", f"{HOW_TO}/gap-report.md")
-TIMEOUT_S = 240
+TIMEOUT_S = 280
 
 
 @functools.cache
