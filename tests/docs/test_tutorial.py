@@ -39,7 +39,13 @@ class Reader:
         """Give commands; they must end with status 0."""
         command = ["bash", "-euo", "pipefail", "-c", f'{text}\necho "$PWD;${{RIGCAL_SOCKET-}}" >&2']
         done = subprocess.run(
-            command, cwd=self.directory, env=self._env, stdin=subprocess.DEVNULL, capture_output=True, text=True
+            command,
+            cwd=self.directory,
+            env=self._env,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            check=False,
         )
         assert done.returncode == 0, f"{text}\n{done.stdout[-3000:]}\n{done.stderr[-2000:]}"
         directory, _, socket = done.stderr.splitlines()[-1].partition(";")
@@ -47,7 +53,7 @@ class Reader:
         return done.stdout
 
     def ask(self, command: str) -> Any:
-        return json.loads(self.type(f"{command} --json"))
+        return json.loads(self.type(f"{command} --json"))["result"]
 
     def wait(self, done: Callable[[], Any]) -> None:
         deadline = time.monotonic() + DEADLINE_S
@@ -57,10 +63,10 @@ class Reader:
 
     def start(self, command: str) -> subprocess.Popen[bytes]:
         """Give a command in another terminal."""
-        log = (self.directory / "daemon.log").open("w")
-        return subprocess.Popen(
-            command.split(), cwd=self.directory, env=self._env, stdout=log, stderr=log, start_new_session=True
-        )
+        with (self.directory / "daemon.log").open("w") as log:
+            return subprocess.Popen(
+                command.split(), cwd=self.directory, env=self._env, stdout=log, stderr=log, start_new_session=True
+            )
 
 
 def test_the_tutorial_ends_with_an_accepted_model(tmp_path: Path) -> None:
@@ -71,7 +77,7 @@ def test_the_tutorial_ends_with_an_accepted_model(tmp_path: Path) -> None:
     reader.type(unpack.text)
     daemon = reader.start(start.commands[0])
     try:
-        reader.wait(lambda: (reader.directory / "rigcal-sim" / "control.sock").exists())
+        reader.wait((reader.directory / "rigcal-sim" / "control.sock").exists)
         reader.type(look.text)
         reader.type(guide.text)
         reader.type(jobs.text)
