@@ -15,7 +15,7 @@ export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 # The tests start a hundred processes: each would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help environment setup demo deb debtest vmtest wheel sdist release check test long webtest lint style types imports quick blind bench soak fuzz lock check-deps clean
+.PHONY: help environment setup demo docs deb debtest vmtest wheel sdist release check test long webtest lint style types imports quick blind bench soak fuzz lock check-deps clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -34,6 +34,11 @@ $(KERNELS)/warm: | environment
 demo: setup ## a simulated rig, from bus traffic to a calibrated model and a report
 	@$(BIN)/rigcal demo
 
+# Pictures first: what a browser is needed for is left out where there is none.
+docs: setup ## the documentation as a site, with its pictures, in build/site
+	$(BIN)/python -m docs.pictures build/pictures
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+
 wheel: environment ## the wheel of the last commit, in dist/; the same commit gives the same bytes
 	@$(BIN)/python -m deploy.release wheel
 
@@ -43,11 +48,11 @@ sdist: environment ## its sdist, which gives the same wheel
 deb: environment ## Debian packages of the last commit, for Debian 12 and 13, in dist/
 	@$(BIN)/python -m deploy.release deb
 
-# Refused before anything is built, where the last commit may not be a release. `make docs` leaves its pages in site/.
+# Refused before anything is built, where the last commit may not be a release. `make docs` leaves its pages in build/site.
 release: environment ## a release of the last commit: wheel, sdist, packages, bills of materials, docs, SHA256SUMS, in dist/
 	@$(BIN)/python -m deploy.release check
 	@SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) $(MAKE) --no-print-directory docs
-	@$(BIN)/python -m deploy.release release --docs site
+	@$(BIN)/python -m deploy.release release --docs build/site
 
 debtest: environment ## the packages in fresh Debian 12 and 13 roots without a network; root, ten minutes
 	@$(BIN)/python -m tests.deploy.packages

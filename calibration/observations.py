@@ -67,7 +67,7 @@ class Observations:
         pose: (n,) standstill; "" where not given. A pose is unique within its session and set-up.
         extra: optional columns by their CSV name (`time_s`, `theta1_dir`, `boom_valve_mA`, ...) -> (n,), NaN where
             not measured.
-        ignored_columns: columns of the file that docs/reference.md does not name.
+        ignored_columns: columns of the file that docs/reference/rig-keys.md does not name.
         ignored_numbers: those of them that hold numbers, which a signal of the rig file could use.
         row_numbers: (n,) where each row was read (`row_name`); None for rows that were made in a program.
         place: what numbers them: the lines of a file, its header is line 1, or the rows of a data frame, from 0.

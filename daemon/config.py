@@ -34,8 +34,10 @@ class CanSection(_Section):
 
     Attributes:
         name: which of the rig's channels it serves (their `link`).
-        interface, channel, bitrate: as python-can has them; `bitrate` is not set on socketcan (networkd does that).
-            `playback` plays the captured log `channel`, as if its first frame came now.
+        interface: kind of adapter, as python-can names it; `playback` plays a captured log as if its first frame came
+            now.
+        channel: interface, port or group, as python-can names it (`can0`, `/dev/ttyACM0`); for `playback` the log.
+        bitrate: bit/s of the bus, for an slcan adapter; on socketcan systemd-networkd sets it.
         allow_transmit: rigcal may send on this bus: SYNC, and active set-up of the nodes listed.
         transmit_nodes: CANopen nodes that may be written to.
         sync_period_ms: send SYNC this often, so that all joints are sampled at one instant.
@@ -134,7 +136,7 @@ class ReportSection(_Section):
 
 
 class TipCanSection(_Section):
-    """The live corrected tip on a CAN link: two frames a time, as docs/tip-frames.md has them.
+    """The live corrected tip on a CAN link: two frames a time, as docs/reference/tip-frames.md has them.
 
     Attributes:
         link: name of a [[can]] link that may transmit.
@@ -176,7 +178,7 @@ class MetricsSection(_Section):
     """Metrics for Prometheus, on the loopback interface alone.
 
     Attributes:
-        port: where they are served, as docs/metrics.md says; 0 for any that is free, which the log names.
+        port: where they are served, as docs/reference/metrics.md says; 0 for any that is free, which the log names.
     """
 
     port: int = Field(ge=0, le=65535)

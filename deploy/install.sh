@@ -94,5 +94,5 @@ rigcal is installed. Then, in this order (deploy/README.md says more):
   2. edit /etc/udev/rules.d/99-rigcal-station.rules: the serial number of the station's adapter
   3. edit /etc/systemd/network/80-can0.network: the bus's bit rate;   systemctl enable --now systemd-networkd
   4. systemctl enable --now rigcal
-  5. the operator's page, if it is wanted (docs/web.md):    systemctl enable --now rigcal-web
+  5. the operator's page, if it is wanted (docs/how-to/operator-page.md):    systemctl enable --now rigcal-web
 NEXT

@@ -7,8 +7,8 @@
     model = rigcal.calibrate(rig, fixes)
     model.predict(fixes).position_mm
 
-`docs/api.md` is a worked example. Everything else in the packages `calibration`, `daemon`, `drivers` and `simulators`
-may change without notice; these names follow Semantic Versioning.
+`docs/how-to/notebook.md` is a worked example. Everything else in the packages `calibration`, `daemon`, `drivers` and
+`simulators` may change without notice; these names follow Semantic Versioning.
 """
 
 from calibration.errors import CalibrationError, DataError, ModelError, RigError, UnsafeError

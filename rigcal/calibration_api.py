@@ -148,7 +148,7 @@ class Model:
 
         Args:
             directory: where to; it is made where it is missing.
-            format_name: as `rigcal model export --format` has it (docs/models.md); `json` and `grid` by default.
+            format_name: as `rigcal model export --format` has it (docs/how-to/export.md); `json` and `grid` by default.
 
         Returns:
             The files that were written.

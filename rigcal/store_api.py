@@ -25,7 +25,7 @@ def open_store(path: str | Path, frames: FrameLibrary = "pandas") -> Store:
     """Open a store for reading, also while the daemon writes to it.
 
     Args:
-        path: the daemon's `store.sqlite`.
+        path: the daemon's `rigcal.sqlite`.
         frames: which library's data frames are given; it has to be installed.
 
     Raises:

@@ -32,7 +32,7 @@ class PlanRow:
 
 
 def read_plan(path: Path, rig: Rig, dwell_s: float) -> list[Stop]:
-    """Read the stops of a plan (CSV; docs/formats.md).
+    """Read the stops of a plan (CSV; docs/reference/formats.md).
 
     Args:
         path: the file.
@@ -47,7 +47,7 @@ def read_plan(path: Path, rig: Rig, dwell_s: float) -> list[Stop]:
 
 
 def plan_rows(path: Path, rig: Rig) -> list[PlanRow]:
-    """Read the poses of a plan (CSV; docs/formats.md).
+    """Read the poses of a plan (CSV; docs/reference/formats.md).
 
     Args:
         path: the file.

@@ -13,7 +13,16 @@ from tests.passed import ROOT, Passed
 MARK = "pytest.mark.long"
 PASSED = Passed(
     "long.passed",
-    ("calibration", "simulators", "daemon/cli", "daemon/report", "daemon/warm_up.py", "requirements-dev.lock"),
+    (
+        "calibration",
+        "simulators",
+        "daemon/cli",
+        "daemon/report",
+        "daemon/warm_up.py",
+        "docs/tutorial.md",
+        "docs/how-to",
+        "requirements-dev.lock",
+    ),
     lambda path: path.name.startswith("test_") and MARK in path.read_text("utf-8"),
 )
 

@@ -39,7 +39,7 @@ class FittedEffect:
     regime: Regime | None = None
 
     def as_dict(self) -> dict[str, object]:
-        """Return the JSON object (docs/formats.md, gap), with the form and the numbers of the variant."""
+        """Return the JSON object (docs/reference/formats.md, gap), with the form and the numbers of the variant."""
         return {
             "family": self.family,
             "where": self.where,

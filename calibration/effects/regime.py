@@ -33,7 +33,7 @@ class Regime:
     border: float
 
     def as_dict(self) -> dict[str, object]:
-        """Return the JSON object `regime` of an effect (docs/formats.md, gap)."""
+        """Return the JSON object `regime` of an effect (docs/reference/formats.md, gap)."""
         return {"variable": self.variable, "above": self.above, "border": self.border}
 
     @property

@@ -63,7 +63,7 @@ class Evaluation:
         return [{"stage": stage, **statistics(sizes_mm(self.errors_mm[stage][rows]))} for stage in STAGES]
 
     def as_dict(self, seconds: float) -> dict[str, object]:
-        """Return the JSON object of `calibrate` and `evaluate` (docs/formats.md); `seconds` is the caller's measure."""
+        """Return the JSON object of `calibrate` and `evaluate` (docs/reference/formats.md); `seconds` is measured."""
         return {
             "rig": self.model.rig.name,
             "n": len(self),

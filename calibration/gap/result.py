@@ -37,7 +37,7 @@ class Candidate:
     reason: str = ""
 
     def as_dict(self) -> dict[str, object]:
-        """Return the JSON object of a candidate in a set (docs/formats.md, gap)."""
+        """Return the JSON object of a candidate in a set (docs/reference/formats.md, gap)."""
         return {"family": self.family, "where": self.where, "posterior": self.posterior}
 
 
@@ -56,7 +56,7 @@ class Disagreement:
     p: float
 
     def as_dict(self) -> dict[str, object]:
-        """Return the JSON object (docs/formats.md, gap)."""
+        """Return the JSON object (docs/reference/formats.md, gap)."""
         return {"where": self.where, "variable": self.variable, "p": self.p}
 
 
@@ -77,7 +77,7 @@ class Evidence:
     certificate_p: float
 
     def as_dict(self) -> dict[str, object]:
-        """Return the members of the JSON object of an effect (docs/formats.md, gap)."""
+        """Return the members of the JSON object of an effect (docs/reference/formats.md, gap)."""
         p = self.certificate_p
         return {
             "log_bayes_factor": self.log_bayes_factor,
@@ -104,7 +104,7 @@ class Break:
     log_bayes_factor: float
 
     def as_dict(self) -> dict[str, object]:
-        """Return the JSON object `break` (docs/formats.md, gap)."""
+        """Return the JSON object `break` (docs/reference/formats.md, gap)."""
         return {
             "variable": self.variable,
             "border": self.border,
@@ -143,7 +143,7 @@ class Experiment:
     stands_out_sigma: Mapping[str, float] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, object]:
-        """Return the JSON object (docs/formats.md, gap), with poses and their promise, if any."""
+        """Return the JSON object (docs/reference/formats.md, gap), with poses and their promise, if any."""
         told: dict[str, object] = {"kind": self.kind, "text": self.text}
         if self.poses:
             told |= {"poses": list(self.poses), "stands_out_sigma": dict(self.stands_out_sigma)}
@@ -251,7 +251,7 @@ class GapResult:
         return {**effect.as_dict(), "posterior": self.posterior[name], **self.evidence[name].as_dict()}
 
     def as_dict(self) -> dict[str, object]:
-        """Return the JSON object of `gap` (docs/formats.md), without `seconds`."""
+        """Return the JSON object of `gap` (docs/reference/formats.md), without `seconds`."""
         return {
             "verdict": self.verdict,
             "effects": [self._effect(e) for e in self.effects],

@@ -47,7 +47,7 @@ class Identifiability:
     observability: Mapping[str, float] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, object]:
-        """Return the JSON object (docs/formats.md, calibrate)."""
+        """Return the JSON object (docs/reference/formats.md, calibrate)."""
         return asdict(self)
 
 

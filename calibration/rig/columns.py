@@ -1,6 +1,6 @@
 """Columns of an observations table: their names, units and meanings.
 
-`calibration.table` reads by them, and docs/reference.md lists them.
+`calibration.table` reads by them, and docs/reference/rig-keys.md lists them.
 """
 
 from __future__ import annotations

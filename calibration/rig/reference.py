@@ -1,4 +1,4 @@
-"""docs/reference.md, made from the code: every column of observations and every key of rig files."""
+"""docs/reference/rig-keys.md, made from the code: every column of observations and every key of rig files."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import json
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -27,12 +28,12 @@ from calibration.rig.channels import (
 from calibration.rig.columns import READ, WRITTEN, Column
 from calibration.rig.description import FixedTransform, Joint, Mass, Prism, Rig, Row, Station, Tolerances
 
-_HEAD = """# Reference: columns and keys
+_HEAD = """# Columns and rig keys
 
-Every column of observations and every key of a rig file. What they are for is in [formats.md](formats.md) and
-[rig-files.md](rig-files.md).
+Every column of observations and every key of a rig file. What they are for is in [files and outputs](formats.md) and
+[rig files](../how-to/rig-files.md).
 
-This page is made from the code: `python -m calibration.rig.reference > docs/reference.md`.
+This page is made from the code: `python -m calibration.rig.reference > docs/reference/rig-keys.md`.
 
 ## Columns of observations
 
@@ -68,7 +69,7 @@ _TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ('`device = "dbc"`', DbcSignal),
     ('`device = "raw"`', RawSignal),
 )
-_ENDINGS = ("mm", "deg", "kg", "s", "ms", "nm", "arcsec", "ppm", "counts", "bits")
+_ENDINGS = ("mm", "m", "deg", "kg", "s", "ms", "nm", "arcsec", "ppm", "counts", "bits", "hz")
 _UNITS = {  # of keys whose names have none: they go with the kind of the joint
     "limits": "deg or mm",
     "sigma": "deg or mm",
@@ -76,12 +77,12 @@ _UNITS = {  # of keys whose names have none: they go with the kind of the joint
     "linearity": "deg or share",
     "max_rate": "deg/s or mm/s",
 }
-_WORDS = {float: "number", int: "whole number", str: "text", bool: "true or false"}
+_WORDS = {float: "number", int: "whole number", str: "text", bool: "true or false", Path: "path"}
 _ENTRY = re.compile(r"        (\w+(?:, \w+)*): (.+)")
 
 
 def page() -> str:
-    """Return the text of docs/reference.md."""
+    """Return the text of docs/reference/rig-keys.md."""
     tables = itertools.chain.from_iterable(_keys(title, model) for title, model in _TABLES)
     columns = (*_columns(READ, needed=True), _WRITTEN, *_columns(WRITTEN, needed=False))
     return "\n".join((_HEAD, *columns, _KEYS, *tables)).rstrip() + "\n"
@@ -89,22 +90,31 @@ def page() -> str:
 
 def _columns(columns: Iterable[Column], *, needed: bool) -> Iterator[str]:
     header = ("column", "unit", "meaning", *(("needed",) if needed else ()))
-    yield from _table(header, ((f"`{c.name}`", c.unit, c.meaning, c.need)[: len(header)] for c in columns))
+    yield from table(header, ((f"`{c.name}`", c.unit, c.meaning, c.need)[: len(header)] for c in columns))
 
 
 def _keys(title: str, model: type[BaseModel]) -> Iterator[str]:
-    """Yield a section: the keys that a model has itself, what it inherits stands elsewhere."""
+    """Yield the section of a table: the keys that a model has itself, what it inherits stands elsewhere."""
     yield f"### {title}"
     yield ""
+    yield from keys(model, _own_fields(model))
+
+
+def keys(model: type[BaseModel], fields: Mapping[str, FieldInfo]) -> Iterator[str]:
+    """Yield the lines that describe some keys of a TOML table: the model's first paragraph, and a row for each key.
+
+    Args:
+        model: its docstring and those of its bases describe each key under `Attributes:`.
+        fields: name -> key, those to list.
+    """
     yield " ".join(str(model.__doc__).split("\n\n")[0].split())
     yield ""
-    own = _own_fields(model)
     told = _told(model)
     rows = (
         (f"`{field.alias or name}`", _type(field), _unit(name), _default(field), told[name])
-        for name, field in own.items()
+        for name, field in fields.items()
     )
-    yield from _table(("key", "type", "unit", "default", "meaning"), rows)
+    yield from table(("key", "type", "unit", "default", "meaning"), rows)
     yield ""
 
 
@@ -136,10 +146,10 @@ def _type(field: FieldInfo) -> str:
     above = next((rule.gt for rule in field.metadata if isinstance(rule, Gt)), None)
     least = next((rule.ge for rule in field.metadata if isinstance(rule, Ge)), None)
     most = next((rule.le for rule in field.metadata if isinstance(rule, Le)), None)
-    if text == "text" and field.metadata:  # the one pattern that there is
+    if any(getattr(rule, "pattern", None) for rule in field.metadata):  # the one pattern that there is
         return "name"
     if above is not None:
-        return f"{text} above {above}"
+        return f"{text} above {above}" if most is None else f"{text} above {above}, at most {most}"
     if least is not None:
         return f"{text}, {least} or more" if most is None else f"{text}, {least} to {most}"
     return text
@@ -171,10 +181,11 @@ def _default(field: FieldInfo) -> str:
     value = field.get_default(call_default_factory=True)
     if value is None or value == () or isinstance(value, BaseModel):
         return ""
-    return f"`{json.dumps(value)}`" if value != {} else "`{}`"
+    return f"`{json.dumps(value, default=str)}`" if value != {} else "`{}`"
 
 
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    """Yield the lines of a table in Markdown."""
     for row in (header, ["---"] * len(header), *rows):
         yield "| " + " | ".join(cell.replace("|", r"\|") for cell in row) + " |"
 

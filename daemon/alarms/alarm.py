@@ -49,7 +49,7 @@ class Rule:
         remedy: what to do; SUBJECT in it stands for the alarm's subject.
         after_s: how long a fault must stand before it is an alarm.
         hold_s: how long its evidence must be gone before the alarm is cleared.
-        meaning: when it raises and clears, for docs/alarms.md.
+        meaning: when it raises and clears, for docs/reference/alarms.md.
         find: its function.
     """
 

@@ -25,10 +25,12 @@ when rigcal is stopped goes on, with its old time, if its reason is still there 
 
 Alarms leave the machine where the configuration says how: by a webhook, by a command, or by both.
 
-    [notify]
-    webhook_url = "https://chat.example.com/hooks/SECRET"
-    command = ["/usr/bin/msmtp", "someone@example.com"]
-    least = "critical"   # alarms below it are not told; "warning" when left out
+```toml
+[notify]
+webhook_url = "https://chat.example.com/hooks/SECRET"
+command = ["/usr/bin/msmtp", "someone@example.com"]
+least = "critical"   # alarms below it are not told; "warning" when left out
+```
 
 Each target is told when an alarm is raised, when it becomes critical and when it is over; an alarm that stands when
 `[notify]` is added, too. What happens within 3 s is one message. At most 20 messages an hour are sent; what comes
@@ -44,11 +46,11 @@ The webhook gets a POST of a JSON object: `text` (all of it, as chat services sh
 
 The command is run without a shell, for at most 30 s, and gets an e-mail without recipients (RFC 5322) on its standard
 input. Exit status 0 is a delivery. The service's sandbox has no network until `network.conf` opens it to the address of
-the webhook or mail server ([deploy/README.md](../deploy/README.md#the-network)). The command runs in it too: programs
+the webhook or mail server ([installation](../../deploy/README.md#the-network)). The command runs in it too: programs
 that speak SMTP themselves, such as msmtp, work; those that hand over to a local mail system by a set-group-ID program
 (Postfix' sendmail) do not.
 
-This page is made from the rules in `daemon/alarms/rules`: `python -m daemon.alarms.library > docs/alarms.md`.
+This page is made from the rules in `daemon/alarms/rules`: `python -m daemon.alarms.library > docs/reference/alarms.md`.
 """
 
 
@@ -65,7 +67,7 @@ def library() -> tuple[Rule, ...]:
 
 
 def page() -> str:
-    """Return the text of docs/alarms.md: `python -m daemon.alarms.library > docs/alarms.md` writes it."""
+    """Return the text of docs/reference/alarms.md."""
     sections = (_section(rule) for rule in sorted(library(), key=lambda rule: rule.kind))
     return "\n".join((_HEAD, *sections))
 

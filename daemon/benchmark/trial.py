@@ -45,7 +45,7 @@ class Trial:
     """A case.
 
     Attributes:
-        kind: a kind of case, as in `docs/gap-benchmark.md`.
+        kind: a kind of case, as in `docs/explanation/gap-benchmark.md`.
         poses, noise, size: its cell; size is the visible RMS of an effect in units of the noise.
         seed: draws it again.
         effects: hidden effects.

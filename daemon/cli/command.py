@@ -30,7 +30,7 @@ _BAR = 40  # characters
 
 
 def exit_status(error: BaseException) -> int:
-    """Return 2 for wrong use or bad input, 3 for a result that would be unsafe to use, else 1 (docs/formats.md)."""
+    """Return 2 for wrong use or bad input, 3 for an unsafe result, else 1 (docs/reference/formats.md)."""
     if isinstance(error, CommandError):
         return error.status
     if isinstance(error, UnsafeError):

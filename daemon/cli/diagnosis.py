@@ -244,7 +244,9 @@ def daemon_state(status: Mapping[str, Any], version: str) -> Iterator[Finding]:
     if store["state"] in ("ok", "checking"):
         yield Finding("store", "good", f"{status['store']}: {store['text'] or 'no fault is known'}")
     else:
-        yield Finding("store", "fault", store["text"], "`rigcal store check` reads all of it; docs/store.md says more")
+        yield Finding(
+            "store", "fault", store["text"], "`rigcal store check` reads all of it; docs/how-to/back-up.md says more"
+        )
     for link in acquisition["links"]:
         yield _link(link)
     yield from _channels(acquisition["channels"])

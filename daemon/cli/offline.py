@@ -190,7 +190,7 @@ def show_evaluation(result: Mapping[str, Any], rows: str) -> None:
     """Print the result of `calibrate` or `evaluate`.
 
     Args:
-        result: the JSON object (docs/formats.md).
+        result: the JSON object (docs/reference/formats.md).
         rows: the rows that the errors are of, e.g. "the 250 fixes it was fitted to".
     """
     from daemon.report.words import number

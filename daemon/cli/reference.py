@@ -13,12 +13,12 @@ from daemon.cli.terminal import echo_text
 HEAD = """# Commands
 
 Every command with its arguments and options. This page is made from the commands: `python -m daemon.cli.reference >
-docs/commands.md`. Each command says the same with `--help`.
+docs/reference/commands.md`. Each command says the same with `--help`.
 
 Exit status of all commands: 0 done, 1 failed, 2 wrong use or bad input, 3 refused because the result would be unsafe
 to use; `rigcal health` alone has those of monitoring systems. With `--json`, standard output holds one JSON object and
-nothing else ([formats.md](formats.md)). Where standard output is no terminal, what is printed has no colours and no
-moving parts.
+nothing else ([files and outputs](formats.md)). Where standard output is no terminal, what is printed has no colours and
+no moving parts.
 
 `rigcal completion bash | zsh | fish` prints the script by which a shell completes commands and options with the Tab
 key; the Debian package and `deploy/install.sh` put all three in place.
@@ -44,7 +44,7 @@ def _parts(context: click.Context, command: click.Command) -> Iterator[str]:
         return
     level = "##" if context.parent is not None and context.parent.parent is None else "###"
     usage = " ".join((context.command_path, *command.collect_usage_pieces(context)))
-    lines = [f"{level} {context.command_path}", "", f"    {usage}", "", _text(command)]
+    lines = [f"{level} {context.command_path}", "", "```text", usage, "```", "", _text(command)]
     records = [
         record
         for parameter in command.get_params(context)

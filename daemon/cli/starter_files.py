@@ -101,7 +101,7 @@ def rig_file(name: str, joints: Sequence[JointChoice], prisms: Sequence[str], he
         heard: what was heard on its bus; None where nobody listened.
     """
     parts = [
-        f"""# A rig file: docs/rig-files.md says how to write one, docs/reference.md lists every key.
+        f"""# A rig file: docs/how-to/rig-files.md says how to write one, docs/reference/rig-keys.md lists every key.
 # FILL IN what the drawings say: numbers of [[row]], offsets of prisms, zeros of encoders. Lengths mm, angles deg.
 {_heard_comment(heard)}
 name = {_quoted(name)}

@@ -1,4 +1,4 @@
-"""A guide as clients see it: the JSON object of `guide.state` (docs/guide.md), with words for every step."""
+"""A guide as clients see it: the JSON of `guide.state` (docs/reference/guide-socket.md), with words for steps."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def check_gap_target(directory: Path) -> None:
 
 
 def gap_answer(gap: GapResult, seconds: float) -> dict[str, object]:
-    """Return the JSON object of `gap` (docs/formats.md), with the rounds and the forecasts that its report shows."""
+    """Return the JSON object of `gap` (docs/reference/formats.md), with rounds and forecasts, as its report shows."""
     return {
         "rig": gap.model.rig.name,
         "n": len(gap.observations),

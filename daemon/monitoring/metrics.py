@@ -383,7 +383,7 @@ FAMILIES: tuple[Family, ...] = (
     Family(
         "rigcal_alarm_active",
         "gauge",
-        "1 for each active alarm; docs/alarms.md has the kinds.",
+        "1 for each active alarm; docs/reference/alarms.md has the kinds.",
         ("kind", "subject", "severity"),
         lambda s: (((a["kind"], a["subject"], a["severity"]), 1.0) for a in s["alarms"]["active"]),
     ),

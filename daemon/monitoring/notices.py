@@ -32,7 +32,7 @@ class Notices:
         active: the alarms that an earlier run has left active, as rows.
         rig: name of the machine.
         clock: of the store's instants.
-        pace: how often messages are sent; as docs/alarms.md says by default.
+        pace: how often messages are sent; as docs/reference/alarms.md says by default.
     """
 
     def __init__(

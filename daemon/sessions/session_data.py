@@ -1,6 +1,6 @@
 """Contents of a stored session, for calibration and report.
 
-Observations come as CSV (docs/formats.md): from here on a session is read exactly as an imported file is.
+Observations come as CSV (docs/reference/formats.md): from here on a session is read exactly as an imported file is.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Encoder of the corrected tip as CAN frames; `tip.dbc` beside this file and docs/tip-frames.md describe them.
+"""Encoder of the corrected tip as CAN frames; `tip.dbc` and docs/reference/tip-frames.md describe them.
 
 Two frames with consecutive 11-bit identifiers carry one tip; both have its counter and its status, so that a receiver
 can pair them. Lengths are in 0.1 mm, little-endian, in the base frame.

@@ -12,7 +12,9 @@ from drivers.stations.serial_port import SerialConfig
 
 
 class StationConfig(ProfileOptions, PollTiming):
-    """A total station and how to listen to it. Its profile's options and its time-outs are the bases' fields.
+    """A total station and how to listen to it.
+
+    Its profile's options and its time-outs are the bases' fields.
 
     Attributes:
         name: of the station; its captures, fixes and events carry it.

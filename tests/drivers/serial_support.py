@@ -1,4 +1,4 @@
-"""Real pseudo-terminals and the frames of docs/protocols.md, for tests of serial drivers."""
+"""Real pseudo-terminals and the frames of docs/reference/protocols.md, for tests of serial drivers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from drivers.stations.link import StationLink
 
 DEADLINE_S = 5.0
 
-# Samples of docs/protocols.md 1.5, BCC included.
+# Samples of docs/reference/protocols.md 1.5, BCC included.
 SLOPE_MM = b"?+00001060m0905356+3545105d+00001060t60+00+00096"
 SLOPE_FINE = b"(+000021760m26822425+34706355d+000021751t00+0000+000**070"
 ANGLES = b"<0905356+3545105-0032d080"

@@ -43,7 +43,7 @@ def store_new(evidence: Evidence) -> Iterator[Finding]:
 
 @rule(
     "warning",
-    "Free space on the disk of the store, or move the state directory to a larger one: docs/store.md says how.",
+    "Free space on the disk of the store, or move the state directory to a larger one: docs/how-to/store.md says how.",
 )
 def store_short_of_room(evidence: Evidence) -> Iterator[Finding]:
     """The store has less room to grow than `free_gb` of its configuration: the oldest captures outside sessions go.

@@ -150,7 +150,7 @@ def model_export(
 
     With --model no daemon is needed; else model NUMBER of the running daemon is taken, the live one by default.
 
-    docs/models.md says how to use each. The error of what is left out is measured over the joint values of
+    docs/how-to/export.md says how to use each. The error of what is left out is measured over the joint values of
     the training.
     """
     if directory is not None and number is not None:

@@ -85,7 +85,7 @@ def rig_import(
 
     A URDF gives joints with limits and rates, mimic joints as couplings, fixed transforms, sliding joints, branches,
     masses, centres of gravity and inertias. What it does not have (errors of encoders, build tolerances, the station,
-    the prisms' places) is assumed, and the file says so. docs/rig-files.md has the columns of a table.
+    the prisms' places) is assumed, and the file says so. docs/how-to/import-arm.md has the columns of a table.
     """
     from calibration.errors import RigError
     from calibration.rig.exchange.from_table import draft_of_table

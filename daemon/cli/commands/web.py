@@ -38,7 +38,7 @@ def web(**options: Any) -> None:
     """Serve the operator's page until stopped; `rigcal web token` lets people in from elsewhere.
 
     On a loopback address the page needs no token: who opens it may do what the user may who started it. Any other
-    address needs TLS, and everybody a token (docs/web.md).
+    address needs TLS, and everybody a token (docs/how-to/operator-page.md).
     """
     ctx = click.get_current_context()
     if ctx.invoked_subcommand is None:

@@ -181,7 +181,7 @@ class ReportInput:
         unidentifiable: names of parameters or combinations that the data cannot see.
         outliers: fixes that the fit set aside.
         warnings: sentences for the operator.
-        ignored_columns: columns of the data that rigcal does not know (docs/formats.md).
+        ignored_columns: columns of the data that rigcal does not know (docs/reference/formats.md).
         setups: station set-ups with their control points, where known.
         latencies: session -> latency of its fixes against the joints, or why it is not known; empty for data of files.
         provenance: label -> value: data hashes, versions, seed, time.

@@ -32,7 +32,7 @@ def export_tables(store: Path, session_id: str, out: Path, form: str) -> list[Pa
     """Write a session's observations, joint readings and fixes.
 
     Observations have the columns of the observations CSV, and are those that calibration may use; readings and fixes
-    have those of the views `v_joints` and `v_fixes` (docs/schema.md), and are all that came from start to end.
+    have those of the views `v_joints` and `v_fixes` (docs/reference/schema.md), and are all from start to end.
 
     Args:
         store: the database.

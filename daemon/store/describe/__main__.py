@@ -1,4 +1,4 @@
-"""`python -m daemon.store.describe schema|metadata [--store FILE]`: docs/schema.md, and metadata.yaml for Datasette."""
+"""`python -m daemon.store.describe schema|metadata [--store FILE]`: docs/reference/schema.md, Datasette's metadata."""
 
 from __future__ import annotations
 

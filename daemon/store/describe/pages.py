@@ -11,9 +11,9 @@ _HEAD = """# The store's tables
 
 Every view, table and column of `rigcal.sqlite`. Read views first: they have ISO times, joints as columns, and units in
 their names. The views here are those of the rig `swdt82`; with another rig its own joints and signals are columns.
-[store.md](store.md#reading-it-with-other-tools) says how to open a store with other tools.
+[The store](../how-to/store.md#reading-it-with-other-tools) says how to open a store with other tools.
 
-This page is made from the code: `python -m daemon.store.describe schema > docs/schema.md`.
+This page is made from the code: `python -m daemon.store.describe schema > docs/reference/schema.md`.
 """
 _YAML_WORDS = {"y", "n", "yes", "no", "on", "off", "true", "false", "null"}
 _TITLE = "rigcal: acquisition and calibration of a drilling boom"

@@ -23,7 +23,7 @@ _XYZ = {
 }
 _SIGMA = {f"sigma_{axis}_mm": f"standard deviation of `{axis}_mm`" for axis in "xyz"}
 _ALARM = {
-    "kind": "kind of the alarm, as in docs/alarms.md",
+    "kind": "kind of the alarm, as in docs/reference/alarms.md",
     "subject": "what it is about: a link, a joint, a session",
     "severity": "`warning` or `critical`",
     "text": "what is wrong",

@@ -1,4 +1,4 @@
-"""Downloads of a Topcon GTS-200 series' memory (docs/protocols.md): blocks with check sums, records in them.
+"""Downloads of a Topcon GTS-200 series' memory (docs/reference/protocols.md): blocks with check sums, records in them.
 
     file   = { STX, 128 characters, number of the block 0 to 9, three digits of block check, ETX, line end }, EOT
     check  = XOR of the characters and the number

@@ -1,4 +1,4 @@
-"""docs/reference.md is what the code says."""
+"""docs/reference/rig-keys.md is what the code says."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from calibration.rig.columns import READ, SIGNALS
 from calibration.rig.description import shipped_rig
 from calibration.rig.reference import page
 
-DOCS = Path(__file__).parents[3] / "docs"
+DOCS = Path(__file__).parents[3] / "docs" / "reference"
 
 
 def test_the_page_is_up_to_date() -> None:
-    written = (DOCS / "reference.md").read_text(encoding="utf-8")
-    assert written == page(), "make it anew: python -m calibration.rig.reference > docs/reference.md"
+    written = (DOCS / "rig-keys.md").read_text(encoding="utf-8")
+    assert written == page(), "make it anew: python -m calibration.rig.reference > docs/reference/rig-keys.md"
 
 
 def test_every_column_that_the_page_names_is_read() -> None:

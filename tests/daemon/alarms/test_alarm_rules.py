@@ -1,4 +1,4 @@
-"""Every rule raises its alarm from evidence and clears it without; every kind is in docs/alarms.md."""
+"""Every rule raises its alarm from evidence and clears it without; every kind is in docs/reference/alarms.md."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from drivers.readings import EventKind, Status
 
 NOW = Stamp(1_790_000_000 * NS_PER_S, 5000 * NS_PER_S, "boot")
 SESSION = OpenSessionRow("s001-r", NOW.shifted(-100 * NS_PER_S))
-DOCS = Path(__file__).parents[3] / "docs"
+DOCS = Path(__file__).parents[3] / "docs" / "reference"
 
 
 def link(up: bool | None = True, name: str = "boom", **more: Any) -> LinkStatus:
@@ -402,7 +402,7 @@ def test_what_an_instrument_says_comes_without_control_characters_and_bounded() 
 
 def test_every_kind_is_in_the_documentation_with_what_to_do() -> None:
     written = (DOCS / "alarms.md").read_text(encoding="utf-8")
-    assert written == page(), "make it anew: python -m daemon.alarms.library > docs/alarms.md"
+    assert written == page(), "make it anew: python -m daemon.alarms.library > docs/reference/alarms.md"
     for rule in library():
         assert f"## {rule.kind}\n" in written
         assert rule.remedy in written

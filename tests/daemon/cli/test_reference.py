@@ -19,8 +19,8 @@ REPOSITORY = Path(__file__).parents[3]
 
 
 def test_the_page_of_all_commands_is_current() -> None:
-    page = (REPOSITORY / "docs" / "commands.md").read_text(encoding="utf-8")
-    assert page == reference(), "python -m daemon.cli.reference > docs/commands.md"
+    page = (REPOSITORY / "docs" / "reference" / "commands.md").read_text(encoding="utf-8")
+    assert page == reference(), "python -m daemon.cli.reference > docs/reference/commands.md"
 
 
 def test_every_command_and_option_is_documented() -> None:

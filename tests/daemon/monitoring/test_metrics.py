@@ -163,8 +163,8 @@ def test_names_follow_the_conventions_and_the_page_lists_them_all() -> None:
     names = [family.name for family in FAMILIES]
     assert len(set(names)) == len(names)
     assert all(family.name.endswith("_total") == (family.kind == "counter") for family in FAMILIES)
-    written = (ROOT / "docs" / "metrics.md").read_text(encoding="utf-8")
-    assert written == page(), "make it anew: python -m daemon.monitoring.metrics_page > docs/metrics.md"
+    written = (ROOT / "docs" / "reference" / "metrics.md").read_text(encoding="utf-8")
+    assert written == page(), "make it anew: python -m daemon.monitoring.metrics_page > docs/reference/metrics.md"
 
 
 def test_a_port_that_is_taken_is_told_and_served_once_it_is_free(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,7 +25,7 @@ from daemon.store.views import Channel, channels_of
 from drivers.readings import Status
 from tests.daemon.store_support import at, fix, reading
 
-DOCS = Path(__file__).parents[3] / "docs"
+DOCS = Path(__file__).parents[3] / "docs" / "reference"
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from drivers.stations.replies import Frame, Garbage
 from drivers.stations.topcon.framing import GtsFramer, block_check, decode_frame, encode_frame
 from tests.drivers.serial_support import ACK_FRAME, SAMPLES, SLOPE_MM, TRACKING, framed
 
-# docs/protocols.md 1.2, 1.3 and 1.6.
+# docs/reference/protocols.md 1.2, 1.3 and 1.6.
 CHECKED = [
     (b"C", b"067"),
     (b"Z12", b"089"),

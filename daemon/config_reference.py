@@ -1,0 +1,65 @@
+"""docs/reference/configuration.md, made from the code: every key of the daemon's configuration.
+
+python -m daemon.config_reference > docs/reference/configuration.md
+"""
+
+from __future__ import annotations
+
+import sys
+
+from pydantic import BaseModel
+
+from calibration.rig.reference import keys
+from daemon.config import (
+    CanSection,
+    Config,
+    JobsSection,
+    MetricsSection,
+    NotifySection,
+    ReportSection,
+    SessionsSection,
+    StoreSection,
+    TipCanSection,
+    TipSection,
+    WebSection,
+)
+from drivers.stations.config import StationConfig
+from drivers.stations.serial_port import SerialConfig
+
+_HEAD = """# Configuration
+
+Every key of the configuration, `/etc/rigcal/rigcal.toml` of the installed service. It is TOML; unknown keys are errors,
+and relative paths count from the file's own directory. `rigcal config check FILE` reads it without opening a device,
+`rigcal init` writes a first one, and [Connect bus and station](../how-to/connect.md) leads through it.
+
+This page is made from the code: `python -m daemon.config_reference > docs/reference/configuration.md`.
+"""
+_TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
+    ("The file", Config),
+    ("`[[can]]`", CanSection),
+    ("`[[station]]`", StationConfig),
+    ("`serial` of a `[[station]]`", SerialConfig),
+    ("`[sessions]`", SessionsSection),
+    ("`[jobs]`", JobsSection),
+    ("`[store]`", StoreSection),
+    ("`[report]`", ReportSection),
+    ("`[tip]`", TipSection),
+    ("`[tip.can]`", TipCanSection),
+    ("`[metrics]`", MetricsSection),
+    ("`[notify]`", NotifySection),
+    ("`[web]`", WebSection),
+)
+
+
+def page() -> str:
+    """Return the text of docs/reference/configuration.md."""
+    sections = {title.strip("`[]") for title, _ in _TABLES}
+    own = {name: field for name, field in Config.model_fields.items() if name not in sections}
+    lines = [_HEAD]
+    for title, model in _TABLES:
+        lines += [f"## {title}", "", *keys(model, own if model is Config else model.model_fields)]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+if __name__ == "__main__":
+    sys.stdout.write(page())

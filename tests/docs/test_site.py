@@ -1,0 +1,112 @@
+"""The site is built strictly, asks nobody for anything, and its references say what the code says."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+import calibration.effects.reference
+import daemon.config_reference
+import rigcal.reference
+from tests.docs.pages import DOCS, ROOT
+
+SOURCES = ("calibration", "daemon", "deploy", "docs", "drivers", "rigcal", "simulators", "tests")
+LOADED = {
+    **{"link": "href", "script": "src", "img": "src", "iframe": "src", "source": "src", "embed": "src"},
+    **{"video": "src", "audio": "src", "object": "data", "use": "href", "image": "href"},
+}
+OUTSIDE = re.compile(r"(?i)^\s*(https?:)?//")
+
+
+@pytest.mark.parametrize(
+    ("name", "page", "module"),
+    [
+        ("configuration", daemon.config_reference.page, "daemon.config_reference"),
+        ("effects", calibration.effects.reference.page, "calibration.effects.reference"),
+        ("python", rigcal.reference.page, "rigcal.reference"),
+    ],
+)
+def test_a_reference_is_what_the_code_says(name: str, page: Callable[[], str], module: str) -> None:
+    file = DOCS / "reference" / f"{name}.md"
+    assert file.read_text(encoding="utf-8") == page(), f"make it anew: python -m {module} > docs/reference/{name}.md"
+
+
+def test_every_page_that_a_file_names_is_there() -> None:
+    for path in sources():
+        for name in re.findall(r"\bdocs/[\w/-]+\.(?:md|yaml)", path.read_text(encoding="utf-8")):
+            assert (ROOT / name).exists(), f"{path.relative_to(ROOT)} names {name}"
+
+
+def sources() -> Iterator[Path]:
+    yield from (ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md", "Makefile"))
+    for name in SOURCES:
+        for ending in ("py", "md", "toml", "sh", "conf", "html", "js"):
+            yield from (path for path in (ROOT / name).rglob(f"*.{ending}") if "vendor" not in path.parts)
+
+
+class Loads(HTMLParser):
+    """Collects what a page makes a browser load."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = {name: value or "" for name, value in attrs}
+        self.addresses += [given[LOADED[tag]]] if LOADED.get(tag) in given else []
+        self.addresses += [part.split()[0] for part in given.get("srcset", "").split(",") if part.strip()]
+        self.addresses += re.findall(r"url\(['\"]?([^'\")]+)", given.get("style", ""))
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(out)]
+    quiet = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=quiet, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return out
+
+
+@pytest.mark.slow
+def test_the_site_asks_nobody_for_anything(site: Path) -> None:
+    pages = list(site.rglob("*.html"))
+    assert len(pages) > 60
+    for page in pages:
+        text = page.read_text(encoding="utf-8")
+        loads = Loads()
+        loads.feed(text)
+        assert loads.addresses, page
+        assert not [address for address in loads.addresses if OUTSIDE.match(address)], page
+        assert 'class="mermaid"' not in text, f"{page}: the theme would load mermaid from elsewhere"
+    for style in site.rglob("*.css"):
+        assert not re.search(r"""(url\(|@import)\s*['"]?(https?:)?//""", style.read_text(encoding="utf-8")), style
+
+
+@pytest.mark.slow
+def test_the_search_works_without_a_server(site: Path) -> None:
+    home = (site / "index.html").read_text(encoding="utf-8")
+    shim = re.findall(r'<script src="([^"]*iframe-worker[^"]*)"', home)
+    assert shim
+    assert (site / shim[0]).is_file()
+    assert "backlash" in (site / "search" / "search_index.js").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_every_page_is_two_clicks_from_the_home_page(site: Path) -> None:
+    def linked(page: Path) -> set[Path]:
+        targets = re.findall(r'href="([^"#:]+\.html)', page.read_text(encoding="utf-8"))
+        return {(page.parent / target).resolve() for target in targets}
+
+    home = site.resolve() / "index.html"
+    first = linked(home)
+    second = {page for one in first for page in linked(one)}
+    everything = {page.resolve() for page in site.rglob("*.html")} - {site.resolve() / "404.html"}
+    assert everything <= {home} | first | second
