@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import tomllib
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
@@ -22,6 +23,7 @@ from drivers.stations.export_format import ColumnMap, ExportedFix, refuse
 from drivers.stations.exports import export_formats
 
 FILE_MAX_BYTES = 128 << 20
+REPEATED_MM = 10.0  # a point that is measured again is nearer to itself
 MOST_GAP_S = 1.0  # between the joint rows on both sides of a fix
 POSE, TIME_S, TIME = "pose", "time_s", "time"
 
@@ -191,6 +193,21 @@ def _seconds(cell: str, source: str, line: int, column: str) -> float:
 def _plain(pose: str) -> str:
     """Return a pose's number without leading zeros, which memories of stations add."""
     return pose.lstrip("0") or "0" if pose.isdigit() else pose
+
+
+def far_repetitions(fixes: Sequence[ExportedFix], source: str) -> tuple[str, ...]:
+    """Return a note on points that are there twice in different places; most likely one of them is another pose."""
+    first: dict[tuple[str, str], ExportedFix] = {}
+    found = []
+    for fix in fixes:
+        other = first.setdefault((fix.target, _plain(fix.point)), fix)
+        apart_mm = math.dist(fix.position_mm, other.position_mm)
+        if apart_mm > REPEATED_MM:
+            found.append(f"{fix.point!r} in lines {other.line} and {fix.line}, {apart_mm:.0f} mm apart")
+    if not found:
+        return ()
+    more = f" and {len(found) - 3} more" if len(found) > 3 else ""
+    return (f"{source} has points twice in different places: {'; '.join(found[:3])}{more}; both are taken",)
 
 
 # ---- observations ----------------------------------------------------------------------------------------------------

@@ -48,6 +48,13 @@ def test_joints_are_matched_by_the_number_of_the_pose(tmp_path: Path) -> None:
     assert (found.pose.tolist(), found.setup.tolist()) == (["001", "002"], ["S1", "S1"])
 
 
+def test_a_point_that_is_there_twice_in_different_places_is_said(tmp_path: Path) -> None:
+    survey, out = tmp_path / "survey.csv", tmp_path / "out.csv"
+    survey.write_text(SURVEY + "2;110;214;313;tmac\n2;110;210;510;tmac\n")
+    *_, note = told(survey, "--out", out)["notes"]
+    assert note == "survey.csv has points twice in different places: '2' in lines 3 and 5, 200 mm apart; both are taken"
+
+
 def test_joints_are_matched_by_time(tmp_path: Path) -> None:
     survey, out = tmp_path / "walk.csv", tmp_path / "out.csv"
     survey.write_text(VICON)
