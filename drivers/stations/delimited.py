@@ -22,25 +22,20 @@ from drivers.stations.export_format import (
     refuse,
 )
 
-SYNONYMS: Mapping[Role, frozenset[str]] = {
-    "point": frozenset(
-        (
-            "point pointname pointid pointnumber pointno ptid ptno pt name id label no nr pose punkt "
-            "punktnr punktnummer ptnr"
-        ).split()
-    ),
-    "x": frozenset("x east easting e xcoordinate xactual actualx measuredx xmeasured rechtswert".split()),
-    "y": frozenset("y north northing n ycoordinate yactual actualy measuredy ymeasured hochwert".split()),
-    "z": frozenset(
-        ("z height elevation elev up orthoheight zcoordinate zactual actualz measuredz zmeasured höhe hoehe").split()
-    ),
-    "hz": frozenset(["hz", "hzangle", "horizontalangle", "hangle", "azimuth", "hzcircle"]),
-    "zenith": frozenset(["v", "vz", "zenith", "zenithangle", "verticalangle", "vangle", "vcircle"]),
-    "distance": frozenset(["sd", "slopedistance", "slopedist", "distance", "range", "d"]),
-    "prism": frozenset(["prism", "code", "target", "reflector", "marker"]),
-    "date": frozenset(["date", "measurementdate"]),
-    "time": frozenset(["time", "datetime", "timestamp", "dateandtime", "measurementtime", "times", "utc"]),
+_NAMES: Mapping[Role, str] = {
+    "point": "point pointname pointid pointnumber pointno ptid ptno pt name id label no nr pose punkt punktnr "
+    "punktnummer ptnr",
+    "x": "x east easting e xcoordinate xactual actualx measuredx xmeasured rechtswert",
+    "y": "y north northing n ycoordinate yactual actualy measuredy ymeasured hochwert",
+    "z": "z height elevation elev up orthoheight zcoordinate zactual actualz measuredz zmeasured höhe hoehe",
+    "hz": "hz hzangle horizontalangle hangle azimuth hzcircle",
+    "zenith": "v vz zenith zenithangle verticalangle vangle vcircle",
+    "distance": "sd slopedistance slopedist distance range d",
+    "prism": "prism code target reflector marker",
+    "date": "date measurementdate",
+    "time": "time datetime timestamp dateandtime measurementtime times utc",
 }
+SYNONYMS: Mapping[Role, frozenset[str]] = {role: frozenset(words.split()) for role, words in _NAMES.items()}
 _SEPARATORS = (";", "\t", ",", " ")
 _HEAD_LINES = 200  # a preamble is not longer
 _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?", re.ASCII)
