@@ -20,8 +20,9 @@ from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_in
 from daemon.acquisition.simulated_channels import with_simulated_channels
 from daemon.acquisition.simulated_rig import SimulatedRig, SimulationError
 from daemon.commands import CommandError
-from daemon.config import CanSection, Config, ConfigError, RigSource
-from daemon.sessions.prism_guard import MotionLimit
+from daemon.config import CanSection, Config, ConfigError
+from daemon.rig_files import RigSource
+from daemon.sessions.prisms.guard import MotionLimit
 from daemon.sessions.replay import captures_of, first_captures
 from drivers.can.channel import ChannelDecoder
 from drivers.can.ports import CanLinkConfig, Interface

@@ -1,20 +1,15 @@
-"""The daemon's configuration and the rig it names: TOML files, checked whole before anything is opened."""
+"""The daemon's configuration: a TOML file, checked whole before anything is opened."""
 
 from __future__ import annotations
 
 import os
 import reprlib
-from collections.abc import Sequence
-from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, get_args
 from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from calibration.errors import RigError
-from calibration.rig.description import Rig, parse_rig, shipped_rigs
 from calibration.rig.toml import LONGEST, parse_toml
 from daemon.commands import CommandError, reading_socket
 from drivers.can.tip_frames import FRAMES
@@ -403,60 +398,3 @@ def _section_of(section: type[BaseModel], part: int | str) -> type[BaseModel]:
     annotation = section.model_fields[part].annotation
     candidates = (annotation, *get_args(annotation))
     return next((c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)), section)
-
-
-# ---- rigs ----------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class RigSource:
-    """A rig and its origin.
-
-    Attributes:
-        rig: the description.
-        text: the TOML it was read from; travels with the model.
-        directory: where the DBC and EDS files that it names are.
-    """
-
-    rig: Rig
-    text: str
-    directory: Path
-
-
-def load_rig(name_or_path: str, signals: Sequence[str] = ()) -> RigSource:
-    """Load a shipped rig by its name, or any rig by the path of its file.
-
-    Args:
-        name_or_path: of the rig.
-        signals: columns of further signals, as `Rig.with_signals` takes them.
-
-    Raises:
-        RigError: no such rig or file, or the file is malformed.
-    """
-    text, name, directory = read_rig_text(name_or_path)
-    rig = parse_rig(text, name)
-    if signals:
-        rig = rig.with_signals(*signals)
-    return RigSource(rig, rig.text, directory)
-
-
-def read_rig_text(name_or_path: str) -> tuple[str, str, Path]:
-    """Read a rig's text, unchecked; returns it with the file's name and directory.
-
-    Raises:
-        RigError: no such rig or file, or it cannot be read.
-    """
-    if name_or_path in shipped_rigs():
-        directory = Path(str(resources.files("calibration").joinpath("rigs")))
-        path = directory / f"{name_or_path}.toml"
-    else:
-        path = Path(name_or_path)
-        directory = path.parent
-        if not path.is_file():
-            shipped = ", ".join(shipped_rigs())
-            raise RigError(name_or_path, "", f"neither a shipped rig ({shipped}) nor a rig file")
-    try:
-        return read_text(path, LONGEST), path.name, directory
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise RigError(str(path), "", f"cannot be read: {reason}") from error

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, TypeVar
 
-from daemon.acquisition.status import AcquisitionStatus
+from daemon.acquisition.status.snapshot import AcquisitionStatus
 from daemon.alarms.board import AlarmBoard
 from daemon.composition import Parts
 from daemon.models.drift import gap_status
@@ -17,9 +17,9 @@ from daemon.monitoring.notices import Notices
 from daemon.sessions.manager import SessionKeeper
 from daemon.store.errors import StoreError
 from daemon.store.health import StoreHealth
-from daemon.store.jobs import JobTable
-from daemon.store.models import ModelTable
-from daemon.store.setups import SetupRow, SetupTable
+from daemon.store.queries.jobs import JobTable
+from daemon.store.queries.models import ModelTable
+from daemon.store.queries.setups import SetupRow, SetupTable
 from daemon.store.store import Store
 
 T = TypeVar("T")

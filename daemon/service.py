@@ -15,8 +15,8 @@ from typing import Any
 from calibration.rig.description import Rig
 from daemon.acquisition.acquisition import Acquisition
 from daemon.acquisition.clock_watch import ClockWatch
-from daemon.acquisition.present_state import expected_of
 from daemon.acquisition.redecoding import redecode_command
+from daemon.acquisition.status.present import expected_of
 from daemon.acquisition.thinning import Thinning
 from daemon.alarms.board import AlarmBoard
 from daemon.alarms.evidence import Gatherer
@@ -49,14 +49,14 @@ from daemon.monitoring.time_watch import TimeWatch
 from daemon.overview import Overview
 from daemon.sessions.manager import SessionKeeper
 from daemon.sessions.station_setups import SetupBook
-from daemon.store.alarms import AlarmTable
 from daemon.store.errors import storage_errors, storage_sentence, unwritable_errors
 from daemon.store.health import StoreHealth, StoreWatch
-from daemon.store.jobs import JobTable
-from daemon.store.models import ModelTable
-from daemon.store.notices import NoticeTable
-from daemon.store.sessions import SessionTable
-from daemon.store.setups import SetupTable
+from daemon.store.queries.alarms import AlarmTable
+from daemon.store.queries.jobs import JobTable
+from daemon.store.queries.models import ModelTable
+from daemon.store.queries.notices import NoticeTable
+from daemon.store.queries.sessions import SessionTable
+from daemon.store.queries.setups import SetupTable
 from daemon.store.store import Store
 from daemon.store.upkeep.housekeeping import Housekeeping, Keeping
 from drivers.clock import NS_PER_S, TimeBudget

@@ -125,7 +125,7 @@ def compile_ahead() -> None:
     from calibration.numerics.matrices import gram
     from calibration.pipeline.calibrate import calibrate
     from calibration.residual.trees.forest import Forest
-    from daemon.config import load_rig
+    from daemon.rig_files import load_rig
 
     findfont("DejaVu Sans")
     source = load_rig(_RIG)

@@ -11,8 +11,8 @@ from calibration.errors import DataError
 from calibration.observations import Observations
 from calibration.rig.description import Rig, parse_rig
 from daemon.sessions.session_data import sessions_csv
+from daemon.store.queries.sessions import all_observations, all_sessions, session
 from daemon.store.reader import Reader
-from daemon.store.sessions import all_observations, all_sessions, session
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -72,7 +72,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
 
 
 def pytest_sessionstart() -> None:
-    """Import what is gated while lines count, so that no test that does not count can be the first to import a module."""
+    """Import what is gated while lines count, so that no test that does not count is the first to import a module."""
     if Coverage.current() is None:
         return
     for package in (drivers, daemon.store, calibration):

@@ -22,9 +22,9 @@ from daemon.acquisition.backlog import BATCH_CAPTURES, Backlog, Batch
 from daemon.acquisition.clock_watch import ClockWatch
 from daemon.acquisition.link_decoders import TICK_NS, LinkDecoders
 from daemon.acquisition.link_intake import LinkIntake
-from daemon.acquisition.present_state import NOTHING_EXPECTED, Expected
-from daemon.acquisition.status import AcquisitionStatus
-from daemon.acquisition.status_board import StatusBoard
+from daemon.acquisition.status.board import StatusBoard
+from daemon.acquisition.status.present import NOTHING_EXPECTED, Expected
+from daemon.acquisition.status.snapshot import AcquisitionStatus
 from daemon.acquisition.thinning import Thinning
 from daemon.store import Store
 from daemon.store.errors import storage_sentence

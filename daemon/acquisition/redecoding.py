@@ -10,8 +10,8 @@ from typing import Any
 from daemon.acquisition.link_decoders import LinkDecoders
 from daemon.commands import CommandError
 from daemon.store import Store
+from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS
 from daemon.store.reader import Reader
-from daemon.store.sessions import AFTER_NS, BEFORE_NS
 from daemon.store.upkeep.full_samples import Stretch, put_again, stretches_between, stretches_of_session
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import Capture, Decoder, Fix, Reading

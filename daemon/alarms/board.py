@@ -19,8 +19,8 @@ from daemon.alarms.evidence import Evidence
 from daemon.alarms.library import library
 from daemon.host.safe_output import duration
 from daemon.monitoring.notice import Notice, Severity
-from daemon.store.alarms import AlarmTable
 from daemon.store.errors import StoreError
+from daemon.store.queries.alarms import AlarmTable
 from drivers.clock import NS_PER_S, Clock, Stamp
 
 log = logging.getLogger(__name__)

@@ -6,13 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from daemon.acquisition.status import AcquisitionStatus, EventStatus, LinkStatus
+from daemon.acquisition.status.snapshot import AcquisitionStatus, EventStatus, LinkStatus
 from daemon.models.live_model import LiveModelHealth
-from daemon.sessions.prism_guard import Suspicion
+from daemon.sessions.prisms.guard import Suspicion
 from daemon.store.health import StoreHealth
-from daemon.store.jobs import FailedJob
-from daemon.store.sessions import OpenSessionRow
-from daemon.store.setups import SetupRow
+from daemon.store.queries.jobs import FailedJob
+from daemon.store.queries.sessions import OpenSessionRow
+from daemon.store.queries.setups import SetupRow
 from daemon.store.upkeep.housekeeping import KeepingState
 from drivers.clock import NS_PER_S, Clock, Stamp
 from drivers.readings import EventKind

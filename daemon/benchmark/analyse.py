@@ -9,7 +9,7 @@ from typing import Any
 
 from calibration.model.prediction import Predictor
 from calibration.numerics.single_thread import one_blas_thread
-from daemon.config import load_rig
+from daemon.rig_files import load_rig
 from daemon.warm_up import prepare
 from drivers.clock import NS_PER_S, SystemClock
 

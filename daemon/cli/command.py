@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from calibration.errors import DataError, ModelError, RigError, UnsafeError
-from daemon.cli.job_lines import percent
-from daemon.cli.terminal import echo_error
+from daemon.cli.terminal import echo_error, percent
 from daemon.commands import CommandError
 from daemon.host.safe_output import json_line, shown, shown_lines
 from drivers.errors import DescriptionError

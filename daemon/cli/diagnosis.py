@@ -110,7 +110,8 @@ def read_configuration(path: Path) -> tuple[Config | None, Finding]:
     from calibration.errors import RigError
     from daemon.commands import CommandError
     from daemon.composition import decoders
-    from daemon.config import load_rig, read_config
+    from daemon.config import read_config
+    from daemon.rig_files import load_rig
     from drivers.errors import DescriptionError
 
     config = None

@@ -11,11 +11,12 @@ from typing import Any
 
 from daemon.acquisition.acquisition import Acquisition
 from daemon.composition import decoders, joiner, motion_limits
-from daemon.config import Config, RigSource
+from daemon.config import Config
+from daemon.rig_files import RigSource
 from daemon.service import declare_channels
+from daemon.sessions.export.session_file import SessionFile
 from daemon.sessions.manager import SessionKeeper
 from daemon.sessions.replay import BOOT_ID, LATEST_UTC_NS, first_captures, merged
-from daemon.sessions.session_file import SessionFile
 from daemon.sessions.station_setups import SetupBook
 from daemon.store.errors import storage_errors
 from daemon.store.store import Store

@@ -19,6 +19,7 @@ from daemon.host.safe_output import shown, shown_lines
 from daemon.host.systemd import is_journal, priority_prefix
 
 _LISTED = 10
+_MOST_SHOWN = 0.99  # of work that goes on: it is not at its end
 # xterm's sequences: another screen without a cursor, its first place, and back to the terminal as it was.
 _BEGIN, _HOME, _END = "\x1b[?1049h\x1b[?25l", "\x1b[H", "\x1b[?25h\x1b[?1049l"
 _REST_OF_LINE, _REST_OF_SCREEN = "\x1b[K", "\x1b[J"
@@ -123,6 +124,11 @@ def echo_table(
             for i, (cell, text) in enumerate(zip(row, line, strict=True))
         ]
         click.echo("  ".join(styled).rstrip(), color=_color())
+
+
+def percent(share: float) -> str:
+    """Return the share that is done of work that goes on; never 100 %."""
+    return f"{min(share, _MOST_SHOWN):.0%}".replace("%", " %")
 
 
 def _width(text: str) -> int:

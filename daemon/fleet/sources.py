@@ -10,12 +10,12 @@ from pathlib import Path
 from calibration.errors import DataError
 from calibration.rig.description import parse_rig
 from calibration.rig.toml import LONGEST
-from daemon.config import load_rig
 from daemon.fleet.assess import FleetSettings, RigTask
+from daemon.rig_files import load_rig
+from daemon.sessions.export.session_file import read_session_file
 from daemon.sessions.session_data import sessions_csv
-from daemon.sessions.session_file import read_session_file
+from daemon.store.queries.sessions import session, sessions_of_use
 from daemon.store.reader import Reader
-from daemon.store.sessions import session, sessions_of_use
 from drivers.files import read_text, read_whole
 
 STORE = "rigcal.sqlite"

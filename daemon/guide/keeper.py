@@ -36,9 +36,9 @@ from daemon.guide.request import request_of, whole_argument
 from daemon.guide.view import Around, headline, state_of
 from daemon.sessions.manager import SessionKeeper
 from daemon.sessions.station_setups import SetupBook
-from daemon.store.guides import Standstill
-from daemon.store.sessions import SessionTable
-from daemon.store.setups import control_points
+from daemon.store.queries.guides import Standstill
+from daemon.store.queries.sessions import SessionTable
+from daemon.store.queries.setups import control_points
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, Clock
 from drivers.readings import Record

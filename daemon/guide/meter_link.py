@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from daemon.host.systemd import parse_line
-from daemon.store.models import ModelRow
+from daemon.store.queries.models import ModelRow
 from daemon.store.store import Store
 
 log = logging.getLogger(__name__)

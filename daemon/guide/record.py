@@ -10,7 +10,7 @@ from typing import Any
 from daemon.commands import REFUSED, CommandError, caller_columns
 from daemon.guide.job import Job, Request
 from daemon.guide.view import headline
-from daemon.store.guides import EventRow, GuideRow, GuideTable
+from daemon.store.queries.guides import EventRow, GuideRow, GuideTable
 from daemon.store.store import Store
 from drivers.clock import Clock, Stamp
 

@@ -10,7 +10,7 @@ from calibration.rig.description import Rig
 from daemon.commands import CHECK
 from daemon.guide.job import Job, PlannedPose, Run, Step, pose_reasons
 from daemon.guide.position import BoomPosition, is_there, joint_rows
-from daemon.store.guides import GuideRow, Standstill
+from daemon.store.queries.guides import GuideRow, Standstill
 
 _MORE = {"button": "Measure 5 more poses", "command": "guide.more", "arguments": {"poses": 5}}
 

@@ -14,9 +14,9 @@ from daemon.config import Config
 from daemon.jobs.order import Order, Outcome, Progress
 from daemon.jobs.scheduler import CHECKS, DueChain, State
 from daemon.models.drift import note_drift, unseen_checks
-from daemon.store.jobs import JobFacts, JobKind, JobTable
-from daemon.store.models import LiveRun, ModelRow, ModelTable, trained_on
-from daemon.store.sessions import SessionTable
+from daemon.store.queries.jobs import JobFacts, JobKind, JobTable
+from daemon.store.queries.models import LiveRun, ModelRow, ModelTable, trained_on
+from daemon.store.queries.sessions import SessionTable
 from daemon.store.store import Store
 from drivers.clock import Clock
 

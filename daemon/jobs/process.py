@@ -36,16 +36,16 @@ from daemon.jobs.checkpoint import FileCheckpoint
 from daemon.jobs.order import Order
 from daemon.models.gap_files import MODEL, gap_answer, write_gap
 from daemon.models.model_files import REPORT, read_model, write_model
-from daemon.report.calibration import calibration_report
-from daemon.report.from_model import provenance, report_input
+from daemon.report.calibration.from_model import provenance, report_input
+from daemon.report.calibration.page import calibration_report
 from daemon.report.front import Facts
-from daemon.report.gap import gap_report
-from daemon.report.gap_words import gap_headline
+from daemon.report.gap.page import gap_report
+from daemon.report.gap.words import gap_headline
 from daemon.sessions.session_data import sessions_csv, sessions_measured, setup_lines
 from daemon.store.errors import StoreError
 from daemon.store.files import FileIdentity
+from daemon.store.queries.sessions import session
 from daemon.store.reader import Reader
-from daemon.store.sessions import session
 from daemon.warm_up import prepare
 from drivers.clock import NS_PER_S, SystemClock
 

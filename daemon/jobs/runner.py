@@ -19,8 +19,8 @@ from daemon.jobs.job_queue import CANCELLED, STOPPED, JobQueue
 from daemon.jobs.order import Outcome, Started
 from daemon.jobs.scheduler import DueChain, DueComparison, due_jobs, next_job, spent_jobs
 from daemon.store.errors import LACKING
-from daemon.store.jobs import JobFacts
-from daemon.store.models import ModelRow
+from daemon.store.queries.jobs import JobFacts
+from daemon.store.queries.models import ModelRow
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, Clock, SystemClock
 

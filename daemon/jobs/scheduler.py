@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from daemon.commands import CHECK
-from daemon.store.jobs import JobFacts, JobKind, SessionFacts
+from daemon.store.queries.jobs import JobFacts, JobKind, SessionFacts
 from drivers.clock import NS_PER_S, Stamp
 
 CHECKS = (JobKind.REPORT, JobKind.COMPARISON)

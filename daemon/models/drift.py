@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from calibration.numerics.statistics import DECISION, Cusum
-from daemon.store.jobs import JobKind, JobTable
-from daemon.store.models import LiveRun, ModelTable
+from daemon.store.queries.jobs import JobKind, JobTable
+from daemon.store.queries.models import LiveRun, ModelTable
 
 
 def unseen_checks(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from calibration.errors import CalibrationError
 from calibration.rig.description import Rig
-from daemon.store.models import ModelRow, ModelTable
+from daemon.store.queries.models import ModelRow, ModelTable
 
 if TYPE_CHECKING:
     from calibration.model.model import CalibratedModel

@@ -16,7 +16,7 @@ from typing import Any
 from calibration.errors import CalibrationError
 from daemon.commands import REFUSED, CommandError, caller_columns, text_argument
 from daemon.models.live_model import LiveModel
-from daemon.store.models import ModelRow, ModelTable
+from daemon.store.queries.models import ModelRow, ModelTable
 
 log = logging.getLogger(__name__)
 

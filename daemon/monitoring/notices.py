@@ -14,7 +14,7 @@ from daemon.monitoring.delivery import Command, Target, Webhook
 from daemon.monitoring.notice import Notice
 from daemon.monitoring.outbox import USUAL, Outbox, Pace
 from daemon.store.errors import StoreError
-from daemon.store.notices import NoticeTable
+from daemon.store.queries.notices import NoticeTable
 from drivers.clock import Clock
 
 log = logging.getLogger(__name__)

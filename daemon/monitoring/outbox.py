@@ -14,7 +14,7 @@ from typing import Any
 
 from daemon.monitoring.delivery import DeliveryError, Target
 from daemon.monitoring.notice import Notice, Severity, message_of
-from daemon.store.notices import NoticeTable
+from daemon.store.queries.notices import NoticeTable
 from drivers.clock import NS_PER_S, Clock, Stamp, SystemClock
 
 log = logging.getLogger(__name__)

@@ -7,7 +7,7 @@ from daemon.commands import CHECK
 from daemon.sessions.open_session import OpenSession
 from daemon.sessions.prism_watch import PrismWatch
 from daemon.sessions.station_setups import SetupBook
-from daemon.store.sessions import SessionTable
+from daemon.store.queries.sessions import SessionTable
 
 CHECK_POSES = (3, 5)
 

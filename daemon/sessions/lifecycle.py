@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping
 from daemon.commands import CommandError, caller_columns
 from daemon.host.time_service import ClockState
 from daemon.sessions.open_session import OpenSession
-from daemon.store.jobs import JobTable
-from daemon.store.sessions import SessionTable, preset_jumps
+from daemon.store.queries.jobs import JobTable
+from daemon.store.queries.sessions import SessionTable, preset_jumps
 from daemon.store.store import Store
 from drivers.clock import Clock, Stamp
 from drivers.readings import Fix

@@ -30,13 +30,13 @@ from daemon.sessions.advice import SessionAdvice, after_a_move
 from daemon.sessions.control_shot import Shot
 from daemon.sessions.lifecycle import SessionLifecycle
 from daemon.sessions.open_session import OpenSession
-from daemon.sessions.prism_guard import MotionLimit, Suspicion
 from daemon.sessions.prism_watch import PrismWatch, as_dict
-from daemon.sessions.standstill_places import Exclusions, StandstillPlaces
+from daemon.sessions.prisms.guard import MotionLimit, Suspicion
+from daemon.sessions.prisms.standstill_places import Exclusions, StandstillPlaces
 from daemon.sessions.station_setups import AXES, Place, SetupBook
 from daemon.sessions.without_job import why_no_job
 from daemon.store.errors import is_unwritable
-from daemon.store.jobs import JobTable
+from daemon.store.queries.jobs import JobTable
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, Clock, Stamp, lies_within
 from drivers.readings import DeviceEvent, EventKind, Fix, Record

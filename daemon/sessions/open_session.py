@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass, field
 
 from daemon.sessions.control_shot import Shot
-from daemon.sessions.prism_evidence import PrismEvidence
-from daemon.sessions.prism_guard import PrismGuard, Word
+from daemon.sessions.prisms.evidence import PrismEvidence
+from daemon.sessions.prisms.guard import PrismGuard, Word
 from daemon.sessions.station_setups import Place
 from drivers.clock import Order, Stamp, lies_within
 

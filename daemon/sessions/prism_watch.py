@@ -11,11 +11,11 @@ from calibration.rig.description import Rig
 from daemon.acquisition.joiner import JoinedFix
 from daemon.commands import caller_columns
 from daemon.sessions.open_session import OpenSession
-from daemon.sessions.prism_evidence import Finding, IdentityLoader, PrismEvidence, Verdict, sightings_of
-from daemon.sessions.prism_guard import CONFIRM, MotionLimit, PrismGuard, Suspicion, Turn, Word
-from daemon.sessions.standstill_places import Exclusions
+from daemon.sessions.prisms.evidence import Finding, IdentityLoader, PrismEvidence, Verdict, sightings_of
+from daemon.sessions.prisms.guard import CONFIRM, MotionLimit, PrismGuard, Suspicion, Turn, Word
+from daemon.sessions.prisms.standstill_places import Exclusions
 from daemon.sessions.station_setups import Place
-from daemon.store.sessions import SessionTable, fixes_since_used, preset_jumps, prism_confirmations
+from daemon.store.queries.sessions import SessionTable, fixes_since_used, preset_jumps, prism_confirmations
 from daemon.store.store import Store
 from drivers.clock import Clock, Stamp
 from drivers.readings import DeviceEvent, EventKind, Fix, LockState, Status

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from daemon.config import Config, ConfigError
-from daemon.sessions.session_file import DoubtfulCaptures
+from daemon.sessions.export.session_file import DoubtfulCaptures
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S, Stamp
 from drivers.errors import DescriptionError

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 from calibration.rig.description import Rig
 from calibration.table import LABEL_COLUMNS, POSITION_COLUMNS, SIGMA_COLUMNS
-from daemon.report.inputs import ControlPoint, SetupLine
+from daemon.report.calibration.inputs import ControlPoint, SetupLine
 from daemon.sessions.steady_time import SteadyTime
+from daemon.store.queries.sessions import first_observation_ns, moving_observations, observations, session
+from daemon.store.queries.setups import misclosures, setups_of
 from daemon.store.reader import Reader
-from daemon.store.sessions import first_observation_ns, moving_observations, observations, session
-from daemon.store.setups import misclosures, setups_of
 from drivers.clock import NS_PER_S, Stamp
 
 Misclosure = tuple[float, float, float]

@@ -10,7 +10,7 @@ from typing import Any
 
 from calibration.rig.description import Rig
 from daemon.commands import REFUSED, CommandError, identifier, mapping_argument, number_argument, text_argument
-from daemon.store.setups import SetupTable, control_points
+from daemon.store.queries.setups import SetupTable, control_points
 from daemon.store.store import Store
 from drivers.clock import Clock
 from drivers.readings import Fix

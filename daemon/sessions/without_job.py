@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from daemon.commands import CHECK
-from daemon.store.jobs import JobKind, JobTable
+from daemon.store.queries.jobs import JobKind, JobTable
 
 
 def why_no_job(session: Mapping[str, Any], jobs: JobTable, *, are_jobs_enabled: bool) -> str | None:

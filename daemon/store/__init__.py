@@ -2,9 +2,9 @@
 
 migrations  the tables
 connection  transactions, rows by table and column;  store  what acquisition writes;  reader  read-only views
-sessions, setups, jobs, models, alarms  the queries, one module a subject
+queries  sessions, set-ups, jobs, models, alarms and so on: one module a subject
 captures, rows  values as they are stored;  files  which files, and the lock;  health  damage, and free space
-views, canned_queries, describe  the store for other programs, and in words
+views, describe  the store for other programs, and in words
 errors  the errors, and the sentences that tell them
 """
 

@@ -36,6 +36,25 @@ class Channel:
         return f"{self.name}_{self.unit.replace('/', '_per_')}" if self.unit else self.name
 
 
+@dataclass(frozen=True)
+class View:
+    """A view.
+
+    Attributes:
+        source: what stands behind FROM.
+        columns: name -> SQL of its value.
+    """
+
+    source: str
+    columns: Mapping[str, str]
+
+    @property
+    def sql(self) -> str:
+        """The SELECT that it stands for."""
+        listed = ",\n    ".join(f"{sql} AS {_identifier(name)}" for name, sql in self.columns.items())
+        return f"SELECT\n    {listed}\nFROM {self.source}"
+
+
 def iso(column: str) -> str:
     """SQL of an instant in ns as ISO text with microseconds, in UTC."""
     return (
@@ -62,8 +81,8 @@ def channels_of(db: Database) -> list[Channel]:
     return [Channel(name, unit, kind == "joint") for name, unit, kind in db.execute(_CHANNELS).fetchall()]
 
 
-def views(channels: Iterable[Channel]) -> dict[str, str]:
-    """Return every view and the SELECT that it stands for.
+def views(channels: Iterable[Channel]) -> dict[str, View]:
+    """Return every view by its name.
 
     Args:
         channels: joints and signals that get columns.
@@ -71,7 +90,7 @@ def views(channels: Iterable[Channel]) -> dict[str, str]:
     channels = list(channels)
     joints = [channel for channel in channels if channel.is_joint]
     return {
-        "v_observations": _select(
+        "v_observations": View(
             "observations",
             {
                 "id": "id",
@@ -89,7 +108,7 @@ def views(channels: Iterable[Channel]) -> dict[str, str]:
                 "fix_id": "fix_id",
             },
         ),
-        "v_fixes": _select(
+        "v_fixes": View(
             "fixes",
             {
                 "id": "id",
@@ -112,7 +131,7 @@ def views(channels: Iterable[Channel]) -> dict[str, str]:
                 "monotonic_ns": "monotonic_ns",
             },
         ),
-        "v_joints": _select(
+        "v_joints": View(
             "joint_samples JOIN channels ON channels.id = channel_id",
             {
                 "id": "joint_samples.id",
@@ -124,7 +143,7 @@ def views(channels: Iterable[Channel]) -> dict[str, str]:
                 "monotonic_ns": "monotonic_ns",
             },
         ),
-        "v_sessions": _select(
+        "v_sessions": View(
             "calibration_sessions AS session",
             {
                 "session": "id",
@@ -146,7 +165,7 @@ def views(channels: Iterable[Channel]) -> dict[str, str]:
                 "rig_sha256": "rig_sha256",
             },
         ),
-        "v_jobs": _select(
+        "v_jobs": View(
             "jobs",
             {
                 "job": "id",
@@ -163,7 +182,7 @@ def views(channels: Iterable[Channel]) -> dict[str, str]:
                 "error": "error",
             },
         ),
-        "v_models": _select(
+        "v_models": View(
             "models AS model",
             {
                 "model": "id",
@@ -180,7 +199,7 @@ def views(channels: Iterable[Channel]) -> dict[str, str]:
                 "rig_sha256": "rig_sha256",
             },
         ),
-        "v_alarms": _select(
+        "v_alarms": View(
             "alarms",
             {
                 "alarm": "id",
@@ -206,9 +225,8 @@ def drop_views(db: Database) -> None:
 
 def make_views(db: Database) -> None:
     """Make the views of a store where they are missing or other channels are known now."""
-    wanted = views(channels_of(db))
-    for name, select in wanted.items():
-        db.create_view(name, select, replace=True)  # leaves one alone that is the same
+    for name, view in views(channels_of(db)).items():
+        db.create_view(name, view.sql, replace=True)  # leaves one alone that is the same
 
 
 def _values(channels: Iterable[Channel]) -> dict[str, str]:
@@ -223,11 +241,6 @@ def _values(channels: Iterable[Channel]) -> dict[str, str]:
 
 def _own_value(joint: Channel) -> str:
     return f"CASE WHEN channels.name = {_text(joint.name)} AND channels.unit = {_text(joint.unit)} THEN value END"
-
-
-def _select(table: str, columns: Mapping[str, str]) -> str:
-    listed = ",\n    ".join(f"{sql} AS {_identifier(name)}" for name, sql in columns.items())
-    return f"SELECT\n    {listed}\nFROM {table}"
 
 
 def _identifier(name: str) -> str:

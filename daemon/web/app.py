@@ -19,7 +19,7 @@ from starlette.staticfiles import StaticFiles
 
 from daemon.commands import REFUSED, CommandError
 from daemon.store.errors import StoreError
-from daemon.store.history import drift_history, misclosure_history, model_changes
+from daemon.store.queries.history import drift_history, misclosure_history, model_changes
 from daemon.store.reader import Reader
 from daemon.web.access import NAME_CHARACTERS, AttemptLimit, Person, Role, TokenBook, role_refusal
 from daemon.web.commands import COMMANDS, TIMEOUT_S, TIMEOUTS_S

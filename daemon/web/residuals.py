@@ -6,7 +6,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from daemon.store.history import session_fixes
+from daemon.store.queries.history import session_fixes
 from daemon.store.reader import Reader
 
 _Key = tuple[str, int, str]

@@ -13,7 +13,7 @@ from calibration.evaluation.drift import check
 from calibration.numerics.statistics import Cusum
 from calibration.observations import Observations, parse_observations
 from calibration.pipeline.calibrate import identify
-from daemon.config import load_rig
+from daemon.rig_files import load_rig
 from daemon.warm_up import prepare
 from simulators.effects.library import parse_effects
 from simulators.rig.truth import RigTruth

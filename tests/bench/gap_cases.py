@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from calibration.observations import parse_observations
 from calibration.pipeline.find_gap import find_gap
-from daemon.config import load_rig
+from daemon.rig_files import load_rig
 from simulators.blind.cases import draw
 from simulators.blind.cells import Cell
 

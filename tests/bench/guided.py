@@ -26,12 +26,12 @@ from calibration.model.prediction import Predictor
 from calibration.observations import Floats, Observations, parse_observations
 from calibration.pipeline.calibrate import calibrate
 from calibration.rig.description import Rig
-from daemon.config import RigSource, load_rig
 from daemon.guide.job import Forecast, Job, Request, stop_reason
 from daemon.guide.keeper import NEEDED_FIXES
 from daemon.guide.meter import Meter, joined
 from daemon.guide.meter_link import Place
 from daemon.guide.position import tolerance
+from daemon.rig_files import RigSource, load_rig
 from simulators.effects.library import parse_effects
 from simulators.rig.truth import RigTruth
 from tests.simulated.observations import simulate_observations

@@ -13,7 +13,7 @@ from multiprocessing import get_context
 
 from calibration.observations import parse_observations
 from calibration.pipeline.calibrate import calibrate
-from daemon.config import load_rig
+from daemon.rig_files import load_rig
 from simulators.blind.scene import SceneSettings, draw_scene
 from simulators.effects.library import parse_effects
 

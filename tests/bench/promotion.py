@@ -12,7 +12,7 @@ from statistics import fmean
 from calibration.evaluation.promotion import compare_held_out
 from calibration.observations import Observations, parse_observations
 from calibration.pipeline.calibrate import identify
-from daemon.config import load_rig
+from daemon.rig_files import load_rig
 from simulators.rig.truth import RigTruth
 from tests.simulated.observations import simulate_observations
 

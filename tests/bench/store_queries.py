@@ -15,7 +15,7 @@ from pathlib import Path
 
 from sqlite_utils import Database
 
-from daemon.store.canned_queries import canned_queries
+from daemon.store.queries.canned_queries import canned_queries
 from daemon.store.views import channels_of
 from tests.bench import year_store
 from tests.bench.year_store import QUERY_S, Bars

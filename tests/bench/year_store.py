@@ -23,13 +23,14 @@ from pathlib import Path
 from daemon.acquisition.link_decoders import LinkDecoders
 from daemon.commands import CommandError
 from daemon.composition import decoders
-from daemon.config import load_rig, parse_config
+from daemon.config import parse_config
 from daemon.control.protocol import request
+from daemon.rig_files import load_rig
 from daemon.service import declare_channels
-from daemon.sessions.export import export_session
+from daemon.sessions.export.captured_logs import export_session
 from daemon.store import Reader, Store
 from daemon.store.captures import Chunk, decode_run, encode_captures
-from daemon.store.sessions import SessionTable, all_observations
+from daemon.store.queries.sessions import SessionTable, all_observations
 from daemon.store.upkeep.packing import SPAN_NS, packed_run
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import Capture, Fix, Reading

@@ -12,7 +12,7 @@ from calibration.gap.result import Candidate, Disagreement, Evidence, Experiment
 from calibration.model.prediction import Predictor
 from calibration.observations import Floats, Observations, parse_observations
 from calibration.pipeline.calibrate import identify
-from daemon.config import load_rig
+from daemon.rig_files import load_rig
 from simulators.effects.library import parse_effects
 from simulators.rig.truth import RigTruth
 from tests.simulated.observations import simulate_observations

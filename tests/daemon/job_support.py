@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from daemon.commands import CHECK
-from daemon.config import Config, JobsSection, load_rig
+from daemon.config import Config, JobsSection
 from daemon.jobs.child import JOB_COMMAND
 from daemon.jobs.runner import JobRunner
+from daemon.rig_files import load_rig
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, ManualClock, Stamp, SystemClock
 from simulators.rig.dataset import SimulatedObservations

@@ -25,7 +25,7 @@ from daemon.models.live_model import LiveModel, Loaded, Missing
 from daemon.models.live_tip import FRESH_S, LiveTip
 from daemon.models.model_files import model_sha256, write_model
 from daemon.models.registry import ModelRegistry
-from daemon.store.models import ModelTable
+from daemon.store.queries.models import ModelTable
 from drivers.clock import Stamp
 from drivers.readings import Reading, Record, Status
 from tests.daemon.job_support import SOURCE, TRUTH, JobRig

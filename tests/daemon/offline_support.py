@@ -9,7 +9,7 @@ from calibration.evaluation.evaluation import Evaluation
 from calibration.model.model import CalibratedModel
 from calibration.observations import parse_observations
 from calibration.pipeline.calibrate import calibrate
-from daemon.config import load_rig
+from daemon.rig_files import load_rig
 
 UR10_CSV = Path(__file__).parents[1] / "data" / "ur10_random_poses.csv"
 TRAIN_ROWS, TEST_ROWS = 240, 60

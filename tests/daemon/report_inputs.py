@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calibration.rig.description import Joint, Rig, shipped_rig
-from daemon.report.inputs import (
+from daemon.report.calibration.inputs import (
     ControlPoint,
     ErrorTable,
     OutlierLine,

@@ -12,8 +12,9 @@ from typing import Any
 
 from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_inputs
 from daemon.commands import CommandError
-from daemon.config import SessionsSection, load_rig
+from daemon.config import SessionsSection
 from daemon.host.time_service import ClockState
+from daemon.rig_files import load_rig
 from daemon.sessions.manager import SessionKeeper
 from daemon.sessions.station_setups import SetupBook
 from daemon.store.store import Store

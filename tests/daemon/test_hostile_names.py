@@ -23,8 +23,8 @@ from daemon.config import Config
 from daemon.control.protocol import request
 from daemon.host.safe_output import shown
 from daemon.host.systemd import Notifier
-from daemon.report.calibration import calibration_report
-from daemon.report.inputs import ControlPoint, ParameterLine, SetupLine
+from daemon.report.calibration.inputs import ControlPoint, ParameterLine, SetupLine
+from daemon.report.calibration.page import calibration_report
 from daemon.service import declare_channels
 from daemon.store.store import Store
 from drivers.clock import ManualClock

@@ -22,7 +22,7 @@ import numba
 from calibration.observations import parse_observations
 from calibration.model.prediction import Predictor
 from calibration.pipeline.calibrate import calibrate
-from daemon.config import load_rig
+from daemon.rig_files import load_rig
 
 def compiled():
     return {

@@ -22,9 +22,9 @@ from calibration.identification.search.checkpoint import pack
 from calibration.model.files import model_to_files
 from calibration.observations import parse_observations
 from calibration.pipeline.calibrate import calibrate
-from daemon.config import load_rig
 from daemon.models.first_load import encode
-from daemon.sessions.session_file import SessionFile
+from daemon.rig_files import load_rig
+from daemon.sessions.export.session_file import SessionFile
 from daemon.store.captures import encode_captures
 from daemon.store.packed_captures import CaptureColumns, packed
 from drivers.logs.can_log import read_can_log, write_can_log

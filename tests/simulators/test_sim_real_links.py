@@ -20,9 +20,10 @@ import pytest
 
 from calibration.rig.description import shipped_rig
 from daemon.composition import live
-from daemon.config import load_rig, parse_config
+from daemon.config import parse_config
 from daemon.control.protocol import request
 from daemon.host.systemd import Notifier
+from daemon.rig_files import load_rig
 from daemon.service import Daemon
 from daemon.store import Store
 from drivers.can.frame import Frame

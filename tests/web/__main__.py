@@ -18,7 +18,7 @@ PASSED = Passed(
         "daemon/web",
         "daemon/guide",
         "daemon/cli/commands/web.py",
-        "daemon/store/history.py",
+        "daemon/store/queries/history.py",
         "tests/web",
         "tests/daemon/web",
     ),

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from daemon.config import Config
-from daemon.store.setups import SetupTable
+from daemon.store.queries.setups import SetupTable
 from drivers.clock import NS_PER_S
 from tests.daemon.idle_daemon import idle_daemon
 from tests.daemon.model_support import ModelRig

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from daemon.acquisition.present_state import SILENT, is_present
-from daemon.acquisition.status import ChannelStatus
+from daemon.acquisition.status.present import SILENT, is_present
+from daemon.acquisition.status.snapshot import ChannelStatus
 from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
 from drivers.readings import EventKind, Status

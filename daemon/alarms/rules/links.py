@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from daemon.acquisition.decode_failures import kind_of
+from daemon.acquisition.status.decode_failures import kind_of
 from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
 from drivers.readings import EventKind

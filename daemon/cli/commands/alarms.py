@@ -9,7 +9,7 @@ import click
 
 from daemon.cli.client import ask, client_options
 from daemon.cli.command import Command
-from daemon.cli.state_lines import cleared_line, show_alarms
+from daemon.cli.lines.state import cleared_line, show_alarms
 from daemon.cli.terminal import echo
 
 

@@ -87,10 +87,10 @@ def compare(
     from calibration.experiments.comparison import shared_rows
     from calibration.experiments.zhou2022.protocol import run_protocol
     from calibration.run import Run
-    from daemon.config import load_rig
     from daemon.report.comparison import comparison_page
     from daemon.report.front import Facts
     from daemon.report.zhou2022 import protocol_page
+    from daemon.rig_files import load_rig
 
     watch = offline.Stopwatch()
     source = load_rig(rig, signals)

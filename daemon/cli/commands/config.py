@@ -22,7 +22,8 @@ def config() -> None:
 def config_check(path: Path, *, as_json: bool) -> dict[str, Any]:
     """Check a configuration, its rig, and the DBC and EDS files they name, without opening any device."""
     from daemon.composition import decoders
-    from daemon.config import load_rig, read_config
+    from daemon.config import read_config
+    from daemon.rig_files import load_rig
 
     settings = read_config(path)
     source = load_rig(settings.rig)

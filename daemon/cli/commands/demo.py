@@ -12,8 +12,8 @@ from typing import Any
 import click
 
 from daemon.cli.command import Command, json_option, progress_display
+from daemon.cli.demo.operator import PRISMS, Advance, DemoError, Operator
 from daemon.cli.offline import show_stages
-from daemon.cli.simulated_operator import PRISMS, Advance, DemoError, Operator
 from daemon.cli.terminal import echo
 
 EFFECTS = (  # hidden effects of the machine, beside its build tolerances
@@ -49,7 +49,7 @@ def demo(out: Path, rate: float, seed: int | None, *, is_hidden: bool, as_json: 
 
     With --hidden, a game: what physics does the simulated boom have that its model lacks?
     """
-    from daemon.cli import hidden
+    from daemon.cli.demo import hidden
 
     started = time.monotonic()
     _make_room(out)

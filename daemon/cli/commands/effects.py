@@ -40,7 +40,7 @@ def effects(name: str | None, rig: str, *, as_json: bool) -> dict[str, object]:
     needs, what it is confused with, and what reveals it. Places and sizes are those of a rig.
     """
     from calibration.effects.library import library
-    from daemon.config import load_rig
+    from daemon.rig_files import load_rig
 
     found = load_rig(rig).rig
     if name is not None and name not in library():

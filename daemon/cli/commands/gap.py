@@ -63,10 +63,10 @@ def gap(
     from calibration.experiments.comparison import shared_rows
     from calibration.pipeline.find_gap import find_gap
     from calibration.run import Run
-    from daemon.config import load_rig
     from daemon.models.gap_files import REPORT, check_gap_target, gap_answer, write_gap
-    from daemon.report.from_model import facts_of, provenance
-    from daemon.report.gap import gap_report
+    from daemon.report.calibration.from_model import facts_of, provenance
+    from daemon.report.gap.page import gap_report
+    from daemon.rig_files import load_rig
 
     source = load_rig(rig, signals)
     check_gap_target(out)
@@ -96,7 +96,7 @@ def gap(
 
 def show_gap(found: GapResult) -> None:
     """Print the workflow's answer for people."""
-    from daemon.report.gap_words import before_and_after, dependence, gap_headline, remaining
+    from daemon.report.gap.words import before_and_after, dependence, gap_headline, remaining
     from daemon.report.words import place_name
 
     echo(gap_headline(found), bold=True)

@@ -53,8 +53,8 @@ def import_(
         read_joints,
         read_map,
     )
-    from daemon.config import load_rig
     from daemon.host.safe_output import write_file
+    from daemon.rig_files import load_rig
     from drivers.stations.exports import export_formats, format_of
 
     if joints is not None and rig is None:

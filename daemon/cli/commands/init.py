@@ -223,7 +223,8 @@ def _check(path: Path) -> None:
     """
     from calibration.errors import RigError
     from daemon.composition import decoders
-    from daemon.config import load_rig, read_config
+    from daemon.config import read_config
+    from daemon.rig_files import load_rig
 
     try:
         settings = read_config(path)

@@ -8,7 +8,7 @@ import click
 
 from daemon.cli.client import ask, client_options
 from daemon.cli.command import Command
-from daemon.cli.job_lines import show_jobs
+from daemon.cli.lines.jobs import show_jobs
 from daemon.cli.terminal import echo
 
 

@@ -86,9 +86,9 @@ def plan(
 
     from calibration.design.planning import plan_poses
     from calibration.run import Run
-    from daemon.config import load_rig
     from daemon.models.gap_files import poses_csv
     from daemon.models.model_files import read_model
+    from daemon.rig_files import load_rig
 
     source = load_rig(rig)
     effects = _effects(separate, source.rig)

@@ -60,9 +60,10 @@ def replay(
     FILES are CAN logs (candump .log, Vector .asc or .blf) and serial captures (.serial).
     """
     from daemon.cli.log_replay import replay_logs, whole_session
-    from daemon.config import load_rig, read_config
+    from daemon.config import read_config
+    from daemon.rig_files import load_rig
+    from daemon.sessions.export.session_file import read_session_file
     from daemon.sessions.replay import stored_readings
-    from daemon.sessions.session_file import read_session_file
     from daemon.store.reader import Reader
 
     settings = read_config(config)

@@ -38,7 +38,7 @@ def rig_check(path: str, svg: Path | None, *, as_json: bool) -> dict[str, Any]:
     """
     from calibration.design.rig_check import check_rig
     from calibration.rig.description import read_rig
-    from daemon.config import read_rig_text
+    from daemon.rig_files import read_rig_text
 
     text, name, _ = read_rig_text(path)
     rig, faults = read_rig(text, name)
@@ -146,7 +146,7 @@ def rig_export(path: str, out: Path, *, as_json: bool) -> dict[str, Any]:
     from calibration.evaluation.writers.dh_table import dh_text
     from calibration.evaluation.writers.urdf_text import urdf_text, xacro_text
     from calibration.kinematics.chain import Chain, Placement
-    from daemon.config import load_rig
+    from daemon.rig_files import load_rig
 
     writers = {".urdf": urdf_text, ".xacro": xacro_text, ".csv": dh_text}
     if out.suffix not in writers:
@@ -161,7 +161,7 @@ def rig_export(path: str, out: Path, *, as_json: bool) -> dict[str, Any]:
 
 
 def _show(found: RigCheck) -> None:
-    from daemon.cli.sketch import sketch
+    from daemon.cli.lines.sketch import sketch
     from daemon.report.drawing import forward_axis
 
     rig, seen = found.rig, found.seen

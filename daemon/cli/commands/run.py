@@ -87,7 +87,8 @@ def run(
     if not sim and (is_by_hand or rig is not None):
         raise click.UsageError("--rig and --by-hand are for a simulated rig: give --sim as well")
     from daemon.composition import live, replayed, simulated
-    from daemon.config import load_rig, parse_config, read_config
+    from daemon.config import parse_config, read_config
+    from daemon.rig_files import load_rig
     from daemon.service import Daemon, stop_on_signals
     from daemon.store.store import Store
 

@@ -10,10 +10,10 @@ import click
 
 from daemon.cli.client import ask, client_options, operator_option, socket_of, who
 from daemon.cli.command import Command, json_option
-from daemon.cli.job_lines import show_jobs
-from daemon.cli.state_lines import show_session
+from daemon.cli.lines.clock import latency_sentence
+from daemon.cli.lines.jobs import show_jobs
+from daemon.cli.lines.state import show_session
 from daemon.cli.terminal import echo, echo_error, echo_table
-from daemon.cli.time_lines import latency_sentence
 from daemon.commands import SESSION_KINDS
 from daemon.control.protocol import request
 
@@ -148,8 +148,8 @@ def session_export(name: str, config: Path, out: Path, form: Any, *, as_json: bo
     csv, parquet, mat: the observations, all joint readings and all fixes as tables.
     """
     from daemon.config import read_config
-    from daemon.sessions.export import export_session
-    from daemon.sessions.export_tables import TABLE_FORMATS, export_tables
+    from daemon.sessions.export.captured_logs import export_session
+    from daemon.sessions.export.tables import TABLE_FORMATS, export_tables
 
     settings = read_config(config)
     if form in TABLE_FORMATS:

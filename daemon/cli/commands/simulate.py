@@ -76,7 +76,7 @@ def simulate(
     share no code with the analysis.
     """
     from daemon.composition import simulated_campaign
-    from daemon.config import load_rig
+    from daemon.rig_files import load_rig
 
     source = load_rig(rig)
     campaign = simulated_campaign(

@@ -11,8 +11,9 @@ import click
 
 from daemon.cli.client import ask, client_options, utc
 from daemon.cli.command import Command
-from daemon.cli.job_lines import job_line
-from daemon.cli.state_lines import (
+from daemon.cli.lines.clock import clock_sentence, latency_sentence
+from daemon.cli.lines.jobs import job_line
+from daemon.cli.lines.state import (
     decoding_lines,
     gap_lines,
     gap_state_lines,
@@ -23,9 +24,8 @@ from daemon.cli.state_lines import (
     station_line,
     store_lines,
 )
-from daemon.cli.summary import next_step, state_sentence, summary
+from daemon.cli.lines.summary import next_step, state_sentence, summary
 from daemon.cli.terminal import Coloured, echo, echo_table
-from daemon.cli.time_lines import clock_sentence, latency_sentence
 
 WIDTH = 100  # where the terminal's is not known
 

@@ -210,7 +210,8 @@ def store_redecode(
     """
     from daemon.acquisition.redecoding import redecode_command
     from daemon.composition import decoders
-    from daemon.config import load_rig, read_config
+    from daemon.config import read_config
+    from daemon.rig_files import load_rig
 
     if (session is None) == (since is None or until is None):
         raise click.UsageError("give either --session, or --from and --to")

@@ -14,8 +14,8 @@ import click
 
 from daemon.cli.client import client_options, socket_of
 from daemon.cli.command import Command, stream_json
-from daemon.cli.job_lines import job_line
-from daemon.cli.summary import LINES, Line, reading, state_sentence, summary
+from daemon.cli.lines.jobs import job_line
+from daemon.cli.lines.summary import LINES, Line, reading, state_sentence, summary
 from daemon.cli.terminal import begin_screen, draw_screen, echo, end_screen
 from daemon.commands import CommandError
 from daemon.control.protocol import request

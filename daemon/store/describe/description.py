@@ -11,9 +11,11 @@ from pathlib import Path
 
 from sqlite_utils import Database
 
-from daemon.store.canned_queries import Query, canned_queries
-from daemon.store.describe.words import TABLES, VIEWS, Words, channel_meaning
+from daemon.store.describe.table_words import TABLES
+from daemon.store.describe.view_words import VIEWS, channel_meaning
+from daemon.store.describe.words import Words
 from daemon.store.errors import StoreError
+from daemon.store.queries.canned_queries import Query, canned_queries
 from daemon.store.store import Store
 from daemon.store.views import Channel, channels_of
 

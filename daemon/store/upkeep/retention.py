@@ -10,8 +10,8 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS
 from daemon.store.rows import RowSource
-from daemon.store.sessions import AFTER_NS, BEFORE_NS
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S
 

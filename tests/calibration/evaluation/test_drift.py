@@ -14,7 +14,7 @@ from calibration.model.model import CalibratedModel
 from calibration.numerics.statistics import CLIP, DECISION, REFERENCE, Cusum, score
 from calibration.observations import Observations, parse_observations
 from calibration.pipeline.calibrate import identify
-from daemon.config import load_rig
+from daemon.rig_files import load_rig
 from simulators.effects.library import parse_effects
 from simulators.rig.truth import RigTruth
 from tests.simulated.observations import simulate_observations

@@ -13,7 +13,7 @@ from calibration.model.files import model_from_files, model_to_files
 from calibration.model.prediction import Predictor
 from calibration.observations import Observations, parse_observations
 from calibration.pipeline.find_gap import find_gap
-from daemon.config import load_rig
+from daemon.rig_files import load_rig
 from simulators.blind.cases import draw
 from simulators.blind.cells import Cell
 

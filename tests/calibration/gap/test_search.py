@@ -15,7 +15,7 @@ from calibration.gap.result import GapResult
 from calibration.identification.reading_steps import step_of
 from calibration.observations import parse_observations
 from calibration.pipeline.find_gap import find_gap
-from daemon.config import load_rig
+from daemon.rig_files import load_rig
 from simulators.blind.aliases import alias_scene
 from simulators.blind.cases import Drawn, draw
 from simulators.blind.cells import Cell, Poses

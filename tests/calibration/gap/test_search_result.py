@@ -9,7 +9,7 @@ import pytest
 
 from calibration.observations import parse_observations
 from calibration.pipeline.calibrate import identify
-from daemon.config import load_rig
+from daemon.rig_files import load_rig
 from simulators.blind.cases import draw
 from simulators.blind.cells import Cell
 from tests.calibration.conftest import Session

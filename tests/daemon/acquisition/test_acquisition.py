@@ -17,7 +17,7 @@ import pytest
 from daemon.acquisition import acquisition as acquisition_module
 from daemon.acquisition import link_intake
 from daemon.acquisition.acquisition import Acquisition
-from daemon.acquisition.status import AcquisitionStatus
+from daemon.acquisition.status.snapshot import AcquisitionStatus
 from daemon.store import Reader, Store
 from drivers.clock import ManualClock, SystemClock
 from drivers.readings import (

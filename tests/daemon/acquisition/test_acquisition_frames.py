@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from daemon.acquisition.acquisition import Acquisition
-from daemon.acquisition.status import FrameStatus
+from daemon.acquisition.status.snapshot import FrameStatus
 from daemon.store import Store
 from drivers.can.raw_signal import BitField, SignalChannel, SignalDecoder
 from drivers.can_decoder import IDS_MAX, CanDecoder

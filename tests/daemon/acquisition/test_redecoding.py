@@ -14,7 +14,8 @@ from daemon.acquisition.redecoding import redecode, redecode_command
 from daemon.acquisition.thinning import Thinning
 from daemon.commands import CommandError
 from daemon.composition import decoders
-from daemon.config import load_rig, parse_config
+from daemon.config import parse_config
+from daemon.rig_files import load_rig
 from daemon.service import declare_channels
 from daemon.store import Store
 from daemon.store.upkeep.full_samples import stretches_between

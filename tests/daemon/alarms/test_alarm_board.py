@@ -14,8 +14,8 @@ from daemon.alarms.board import GRACE_S, AlarmBoard
 from daemon.alarms.evidence import Evidence
 from daemon.alarms.library import library
 from daemon.store import Store
-from daemon.store.alarms import AlarmTable
-from daemon.store.jobs import FailedJob
+from daemon.store.queries.alarms import AlarmTable
+from daemon.store.queries.jobs import FailedJob
 from drivers.clock import ManualClock
 from tests.daemon.damage import fill_up
 from tests.daemon.store_support import at, table

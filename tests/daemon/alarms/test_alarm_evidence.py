@@ -12,9 +12,9 @@ from daemon.alarms.evidence import Gatherer
 from daemon.jobs.order import Outcome
 from daemon.models.drift import note_drift
 from daemon.service import is_store_new
-from daemon.store.jobs import FailedJob, JobTable
-from daemon.store.sessions import SessionTable
-from daemon.store.setups import SetupRow, SetupTable
+from daemon.store.queries.jobs import FailedJob, JobTable
+from daemon.store.queries.sessions import SessionTable
+from daemon.store.queries.setups import SetupRow, SetupTable
 from drivers.readings import DeviceEvent, EventKind
 from tests.daemon.model_support import ModelRig, wait
 

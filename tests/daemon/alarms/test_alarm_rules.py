@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from daemon.acquisition.decode_failures import DecodeStatus
-from daemon.acquisition.status import (
+from daemon.acquisition.status.decode_failures import DecodeStatus
+from daemon.acquisition.status.snapshot import (
     AcquisitionStatus,
     ChannelStatus,
     EventStatus,
@@ -22,11 +22,11 @@ from daemon.alarms.alarm import Alarm
 from daemon.alarms.evidence import Evidence
 from daemon.alarms.library import library, page
 from daemon.models.live_model import LiveModelHealth
-from daemon.sessions.prism_guard import Suspicion
+from daemon.sessions.prisms.guard import Suspicion
 from daemon.store.health import HealthState, StoreHealth
-from daemon.store.jobs import FailedJob
-from daemon.store.sessions import OpenSessionRow
-from daemon.store.setups import SetupRow
+from daemon.store.queries.jobs import FailedJob
+from daemon.store.queries.sessions import OpenSessionRow
+from daemon.store.queries.setups import SetupRow
 from daemon.store.upkeep.housekeeping import KeepingState
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import EventKind, Status

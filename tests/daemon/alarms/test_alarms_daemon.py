@@ -17,9 +17,10 @@ from typing import Any
 import pytest
 
 from daemon.composition import live
-from daemon.config import load_rig, parse_config
+from daemon.config import parse_config
 from daemon.control.protocol import request
 from daemon.host.systemd import Notifier
+from daemon.rig_files import load_rig
 from daemon.service import Daemon
 from daemon.store import Store
 from tests.daemon.acquisition.test_clock_watch import SetClock

@@ -18,7 +18,7 @@ from daemon.benchmark.cases import LABELS, Case, CasesError, draw_cases, measure
 from daemon.benchmark.score import Score, scores, tallies
 from daemon.benchmark.trial import Floats, Trial, trial
 from daemon.cli.main import main as rigcal
-from daemon.config import load_rig
+from daemon.rig_files import load_rig
 
 STRANGE = ("gear_mesh",)  # what no library has
 TWIN_MM = np.array([[0.0, 0.0, 0.0], [90.0, 0.0, 0.0]])  # without the effect

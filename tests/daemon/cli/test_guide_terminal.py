@@ -14,7 +14,7 @@ from daemon.guide.position import BoomPosition
 from daemon.guide.request import request_of
 from daemon.guide.view import Around, state_of
 from daemon.models.gap_files import poses_csv
-from daemon.store.guides import GuideRow
+from daemon.store.queries.guides import GuideRow
 from drivers.clock import Stamp
 
 RIG = shipped_rig("swdt82")

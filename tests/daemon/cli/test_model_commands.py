@@ -19,9 +19,10 @@ from calibration.model.prediction import Predictor
 from calibration.rig.channels import RawSignal
 from daemon.cli.main import main
 from daemon.composition import decoders, live
-from daemon.config import Config, ConfigError, load_rig, parse_config
+from daemon.config import Config, ConfigError, parse_config
 from daemon.control.server import ControlServer
 from daemon.models.model_files import read_model, write_model
+from daemon.rig_files import load_rig
 from daemon.service import tip_sender
 from drivers.can.tip_frames import TipMessage, TipStatus, encode_tip
 from drivers.errors import TransmitForbiddenError

@@ -16,8 +16,8 @@ from calibration.errors import CalibrationError, DataError, ModelError, RigError
 from calibration.rig.description import shipped_rig
 from daemon.cli.command import Command, json_option, progress_display
 from daemon.cli.offline import read_observations
-from daemon.config import load_rig
 from daemon.host.safe_output import write_file
+from daemon.rig_files import load_rig
 
 
 @click.command(cls=Command)

@@ -13,7 +13,7 @@ from calibration.rig.description import parse_rig
 from daemon.acquisition.channels import decoder_factories
 from daemon.acquisition.simulated_channels import with_simulated_channels
 from daemon.cli.main import main
-from daemon.config import load_rig
+from daemon.rig_files import load_rig
 from drivers.readings import Reading
 from simulators.rig.truth import RigTruth
 from simulators.rig_simulator import RigSimulator

@@ -12,7 +12,7 @@ from daemon.cli.main import main as rigcal
 from daemon.commands import CommandError
 from daemon.control.protocol import request
 from daemon.control.server import ControlServer
-from daemon.store.jobs import JobTable
+from daemon.store.queries.jobs import JobTable
 from daemon.store.store import Store
 
 release = threading.Event()

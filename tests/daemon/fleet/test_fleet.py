@@ -22,7 +22,7 @@ from daemon.fleet.comparison import compare, gains
 from daemon.fleet.run import RESULTS, Cluster, Here, assess_all, local_workers
 from daemon.fleet.sources import find_rigs
 from daemon.store import Store
-from daemon.store.sessions import SessionTable
+from daemon.store.queries.sessions import SessionTable
 from tests.daemon.store_support import at
 from tests.simulated.fleet import COMMON, ODD, drawing, simulated_rig, write_rig
 

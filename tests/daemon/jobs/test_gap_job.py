@@ -8,14 +8,14 @@ from typing import Any
 import pytest
 
 from calibration.numerics.statistics import CLIP
-from daemon.cli.state_lines import gap_lines
+from daemon.cli.lines.state import gap_lines
 from daemon.jobs.job_queue import JobQueue
 from daemon.jobs.order import Order
 from daemon.jobs.process import perform
 from daemon.models.drift import drift_status, gap_status, note_drift
 from daemon.models.model_files import read_model
-from daemon.store.jobs import JobTable
-from daemon.store.models import ModelTable
+from daemon.store.queries.jobs import JobTable
+from daemon.store.queries.models import ModelTable
 from simulators.effects.library import parse_effects
 from simulators.rig.truth import RigTruth
 from tests.daemon.job_support import SOURCE, JobRig

@@ -10,7 +10,7 @@ import pytest
 
 from calibration.observations import parse_observations
 from calibration.pipeline.calibrate import identify
-from daemon.cli.time_lines import latency_sentence
+from daemon.cli.lines.clock import latency_sentence
 from daemon.jobs.order import Order
 from daemon.jobs.process import perform
 from daemon.models.model_files import write_model

@@ -13,7 +13,7 @@ from daemon.jobs.scheduler import (
     next_job,
     spent_jobs,
 )
-from daemon.store.jobs import JobFacts, JobKind, SessionFacts
+from daemon.store.queries.jobs import JobFacts, JobKind, SessionFacts
 from drivers.clock import NS_PER_S, Stamp
 
 T0 = Stamp(1_700_000_000 * NS_PER_S, 100 * NS_PER_S, "boot")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.cli.state_lines import model_lines
+from daemon.cli.lines.state import model_lines
 from daemon.commands import CommandError
 from tests.daemon.model_support import ModelRig
 

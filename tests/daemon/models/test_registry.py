@@ -21,7 +21,7 @@ from daemon.jobs.runner import JobRunner
 from daemon.models.live_model import LiveModel, Loaded, Missing
 from daemon.store.errors import NotInStoreError
 from daemon.store.migrations import MIGRATIONS
-from daemon.store.models import ModelRow, ModelTable
+from daemon.store.queries.models import ModelRow, ModelTable
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import DeviceEvent, EventKind
 from tests.daemon.job_support import SOURCE, JobRig

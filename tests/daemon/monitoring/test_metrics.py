@@ -15,14 +15,16 @@ from typing import Any
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from daemon.acquisition.status_board import StatusBoard
+from daemon.acquisition.status.board import StatusBoard
 from daemon.composition import live
-from daemon.config import ConfigError, load_rig, parse_config
+from daemon.config import ConfigError, parse_config
 from daemon.control.protocol import request
 from daemon.host.systemd import Notifier, network_hint
 from daemon.monitoring import metrics_server
-from daemon.monitoring.metrics import FAMILIES, page
+from daemon.monitoring.metrics import FAMILIES
+from daemon.monitoring.metrics_page import page
 from daemon.monitoring.metrics_server import MetricsServer
+from daemon.rig_files import load_rig
 from daemon.service import Daemon
 from daemon.store import Store
 from drivers.clock import ManualClock
@@ -162,7 +164,7 @@ def test_names_follow_the_conventions_and_the_page_lists_them_all() -> None:
     assert len(set(names)) == len(names)
     assert all(family.name.endswith("_total") == (family.kind == "counter") for family in FAMILIES)
     written = (ROOT / "docs" / "metrics.md").read_text(encoding="utf-8")
-    assert written == page(), "make it anew: python -m daemon.monitoring.metrics > docs/metrics.md"
+    assert written == page(), "make it anew: python -m daemon.monitoring.metrics_page > docs/metrics.md"
 
 
 def test_a_port_that_is_taken_is_told_and_served_once_it_is_free(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,8 +24,8 @@ from daemon.monitoring.notice import LISTED, Notice, message_of
 from daemon.monitoring.notices import Notices
 from daemon.monitoring.outbox import Pace
 from daemon.store import Store
-from daemon.store.alarms import AlarmTable
-from daemon.store.notices import NoticeTable
+from daemon.store.queries.alarms import AlarmTable
+from daemon.store.queries.notices import NoticeTable
 from drivers.clock import ManualClock
 from tests.daemon.acquisition_support import wait_until
 from tests.daemon.idle_daemon import idle_daemon

@@ -1,6 +1,6 @@
 """The computer's clock, watched: quiet where nobody ever kept it, told once somebody no longer does."""
 
-from daemon.cli.time_lines import clock_sentence
+from daemon.cli.lines.clock import clock_sentence
 from daemon.host.time_service import ClockState
 from daemon.monitoring.time_watch import TimeWatch
 from drivers.clock import ManualClock

@@ -11,9 +11,9 @@ import pytest
 from click.testing import CliRunner
 
 from daemon.cli.main import main
-from daemon.report.calibration import calibration_report
+from daemon.report.calibration.page import calibration_report
 from daemon.report.front import Facts, judge
-from daemon.report.gap import gap_report
+from daemon.report.gap.page import gap_report
 from daemon.report.plain_names import coefficient_words, constant_words, in_words, unit_words
 from tests.daemon import gap_support
 from tests.daemon.report_inputs import report_input

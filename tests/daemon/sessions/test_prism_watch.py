@@ -14,10 +14,10 @@ from daemon.acquisition.joiner import ObservationJoiner, joint_inputs
 from daemon.cli.main import main
 from daemon.commands import CommandError
 from daemon.config import SessionsSection, parse_config
-from daemon.sessions.export import export_session
+from daemon.sessions.export.captured_logs import export_session
+from daemon.sessions.export.session_file import SessionFile, read_session_file
 from daemon.sessions.manager import SessionKeeper
-from daemon.sessions.prism_guard import MotionLimit
-from daemon.sessions.session_file import SessionFile, read_session_file
+from daemon.sessions.prisms.guard import MotionLimit
 from daemon.store.reader import Reader
 from drivers.clock import ManualClock
 from drivers.logs.can_log import write_can_log

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from calibration.observations import parse_observations
-from daemon.acquisition.present_state import expected_of
-from daemon.cli.state_lines import show_session
+from daemon.acquisition.status.present import expected_of
+from daemon.cli.lines.state import show_session
 from daemon.commands import CommandError
-from daemon.config import Config, SessionsSection, load_rig
+from daemon.config import Config, SessionsSection
 from daemon.control.server import ControlServer
 from daemon.host.time_service import ClockState
+from daemon.rig_files import load_rig
 from daemon.sessions.session_data import sessions_csv, setup_lines
 from daemon.store.errors import NotInStoreError
 from daemon.store.reader import Reader

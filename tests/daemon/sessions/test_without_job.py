@@ -6,9 +6,9 @@ from typing import Any
 
 from daemon.sessions.session_data import sessions_measured
 from daemon.sessions.without_job import why_no_job
-from daemon.store.jobs import JobTable
+from daemon.store.queries.jobs import JobTable
+from daemon.store.queries.sessions import SessionTable
 from daemon.store.reader import Reader
-from daemon.store.sessions import SessionTable
 from tests.daemon.job_support import JobRig
 
 

@@ -14,12 +14,13 @@ import pytest
 from sqlite_utils import Database
 
 from daemon.store import Reader, Store, StoreError
-from daemon.store.canned_queries import canned_queries
 from daemon.store.describe.__main__ import example
 from daemon.store.describe.pages import datasette_metadata, schema_page
-from daemon.store.describe.words import TABLES, VIEWS
+from daemon.store.describe.table_words import TABLES
+from daemon.store.describe.view_words import VIEWS
 from daemon.store.migrations import MIGRATIONS
-from daemon.store.sessions import SessionTable, session
+from daemon.store.queries.canned_queries import canned_queries
+from daemon.store.queries.sessions import SessionTable, session
 from daemon.store.views import Channel, channels_of
 from drivers.readings import Status
 from tests.daemon.store_support import at, fix, reading

@@ -7,7 +7,7 @@ import contextlib
 import msgpack
 
 from daemon.acquisition.channels import decoder_factories
-from daemon.config import load_rig
+from daemon.rig_files import load_rig
 from drivers.can.error_frames import BusErrors
 from drivers.can.frame import DATA_MAX, EXTENDED_ID_MAX, Frame, SlcanLines, parse_can_frame, parse_multicast
 from drivers.can.j1939 import J1939Id

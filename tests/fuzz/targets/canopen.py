@@ -6,7 +6,7 @@ import contextlib
 import struct
 
 from daemon.acquisition.channels import decoder_factories, node_setups
-from daemon.config import load_rig
+from daemon.rig_files import load_rig
 from drivers.can.frame import Frame
 from drivers.canopen.cia301 import classify
 from drivers.canopen.node_setup import SetupRunner

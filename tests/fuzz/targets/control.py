@@ -12,9 +12,10 @@ from pathlib import Path
 
 from calibration.rig.description import shipped_rig
 from daemon.composition import replayed
-from daemon.config import load_rig, parse_config
+from daemon.config import parse_config
 from daemon.control.protocol import MAX_LINE_BYTES
 from daemon.host.systemd import Notifier
+from daemon.rig_files import load_rig
 from daemon.service import Daemon
 from daemon.store.store import Store
 from tests.fuzz.target import Run, Target, check_refusal, scratch_directory

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calibration.gap.result import GapResult
 from calibration.observations import Observations, parse_observations
 from calibration.pipeline.find_gap import find_gap
-from daemon.config import load_rig
+from daemon.rig_files import load_rig
 from simulators.effects.library import parse_effects
 from simulators.rig.truth import RigTruth
 from tests.simulated.observations import simulate_observations

@@ -16,7 +16,7 @@ from calibration.identification.samples import averaged
 from calibration.identification.solve import solve
 from calibration.observations import Observations, parse_observations
 from calibration.run import DEFAULT_RUN
-from daemon.config import load_rig
+from daemon.rig_files import load_rig
 from simulators.rig.truth import RigTruth
 from tests.simulated.observations import simulate_observations
 

@@ -1,0 +1,315 @@
+"""Gathers what the writer does, and says at any moment how things are."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from daemon.acquisition.link_intake import LinkIntake
+from daemon.acquisition.status.decode_failures import FailureCounter
+from daemon.acquisition.status.present import (
+    NOTHING_EXPECTED,
+    Expected,
+    ExpectedChannel,
+    ExpectedStation,
+    is_present,
+    present_status,
+    station_sentence,
+)
+from daemon.acquisition.status.snapshot import (
+    AcquisitionStatus,
+    ChannelStatus,
+    EventCount,
+    EventStatus,
+    FrameStatus,
+    GapCount,
+    GapStatus,
+    LinkStatus,
+    StationStatus,
+)
+from drivers.can.summary import CanSummary
+from drivers.clock import NS_PER_S, Clock, Stamp
+from drivers.readings import (
+    Capture,
+    DecodeFailure,
+    DeviceEvent,
+    EventKind,
+    Fix,
+    Gap,
+    LockState,
+    Reading,
+    Record,
+    Status,
+)
+
+RATE_WINDOW_BATCHES = 40
+LAG_WINDOW_BATCHES = 1200  # a minute at the usual 20 batches a second
+
+
+@dataclass
+class _Link:
+    """Last record of a link, and its counters."""
+
+    since: Stamp
+    up: bool | None = None
+    reason: str = ""
+    dropped: int = 0
+    dropped_at: Stamp | None = None
+    restarts: int = 0
+    restarted_at: Stamp | None = None
+
+
+class StatusBoard:
+    """Gathers what the writer does; may be read from any thread.
+
+    Args:
+        clock: for ages and lags.
+        expected: what should be heard; nothing more is known of what was never heard.
+    """
+
+    def __init__(self, clock: Clock, expected: Expected = NOTHING_EXPECTED) -> None:
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._started = clock.now()
+        self._channels = {channel.name: channel for channel in expected.channels}
+        self._stations = {station.name: station for station in expected.stations}
+        self._links: dict[str, _Link] = {}
+        self._totals: Counter[str] = Counter()
+        self._history: deque[tuple[int, Counter[str]]] = deque(maxlen=RATE_WINDOW_BATCHES)
+        self._lags_ns: deque[int] = deque(maxlen=LAG_WINDOW_BATCHES)
+        self._readings: dict[str, Reading] = {}
+        self._fixes: dict[str, Fix] = {}
+        self._good_fixes: dict[str, Fix] = {}
+        self._fix_counts: Counter[str] = Counter()
+        self._failures = FailureCounter()
+        self._gaps: dict[tuple[str, str], Gap] = {}
+        self._gap_counts: Counter[tuple[str, str]] = Counter()
+        self._missed: Counter[tuple[str, str]] = Counter()
+        self._event_counts: Counter[tuple[str, str]] = Counter()
+        self._events: dict[tuple[str, str], tuple[int, DeviceEvent]] = {}
+        self._event_count = 0
+        self._error: str | None = None
+
+    def set_error(self, error: str | None) -> None:
+        """Why nothing can be stored; None when it can again."""
+        with self._lock:
+            self._error = error
+
+    def captured(self, captures: Sequence[Capture]) -> None:
+        """These captures are stored now."""
+        now_ns = self._clock.monotonic_ns()
+        counts = Counter([capture.link for capture in captures])
+        with self._lock:
+            self._totals.update(counts)
+            self._history.append((now_ns, self._totals.copy()))
+            if captures:
+                self._lags_ns.append(now_ns - min(capture.stamp.monotonic_ns for capture in captures))
+
+    def recorded(self, records: Sequence[Record]) -> None:
+        """These records are stored now."""
+        with self._lock:
+            self._failures.tell_time(self._clock.monotonic_ns())
+            decoded: list[str] = []
+            malformed = Status.MALFORMED
+            for record in records:
+                if isinstance(record, Reading):
+                    self._readings[record.channel] = record
+                    if record.status is not malformed:
+                        decoded.append(record.channel)
+                elif isinstance(record, Fix):
+                    self._fixes[record.station] = record
+                    self._fix_counts[record.station] += 1
+                    decoded.append(record.station)
+                    if record.status is Status.OK:
+                        self._good_fixes[record.station] = record
+                elif isinstance(record, DecodeFailure):
+                    self._failures.add(record.device, record.reason)
+                elif isinstance(record, DeviceEvent):
+                    self._happened(record)
+                else:
+                    self._note_gap(record)
+            self._failures.decoded.update(decoded)
+
+    def _note_gap(self, gap: Gap) -> None:
+        key = gap.channel, gap.reason.value
+        was_open = self._gaps.pop(key, None)
+        if gap.end is None:
+            self._gaps[key] = gap
+        if was_open is None or was_open.start != gap.start:  # it is told when it opens and again when it closes
+            self._gap_counts[key] += 1
+        if gap.end is not None:
+            self._missed[key] += gap.missed or 0
+
+    def _happened(self, event: DeviceEvent) -> None:
+        self._event_count += 1
+        self._event_counts[event.device, event.kind.value] += 1
+        self._events[event.device, event.kind] = self._event_count, event
+        if event.kind in (EventKind.LINK_UP, EventKind.LINK_LOST):
+            link = self._links.setdefault(event.device, _Link(event.stamp))
+            is_up = event.kind is EventKind.LINK_UP
+            if link.up is not is_up or is_up:  # a link that is opened anew is heard anew
+                link.since = event.stamp
+            link.up, link.reason = is_up, "" if is_up else event.text
+
+    def snapshot(
+        self,
+        intakes: Sequence[LinkIntake],
+        summaries: Sequence[CanSummary],
+        defects: Mapping[str, Stamp] = MappingProxyType({}),
+        *,
+        is_behind: bool = False,
+    ) -> AcquisitionStatus:
+        """All of it, now.
+
+        Args:
+            intakes: of all links.
+            summaries: of the CAN links.
+            defects: link -> when its decoder last showed a defect.
+            is_behind: as `AcquisitionStatus` has it.
+        """
+        heard = {summary.link: summary for summary in summaries}
+        now = self._clock.now()
+        with self._lock:
+            self._failures.tell_time(now.monotonic_ns)
+            lags = sorted(self._lags_ns)
+            last_lag = self._lags_ns[-1] if lags else 0
+            links = [self._link(intake, heard.get(intake.name), defects.get(intake.name), now) for intake in intakes]
+            by_name = {link.name: link for link in links}
+            return AcquisitionStatus(
+                links=links,
+                frames=_frames(summaries),
+                channels=[self._channel(name, by_name, now) for name in self._known(self._channels, self._readings)],
+                stations=[self._station(name, by_name, now) for name in self._known(self._stations, self._fixes)],
+                decode_failures=self._failures.totals(),
+                decoding=self._failures.status(),
+                gaps=sorted((_gap(gap, now) for gap in self._gaps.values()), key=lambda gap: -gap.age_s),
+                last_events=sorted(
+                    (_event(number, event, now) for number, event in self._events.values()), key=lambda e: e.number
+                ),
+                gap_counts=[
+                    GapCount(channel, reason, count, self._missed[channel, reason])
+                    for (channel, reason), count in self._gap_counts.items()
+                ],
+                event_counts=[EventCount(device, kind, count) for (device, kind), count in self._event_counts.items()],
+                writer_lag_s=last_lag / NS_PER_S,
+                writer_lag_p99_s=lags[int(0.99 * (len(lags) - 1))] / NS_PER_S if lags else 0.0,
+                error=self._error,
+                is_behind=is_behind,
+            )
+
+    @staticmethod
+    def _known(expected: Mapping[str, object], heard: Mapping[str, object]) -> list[str]:
+        """Return the expected devices in their order, then the others that were heard."""
+        return [*dict.fromkeys([*expected, *heard])]
+
+    def _channel(self, name: str, links: Mapping[str, LinkStatus], now: Stamp) -> ChannelStatus:
+        reading = self._readings.get(name)
+        unit = reading.unit if reading is not None else ""
+        expected = self._channels.get(name, ExpectedChannel(name, unit, "", "signal", 0.0))
+        last, age_s = (None, None) if reading is None else (reading.status.value, _age_s(reading.stamp, now))
+        status = present_status(last, age_s, expected.timeout_s, *_open(links.get(expected.link)))
+        return ChannelStatus(
+            name=name,
+            unit=expected.unit,
+            value=reading.value if reading is not None and is_present(status) else None,
+            status=status,
+            age_s=age_s,
+            last_status=last,
+            link=expected.link,
+            kind=expected.kind,
+        )
+
+    def _station(self, name: str, links: Mapping[str, LinkStatus], now: Stamp) -> StationStatus:
+        fix, good = self._fixes.get(name), self._good_fixes.get(name)
+        expected = self._stations.get(name, ExpectedStation(name, 0.0))
+        last, age_s = (None, None) if fix is None else (fix.status.value, _age_s(fix.stamp, now))
+        status = present_status(last, age_s, expected.timeout_s, *_open(links.get(name)))
+        last_lock, reason = ("", "") if fix is None else (fix.lock.value, fix.reason)
+        return StationStatus(
+            name=name,
+            status=status,
+            lock=last_lock if is_present(status) else LockState.UNKNOWN.value,
+            reason=reason,
+            age_s=age_s,
+            fixes=self._fix_counts[name],
+            last_status=last or "",
+            last_lock=last_lock,
+            good_age_s=None if good is None else _age_s(good.stamp, now),
+            tilt_ok=None if fix is None else fix.tilt_ok,
+            sentence=station_sentence(status, age_s, last_lock, last or "", reason),
+        )
+
+    def _link(
+        self, intake: LinkIntake, heard: CanSummary | None, decoder_failed: Stamp | None, now: Stamp
+    ) -> LinkStatus:
+        name, per_s = intake.name, 0.0
+        if len(self._history) > 1:
+            (before_ns, before), (after_ns, after) = self._history[0], self._history[-1]
+            per_s = (after[name] - before[name]) * NS_PER_S / max(after_ns - before_ns, 1)
+        link = self._links.setdefault(name, _Link(self._started))
+        if link.up is None and self._totals[name]:
+            link.up = True  # a log that is played back says nothing of a port
+        if intake.dropped > link.dropped:
+            link.dropped, link.dropped_at = intake.dropped, now
+        if intake.restarts > link.restarts:
+            link.restarts, link.restarted_at = intake.restarts, now
+        return LinkStatus(
+            name=name,
+            up=link.up,
+            captures=self._totals[name],
+            captures_per_s=per_s,
+            dropped=intake.dropped,
+            queued=intake.queued,
+            restarts=intake.restarts,
+            error_frames=None if heard is None else heard.error_frames,
+            unlisted_frames=None if heard is None else heard.unlisted_frames,
+            since_s=_age_s(link.since, now),
+            reason=link.reason,
+            dropped_age_s=None if link.dropped_at is None else _age_s(link.dropped_at, now),
+            restarted_age_s=None if link.restarted_at is None else _age_s(link.restarted_at, now),
+            decoder_failed_age_s=None if decoder_failed is None else _age_s(decoder_failed, now),
+        )
+
+
+def _age_s(stamp: Stamp, now: Stamp) -> float:
+    return now.since(stamp) / NS_PER_S
+
+
+def _open(link: LinkStatus | None) -> tuple[bool | None, float]:
+    """Return the state of a link and since when it has it; unknown of none."""
+    return (None, 0.0) if link is None else (link.up, link.since_s)
+
+
+def _gap(gap: Gap, now: Stamp) -> GapStatus:
+    return GapStatus(gap.channel, gap.reason.value, gap.start.utc_ns, _age_s(gap.start, now))
+
+
+def _event(number: int, event: DeviceEvent, now: Stamp) -> EventStatus:
+    return EventStatus(
+        event.device,
+        event.kind.value,
+        event.text,
+        event.code,
+        event.stamp.utc_ns,
+        _age_s(event.stamp, now),
+        number,
+    )
+
+
+def _frames(summaries: Sequence[CanSummary]) -> list[FrameStatus]:
+    return [
+        FrameStatus(
+            link=summary.link,
+            identifier=f"{one.arbitration_id:0{8 if one.is_extended else 3}X}",
+            names=one.names,
+            count=one.count,
+            rate_per_s=one.rate_per_s,
+            age_s=one.age_s,
+            missed=one.missed,
+        )
+        for summary in summaries
+        for one in summary.ids
+    ]

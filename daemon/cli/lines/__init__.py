@@ -1,0 +1,1 @@
+"""The daemon's state, jobs, clock and rig in lines for people."""

@@ -1,0 +1,53 @@
+"""The page of all metrics, made from their families: `python -m daemon.monitoring.metrics_page > docs/metrics.md`."""
+
+from __future__ import annotations
+
+import sys
+
+from daemon.monitoring.metrics import FAMILIES
+
+_HEAD = """# Metrics
+
+rigcal serves its state in [Prometheus' text format](https://prometheus.io/docs/instrumenting/exposition_formats/)
+where the configuration has
+
+    [metrics]
+    port = 9750
+
+at `http://127.0.0.1:9750/metrics`. It listens on the loopback interface alone: a collector on the rig's computer
+(Prometheus itself, its agent mode, Grafana Alloy, Telegraf) reads it and takes it further. The service has no network
+until `network.conf` opens it ([deploy/README.md](../deploy/README.md#the-network)). Counters count since the
+daemon's start. All of it is in `rigcal status --json` too; besides stand the `process_` metrics of the official Python
+client (memory, descriptors, CPU time).
+
+An example of a scrape configuration and of a rule:
+
+    scrape_configs:
+      - job_name: rigcal
+        static_configs: [{targets: ["127.0.0.1:9750"]}]
+
+    - alert: RigcalCritical
+      expr: rigcal_alarms{severity="critical"} > 0 or rigcal_alarms_looked_age_seconds > 30 or up{job="rigcal"} == 0
+
+A monitoring system that runs commands asks `rigcal health`: one line a finding with what to do, and the exit status of
+the Nagios plugin interface (0 good, 1 warning, 2 critical, 3 the daemon cannot be asked). A member of `read_group` may
+run it.
+
+This page is made from the families in `daemon/monitoring/metrics.py`:
+`python -m daemon.monitoring.metrics_page > docs/metrics.md`.
+
+| metric | kind | labels | meaning |
+|---|---|---|---|
+"""
+
+
+def page() -> str:
+    """Return the text of docs/metrics.md."""
+    rows = (
+        f"| `{f.name}` | {f.kind} | {', '.join(f'`{label}`' for label in f.labels)} | {f.help} |\n" for f in FAMILIES
+    )
+    return _HEAD + "".join(rows)
+
+
+if __name__ == "__main__":
+    sys.stdout.write(page())

@@ -1,0 +1,1 @@
+"""The calibration report: its input, its figures and its page."""

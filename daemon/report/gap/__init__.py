@@ -1,0 +1,1 @@
+"""The gap report: its sentences, its figures and its page."""

@@ -1,0 +1,1 @@
+"""A stored session as files: captured logs with the operator's commands, and tables."""

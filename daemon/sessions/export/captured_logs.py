@@ -1,0 +1,132 @@
+"""A stored session as captured logs again, with what `rigcal replay` must know of them, and its observations CSV."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+from calibration.rig.description import parse_rig
+from daemon.commands import CommandError
+from daemon.config import Config, ConfigError
+from daemon.host.safe_output import write_file
+from daemon.sessions.export.session_file import DoubtfulCaptures, SessionFile
+from daemon.sessions.session_data import sessions_csv
+from daemon.sessions.steady_time import SteadyTime
+from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS, prism_confirmations, session
+from daemon.store.queries.setups import control_points
+from daemon.store.reader import Reader
+from drivers.logs.can_log import write_can_log
+from drivers.logs.serial_log import SerialLogHeader, SerialLogWriter
+from drivers.readings import CanCapture, Capture, SerialCapture
+
+CanFormat = Literal["log", "asc", "blf"]
+
+
+def export_session(config: Config, session_id: str, out: Path, can_format: CanFormat) -> list[Path]:
+    """Write a session's captures, a file a link, what the operator said of it, and its observations.
+
+    Logs know UTC alone, so the captures' is made steady: what was recorded while the computer's clock was set must not
+    come again at another time than what came before and after it. Nor can logs say that a capture's time is doubtful:
+    the session file does.
+
+    Args:
+        config: of the daemon whose store it is; gives the stations' profiles and speeds.
+        session_id: a session that has ended.
+        out: directory, made if need be.
+        can_format: of the CAN logs: candump `log`, Vector `asc` or `blf`.
+
+    Returns:
+        The files, `<session>-<link>.<format>`, `<session>-<station>.serial`, `<session>.json` and `<session>.csv`.
+
+    Raises:
+        CommandError: no such session, or it is still open.
+        ConfigError: its station is not in the configuration.
+    """
+    with Reader(config.store_path) as reader:
+        found = ended_session(reader, session_id)
+        started, ended = reader.stamp(found, "started_"), reader.stamp(found, "ended_")
+        since, until = started.shifted(-BEFORE_NS), ended.shifted(AFTER_NS)
+        out.mkdir(parents=True, exist_ok=True)
+        files = []
+        steady = SteadyTime()
+        steady.of(since)
+        doubtful: dict[str, DoubtfulCaptures] = {}
+        for link in reader.links():
+            stored = reader.captures(link["name"], since, until)
+            doubts = _Doubts()
+            captures = doubts.noted(replace(capture, stamp=steady.of(capture.stamp)) for capture in stored)
+            if link["kind"] == "can":
+                path = out / f"{session_id}-{link['name']}.{can_format}"
+                write_can_log(path, (c for c in captures if isinstance(c, CanCapture)))
+            else:
+                path = out / f"{session_id}-{link['name']}.serial"
+                with path.open("w", encoding="utf-8", newline="\n") as stream:
+                    writer = SerialLogWriter(stream, _header(config, link["name"]))
+                    for capture in captures:
+                        if isinstance(capture, SerialCapture):
+                            writer.write(capture)
+            files.append(path)
+            if doubts.runs:
+                doubtful[link["name"]] = DoubtfulCaptures(captures=doubts.captures, runs=tuple(doubts.runs))
+        words = [
+            (row["turning"], steady.of(reader.stamp(row)).utc_ns) for row in prism_confirmations(reader, session_id)
+        ]
+        told = SessionFile(
+            prism=found["prism"],
+            kind=found["kind"],
+            since_utc_ns=steady.of(started).utc_ns,
+            until_utc_ns=steady.of(ended).utc_ns,
+            prism_confirmed_utc_ns=tuple(at_ns for turning, at_ns in words if not turning),
+            prism_turned_utc_ns=tuple(at_ns for turning, at_ns in words if turning),
+            control_points={
+                point["name"]: (point["x_mm"], point["y_mm"], point["z_mm"])
+                for point in control_points(reader, found["setup_id"])
+            },
+            doubtful=doubtful,
+        )
+        path = out / f"{session_id}.json"
+        write_file(path, told.model_dump_json(indent=2, exclude_defaults=True).encode() + b"\n")
+        files.append(path)
+        table = out / f"{session_id}.csv"
+        write_file(table, sessions_csv(reader, parse_rig(found["rig_text"], "the session's rig"), [session_id]))
+        return [*files, table]
+
+
+def ended_session(reader: Reader, session_id: str) -> dict[str, Any]:
+    """Return the row of a session that has ended.
+
+    Raises:
+        CommandError: no such session, or it is still open.
+    """
+    found = session(reader, session_id)
+    if found is None:
+        raise CommandError(f"{reader.path} has no session {session_id!r}; `rigcal session list` shows them")
+    if found["ended_utc_ns"] is None:
+        raise CommandError(f"session {session_id!r} is still open; stop it first")
+    return found
+
+
+class _Doubts:
+    """Notes which of the captures that pass are of doubtful time, as DoubtfulCaptures has it."""
+
+    def __init__(self) -> None:
+        self.captures = 0
+        self.runs: list[tuple[int, int]] = []
+
+    def noted(self, captures: Iterable[Capture]) -> Iterator[Capture]:
+        for capture in captures:
+            if capture.stamp.is_doubtful:
+                number = self.captures
+                first = self.runs.pop()[0] if self.runs and self.runs[-1][1] == number - 1 else number
+                self.runs.append((first, number))
+            self.captures += 1
+            yield capture
+
+
+def _header(config: Config, link: str) -> SerialLogHeader:
+    for station in config.station:
+        if station.name == link:
+            return SerialLogHeader(link, station.serial.baud, station.profile)
+    raise ConfigError(f"station {link!r} of the stored session is not in the configuration; add its [[station]]")

@@ -1,0 +1,329 @@
+"""Evidence of the joints that a station is on the prism that is meant: the rigid fit of its targets.
+
+Fixes between two instants at which a station may have changed its target are of one target: a stretch. Each stretch is
+held against the others of the session and against the poses that earlier sessions of the set-up have left, by
+`calibration.identification.prism_identity`: a base that stands still places all prisms by one rigid transform. What
+cannot be compared with anything yet is kept, and judged again whenever there is more.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calibration.rig.description import Rig
+from daemon.acquisition.joiner import JoinedFix
+from daemon.sessions.prisms.standstill_places import travel_mm
+from daemon.sessions.station_setups import Place
+from daemon.warm_up import prepare
+from drivers.clock import Stamp
+
+if TYPE_CHECKING:
+    from calibration.identification.prism_identity import Misfits, PrismIdentity, Targets
+
+log = logging.getLogger(__name__)
+
+LATE_S = 0.25  # by so much the instants of fixes and of joints may differ while the boom moves
+MOST_SLACK_MM = 500.0  # a fix that may be further off for the motion tells nothing
+MOVED_MM = 100.0  # the boom, before another fix of a stretch is looked at
+MOST_OF_STRETCH = 60  # fixes that are looked at
+MOST_OF_GROUP = 10  # others that one is compared with
+MOST_STRETCHES = 40  # that are kept to compare others with
+STRONG = 3  # targets that determine where the base stands
+CLEARLY = 2.0  # another name must fit so many times better, or worse
+
+
+class Verdict(Enum):
+    """Verdict of the joints on a stretch."""
+
+    OPEN = "nothing yet"
+    NAMED = "the prism that is meant"
+    OTHER = "another target"
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A target's place with the machine's joints.
+
+    Attributes:
+        prism: that it is taken for.
+        joints: readings in the rig's order, deg or mm.
+        place_mm: in the station's frame.
+        slack_mm: by how far it may be off since the boom moved.
+    """
+
+    prism: str
+    joints: tuple[float, ...]
+    place_mm: Place
+    slack_mm: float = 0.0
+
+
+@dataclass(eq=False)
+class Stretch:
+    """Fixes of one target.
+
+    Attributes:
+        station: whose.
+        since: the first of them.
+        is_believed: an operator says that they are of the prism that is meant; the joints are not asked.
+        sightings: those that are looked at.
+        instants_ns: of its observations that calibration may use as far as the target goes, monotonic.
+        verdict: so far.
+        is_sure: there was enough to compare with.
+    """
+
+    station: str
+    since: Stamp
+    is_believed: bool = False
+    sightings: list[Sighting] = field(default_factory=list)
+    instants_ns: list[int] = field(default_factory=list)
+    verdict: Verdict = Verdict.OPEN
+    is_sure: bool = False
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A verdict that has changed.
+
+    Attributes:
+        stretch: on which.
+        distance_m: how far its target lies from where the joints put the prism that is meant.
+        is_like: which other prism, or `a reflector that stands`, it fits instead; "" where it fits none.
+    """
+
+    stretch: Stretch
+    distance_m: float = 0.0
+    is_like: str = ""
+
+
+class IdentityLoader:
+    """The mathematics, imported beside everything else when a session first needs it.
+
+    Args:
+        rig: the machine.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+        self._thread: threading.Thread | None = None
+        self._loaded: PrismIdentity | None = None
+
+    def now(self) -> PrismIdentity | None:
+        """Return what tells prisms apart; None while it is being loaded."""
+        return self._loaded
+
+    def start(self, wait_s: float = 0.0) -> None:
+        """Begin to load it, and wait for it at most so long."""
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._load, name="prism-identity", daemon=True)
+            self._thread.start()
+        if wait_s:
+            self._thread.join(wait_s)
+
+    def _load(self) -> None:
+        try:
+            prepare()
+            from calibration.identification.prism_identity import PrismIdentity
+
+            made = PrismIdentity(self._rig)
+            middle = tuple(sum(joint.limits) / 2 for joint in self._rig.joints)
+            made.own_misfits(targets(self._rig, [Sighting(self._rig.prism_names[0], middle, (0.0, 0.0, 0.0))]))
+        except Exception:
+            log.exception("what the joints say of prisms cannot be asked; new locks are judged by distance alone")
+        else:
+            self._loaded = made
+
+
+class PrismEvidence:
+    """The stretches of one session.
+
+    Args:
+        rig: the machine.
+        prism: that the session is of.
+        loader: of the mathematics.
+        earlier: groups of sightings that are relied on as long as they fit each other, the oldest first: of each
+            earlier session of the set-up, and of this one before the daemon ended.
+    """
+
+    def __init__(
+        self, rig: Rig, prism: str, loader: IdentityLoader, earlier: Sequence[Sequence[Sighting]] = ()
+    ) -> None:
+        self._rig, self._prism, self._loader = rig, prism, loader
+        self._travel_mm = travel_mm(rig)
+        self._earlier = [list(group) for group in earlier if group]
+        self._stretches: list[Stretch] = []
+        self._waits = False
+
+    def stretch(self, station: str, since: Stamp, is_believed: bool) -> Stretch:
+        """Return the stretch of a station that began then; a new one the first time."""
+        for known in reversed(self._stretches):
+            if known.station == station and known.since == since:
+                return known
+        made = Stretch(station, since, is_believed)
+        self._stretches.append(made)
+        if len(self._stretches) > MOST_STRETCHES:
+            gone = next((s for s in self._stretches if s.verdict is Verdict.OTHER), self._stretches[0])
+            self._stretches.remove(gone)
+        return made
+
+    def take(self, stretch: Stretch, joined: JoinedFix, place_mm: Place) -> list[Finding]:
+        """Take a fix of a stretch; the verdicts that it changes."""
+        sighting = self._sighting(joined, place_mm)
+        is_new = sighting is not None and self._tells(stretch, sighting)
+        if is_new and sighting is not None:
+            if len(stretch.sightings) == MOST_OF_STRETCH:
+                del stretch.sightings[::2]
+            stretch.sightings.append(sighting)
+        identity = self._loader.now()
+        if identity is None:
+            self._waits = True
+            return []
+        if not is_new and not self._waits:
+            return []
+        open_ones = self._stretches if self._waits else [stretch]
+        self._waits = False
+        return self._judge(identity, open_ones)
+
+    def _sighting(self, joined: JoinedFix, place_mm: Place) -> Sighting | None:
+        joints = self._rig.joints
+        if not all(joint.column in joined.values for joint in joints):
+            return None
+        rates = [(joint, abs(joined.values.get(f"{joint.name}_rate", 0.0))) for joint in joints]
+        slack_mm = LATE_S * sum(rate * self._travel_mm[joint.column] for joint, rate in rates)
+        if joined.standstill is not None:
+            slack_mm = 0.0
+        if slack_mm > MOST_SLACK_MM:
+            return None
+        return Sighting(self._prism, tuple(joined.values[joint.column] for joint in joints), place_mm, slack_mm)
+
+    def _tells(self, stretch: Stretch, sighting: Sighting) -> bool:
+        """True if the boom has moved since the stretch was last looked at."""
+        if not stretch.sightings:
+            return True
+        changes = zip(self._rig.joints, sighting.joints, stretch.sightings[-1].joints, strict=True)
+        return sum(abs(now - then) * self._travel_mm[joint.column] for joint, now, then in changes) > MOVED_MM
+
+    def _judge(self, identity: PrismIdentity, stretches: Sequence[Stretch]) -> list[Finding]:
+        """Judge stretches, and all others anew when one of their verdicts has changed."""
+        found: list[Finding] = []
+        asked = list(stretches)
+        for _ in range(3):
+            news = [finding for stretch in asked for finding in self._judge_as_one(identity, [stretch])]
+            unsure = [s for s in self._stretches if not s.is_sure and not s.is_believed]
+            if len(unsure) > 1:
+                news += self._judge_as_one(identity, unsure)
+            found += news
+            if not news:
+                break
+            asked = self._stretches
+        return list({id(finding.stretch): finding for finding in found}.values())
+
+    def _judge_as_one(self, identity: PrismIdentity, judged: Sequence[Stretch]) -> list[Finding]:
+        """Judge one stretch, or several that may be of one target; the verdicts that change.
+
+        What is compared with something that determines where the base stands, or is enough for that itself, is judged
+        for sure. Several stretches are judged together only so: each by itself was too little.
+        """
+        sightings = [one for stretch in judged for one in _some(stretch.sightings)]
+        if any(stretch.is_believed for stretch in judged) or not sightings:
+            return []
+        relied, own = self._relied_on(identity, judged), targets(self._rig, sightings)
+        if len(relied) + len(own) < 2:
+            return []
+        misfits, is_sure = identity.misfits(relied, own), len(relied) >= STRONG
+        verdict = self._verdict(misfits, len(relied), len(own))
+        if not is_sure and len(own) > STRONG:
+            alone = identity.misfits(targets(self._rig, []), own)
+            if (by_itself := self._verdict(alone, 0, len(own))) is not Verdict.OPEN:
+                misfits, verdict, is_sure = alone, by_itself, True
+        if len(judged) > 1 and not is_sure:
+            return []
+        # Where nothing fits, what was found before stays
+        ends_doubt = len(judged) == 1 and judged[0].verdict is Verdict.OTHER and misfits.prism[self._index()] <= 1.0
+        if verdict is Verdict.OPEN and not ends_doubt:
+            return []
+        changed = [stretch for stretch in judged if stretch.verdict is not verdict]
+        for stretch in judged:
+            stretch.verdict, stretch.is_sure = verdict, is_sure and verdict is not Verdict.OPEN
+        distance_m = float(misfits.distance_mm[self._index()]) / 1000
+        return [Finding(stretch, distance_m, self._likeness(misfits, len(own))) for stretch in changed]
+
+    def _verdict(self, misfits: Misfits, relied: int, own: int) -> Verdict:
+        named, other = float(misfits.prism[self._index()]), self._best_other(misfits, own)[0]
+        if named <= 1.0:
+            return Verdict.NAMED if other > max(1.0, CLEARLY * named) else Verdict.OPEN
+        fits_another = other <= 1.0 and named > CLEARLY * other
+        return Verdict.OTHER if fits_another or relied >= STRONG else Verdict.OPEN
+
+    def _best_other(self, misfits: Misfits, own: int) -> tuple[float, str]:
+        """Return the misfit and the name of the best of all other names."""
+        named = [
+            (float(misfit), f"prism {name}")
+            for name, misfit in zip(self._rig.prism_names, misfits.prism, strict=True)
+            if name != self._prism
+        ]
+        if own > 1:
+            named.append((misfits.standing, "a reflector that stands still"))
+        return min(named, default=(np.inf, ""))
+
+    def _likeness(self, misfits: Misfits, own: int) -> str:
+        misfit, name = self._best_other(misfits, own)
+        return name if misfit <= 1.0 else ""
+
+    def _relied_on(self, identity: PrismIdentity, judged: Sequence[Stretch]) -> Targets:
+        """Return what stretches are compared with: groups that fit each other; those that fit worst are left out."""
+        groups = [_some(group) for group in self._earlier]
+        is_later = False
+        for stretch in self._stretches:
+            if stretch in judged:
+                is_later = True
+            # An operator's word counts from then on, never backwards
+            elif stretch.verdict is not Verdict.OTHER and not (is_later and stretch.is_believed):
+                groups.append(_some(stretch.sightings))
+        groups = [group for group in groups if group]
+        while groups:
+            joined = targets(self._rig, [one for group in groups for one in group])
+            of_groups = np.split(identity.own_misfits(joined), np.cumsum([len(group) for group in groups])[:-1])
+            misfits = [float(np.median(of_group)) for of_group in of_groups]
+            if max(misfits) <= 1.0:
+                return joined
+            groups.pop(misfits.index(max(misfits)))
+        return targets(self._rig, [])
+
+    def _index(self) -> int:
+        return self._rig.prism_names.index(self._prism)
+
+
+def _some(sightings: Sequence[Sighting]) -> Sequence[Sighting]:
+    """Return a few of a stretch's sightings, from its whole length."""
+    return sightings[:: math.ceil(len(sightings) / MOST_OF_GROUP) or 1]
+
+
+def sightings_of(rig: Rig, rows: Sequence[tuple[str, Mapping[str, float], Place]]) -> list[Sighting]:
+    """Return sightings from stored observations: prism, values by column, place in mm; those that lack a joint, not."""
+    columns = [joint.column for joint in rig.joints]
+    return [
+        Sighting(prism, tuple(values[column] for column in columns), place_mm)
+        for prism, values, place_mm in rows
+        if prism in rig.prism_names and all(column in values for column in columns)
+    ]
+
+
+def targets(rig: Rig, sightings: Sequence[Sighting]) -> Targets:
+    """Return sightings as arrays."""
+    from calibration.identification.prism_identity import Targets
+
+    names = rig.prism_names
+    return Targets(
+        np.array([one.joints for one in sightings], dtype=np.float64).reshape(-1, len(rig.joints)),
+        np.array([names.index(one.prism) for one in sightings], dtype=np.intp),
+        np.array([one.place_mm for one in sightings], dtype=np.float64).reshape(-1, 3),
+        np.array([one.slack_mm for one in sightings], dtype=np.float64),
+    )

@@ -1,0 +1,95 @@
+"""Meanings of the store's views: a column that repeats a table's has the table's words, the others have their own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from daemon.store.describe.table_words import TABLES
+from daemon.store.describe.words import Words
+from daemon.store.views import iso, views
+
+_ORDER = {
+    "boot_id": "boot of the computer; together with `monotonic_ns` the order of time, and indexed",
+    "monotonic_ns": "ns on the monotonic clock of that boot",
+}
+_DURATION = {"duration_s": "how long it took, s"}
+
+
+def _words(view: str, title: str, description: str, own: Mapping[str, str], *, has_channels: bool = False) -> Words:
+    """Return a view in words.
+
+    Args:
+        view: its name.
+        title: as of `Words`.
+        description: as of `Words`.
+        own: meanings of the columns that are not a table's, or mean more in the view.
+        has_channels: as of `Words`.
+    """
+    found = views(())[view]
+    table = found.source.split()[0]
+    known = TABLES[table].meanings()
+    known |= {iso(f"{prefix}utc_ns"): f"ISO time, UTC: {event}" for prefix, event in TABLES[table].instants.items()}
+    plain = {name: sql.removeprefix(f"{table}.") for name, sql in found.columns.items()}
+    columns = {name: known[sql] for name, sql in plain.items() if sql in known}
+    return Words(title, description, columns | dict(own), has_channels=has_channels)
+
+
+VIEWS: dict[str, Words] = {
+    "v_observations": _words(
+        "v_observations",
+        "Observations, joints as columns",
+        "The table that calibration reads: one row for each fix of a session with joints and signals at its instant.",
+        {"fix_id": "the fix in `v_fixes`"},
+        has_channels=True,
+    ),
+    "v_fixes": _words(
+        "v_fixes",
+        "Fixes, angles in degrees",
+        "What the total stations sent, one row an answer, failed measurements too.",
+        {"hz_angle_deg": "horizontal angle, degrees", "zenith_angle_deg": "zenith angle, degrees", **_ORDER},
+    ),
+    "v_joints": _words(
+        "v_joints",
+        "Joint readings, joints as columns",
+        "One row for each reading: the column of its joint has the value, the others are empty. All readings within "
+        "sessions, elsewhere one a second.",
+        {"joint": "name of the joint", **_ORDER},
+        has_channels=True,
+    ),
+    "v_sessions": _words(
+        "v_sessions",
+        "Sessions with their numbers of observations",
+        "One row for each calibration session.",
+        {
+            "observations": "how many calibration may use",
+            "excluded_observations": "how many it must not use",
+            **_DURATION,
+        },
+    ),
+    "v_jobs": _words("v_jobs", "Jobs with their times", "One row for each job.", _DURATION),
+    "v_models": _words(
+        "v_models",
+        "Models with their errors",
+        "One row for each calibrated model.",
+        {
+            "live_since": "ISO time, UTC: when it last went live, NULL where it never did",
+            "training_rms_mm": "RMS error of its last stage on its own training rows, mm",
+            "noise_mm": "scatter of a fix, mm",
+        },
+    ),
+    "v_alarms": _words(
+        "v_alarms",
+        "Alarms with their times",
+        "One row for each fault that was told.",
+        {"duration_s": "how long it lasted, s"},
+    ),
+}
+
+
+def channel_meaning(column: str, name: str, unit: str, *, is_joint: bool) -> str:
+    """Return the meaning of a view's column that is of a joint or a signal."""
+    if column == f"{name}_dir":
+        return f"last direction of motion of joint {name}: -1, 0 or 1"
+    if column == f"{name}_rate":
+        return f"speed of joint {name}, {unit}/s"
+    return f"{'joint' if is_joint else 'signal'} {name}{f', {unit}' if unit else ''}"

@@ -1,0 +1,1 @@
+"""Statements of each subject: one module for alarms, guides, jobs, models, sessions and so on."""

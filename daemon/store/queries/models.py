@@ -1,0 +1,284 @@
+"""The tables of models: every model and its state, every change of it, and how live models did on check sessions.
+
+A model is made as a candidate, goes live when an operator accepts it, and is retired when another takes its place; it
+can be put back. One is live per rig. Each change leaves a row in `model_states`; no row of these tables is ever
+deleted, and neither are the models' directories.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from daemon.store.connection import Connection
+from daemon.store.errors import NotInStoreError
+from daemon.store.queries.sessions import SessionTable, first_observation_ns, newest_observation_ns, preset_jumps
+from drivers.clock import Clock
+
+_MODELS = """SELECT model.id, model.rig, model.path, model.manifest_sha256, model.stage, model.state,
+        model.metrics_json, model.created_utc_ns, job.result_json
+    FROM models AS model LEFT JOIN jobs AS job ON job.id = model.job_id"""
+# This runs twice a second for months: each step finds its rows by an index.
+_LIVE_RUN = """SELECT state.id AS since, model.id AS model_id, coalesce(state.after_session, 0) AS after_session
+    FROM models AS model CROSS JOIN model_states AS state ON state.model_id = model.id
+    WHERE model.rig = ? AND model.state = 'live' AND state.state = 'live' AND state.zeros_checked_through IS NULL
+    ORDER BY state.id DESC LIMIT 1"""
+_DRIFTED = """SELECT session.rowid AS number, session.id FROM drift_checks AS drift
+    CROSS JOIN calibration_sessions AS session ON session.id = drift.session_id
+    WHERE drift.live_since = ? AND drift.alarm = 'worse' ORDER BY drift.id LIMIT 1"""
+_DRIFT_CHECKS = """SELECT session_id, standstills, ratio, reason, upper, lower, alarm FROM drift_checks
+    WHERE live_since = ? ORDER BY id"""
+
+
+@dataclass(frozen=True)
+class ModelRow:
+    """A model of the store.
+
+    Attributes:
+        id: its number.
+        rig: name of the machine it is of.
+        state: candidate, live or retired.
+        stage: geometric, effects or hybrid.
+        path: its directory.
+        manifest_sha256: of its manifest when it was written.
+        sessions: those that it was trained on.
+        created_utc_ns: when it was made.
+        metrics: errors on its training rows (`training`, `noise_mm`), and `comparison`, where there was one: its
+            figures on held-out sessions beside those of the model `live` then, as `evaluation.promotion` has them.
+    """
+
+    id: int
+    rig: str
+    state: str
+    stage: str
+    path: Path
+    manifest_sha256: str
+    sessions: tuple[str, ...]
+    created_utc_ns: int
+    metrics: Mapping[str, Any]
+
+    @property
+    def comparison(self) -> Mapping[str, Any] | None:
+        """Its figures on held-out sessions; None before they are known."""
+        found = self.metrics.get("comparison")
+        return found if isinstance(found, dict) else None
+
+    def as_dict(self) -> dict[str, Any]:
+        """For the control socket."""
+        return asdict(self) | {"path": str(self.path), "sessions": list(self.sessions)}
+
+
+@dataclass(frozen=True)
+class LiveRun:
+    """The time from a model's going live until another does.
+
+    Attributes:
+        since: number of the change by which it went live.
+        model_id: which model.
+        after_session: number of the rig's newest session then.
+    """
+
+    since: int
+    model_id: int
+    after_session: int
+
+
+class ModelTable:
+    """The models of one rig.
+
+    Args:
+        store: the database.
+        rig_name: whose models go live.
+        clock: time of the changes.
+    """
+
+    def __init__(self, store: Connection, rig_name: str, clock: Clock) -> None:
+        self._store, self._rig, self._clock = store, rig_name, clock
+        self._sessions = SessionTable(store, rig_name)
+
+    # ---- models ------------------------------------------------------------------------------------------------------
+
+    def all(self) -> list[ModelRow]:
+        """All models of the store, other rigs' too, oldest first."""
+        return [_row(row) for row in self._store.rows(f"{_MODELS} ORDER BY model.id")]
+
+    def get(self, model_id: object) -> ModelRow:
+        """The model of that number; NotInStoreError if there is none."""
+        found = type(model_id) is int and self._store.rows(f"{_MODELS} WHERE model.id = ?", (model_id,))
+        if not found:
+            raise NotInStoreError(f"there is no model {model_id!r:.80}; `rigcal model list` shows them")
+        return _row(found[0])
+
+    def at(self, path: str) -> ModelRow:
+        """The model in a directory; NotInStoreError if there is none."""
+        found = self._store.rows(f"{_MODELS} WHERE model.path = ? ORDER BY model.id DESC LIMIT 1", (path,))
+        if not found:
+            raise NotInStoreError(f"there is no model at {path}; `rigcal model list` shows them")
+        return _row(found[0])
+
+    def live(self) -> ModelRow | None:
+        """The rig's live model."""
+        found = self._store.rows(f"{_MODELS} WHERE model.rig = ? AND model.state = 'live'", (self._rig,))
+        return _row(found[0]) if found else None
+
+    def waiting(self) -> ModelRow | None:
+        """The rig's newest model, if it is a candidate."""
+        found = self._store.rows(f"{_MODELS} WHERE model.rig = ? ORDER BY model.id DESC LIMIT 1", (self._rig,))
+        return _row(found[0]) if found and found[0]["state"] == "candidate" else None
+
+    def predecessor(self, model: ModelRow) -> int | None:
+        """The model that was live when this one was accepted; None for a first one."""
+        (first,) = self._store.rows(
+            "SELECT replaced_id FROM model_states WHERE model_id = ? AND state = 'live' ORDER BY id LIMIT 1",
+            (model.id,),
+        )
+        return None if first["replaced_id"] is None else int(first["replaced_id"])
+
+    def history(self, model: ModelRow) -> list[dict[str, Any]]:
+        """Every change of a model's state, oldest first."""
+        return self._store.rows(
+            "SELECT state, utc_ns, operator, caller_user AS user, reason, replaced_id FROM model_states "
+            "WHERE model_id = ? ORDER BY id",
+            (model.id,),
+        )
+
+    def jumped(self, model: ModelRow) -> dict[str, int]:
+        """Devices whose readings jumped since the model was trained, beyond what an operator has checked.
+
+        What a session measured after a jump is in no model, so jumps count from the start of the newest session. What
+        came later is decided by boots and the monotonic clock: a wall clock may be wrong for whole boots.
+
+        Returns:
+            device -> number of its newest jump among the store's device events.
+        """
+        sql = "SELECT coalesce(max(zeros_checked_through), 0) FROM model_states WHERE model_id = ?"
+        checked_through = self._store.number(sql, (model.id,)) or 0
+        jumps = preset_jumps(self._store, self._sessions.newest_start(model.sessions), checked_through)
+        newest: dict[str, int] = {}
+        for jump in jumps:
+            newest[jump.device] = max(jump.number, newest.get(jump.device, 0))
+        return dict(sorted(newest.items()))
+
+    def training_ns(self, model: ModelRow) -> tuple[int, int]:
+        """UTC, ns, that `time_s` of its training counts from, and of the newest observation it was trained on."""
+        return first_observation_ns(self._store), newest_observation_ns(self._store, model.sessions)
+
+    def live_run(self) -> LiveRun | None:
+        """The live model's run; None where none is live."""
+        found = self._store.rows(_LIVE_RUN, (self._rig,))
+        return LiveRun(**found[0]) if found else None
+
+    def drifted(self, run: LiveRun) -> tuple[int, str] | None:
+        """Number and id of the check session by which a live model was found to have drifted; None before."""
+        found = self._store.rows(_DRIFTED, (run.since,))
+        return (found[0]["number"], found[0]["id"]) if found else None
+
+    def drift_checks(self, live_since: int) -> list[dict[str, Any]]:
+        """The check sessions held against a live model so far, and how its sums stand after each, oldest first."""
+        return self._store.rows(_DRIFT_CHECKS, (live_since,))
+
+    # ---- changes -----------------------------------------------------------------------------------------------------
+
+    def add(self, job_id: int, result: Mapping[str, Any]) -> None:
+        """Add the candidate that a job has made."""
+        row = {
+            "rig": self._rig,
+            "path": result["model"],
+            "manifest_sha256": result["manifest_sha256"],
+            "rig_sha256": self._sessions.rig_of(result.get("sessions", ())),
+            "stage": result["stage"],
+            "state": "candidate",
+            "job_id": job_id,
+            "metrics_json": result["metrics"],
+        }
+        with self._store.transaction():
+            model_id = self._store.insert("models", row | self._store.instant(self._clock.now(), "created_"))
+            self._note_state(model_id, "candidate", f"made by job {job_id}")
+
+    def note_comparison(self, path: str, comparison: Mapping[str, Any]) -> None:
+        """Note how the model in a directory did on held-out sessions; an earlier comparison is replaced."""
+        with self._store.transaction():
+            for row in self._store.rows("SELECT id, metrics_json FROM models WHERE path = ?", (path,)):
+                metrics = json.loads(row["metrics_json"]) | {"comparison": comparison}
+                self._store.update("models", {"id": row["id"]}, {"metrics_json": metrics})
+
+    def go_live(self, model: ModelRow, replaced: ModelRow | None, reason: str, **by: object) -> bool:
+        """Make a model the live one and retire the one before it.
+
+        Args:
+            model: as it was when the decision was made.
+            replaced: the live model then.
+            reason: why, a clause.
+            by: `operator`, and the columns of who gave the command.
+
+        Returns:
+            False, with nothing changed, if another model is live, or the model was compared anew or has changed its
+            state since.
+        """
+        with self._store.transaction():
+            now_live = self.live()
+            if self.get(model.id) != model or (now_live and now_live.id) != (replaced and replaced.id):
+                return False
+            if replaced is not None:
+                self._store.update("models", {"id": replaced.id}, {"state": "retired"})
+                self._note_state(replaced.id, "retired", f"model {model.id} took its place", **by)
+            self._store.update("models", {"id": model.id}, {"state": "live"})
+            replaced_id = replaced.id if replaced else None
+            after_session = self._sessions.newest_number()
+            self._note_state(model.id, "live", reason, replaced_id=replaced_id, after_session=after_session, **by)
+        return True
+
+    def reject(self, model: ModelRow, reason: str, **by: object) -> bool:
+        """Retire a candidate that an operator does not want; it never goes live.
+
+        Args:
+            model: as it was when the decision was made.
+            reason: why, a clause.
+            by: as of `go_live`.
+
+        Returns:
+            False, with nothing changed, if it is no candidate any more.
+        """
+        with self._store.transaction():
+            if self.get(model.id).state != "candidate":
+                return False
+            self._store.update("models", {"id": model.id}, {"state": "retired"})
+            self._note_state(model.id, "retired", reason, **by)
+        return True
+
+    def was_live(self, model: ModelRow) -> bool:
+        """True if a model was ever the live one."""
+        return any(change["state"] == "live" for change in self.history(model))
+
+    def note_zeros_checked(self, model: ModelRow, through: int, **by: object) -> None:
+        """Note that an operator has made sure that the joints' zeros are those that the live model was trained with.
+
+        Args:
+            model: the live one.
+            through: number of the newest device event that was known then; jumps beyond it count.
+            by: as of `go_live`.
+        """
+        self._note_state(model.id, "live", "zeros checked", zeros_checked_through=through, **by)
+
+    def _note_state(self, model_id: int, state: str, reason: str, **columns: object) -> None:
+        row = {"model_id": model_id, "state": state, "reason": reason, **columns}
+        self._store.insert("model_states", row | self._store.instant(self._clock.now()))
+
+    def add_drift_check(self, **columns: object) -> None:
+        """Add a check session that was held against a live model."""
+        self._store.insert("drift_checks", columns | self._store.instant(self._clock.now()))
+
+
+def trained_on(models: Sequence[ModelRow | None]) -> frozenset[str]:
+    """Sessions that any of these models was trained on."""
+    return frozenset(session for model in models if model is not None for session in model.sessions)
+
+
+def _row(row: Mapping[str, Any]) -> ModelRow:
+    made = json.loads(row["result_json"] or "{}")
+    same = {name: row[name] for name in ("id", "rig", "state", "stage", "manifest_sha256", "created_utc_ns")}
+    sessions = tuple(made.get("sessions", ()))
+    return ModelRow(**same, path=Path(row["path"]), sessions=sessions, metrics=json.loads(row["metrics_json"]))

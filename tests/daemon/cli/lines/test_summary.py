@@ -1,0 +1,198 @@
+"""The state on one screen, the next step, jobs in words, and the live watch."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import select
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from daemon.cli.lines.jobs import job_line, percent
+from daemon.cli.lines.summary import LINES, next_step, state_sentence, summary
+from daemon.cli.main import main
+from tests.daemon.idle_daemon import idle_daemon
+
+TERMINAL = (100, 24)
+
+
+def alarm(number: int, severity: str = "critical") -> dict[str, Any]:
+    return {
+        "severity": severity,
+        "kind": "joint_silent",
+        "subject": f"theta{number}",
+        "text": f"theta{number} is not heard any more (last: ok), and this is a long text that is wrapped",
+        "remedy": "Check the encoder's power and cable; without it no fix can be used.",
+        "age_s": 40.0,
+        "since_utc_ns": 1_700_000_000_000_000_000,
+    }
+
+
+def session(**changes: Any) -> dict[str, Any]:
+    return {
+        "id": "s001-r",
+        "kind": "static_poses",
+        "prism": "r",
+        "poses": 4,
+        "observations": 40,
+        "setup_moved": False,
+        "control_shots": [{"point": "cp1", "phase": "start", "misclosure_mm": None}],
+        "excluded": {f"reason {n}, which takes its place on a line of the screen": 50 - n for n in range(12)},
+        **changes,
+    }
+
+
+def status(**changes: Any) -> dict[str, Any]:
+    channels = [
+        {
+            "name": f"theta{n}",
+            "unit": "deg",
+            "kind": "joint",
+            "status": "ok",
+            "value": 12.5,
+            "age_s": 0.1,
+            "link": "boom",
+        }
+        for n in range(9)
+    ]
+    return {
+        "rig": "swdt82",
+        "mode": "live",
+        "version": "0.2.0",
+        "store": "/var/lib/rigcal/rigcal.sqlite",
+        "alarms": {"active": [], "looked_age_s": 0.5},
+        "notices": [],
+        "store_health": {"state": "ok", "text": ""},
+        "unreadable": {},
+        "acquisition": {
+            "links": [{"name": "boom", "up": True, "captures_per_s": 800.0, "dropped": 0, "reason": ""}],
+            "channels": channels,
+            "stations": [{"name": "station", "sentence": "locked, ok, 0 s ago", "fixes": 12}],
+            "gaps": [],
+            "decoding": [],
+            "is_behind": False,
+        },
+        "session": None,
+        "setup": {"id": "S1", "state": "ok"},
+        "jobs": [],
+        "models": {"live": None, "candidate": None},
+        "gap": None,
+        **changes,
+    }
+
+
+WORST = status(
+    alarms={"active": [alarm(n) for n in range(9)], "looked_age_s": 0.5},
+    session=session(),
+    jobs=[
+        {"id": n, "kind": "gap", "session_id": "s", "state": "queued", "error": None, "progress": 0.0, "message": ""}
+        for n in range(8)
+    ],
+)
+
+
+@pytest.mark.parametrize("told", [status(), status(session=session()), WORST], ids=["idle", "session", "worst"])
+def test_the_state_fits_a_terminal_of_24_lines(told: dict[str, Any]) -> None:
+    lines = summary(told, TERMINAL[0])
+    assert len(lines) <= LINES == TERMINAL[1] - 1
+    assert max(len(line.text) for line in lines) <= TERMINAL[0]
+    assert lines[0].text.startswith("rig       swdt82 (live)")
+    assert lines[1].text.startswith("state     ")
+    assert any(line.text.startswith("next      ") for line in lines)
+
+
+def test_what_does_not_fit_is_counted_with_the_command_that_shows_it() -> None:
+    text = "\n".join(line.text for line in summary(WORST, TERMINAL[0]))
+    assert "more: `rigcal alarms` has all" in text
+    assert "CRITICAL joint_silent theta0" in text
+
+
+CANDIDATE = {
+    "id": 2,
+    "stage": "hybrid",
+    "is_acceptable": True,
+    "refused_because": None,
+    "comparison": {"sentence": "x"},
+}
+
+
+@pytest.mark.parametrize(
+    ("told", "step"),
+    [
+        (WORST, "theta0: Check the encoder's power"),
+        (status(setup=None), "`rigcal setup new"),
+        (status(), "`rigcal session start"),
+        (status(session=session(control_shots=[])), "`rigcal session shoot NAME`"),
+        (status(session=session()), "21 more poses"),
+        (status(session=session(kind="check", poses=4)), "1 more pose,"),
+        (status(session=session(poses=30)), "`rigcal session shoot cp1`"),
+        (
+            status(session=session(poses=30, control_shots=[{"point": "c", "phase": "end", "misclosure_mm": 1.0}])),
+            "`rigcal session stop`",
+        ),
+        (status(jobs=WORST["jobs"]), "`rigcal watch`"),
+        (status(models={"live": None, "candidate": CANDIDATE}), "`rigcal model accept 2`"),
+        (status(models={"live": {"id": 1}, "candidate": None}), "nothing needs doing"),
+    ],
+)
+def test_the_next_step_is_a_command_or_an_act(told: dict[str, Any], step: str) -> None:
+    assert step in next_step(told)
+
+
+def test_the_state_is_one_sentence() -> None:
+    assert state_sentence(status()) == "ready, no model is live, no session is open"
+    assert state_sentence(status(session=session())).startswith("recording session s001-r")
+    held = status(alarms={"active": [], "looked_age_s": 90.0})
+    assert state_sentence(held).startswith("held up")
+
+
+def test_a_job_that_runs_never_stands_at_100_percent() -> None:
+    job = {"id": 1, "kind": "gap", "session_id": "s1", "state": "running", "error": None, "progress": 1.0}
+    assert job_line(job | {"message": "drawing"}) == "job 1 gap of s1: running, 99 %: drawing"
+    assert [percent(share) for share in (0.0, 0.994, 0.999, 1.0)] == ["0 %", "99 %", "99 %", "99 %"]
+
+
+def test_status_and_watch_of_a_daemon_are_plain_where_they_are_piped(tmp_path: Path) -> None:
+    with idle_daemon(tmp_path) as config:
+        socket = ["--socket", str(config.socket_path)]
+        shown = CliRunner().invoke(main, ["status", *socket])
+        assert len(shown.stdout.splitlines()) <= LINES
+        assert "\x1b" not in shown.stdout
+        told = json.loads(CliRunner().invoke(main, ["status", *socket, "--json"]).stdout)
+        assert told["summary"]["next"].startswith("describe where the station stands")
+        watched = CliRunner().invoke(main, ["watch", "--count", "2", "--interval", "0.2", *socket])
+        assert (watched.exit_code, len(watched.stdout.splitlines())) == (0, 2)
+        assert "theta1" in watched.stdout
+        assert "\x1b" not in watched.stdout
+    lost = CliRunner().invoke(main, ["watch", "--count", "1", *socket])
+    assert lost.exit_code == 0
+    assert "connection lost, trying again" in lost.stdout
+
+
+def test_watch_refreshes_a_terminal_and_leaves_it_as_it_was(tmp_path: Path) -> None:
+    with idle_daemon(tmp_path) as config:
+        master, slave = pty.openpty()
+        command = [sys.executable, "-m", "daemon.cli.main", "watch", "--count", "2", "--interval", "0.2"]
+        watching = subprocess.Popen(
+            [*command, "--socket", str(config.socket_path)], stdout=slave, env={**os.environ, "TERM": "xterm"}
+        )
+        os.close(slave)
+        said = b""
+        while select.select([master], [], [], 30)[0]:
+            try:
+                chunk = os.read(master, 4096)
+            except OSError:  # Linux: the last writer has gone
+                break
+            said += chunk
+        os.close(master)
+        assert watching.wait(30) == 0
+    assert said.startswith(b"\x1b[?1049h")
+    assert said.endswith(b"\x1b[?25h\x1b[?1049l")
+    assert said.count(b"\x1b[H") == 2
+    assert b"joints" in said

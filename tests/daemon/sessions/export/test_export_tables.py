@@ -1,0 +1,96 @@
+"""A session as tables for other programs, read again with the libraries that such programs use."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner
+from scipy.io import loadmat
+
+from calibration.observations import Observations
+from calibration.rig.description import shipped_rig
+from daemon.cli.main import main
+from daemon.store import Store
+from daemon.store.queries.sessions import SessionTable
+from tests.daemon.store_support import at, fix, reading
+
+CONFIG = 'rig = "swdt82"\nstate_directory = "."\n[[can]]\nchannel = "can0"\n[[station]]\nserial.path = "/dev/station"\n'
+RIG = shipped_rig("swdt82")
+JOINTS = {joint.column: 10.0 + n for n, joint in enumerate(RIG.joints)}
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A configuration whose store has a session of two observations, 30 readings of a joint and two fixes."""
+    directory = tmp_path_factory.mktemp("state")
+    path = directory / "rig.toml"
+    path.write_text(CONFIG)
+    text = resources.files("calibration").joinpath("rigs", "swdt82.toml").read_text()
+    with contextlib.closing(Store(directory / "rigcal.sqlite")) as store:
+        store.declare_channels({joint.name: joint.unit for joint in RIG.joints}, {})
+        store.insert("links", {"name": "station", "kind": "serial"})
+        store.insert_records([reading("theta1", n / 10, float(n)) for n in range(-10, 50)])
+        store.insert_records([fix(n, station="station") for n in (-1.0, 1.0, 2.0)])
+        table = SessionTable(store, "swdt82")
+        table.start(at(0.0), text, id="s001-r", prism="r", operator="", kind="static_poses")
+        for n in (1, 2):
+            place = {"x_mm": 100.0 * n, "y_mm": 2.0, "z_mm": 3.0, "moving": 0, "values_json": JOINTS}
+            table.add_observation(n + 1, at(n), session_id="s001-r", prism="r", pose=f"1.{n}", **place)
+        table.change("s001-r", state="closed", **store.instant(at(2.95), "ended_"))
+    return path
+
+
+def export(config: Path, out: Path, form: str) -> list[Path]:
+    arguments = ["session", "export", "s001-r", "--config", str(config), "--out", str(out), "--format", form, "--json"]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 0, result.output
+    return [Path(file) for file in json.loads(result.stdout)["files"]]
+
+
+def test_csv(config: Path, tmp_path: Path) -> None:
+    observations, joints, fixes = export(config, tmp_path, "csv")
+    assert [path.name for path in (observations, joints, fixes)] == [
+        "s001-r.csv",
+        "s001-r-joints.csv",
+        "s001-r-fixes.csv",
+    ]
+    table = Observations.from_csv(observations, RIG)
+    assert table.position_mm[:, 0].tolist() == [100.0, 200.0]
+    assert pd.read_csv(joints)["theta1_deg"].tolist() == [float(n) for n in range(30)]
+    assert pd.to_datetime(pd.read_csv(fixes)["time"]).dt.second.tolist() == [21, 22]
+
+
+def test_parquet(config: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    observations, joints, fixes = map(pd.read_parquet, export(config, tmp_path, "parquet"))
+    assert observations["L2_mm"].tolist() == [JOINTS["L2_mm"]] * 2
+    assert observations["pose"].tolist() == ["1.1", "1.2"]
+    assert (joints["theta1_deg"].sum(), str(joints["L2_mm"].dtype)) == (435.0, "float64")
+    assert fixes["slope_distance_m"].tolist() == [11.7845, 11.7845]
+
+
+def test_mat(config: Path, tmp_path: Path) -> None:
+    (path,) = export(config, tmp_path, "mat")
+    found = loadmat(path, simplify_cells=True)
+    assert found["observations"]["x_mm"].tolist() == [100.0, 200.0]
+    assert found["joints"]["theta1_deg"].tolist() == [float(n) for n in range(30)]
+    assert np.isnan(found["joints"]["L2_mm"]).all()
+    assert found["joints"]["time"][0] == "2023-11-14T22:13:20.000000Z"
+
+
+def test_candump(config: Path, tmp_path: Path) -> None:
+    assert "s001-r.json" in {path.name for path in export(config, tmp_path, "candump")}
+
+
+@pytest.mark.parametrize("form", ["csv", "mat"])
+def test_an_unknown_session_is_refused(config: Path, tmp_path: Path, form: str) -> None:
+    arguments = ["session", "export", "no", "--config", str(config), "--out", str(tmp_path), "--format", form]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code != 0
+    assert "no session 'no'" in result.stderr

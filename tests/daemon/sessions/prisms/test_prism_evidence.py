@@ -1,0 +1,175 @@
+"""A session whose station follows another prism from its start, or after a control point: the joints tell."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon.sessions.prisms.evidence import IdentityLoader, PrismEvidence, Sighting, Verdict, targets
+from drivers.readings import EventKind
+from simulators.rig.truth import RigTruth
+from tests.daemon.session_support import SOURCE, Rig
+from tests.daemon.store_support import table
+
+RIG = SOURCE.rig
+TRUTH = RigTruth(RIG, 5)
+CONTROL_MM = (9000.0, 500.0, 2000.0)
+POSES = np.random.default_rng(4).uniform(
+    [j.limits[0] for j in RIG.joints], [j.limits[1] for j in RIG.joints], (12, len(RIG.joints))
+)
+
+
+def arrays(joints: Mapping[str, float]) -> dict[str, np.ndarray]:
+    return {name: np.array([value]) for name, value in joints.items()}
+
+
+class TrueRig(Rig):
+    """A rig that stands at poses, and whose station measures where a true machine has its prisms."""
+
+    def stand(self, pose: int, target: str, seconds: float = 2.0) -> None:
+        """Drive to a pose, with the station locked on a prism of the machine."""
+        self.values = dict(zip(RIG.joint_names, map(float, POSES[pose]), strict=True))
+        east, north, up = TRUTH.prism_mm(target, arrays(self.values), setup="S1")[0]
+        self.target_mm = float(east), float(north), float(up)
+        self.live(seconds)
+
+    def used(self, session: str) -> int:
+        rows = table(self.store.path, "observations")
+        return sum(row["session_id"] == session and row["excluded"] is None for row in rows)
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[TrueRig]:
+    made = TrueRig(tmp_path / "rigcal.sqlite")
+    made.say("setup_new", id="S1", instrument="GTS-905A")
+    yield made
+    made.store.close()
+
+
+def texts(rig: Rig, kind: EventKind) -> list[str]:
+    return [row["text"] for row in table(rig.store.path, "device_events") if row["kind"] == kind]
+
+
+def hold_session(rig: TrueRig, prism: str, poses: range) -> None:
+    """A session that is on its prism."""
+    rig.say("start", prism=prism)
+    for pose in poses:
+        rig.stand(pose, prism)
+    rig.say("stop")
+
+
+@pytest.mark.parametrize("target", ["b", "s", "w"])
+def test_another_prism_from_a_session_s_first_fix_on_is_told_by_what_the_set_up_has_seen(
+    rig: TrueRig, target: str
+) -> None:
+    hold_session(rig, "r", range(4))
+    session = rig.say("start", prism="r")["id"]
+    rig.stand(4, target)
+    assert rig.used(session) == 0
+    (suspicion,) = rig.keeper.prism_suspicions()
+    assert f"it fits prism {target}" in suspicion.reason
+    assert "where the joints put r" in texts(rig, EventKind.PRISM_JUMP)[-1]
+    rig.stand(5, "r")
+    assert rig.keeper.prism_suspicions() == []
+    assert rig.used(session) > 0
+    assert texts(rig, EventKind.LOCK_ACQUIRED) != []
+
+
+def test_another_prism_is_told_by_fixes_of_a_third_one(rig: TrueRig) -> None:
+    hold_session(rig, "w", range(4))
+    session = rig.say("start", prism="r")["id"]
+    rig.stand(4, "b")
+    assert rig.used(session) == 0
+
+
+def test_another_prism_that_is_found_on_the_way_back_from_a_control_point_is_excluded_once_the_boom_has_moved(
+    rig: TrueRig,
+) -> None:
+    session = rig.say("start", prism="r")["id"]
+    rig.stand(0, "r", 0.0)
+    rig.shoot("cp1", CONTROL_MM)
+    for pose in range(5):  # of r there was no fix yet, and nothing to compare with
+        rig.stand(pose, "s")
+    assert rig.used(session) == 0
+    assert [s.station for s in rig.keeper.prism_suspicions()] == ["station"]
+    for pose in range(5, 9):
+        rig.stand(pose, "r")
+    assert rig.keeper.prism_suspicions() == []
+    assert rig.used(session) > 80
+
+
+def test_a_reflector_that_stands_beside_the_machine_is_no_prism(rig: TrueRig) -> None:
+    session = rig.say("start", prism="r")["id"]
+    rig.stand(0, "r", 0.0)
+    stands_mm = rig.target_mm
+    for pose in range(1, 4):
+        rig.stand(pose, "r", 0.0)
+        rig.target_mm = stands_mm
+        rig.live(2)
+    assert rig.used(session) == 0
+    assert "a reflector that stands still" in rig.keeper.prism_suspicions()[0].reason
+
+
+def test_a_boom_that_moves_far_while_lock_is_lost_is_not_suspected(rig: TrueRig) -> None:
+    hold_session(rig, "r", range(3))
+    session = rig.say("start", prism="r")["id"]
+    for pose in range(3, 9):  # metres from one to the next, within one step
+        rig.stand(pose, "r")
+    assert rig.keeper.prism_suspicions() == []
+    assert rig.say("stop")["poses"] == 6
+    assert not any(
+        "perhaps" in str(row["excluded"])
+        for row in table(rig.store.path, "observations")
+        if row["session_id"] == session
+    )
+
+
+def test_what_a_restarted_daemon_sees_is_held_against_what_was_stored_before(rig: TrueRig) -> None:
+    session = rig.say("start", prism="r")["id"]
+    for pose in range(4):
+        rig.stand(pose, "r")
+    before = rig.used(session)
+    rig.keeper = rig.new_keeper()
+    rig.stand(4, "s", 4.0)
+    assert rig.used(session) == before
+    assert len(rig.keeper.prism_suspicions()) == 1
+
+
+def test_what_an_operator_confirms_the_joints_do_not_overrule(rig: TrueRig) -> None:
+    hold_session(rig, "r", range(4))
+    session = rig.say("start", prism="r")["id"]
+    rig.stand(4, "s")
+    rig.say("confirm_prism", operator="Ada")
+    rig.live(2)
+    assert rig.keeper.prism_suspicions() == []
+    assert rig.used(session) > 0
+
+
+def test_an_earlier_session_on_the_wrong_prism_does_not_make_the_right_one_wrong(rig: TrueRig) -> None:
+    loader = IdentityLoader(RIG)
+    loader.start(60)
+    identity = loader.now()
+    assert identity is not None
+
+    def seen(target: str, poses: range) -> list[Sighting]:
+        rows = []
+        for pose in poses:
+            joints = tuple(map(float, POSES[pose]))
+            x, y, z = map(
+                float, TRUTH.prism_mm(target, arrays(dict(zip(RIG.joint_names, joints, strict=True))), setup="S1")[0]
+            )
+            rows.append(Sighting("r", joints, (x, y, z)))
+        return rows
+
+    evidence = PrismEvidence(RIG, "r", loader, [seen("r", range(3)), seen("b", range(3, 5)), seen("r", range(5, 7))])
+    stretch = evidence.stretch("station", rig.clock.now(), False)
+    stretch.sightings += seen("r", range(8, 9))
+    relied = evidence._relied_on(identity, [stretch])
+    assert len(relied) == 5
+    assert (identity.own_misfits(relied) <= 1.0).all()
+    (finding,) = evidence._judge(identity, [stretch])
+    assert finding.stretch.verdict is Verdict.NAMED
+    assert len(targets(RIG, [])) == 0
