@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +78,26 @@ def test_a_radius_of_a_row_is_what_plan_keeps_clear_of(tmp_path: Path) -> None:
     assert any("75 mm of row 2" in sentence for sentence in planned["assumptions"])
 
 
+@pytest.mark.parametrize(
+    ("pattern", "scale", "said"),
+    [
+        (r"(?<=alpha_deg = )[-\d.]+", 0.01745329, "alpha_deg of row 1 is 1.5708, a multiple of a right angle in rad"),
+        (r"(?<=limits = \[)-360, 360", 0.01745329, "no joint turns further than 6.28318 deg: if limits are in rad"),
+        (r"(?<=[ad]_mm = )[-\d.]+", 0.001, "no length of a row is over 0.612 mm: if lengths are in m"),
+    ],
+    ids=["angles", "limits", "lengths"],
+)
+def test_check_asks_about_numbers_that_would_fit_another_unit(
+    tmp_path: Path, pattern: str, scale: float, said: str
+) -> None:
+    text = re.sub(
+        pattern, lambda found: ", ".join(f"{float(x) * scale:.7f}" for x in found[0].split(",")), load_rig("ur10").text
+    )
+    (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
+    assert any(said in sentence for sentence in told("rig", "check", tmp_path / "mine.toml")["warnings"])
+    assert not any("here, convert" in sentence for sentence in told("rig", "check", "ur10")["warnings"])
+
+
 def test_check_tells_every_fault_with_its_line(tmp_path: Path) -> None:
     lines = load_rig("ur10").text.splitlines()
     lines[lines.index("d_mm = 127.3")] = "d_mm = 'x'"
@@ -109,6 +130,9 @@ def test_a_rig_survives_the_way_out_and_in(panda: Path, tmp_path: Path) -> None:
         (("run", "--rig", "ur10"), "--rig and --by-hand are for a simulated rig"),
         (("simulate", "--rig", "ur10", "--poses", "3", "--effect", "nix@q1", "--out", "o"), "unknown effect"),
         (("simulate", "--rig", "ur10", "--poses", "3", "--effect", "backlash@q9", "--out", "o"), "it acts at"),
+        (("simulate", "--rig", "ur10", "--poses", "3", "--effect", "backlash", "--out", "o"), "as in backlash@JOINT"),
+        (("simulate", "--rig", "ur10", "--poses", "3", "--effect", "clock_drift", "--out", "o"), "clock_drift@clock"),
+        (("simulate", "--rig", "ur10", "--poses", "3", "--noise", "nan", "--out", "o"), "'nan' is not a finite number"),
     ],
 )
 def test_wrong_use_is_refused(tmp_path: Path, arguments: tuple[str, ...], reason: str) -> None:
