@@ -92,7 +92,7 @@ def intervals(gap: GapResult) -> list[Interval]:
                     coefficient.prior_sigma * scale,
                     lower * scale,
                     upper * scale,
-                    unit,
+                    unit_words(unit),
                 )
             )
     return found

@@ -113,11 +113,21 @@ def test_a_rig_survives_the_way_out_and_in(panda: Path, tmp_path: Path) -> None:
     for name in ("panda.urdf", "panda.csv"):
         told("rig", "export", panda, "--out", tmp_path / name)
         tips = [] if name.endswith("csv") else ["--tip", "panda_leftfinger", "--tip", "panda_rightfinger"]
-        again = told("rig", "import", tmp_path / name, *tips, "--out", tmp_path / "again.toml")
+        copy = tmp_path / f"{name}.toml"
+        again = told("rig", "import", tmp_path / name, *tips, "--out", copy)
         assert again["joints"] == [joint.name for joint in load_rig(str(panda)).rig.joints]
-        wanted, found = (told("rig", "check", path)["zero_pose"] for path in (panda, tmp_path / "again.toml"))
+        wanted, found = (told("rig", "check", path)["zero_pose"] for path in (panda, copy))
         for prism, place in wanted["prisms_mm"].items():
             np.testing.assert_allclose(found["prisms_mm"][prism], place, atol=1e-5)
+
+
+def test_an_import_does_not_overwrite_a_rig_file(tmp_path: Path) -> None:
+    mine, table = tmp_path / "mine.toml", tmp_path / "t.csv"
+    mine.write_text("# a day's work\n", encoding="utf-8")
+    table.write_text("joint,a_mm\nq1,1\n", encoding="utf-8")
+    done = rigcal("rig", "import", table, "--out", mine)
+    assert (done.exit_code, "is there already" in done.stderr) == (2, True), done.stderr
+    assert mine.read_text(encoding="utf-8") == "# a day's work\n"
 
 
 @pytest.mark.parametrize(
