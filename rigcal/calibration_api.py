@@ -83,7 +83,11 @@ class Model:
 
     @property
     def effects(self) -> tuple[FittedEffect, ...]:
-        """The named effects on top of the kinematics."""
+        """The named effects on top of the kinematics.
+
+        `reported` of an effect has the numbers that reports list. Their standard errors count what the loads of the
+        masses leave open; those of `coefficients` are of the fit alone.
+        """
         return self.data.effects
 
     @property

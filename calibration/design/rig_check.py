@@ -14,6 +14,9 @@ from calibration.kinematics.chain import Chain, Placement
 from calibration.observations import Floats, Observations
 from calibration.rig.description import Rig
 
+_LEAST_MM = 10.0  # a machine has a longer link
+_TURN_RAD = 6.4  # limits of whole turns in rad
+_ROUNDED = 1e-3  # of a right angle: pi / 2 written with four digits
 POSES = 100  # at which the parameters are looked for
 _POSES_EACH = 2.0  # poses for each parameter where 100 are too few
 
@@ -65,6 +68,7 @@ class RigCheck:
         return tuple(self._warnings())
 
     def _warnings(self) -> Iterator[str]:
+        yield from _unit_warnings(self.rig)
         assumed = [link for link in self.links if link.is_assumed]
         if assumed:
             yield (
@@ -110,6 +114,28 @@ class RigCheck:
             "identifiability": self.seen.as_dict(),
             "warnings": list(self.warnings),
         }
+
+
+def _unit_warnings(rig: Rig) -> Iterator[str]:
+    """Yield sentences on numbers that would fit another unit than rig files have."""
+    lengths = [abs(x) for row in rig.rows for x in (row.a_mm, row.d_mm, row.b_mm)]
+    lengths += [abs(x) for row in rig.rows if row.before for x in (row.before.x_mm, row.before.y_mm, row.before.z_mm)]
+    lengths += [abs(x) for joint in rig.joints if joint.kind == "prismatic" for x in joint.limits]
+    if 0.0 < max(lengths) < _LEAST_MM:
+        yield f"no length of a row is over {max(lengths):g} mm: if lengths are in m here, convert them to mm"
+    turning = [joint for joint in rig.joints if joint.kind == "revolute"]
+    widest = max((abs(x) for joint in turning for x in joint.limits), default=0.0)
+    if len(turning) > 1 and widest < _TURN_RAD:
+        yield f"no joint turns further than {widest:g} deg: if limits are in rad here, convert them to deg"
+    for number, row in enumerate(rig.rows, 1):
+        for key in ("alpha_deg", "theta_deg"):
+            quarters = abs(getattr(row, key)) / (np.pi / 2.0)
+            if quarters > 0.5 and abs(quarters - round(quarters)) < _ROUNDED:
+                yield (
+                    f"{key} of row {number} is {getattr(row, key):g}, a multiple of a right angle in rad: if angles "
+                    "are in rad here, convert them to deg"
+                )
+                return
 
 
 def check_rig(rig: Rig) -> RigCheck:

@@ -27,7 +27,7 @@ class FittedEffect:
 
     Attributes:
         family, where: which effect it is and the place it is at.
-        coefficients: in the family's order.
+        coefficients: in the family's order, with standard errors of the fit; `reported` is for people.
         settings: the numbers of its variant.
         regime: the rows in which it acts; None for all.
     """

@@ -95,7 +95,8 @@ def correction_grid(
     joints = model.rig.joints
     least = 2 ** len(joints)
     if most_poses < least:
-        raise DataError("grid", f"two values for each of {len(joints)} joints make {least} poses; allow so many")
+        reason = f"two values for each of {len(joints)} joints make {least:,} poses, and {most_poses:,} are allowed"
+        raise DataError("grid", f"{reason}; allow more, or export other formats, such as json or c-header")
     machine = Machine(model, setup_of(model))
     low, high = trained_ranges(model)
     bends_mm = _curvature_mm(machine, prisms, low, high, rng)

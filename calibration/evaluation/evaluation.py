@@ -152,7 +152,7 @@ def _strange(error_mm: Floats, sigma_mm: Floats) -> Iterator[str]:
     times = float(np.median(sizes_mm(error_mm) / sizes_mm(sigma_mm)))
     if len(error_mm) >= _LEAST_TO_JUDGE and times > _STRANGE:
         yield (
-            f"the model does not describe this data: half of the fixes are off by more than {times:.1f} times the "
+            f"the model does not describe this data: half of the fixes are off by more than {times:,.0f} times the "
             f"expected; another machine or rig file, a moved base or prism, or a column that was read differently"
         )
 

@@ -180,6 +180,11 @@ def _check_spread(setup: str, position_mm: Floats) -> None:
     if len(position_mm) < 3:
         fixes = "1 fix" if len(position_mm) == 1 else f"{len(position_mm)} fixes"
         raise UnsafeError(f"{in_words(setup)}: {fixes} cannot place the base; at least 3 in different places")
+    if np.ptp(position_mm, axis=0).max() == 0.0:
+        raise UnsafeError(
+            f"{in_words(setup)}: all {len(position_mm)} fixes have the same coordinates: did the station repeat one, "
+            "or are the columns filled with one value?"
+        )
     if _on_a_line(position_mm):
         raise UnsafeError(
             f"{in_words(setup)}: all fixes lie on a line, so the base may turn about it; measure other poses"

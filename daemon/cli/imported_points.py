@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import tomllib
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
@@ -22,6 +23,7 @@ from drivers.stations.export_format import ColumnMap, ExportedFix, refuse
 from drivers.stations.exports import export_formats
 
 FILE_MAX_BYTES = 128 << 20
+REPEATED_MM = 10.0  # a point that is measured again is nearer to itself
 MOST_GAP_S = 1.0  # between the joint rows on both sides of a fix
 POSE, TIME_S, TIME = "pose", "time_s", "time"
 
@@ -97,6 +99,7 @@ class JointRows:
         by_pose: pose -> values, where the file has poses.
         times_s: of the rows, rising; empty where the file has no times.
         rows: values of each row.
+        max_rates: of the columns in deg/s for joints that turn; None for those that slide.
     """
 
     source: str
@@ -104,6 +107,7 @@ class JointRows:
     by_pose: Mapping[str, Sequence[float]]
     times_s: Sequence[float]
     rows: Sequence[Sequence[float]]
+    max_rates: Sequence[float | None]
 
     def of(self, fix: ExportedFix, source: str) -> Sequence[float]:
         """Return the joint values of a fix: those of its pose, or between the rows before and after its time.
@@ -127,7 +131,8 @@ class JointRows:
             refuse(source, reason, fix.line)
         before, after = self.times_s[place - 1], self.times_s[place]
         share = (fix.time_s - before) / (after - before)
-        return [a + share * (b - a) for a, b in zip(self.rows[place - 1], self.rows[place], strict=True)]
+        pairs = zip(self.rows[place - 1], self.rows[place], self.max_rates, strict=True)
+        return [a + share * _step(a, b, after - before, rate) for a, b, rate in pairs]
 
 
 def read_joints(path: Path, rig: Rig) -> JointRows:
@@ -140,12 +145,7 @@ def read_joints(path: Path, rig: Rig) -> JointRows:
     lines = lines_of(read_export(path))
     header = cells_of(lines[0], ",")
     joints = tuple(joint.column for joint in rig.joints)
-    for column in joints:
-        if header.count(column) != 1:
-            problem = (
-                "is there twice" if column in header else f"is missing; rig {rig.name!r} needs {', '.join(joints)}"
-            )
-            refuse(source, f"the column {problem}", 1, column)
+    _check_joint_columns(header, joints, rig, source)
     key = next((name for name in (POSE, TIME_S, TIME) if name in header), None)
     if key is None:
         refuse(
@@ -174,7 +174,27 @@ def read_joints(path: Path, rig: Rig) -> JointRows:
     if not by_pose and not timed:
         refuse(source, "no rows below the header")
     timed.sort(key=lambda each: each[0])
-    return JointRows(source, joints, by_pose, [at for at, _ in timed], [row for _, row in timed])
+    rates = [joint.max_rate if joint.kind == "revolute" else None for joint in rig.joints]
+    return JointRows(source, joints, by_pose, [at for at, _ in timed], [row for _, row in timed], rates)
+
+
+def _check_joint_columns(header: Sequence[str], joints: Sequence[str], rig: Rig, source: str) -> None:
+    if len(header) == 1:
+        refuse(source, "one column only: separate columns by commas, and write decimals with a point", 1)
+    for column in joints:
+        if header.count(column) != 1:
+            problem = (
+                "is there twice" if column in header else f"is missing; rig {rig.name!r} needs {', '.join(joints)}"
+            )
+            refuse(source, f"the column {problem}", 1, column)
+
+
+def _step(value: float, following: float, seconds: float, max_rate: float | None) -> float:
+    """Return how far a joint has moved; one that would have turned too fast is read on another turn, as 359 and 1."""
+    step = following - value
+    if max_rate is None or abs(step) <= max_rate * seconds:
+        return step
+    return (step + 180.0) % 360.0 - 180.0
 
 
 def _seconds(cell: str, source: str, line: int, column: str) -> float:
@@ -191,6 +211,21 @@ def _seconds(cell: str, source: str, line: int, column: str) -> float:
 def _plain(pose: str) -> str:
     """Return a pose's number without leading zeros, which memories of stations add."""
     return pose.lstrip("0") or "0" if pose.isdigit() else pose
+
+
+def far_repetitions(fixes: Sequence[ExportedFix], source: str) -> tuple[str, ...]:
+    """Return a note on points that are there twice in different places; most likely one of them is another pose."""
+    first: dict[tuple[str, str], ExportedFix] = {}
+    found = []
+    for fix in fixes:
+        other = first.setdefault((fix.target, _plain(fix.point)), fix)
+        apart_mm = math.dist(fix.position_mm, other.position_mm)
+        if apart_mm > REPEATED_MM:
+            found.append(f"{fix.point!r} in lines {other.line} and {fix.line}, {apart_mm:.0f} mm apart")
+    if not found:
+        return ()
+    more = f" and {len(found) - 3} more" if len(found) > 3 else ""
+    return (f"{source} has points twice in different places: {'; '.join(found[:3])}{more}; both are taken",)
 
 
 # ---- observations ----------------------------------------------------------------------------------------------------

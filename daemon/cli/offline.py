@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import logging
+import math
 import sys
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -24,6 +25,18 @@ DATA_MAX_BYTES = 128 << 20  # half a million fixes
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 DIRECTORY = click.Path(path_type=Path)
 
+
+class FiniteRange(click.FloatRange):
+    """A range of numbers; "nan" is none, though it is neither below nor above anything."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a finite number.", param, ctx)
+        return number
+
+
+ABOVE_0 = FiniteRange(min=0, min_open=True)
 rig_option = click.option("--rig", required=True, metavar="RIG", help="Name of a shipped rig, or path of a rig file.")
 data_option = click.option("--data", type=FILE, required=True, metavar="CSV", help="Observations, one row per fix.")
 signal_option = click.option(
@@ -53,13 +66,13 @@ csv_out_option = click.option(
 tolerance_option = click.option(
     "--tolerance",
     "tolerance_mm",
-    type=click.FloatRange(min=0, min_open=True),
+    type=ABOVE_0,
     metavar="MM",
     help="Root mean square error that the machine may have: say whether it passed. Fixes that were fitted cannot pass.",
 )
 time_limit_option = click.option(
     "--time-limit",
-    type=click.FloatRange(min=0, min_open=True),
+    type=ABOVE_0,
     metavar="SECONDS",
     help="End each global search after this time, and go on with the best until then.",
 )

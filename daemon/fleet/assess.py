@@ -53,6 +53,7 @@ class RigTask:
         data: observations CSV of the sessions that train.
         checks: observations CSV of check sessions, which never train; None without any.
         settings: what to do.
+        files: CSV files that `data` is made of, each with the line of `data` that its first row is.
     """
 
     name: str
@@ -61,6 +62,14 @@ class RigTask:
     data: bytes
     checks: bytes | None
     settings: FleetSettings
+    files: tuple[tuple[str, int], ...] = ()
+
+    def place(self, line: int) -> tuple[str, int]:
+        """Return the file that a line of `data` is of, and its number there."""
+        return next(
+            ((name, line - first + 2) for name, first in reversed(self.files) if first <= line),
+            (self.files[0][0] if self.files else self.name, line),
+        )
 
     @property
     def sha256(self) -> str:
@@ -80,7 +89,7 @@ def assess(task: RigTask) -> dict[str, Any]:
         None, and `warnings`.
     """
     prepare()
-    from calibration.errors import CalibrationError
+    from calibration.errors import CalibrationError, DataError
     from calibration.rig.description import parse_rig
 
     answer: dict[str, Any] = {"name": task.name, "source": task.source, "sha256": task.sha256}
@@ -89,7 +98,10 @@ def assess(task: RigTask) -> dict[str, Any]:
         with ThreadPoolExecutor(1) as pool:
             return answer | {"rig": rig.name} | _assessed(task, rig, pool)
     except CalibrationError as error:
-        return answer | {"error": str(error), "kind": type(error).__name__}
+        told = str(error)
+        if isinstance(error, DataError) and error.source == task.name and error.line is not None:
+            told = str(DataError(task.place(error.line)[0], error.reason, task.place(error.line)[1], error.column))
+        return answer | {"error": told, "kind": type(error).__name__}
 
 
 def _assessed(task: RigTask, rig: Rig, pool: Executor) -> dict[str, Any]:

@@ -28,11 +28,9 @@ def fleet_report(fleet: Fleet, made: str, files: Sequence[str]) -> str:
     for group in fleet.groups:
         sections += [_overview(group), _common(group), _outliers(group), _drift(group), _gains(group)]
     if fleet.failed:
-        rows = [[answer["name"], answer["kind"], answer["error"]] for answer in fleet.failed[:_MOST_RIGS]]
-        heads = ("rig", "error", "reason")
-        sections.append(
-            markup.section("Rigs that could not be assessed", markup.table(heads, rows, text_columns=(0, 1, 2)))
-        )
+        rows = [[answer["name"], answer["error"]] for answer in fleet.failed[:_MOST_RIGS]]
+        table = markup.table(("rig", "reason"), rows, text_columns=(0, 1))
+        sections.append(markup.section("Rigs that could not be assessed", table))
     sections.append(markup.section("Files", markup.items(files)))
     return markup.page("Fleet", "".join(sections))
 

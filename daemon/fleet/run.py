@@ -44,8 +44,12 @@ class Here:
     """This process, one rig after another."""
 
     def answers(self, tasks: Iterator[RigTask]) -> Iterator[Answer]:
-        """Yield the answers in the order of the tasks."""
-        return map(assess, tasks)
+        """Yield the answers in the order of the tasks; as on a cluster, no error of one rig ends the others."""
+        for task in tasks:
+            try:
+                yield assess(task)
+            except Exception as error:  # noqa: BLE001
+                yield _failed(task.name, task.source, error)
 
 
 class Cluster:

@@ -20,6 +20,7 @@ from drivers.files import read_text, read_whole
 
 STORE = "rigcal.sqlite"
 RIG_FILE = "rig.toml"
+_NOTHING = f"neither a {STORE} nor CSV files of observations in it"
 _CSV_MAX_BYTES = 128 << 20
 
 
@@ -58,17 +59,17 @@ def find_rigs(directories: Sequence[Path], pattern: str | None, rig: str | None)
         rig: the rig of directories without a `rig.toml`.
 
     Raises:
-        DataError: a directory holds neither, the pattern matches nothing, or there is no rig at all.
+        DataError: no directory holds either, the pattern matches nothing, or there is no rig at all.
     """
     found: list[tuple[Path, Path]] = []  # what names the rig, and where its data are
     for directory in directories:
         store = directory / STORE
         if store.is_file():
             found.append((directory, store))
-        elif directory.is_dir() and any(directory.glob("*.csv")):
-            found.append((directory, directory))
         else:
-            raise DataError(str(directory), f"neither a {STORE} nor CSV files of observations in it")
+            found.append((directory, directory))
+    if directories and pattern is None and not any(_has_data(data) for _, data in found):
+        raise DataError(", ".join(map(str, directories)), _NOTHING)
     if pattern is not None:
         stores = sorted(Path(path) for path in glob.glob(pattern, recursive=True) if Path(path).is_file())
         if not stores:
@@ -77,6 +78,10 @@ def find_rigs(directories: Sequence[Path], pattern: str | None, rig: str | None)
     if not found:
         raise DataError("fleet", "name directories of rigs, or stores with --stores")
     return [RigSource(name, path, rig) for name, path in sorted(_named(found))]
+
+
+def _has_data(path: Path) -> bool:
+    return path.is_file() or any(path.glob("*.csv"))
 
 
 def _named(found: Sequence[tuple[Path, Path]]) -> Iterator[tuple[str, Path]]:
@@ -106,6 +111,8 @@ def _of_store(source: RigSource, settings: FleetSettings) -> RigTask:
 
 
 def _of_directory(source: RigSource, settings: FleetSettings) -> RigTask:
+    if not _has_data(source.path):
+        raise DataError(str(source.path), _NOTHING)
     own = source.path / RIG_FILE
     if own.is_file():
         text = read_text(own, LONGEST)
@@ -120,7 +127,8 @@ def _of_directory(source: RigSource, settings: FleetSettings) -> RigTask:
             (checks if _is_check(path) else training).append(path)
     if not training:
         raise DataError(str(source.path), "no CSV file of observations that may train: one with a column prism")
-    return RigTask(source.name, str(source.path), text, _joined(training), _joined(checks) or None, settings)
+    data, files = _joined(training)
+    return RigTask(source.name, str(source.path), text, data, _joined(checks)[0] or None, settings, files)
 
 
 def _header(path: Path) -> bytes:
@@ -134,17 +142,19 @@ def _is_check(path: Path) -> bool:
     return told.is_file() and read_session_file(told).kind == "check"
 
 
-def _joined(files: Sequence[Path]) -> bytes:
-    """Return several CSV files as one."""
-    if not files:
-        return b""
-    header = _header(files[0])
-    parts = []
-    for path in files:
+def _joined(paths: Sequence[Path]) -> tuple[bytes, tuple[tuple[str, int], ...]]:
+    """Return several CSV files as one, and each file's name with the line that its first row is there."""
+    if not paths:
+        return b"", ()
+    header = _header(paths[0])
+    parts, files, line = [header + b"\n"], [], 2
+    for path in paths:
         if _header(path) != header:
-            raise DataError(path.name, f"has other columns than {files[0].name}; the files of a rig have the same", 1)
+            raise DataError(path.name, f"has other columns than {paths[0].name}; the files of a rig have the same", 1)
         parts.append(_ended(read_whole(path, _CSV_MAX_BYTES).partition(b"\n")[2]))
-    return header + b"\n" + b"".join(parts)
+        files.append((path.name, line))
+        line += parts[-1].count(b"\n")
+    return b"".join(parts), tuple(files)
 
 
 def _ended(data: bytes) -> bytes:

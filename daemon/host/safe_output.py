@@ -65,12 +65,14 @@ def write_file(path: Path, data: bytes) -> None:
     """Write a file whole or not at all: beside it, flushed to disk, renamed. A link's target is written.
 
     Raises:
-        OSError: `path` names something that is no regular file (a device, a pipe, a directory), or the file system
-            refuses.
+        OSError: `path` names something that is no regular file (a device, a pipe, a directory), its directory is
+            missing, or the file system refuses.
     """
     path = path.resolve()
     if path.exists() and not path.is_file():
         raise OSError(errno.EINVAL, "is not a regular file; name another", str(path))
+    if not path.parent.is_dir():
+        raise OSError(errno.ENOENT, "its directory does not exist; make it, or name another", str(path))
     scratch = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with scratch.open("wb") as file:

@@ -22,49 +22,20 @@ from drivers.stations.export_format import (
     refuse,
 )
 
-SYNONYMS: Mapping[Role, frozenset[str]] = {
-    "point": frozenset(
-        [
-            "point",
-            "pointname",
-            "pointid",
-            "pointnumber",
-            "pointno",
-            "ptid",
-            "ptno",
-            "pt",
-            "name",
-            "id",
-            "label",
-            "no",
-            "nr",
-            "pose",
-        ]
-    ),
-    "x": frozenset(["x", "east", "easting", "e", "xcoordinate", "xactual", "actualx", "measuredx", "xmeasured"]),
-    "y": frozenset(["y", "north", "northing", "n", "ycoordinate", "yactual", "actualy", "measuredy", "ymeasured"]),
-    "z": frozenset(
-        [
-            "z",
-            "height",
-            "elevation",
-            "elev",
-            "up",
-            "orthoheight",
-            "zcoordinate",
-            "zactual",
-            "actualz",
-            "measuredz",
-            "zmeasured",
-        ]
-    ),
-    "hz": frozenset(["hz", "hzangle", "horizontalangle", "hangle", "azimuth", "hzcircle"]),
-    "zenith": frozenset(["v", "vz", "zenith", "zenithangle", "verticalangle", "vangle", "vcircle"]),
-    "distance": frozenset(["sd", "slopedistance", "slopedist", "distance", "range", "d"]),
-    "prism": frozenset(["prism", "code", "target", "reflector", "marker"]),
-    "date": frozenset(["date", "measurementdate"]),
-    "time": frozenset(["time", "datetime", "timestamp", "dateandtime", "measurementtime", "times", "utc"]),
+_NAMES: Mapping[Role, str] = {
+    "point": "point pointname pointid pointnumber pointno ptid ptno pt name id label no nr pose punkt punktnr "
+    "punktnummer ptnr",
+    "x": "x east easting e xcoordinate xactual actualx measuredx xmeasured rechtswert",
+    "y": "y north northing n ycoordinate yactual actualy measuredy ymeasured hochwert",
+    "z": "z height elevation elev up orthoheight zcoordinate zactual actualz measuredz zmeasured höhe hoehe",
+    "hz": "hz hzangle horizontalangle hangle azimuth hzcircle",
+    "zenith": "v vz zenith zenithangle verticalangle vangle vcircle",
+    "distance": "sd slopedistance slopedist distance range d",
+    "prism": "prism code target reflector marker",
+    "date": "date measurementdate",
+    "time": "time datetime timestamp dateandtime measurementtime times utc",
 }
+SYNONYMS: Mapping[Role, frozenset[str]] = {role: frozenset(words.split()) for role, words in _NAMES.items()}
 _SEPARATORS = (";", "\t", ",", " ")
 _HEAD_LINES = 200  # a preamble is not longer
 _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?", re.ASCII)
@@ -81,6 +52,12 @@ _ANGLE_WORDS: dict[str, AngleUnit] = {
     **dict.fromkeys(("rad", "radian", "radians"), "rad"),
 }
 _UNIT = re.compile(r"[\[(]\s*([^\])]+?)\s*[\])]|_(mm|cm|m|in|ft|deg|gon|rad)$")
+_BEFORE_UNIT = re.compile(r"\s+(?=[\[(])")  # blanks between a name and its unit
+_WHOLE = re.compile(r"[+-]?\d+", re.ASCII)
+_TWO_MEANINGS = (
+    "{} cells where {} are due: commas separate columns and are decimal signs as well; export with decimal points, or "
+    "with semicolons between columns"
+)
 _TIME_FORMATS = ("%d.%m.%Y %H:%M:%S.%f", "%d.%m.%Y %H:%M:%S", "%m/%d/%Y %H:%M:%S.%f", "%m/%d/%Y %H:%M:%S")
 _CLOCK_FORMATS = ("%H:%M:%S.%f", "%H:%M:%S")
 
@@ -102,7 +79,7 @@ def lines_of(text: str) -> list[str]:
 def cells_of(line: str, separator: str) -> list[str]:
     """Return the cells of a line."""
     if separator == " ":
-        return line.split()
+        return _BEFORE_UNIT.sub("", line).split()
     try:
         return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
     except csv.Error:  # a field of more characters than any that means something
@@ -117,10 +94,9 @@ def number_of(cell: str, decimal: str) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def decimal_of(cells: Iterable[str], separator: str) -> str:
-    """Return the sign before fractions: a comma where it is in numbers and does not separate them."""
-    has_commas = separator != "," and any("," in cell and _NUMBER.fullmatch(cell) for cell in cells)
-    return "," if has_commas else "."
+def decimal_of(cells: Iterable[str]) -> str:
+    """Return the sign before fractions: a comma where it is in numbers, between quotes if it separates them too."""
+    return "," if any("," in cell and _NUMBER.fullmatch(cell) for cell in cells) else "."
 
 
 # ---- the map ---------------------------------------------------------------------------------------------------------
@@ -142,7 +118,11 @@ def guess_table(text: str, source: str, name: str) -> Guess:
         for number, line in enumerate(lines[:_HEAD_LINES], 1):
             roles = _roles(cells_of(line, separator))
             if {"x", "y", "z"} <= roles.keys() or {"hz", "zenith", "distance"} <= roles.keys():
-                return _with_header(lines, separator, number, roles, name)
+                if separator == " " and any(
+                    cell[-1] in ",;" for cell in lines[number : number + 1] for cell in cell.split()
+                ):
+                    continue  # a remark that names the columns; the rows are separated otherwise
+                return _with_header(lines, separator, number, roles, name, source)
     return _without_header(lines, source, name)
 
 
@@ -150,30 +130,34 @@ def _roles(cells: list[str]) -> dict[Role, str]:
     """Return the roles of a header's cells, each by the first that has it."""
     roles: dict[Role, str] = {}
     for cell in cells:
-        plain = re.sub(r"[^a-z0-9]", "", _UNIT.sub("", cell.lower()))
+        plain = re.sub(r"[\W_]", "", _UNIT.sub("", cell.lower()))
         for role, words in SYNONYMS.items():
             if plain in words:
                 roles.setdefault(role, cell)
     return roles
 
 
-def _with_header(lines: list[str], separator: str, header: int, roles: dict[Role, str], name: str) -> Guess:
+def _with_header(
+    lines: list[str], separator: str, header: int, roles: dict[Role, str], name: str, source: str
+) -> Guess:
     cells = cells_of(lines[header - 1], separator)
     notes = [f"line {header} is the header; columns are separated by {_said(separator)}"]
     first = header + 1
     while first < len(lines) and not any(map(str.isdigit, lines[first - 1])):
         first += 1  # a line of units, an empty one
     sample = [cells_of(line, separator) for line in lines[first - 1 : first + 200] if line.strip()]
-    decimal = decimal_of((cell for row in sample for cell in row), separator)
+    decimal = decimal_of(cell for row in sample for cell in row)
     if {"x", "y", "z"} <= roles.keys():
         roles = {role: cell for role, cell in roles.items() if role not in ("hz", "zenith", "distance")}
     else:
         roles = {role: cell for role, cell in roles.items() if role not in ("x", "y", "z")}
     by_role = ", ".join(f"{role}: {cell!r}" for role, cell in roles.items())
     notes.append(f"columns by their names: {by_role}")
+    if "point" not in roles:
+        notes.append("no column is known to name the points, so they are 1, 2, ... in the order of the file")
     measured = [roles[role] for role in ("x", "y", "z", "distance") if role in roles]
     units_line = cells_of(lines[header], separator) if first > header + 1 else []
-    length = _unit(measured, cells, units_line, lines[: header - 1], _LENGTH_WORDS)
+    length = _unit(measured, cells, units_line, lines[: header - 1], _LENGTH_WORDS, source)
     if length is None:
         places = [cells.index(cell) for cell in measured]
         values = [number_of(row[p], decimal) for row in sample for p in places if p < len(row)]
@@ -181,9 +165,14 @@ def _with_header(lines: list[str], separator: str, header: int, roles: dict[Role
         length = "m" if largest < 200 else "mm"
         notes.append(f"no unit of length is named; {largest:g} is the greatest number, so {length} is taken")
     angles = [roles[role] for role in ("hz", "zenith") if role in roles]
-    angle = _unit(angles, cells, units_line, lines[: header - 1], _ANGLE_WORDS)
+    angle = _unit(angles, cells, units_line, lines[: header - 1], _ANGLE_WORDS, source)
     if angles and angle is None:
-        notes.append("no unit of angles is named, so degrees are taken")
+        values = [
+            number_of(row[cells.index(a)], decimal) for row in sample for a in angles if cells.index(a) < len(row)
+        ]
+        largest = max((abs(value) for value in values if value is not None), default=0.0)
+        angle = "rad" if largest <= math.tau else "deg" if largest <= 360.0 else "gon"  # a zenith angle is near 90 deg
+        notes.append(f"no unit of angles is named; {largest:g} is the greatest number, so {angle} is taken")
     time_format = _time_format(sample, cells, roles, notes)
     found = ColumnMap.model_validate(
         {
@@ -205,9 +194,10 @@ def _without_header(lines: list[str], source: str, name: str) -> Guess:
     for separator in _SEPARATORS:
         for number, line in enumerate(lines[:_HEAD_LINES], 1):
             cells = cells_of(line, separator)
-            decimal = decimal_of(cells, separator)
+            decimal = decimal_of(cells)
             numbers = [place for place, cell in enumerate(cells, 1) if number_of(cell, decimal) is not None]
             if len(cells) >= 4 and len(numbers) >= 3 and {2, 3, 4} <= set(numbers):
+                _check_without_header(lines, separator, number, source)
                 sample = [cells_of(each, separator) for each in lines[number - 1 : number + 200] if each.strip()]
                 values = [number_of(cell, decimal) for row in sample for cell in row[1:4]]
                 largest = max((abs(value) for value in values if value is not None), default=0.0)
@@ -226,17 +216,41 @@ def _without_header(lines: list[str], source: str, name: str) -> Guess:
     )
 
 
+def _check_without_header(lines: list[str], separator: str, first: int, source: str) -> None:
+    """Refuse a header that nothing is known of, and commas that are separator and decimal sign in one."""
+    cells = cells_of(lines[first - 1], separator)
+    for number, line in enumerate(lines[: first - 1], 1):
+        names = cells_of(line, separator)
+        if len(names) == len(cells) and not any(number_of(name, ",") is not None for name in names):
+            said = f"its names are not known ({', '.join(names)})"
+            refuse(source, f"this is a header, and {said}; call the columns point, x, y and z in it", number)
+    if separator == "," and len(cells) >= 7 and all(map(_WHOLE.fullmatch, cells[1:7])):
+        refuse(source, _TWO_MEANINGS.format(len(cells), 4), first)
+
+
 def _unit(
-    of: list[str], header: list[str], units_line: list[str], preamble: list[str], words: Mapping[str, str]
+    of: list[str],
+    header: list[str],
+    units_line: list[str],
+    preamble: list[str],
+    words: Mapping[str, str],
+    source: str,
 ) -> str | None:
     """Return the unit of some columns: from their names, the line below the header, or a line before it."""
+    units: dict[str, str] = {}  # unit -> the first column that has it
     for cell in of:
         found = _UNIT.search(cell.lower())
         place = header.index(cell)
         below = units_line[place].lower() if place < len(units_line) else ""
         for word in ((found[1] or found[2]) if found else "", below):
             if word and word.strip("[]() ") in words:
-                return words[word.strip("[]() ")]
+                units.setdefault(words[word.strip("[]() ")], cell)
+                break
+    if len(units) > 1:
+        said = " and ".join(f"{cell!r} in {unit}" for unit, cell in units.items())
+        refuse(source, f"the columns have different units, {said}; export them in one unit")
+    if units:
+        return next(iter(units))
     for line in preamble:
         if "unit" in line.lower():
             for word in re.findall(r"[a-z°]+", line.lower()):
@@ -283,12 +297,20 @@ def read_table(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
         if not line.strip():
             continue
         cells = cells_of(line, columns.separator)
+        if header and any(cells[len(header) :]):
+            reason = f"{len(cells)} cells where the header has {len(header)}"
+            refuse(
+                source, _TWO_MEANINGS.format(len(cells), len(header)) if columns.separator == "," else reason, number
+            )
 
         def number_at(role: Role, cells: list[str] = cells, number: int = number) -> float:
             cell = _cell(cells, places[role], columns.columns[role], number, source)
             value = number_of(cell, columns.decimal)
             if value is None:
-                refuse(source, f"{cell!r} is not a number", number, columns.columns[role])
+                said = (
+                    f"{cell!r} is not a number" if cell else "the cell is empty; leave out lines without a measurement"
+                )
+                refuse(source, said, number, columns.columns[role])
             return value
 
         def text_at(role: Role, cells: list[str] = cells) -> str:

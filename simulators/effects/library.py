@@ -84,7 +84,8 @@ def _parse_one(part: str) -> Effect:
     if kind is None:
         raise ValueError(f"unknown effect {family!r}; known: {', '.join(sorted(FAMILIES))}")
     if not at or not where:
-        raise ValueError(f"{part!r}: say where, as in {family}@theta4")
+        place = {"joint": "JOINT", "revolute": "JOINT", "prismatic": "JOINT", "prism": "PRISM"}
+        raise ValueError(f"{part!r}: say where, as in {family}@{place.get(kind.acts_at[0], kind.acts_at[0])}")
     known = {f.name: f.type for f in fields(kind) if f.name != "where"}
     values: dict[str, float | int] = {}
     for setting in settings:

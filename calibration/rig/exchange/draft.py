@@ -21,6 +21,7 @@ angle_sigma_arcsec = 1.0
 distance_sigma_mm = 0.1
 distance_sigma_ppm = 1.0
 """
+LIMITS_ASSUMED = "limits assumed"  # the remark of a joint
 SIGMA = {"revolute": 0.002, "prismatic": 0.02}  # deg and mm; assumed of encoders that a description says nothing of
 
 
@@ -55,6 +56,13 @@ class Draft:
     def add(self, section: str, keys: Mapping[str, object], remark: str = "") -> None:
         """Add a table to `[[section]]`."""
         self.sections[section].append(Section(keys, remark))
+
+    @property
+    def assumed(self) -> str:
+        """The sentence on what no other description says."""
+        joints = [str(t.keys["name"]) for t in self.sections["joint"] if LIMITS_ASSUMED in t.remark]
+        limits = f"the limits of {', '.join(joints)}, " if joints else ""
+        return f"Assumed: the random errors of readings (sigma), {limits}the build tolerances and the station."
 
     def text(self) -> str:
         """Return the TOML."""

@@ -20,7 +20,7 @@ from typing import get_args
 
 from calibration.errors import RigError
 from calibration.rig.description import Convention
-from calibration.rig.exchange.draft import SIGMA, Draft, free_name
+from calibration.rig.exchange.draft import LIMITS_ASSUMED, SIGMA, Draft, free_name
 from calibration.rig.exchange.frames import tidy
 
 CONSTANTS = {"alpha": "deg", "a": "mm", "d": "mm", "theta": "deg", "beta": "deg", "b": "mm"}
@@ -101,7 +101,7 @@ class _Table:
                 draft.add("prism", keys | {"offset_known": False}, "where the reflector sits is not known")
         draft.notes += [
             f"Convention: {self._convention}.",
-            "Assumed: the random errors of readings (sigma), the build tolerances and the station.",
+            draft.assumed,
         ]
         return draft
 
@@ -113,6 +113,10 @@ class _Table:
         unknown = [name for name in names if name not in _KNOWN]
         if unknown or len(set(names)) < len(names):
             what = f"unknown column {unknown[0]!r}" if unknown else "two columns have one name"
+            if len(names) == 1 and any(mark in header for mark in ";\t"):
+                raise RigError(
+                    self._source, "header", "separate columns by commas, and write decimals with a point", first
+                )
             raise RigError(self._source, "header", f"{what}; there are {', '.join(sorted(_KNOWN))}", first)
         self._has_drives = any(f"{driven}_drive" in names for driven in DRIVES)
         for number, line in lines:
@@ -164,6 +168,12 @@ class _Table:
     def _add_joint(self, line: int, cells: Mapping[str, str], kind: str) -> None:
         name = cells["joint"]
         if name in self._kinds:
+            given = next(t.keys["limits"] for t in self._draft.sections["joint"] if t.keys["name"] == name)
+            assert isinstance(given, list)
+            for column, limit in zip(("lower", "upper"), given, strict=True):
+                if column in cells and self._number(line, cells, column, 0.0) != limit:
+                    reason = f"joint {name!r} has {limit:g} on a line before; a joint has its limits once"
+                    raise RigError(self._source, column, reason, line)
             return
         self._kinds[name] = kind
         low, high = _ASSUMED_LIMITS[kind]
@@ -171,7 +181,7 @@ class _Table:
         keys: dict[str, object] = {"name": name, "kind": kind, "limits": limits, "sigma": SIGMA[kind]}
         if "max_rate" in cells:
             keys["max_rate"] = self._number(line, cells, "max_rate", 0.0)
-        self._draft.add("joint", keys, "" if {"lower", "upper"} <= set(cells) else "limits assumed")
+        self._draft.add("joint", keys, "" if {"lower", "upper"} <= set(cells) else LIMITS_ASSUMED)
 
     def _terms(self, line: int, text: str) -> dict[str, float]:
         """Return joint -> coefficient of a sum such as `0.5*q1 - q2`."""

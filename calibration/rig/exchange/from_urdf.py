@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.errors import RigError
-from calibration.rig.exchange.draft import SIGMA, Draft, free_name
+from calibration.rig.exchange.draft import LIMITS_ASSUMED, SIGMA, Draft, free_name
 from calibration.rig.exchange.frames import (
     Floats,
     Line,
@@ -95,7 +95,7 @@ class _Import:
         self._add_masses()
         still = [j.name for j in self._urdf.joints.values() if j.moves and j.name not in self._nodes]
         self._draft.notes += [
-            "Assumed: the random errors of readings (sigma), the build tolerances and the station.",
+            self._draft.assumed,
             "Left out: shapes, efforts, friction and transmissions, which rigcal does not use.",
             *([f"At zero, because no tip moves with them: {', '.join(still)}."] if still else []),
         ]
@@ -104,19 +104,20 @@ class _Import:
     def _ends(self) -> tuple[str, ...]:
         """Return, of every moving chain that nothing moving continues, the last link along fixed joints."""
         below: dict[str, list[UrdfJoint]] = {}
+        moving: set[str] = set()  # links that something beyond moves on
         for joint in self._urdf.joints.values():
             below.setdefault(joint.parent, []).append(joint)
-
-        def moves_further(link: str) -> bool:
-            return any(j.moves or moves_further(j.child) for j in below.get(link, []))
-
+            link: str | None = joint.parent if joint.moves else None
+            while link is not None and link not in moving:
+                moving.add(link)
+                link = self._urdf.joints[link].parent if link in self._urdf.joints else None
         ends = []
         for joint in self._urdf.joints.values():
-            if joint.moves and self._is_inside(joint.child) and not moves_further(joint.child):
-                link = joint.child
-                while below.get(link):
-                    link = below[link][0].child
-                ends.append(link)
+            if joint.moves and self._is_inside(joint.child) and joint.child not in moving:
+                end = joint.child
+                while below.get(end):
+                    end = below[end][0].child
+                ends.append(end)
         if not ends:
             raise RigError(self._source, "", f"nothing moves on link {self._base!r}")
         return tuple(ends)
@@ -191,7 +192,7 @@ class _Import:
         limits, remark = joint.limits, "" if self._names[joint.name] == joint.name else joint.name
         if limits is None or limits[0] == limits[1]:
             limits = (-assumed / unit, assumed / unit)
-            remark = "; ".join(filter(None, (remark, "limits assumed: the URDF gives none")))
+            remark = "; ".join(filter(None, (remark, f"{LIMITS_ASSUMED}: the URDF gives none")))
         name = self._names[joint.name]
         keys: dict[str, object] = {"name": name, "kind": joint.kind, "limits": [tidy(x * unit) for x in limits]}
         keys["sigma"] = SIGMA[joint.kind]

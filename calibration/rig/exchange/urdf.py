@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,23 +140,37 @@ class _Reader:
 
     def robot(self, root: ET.Element) -> Urdf:
         elements = list(root.iter())
-        if root.tag != "robot" or len(elements) > _MOST_ELEMENTS:
+        if _plain(root.tag) != "robot":
             raise self._fault("", f"no URDF: the outermost element is <{_plain(root.tag)}>, not <robot>")
+        if len(elements) > _MOST_ELEMENTS:
+            raise self._fault("", f"it has {len(elements):,} elements, {_MOST_ELEMENTS:,} at most are read")
         raw = next((e for e in elements if "xacro" in e.tag), None)
         if raw is not None:
             raise self._fault(
                 f"<{_plain(raw.tag)}>", "xacro that was not expanded; run `xacro FILE > ROBOT.urdf`, and import that"
             )
-        links = {self._name(e): self._inertial(e) for e in root.findall("link")}
-        joints = [self._joint(e) for e in root.findall("joint")]
+        for element in elements:  # a namespace of the whole document says nothing
+            element.tag = _plain(element.tag)
+        links = self._links(root)
+        joints = _in_own_units([self._joint(e) for e in root.findall("joint")])
         by_child = {joint.child: joint for joint in joints}
         self._check_tree(links, joints, by_child)
         return Urdf(root.get("name") or "robot", links, by_child)
 
+    def _links(self, root: ET.Element) -> dict[str, Inertial | None]:
+        links: dict[str, Inertial | None] = {}
+        for element in root.findall("link"):
+            name = self._name(element)
+            if name in links:
+                raise self._fault(f"link {name!r}", "two links have this name")
+            links[name] = self._inertial(element)
+        return links
+
     def _check_tree(self, links: Iterable[str], joints: list[UrdfJoint], by_child: Mapping[str, UrdfJoint]) -> None:
         known, names = set(links), {joint.name: joint for joint in joints}
-        if len(names) < len(joints):
-            raise self._fault("joint", "two joints have one name")
+        for joint in joints:
+            if names[joint.name] is not joint:
+                raise self._fault(f"joint {joint.name!r}", "two joints have this name")
         for joint in joints:
             for link in (joint.parent, joint.child):
                 if link not in known:
@@ -167,7 +181,8 @@ class _Reader:
                 raise self._fault(f"joint {joint.name!r}", f"it mimics {joint.mimic.joint!r}, which is no joint")
         roots = [link for link in links if link not in by_child]
         if len(roots) != 1:
-            raise self._fault("link", f"{len(roots)} links are no joint's child; a rig has one base")
+            said = f" ({', '.join(roots[:5])}{', ...' if len(roots) > 5 else ''})" if roots else ""
+            raise self._fault("link", f"{len(roots)} links are no joint's child{said}; a rig has one base")
         for start in by_child:
             link, steps = start, 0
             while link in by_child:
@@ -292,3 +307,16 @@ def rotation_of_rpy(roll: float, pitch: float, yaw: float) -> Floats:
 def _plain(tag: str) -> str:
     """Return an element's name without the address of its namespace."""
     return tag.rpartition("}")[2]
+
+
+def _in_own_units(joints: list[UrdfJoint]) -> list[UrdfJoint]:
+    """Return the joints with multipliers of mimics in rad and mm, where the document has rad and m."""
+    slides = {joint.name: joint.kind == "prismatic" for joint in joints}
+    out = []
+    for joint in joints:
+        mimic = joint.mimic
+        if mimic is not None and slides.get(mimic.joint, slides[joint.name]) != slides[joint.name]:
+            scaled = mimic.multiplier * (1e3 if slides[joint.name] else 1e-3)
+            joint = replace(joint, mimic=replace(mimic, multiplier=scaled))  # noqa: PLW2901
+        out.append(joint)
+    return out

@@ -45,7 +45,14 @@ def import_(
     refused whole, with line, column and reason.
     """
     from calibration.observations import parse_observations
-    from daemon.cli.imported_points import map_text, observations_csv, read_export, read_joints, read_map
+    from daemon.cli.imported_points import (
+        far_repetitions,
+        map_text,
+        observations_csv,
+        read_export,
+        read_joints,
+        read_map,
+    )
     from daemon.host.safe_output import write_file
     from daemon.rig_files import load_rig
     from drivers.stations.exports import export_formats, format_of
@@ -70,6 +77,7 @@ def import_(
         guess = known.guess(text, file.name)
         columns, notes = guess.map, guess.notes
     fixes = known.read(text, columns, file.name)
+    notes += far_repetitions(fixes, file.name)
     rows = None if joints is None or described is None else read_joints(joints, described)
     labels = {"setup": setup, "session": session}
     table = observations_csv(fixes, columns, file.name, described, rows, prism, labels)

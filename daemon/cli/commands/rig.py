@@ -10,6 +10,7 @@ import click
 from daemon.cli.command import Command, json_option
 from daemon.cli.offline import FILE
 from daemon.cli.terminal import echo, echo_error, echo_list, echo_table
+from daemon.commands import CommandError
 from daemon.host.safe_output import write_file
 from daemon.report.words import number
 
@@ -93,6 +94,8 @@ def rig_import(
     from calibration.rig.exchange.urdf import LONGEST, parse_urdf
     from drivers.files import read_text
 
+    if out.exists():
+        raise CommandError(f"{out} is there already, and is not overwritten; name another file, or remove it")
     is_table = path.suffix.lower() == ".csv"
     if is_table and (base or tips):
         raise click.UsageError("--base and --tip name links of a URDF; a table has none")

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from daemon.cli.command import Command, json_option
-from daemon.cli.offline import FILE, rig_option, seed_option
+from daemon.cli.offline import ABOVE_0, FILE, rig_option, seed_option
 from daemon.cli.terminal import echo
 from daemon.host.safe_output import write_file
 from daemon.report.words import number
@@ -35,7 +35,7 @@ _MOST_POSES = 100_000
 @click.option(
     "--noise",
     "noise_mm",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=ABOVE_0,
     metavar="MM",
     help="Standard deviation of each coordinate of a fix, also stated in the data; the rig file's station by default.",
 )

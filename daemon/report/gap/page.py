@@ -8,6 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from calibration.effects.base import FittedCoefficient
 from calibration.effects.context import EffectContext
 from calibration.effects.fitted import FittedEffect
 from calibration.effects.library import library
@@ -82,7 +83,7 @@ def intervals(gap: GapResult) -> list[Interval]:
             if coefficient.name not in bounds:
                 continue
             lower, upper = bounds[coefficient.name]
-            scale, unit = readable_unit(coefficient.unit, max(abs(lower), abs(upper)))
+            scale, unit = readable_unit(coefficient.unit, _size(coefficient))
             found.append(
                 Interval(
                     f"{place_name(effect.family, effect.where)}, {coefficient_words(coefficient.name)}",
@@ -95,6 +96,11 @@ def intervals(gap: GapResult) -> list[Interval]:
                 )
             )
     return found
+
+
+def _size(coefficient: FittedCoefficient) -> float:
+    """Return the largest number of a coefficient and its interval: the unit is chosen for these, not for its bounds."""
+    return max(abs(coefficient.value), INTERVAL_SIGMAS * coefficient.standard_error)
 
 
 def coefficient_bounds(gap: GapResult, effect: FittedEffect) -> dict[str, tuple[float, float]]:
@@ -188,7 +194,7 @@ def _found(gap: GapResult) -> str:
         bounds = coefficient_bounds(gap, effect)
         for c in effect.reported:
             ends = bounds.get(c.name)
-            scale, unit = readable_unit(c.unit, max(map(abs, ends)) if ends else abs(c.value))
+            scale, unit = readable_unit(c.unit, _size(c))
             limits = f"{number(ends[0] * scale)} .. {number(ends[1] * scale)}" if ends else ""
             interval = f"{PLUS_MINUS} {number(INTERVAL_SIGMAS * c.standard_error * scale, 2)}"
             words = coefficient_words(c.name)

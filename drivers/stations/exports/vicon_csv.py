@@ -48,7 +48,7 @@ def _guess(text: str, source: str) -> Guess:
         {
             "format": FORMAT.name,
             "separator": separator,
-            "decimal": decimal_of(sample, separator),
+            "decimal": decimal_of(sample),
             "header_line": at + 4,
             "first_line": at + 6,
             "length_unit": units.pop(),

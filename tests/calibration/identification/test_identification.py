@@ -182,6 +182,11 @@ def test_mirrored_coordinates_are_refused_by_name(session: Session) -> None:
         rough_start(chain, averaged(chain, swapped), np.zeros(len(chain)))
 
 
+def test_a_station_that_repeats_one_fix_is_told_so(session: Session) -> None:
+    with pytest.raises(UnsafeError, match="all 250 fixes have the same coordinates"):
+        place(session.rig, replace(session.training, position_mm=np.ones((250, 3))))
+
+
 def test_fixes_on_a_line_cannot_place_a_base(session: Session) -> None:
     position = np.outer(np.arange(250.0), [10.0, 20.0, 30.0])
     with pytest.raises(UnsafeError, match="all fixes lie on a line"):

@@ -48,6 +48,30 @@ def test_joints_are_matched_by_the_number_of_the_pose(tmp_path: Path) -> None:
     assert (found.pose.tolist(), found.setup.tolist()) == (["001", "002"], ["S1", "S1"])
 
 
+def test_between_two_times_a_joint_goes_on_from_the_end_of_its_turn(tmp_path: Path) -> None:
+    survey, out, joints = tmp_path / "walk.csv", tmp_path / "out.csv", tmp_path / "joints.csv"
+    survey.write_text("point,x [mm],y [mm],z [mm],time\n1,1000,200,300,10.5\n")
+    joints.write_text(f"time_s,{','.join(JOINTS)}\n10.0,359,1,10,-90,0,0\n11.0,3,359,20,-95,0,0\n")
+    told(survey, "--rig", "ur10", "--joints", joints, "--prism", "tmac", "--out", out)
+    found = Observations.from_csv(out, RIG)
+    assert [float(found.joints[name][0]) for name in RIG.joint_names] == [1.0, 0.0, 15.0, -92.5, 0.0, 0.0]
+
+
+def test_joints_of_a_spreadsheet_in_another_language_are_refused(tmp_path: Path) -> None:
+    survey, joints = tmp_path / "survey.csv", tmp_path / "joints.csv"
+    survey.write_text(SURVEY)
+    joints.write_text(f"pose;{';'.join(JOINTS)}\n1;0,5;0;0;0;0;0\n")
+    done = run(survey, "--rig", "ur10", "--joints", joints, "--out", tmp_path / "out.csv")
+    assert (done.exit_code, "line 1: one column only: separate columns by commas" in done.stderr) == (2, True)
+
+
+def test_a_point_that_is_there_twice_in_different_places_is_said(tmp_path: Path) -> None:
+    survey, out = tmp_path / "survey.csv", tmp_path / "out.csv"
+    survey.write_text(SURVEY + "2;110;214;313;tmac\n2;110;210;510;tmac\n")
+    *_, note = told(survey, "--out", out)["notes"]
+    assert note == "survey.csv has points twice in different places: '2' in lines 3 and 5, 200 mm apart; both are taken"
+
+
 def test_joints_are_matched_by_time(tmp_path: Path) -> None:
     survey, out = tmp_path / "walk.csv", tmp_path / "out.csv"
     survey.write_text(VICON)

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +78,26 @@ def test_a_radius_of_a_row_is_what_plan_keeps_clear_of(tmp_path: Path) -> None:
     assert any("75 mm of row 2" in sentence for sentence in planned["assumptions"])
 
 
+@pytest.mark.parametrize(
+    ("pattern", "scale", "said"),
+    [
+        (r"(?<=alpha_deg = )[-\d.]+", 0.01745329, "alpha_deg of row 1 is 1.5708, a multiple of a right angle in rad"),
+        (r"(?<=limits = \[)-360, 360", 0.01745329, "no joint turns further than 6.28318 deg: if limits are in rad"),
+        (r"(?<=[ad]_mm = )[-\d.]+", 0.001, "no length of a row is over 0.612 mm: if lengths are in m"),
+    ],
+    ids=["angles", "limits", "lengths"],
+)
+def test_check_asks_about_numbers_that_would_fit_another_unit(
+    tmp_path: Path, pattern: str, scale: float, said: str
+) -> None:
+    text = re.sub(
+        pattern, lambda found: ", ".join(f"{float(x) * scale:.7f}" for x in found[0].split(",")), load_rig("ur10").text
+    )
+    (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
+    assert any(said in sentence for sentence in told("rig", "check", tmp_path / "mine.toml")["warnings"])
+    assert not any("here, convert" in sentence for sentence in told("rig", "check", "ur10")["warnings"])
+
+
 def test_check_tells_every_fault_with_its_line(tmp_path: Path) -> None:
     lines = load_rig("ur10").text.splitlines()
     lines[lines.index("d_mm = 127.3")] = "d_mm = 'x'"
@@ -92,11 +113,21 @@ def test_a_rig_survives_the_way_out_and_in(panda: Path, tmp_path: Path) -> None:
     for name in ("panda.urdf", "panda.csv"):
         told("rig", "export", panda, "--out", tmp_path / name)
         tips = [] if name.endswith("csv") else ["--tip", "panda_leftfinger", "--tip", "panda_rightfinger"]
-        again = told("rig", "import", tmp_path / name, *tips, "--out", tmp_path / "again.toml")
+        copy = tmp_path / f"{name}.toml"
+        again = told("rig", "import", tmp_path / name, *tips, "--out", copy)
         assert again["joints"] == [joint.name for joint in load_rig(str(panda)).rig.joints]
-        wanted, found = (told("rig", "check", path)["zero_pose"] for path in (panda, tmp_path / "again.toml"))
+        wanted, found = (told("rig", "check", path)["zero_pose"] for path in (panda, copy))
         for prism, place in wanted["prisms_mm"].items():
             np.testing.assert_allclose(found["prisms_mm"][prism], place, atol=1e-5)
+
+
+def test_an_import_does_not_overwrite_a_rig_file(tmp_path: Path) -> None:
+    mine, table = tmp_path / "mine.toml", tmp_path / "t.csv"
+    mine.write_text("# a day's work\n", encoding="utf-8")
+    table.write_text("joint,a_mm\nq1,1\n", encoding="utf-8")
+    done = rigcal("rig", "import", table, "--out", mine)
+    assert (done.exit_code, "is there already" in done.stderr) == (2, True), done.stderr
+    assert mine.read_text(encoding="utf-8") == "# a day's work\n"
 
 
 @pytest.mark.parametrize(
@@ -109,6 +140,9 @@ def test_a_rig_survives_the_way_out_and_in(panda: Path, tmp_path: Path) -> None:
         (("run", "--rig", "ur10"), "--rig and --by-hand are for a simulated rig"),
         (("simulate", "--rig", "ur10", "--poses", "3", "--effect", "nix@q1", "--out", "o"), "unknown effect"),
         (("simulate", "--rig", "ur10", "--poses", "3", "--effect", "backlash@q9", "--out", "o"), "it acts at"),
+        (("simulate", "--rig", "ur10", "--poses", "3", "--effect", "backlash", "--out", "o"), "as in backlash@JOINT"),
+        (("simulate", "--rig", "ur10", "--poses", "3", "--effect", "clock_drift", "--out", "o"), "clock_drift@clock"),
+        (("simulate", "--rig", "ur10", "--poses", "3", "--noise", "nan", "--out", "o"), "'nan' is not a finite number"),
     ],
 )
 def test_wrong_use_is_refused(tmp_path: Path, arguments: tuple[str, ...], reason: str) -> None:

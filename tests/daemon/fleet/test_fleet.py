@@ -170,6 +170,35 @@ def test_a_fleet_with_the_gap_workflow(directory: Path) -> None:
     assert found["effects"] == []
 
 
+def test_a_rig_without_data_is_listed_and_a_bad_line_has_its_file(tmp_path: Path) -> None:
+    rig = simulated_rig(0, 30, sessions=1)
+    for name in ("bad", "empty"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "bad/rig.toml").write_text(rig.rig_text)
+    header, *lines = rig.csv.decode().splitlines()
+    (tmp_path / "bad/a.csv").write_text("\n".join([header, *lines[:10]]))
+    wrong = [line.replace(".", "x", 1) if n == 3 else line for n, line in enumerate(lines[10:])]
+    (tmp_path / "bad/b.csv").write_text("\n".join([header, *wrong]) + "\n")
+    sources = find_rigs([tmp_path / "bad", tmp_path / "empty"], None, None)
+    bad, empty = assess_all(sources, SETTINGS, tmp_path / "out", Here(), lambda *_: None)
+    assert bad["error"].startswith("b.csv, line 5, column ")
+    assert empty["error"].endswith("neither a rigcal.sqlite nor CSV files of observations in it")
+
+
+def test_a_fault_of_the_program_at_one_rig_does_not_end_the_others(
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails_at_the_first(task: RigTask) -> dict[str, Any]:
+        if task.name == "rig0000":
+            raise ZeroDivisionError("of the program")
+        return {"name": task.name}
+
+    monkeypatch.setattr("daemon.fleet.run.assess", fails_at_the_first)
+    sources = find_rigs([directory / "rig0000", directory / "rig0001"], None, None)
+    first, second = assess_all(sources, SETTINGS, tmp_path, Here(), lambda *_: None)
+    assert (first["kind"], second) == ("ZeroDivisionError", {"name": "rig0001"})
+
+
 def test_wrong_places_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"neither a rigcal\.sqlite nor CSV files"):
         find_rigs([tmp_path], None, None)

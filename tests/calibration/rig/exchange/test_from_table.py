@@ -45,6 +45,13 @@ def test_a_rigs_table_is_the_same_rig_again(name: str) -> None:
     assert [joint.limits for joint in other.joints] == [joint.limits for joint in rig.joints]
 
 
+def test_an_import_tells_whose_limits_it_assumes() -> None:
+    draft = draft_of_table("joint,a_mm,lower,upper\nq1,100,-90,90\nq2,100,,\n", "x.csv")
+    assert draft.notes[-1] == (
+        "Assumed: the random errors of readings (sigma), the limits of q2, the build tolerances and the station."
+    )
+
+
 def test_a_row_may_be_driven_by_a_sum() -> None:
     rig = draft_of_table("joint,a_mm,theta_drive\nq1,100,\nq2,100,\n,100,-q1 + 0.5*q2\n", "x.csv").rig()
     assert rig.rows[2].drive == {"theta": {"q1": -1.0, "q2": 0.5}}
@@ -61,6 +68,8 @@ def test_a_row_may_be_driven_by_a_sum() -> None:
         ("joint,kind\nq1,screw\n", "neither revolute nor prismatic"),
         ("joint,theta_drive\nq1,q1 q2\n", "no sum such as"),
         ("a_mm\n1\n", "no row names a joint"),
+        ("joint;a_mm\nq1;1,5\n", "separate columns by commas"),
+        ("joint,lower,upper\nq1,-9,9\nq1,-9,8\n", r"upper: joint 'q1' has 9 on a line before.*\(line 3\)"),
         ("# convention: craig\njoint,a_mm\nq1,1\n", "'craig' is none of"),
     ],
 )

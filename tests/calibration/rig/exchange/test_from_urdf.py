@@ -125,12 +125,38 @@ JOINT = '<joint name="j" type="{}"><parent link="a"/><child link="b"/>{}</joint>
         ("<robot>" + LINKS + JOINT.format("revolute", '<mimic joint="j"/>') + "</robot>", "mimics itself"),
         ("<robot>" + LINKS + JOINT.format("floating", "") + "</robot>", "nothing moves"),
         ("<robot>" + LINKS + JOINT.format("revolute", '<limit lower="1" upper="0"/>') + "</robot>", "limits fall"),
+        ("<robot>" + LINKS + '<link name="b"/>' + JOINT.format("revolute", "") + "</robot>", "'b': two links"),
+        ("<robot>" + LINKS + 2 * JOINT.format("revolute", "") + "</robot>", "'j': two joints"),
+        ("<robot>" + '<link name="a"/>' * 20_001 + "</robot>", "20,002 elements"),
         ("<robot>" + '<link name="b"/>' + JOINT.format("revolute", "") + "</robot>", "no link 'a'"),
     ],
 )
 def test_what_is_no_machine_is_refused_with_its_place(text: str, reason: str) -> None:
     with pytest.raises(RigError, match=reason):
         draft_of_urdf(parse_urdf(text, "bad.urdf"), "bad.urdf").rig()
+
+
+MIXED = """<robot name="mixed" xmlns="http://of.some/schema">
+<link name="b"/><link name="l1"/><link name="l2"/><link name="l3"/><link name="l4"/>
+<joint name="swing" type="revolute"><parent link="b"/><child link="l1"/><origin xyz="0.1 0.2 0.5" rpy="0.3 0 0.2"/>
+  <axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>
+<joint name="rack" type="prismatic"><parent link="l1"/><child link="l2"/><origin xyz="0.1 0.2 0.5" rpy="0.3 0 0.2"/>
+  <axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="1" effort="1"/>
+  <mimic joint="swing" multiplier="0.3" offset="0.05"/></joint>
+<joint name="slide" type="prismatic"><parent link="l2"/><child link="l3"/><origin xyz="0.1 0 0" rpy="0.3 0 0.2"/>
+  <axis xyz="1 0 0"/><limit lower="-0.5" upper="0.5" velocity="1" effort="1"/></joint>
+<joint name="pinion" type="revolute"><parent link="l3"/><child link="l4"/><origin xyz="0.1 0.2 0.5" rpy="0.3 0 0.2"/>
+  <axis xyz="0 1 1"/><limit lower="-1" upper="1" velocity="1" effort="1"/>
+  <mimic joint="slide" multiplier="-2" offset="0.1"/></joint>
+<link name="tip"/><joint name="seat" type="fixed"><parent link="l4"/><child link="tip"/><origin xyz="0.3 0 0"/></joint>
+</robot>"""
+
+
+def test_a_slide_that_follows_a_turn_and_a_turn_that_follows_a_slide_move_as_far_as_in_the_document() -> None:
+    rig = draft_of_urdf(parse_urdf(MIXED, "mixed.urdf"), "mixed.urdf").rig()
+    poses = poses_of(rig)
+    wanted = Pinocchio(MIXED, rig.joints).places_mm(["tip"], poses)
+    np.testing.assert_allclose(prisms_mm(rig, poses), wanted, rtol=0.0, atol=EXACT_MM)
 
 
 def test_unknown_links_and_still_tips_are_refused() -> None:
@@ -149,6 +175,7 @@ def test_a_joint_without_limits_gets_some_and_the_file_says_so() -> None:
     draft = draft_of_urdf(parse_urdf(text, "turn.urdf"), "turn.urdf")
     assert draft.rig().joints[0].limits == (-180.0, 180.0)
     assert "limits assumed" in draft.text()
+    assert "the limits of j," in draft.notes[0]
 
 
 def test_a_document_that_yourdfpy_reads_too() -> None:

@@ -152,6 +152,27 @@ def test_a_faro_table_with_a_preamble_and_decimal_commas() -> None:
     assert fix.line == 4
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Punkt;Höhe [mm];Rechtswert [mm];Hochwert [mm]\nP1;300,5;1000,25;2000,5\n",
+        'name,x,y,z\nP1,"1000,25","2000,5","300,5"\n',
+        "// Collection::Group::Target X Y Z (mm)\nP1, 1000.25, 2000.5, 300.5\n",
+        "name x [mm] y [mm] z [mm]\nP1 1000.25 2000.5 300.5\n",
+    ],
+)
+def test_coordinates_are_found_however_they_are_named_and_separated(text: str) -> None:
+    (fix,) = fixes(text, "plain_csv")
+    assert (fix.point, fix.position_mm) == ("P1", (1000.25, 2000.5, 300.5))
+
+
+@pytest.mark.parametrize(("right", "unit"), [(90.0, "deg"), (100.0, "gon"), (math.pi / 2, "rad")])
+def test_the_unit_of_angles_follows_from_their_size_where_none_is_named(right: float, unit: str) -> None:
+    text = f"name,hz,v,slope distance\nP1,{3.99 * right},{right},12.5\nP2,{right},{right},12.5\n"
+    guess = export_formats()["plain_csv"].guess(text, "file")
+    assert (guess.map.angle_unit, guess.map.length_unit) == (unit, "m")
+
+
 @pytest.mark.parametrize("semicolons", [False, True])
 def test_vicon_trajectories(semicolons: bool) -> None:
     found = fixes(VICON.replace(",", ";") if semicolons else VICON, "vicon_csv")
@@ -184,6 +205,18 @@ def test_what_is_not_named_is_guessed_and_said() -> None:
         (VICON.replace("2,0,", "two,0,"), "survey.txt, line 7, column Frame: 'two' is not the number of a frame"),
         (VICON.replace("mm", "deg"), "units are deg"),
         ("some text\nand more\n", "no line names columns x, y, z"),
+        (
+            "nom,est,nord,haut\nP1,1.5,2.5,3.5\n",
+            "line 1: this is a header, and its names are not known (nom, est, nord",
+        ),
+        (
+            "name,x,y,z\nP1,1229,36,2472,01,120,82\n",
+            "line 2: 7 cells where 4 are due: commas separate columns and are dec",
+        ),
+        ("P1,1229,36,2472,01,120,82\n", "line 1: 7 cells where 4 are due"),
+        ("name;x;y;z\nP1;1.5;2.5;3.5;4.5\n", "line 2: 5 cells where the header has 4"),
+        ("name,x [mm],y [m],z [mm]\nP1,1229.5,2.5,3.5\n", "different units, 'x [mm]' in mm and 'y [m]' in m"),
+        ("name,x,y,z\nP1,1229.5,,3.5\n", "line 2, column y: the cell is empty"),
     ],
 )
 def test_bad_tables_are_refused_whole(text: str, said: str) -> None:
