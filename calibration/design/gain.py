@@ -21,7 +21,8 @@ from calibration.design.exchange import covariance_of
 from calibration.design.knowledge import Knowledge
 from calibration.design.poses import plan, whitened
 from calibration.design.visibility import Bodies, Site, in_view, placement, site
-from calibration.identification.refinement import refine
+from calibration.identification.refinement import Fit, refine
+from calibration.identification.samples import Samples
 from calibration.identification.solve import place
 from calibration.kinematics.chain import Chain, Placement
 from calibration.numerics.matrices import root_of
@@ -34,6 +35,8 @@ VOLUME = 400  # poses of the work volume; a larger sample changes the RMS by les
 _CANDIDATES = 3000
 _CHUNK = 10  # poses that are ordered for short motion among themselves: the most telling ones come first
 _SEED = 0
+_NEARER = 0.7  # a round must lower the errors to this share, or it is the last
+_MEDIAN_NORM = 1.54  # of a 3-D normal distribution of unit variance
 
 
 @dataclass(frozen=True)
@@ -103,7 +106,7 @@ def from_rows(rig: Rig, observations: Observations | None, setup: str, *, lackin
     with threadpool_limits(1, user_api="blas"):
         chain, samples, start = place(rig, rows)
         nominal = refine(chain, samples, start.x, free=np.isinf(chain.prior_sigma))
-        fit = refine(chain, samples, nominal.x)
+        fit = _fit_all_prisms(chain, samples, nominal.x)
     excess = fit.excess_variance + samples.repeat_variance
     fixes = len(rows) / max(1, len(_standstills(rows)))
     if setup in placed:
@@ -117,6 +120,27 @@ def from_rows(rig: Rig, observations: Observations | None, setup: str, *, lackin
     elsewhere = Knowledge(chain, fit.x, 0, root_of(fit.covariance), excess)
     here = elsewhere.at_new_setup(Chain(rig, {setup: placement(at)}))
     return Measured(here, at, is_placed=False, lacking=lacking, fixes=fixes)
+
+
+def _fit_all_prisms(chain: Chain, samples: Samples, x: Floats) -> Fit:
+    """Fit from the nominal model, no prism left out.
+
+    A prism that is measured next lies centimetres off in its first poses, beside many of another that fit within
+    millimetres: the refinement would take all of them for outliers, for good. The noise is first held at what the worst
+    prism leaves, and lowered as the model comes nearer to it.
+    """
+    noise_mm = math.inf
+    while (worst_mm := _worst_prism_mm(chain, samples, x)) < _NEARER * noise_mm:
+        noise_mm = worst_mm
+        x = refine(chain, samples, x, excess_variance=noise_mm**2).x
+    return refine(chain, samples, x)
+
+
+def _worst_prism_mm(chain: Chain, samples: Samples, x: Floats) -> float:
+    """Return the standard deviation an axis of the prism that fits worst, by the median of its errors."""
+    error_mm = np.linalg.norm(chain.positions_mm(x, samples.data) - samples.position_mm, axis=1)
+    prism = samples.data.prism
+    return max(float(np.median(error_mm[prism == one])) for one in np.unique(prism)) / _MEDIAN_NORM
 
 
 def _placed(observations: Observations) -> list[str]:

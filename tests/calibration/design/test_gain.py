@@ -15,12 +15,16 @@ RIG = shipped_rig("swdt82")
 TRUTH = RigTruth(RIG, 5)
 
 
-def rows(poses: Floats, setup: str = "S1") -> Observations:
+def csv_text(poses: Floats, setup: str, prism: str) -> str:
     held = dict(zip(RIG.joint_names, poses.T, strict=True))
     data = simulate_observations(
-        TRUTH, len(poses), 7, poses=held, prisms=["r"], repeats=3, setup=setup, session=f"s-{setup}"
+        TRUTH, len(poses), 7, poses=held, prisms=[prism], repeats=3, setup=setup, session=f"s-{setup}-{prism}"
     )
-    return parse_observations(data.csv_text().encode(), RIG, "simulated.csv")
+    return data.csv_text()
+
+
+def rows(poses: Floats, setup: str = "S1") -> Observations:
+    return parse_observations(csv_text(poses, setup, "r").encode(), RIG, "simulated.csv")
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +67,14 @@ def test_what_other_set_ups_told_of_the_machine_is_known_at_a_new_one(poses: Flo
     spread = [np.diag(m.knowledge.root @ m.knowledge.root.T)[:body].sum() for m in (fresh, known)]
     assert spread[1] < 0.8 * spread[0]
     assert not np.allclose(known.knowledge.x[:body], 0.0)
+
+
+def test_a_prism_far_off_is_learned_beside_one_that_fits_well() -> None:
+    volume = from_rows(RIG, None, "S1").volume
+    inner, outer = csv_text(volume[:90], "S1", "w"), csv_text(volume[100:108], "S1", "b")
+    text = inner + outer.partition("\n")[2]
+    both = from_rows(RIG, parse_observations(text.encode(), RIG, "simulated.csv"), "S1")
+    assert rms_mm(both.accuracy(), ("b",)) < 5.0
 
 
 def test_coverage_is_the_share_of_the_work_volume_inside_all_ranges() -> None:
