@@ -11,7 +11,9 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import csr_array
 
+from calibration.effects.columns import EffectColumns
 from calibration.effects.fitted import Choice
 from calibration.effects.regime import Regime, variables
 from calibration.gap.candidates import CandidateEffect, candidate_at, each_candidate, variants_at
@@ -207,18 +209,34 @@ class _Columns:
         self._without = SoftProjection(self._kinematics)
         self._removed_target = self._without.removed(self._target)
         self.candidates: list[CandidateEffect] = []
-        self._of: dict[int, list[tuple[int, int]]] = {}  # number of columns -> candidates with their options
+        self._of: dict[int, list[tuple[int, int, int]]] = {}  # number of columns -> candidate, option, block of each
+        self._by_reading: dict[int, csr_array] = {}
         own_sigma: dict[int, list[Floats]] = {}
         own_rows: dict[int, list[Floats]] = {}
         for number, candidate in enumerate(candidates):
-            for option, additions in enumerate(candidate.additions):
-                self._of.setdefault(len(additions), []).append((number, option))
+            block: dict[int, int] = {}
+            for option, first in enumerate(candidate.first_equal):
+                additions = candidate.additions[option]
+                blocks = own_rows.setdefault(len(additions), [])
+                if option == first:
+                    block[option] = len(blocks)
+                    blocks.append(self._whitened(projection, additions, rows))
+                self._of.setdefault(len(additions), []).append((number, option, block[first]))
                 own_sigma.setdefault(len(additions), []).append(_LIKELY * additions.prior_sigma)
-                moved = projection.whitened(projection.moved_mm(additions))
-                own_rows.setdefault(len(additions), []).append(moved[rows])
             self.candidates.append(replace(candidate, additions=()))
         self._sigma = {width: np.array(each) for width, each in own_sigma.items()}
         self._rows = {width: np.hstack(own_rows.pop(width)) for width in self._of}
+
+    def _whitened(self, projection: Projection, additions: EffectColumns, rows: Integers) -> Floats:
+        """Return some of the whitened rows (r,) of an effect; of one that acts through its joint alone, only these."""
+        joints = set(additions.joint.tolist())
+        if additions.shift_mm is not None or len(joints) != 1:
+            whole = projection.whitened(projection.moved_mm(additions))
+            return whole[rows]
+        joint = joints.pop()
+        if joint not in self._by_reading:
+            self._by_reading[joint] = projection.whitened_by_reading(joint)[rows]
+        return np.asarray(self._by_reading[joint] @ additions.column)
 
     def evidence(self, borders: int, slice_of: Integers) -> list[Floats]:
         """Return for each candidate (options, borders, 2) log evidence with the prior odds of its forms.
@@ -233,9 +251,10 @@ class _Columns:
         index = [rows_of(np.flatnonzero(slice_of == number)) for number in range(borders + 1)]
         found: list[list[Floats]] = [[] for _ in self.candidates]
         for width, options in self._of.items():
-            products = self._products(self._rows[width], width, index)
-            values = _log_bayes_factors(*products, self._sigma[width][:, None, None])
-            for (number, option), own in zip(options, values, strict=True):
+            block = [own for _, _, own in options]
+            products, along = self._products(self._rows[width], width, index)
+            values = _log_bayes_factors(products[block], along[block], self._sigma[width][:, None, None])
+            for (number, option, _), own in zip(options, values, strict=True):
                 found[number].append(own + self.candidates[number].log_odds[option])
         return [np.array(own) for own in found]
 
@@ -269,8 +288,13 @@ def _on_both_sides(slices: Sequence[Floats]) -> Floats:
 
 def _log_bayes_factors(gram: Floats, along: Floats, sigma: Floats) -> Floats:
     """Return (...) log Bayes factors, as `from_products`, of (..., k, k), (..., k) and (..., k)."""
-    factor = np.linalg.cholesky(gram * sigma[..., None] * sigma[..., None, :] + np.eye(gram.shape[-1]))
-    solved = np.linalg.solve(factor, (along * sigma)[..., None])[..., 0]
-    log_root = np.log(np.diagonal(factor, axis1=-2, axis2=-1)).sum(axis=-1)
-    out: Floats = 0.5 * (solved**2).sum(axis=-1) - log_root
+    count, right = gram.shape[-1], along * sigma
+    # The last row of the bordered matrix's factor solves the system; its corner only keeps it positive definite.
+    bordered = np.empty((*gram.shape[:-2], count + 1, count + 1))
+    bordered[..., :count, :count] = gram * sigma[..., None] * sigma[..., None, :] + np.eye(count)
+    bordered[..., count, :count] = bordered[..., :count, count] = right
+    bordered[..., count, count] = 1.0 + 2.0 * (right**2).sum(axis=-1)
+    factor = np.linalg.cholesky(bordered)
+    log_root = np.log(np.diagonal(factor, axis1=-2, axis2=-1)[..., :count]).sum(axis=-1)
+    out: Floats = 0.5 * (factor[..., count, :count] ** 2).sum(axis=-1) - log_root
     return out
