@@ -59,13 +59,16 @@ class EffectInRegime:
         return self.joint.choices[-1]
 
 
-def effect_in_regime(problem: Problem, joint: JointFit, families: Collection[str]) -> EffectInRegime | None:
+def effect_in_regime(
+    problem: Problem, joint: JointFit, families: Collection[str], like: Sequence[CandidateEffect] = ()
+) -> EffectInRegime | None:
     """Return the effect of greatest evidence in a part of the data, where that is beyond doubt.
 
     Args:
         problem: the data.
         joint: kinematics and effects that are there, with the weights that count; one of the same name gives way.
         families: of effects that may be there.
+        like: candidates about another fit, most of whose columns are the same.
 
     Returns:
         The effect; None where nothing is certain.
@@ -73,7 +76,7 @@ def effect_in_regime(problem: Problem, joint: JointFit, families: Collection[str
     fitted: dict[str, _Fitted] = {}
     about = problem.project(joint)
     for _ in range(_ROUNDS):
-        promising = [choice for choice, log_odds in _screened(about, families) if log_odds > _BETTER]
+        promising = [choice for choice, log_odds in _screened(about, families, like) if log_odds > _BETTER]
         for choice in promising[:_FITTED]:
             if str(choice) not in fitted:
                 fitted[str(choice)] = _fitted(problem, joint, choice)
@@ -156,12 +159,14 @@ def _best_part(problem: Problem, joint: JointFit) -> tuple[Regime, float]:
     return part, 1.0 / float(np.exp([least - total for total, _ in found]).sum())
 
 
-def _screened(projection: Projection, families: Collection[str]) -> list[tuple[Choice, float]]:
+def _screened(
+    projection: Projection, families: Collection[str], like: Sequence[CandidateEffect] = ()
+) -> list[tuple[Choice, float]]:
     """Return every candidate in its best part about a fit with its log odds, the most probable first.
 
     The odds are against nothing and averaged over forms, sides and borders.
     """
-    every = each_candidate(projection.situation, projection, families)
+    every = each_candidate(projection.situation, projection, families, like)
     values = {name: projection.samples.average(v[:, None])[:, 0] for name, v in variables(projection.situation).items()}
     log_prior = _REGIME - math.log(2.0 * max(len(values), 1))
     some = np.unique(np.linspace(0, len(projection.samples) - 1, _SCREENED).astype(np.intp))
