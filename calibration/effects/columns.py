@@ -181,8 +181,10 @@ def sharing(parts: Iterable[EffectColumns], known: Iterable[EffectColumns] = ())
         same = next((other for other in alike if same_columns(other, part)), None)
         if same is None:
             alike.append(part)
-        is_own = same is None or same.column is part.column
-        out.append(part if is_own else replace(part, column=same.column, shift_mm=same.shift_mm))
+            out.append(part)
+        else:
+            is_own = same.column is part.column
+            out.append(part if is_own else replace(part, column=same.column, shift_mm=same.shift_mm))
     return tuple(out)
 
 
