@@ -86,6 +86,7 @@ class Family(ABC):
             always computed; or nothing.
         column: the optional column that it needs, `{where}` in it for its place; empty for none.
         limit_sigma: relative uncertainty of the hard limits, where they follow from a load.
+        goes_by_readings: True if its columns depend on the readings alone, whatever the kinematics are.
         goes_by_travel: True if it grows with the path that its joint travels.
         comes_after: families that the same load causes and that are the larger ones as a rule: beside structure without
             a name it is looked for only when all of them that the data ask for are there.
@@ -102,6 +103,7 @@ class Family(ABC):
     goes_with: ClassVar[Literal["", "torque", "weights"]] = ""
     column: ClassVar[str] = ""
     limit_sigma: ClassVar[float] = 0.0
+    goes_by_readings: ClassVar[bool] = False
     goes_by_travel: ClassVar[bool] = False
     comes_after: ClassVar[tuple[str, ...]] = ()
     moves_machine: ClassVar[bool] = True

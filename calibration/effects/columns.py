@@ -113,6 +113,11 @@ class EffectColumns:
             out[:, :, self._shifting] += self.shift_mm[:, :, self._shifting]
 
     @cached_property
+    def sums(self) -> tuple[int, float, float]:
+        """Number of coefficients and sums of their columns, which tell different ones apart without comparing them."""
+        return len(self), float(self.column.sum()), 0.0 if self.shift_mm is None else float(self.shift_mm.sum())
+
+    @cached_property
     def _shifting(self) -> slice:
         """Coefficients from the first to the last one that moves a prism itself."""
         found = np.flatnonzero([] if self.shift_mm is None else self.shift_mm.any(axis=(0, 1)))
@@ -169,20 +174,18 @@ def sharing(parts: Iterable[EffectColumns], known: Iterable[EffectColumns] = ())
     """
     kept: dict[tuple[int, float, float], list[EffectColumns]] = {}
     for part in known:
-        kept.setdefault(_sums(part), []).append(part)
+        kept.setdefault(part.sums, []).append(part)
     out = []
     for part in parts:
-        alike = kept.setdefault(_sums(part), [])
+        alike = kept.setdefault(part.sums, [])
         same = next((other for other in alike if same_columns(other, part)), None)
         if same is None:
             alike.append(part)
-        out.append(part if same is None else replace(part, column=same.column, shift_mm=same.shift_mm))
+            out.append(part)
+        else:
+            is_own = same.column is part.column
+            out.append(part if is_own else replace(part, column=same.column, shift_mm=same.shift_mm))
     return tuple(out)
-
-
-def _sums(part: EffectColumns) -> tuple[int, float, float]:
-    """Return what tells columns of different sums apart without comparing them."""
-    return len(part), float(part.column.sum()), 0.0 if part.shift_mm is None else float(part.shift_mm.sum())
 
 
 @lru_cache

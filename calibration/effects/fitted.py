@@ -240,9 +240,10 @@ def _known(effect: FittedEffect, context: EffectContext) -> NDArray[np.bool_]:
 
 def _moves(family: Family, context: EffectContext, effect: Choice | FittedEffect) -> tuple[Floats, Floats | None]:
     """Return (n, k) columns at the joint; (n, 3, k) displacements of the prism, None for effects at a joint."""
-    acts = np.ones(len(context)) if effect.regime is None else effect.regime.holds(context).astype(np.float64)
+    acts = None if effect.regime is None else effect.regime.holds(context).astype(np.float64)
     if isinstance(family, JointFamily):
-        return family.columns(context, effect.where, effect.settings) * acts[:, None], None
+        column = family.columns(context, effect.where, effect.settings)
+        return column if acts is None else column * acts[:, None], None
     assert isinstance(family, PrismFamily)  # there are these two
-    shift = family.shift_mm(context, effect.where, effect.settings) * acts[:, None, None]
-    return np.zeros((len(context), shift.shape[2])), shift
+    shift = family.shift_mm(context, effect.where, effect.settings)
+    return np.zeros((len(context), shift.shape[2])), shift if acts is None else shift * acts[:, None, None]

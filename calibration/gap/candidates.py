@@ -48,9 +48,10 @@ class CandidateEffect:
     @cached_property
     def first_equal(self) -> tuple[int, ...]:
         """(o,) for each variant the first one with the same columns; the two differ in their prior alone."""
+        every = self.additions
         return tuple(
-            next((k for k in range(n) if same_columns(self.additions[k], own)), n)
-            for n, own in enumerate(self.additions)
+            next((k for k in range(n) if every[k].sums == own.sums and same_columns(every[k], own)), n)
+            for n, own in enumerate(every)
         )
 
 
@@ -84,23 +85,29 @@ def candidate_effects(
         like: candidates about another fit, most of whose columns are the same.
     """
     found, disabled = _possible(situation, families, without)
-    alike = {(c.family, c.where): c.additions for c in like}
+    alike = {(c.family, c.where): c for c in like}
     log_prior = _log_priors([name for name, _, _ in found], {name.partition("@")[0] for name in without})
     return CandidateEffects(
         tuple(
-            candidate_at(situation, over, name, where, choices, log_prior[name], alike.get((name, where), ()))
+            candidate_at(situation, over, name, where, choices, log_prior[name], alike.get((name, where)))
             for name, where, choices in found
         ),
         disabled,
     )
 
 
-def each_candidate(situation: EffectContext, over: Projection, families: Collection[str]) -> Iterator[CandidateEffect]:
-    """Yield the candidates of the given families, one at a time: all of them are gigabytes for thousands of fixes."""
+def each_candidate(
+    situation: EffectContext, over: Projection, families: Collection[str], like: Sequence[CandidateEffect] = ()
+) -> Iterator[CandidateEffect]:
+    """Yield the candidates of the given families, one at a time: all of them are gigabytes for thousands of fixes.
+
+    Arguments are those of `candidate_effects`.
+    """
     found, _ = _possible(situation, families, ())
+    alike = {(c.family, c.where): c for c in like}
     log_prior = _log_priors([name for name, _, _ in found], ())
     for name, where, choices in found:
-        yield candidate_at(situation, over, name, where, choices, log_prior[name])
+        yield candidate_at(situation, over, name, where, choices, log_prior[name], alike.get((name, where)))
 
 
 def _possible(
@@ -149,18 +156,25 @@ def candidate_at(
     where: str,
     choices: Sequence[Choice],
     log_prior: float = 0.0,
-    known: Sequence[EffectColumns] = (),
+    like: CandidateEffect | None = None,
 ) -> CandidateEffect:
-    """Return the candidate with the given variants; columns that are equal to `known` ones are these."""
+    """Return the candidate with the given variants; columns that are equal to those of one `like` it are these."""
     odds = np.array([library()[family].odds(choice.settings) for choice in choices])
     return CandidateEffect(
         family,
         where,
         tuple(choices),
-        sharing((choice.columns(situation).over(over.samples.average) for choice in choices), known),
+        sharing((_columns(choice, situation, over, like) for choice in choices), like.additions if like else ()),
         np.log(odds / odds.sum()),
         log_prior,
     )
+
+
+def _columns(choice: Choice, situation: EffectContext, over: Projection, like: CandidateEffect | None) -> EffectColumns:
+    """Return the columns of a variant: those of the same variant about another fit, where no fit changes them."""
+    if like is not None and choice in like.options and library()[choice.family].goes_by_readings:
+        return like.additions[like.options.index(choice)]
+    return choice.columns(situation).over(over.samples.average)
 
 
 def variants_at(situation: EffectContext, family: str, where: str) -> tuple[Choice, ...]:

@@ -16,6 +16,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.sparse import csr_array
 
 from calibration.effects.columns import EffectColumns, joined
 from calibration.effects.context import EffectContext
@@ -109,6 +110,29 @@ class Projection:
         """Return displacements (m, 3, k), mm in the station's frame, as (3 m, k) in units of the noise."""
         whitened: Floats = self._whiten(moved_mm)
         return whitened
+
+    def whitened_by_reading(self, joint: int) -> csr_array:
+        """Return (3 m, m) the whitened displacements by one unit of a joint's reading in each of the samples.
+
+        A sample's displacement is seen in the rows of its own standstill alone: its fixes share noise.
+
+        Args:
+            joint: its index in the chain.
+        """
+        standstill = np.unique(self.samples.standstill, return_inverse=True)[1]
+        order = np.argsort(standstill, kind="stable")
+        first = np.searchsorted(standstill[order], standstill)
+        place = np.empty_like(order)
+        place[order] = np.arange(len(order))
+        place -= first  # of each sample among those of its standstill
+        width = int(place.max()) + 1
+        at = self.joint_jacobian[:, :, joint, None] * (place[:, None, None] == np.arange(width))
+        sample = order[np.minimum(first[:, None] + np.arange(width), len(order) - 1)]
+        is_own = standstill[sample] == standstill[:, None]
+        column, shown = np.repeat(sample, 3, axis=0), np.repeat(is_own, 3, axis=0)
+        row = np.repeat(np.arange(len(column)), shown.sum(axis=1))
+        shape = (len(column), len(order))
+        return csr_array((self._whiten(at)[shown], (row, column[shown])), shape=shape)
 
     def columns(self, moved_mm: Floats) -> Floats:
         """Return displacements (m, 3, k) as (3 m, k) in the projected space of `residual`."""

@@ -7,17 +7,21 @@ the variable, so that all borders of it cost little more than one.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_array
 
+from calibration.effects.columns import EffectColumns
 from calibration.effects.fitted import Choice
 from calibration.effects.regime import Regime, variables
 from calibration.gap.candidates import CandidateEffect, candidate_at, each_candidate, variants_at
 from calibration.gap.joint_fit import JointFit, Problem
 from calibration.gap.projection import Integers, Projection, SoftProjection, rows_of
 from calibration.gap.screening import Screen
+from calibration.numerics.matrices import gram
 from calibration.observations import Floats
 
 _BORDERS = 6  # of a variable, at first
@@ -29,6 +33,8 @@ _ROUNDS = 2
 _PASSES = 3  # of a border and the fit that it depends on
 _OUTLIER = 6.0  # median errors: more is no worse
 _HALF = 0.5
+_AT_ONCE = 1_000_000  # values of products: more than the caches hold costs time, and gigabytes where there are many
+_WIDE = 50  # columns of curves, most of whose values are zero
 _REGIME = math.log(0.1)  # prior probability that an effect acts in a part only
 _LIKELY = 3.0  # factor on plausible sizes: only an effect that is large shows in a part
 _BETTER = math.log(999.0)  # log odds against nothing
@@ -53,13 +59,16 @@ class EffectInRegime:
         return self.joint.choices[-1]
 
 
-def effect_in_regime(problem: Problem, joint: JointFit, families: Collection[str]) -> EffectInRegime | None:
+def effect_in_regime(
+    problem: Problem, joint: JointFit, families: Collection[str], like: Sequence[CandidateEffect] = ()
+) -> EffectInRegime | None:
     """Return the effect of greatest evidence in a part of the data, where that is beyond doubt.
 
     Args:
         problem: the data.
         joint: kinematics and effects that are there, with the weights that count; one of the same name gives way.
         families: of effects that may be there.
+        like: candidates about another fit, most of whose columns are the same.
 
     Returns:
         The effect; None where nothing is certain.
@@ -67,7 +76,7 @@ def effect_in_regime(problem: Problem, joint: JointFit, families: Collection[str
     fitted: dict[str, _Fitted] = {}
     about = problem.project(joint)
     for _ in range(_ROUNDS):
-        promising = [choice for choice, log_odds in _screened(about, families) if log_odds > _BETTER]
+        promising = [choice for choice, log_odds in _screened(about, families, like) if log_odds > _BETTER]
         for choice in promising[:_FITTED]:
             if str(choice) not in fitted:
                 fitted[str(choice)] = _fitted(problem, joint, choice)
@@ -150,12 +159,14 @@ def _best_part(problem: Problem, joint: JointFit) -> tuple[Regime, float]:
     return part, 1.0 / float(np.exp([least - total for total, _ in found]).sum())
 
 
-def _screened(projection: Projection, families: Collection[str]) -> list[tuple[Choice, float]]:
+def _screened(
+    projection: Projection, families: Collection[str], like: Sequence[CandidateEffect] = ()
+) -> list[tuple[Choice, float]]:
     """Return every candidate in its best part about a fit with its log odds, the most probable first.
 
     The odds are against nothing and averaged over forms, sides and borders.
     """
-    every = each_candidate(projection.situation, projection, families)
+    every = each_candidate(projection.situation, projection, families, like)
     values = {name: projection.samples.average(v[:, None])[:, 0] for name, v in variables(projection.situation).items()}
     log_prior = _REGIME - math.log(2.0 * max(len(values), 1))
     some = np.unique(np.linspace(0, len(projection.samples) - 1, _SCREENED).astype(np.intp))
@@ -189,6 +200,14 @@ def borders(values: Floats, count: int) -> Floats:
     return found
 
 
+class _Use(NamedTuple):
+    """A candidate in a form that has a block of columns, and their prior sigmas (k,)."""
+
+    candidate: int
+    option: int
+    sigma: Floats
+
+
 class _Columns:
     """Whitened columns of candidates, and their evidence in parts of some samples of a projection.
 
@@ -207,18 +226,31 @@ class _Columns:
         self._without = SoftProjection(self._kinematics)
         self._removed_target = self._without.removed(self._target)
         self.candidates: list[CandidateEffect] = []
-        self._of: dict[int, list[tuple[int, int]]] = {}  # number of columns -> candidates with their options
-        own_sigma: dict[int, list[Floats]] = {}
+        self._of: dict[int, list[list[_Use]]] = {}  # number of columns -> forms that have each block
+        self._by_reading: dict[int, csr_array] = {}
         own_rows: dict[int, list[Floats]] = {}
         for number, candidate in enumerate(candidates):
-            for option, additions in enumerate(candidate.additions):
-                self._of.setdefault(len(additions), []).append((number, option))
-                own_sigma.setdefault(len(additions), []).append(_LIKELY * additions.prior_sigma)
-                moved = projection.whitened(projection.moved_mm(additions))
-                own_rows.setdefault(len(additions), []).append(moved[rows])
+            uses: dict[int, list[_Use]] = {}
+            for option, first in enumerate(candidate.first_equal):
+                additions = candidate.additions[option]
+                if option == first:
+                    uses[option] = []
+                    self._of.setdefault(len(additions), []).append(uses[option])
+                    own_rows.setdefault(len(additions), []).append(self._whitened(projection, additions, rows))
+                uses[first].append(_Use(number, option, _LIKELY * additions.prior_sigma))
             self.candidates.append(replace(candidate, additions=()))
-        self._sigma = {width: np.array(each) for width, each in own_sigma.items()}
         self._rows = {width: np.hstack(own_rows.pop(width)) for width in self._of}
+
+    def _whitened(self, projection: Projection, additions: EffectColumns, rows: Integers) -> Floats:
+        """Return some of the whitened rows (r,) of an effect; of one that acts through its joint alone, only these."""
+        joints = set(additions.joint.tolist())
+        if additions.shift_mm is not None or len(joints) != 1:
+            whole = projection.whitened(projection.moved_mm(additions))
+            return whole[rows]
+        joint = joints.pop()
+        if joint not in self._by_reading:
+            self._by_reading[joint] = projection.whitened_by_reading(joint)[rows]
+        return np.asarray(self._by_reading[joint] @ additions.column)
 
     def evidence(self, borders: int, slice_of: Integers) -> list[Floats]:
         """Return for each candidate (options, borders, 2) log evidence with the prior odds of its forms.
@@ -231,13 +263,15 @@ class _Columns:
             For the samples that are not above a border, and for those that are.
         """
         index = [rows_of(np.flatnonzero(slice_of == number)) for number in range(borders + 1)]
-        found: list[list[Floats]] = [[] for _ in self.candidates]
-        for width, options in self._of.items():
-            products = self._products(self._rows[width], width, index)
-            values = _log_bayes_factors(*products, self._sigma[width][:, None, None])
-            for (number, option), own in zip(options, values, strict=True):
-                found[number].append(own + self.candidates[number].log_odds[option])
-        return [np.array(own) for own in found]
+        found: list[dict[int, Floats]] = [{} for _ in self.candidates]
+        for width, uses in self._of.items():
+            step = max(_AT_ONCE // (2 * borders * width**2), 1)
+            for first in range(0, len(uses), step):
+                columns = self._rows[width][:, first * width : (first + step) * width]
+                products = self._products(columns, width, index)
+                for number, option, own in _each_use(uses[first : first + step], *products):
+                    found[number][option] = own + self.candidates[number].log_odds[option]
+        return [np.array([own[option] for option in range(len(own))]) for own in found]
 
     def _products(self, columns: Floats, width: int, index: Sequence[Integers]) -> tuple[Floats, Floats]:
         """Return products (o, b, 2, k, k) of blocks of projected columns, and with the target (o, b, 2, k).
@@ -253,12 +287,23 @@ class _Columns:
             with_kinematics.append(self._kinematics[rows].T @ own)
             with_target.append(self._target[rows] @ own)
             blocks = np.ascontiguousarray(own.reshape(len(own), -1, width).swapaxes(0, 1))
-            grams.append(blocks.swapaxes(1, 2) @ blocks)
+            is_wide = width >= _WIDE
+            grams.append(np.stack([gram(block) for block in blocks]) if is_wide else blocks.swapaxes(1, 2) @ blocks)
         removed = self._without.removed_by(_on_both_sides(with_kinematics))
         along = _on_both_sides(with_target) - np.einsum("...qk,q->...k", removed, self._removed_target)
         removed = np.moveaxis(removed.reshape(*removed.shape[:3], -1, width), 3, 0)
-        gram = np.moveaxis(_on_both_sides(grams), 2, 0) - removed.swapaxes(-1, -2) @ removed
-        return gram, np.moveaxis(along.reshape(*along.shape[:2], -1, width), 2, 0)
+        products = np.moveaxis(_on_both_sides(grams), 2, 0) - removed.swapaxes(-1, -2) @ removed
+        return products, np.moveaxis(along.reshape(*along.shape[:2], -1, width), 2, 0)
+
+
+def _each_use(uses: Sequence[Sequence[_Use]], products: Floats, along: Floats) -> Iterator[tuple[int, int, Floats]]:
+    """Yield candidate, option and log Bayes factors (b, 2) of all forms that have each of o blocks of columns."""
+    for turn in range(max(map(len, uses))):
+        block = [number for number, own in enumerate(uses) if len(own) > turn]
+        sigma = np.array([uses[number][turn].sigma for number in block])
+        values = _log_bayes_factors(products[block], along[block], sigma[:, None, None])
+        for number, own in zip(block, values, strict=True):
+            yield uses[number][turn].candidate, uses[number][turn].option, own
 
 
 def _on_both_sides(slices: Sequence[Floats]) -> Floats:
@@ -267,10 +312,15 @@ def _on_both_sides(slices: Sequence[Floats]) -> Floats:
     return np.stack([below[:-1], below[-1] - below[:-1]], axis=1)
 
 
-def _log_bayes_factors(gram: Floats, along: Floats, sigma: Floats) -> Floats:
+def _log_bayes_factors(products: Floats, along: Floats, sigma: Floats) -> Floats:
     """Return (...) log Bayes factors, as `from_products`, of (..., k, k), (..., k) and (..., k)."""
-    factor = np.linalg.cholesky(gram * sigma[..., None] * sigma[..., None, :] + np.eye(gram.shape[-1]))
-    solved = np.linalg.solve(factor, (along * sigma)[..., None])[..., 0]
-    log_root = np.log(np.diagonal(factor, axis1=-2, axis2=-1)).sum(axis=-1)
-    out: Floats = 0.5 * (solved**2).sum(axis=-1) - log_root
+    count, right = products.shape[-1], along * sigma
+    # The last row of the bordered matrix's factor solves the system; its corner only keeps it positive definite.
+    bordered = np.empty((*products.shape[:-2], count + 1, count + 1))
+    bordered[..., :count, :count] = products * sigma[..., None] * sigma[..., None, :] + np.eye(count)
+    bordered[..., count, :count] = bordered[..., :count, count] = right
+    bordered[..., count, count] = 1.0 + 2.0 * (right**2).sum(axis=-1)
+    factor = np.linalg.cholesky(bordered)
+    log_root = np.log(np.diagonal(factor, axis1=-2, axis2=-1)[..., :count]).sum(axis=-1)
+    out: Floats = 0.5 * (factor[..., count, :count] ** 2).sum(axis=-1) - log_root
     return out

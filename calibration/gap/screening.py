@@ -11,26 +11,25 @@ import itertools
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import chdtrc, logsumexp
 
 from calibration.effects.base import FittedCoefficient
-from calibration.effects.columns import EffectColumns, joined
+from calibration.effects.columns import EffectColumns
 from calibration.effects.context import EffectContext
 from calibration.effects.fitted import Choice, FittedEffect
 from calibration.effects.library import library
 from calibration.gap.candidates import CandidateEffect
+from calibration.gap.column_products import BlockProducts, ProjectedProducts
 from calibration.gap.projection import Projection, from_products
 from calibration.observations import Floats
 
 _PAIRED = 10
 _SECOND = math.log(0.05)  # prior probability that a second effect is there
-_AT_ONCE = 128  # columns
-_KEPT = 20_000_000  # values of variants' rows that are cached; all are gigabytes where there are thousands of fixes
 _SEEN = 1e-10  # least eigenvalue of products of columns, of their largest
+_ROUNDING = 1e-12
 _TINY = float(np.finfo(np.float64).tiny)
 _EQUAL = 5.0  # log Bayes factor; less is no difference
 SCALES = (1 / 3, 1.0, 3.0, 10.0)  # of plausible sizes, which are not known better than that
@@ -99,57 +98,6 @@ class ScoredEffect:
         return sum(name in listed for name in names) or len(names)
 
 
-class BlockProducts(Protocol):
-    """Products of blocks of candidates' columns in a projected space."""
-
-    def along(self, block: int) -> Floats:
-        """Return (k,) the products of a block's columns with the target."""
-
-    def product(self, a: int, b: int) -> Floats:
-        """Return (k, l) the products of the columns of two blocks."""
-
-
-class _ProjectedProducts:
-    """Products of columns with the kinematics of a projection projected out, each computed when it is asked for."""
-
-    def __init__(self, projection: Projection, blocks: Sequence[EffectColumns]) -> None:
-        self._projection, self._blocks = projection, blocks
-        target = projection.target
-        removed_target = projection.without_kinematics.removed(target)
-        self._kept = dict[int, Floats]()
-        self._removed: list[Floats] = []
-        self._along: list[Floats] = []
-        self._gram: dict[tuple[int, int], Floats] = {}
-        for together in _batches(blocks):
-            whitened = projection.whitened(projection.moved_mm(joined(together, len(projection.samples))))
-            removed = projection.without_kinematics.removed(whitened)
-            along = whitened.T @ target - removed.T @ removed_target
-            edges = np.cumsum([len(additions) for additions in together])[:-1]
-            self._along += np.split(along, edges)
-            both = zip(np.split(whitened, edges, axis=1), np.split(removed, edges, axis=1), strict=True)
-            for number, (rows, own) in enumerate(both, len(self._removed)):
-                self._gram[number, number] = rows.T @ rows - own.T @ own
-                self._removed.append(own)
-
-    def along(self, block: int) -> Floats:
-        return self._along[block]
-
-    def product(self, a: int, b: int) -> Floats:
-        if (a, b) not in self._gram:
-            product = self._whitened(a).T @ self._whitened(b) - self._removed[a].T @ self._removed[b]
-            self._gram[a, b], self._gram[b, a] = product, product.T
-        return self._gram[a, b]
-
-    def _whitened(self, block: int) -> Floats:
-        """Return (3 m, k) the whitened columns of a block."""
-        if block not in self._kept:
-            rows = self._projection.whitened(self._projection.moved_mm(self._blocks[block]))
-            while self._kept and sum(kept.size for kept in self._kept.values()) + rows.size > _KEPT:
-                del self._kept[next(iter(self._kept))]
-            self._kept[block] = rows
-        return self._kept[block]
-
-
 class Screen:
     """Products of the columns of all candidates in the projected space, so that any set of them is scored at once.
 
@@ -173,7 +121,8 @@ class Screen:
                 if first == option:
                     blocks.append(candidate.additions[option])
         self._blocks = blocks
-        self._products = _ProjectedProducts(projection, blocks) if products is None else products
+        self._eigen_of: dict[int, tuple[Floats, Floats, Floats, Floats]] = {}
+        self._products = ProjectedProducts(projection, blocks) if products is None else products
 
     def columns(self, candidate: int, option: int) -> Floats:
         """Return (3 m, k) the projected columns of a variant."""
@@ -329,8 +278,15 @@ class Screen:
         """Return eigenvalues (k,) and axes (k, k) of a variant's G'G in prior sigmas, and G'r along these axes."""
         block = self._block[number, option]
         sigma = self.candidates[number].additions[option].prior_sigma
+        if block in self._eigen_of:  # variants that differ in one factor on their sigmas have the same axes
+            of, size, axes, along = self._eigen_of[block]
+            factor = sigma[0] / of[0]
+            if np.allclose(sigma, factor * of, rtol=_ROUNDING, atol=0.0):
+                return size * factor**2, axes, along * factor
         size, axes = np.linalg.eigh(self._products.product(block, block) * sigma * sigma[:, None])
-        return np.maximum(size, 0.0), axes, axes.T @ (self._products.along(block) * sigma)
+        size, along = np.maximum(size, 0.0), axes.T @ (self._products.along(block) * sigma)
+        self._eigen_of[block] = sigma, size, axes, along
+        return size, axes, along
 
 
 class Beside:
@@ -375,18 +331,6 @@ def _explained(size: Floats, along: Floats) -> tuple[float, int]:
     """Return the squares that columns explain and their rank, from the eigenvalues (k,) of G'G and G'r along these."""
     seen = size > _SEEN * max(float(size[-1]), _TINY)
     return float((along[seen] ** 2 / size[seen]).sum()), int(seen.sum())
-
-
-def _batches(blocks: Sequence[EffectColumns]) -> Iterator[Sequence[EffectColumns]]:
-    """Yield the blocks in batches of some columns, wider ones alone: one pass over the rows serves a batch."""
-    first, width = 0, 0
-    for number, additions in enumerate(blocks):
-        if width and width + len(additions) > _AT_ONCE:
-            yield blocks[first:number]
-            first, width = number, 0
-        width += len(additions)
-    if width:
-        yield blocks[first:]
 
 
 def by_family(scored: Iterable[ScoredEffect]) -> dict[str, float]:

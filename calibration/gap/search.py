@@ -256,18 +256,21 @@ def _in_regimes(problem: Problem, families: Collection[str], found: SearchResult
         found: with effects that act in all rows.
         least_cost: of the fits that led to it, also of those with effects that it was not sure of.
     """
-    alone = problem.with_mild_outliers(problem.kinematics_only())
+    alone, like = problem.with_mild_outliers(problem.kinematics_only()), found.candidates.candidates
     if len(found.joint.choices) <= 1 and _leaves_noise(problem, found):
-        one = effect_in_regime(problem, alone, [choice.family for choice in found.joint.choices])
+        one = effect_in_regime(problem, alone, [choice.family for choice in found.joint.choices], like)
         if one is None or found.joint.fit.cost - one.joint.fit.cost < _REGIME:
             return found
     starts = [alone, *([found.joint] if found.joint.choices else [])]
     if (alone.fit.weight < OUTLIER).mean() >= _MANY:
         starts.append(replace(alone, fit=replace(alone.fit, weight=np.ones_like(alone.fit.weight))))
-    least_cost = min(least_cost, _cost_with_formulas(problem, found))
+    with_formulas: float | None = None
     for start in starts:
-        one = effect_in_regime(problem, start, families)
+        one = effect_in_regime(problem, start, families, like)
         if one is None or least_cost - one.joint.fit.cost < _REGIME:
+            continue
+        with_formulas = _cost_with_formulas(problem, found) if with_formulas is None else with_formulas
+        if with_formulas - one.joint.fit.cost < _REGIME:
             continue
         if start is found.joint and detect(Grammar(problem.project(one.joint)), problem.rng()).significant:
             continue  # all others are there already

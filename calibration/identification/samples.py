@@ -155,7 +155,7 @@ def _averages(of_row: Integers, values: Floats) -> Floats:
     order = np.argsort(of_row, kind="stable")
     first = np.flatnonzero(np.diff(of_row[order], prepend=-1))
     if len(first) == len(order):
-        return values[order]
+        return np.ascontiguousarray(values) if (np.diff(order) > 0).all() else values[order]
     count = np.diff(first, append=len(order)).reshape(-1, *([1] * (values.ndim - 1)))
     averages: Floats = np.add.reduceat(values[order], first, axis=0) / count
     return averages

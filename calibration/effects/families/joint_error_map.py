@@ -41,6 +41,7 @@ class JointErrorMap(JointFamily):
     equation = "d_theta = sum of c_i B_i(theta), B_i even cubic B-splines, theta as read"
     source = "P-splines (Eilers and Marx 1996) with independent weights (Higdon 2002)"
     kind = "revolute"
+    goes_by_readings = True
     confused_with = ("encoder_harmonic", "angle_scale", "joint_compliance")
     revealed_by = "poses that fill the joint's range densely, several in each wave of the curve"
 

@@ -17,7 +17,7 @@ from calibration.gap.background.judgement import curves, judged, judgements
 from calibration.gap.background.reading_noise import with_reading_noise
 from calibration.gap.background.search import MAP, ODDS, is_curve, linear_system, search_beside
 from calibration.gap.background.system import Model, System
-from calibration.gap.candidates import candidate_effects
+from calibration.gap.candidates import candidate_at, variants_at
 from calibration.gap.joint_fit import JointFit, Problem
 from calibration.gap.projection import Integers, Projection, rows_of
 from calibration.gap.result import Evidence
@@ -141,11 +141,10 @@ def _refined(problem: Problem, joint: JointFit) -> JointFit:
 def _with_map(problem: Problem, joint: JointFit, where: str) -> JointFit:
     """Return a fit with the map of one more joint, in its best variant."""
     projection = problem.project(joint)
-    candidates = candidate_effects(projection.situation, projection, [MAP]).candidates
-    own = [c for c in candidates if c.where == where]
-    if not own:
+    forms = variants_at(projection.situation, MAP, where)
+    if not forms:
         return joint
-    scored = Screen(projection, own).score()[0]
+    scored = Screen(projection, [candidate_at(projection.situation, projection, MAP, where, forms)]).score()[0]
     if scored.log_bayes_factor <= 0.0:
         return joint
     return problem.fit([*joint.choices, scored.choice], projection.solved(scored.scaled_additions))

@@ -27,6 +27,7 @@ Effect = tuple[CandidateEffect, int, float]
 
 _ITERATIONS, _FEW = 60, 10
 _START, _AGAIN = -1.0, -3.0  # log scale of a block at the beginning, and of one that had vanished
+_AT_ONCE = 3000  # rows
 _GONE = -5.0  # log scale of a block that has vanished
 _SEEN = 1e-10  # least eigenvalue of products of columns, of their largest
 
@@ -107,14 +108,14 @@ class System:
         """Return the same system of some of the whitened rows (r,) alone: their products, and no columns."""
         out = copy(self)
         out.columns = self.columns[:0]
-        columns, target = self.columns[rows], self.projection.target[rows]
-        out.products = Products(
-            columns.T @ columns,
-            columns.T @ target,
-            float(target @ target),
-            len(rows),
-            self.products.least_noise,
-        )
+        gram, along = np.zeros_like(self.products.gram), np.zeros_like(self.products.along)
+        target = self.projection.target
+        for first in range(0, len(rows), _AT_ONCE):  # a copy of half the rows of all columns would be 100 MB
+            some = rows[first : first + _AT_ONCE]
+            columns = self.columns[some]
+            gram += columns.T @ columns
+            along += columns.T @ target[some]
+        out.products = Products(gram, along, float(target[rows] @ target[rows]), len(rows), self.products.least_noise)
         return out
 
     def chosen(self, effects: Sequence[Effect]) -> list[Chosen]:
