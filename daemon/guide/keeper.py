@@ -226,9 +226,9 @@ class GuideKeeper:
 
     def now(self) -> dict[str, Any] | None:
         """Return the open guide with its step, for `status`; None while none is open."""
-        guide = self._state()["guide"]
-        if guide is None or guide["state"] != "open":
+        if not self._record.is_open:
             return None
+        guide = self._state()["guide"]
         return {key: guide[key] for key in ("id", "prisms", "step")}
 
     def _state(self) -> dict[str, Any]:
