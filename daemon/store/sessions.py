@@ -11,6 +11,7 @@ from typing import Any
 from daemon.host.time_service import ClockState
 from daemon.store.connection import Connection
 from daemon.store.errors import NotInStoreError
+from daemon.store.places import since
 from daemon.store.rows import RowSource
 from daemon.store.views import in_session
 from drivers.clock import NS_PER_S, Stamp
@@ -69,8 +70,9 @@ _BETWEEN = """SELECT 1 FROM observations AS o JOIN control_shots AS c ON c.sessi
     WHERE o.session_id = ? AND o.excluded IS NULL
         AND (o.boot_id, o.monotonic_ns) > (c.boot_id, c.monotonic_ns) LIMIT 1"""
 # A boot's number rises from boot to boot, and monotonic_ns within one; utc_ns may step.
-_JUMPS = """SELECT id, device, utc_ns, monotonic_ns, boot_id FROM device_events
-    WHERE kind = 'preset_jump' AND (boot_id, monotonic_ns) >= (?, ?) AND id > ? ORDER BY boot_id, monotonic_ns, id"""
+_JUMPS = f"""SELECT row.id, device, utc_ns, monotonic_ns, boot_id FROM boots CROSS JOIN device_events AS row
+    WHERE kind = 'preset_jump' AND {since("row.", ("?1", "?2"))} AND row.id > ?3
+    ORDER BY boots.id, monotonic_ns, row.id"""
 _EXCLUDE = "UPDATE observations SET excluded = ? WHERE session_id = ? AND boot_id = ? AND monotonic_ns = ?"
 _OBSERVATIONS = """SELECT session_id, setup_id, prism, pose, utc_ns, monotonic_ns, boot_id, x_mm, y_mm, z_mm,
         sigma_x_mm, sigma_y_mm, sigma_z_mm, dwell_s, values_json
@@ -78,9 +80,9 @@ _OBSERVATIONS = """SELECT session_id, setup_id, prism, pose, utc_ns, monotonic_n
 # Fixes of a moving boom; those of poses leave them out, for that reason alone.
 _MOVING = _OBSERVATIONS.replace("excluded IS NULL", "moving AND coalesce(excluded, 'moving') = 'moving'")
 # All that a station gave in a session from the last fix that calibration may use, or from the session's start.
-_FIXES = """SELECT fixes.* FROM fixes,
-        (SELECT started_boot_id, started_monotonic_ns FROM calibration_sessions WHERE id = ?1)
-    WHERE station = ?2 AND (boot_id, monotonic_ns) >= (started_boot_id, started_monotonic_ns)
+_FIXES = f"""SELECT fixes.* FROM calibration_sessions AS session CROSS JOIN boots CROSS JOIN fixes
+    WHERE session.id = ?1 AND station = ?2
+        AND {since("fixes.", ("session.started_boot_id", "session.started_monotonic_ns"))}
         AND fixes.id >= coalesce((SELECT max(fix_id) FROM observations JOIN fixes AS used ON used.id = fix_id
             WHERE session_id = ?1 AND excluded IS NULL AND used.station = ?2), 0)
     ORDER BY fixes.id"""
