@@ -1,8 +1,9 @@
-"""Conditions on places, (boot, monotonic time), that an index serves whole.
+"""Conditions on places, (boot, monotonic time), that an index serves whole where a place is of another table's row.
 
-Of `(boot_id, monotonic_ns) >= (?, ?)` SQLite searches an index by the first column alone, and reads the whole boot.
-So queries go boot by boot, in the order of time: `FROM boots CROSS JOIN table AS row WHERE` these conditions. The plus
-keeps the planner from searching the rows by a range of boots instead.
+SQLite searches an index by both columns for `(boot_id, monotonic_ns) >= (?, ?)`, but by the first alone, and reads the
+whole boot, where columns of another table stand on the right. So such queries go boot by boot, in the order of time:
+`FROM ... CROSS JOIN boots CROSS JOIN table AS row WHERE` these conditions. The plus keeps the planner from searching
+the rows by a range of boots instead.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ def since(row: str, place: Sql) -> str:
 
     Args:
         row: its alias with what its columns begin with, `chunk.last_`.
-        place: parameters or columns.
+        place: columns of a table that stands before, or parameters.
     """
     boot, at_ns = place
     return (

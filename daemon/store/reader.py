@@ -15,15 +15,14 @@ from daemon.store.captures import decode_captures
 from daemon.store.errors import StoreError
 from daemon.store.files import FileIdentity
 from daemon.store.migrations import pending_migrations
-from daemon.store.places import since
 from daemon.store.rows import sql_value, stamp_of, stored_text
 from drivers.clock import Stamp
 from drivers.readings import Capture
 
 # By the index alone, then chunk by chunk in their order: neither all chunks are read, nor any sorted. One statement, so
 # that chunks which are packed meanwhile are read as they were.
-CHUNKS = f"""SELECT id, chunk FROM raw_chunks WHERE id IN (SELECT row.id FROM boots CROSS JOIN raw_chunks AS row
-        WHERE {since("row.last_", ("?1", "?2"))} AND (first_boot_id, first_monotonic_ns) <= (?3, ?4)
+CHUNKS = """SELECT id, chunk FROM raw_chunks WHERE id IN (SELECT id FROM raw_chunks
+        WHERE (last_boot_id, last_monotonic_ns) >= (?1, ?2) AND (first_boot_id, first_monotonic_ns) <= (?3, ?4)
             AND (?5 IS NULL OR link_id = (SELECT id FROM links WHERE name = ?5)))
     ORDER BY id"""
 _SAMPLE = "channels.name AS channel, unit, utc_ns, value, status, raw_counts"

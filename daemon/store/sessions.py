@@ -70,9 +70,8 @@ _BETWEEN = """SELECT 1 FROM observations AS o JOIN control_shots AS c ON c.sessi
     WHERE o.session_id = ? AND o.excluded IS NULL
         AND (o.boot_id, o.monotonic_ns) > (c.boot_id, c.monotonic_ns) LIMIT 1"""
 # A boot's number rises from boot to boot, and monotonic_ns within one; utc_ns may step.
-_JUMPS = f"""SELECT row.id, device, utc_ns, monotonic_ns, boot_id FROM boots CROSS JOIN device_events AS row
-    WHERE kind = 'preset_jump' AND {since("row.", ("?1", "?2"))} AND row.id > ?3
-    ORDER BY boots.id, monotonic_ns, row.id"""
+_JUMPS = """SELECT id, device, utc_ns, monotonic_ns, boot_id FROM device_events
+    WHERE kind = 'preset_jump' AND (boot_id, monotonic_ns) >= (?, ?) AND id > ? ORDER BY boot_id, monotonic_ns, id"""
 _EXCLUDE = "UPDATE observations SET excluded = ? WHERE session_id = ? AND boot_id = ? AND monotonic_ns = ?"
 _OBSERVATIONS = """SELECT session_id, setup_id, prism, pose, utc_ns, monotonic_ns, boot_id, x_mm, y_mm, z_mm,
         sigma_x_mm, sigma_y_mm, sigma_z_mm, dwell_s, values_json

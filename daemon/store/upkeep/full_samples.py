@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 
-from daemon.store.places import since
 from daemon.store.reader import Reader
 from daemon.store.store import Store
 from drivers.clock import Stamp
@@ -19,10 +18,9 @@ _SESSION = "SELECT * FROM calibration_sessions WHERE id = ?"
 _STRETCHES = """SELECT first_boot_id AS boot_id, min(first_monotonic_ns) AS first_ns, max(last_monotonic_ns) AS last_ns,
         min(first_utc_ns) AS first_utc_ns, max(last_utc_ns) AS last_utc_ns
     FROM raw_chunks WHERE last_utc_ns >= ? AND first_utc_ns <= ? GROUP BY first_boot_id ORDER BY first_boot_id"""
-_BETWEEN = f"""SELECT first_boot_id AS boot_id, min(first_monotonic_ns) AS first_ns, max(last_monotonic_ns) AS last_ns,
+_BETWEEN = """SELECT first_boot_id AS boot_id, min(first_monotonic_ns) AS first_ns, max(last_monotonic_ns) AS last_ns,
         min(first_utc_ns) AS first_utc_ns, max(last_utc_ns) AS last_utc_ns
-    FROM boots CROSS JOIN raw_chunks AS row
-    WHERE {since("row.last_", ("?1", "?2"))} AND (first_boot_id, first_monotonic_ns) <= (?3, ?4)
+    FROM raw_chunks WHERE (last_boot_id, last_monotonic_ns) >= (?, ?) AND (first_boot_id, first_monotonic_ns) <= (?, ?)
     GROUP BY first_boot_id ORDER BY first_boot_id"""
 
 Stretch = tuple[Stamp, Stamp]

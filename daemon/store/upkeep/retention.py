@@ -10,7 +10,6 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from daemon.store.places import LEAST_NS, MOST_NS, between
 from daemon.store.rows import RowSource
 from daemon.store.sessions import AFTER_NS, BEFORE_NS
 from daemon.store.store import Store
@@ -18,8 +17,8 @@ from drivers.clock import NS_PER_S
 
 Place = tuple[int, int]  # row of a boot, and ns of its monotonic clock: in this order everything was measured
 
-FIRST: Place = (0, LEAST_NS)
-LAST: Place = (2**63 - 1, MOST_NS)
+FIRST: Place = (0, -(2**63))
+LAST: Place = (2**63 - 1, 2**63 - 1)
 NEWEST_KEPT_NS = 3600 * NS_PER_S  # a session that begins now needs the last minute, and people look at the last hour
 TRUE_SINCE_NS = 1_735_689_600 * NS_PER_S  # 2025: a clock that shows an earlier time is not set
 STEP_CHUNKS = 20
@@ -30,22 +29,19 @@ _DAY_NS = 86_400 * NS_PER_S
 
 _WINDOWS = """SELECT started_boot_id, started_monotonic_ns, ended_boot_id, ended_monotonic_ns FROM calibration_sessions
     ORDER BY started_boot_id, started_monotonic_ns"""
-_BEGIN = ("?1", "?2")
 # In the order of their ends, which the index has. One that waits to be decoded stays.
-_CHUNKS = f"""SELECT chunk.id, first_boot_id, first_monotonic_ns, last_boot_id, last_monotonic_ns, last_utc_ns
-    FROM boots CROSS JOIN raw_chunks AS chunk
-    WHERE {between("chunk.last_", _BEGIN, ("?3", "?4 - 1"))} AND (first_boot_id, first_monotonic_ns) >= (?1, ?2)
-        AND chunk.id NOT IN (SELECT chunk_id FROM undecoded_chunks)
-    ORDER BY boots.id, last_monotonic_ns LIMIT ?5"""
+_CHUNKS = """SELECT id, first_boot_id, first_monotonic_ns, last_boot_id, last_monotonic_ns, last_utc_ns FROM raw_chunks
+    WHERE (last_boot_id, last_monotonic_ns) >= (?1, ?2) AND (last_boot_id, last_monotonic_ns) < (?3, ?4)
+        AND (first_boot_id, first_monotonic_ns) >= (?1, ?2)
+        AND id NOT IN (SELECT chunk_id FROM undecoded_chunks)
+    ORDER BY last_boot_id, last_monotonic_ns LIMIT ?5"""
 _NEWEST = """SELECT last_boot_id, last_monotonic_ns FROM raw_chunks
     ORDER BY last_boot_id DESC, last_monotonic_ns DESC LIMIT 1"""
-_BETWEEN = between("row.", _BEGIN, ("?3", "?4"))
-_ROWS = (
-    f"""DELETE FROM {{0}} WHERE id IN (SELECT row.id FROM boots CROSS JOIN {{0}} AS row WHERE {_BETWEEN} LIMIT ?5)"""
-)
-_FIXES = f"""DELETE FROM fixes WHERE id IN (SELECT row.id FROM boots CROSS JOIN fixes AS row
-    WHERE station = ?6 AND {_BETWEEN}
-        AND NOT EXISTS (SELECT 1 FROM observations WHERE fix_id = row.id) LIMIT ?5)"""
+_ROWS = """DELETE FROM {0} WHERE id IN (SELECT id FROM {0}
+    WHERE (boot_id, monotonic_ns) >= (?1, ?2) AND (boot_id, monotonic_ns) <= (?3, ?4) LIMIT ?5)"""
+_FIXES = """DELETE FROM fixes WHERE id IN (SELECT id FROM fixes
+    WHERE station = ?6 AND (boot_id, monotonic_ns) >= (?1, ?2) AND (boot_id, monotonic_ns) <= (?3, ?4)
+        AND NOT EXISTS (SELECT 1 FROM observations WHERE fix_id = fixes.id) LIMIT ?5)"""
 _STATIONS = """WITH RECURSIVE known(name) AS (SELECT min(station) FROM fixes
         UNION ALL SELECT (SELECT min(station) FROM fixes WHERE station > name) FROM known WHERE name IS NOT NULL)
     SELECT name FROM known WHERE name IS NOT NULL"""

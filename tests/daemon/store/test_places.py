@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from daemon.store import Store, sessions
+from daemon.store import Store, reader, sessions
 from daemon.store.places import LEAST_NS, MOST_NS, between, since
 from daemon.store.upkeep import full_samples, retention
 from drivers.clock import Stamp
@@ -51,16 +51,23 @@ def test_rows_between_places_are_those_of_the_comparison(
     assert store.rows(asked, (*first, *last)) == store.rows(plain, (*first, *last))
 
 
+_END = "(last_boot_id,last_monotonic_ns)"
+_AT = "(boot_id,monotonic_ns)"
+
+
 @pytest.mark.parametrize(
     ("sql", "parameters", "searched"),
     [
-        (retention._CHUNKS, 5, "raw_chunks_by_end (last_boot_id=? AND last_monotonic_ns>? AND last_monotonic_ns<?)"),
-        (retention._ROWS.format("joint_samples"), 5, "joint_samples_by_instant (boot_id=? AND monotonic_ns>? AND"),
-        (retention._ROWS.format("signals"), 5, "signals_by_instant (boot_id=? AND monotonic_ns>? AND monotonic_ns<?)"),
-        (retention._FIXES, 6, "fixes_by_instant (station=? AND boot_id=? AND monotonic_ns>? AND monotonic_ns<?)"),
-        (full_samples._BETWEEN, 4, "raw_chunks_by_end (last_boot_id=? AND last_monotonic_ns>?)"),
+        (retention._CHUNKS, 5, f"raw_chunks_by_end ({_END}>(?,?) AND {_END}<(?,?))"),
+        (retention._ROWS.format("joint_samples"), 5, f"joint_samples_by_instant ({_AT}>(?,?) AND {_AT}<(?,?))"),
+        (retention._ROWS.format("signals"), 5, f"signals_by_instant ({_AT}>(?,?) AND {_AT}<(?,?))"),
+        (retention._FIXES, 6, f"fixes_by_instant (station=? AND {_AT}>(?,?) AND {_AT}<(?,?))"),
+        (reader.CHUNKS, 5, f"raw_chunks_by_end ({_END}>(?,?))"),
+        (full_samples._BETWEEN, 4, f"raw_chunks_by_end ({_END}>(?,?))"),
+        (sessions._JUMPS, 3, f"device_events_of_jumps ({_AT}>(?,?))"),
         (sessions._FIXES, 2, "fixes_by_instant (station=? AND boot_id=? AND monotonic_ns>?)"),
-        (sessions._JUMPS, 3, "device_events_of_jumps (boot_id=? AND monotonic_ns>?)"),
+        (sessions._FIXES_MEASURED, 1, "fixes_by_instant (station=? AND boot_id=? AND monotonic_ns>? AND"),
+        (sessions._JOINTS_MEASURED, 1, "joint_samples_by_instant (boot_id=? AND monotonic_ns>? AND monotonic_ns<?)"),
     ],
 )
 def test_an_index_is_searched_by_boot_and_instant(store: Store, sql: str, parameters: int, searched: str) -> None:

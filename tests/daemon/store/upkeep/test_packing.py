@@ -120,8 +120,7 @@ def test_captures_of_a_time_are_found_by_an_index_and_no_other_chunk_is_read(pat
     fill(store, 3)
     with contextlib.closing(sqlite3.connect(path)) as db:
         plan = str(db.execute(f"EXPLAIN QUERY PLAN {CHUNKS}", (1, 5, 1, 9, "boom")).fetchall())
-    by_end = "USING COVERING INDEX raw_chunks_by_end (last_boot_id=? AND last_monotonic_ns>?)"
-    assert f"SEARCH row {by_end}" in plan
+    assert "SEARCH raw_chunks USING COVERING INDEX raw_chunks_by_end" in plan
     assert "SEARCH raw_chunks USING INTEGER PRIMARY KEY" in plan
     assert "SCAN raw_chunks" not in plan
     assert "TEMP B-TREE" not in plan
