@@ -43,11 +43,11 @@ sdist: environment ## its sdist, which gives the same wheel
 deb: environment ## Debian packages of the last commit, for Debian 12 and 13, in dist/
 	@$(BIN)/python -m deploy.release deb
 
-# Refused before anything is built, where the last commit may not be a release. `make docs` leaves its pages in site/.
+# Refused before anything is built, where the last commit may not be a release. `make docs` leaves its pages in build/site.
 release: environment ## a release of the last commit: wheel, sdist, packages, bills of materials, docs, SHA256SUMS, in dist/
 	@$(BIN)/python -m deploy.release check
 	@SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) $(MAKE) --no-print-directory docs
-	@$(BIN)/python -m deploy.release release --docs site
+	@$(BIN)/python -m deploy.release release --docs build/site
 
 debtest: environment ## the packages in fresh Debian 12 and 13 roots without a network; root, ten minutes
 	@$(BIN)/python -m tests.deploy.packages
@@ -121,6 +121,6 @@ check-deps: environment ## known vulnerabilities of the locked packages, where a
 	@$(BIN)/python -m tests.dependencies
 
 clean: ## remove everything that make has made
-	rm -rf .venv .cache build dist site rigcal-demo rigcal-sim fuzz-faults htmlcov .coverage* *.egg-info
+	rm -rf .venv .cache build dist rigcal-demo rigcal-sim fuzz-faults htmlcov .coverage* *.egg-info
 	rm -rf .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -13,7 +13,15 @@ from tests.passed import ROOT, Passed
 MARK = "pytest.mark.long"
 PASSED = Passed(
     "long.passed",
-    ("calibration", "simulators", "daemon/cli", "daemon/report", "daemon/warm_up.py", "requirements-dev.lock"),
+    (
+        "calibration",
+        "simulators",
+        "daemon/cli",
+        "daemon/report",
+        "daemon/warm_up.py",
+        "requirements-dev.lock",
+        "pyproject.toml",
+    ),
     lambda path: path.name.startswith("test_") and MARK in path.read_text("utf-8"),
 )
 
