@@ -126,6 +126,6 @@ check-deps: environment ## known vulnerabilities of the locked packages, where a
 	@$(BIN)/python -m tests.dependencies
 
 clean: ## remove everything that make has made
-	rm -rf .venv .cache build dist site rigcal-demo rigcal-sim fuzz-faults htmlcov .coverage* *.egg-info
+	rm -rf .venv .cache build dist rigcal-demo rigcal-sim fuzz-faults htmlcov .coverage* *.egg-info
 	rm -rf .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 from sqlite_utils import Database
 
+from daemon.store.places import between
+
 _CHANNELS = "SELECT name, unit, kind FROM channels ORDER BY kind, id"
 _DEG_PER_RAD = 57.29577951308232
 
@@ -66,14 +68,11 @@ def iso(column: str) -> str:
 def in_session(table: str) -> str:
     """SQL of FROM and WHERE: the rows of `table`, as `row`, from a session's start to its end.
 
-    Boot by boot, because SQLite searches an index by the first column alone where two are compared at once. The
-    session's name is the parameter `:session`.
+    The session's name is the parameter `:session`.
     """
-    return f"""FROM calibration_sessions AS session CROSS JOIN boots AS boot CROSS JOIN {table} AS row
-WHERE session.id = :session AND boot.id BETWEEN session.started_boot_id AND session.ended_boot_id
-    AND row.boot_id = boot.id
-    AND row.monotonic_ns >= iif(boot.id = session.started_boot_id, session.started_monotonic_ns, {-(2**63)})
-    AND row.monotonic_ns <= iif(boot.id = session.ended_boot_id, session.ended_monotonic_ns, {2**63 - 1})"""
+    first, last = ((f"session.{end}_boot_id", f"session.{end}_monotonic_ns") for end in ("started", "ended"))
+    return f"""FROM calibration_sessions AS session CROSS JOIN boots CROSS JOIN {table} AS row
+WHERE session.id = :session AND {between("row.", first, last)}"""
 
 
 def channels_of(db: Database) -> list[Channel]:

@@ -81,7 +81,7 @@ def test_the_public_face_is_that_of_the_wheel(home: Home) -> None:
 @pytest.fixture(scope="module")
 def demo(home: Home) -> Iterator[dict[str, Any]]:
     """The demonstration's result; its daemon runs again, with its store and models."""
-    result = home.rigcal("demo", "--out", "demo", "--rate", "50")
+    result = home.rigcal("demo", "--out", "demo")
     with (home.directory / "daemon.log").open("w") as log:
         daemon = subprocess.Popen(
             [home.bin / "rigcal", "run", "--config", "demo/rigcal.toml"],

@@ -76,10 +76,10 @@ GROUP BY pose, prism ORDER BY min(id)""",
             "joints_of_session",
             "Joints in a session, second by second",
             "Mean reading of each joint in each second of a session that has ended.",
-            f"""WITH means AS (SELECT boot.id AS boot_id, row.monotonic_ns / 1000000000 AS second, row.channel_id,
+            f"""WITH means AS (SELECT boots.id AS boot_id, row.monotonic_ns / 1000000000 AS second, row.channel_id,
         min(row.utc_ns) AS utc_ns, avg(row.value) AS value
     {in_session("joint_samples")}
-    GROUP BY boot.id, second, row.channel_id)
+    GROUP BY boots.id, second, row.channel_id)
 SELECT {iso("min(utc_ns)")} AS time{_joint_values(joints)}
 FROM means JOIN channels ON channels.id = channel_id GROUP BY boot_id, second ORDER BY boot_id, second""",
             ("session",),

@@ -11,6 +11,7 @@ from typing import Any
 from daemon.host.time_service import ClockState
 from daemon.store.connection import Connection
 from daemon.store.errors import NotInStoreError
+from daemon.store.places import since
 from daemon.store.rows import RowSource
 from daemon.store.views import in_session
 from drivers.clock import NS_PER_S, Stamp
@@ -78,9 +79,9 @@ _OBSERVATIONS = """SELECT session_id, setup_id, prism, pose, utc_ns, monotonic_n
 # Fixes of a moving boom; those of poses leave them out, for that reason alone.
 _MOVING = _OBSERVATIONS.replace("excluded IS NULL", "moving AND coalesce(excluded, 'moving') = 'moving'")
 # All that a station gave in a session from the last fix that calibration may use, or from the session's start.
-_FIXES = """SELECT fixes.* FROM fixes,
-        (SELECT started_boot_id, started_monotonic_ns FROM calibration_sessions WHERE id = ?1)
-    WHERE station = ?2 AND (boot_id, monotonic_ns) >= (started_boot_id, started_monotonic_ns)
+_FIXES = f"""SELECT fixes.* FROM calibration_sessions AS session CROSS JOIN boots CROSS JOIN fixes
+    WHERE session.id = ?1 AND station = ?2
+        AND {since("fixes.", ("session.started_boot_id", "session.started_monotonic_ns"))}
         AND fixes.id >= coalesce((SELECT max(fix_id) FROM observations JOIN fixes AS used ON used.id = fix_id
             WHERE session_id = ?1 AND excluded IS NULL AND used.station = ?2), 0)
     ORDER BY fixes.id"""

@@ -166,6 +166,7 @@ def test_deleting_reads_by_indexes(store: Store) -> None:
         assert "SEARCH" in plan or "USING COVERING INDEX" in plan
         assert "SCAN observations" not in plan
         assert not any(f"SCAN {name}'" in plan for name in ("raw_chunks", "joint_samples", "signals", "fixes")), plan
+        assert "TEMP B-TREE" not in plan
 
 
 # ---- as the daemon does it -------------------------------------------------------------------------------------------
