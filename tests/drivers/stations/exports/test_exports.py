@@ -124,6 +124,7 @@ def test_sdr_polar_measurements() -> None:
 def test_bad_sdr_files_are_refused() -> None:
     good = sdr("08TP", "1", 1.0, 2.0, 3.0)
     assert "line 4: 'x.0' is not a number, in column 2" in refused(SDR_HEAD + good + sdr("08TP", "2", "x.0", 2.0, 3.0))
+    assert "line 3: 'nan' is not a number, in column 3" in refused(SDR_HEAD + sdr("08TP", "1", 1.0, "nan", 3.0))
     assert "columns of another width" in refused(SDR_HEAD.replace("SDR33", "SDR20") + good)
     moved = sdr("02TP", "3", 0.0, 0.0, 0.0, 1.5) + good + sdr("02TP", "4", 9.0, 0.0, 0.0, 1.5)
     assert "line 5: a second place of the station" in refused(SDR_HEAD + moved)
