@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -222,6 +223,21 @@ def test_what_is_not_named_is_guessed_and_said() -> None:
 )
 def test_bad_tables_are_refused_whole(text: str, said: str) -> None:
     assert said in refused(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "change", "said"),
+    [
+        (LEICA, {"header_line": 99}, "the map's header is in line 99, the file has 4"),
+        (VICON, {"header_line": 99}, "the map's header is in line 99, the file has 11"),
+        (LEICA, {"columns": {"point": 1, "x": 0, "y": 3, "z": 4}}, "column 0: columns of the map are counted from 1"),
+    ],
+)
+def test_a_map_of_another_file_is_refused(text: str, change: dict[str, object], said: str) -> None:
+    known = format_of(text, "file")
+    columns = known.guess(text, "file").map
+    with pytest.raises(DescriptionError, match=re.escape(said)):
+        known.read(text, columns.model_copy(update=change), "file")
 
 
 def test_an_empty_file_is_of_no_format() -> None:
