@@ -30,7 +30,7 @@ def parse_toml(text: str) -> dict[str, Any]:
         if len(line) > 2 * _PARTS_MAX and len(_PART.findall(line)) > _PARTS_MAX:
             raise ValueError(f"line {number}: more than {_PARTS_MAX} points; what is meant by it?")
     try:
-        document = tomllib.loads(text)
+        document = tomllib.loads(text.removeprefix("\ufeff"))  # a mark that editors on Windows set
     except RecursionError as error:
         raise ValueError("nested too deeply") from error
     _check_integers(document)

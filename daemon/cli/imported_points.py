@@ -53,7 +53,7 @@ def read_map(path: Path) -> ColumnMap:
         DescriptionError: it cannot be read, or a key of it is wrong.
     """
     try:
-        found = ColumnMap.model_validate(tomllib.loads(read_whole(path, 1 << 20).decode()))
+        found = ColumnMap.model_validate(tomllib.loads(read_whole(path, 1 << 20).decode("utf-8-sig")))
     except OSError as error:
         raise DescriptionError(str(path), f"cannot be read: {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

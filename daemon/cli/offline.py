@@ -26,14 +26,20 @@ FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 DIRECTORY = click.Path(path_type=Path)
 
 
-class FiniteRange(click.FloatRange):
-    """A range of numbers; "nan" is none, though it is neither below nor above anything."""
-
+class _Finite:
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        number = super().convert(value, param, ctx)
+        number = super().convert(value, param, ctx)  # type: ignore[misc]  # of the click type beside
         if not math.isfinite(number):
-            self.fail(f"{value!r} is not a finite number.", param, ctx)
+            self.fail(f"{value!r} is not a finite number.", param, ctx)  # type: ignore[attr-defined]
         return number
+
+
+class FiniteNumber(_Finite, click.types.FloatParamType):
+    """A number; "nan" and "inf" are none."""
+
+
+class FiniteRange(_Finite, click.FloatRange):
+    """A range of numbers; "nan" is in none, though it is neither below nor above anything."""
 
 
 ABOVE_0 = FiniteRange(min=0, min_open=True)

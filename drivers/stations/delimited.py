@@ -76,6 +76,17 @@ def lines_of(text: str) -> list[str]:
     return text.lstrip("\ufeff").replace("\r\n", "\n").replace("\r", "\n").split("\n")
 
 
+def line_at(lines: list[str], number: int, source: str) -> str:
+    """Return the line of a number from 1, which a map names.
+
+    Raises:
+        DescriptionError: the file is shorter.
+    """
+    if number > len(lines):
+        refuse(source, f"the map's header is in line {number}, the file has {len(lines)}; is the map of another file?")
+    return lines[number - 1]
+
+
 def cells_of(line: str, separator: str) -> list[str]:
     """Return the cells of a line."""
     if separator == " ":
@@ -287,7 +298,8 @@ def read_table(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
         DescriptionError: a column is missing, or a cell is no number; with file, line, column and reason.
     """
     lines = lines_of(text)
-    header = cells_of(lines[columns.header_line - 1], columns.separator) if columns.header_line else []
+    at = columns.header_line
+    header = cells_of(line_at(lines, at, source), columns.separator) if at else []
     places = {role: _place(column, header, columns.header_line, source) for role, column in columns.columns.items()}
     is_polar = {"hz", "zenith", "distance"} <= places.keys()
     if not is_polar and not {"x", "y", "z"} <= places.keys():
@@ -332,6 +344,8 @@ def read_table(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
 
 def _place(column: str | int, header: list[str], header_line: int, source: str) -> int:
     if isinstance(column, int):
+        if column < 1:
+            refuse(source, "columns of the map are counted from 1", None, column)
         return column - 1
     if header.count(column) != 1:
         problem = "is not in the header" if column not in header else "is in the header twice; give its number"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from daemon.cli.command import Command, json_option, progress_display
-from daemon.cli.offline import FiniteRange, rig_option, seed_option
+from daemon.cli.offline import FiniteNumber, rig_option, seed_option
 from daemon.cli.terminal import echo, echo_list, echo_table
 from daemon.host.safe_output import write_file
 from daemon.report.words import number
@@ -53,7 +53,7 @@ _LIST_SEPARATOR = " "
 @click.option(
     "--floor",
     "floor_mm",
-    type=FiniteRange(),
+    type=FiniteNumber(),
     metavar="MM",
     help="Height of the floor over the base's origin; by default 15 % of the reach below it.",
 )

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from daemon.cli.command import Command, json_option
-from daemon.cli.offline import ABOVE_0, FILE, rig_option, seed_option
+from daemon.cli.offline import FILE, FiniteRange, rig_option, seed_option
 from daemon.cli.terminal import echo
 from daemon.host.safe_output import write_file
 from daemon.report.words import number
@@ -35,7 +35,7 @@ _MOST_POSES = 100_000
 @click.option(
     "--noise",
     "noise_mm",
-    type=ABOVE_0,
+    type=FiniteRange(min=0.0, min_open=True),
     metavar="MM",
     help="Standard deviation of each coordinate of a fix, also stated in the data; the rig file's station by default.",
 )

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import re
 
+from drivers.stations.delimited import number_of
 from drivers.stations.export_format import (
     MM_PER,
     RAD_PER,
@@ -97,10 +98,10 @@ def _name(cells: list[str], place: int) -> str:
 
 def _number(cells: list[str], place: int, code: str, line: int, source: str) -> float:
     text = _name(cells, place)
-    try:
-        return float(text)
-    except ValueError:
+    value = number_of(text, ".")
+    if value is None:
         refuse(source, f"{text!r} is not a number, in column {place + 1} of a record {code}", line)
+    return value
 
 
 FORMAT = ExportFormat(

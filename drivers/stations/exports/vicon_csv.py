@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import re
 
-from drivers.stations.delimited import cells_of, decimal_of, lines_of, number_of
+from drivers.stations.delimited import cells_of, decimal_of, line_at, lines_of, number_of
 from drivers.stations.export_format import MM_PER, ColumnMap, ExportedFix, ExportFormat, Guess, refuse
 
 _KINDS = {"trajectories", "objects", "devices", "joints", "segments", "model outputs"}
@@ -63,7 +63,7 @@ def _read(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
     if columns.rate_hz is None or columns.header_line < 2:
         refuse(source, "the map of trajectories needs rate_hz and header_line")
     lines = lines_of(text)
-    header = cells_of(lines[columns.header_line - 1], columns.separator)
+    header = cells_of(line_at(lines, columns.header_line, source), columns.separator)
     names = cells_of(lines[columns.header_line - 2], columns.separator)
     axes = "".join(cell.upper() if cell.upper() in ("X", "Y", "Z") else "-" for cell in header)
     starts = [found.start() for found in re.finditer("XYZ", axes)]

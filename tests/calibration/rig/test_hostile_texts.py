@@ -44,6 +44,11 @@ def test_a_rig_file_that_no_parser_ends_with_is_refused(text: str, reason: str) 
     assert len(str(caught.value)) < 1100
 
 
+def test_the_byte_order_mark_of_an_editor_is_no_part_of_a_rig_file() -> None:
+    text = shipped_rig("ur10").text
+    assert parse_rig("\ufeff" + text.replace("\n", "\r\n"), "mine.toml").rows == parse_rig(text, "ur10").rows
+
+
 def test_points_in_comments_and_numbers_are_no_parts_of_keys() -> None:
     text = rig_text("ur10")
     parse_rig(f"# {'.' * 300}\n# {'. ' * 300}\n{text}", "rig.toml")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +125,7 @@ def test_sdr_polar_measurements() -> None:
 def test_bad_sdr_files_are_refused() -> None:
     good = sdr("08TP", "1", 1.0, 2.0, 3.0)
     assert "line 4: 'x.0' is not a number, in column 2" in refused(SDR_HEAD + good + sdr("08TP", "2", "x.0", 2.0, 3.0))
+    assert "line 3: 'nan' is not a number, in column 3" in refused(SDR_HEAD + sdr("08TP", "1", 1.0, "nan", 3.0))
     assert "columns of another width" in refused(SDR_HEAD.replace("SDR33", "SDR20") + good)
     moved = sdr("02TP", "3", 0.0, 0.0, 0.0, 1.5) + good + sdr("02TP", "4", 9.0, 0.0, 0.0, 1.5)
     assert "line 5: a second place of the station" in refused(SDR_HEAD + moved)
@@ -221,6 +223,21 @@ def test_what_is_not_named_is_guessed_and_said() -> None:
 )
 def test_bad_tables_are_refused_whole(text: str, said: str) -> None:
     assert said in refused(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "change", "said"),
+    [
+        (LEICA, {"header_line": 99}, "the map's header is in line 99, the file has 4"),
+        (VICON, {"header_line": 99}, "the map's header is in line 99, the file has 11"),
+        (LEICA, {"columns": {"point": 1, "x": 0, "y": 3, "z": 4}}, "column 0: columns of the map are counted from 1"),
+    ],
+)
+def test_a_map_of_another_file_is_refused(text: str, change: dict[str, object], said: str) -> None:
+    known = format_of(text, "file")
+    columns = known.guess(text, "file").map
+    with pytest.raises(DescriptionError, match=re.escape(said)):
+        known.read(text, columns.model_copy(update=change), "file")
 
 
 def test_an_empty_file_is_of_no_format() -> None:
