@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from calibration.effects.columns import EffectColumns, same_columns, sharing
+from calibration.effects.columns import EffectColumns, same_columns, sharing, without_zeros
 from calibration.effects.context import EffectContext
 from calibration.effects.fitted import Choice
 from calibration.effects.library import library
@@ -174,7 +174,7 @@ def _columns(choice: Choice, situation: EffectContext, over: Projection, like: C
     """Return the columns of a variant: those of the same variant about another fit, where no fit changes them."""
     if like is not None and choice in like.options and library()[choice.family].goes_by_readings:
         return like.additions[like.options.index(choice)]
-    return choice.columns(situation).over(over.samples.average)
+    return without_zeros(choice.columns(situation).over(over.samples.average))
 
 
 def variants_at(situation: EffectContext, family: str, where: str) -> tuple[Choice, ...]:

@@ -15,13 +15,12 @@ from typing import Protocol
 import numpy as np
 from scipy.sparse import csr_array
 
-from calibration.effects.columns import EffectColumns, joined
+from calibration.effects.columns import EffectColumns, RareColumns, joined
 from calibration.gap.projection import Projection
 from calibration.observations import Floats
 
-_AT_ONCE = 128  # columns
+_AT_ONCE = 64  # columns
 _KEPT = 20_000_000  # values of variants' rows that are cached; all are gigabytes where there are thousands of fixes
-_RARE = 0.25  # share of values that are not zero, at most, in columns that are multiplied without their zeros
 
 
 class BlockProducts(Protocol):
@@ -60,7 +59,7 @@ class ProjectedProducts:
     def __init__(self, projection: Projection, blocks: Sequence[EffectColumns]) -> None:
         self._projection, self._blocks = projection, blocks
         self._removed_target = projection.without_kinematics.removed(projection.target)
-        self._rare = [_without_zeros(block) for block in blocks]
+        self._rare = [block.stored if isinstance(block, RareColumns) else None for block in blocks]
         self._at_joint: dict[int, _AtJoint] = {}
         self._kept = dict[int, Floats]()
         self._removed: dict[int, Floats] = {}
@@ -132,14 +131,6 @@ class ProjectedProducts:
                 del self._kept[next(iter(self._kept))]
             self._kept[block] = rows
         return self._kept[block]
-
-
-def _without_zeros(block: EffectColumns) -> csr_array | None:
-    """Return the columns (m, k) of a block without their zeros, where these are most and one joint moves."""
-    few = _RARE * block.column.size
-    if block.shift_mm is not None or len(set(block.joint.tolist())) != 1 or np.count_nonzero(block.column) > few:
-        return None
-    return csr_array(block.column)
 
 
 def _batches(blocks: Sequence[EffectColumns], numbers: Sequence[int]) -> Iterator[Sequence[int]]:
