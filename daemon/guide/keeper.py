@@ -32,9 +32,10 @@ from daemon.guide.job import Job, Pose
 from daemon.guide.meter_link import Place
 from daemon.guide.position import PositionWatch, is_there
 from daemon.guide.record import GuideRecord, is_on_prism
-from daemon.guide.request import request_of, whole_argument
+from daemon.guide.request import misfit, request_of, whole_argument
 from daemon.guide.view import Around, headline, state_of
 from daemon.sessions.manager import SessionKeeper
+from daemon.sessions.open_session import CONTROL_POINT_RADIUS_MM
 from daemon.sessions.station_setups import SetupBook
 from daemon.store.queries.guides import Standstill
 from daemon.store.queries.sessions import SessionTable
@@ -52,6 +53,7 @@ MORE_POSES = 5
 _CANCEL_S = 5.0
 _STANDS_S = 20.0  # of a simulated boom at a pose that it was sent to
 _SENT_AGAIN_S = 120.0
+_MOVED = "the station has moved, its control points no longer fit: the next guide needs a new set-up"
 
 
 class GuideKeeper:
@@ -119,6 +121,11 @@ class GuideKeeper:
         """Note where boom and station are; costs nothing while no guide is open."""
         if self._record.is_open:
             self._watch.on_records(records)
+
+    def open_step(self) -> str | None:
+        """Return the step of the open guide in a few words; None without one."""
+        opened = self._record.opened()
+        return None if opened is None else headline(opened[1])
 
     def guarding(self, name: str, handler: Handler) -> Handler:
         """Return a command that is refused while a guide is open, which holds its sessions itself."""
@@ -222,6 +229,8 @@ class GuideKeeper:
             step, run = job.step, job.run
             if step is None or step.kind != "poses" or not job.is_enough:
                 raise CommandError(f"more poses are for when there are enough; now: {headline(job)}", REFUSED)
+            if self._is_choosing:
+                raise CommandError("more poses are being chosen already", REFUSED)
             self._record.tapped()
             left = len(run.upcoming(count))
             if left < count:
@@ -238,13 +247,17 @@ class GuideKeeper:
         with self._record.turn:
             self._record.needs_step({})
             self._record.tapped()
-            opened = self._sessions.open_session()
-            if opened is not None and opened["poses"]:
-                self._sessions.stop_command({})
-            elif opened is not None:
-                self._sessions.abort_command({})
-            self._happen("stopped", {"reason": reason})
+            self._abandon(reason)
             return self._state()
+
+    def _abandon(self, reason: str) -> None:
+        """Close the open session if it has poses, else abort it, and end the guide."""
+        opened = self._sessions.open_session()
+        if opened is not None and opened["poses"]:
+            self._sessions.stop_command({})
+        elif opened is not None:
+            self._sessions.abort_command({})
+        self._happen("stopped", {"reason": reason})
 
     def _measured_here(self) -> None:
         """Take the standstill at which the boom is for the pose, wherever that is."""
@@ -314,6 +327,9 @@ class GuideKeeper:
             if not self._advisor.is_alive:
                 self._start_advisor()
             run, step, step_id = job.run, job.step, job.step_id
+            if unfit := misfit(job, self._rig):
+                self._abandon(unfit)
+                return
             if run.session and run.poses is None and not self._is_choosing:
                 self._choose(run.most)
             point_mm = self._point_mm(step.point or self._next_point(job))
@@ -377,6 +393,9 @@ class GuideKeeper:
         job, row = self._record.job, self._record.row
         if job is None or row is None:
             return
+        if self._setups.has_moved(row.setup_id):  # no session can be held there any more
+            self._abandon(_MOVED)
+            return
         last, opened = self._record.table.newest_observation(), self._sessions.open_session()
         if opened is None or opened["prism"] != job.run.prism:  # else it was opened just before the daemon ended
             arguments = {
@@ -399,8 +418,10 @@ class GuideKeeper:
         self._happen("closed", {"session": job.run.session})
 
     def _shoot(self, point: str, step_id: str) -> None:
-        shot = self._sessions.shoot_command({"point": point})
+        shot = self._sessions.shoot_command({"point": point}, most_off_mm=CONTROL_POINT_RADIUS_MM)
         self._happen("shot", {"point": point, "misclosure_mm": shot["misclosure_mm"]}, only_at=step_id)
+        if shot["moved"] and shot["phase"] == "start":  # nothing that is measured from here on could be used
+            self._abandon(_MOVED)
 
     def _give_up_work(self) -> None:
         """End a shot that is being measured."""
@@ -521,6 +542,9 @@ class GuideKeeper:
         # Fixes that were captured and are not decoded yet must not count where the station was on no prism.
         for since, until in self._record.times_away():
             self._sessions.look_away(since, until)
+        guide = self._record.opened()
+        if guide is not None and not guide[1].run.session:  # one that the last run had just opened, if any
+            self._sessions.look_away(guide[0].started)
         if self._record.is_open:
             self._start_advisor()
 
