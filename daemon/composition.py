@@ -6,6 +6,7 @@ One function for each way to run: live, simulated, replayed. Nothing else in `da
 from __future__ import annotations
 
 import contextlib
+import re
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +20,7 @@ from daemon.acquisition.channels import decoder_factories, node_setups
 from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_inputs
 from daemon.acquisition.simulated_channels import with_simulated_channels
 from daemon.acquisition.simulated_rig import SimulatedRig, SimulationError
-from daemon.commands import CommandError
+from daemon.commands import REFUSED, CommandError
 from daemon.config import CanSection, Config, ConfigError
 from daemon.rig_files import RigSource
 from daemon.sessions.prisms.guard import MotionLimit
@@ -40,6 +41,8 @@ from simulators.replay import ReplayLink
 SIMULATED_SYNC_MS = 200
 
 Mode = Literal["live", "simulated", "replayed"]
+_SIMULATED_BOOT = "simulated-"
+_KERNEL_BOOT = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")  # random(4)
 
 
 def _never() -> bool:
@@ -93,6 +96,31 @@ def live(
     return _parts("live", config, source, clock or SystemClock(), aim=aim)
 
 
+def require_apart(boots: Sequence[str], store: Path, *, is_simulated: bool) -> None:
+    """Refuse to put a machine's records and those of a simulated one into one store: models would be made of both.
+
+    Args:
+        boots: those that the store knows.
+        store: its path.
+        is_simulated: whether a simulated rig is to be run on it.
+
+    Raises:
+        CommandError: it holds records of the other kind.
+    """
+    if is_simulated and any(_KERNEL_BOOT.fullmatch(boot) for boot in boots):
+        raise CommandError(
+            f"{store} holds records of a real machine, which a simulated one must not be mixed with: give --config a "
+            "file with another state_directory, or none",
+            REFUSED,
+        )
+    if not is_simulated and any(boot.startswith(_SIMULATED_BOOT) for boot in boots):
+        raise CommandError(
+            f"{store} holds records of a simulated rig, which a real machine's must not be mixed with: move "
+            f"{store.parent} away, or set another state_directory",
+            REFUSED,
+        )
+
+
 @contextlib.contextmanager
 def simulated(
     config: Config,
@@ -119,7 +147,7 @@ def simulated(
     """
     source, config = _with_devices(source, config)
     now = SystemClock().now()
-    clock = ScaledClock(rate, Stamp(now.utc_ns, now.monotonic_ns, f"simulated-{uuid.uuid4()}"))
+    clock = ScaledClock(rate, Stamp(now.utc_ns, now.monotonic_ns, f"{_SIMULATED_BOOT}{uuid.uuid4()}"))
     ports = config.state_directory / "ports"
     ports.mkdir(parents=True, exist_ok=True)
     if len(config.can) > 1 or len(config.station) > 1:

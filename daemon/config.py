@@ -79,10 +79,10 @@ class SessionsSection(_Section):
         control_tolerance_mm: a control point that is further off than this says that the set-up moved.
     """
 
-    settle_s: float = Field(default=1.0, ge=0)
-    fixes_per_shot: int = Field(default=5, ge=1)
-    shot_timeout_s: float = Field(default=60.0, gt=0)
-    control_tolerance_mm: float = Field(default=5.0, gt=0)
+    settle_s: float = Field(default=1.0, ge=0, le=3600)
+    fixes_per_shot: int = Field(default=5, ge=1, le=1000)
+    shot_timeout_s: float = Field(default=60.0, gt=0, le=3600)
+    control_tolerance_mm: float = Field(default=5.0, gt=0, le=1000)
 
 
 class JobsSection(_Section):
@@ -96,9 +96,9 @@ class JobsSection(_Section):
     """
 
     enabled: bool = True
-    time_limit_s: float = Field(default=1800.0, gt=0)
+    time_limit_s: float = Field(default=1800.0, gt=0, le=7 * 86_400)
     max_attempts: int = Field(default=3, ge=1)
-    seed: int = 0
+    seed: int = Field(default=0, ge=0)
 
 
 class StoreSection(_Section):
@@ -113,8 +113,8 @@ class StoreSection(_Section):
         backups: how many are kept.
     """
 
-    keep_days: float | None = Field(default=None, ge=1)
-    free_gb: float = Field(default=5.0, gt=0)
+    keep_days: float | None = Field(default=None, ge=1, le=36_500)
+    free_gb: float = Field(default=5.0, gt=0, le=1e6)
     backup_directory: Path | None = None
     backups: int = Field(default=3, ge=1)
 
@@ -201,9 +201,17 @@ class NotifySection(_Section):
     @field_validator("webhook_url")
     @classmethod
     def _is_http(cls, url: str | None) -> str | None:
-        parts = urlsplit(url or "http://none")
-        if parts.scheme not in ("http", "https") or not parts.hostname or not (url or "").isascii():
-            raise ValueError("give the address of a web server: https://HOST/PATH")
+        # What an error says of an address that no client takes would hold its secret.
+        try:
+            parts = urlsplit(url or "http://none")
+            is_good = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+        except ValueError:
+            is_good = False
+        is_plain = all("!" <= letter <= "~" for letter in url or "")
+        if not is_good or not is_plain or parts.username is not None:
+            raise ValueError(
+                "give the address of a web server, without user, blanks or others than ASCII: https://HOST/PATH"
+            )
         return url
 
     @field_validator("command")
@@ -388,6 +396,8 @@ def _sentence(error: Any) -> str:
         return f"{key}: unknown key; allowed here: {allowed}"
     if error["type"] == "missing":
         return f"{key}: missing; it is required"
+    if error["loc"][-1:] == ("webhook_url",):  # it may hold a secret
+        return f"{key}: {message}"
     if isinstance(error["input"], dict):  # a whole table: the message names what is wrong in it
         return f"{key}: {message}"
     return f"{key}: {message}, found {reprlib.repr(error['input'])}"

@@ -44,6 +44,7 @@ class Course:
         watch: boom and station.
         advisor: what is still to gain.
         standstill: the newest one of this pose whose observations count.
+        is_choosing: poses are asked for, and have not come yet.
     """
 
     def __init__(
@@ -59,7 +60,7 @@ class Course:
         self.advisor = Advisor(meter_place, self._training, clock, self._take_enough)
         self.standstill: Standstill | None = None
         self._store, self._sessions, self._session_table = store, sessions, SessionTable(store, rig.name)
-        self._is_choosing = False
+        self.is_choosing = False
         self._try_again = 0.0  # real monotonic seconds
 
     def begin(self, request: Request, setup_id: str, operator: str) -> None:
@@ -76,6 +77,9 @@ class Course:
         # Fixes that were captured and are not decoded yet must not count where the station was on no prism.
         for since, until in self.record.times_away():
             self._sessions.look_away(since, until)
+        guide = self.record.opened()
+        if guide is not None and not guide[1].run.session:  # one that the last run had just opened, if any
+            self._sessions.look_away(guide[0].started)
         if self.record.is_open:
             self.start_advisor()
 
@@ -97,6 +101,15 @@ class Course:
             if changed is not None:
                 self._followed(*changed)
             return changed is not None
+
+    def abandon(self, reason: str) -> None:
+        """Close the open session if it has poses, else abort it, and end the guide."""
+        opened = self._sessions.open_session()
+        if opened is not None and opened["poses"]:
+            self._sessions.stop_command({})
+        elif opened is not None:
+            self._sessions.abort_command({})
+        self.happen("stopped", {"reason": reason})
 
     def aimed(self) -> None:
         """Count fixes from now on: the station is on the prism."""
@@ -140,7 +153,7 @@ class Course:
     def start_advisor(self) -> None:
         """Start the gain meter's process, or another one."""
         self.advisor.start()
-        self._is_choosing = False
+        self.is_choosing = False
         if not self.advisor.is_alive:
             self.wait()
         self._assess()
@@ -165,18 +178,18 @@ class Course:
     def choose(self, count: int, *, as_more: bool = False) -> None:
         """Ask for poses of the run, unless the first ones are asked for already."""
         job, row = self.record.job, self.record.row
-        if job is None or row is None or (self._is_choosing and not as_more):
+        if job is None or row is None or (self.is_choosing and not as_more):
             return
         seed = 1000 * row.id + 100 * job.at + len(job.run.poses or ())
         caller = current_caller() if as_more else None
         take = partial(self._take_poses, caller, as_more=as_more)
-        self._is_choosing = self.advisor.choose(job, row.setup_id, count, seed, take)
+        self.is_choosing = self.advisor.choose(job, row.setup_id, count, seed, take)
 
     def _take_poses(
         self, caller: Caller | None, session: str, poses: list[Pose], trouble: str, *, as_more: bool
     ) -> None:
         with self.record.turn, acting_for(caller):
-            self._is_choosing = False
+            self.is_choosing = False
             self.advisor.trouble = trouble
             job = self.record.job
             if job is None or job.state != "open" or job.run.session != session:

@@ -66,7 +66,7 @@ class GuideKeeper:
         self._model, self._settle_s, self._has_aim = model, settle_s, has_aim
         self._course = Course(rig, store, sessions, joiner, clock, meter_place)
         self._record = self._course.record
-        self._worker = GuideWorker(rig, self._course, sessions, clock, has_aim=has_aim, drive=drive)
+        self._worker = GuideWorker(rig, self._course, sessions, setups, clock, has_aim=has_aim, drive=drive)
         store.unless_damaged(self._course.restore, None)
 
     def start(self) -> None:
@@ -182,6 +182,8 @@ class GuideKeeper:
             step, run = job.step, job.run
             if step is None or step.kind != "poses" or not job.is_enough:
                 raise CommandError(f"more poses are for when there are enough; now: {headline(job)}", REFUSED)
+            if self._course.is_choosing:
+                raise CommandError("more poses are being chosen already", REFUSED)
             self._record.tapped()
             left = len(run.upcoming(count))
             if left < count:
@@ -198,12 +200,7 @@ class GuideKeeper:
         with self._record.turn:
             self._record.needs_step({})
             self._record.tapped()
-            opened = self._sessions.open_session()
-            if opened is not None and opened["poses"]:
-                self._sessions.stop_command({})
-            elif opened is not None:
-                self._sessions.abort_command({})
-            self._course.happen("stopped", {"reason": reason})
+            self._course.abandon(reason)
             return self._state()
 
     def _measured_here(self) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 from calibration.rig.description import Rig
 from daemon.commands import CommandError, identifier, number_argument
-from daemon.guide.job import Pose, Request
+from daemon.guide.job import Job, Pose, Request
 
 MOST_POSES = 1000
 DEFAULT_POSES = 20
@@ -53,6 +53,17 @@ def request_of(arguments: Mapping[str, Any], rig: Rig, known_points: Sequence[st
         raise CommandError(f"a check has {CHECK_POSES[0]} to {CHECK_POSES[1]} poses, or 0 for no check, not {check}")
     poses = whole_argument(arguments, "poses", DEFAULT_POSES, 1, MOST_POSES)
     return Request(tuple(points), tuple(prisms), poses, check, target_mm, plan)
+
+
+def misfit(job: Job, rig: Rig) -> str:
+    """Return why a job cannot go on with the rig as its file has it now, a clause; "" where it can."""
+    prisms = sorted({run.prism for run in job.runs} - set(rig.prism_names))
+    if prisms:
+        return f"the rig file has changed: it has no prism {prisms[0]} any more"
+    poses = [pose.joints for run in job.runs for pose in run.poses or ()]
+    if any(set(pose) != set(rig.joint_names) for pose in poses):
+        return "the rig file has changed: the poses of this guide are of other joints"
+    return ""
 
 
 def whole_argument(arguments: Mapping[str, Any], key: str, default: int, least: int, most: int) -> int:

@@ -17,7 +17,10 @@ from daemon.commands import CHECK, CommandError, acting_for
 from daemon.guide.course import Course
 from daemon.guide.job import Job
 from daemon.guide.position import is_there, joints_of
+from daemon.guide.request import misfit
 from daemon.sessions.manager import SessionKeeper
+from daemon.sessions.open_session import CONTROL_POINT_RADIUS_MM
+from daemon.sessions.station_setups import SetupBook
 from drivers.clock import NS_PER_S, Clock
 
 log = logging.getLogger(__name__)
@@ -27,6 +30,7 @@ NEEDED_FIXES = 5  # at a pose
 _CANCEL_S = 5.0
 _STANDS_S = 20.0  # of a simulated boom at a pose that it was sent to
 _SENT_AGAIN_S = 120.0
+_MOVED = "the station has moved, its control points no longer fit: the next guide needs a new set-up"
 
 Drive = Callable[[Sequence[Mapping[str, Any]]], int]
 """Has the boom go to the rows of a pose plan; returns how many stops are to come."""
@@ -39,6 +43,7 @@ class GuideWorker:
         rig: the machine.
         course: of the guide.
         sessions: opens, shoots in and closes sessions.
+        setups: tells whether the station has moved.
         clock: time.
         has_aim: something turns the station without an operator.
         drive: where something drives the boom without an operator; None where nothing does.
@@ -49,10 +54,18 @@ class GuideWorker:
     """
 
     def __init__(
-        self, rig: Rig, course: Course, sessions: SessionKeeper, clock: Clock, *, has_aim: bool, drive: Drive | None
+        self,
+        rig: Rig,
+        course: Course,
+        sessions: SessionKeeper,
+        setups: SetupBook,
+        clock: Clock,
+        *,
+        has_aim: bool,
+        drive: Drive | None,
     ) -> None:
         self.wanted = self.busy = ""
-        self._rig, self._course, self._sessions, self._clock = rig, course, sessions, clock
+        self._rig, self._course, self._sessions, self._setups, self._clock = rig, course, sessions, setups, clock
         self._has_aim, self._drive = has_aim, drive
         self._driven = ("", 0)  # step whose pose the boom was sent to, and when
         self._cancelled, self._stopping = threading.Event(), threading.Event()
@@ -101,6 +114,9 @@ class GuideWorker:
             if not course.advisor.is_alive:
                 course.start_advisor()
             run, step, step_id = job.run, job.step, job.step_id
+            if unfit := misfit(job, self._rig):
+                course.abandon(unfit)
+                return
             if run.session and run.poses is None:
                 course.choose(run.most)
             is_at_point = not self._has_aim and course.watch.is_at(course.point_mm(course.point(job)))
@@ -163,6 +179,9 @@ class GuideWorker:
         job, row = self._course.record.job, self._course.record.row
         if job is None or row is None:
             return
+        if self._setups.has_moved(row.setup_id):  # no session can be held there any more
+            self._course.abandon(_MOVED)
+            return
         last, opened = self._course.record.table.newest_observation(), self._sessions.open_session()
         if opened is None or opened["prism"] != job.run.prism:  # else it was opened just before the daemon ended
             arguments = {
@@ -185,5 +204,7 @@ class GuideWorker:
         self._course.happen("closed", {"session": job.run.session})
 
     def _shoot(self, point: str, step_id: str) -> None:
-        shot = self._sessions.shoot_command({"point": point})
+        shot = self._sessions.shoot_command({"point": point}, most_off_mm=CONTROL_POINT_RADIUS_MM)
         self._course.happen("shot", {"point": point, "misclosure_mm": shot["misclosure_mm"]}, only_at=step_id)
+        if shot["moved"] and shot["phase"] == "start":  # nothing that is measured from here on could be used
+            self._course.abandon(_MOVED)

@@ -8,6 +8,7 @@ the store: what the store has refused has not happened. `on_records` runs in the
 from __future__ import annotations
 
 import logging
+import math
 import sqlite3
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -283,8 +284,11 @@ class SessionKeeper:
             log.warning("session %s is used, by the word of %s: %s", session_id, operator or "an operator", despite)
             return self._table.summary(session_id)
 
-    def shoot_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Measure a control point: the mean of the next good fixes. The first shot of a point defines its place."""
+    def shoot_command(self, arguments: Mapping[str, Any], *, most_off_mm: float = math.inf) -> dict[str, Any]:
+        """Measure a control point: the mean of the next good fixes. The first shot of a point defines its place.
+
+        What lies further than `most_off_mm` from the known place is something else, and refused.
+        """
         with self._commands:
             session = self._needs_open()
             name = identifier(arguments, "point", "a control point's name")
@@ -299,7 +303,9 @@ class SessionKeeper:
                 self._shot = shot
                 shot.wait(self._clock, self._settings.shot_timeout_s)
                 phase = self._table.phase(session.id, name)
-                result = self._setups.store_shot(session.setup_id, session.id, name, phase, shot.fixes, shot.places_mm)
+                result = self._setups.store_shot(
+                    session.setup_id, session.id, name, phase, shot.fixes, shot.places_mm, most_off_mm=most_off_mm
+                )
                 # Before the shot is over: fixes that come late are of the point, and known to be
                 session.control_points = self._setups.control_points(session.setup_id)
             finally:

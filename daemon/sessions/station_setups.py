@@ -96,13 +96,25 @@ class SetupBook:
             )
         return wanted
 
+    def has_moved(self, setup_id: str) -> bool:
+        """Return True if a control point of the set-up was not where it had been."""
+        return self._table.states()[setup_id] != "ok"
+
     def current(self) -> str | None:
         """The newest set-up; None where there is none, and where it has moved."""
         newest = self._table.newest()
         return newest.id if newest is not None and newest.state == "ok" else None
 
     def store_shot(
-        self, setup_id: str, session_id: str, name: str, phase: str, fixes: Sequence[Fix], places_mm: Sequence[Place]
+        self,
+        setup_id: str,
+        session_id: str,
+        name: str,
+        phase: str,
+        fixes: Sequence[Fix],
+        places_mm: Sequence[Place],
+        *,
+        most_off_mm: float = math.inf,
     ) -> dict[str, Any]:
         """Write down that a control point was shot, and whether it still is where it was.
 
@@ -113,14 +125,25 @@ class SetupBook:
             phase: `start` or `end` of the session.
             fixes: fixes that are averaged.
             places_mm: their places in the station's frame.
+            most_off_mm: what lies further from the point's known place is taken for something else.
 
         Returns:
             point, phase, x_mm, y_mm, z_mm, misclosure_mm (None if this shot defined the point), moved.
+
+        Raises:
+            CommandError: the station is on something else; nothing is stored.
         """
         known = self._known_place(setup_id, session_id, name, phase)
         place = {axis: fmean(p[i] for p in places_mm) for i, axis in enumerate(AXES)}
         reference = known or place
         distance_mm = math.dist([*place.values()], [reference[axis] for axis in AXES])
+        if distance_mm > most_off_mm:
+            raise CommandError(
+                f"the station is on something that is {distance_mm / 1e3:.1f} m from control point {name}, and nothing "
+                f"was stored: aim it at {name} and measure again; if the station itself was moved, stop the guide and "
+                "start another one with a new set-up",
+                REFUSED,
+            )
         misclosure_mm = distance_mm if known else None
         moved = distance_mm > self._tolerance_mm
         with self._store.transaction():

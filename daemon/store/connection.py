@@ -244,6 +244,10 @@ class Connection:
                 self._boots[stamp.boot_id] = row
         return row
 
+    def boots(self) -> list[str]:
+        """Names of the boots that anything was stored in, oldest first."""
+        return [str(row["kernel_boot_id"]) for row in self.rows("SELECT kernel_boot_id FROM boots ORDER BY id")]
+
     def rig_file(self, rig: str, text: str) -> str:
         """The SHA-256 of a rig file, which is stored on first sight."""
         sha256 = hashlib.sha256(text.encode()).hexdigest()

@@ -113,8 +113,7 @@ class Page:
                 429, f"too many wrong tokens; try again in {wait_s:.0f} s", **{"Retry-After": f"{wait_s:.0f}"}
             )
         person = self._tokens.find(token) if len(token) <= _TOKEN_CHARACTERS else None
-        if person is None:
-            self._wrong.note(address)
+        if person is None and self._wrong.note(address, token):
             log.warning("a wrong token from %s", address)
         return person
 

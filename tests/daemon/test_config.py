@@ -59,6 +59,32 @@ def test_every_wrong_key_is_told_at_once(tmp_path: Path) -> None:
     assert "'socketcan', 'virtual', 'udp_multicast', 'slcan' or 'playback', found 'serial'" in message
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        *(
+            "[store]\nkeep_days = 1e300",
+            "[store]\nfree_gb = 1e300",
+            "[jobs]\nseed = -5",
+            "[jobs]\ntime_limit_s = 1e300",
+        ),
+        *("[sessions]\nsettle_s = 1e300", "[sessions]\nshot_timeout_s = 1e300", "[sessions]\nfixes_per_shot = 1000000"),
+    ],
+)
+def test_a_number_that_no_clock_disk_or_generator_takes_is_refused(tmp_path: Path, text: str) -> None:
+    key = text.split()[1]
+    assert f".{key}: Input should be" in check(f'rig = "swdt82"\n{text}\n', tmp_path)
+
+
+@pytest.mark.parametrize(
+    "url", ["http://user:SECRET@host/x", "http://host/SECRET x", "http://host:99999/", "ftp://host"]
+)
+def test_an_address_that_no_client_takes_is_no_webhook(tmp_path: Path, url: str) -> None:
+    told = check(f'rig = "swdt82"\n[notify]\nwebhook_url = "{url}"\n', tmp_path)
+    assert "give the address of a web server" in told
+    assert "SECRET" not in told
+
+
 def test_a_missing_key_is_named(tmp_path: Path) -> None:
     assert "rig: missing; it is required" in check('state_directory = "x"', tmp_path)
 

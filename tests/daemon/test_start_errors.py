@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.composition import Parts, joiner
+from daemon.commands import REFUSED, CommandError
+from daemon.composition import Parts, joiner, require_apart
 from daemon.config import Config
 from daemon.service import Daemon
 from daemon.store import Store, StoreError
@@ -113,3 +114,18 @@ def test_a_file_that_may_not_grow_is_told(tmp_path: Path, limit_kb: int) -> None
     sentence = start(tmp_path, tmp_path, limit)
     assert f"{tmp_path / 'rigcal.sqlite'}: cannot be" in sentence
     assert "MiB free in" in sentence
+
+
+def test_a_simulated_rig_and_a_real_machine_have_no_store_together(tmp_path: Path) -> None:
+    with contextlib.closing(Store(tmp_path / "rigcal.sqlite")) as store:
+        store.boot_row(SystemClock().now())
+    config = tmp_path / "rigcal.toml"
+    config.write_text(CONFIG.format(state=tmp_path) + '[[station]]\nserial.path = "/dev/none"\n', encoding="utf-8")
+    command = [sys.executable, "-m", "daemon.cli.main", "run", "--sim", "--config", str(config)]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert ended.returncode == REFUSED, ended.stderr
+    assert "holds records of a real machine" in ended.stderr
+    require_apart(["boot-a"], tmp_path, is_simulated=True)
+    require_apart(["simulated-1"], tmp_path, is_simulated=True)
+    with pytest.raises(CommandError, match="records of a simulated rig"):
+        require_apart(["simulated-1"], tmp_path, is_simulated=False)

@@ -17,6 +17,7 @@ from daemon.host.systemd import Notifier, set_up_logging
 
 if TYPE_CHECKING:
     from daemon.config import Config
+    from daemon.store.store import Store
 
 SIMULATED_CONFIG = """
 rig = "swdt82"
@@ -82,7 +83,8 @@ def run(
 ) -> dict[str, Any]:
     """Run the daemon until it is told to stop (SIGTERM, Ctrl-C) or a replay has ended.
 
-    A replay keeps its store in a directory of its own, beside the configured one's.
+    A replay keeps its store in a directory of its own, beside the configured one's. A simulated rig is refused on the
+    store of a real one, and the other way round.
     """
     if not sim and (is_by_hand or rig is not None):
         raise click.UsageError("--rig and --by-hand are for a simulated rig: give --sim as well")
@@ -90,7 +92,6 @@ def run(
     from daemon.config import parse_config, read_config
     from daemon.rig_files import load_rig
     from daemon.service import Daemon, stop_on_signals
-    from daemon.store.store import Store
 
     set_up_logging(level=logging.DEBUG if verbose else logging.INFO)
     if not verbose:
@@ -114,7 +115,7 @@ def run(
         with notifier.extending(f"opening the store {settings.store_path}"):
             _make_directory(settings)
             # The store first: its lock keeps a second daemon from touching anything of the first one's.
-            store = stack.enter_context(contextlib.closing(Store(settings.store_path)))
+            store = stack.enter_context(contextlib.closing(_store(settings, is_simulated=sim)))
             if sim:
                 machine = simulated(
                     settings,
@@ -136,6 +137,20 @@ def run(
     if not as_json:
         echo(f"the store is {settings.store_path}")
     return {"rig": source.rig.name, "mode": parts.mode, "store": str(settings.store_path)}
+
+
+def _store(settings: Config, *, is_simulated: bool) -> Store:
+    """Open the store for writing; CommandError if it holds records of a real machine, and a simulated one is to run."""
+    from daemon.composition import require_apart
+    from daemon.store.store import Store
+
+    store = Store(settings.store_path)
+    try:
+        store.unless_damaged(lambda: require_apart(store.boots(), store.path, is_simulated=is_simulated), None)
+    except BaseException:
+        store.close()
+        raise
+    return store
 
 
 def _make_directory(settings: Config) -> None:

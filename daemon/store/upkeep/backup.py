@@ -7,6 +7,7 @@ without it was never finished.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import re
@@ -101,8 +102,10 @@ def make_backup(store: Path, models: Path, directory: Path, keep: int, now_utc_n
     Raises:
         StoreError: there is no room, the file system refuses, or the copy is not sound; earlier backups stay.
     """
-    name = f"rigcal-{datetime.fromtimestamp(now_utc_ns // 10**9, UTC):%Y%m%dT%H%M%SZ}"
+    name = f"rigcal-{_named(now_utc_ns)}"
     target, scratch = directory / name, directory / f".{name}{_UNFINISHED}"
+    if directory.resolve().is_relative_to(models.resolve()):
+        raise StoreError(f"{directory} is among the models, and would be in every backup: name another directory")
     with storage_errors(directory):
         directory.mkdir(parents=True, exist_ok=True)
         for left in directory.glob(f".rigcal-*{_UNFINISHED}"):  # of one that was killed
@@ -164,8 +167,9 @@ def restore_backup(backup: Path, store: Path, models: Path, now_utc_ns: int, go_
             shutil.rmtree(scratch, ignore_errors=True)
             try:
                 shutil.copytree(backup, scratch)
+                _give_to_owner_of(store.parent, scratch)
                 _sync_tree(scratch)
-                aside = store.parent / f"replaced-{datetime.fromtimestamp(now_utc_ns // 10**9, UTC):%Y%m%dT%H%M%SZ}"
+                aside = _new_name(store.parent, f"replaced-{_named(now_utc_ns)}")
                 moves = [(beside, aside / beside.name) for beside in _files_of(store) if beside.exists()]
                 moves += [(models, aside / MODELS)] if models.exists() else []
                 had_some = bool(moves)
@@ -176,6 +180,24 @@ def restore_backup(backup: Path, store: Path, models: Path, now_utc_ns: int, go_
     finally:
         lock.release()
     return aside if had_some else None
+
+
+def _named(utc_ns: int) -> str:
+    return f"{datetime.fromtimestamp(utc_ns // 10**9, UTC):%Y%m%dT%H%M%SZ}"
+
+
+def _new_name(directory: Path, name: str) -> Path:
+    """Return a path that nothing has yet: what was replaced within the same second is not written over."""
+    paths = (directory / f"{name}{'' if not n else f'-{n}'}" for n in itertools.count())
+    return next(path for path in paths if not path.exists())
+
+
+def _give_to_owner_of(directory: Path, tree: Path) -> None:
+    """Give files that root has written to whom their directory belongs: the service could not write to them else."""
+    if os.geteuid() == 0:
+        owner = directory.stat()
+        for path in (tree, *tree.rglob("*")):
+            os.chown(path, owner.st_uid, owner.st_gid, follow_symlinks=False)
 
 
 def _files_of(store: Path) -> list[Path]:

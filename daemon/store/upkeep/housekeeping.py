@@ -31,7 +31,7 @@ ROOM_S = 60.0  # between two looks at the room
 STOP_S = 5.0
 NICE = 15
 DAY_S = 86_400.0
-LEAST_DAYS = 1.0  # that a command keeps
+LEAST_DAYS, MOST_DAYS = 1.0, 36_500.0  # that a command keeps
 # By age, no more than this many days of records go in one day: a clock that is set wrongly must not cost a year.
 AGED_DAYS = 7.0
 BACKUP_AFTER_S = 600.0  # of running: not in the midst of a start
@@ -99,6 +99,7 @@ class Housekeeping:
         self._store, self._clock, self._keeping = store, clock, keeping
         self._packing, self._retention = Packing(store), Retention(store)
         self._real = SystemClock()
+        self._told = ""
         self._turn = threading.Lock()  # of steps: a command may delete as well
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
@@ -140,6 +141,10 @@ class Housekeeping:
             log.warning("the store is not looked after for now: %s", storage_sentence(self._store.path, error))
         except (StoreError, OSError) as error:
             log.warning("the store is not looked after for now: %s", error)
+        except Exception as error:  # a fault of rigcal must not end the packing and the backups of months
+            if str(error) != self._told:
+                log.exception("the store is not looked after for now")
+            self._told = str(error)
         return False
 
     def prune_command(self, arguments: Mapping[str, Any], go_on: Callable[[], None]) -> dict[str, Any]:
@@ -150,8 +155,8 @@ class Housekeeping:
             go_on: called between steps; what it raises ends the work.
         """
         days = number_argument(arguments, "days")
-        if days is None or days < LEAST_DAYS:
-            raise CommandError(f"days must be {LEAST_DAYS:g} or more, not {days!r:.80}")
+        if days is None or not LEAST_DAYS <= days <= MOST_DAYS:
+            raise CommandError(f"days must be {LEAST_DAYS:g} or more, up to {MOST_DAYS:g}, not {days!r:.80}")
         newest_ns = self._prune(self._clock.now().utc_ns - round(days * DAY_S * NS_PER_S), go_on)
         return {"deleted_until_utc_ns": newest_ns}
 

@@ -200,6 +200,37 @@ def test_the_terminal_leads_and_scripts_may_answer(daemon: DaemonProcess) -> Non
     assert state(daemon)["steps"][2]["poses"]["skipped"] == [{"pose": 1, "reason": "a wall"}]
 
 
+@pytest.mark.slow
+def test_a_shot_of_something_else_is_refused_and_a_station_that_moved_ends_the_guide(daemon: DaemonProcess) -> None:
+    def opened(setup: str, cp1: list[float]) -> None:
+        new_setup = {"id": setup, "control_points": {"cp1": cp1}}
+        daemon.say("guide.start", new_setup=new_setup, prisms=["r"], poses=6, check_poses=0)
+        daemon.wait("the session", lambda: not state(daemon)["step"]["is_busy"])
+
+    daemon.say("simulation.aim", target="cp1")
+    opened("elsewhere", [9e3, 9e3, 9e3])
+    daemon.say("guide.done")
+    daemon.wait("a word about the shot", lambda: "nothing was stored" in str(state(daemon)["messages"]))
+    refused = state(daemon)
+    assert "from control point cp1, and nothing was stored: aim it at cp1" in str(refused["messages"])
+    assert (refused["step"]["kind"], refused["step"]["button"] is not None) == ("shoot_control_point", True)
+    daemon.say("guide.stop", reason="the test goes on")
+    setups = {setup["id"]: setup for setup in daemon.say("setup.list")}
+    assert setups["elsewhere"]["state"] == "ok"
+
+    daemon.say("guide.start", new_setup={"id": "here"}, prisms=["r"], poses=6, check_poses=0)
+    shot = GuidedOperator(daemon.say).follow(lambda s: s["step"]["kind"] == "change_prism")
+    assert shot["state"] == "open"
+    daemon.say("guide.stop", reason="the test goes on")
+    (point,) = next(setup for setup in daemon.say("setup.list") if setup["id"] == "here")["control_points"]
+    daemon.say("simulation.aim", target="cp1")
+    opened("moved", [point["x_mm"] + 50.0, point["y_mm"], point["z_mm"]])
+    daemon.wait("its end", lambda: state(daemon)["state"] != "open")
+    assert state(daemon)["state"] == "abandoned"
+    assert "the station has moved" in state(daemon)["step"]["instruction"]
+    assert daemon.say("session.list")[-1]["state"] == "aborted"
+
+
 def read_until(descriptor: int, text: str) -> str:
     said, deadline = "", time.monotonic() + 200.0
     while text not in said:

@@ -8,7 +8,8 @@ import pytest
 
 from calibration.rig.description import shipped_rig
 from daemon.commands import CommandError
-from daemon.guide.request import request_of
+from daemon.guide.job import Job, Request
+from daemon.guide.request import misfit, request_of
 
 RIG = shipped_rig("swdt82")
 POSE: dict[str, Any] = {joint.column: sum(joint.limits) / 2 for joint in RIG.joints}
@@ -51,3 +52,11 @@ def test_a_plan_comes_with_the_prisms_in_view() -> None:
 def test_what_no_guide_can_do_is_refused_with_its_reason(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(CommandError, match=message):
         request_of(arguments, RIG, [])
+
+
+def test_a_guide_does_not_go_on_with_a_rig_file_of_other_joints_or_prisms() -> None:
+    job = Job.of(request_of({"plan": [POSE], "prisms": ["r"]}, RIG, []))
+    assert misfit(job, RIG) == ""
+    assert "no prism r any more" in misfit(job, shipped_rig("ur10"))
+    of_others = Request(("cp1",), ("r",), 1, 0, None, (({"theta1": 0.0}, ("r",)),))
+    assert "of other joints" in misfit(Job.of(of_others), RIG)

@@ -8,8 +8,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from daemon.store import Store, reader, sessions
+from daemon.store import Store, reader
 from daemon.store.places import LEAST_NS, MOST_NS, between, since
+from daemon.store.queries import sessions
 from daemon.store.upkeep import full_samples, retention
 from drivers.clock import Stamp
 

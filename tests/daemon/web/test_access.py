@@ -59,16 +59,23 @@ def test_a_damaged_file_lets_nobody_in(tmp_path: Path, text: str) -> None:
 def test_wrong_tokens_are_limited_for_each_address_and_in_all() -> None:
     clock = ManualClock()
     limit = AttemptLimit(clock)
-    for _ in range(10):
+    for number in range(10):
         assert limit.wait_s("10.0.0.1") == 0
-        limit.note("10.0.0.1")
+        assert limit.note("10.0.0.1", f"guess {number}")
     assert limit.wait_s("10.0.0.1") == 60
     assert limit.wait_s("10.0.0.2") == 0
     clock.advance(61)
     assert limit.wait_s("10.0.0.1") == 0
     for number in range(100):
-        limit.note(f"10.1.0.{number}")
+        limit.note(f"10.1.0.{number}", f"another guess {number}")
     assert limit.wait_s("10.2.0.1") > 0
+
+
+def test_a_browser_that_keeps_a_removed_token_shuts_nobody_out() -> None:
+    limit = AttemptLimit(ManualClock())
+    assert limit.note("10.0.0.1", "removed")
+    assert not any(limit.note("10.0.0.1", "removed") for _ in range(200))
+    assert limit.wait_s("10.0.0.1") == limit.wait_s("10.0.0.2") == 0
 
 
 def test_what_writes_needs_more_than_reading_and_what_goes_live_needs_approval() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import os
 import shutil
 import sqlite3
 import threading
@@ -92,6 +93,33 @@ def test_a_backup_of_a_store_that_is_written_to_is_restored_with_its_live_model(
     assert (site.models / "00001-gap" / "model.json").read_text() == "{}"
     with contextlib.closing(Store(site.path)) as again:
         assert again.number("SELECT sum(captures) FROM raw_chunks", []) == held
+
+
+def test_what_was_replaced_is_kept_though_it_was_within_the_same_second(site: Site) -> None:
+    backup = site.back_up()
+    site.store.close()
+    site.path.write_bytes(b"rust")
+    first, second = site.restore(backup), site.restore(backup)
+    assert first is not None
+    assert second is not None
+    assert first != second
+    assert (first / "rigcal.sqlite").read_bytes() == b"rust"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, as on a rig")
+def test_what_root_restores_belongs_to_the_service(site: Site) -> None:
+    backup = site.back_up()
+    site.store.close()
+    os.chown(site.path.parent, 4711, 4712)
+    site.restore(backup)
+    restored = [site.path, site.models, *site.models.rglob("*")]
+    assert {(path.stat().st_uid, path.stat().st_gid) for path in restored} == {(4711, 4712)}
+
+
+def test_backups_are_not_kept_among_the_models_that_they_hold(site: Site) -> None:
+    with pytest.raises(StoreError, match="would be in every backup"):
+        make_backup(site.path, site.models, site.models / "backups", 3, UTC_0, nothing)
+    assert not (site.models / "backups").exists()
 
 
 def test_nothing_is_restored_under_a_running_daemon(site: Site) -> None:
