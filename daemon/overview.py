@@ -42,6 +42,7 @@ class Overview:
         store: open for writing.
         store_health, acquisition: tell of the store and of acquisition.
         clock: tells of the computer's clock; None where it is not known, or is another one.
+        guide: tells the step of the open guide in a few words; None without one.
         alarms, notices, sessions, jobs, models, model_table: the parts.
     """
 
@@ -53,6 +54,7 @@ class Overview:
     alarms: AlarmBoard
     notices: Notices
     sessions: SessionKeeper
+    guide: Callable[[], str | None]
     jobs: JobTable
     models: ModelRegistry
     model_table: ModelTable
@@ -82,6 +84,7 @@ class Overview:
             "acquisition": asdict(self.acquisition()),
             "clock": self.clock(),
             "session": stored("session", self.sessions.open_session),
+            "guide": self.guide(),
             "setup": stored("setup", lambda: _setup(setups.newest())),
             "control_shots": stored("control_shots", setups.newest_shots) or [],
             "jobs": stored("jobs", self.jobs.unfinished) or [],

@@ -180,6 +180,7 @@ class Daemon:
             self._alarms,
             self._notices,
             self._sessions,
+            self._guide.open_step,
             self._job_table,
             self._models,
             self._model_table,

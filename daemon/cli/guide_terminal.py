@@ -183,10 +183,10 @@ def _gain_lines(guide: Mapping[str, Any]) -> Iterator[str]:
             f"Expected error over the work volume: {accuracy['now_mm']:.2f} mm, after 5 more poses "
             f"{accuracy['after_5_mm']:.2f} mm{target}"
         )
-    if coverage is not None:
+    if coverage is not None and guide["prism"] is not None:
         share = coverage["prism_volume_share"]
         filled = round(_BAR * share)
-        yield f"Work volume enclosed by prism {guide['prism'] or ''}: [{'#' * filled:{_BAR}}] {share:.0%}"
+        yield f"Work volume enclosed by prism {guide['prism']}: [{'#' * filled:{_BAR}}] {share:.0%}"
 
 
 def _keys_line(step: Mapping[str, Any]) -> str:

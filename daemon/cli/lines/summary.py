@@ -56,6 +56,8 @@ def next_step(status: Mapping[str, Any]) -> str:
     critical = next((alarm for alarm in alarms if alarm["severity"] == "critical"), None)
     if critical is not None:
         return f"{critical['subject']}: {critical['remedy']}"
+    if status.get("guide") is not None:
+        return f"a guide is open, `rigcal session guide` leads: {status['guide']}"
     if status["session"] is not None:
         return _in_session(status["session"])
     if status["jobs"]:

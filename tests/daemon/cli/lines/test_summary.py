@@ -107,6 +107,11 @@ def test_the_state_fits_a_terminal_of_24_lines(told: dict[str, Any]) -> None:
     assert any(line.text.startswith("next      ") for line in lines)
 
 
+def test_the_next_step_while_a_guide_is_open_is_that_of_the_guide() -> None:
+    told = status(guide="Go to pose 4 of 20", session=session())
+    assert next_step(told) == "a guide is open, `rigcal session guide` leads: Go to pose 4 of 20"
+
+
 def test_what_does_not_fit_is_counted_with_the_command_that_shows_it() -> None:
     text = "\n".join(line.text for line in summary(WORST, TERMINAL[0]))
     assert "more: `rigcal alarms` has all" in text
