@@ -85,7 +85,7 @@ def test_a_page_runs_with_that_model(name: str, calibrated: Path, tmp_path: Path
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DaemonProcess]:
     """A daemon on a simulated rig, on which the page of sessions has held one."""
-    daemon = DaemonProcess(tmp_path_factory.mktemp("rig"), "--sim", "--rate", "20", jobs=False)
+    daemon = DaemonProcess(tmp_path_factory.mktemp("rig"), "--sim", "--rate", "5", jobs=False)
     try:
         daemon.wait("a fix", daemon.has_fix)
         run(f"{HOW_TO}/sessions.md", daemon.directory, RIGCAL_SOCKET=str(daemon.socket))
