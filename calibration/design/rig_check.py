@@ -16,6 +16,7 @@ from calibration.rig.description import Rig
 
 _LEAST_MM = 10.0  # a machine has a longer link
 _TURN_RAD = 6.4  # limits of whole turns in rad
+_THICK = 0.25  # of the reach: no link is as wide
 _ROUNDED = 1e-3  # of a right angle: pi / 2 written with four digits
 POSES = 100  # at which the parameters are looked for
 _POSES_EACH = 2.0  # poses for each parameter where 100 are too few
@@ -75,6 +76,12 @@ class RigCheck:
                 f"`rigcal plan` assumes a radius of {assumed[0].radius_mm:.0f} mm (1.2 % of the reach) for the links "
                 f"of {len(assumed)} of {len(self.links)} rows; give them radius_mm"
             )
+        for link in self.links:
+            if not link.is_assumed and link.radius_mm > _THICK * self.at.reach_mm:
+                yield (
+                    f"radius_mm of row {link.row} is {link.radius_mm:g} mm, over a quarter of the reach: it is half "
+                    "the width of a link, and links that always touch are not kept clear of each other"
+                )
         outside = [j for j in self.rig.joints if not j.limits[0] <= 0.0 <= j.limits[1]]
         if outside:
             yield (

@@ -83,19 +83,19 @@ def test_a_radius_of_a_row_is_what_plan_keeps_clear_of(tmp_path: Path) -> None:
     [
         (r"(?<=alpha_deg = )[-\d.]+", 0.01745329, "alpha_deg of row 1 is 1.5708, a multiple of a right angle in rad"),
         (r"(?<=limits = \[)-360, 360", 0.01745329, "no joint turns further than 6.28318 deg: if limits are in rad"),
+        (r"(?<=radius_mm = )75", 10.0, "radius_mm of row 2 is 750 mm, over a quarter of the reach"),
         (r"(?<=[ad]_mm = )[-\d.]+", 0.001, "no length of a row is over 0.612 mm: if lengths are in m"),
     ],
-    ids=["angles", "limits", "lengths"],
+    ids=["angles", "limits", "radius", "lengths"],
 )
 def test_check_asks_about_numbers_that_would_fit_another_unit(
     tmp_path: Path, pattern: str, scale: float, said: str
 ) -> None:
-    text = re.sub(
-        pattern, lambda found: ", ".join(f"{float(x) * scale:.7f}" for x in found[0].split(",")), load_rig("ur10").text
-    )
+    text = load_rig("ur10").text.replace("a_mm = -612", "a_mm = -612\nradius_mm = 75")
+    text = re.sub(pattern, lambda found: ", ".join(f"{float(x) * scale:.7f}" for x in found[0].split(",")), text)
     (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
     assert any(said in sentence for sentence in told("rig", "check", tmp_path / "mine.toml")["warnings"])
-    assert not any("here, convert" in sentence for sentence in told("rig", "check", "ur10")["warnings"])
+    assert not any("here, convert" in text or "quarter" in text for text in told("rig", "check", "ur10")["warnings"])
 
 
 def test_check_tells_every_fault_with_its_line(tmp_path: Path) -> None:
