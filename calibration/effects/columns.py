@@ -9,7 +9,6 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from calibration.kinematics.chain import ChainData, Linearisation
 from calibration.observations import Floats
@@ -17,7 +16,6 @@ from calibration.observations import Floats
 Integers = NDArray[np.intp]
 
 NO_JOINT = -1
-_RARE = 0.25  # share of values that are not zero, at most, in columns that are stored without their zeros
 _FEW = 50  # coefficients that are summed by one small product, with many zeros
 
 
@@ -85,7 +83,7 @@ class EffectColumns:
         if self.joint.size <= _FEW:
             few: Floats = self.column @ _by_joint(self.joint.tobytes(), coefficients.tobytes(), joints)
             return few
-        out = np.zeros((self.stored.shape[0], joints))
+        out = np.zeros((self.rows, joints))
         for joint, own in _runs(self.joint.tobytes()):
             out[:, joint] += self.column[:, own] @ coefficients[own]
         return out
@@ -93,7 +91,7 @@ class EffectColumns:
     def shifted_mm(self, coefficients: Floats) -> Floats:
         """Return the displacement of the prisms beside that, (m, 3) in the station's frame, by coefficients (k,)."""
         if self.shift_mm is None:
-            return np.zeros((self.stored.shape[0], 3))
+            return np.zeros((self.rows, 3))
         shifted: Floats = self.shift_mm[:, :, self._shifting] @ coefficients[self._shifting]
         return shifted
 
@@ -103,7 +101,7 @@ class EffectColumns:
         Args:
             joint_jacobian: (m, 3, joints) by readings, mm per deg or mm.
         """
-        moved = np.empty((self.stored.shape[0], 3, len(self)))
+        moved = np.empty((self.rows, 3, len(self)))
         self._move(joint_jacobian, moved)
         return moved
 
@@ -117,12 +115,20 @@ class EffectColumns:
     @cached_property
     def sums(self) -> tuple[int, float, float]:
         """Number of coefficients and sums of their columns, which tell different ones apart without comparing them."""
-        return len(self), float(self.stored.sum()), 0.0 if self.shift_mm is None else float(self.shift_mm.sum())
+        return len(self), float(self.column.sum()), 0.0 if self.shift_mm is None else float(self.shift_mm.sum())
 
     @property
-    def stored(self) -> Floats | csr_array:
-        """`column` as it is in memory."""
-        return self.column
+    def rows(self) -> int:
+        """Number of rows m."""
+        return len(self.column)
+
+    def has_columns_of(self, other: EffectColumns) -> bool:
+        """Return True if these are the very columns in memory of another set of coefficients."""
+        return self.column is other.column and self.shift_mm is other.shift_mm
+
+    def with_columns_of(self, other: EffectColumns) -> EffectColumns:
+        """Return the coefficients with the columns in memory of another set, which are equal."""
+        return replace(self, column=other.column, shift_mm=other.shift_mm)
 
     @cached_property
     def _shifting(self) -> slice:
@@ -144,45 +150,6 @@ class EffectColumns:
         return self.over(lambda values: values[rows])
 
 
-class RareColumns(EffectColumns):
-    """Coefficients at a joint whose columns are mostly zero, and in memory without these.
-
-    Args:
-        names, joint, prior_sigma: as of `EffectColumns`.
-        column: the same, dense or sparse.
-        shift_mm: None.
-    """
-
-    _stored: csr_array
-
-    def __init__(
-        self, names: tuple[str, ...], joint: Integers, column: Floats | csr_array, prior_sigma: Floats, shift_mm: None
-    ) -> None:
-        stored = column if isinstance(column, csr_array) else csr_array(column)
-        kept = {"names": names, "joint": joint, "_stored": stored, "prior_sigma": prior_sigma, "shift_mm": shift_mm}
-        for name, value in kept.items():
-            object.__setattr__(self, name, value)
-
-    @property
-    def column(self) -> Floats:
-        """(m, k) deg or mm, made anew each time."""
-        dense: Floats = self._stored.toarray()
-        return dense
-
-    @property
-    def stored(self) -> csr_array:
-        """`column` without its zeros."""
-        return self._stored
-
-
-def without_zeros(columns: EffectColumns) -> EffectColumns:
-    """Return the same coefficients, without the zeros of their columns where these are most and one joint moves."""
-    is_at_joint = columns.shift_mm is None and len(set(columns.joint.tolist())) == 1
-    if not is_at_joint or np.count_nonzero(columns.column) > _RARE * columns.column.size:
-        return columns
-    return RareColumns(columns.names, columns.joint, columns.column, columns.prior_sigma, None)
-
-
 def joined(parts: Sequence[EffectColumns], rows: int) -> EffectColumns:
     """Join the coefficients of several effects, all for the same number of rows."""
     shift = None
@@ -202,25 +169,13 @@ def same_columns(a: EffectColumns, b: EffectColumns) -> bool:
     """Return True if two sets of coefficients differ in their names and priors alone."""
     if not np.array_equal(a.joint, b.joint):
         return False
-    if a.stored is b.stored and a.shift_mm is b.shift_mm:
+    if a.has_columns_of(b):
         return True
-    if not _equal(a.stored, b.stored):
+    if not np.array_equal(a.column, b.column):
         return False
     if a.shift_mm is None or b.shift_mm is None:
         return a.shift_mm is b.shift_mm
     return np.array_equal(a.shift_mm, b.shift_mm)
-
-
-def _with_columns_of(other: EffectColumns, part: EffectColumns) -> EffectColumns:
-    if isinstance(part, RareColumns):
-        return RareColumns(part.names, part.joint, other.stored, part.prior_sigma, None)
-    return replace(part, column=other.column, shift_mm=other.shift_mm)
-
-
-def _equal(a: Floats | csr_array, b: Floats | csr_array) -> bool:
-    if isinstance(a, csr_array) and isinstance(b, csr_array):
-        return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("indptr", "indices", "data"))
-    return not isinstance(a, csr_array) and not isinstance(b, csr_array) and np.array_equal(a, b)
 
 
 def sharing(parts: Iterable[EffectColumns], known: Iterable[EffectColumns] = ()) -> tuple[EffectColumns, ...]:
@@ -241,7 +196,7 @@ def sharing(parts: Iterable[EffectColumns], known: Iterable[EffectColumns] = ())
             alike.append(part)
             out.append(part)
         else:
-            out.append(part if same.stored is part.stored else _with_columns_of(same, part))
+            out.append(part if part.has_columns_of(same) else part.with_columns_of(same))
     return tuple(out)
 
 

@@ -13,11 +13,12 @@ from functools import cached_property
 
 import numpy as np
 
-from calibration.effects.columns import EffectColumns, same_columns, sharing, without_zeros
+from calibration.effects.columns import EffectColumns, same_columns, sharing
 from calibration.effects.context import EffectContext
 from calibration.effects.fitted import Choice
 from calibration.effects.library import library
 from calibration.gap.projection import Projection
+from calibration.gap.rare_columns import without_zeros
 from calibration.observations import Floats
 
 LEAST_KNOWN = 0.5  # share of the rows that have what an effect needs

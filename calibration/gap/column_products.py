@@ -15,8 +15,9 @@ from typing import Protocol
 import numpy as np
 from scipy.sparse import csr_array
 
-from calibration.effects.columns import EffectColumns, RareColumns, joined
+from calibration.effects.columns import EffectColumns, joined
 from calibration.gap.projection import Projection
+from calibration.gap.rare_columns import RareColumns
 from calibration.observations import Floats
 
 _AT_ONCE = 64  # columns
@@ -59,7 +60,7 @@ class ProjectedProducts:
     def __init__(self, projection: Projection, blocks: Sequence[EffectColumns]) -> None:
         self._projection, self._blocks = projection, blocks
         self._removed_target = projection.without_kinematics.removed(projection.target)
-        self._rare = [block.stored if isinstance(block, RareColumns) else None for block in blocks]
+        self._rare = [block.sparse if isinstance(block, RareColumns) else None for block in blocks]
         self._at_joint: dict[int, _AtJoint] = {}
         self._kept = dict[int, Floats]()
         self._removed: dict[int, Floats] = {}

@@ -178,5 +178,5 @@ def test_an_effect_beside_others_is_weighed_as_all_together_are(bare: Projection
 def test_forms_that_differ_in_their_prior_alone_share_their_columns(bare: Projection) -> None:
     forms = variants_at(bare.situation, "joint_error_map", "theta7")
     first, second = candidate_at(bare.situation, bare, "joint_error_map", "theta7", forms).additions[:2]
-    assert first.stored is second.stored
+    assert first.has_columns_of(second)
     assert (first.prior_sigma < second.prior_sigma).all()
