@@ -31,7 +31,7 @@ def timing(latencies: Mapping[str, Latency | str]) -> str:
         return ""
     known = {name: latency for name, latency in latencies.items() if not isinstance(latency, str)}
     rows = [[name, _size(latency), str(latency.fixes), str(latency.motions)] for name, latency in known.items()]
-    columns = ["session", "latency of the fixes, ms", "fixes", "motions"]
+    columns = ["session", f"latency {PLUS_MINUS} standard error, ms", "fixes", "motions"]
     unknown = [f"{name}: not known, {why}." for name, why in latencies.items() if isinstance(why, str)]
     return markup.section(
         "Timing of station and bus",

@@ -1,6 +1,7 @@
 """The operator's page on a store of 24 hours: `python -m tests.bench.page [--seconds 60] [--keep DIRECTORY]`.
 
-A simulated rig measures at its own speed into a store that holds a day already. Measured: the first paint in Chromium
+A simulated rig measures at its own speed into a store that holds a day already (made of copies of packed captures in
+100 s of CPU; `--keep` keeps it for the next time). Measured: the first paint in Chromium
 and how often what is shown changes there; CPU time of the web process with three clients; and with twenty clients, one
 of them stalled, what acquisition loses, beside the same time without any. Exit status 1: a bar is missed.
 """

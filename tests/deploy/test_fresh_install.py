@@ -104,7 +104,7 @@ def test_the_demonstration_ends_with_a_model_that_can_be_accepted(home: Home, de
     until = time.monotonic() + DEADLINE_S
     while home.run("rigcal", "status", "--socket", socket).returncode != 0:
         assert time.monotonic() < until, (home.directory / "daemon.log").read_text(encoding="utf-8")
-    (newest, *_) = home.rigcal("model", "list", "--socket", socket)
+    newest = home.rigcal("model", "list", "--socket", socket)["result"][-1]
     home.rigcal("model", "accept", str(newest["id"]), "--socket", socket)
-    live = [model["id"] for model in home.rigcal("model", "list", "--socket", socket) if model["state"] == "live"]
-    assert live == [newest["id"]]
+    models = home.rigcal("model", "list", "--socket", socket)["result"]
+    assert [model["id"] for model in models if model["state"] == "live"] == [newest["id"]]
