@@ -80,7 +80,7 @@ class SessionsSection(_Section):
     """
 
     settle_s: float = Field(default=1.0, ge=0, le=3600)
-    fixes_per_shot: int = Field(default=5, ge=1, le=1000)
+    fixes_per_shot: int = Field(default=5, ge=1, le=10_000)
     shot_timeout_s: float = Field(default=60.0, gt=0, le=3600)
     control_tolerance_mm: float = Field(default=5.0, gt=0, le=1000)
 
