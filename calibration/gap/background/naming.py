@@ -10,8 +10,8 @@ import numpy as np
 from scipy.special import expit
 
 from calibration.effects.fitted import Choice
-from calibration.gap.adoption import finer_forms, refined_choice
 from calibration.effects.library import library
+from calibration.gap.adoption import finer_forms, refined_choice
 from calibration.gap.background.blocks import Block
 from calibration.gap.background.certificate import certificates
 from calibration.gap.background.judgement import curves, judged, judgements
