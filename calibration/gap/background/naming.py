@@ -10,6 +10,7 @@ import numpy as np
 from scipy.special import expit
 
 from calibration.effects.fitted import Choice
+from calibration.effects.library import library
 from calibration.gap.adoption import finer_forms, refined_choice
 from calibration.gap.background.blocks import Block
 from calibration.gap.background.certificate import certificates
@@ -141,7 +142,8 @@ def _refined(problem: Problem, joint: JointFit) -> JointFit:
 def _with_map(problem: Problem, joint: JointFit, where: str) -> JointFit:
     """Return a fit with the map of one more joint, in its best variant."""
     projection = problem.project(joint)
-    forms = variants_at(projection.situation, MAP, where)
+    is_possible = where in library()[MAP].places(projection.situation.rig)
+    forms = variants_at(projection.situation, MAP, where) if is_possible else ()
     if not forms:
         return joint
     scored = Screen(projection, [candidate_at(projection.situation, projection, MAP, where, forms)]).score()[0]
