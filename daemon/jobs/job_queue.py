@@ -14,6 +14,7 @@ from daemon.config import Config
 from daemon.jobs.order import Order, Outcome, Progress
 from daemon.jobs.scheduler import CHECKS, DueChain, State
 from daemon.models.drift import note_drift, unseen_checks
+from daemon.store.queries.guides import GuideTable
 from daemon.store.queries.jobs import JobFacts, JobKind, JobTable
 from daemon.store.queries.models import LiveRun, ModelRow, ModelTable, trained_on
 from daemon.store.queries.sessions import SessionTable
@@ -43,6 +44,7 @@ class JobQueue:
         self.table = JobTable(store, rig_name)
         self._sessions = SessionTable(store, rig_name)
         self._models = ModelTable(store, rig_name, clock)
+        self._guides = GuideTable(store, rig_name)
 
     def state(self) -> State:
         """The facts that scheduling goes by."""
@@ -57,6 +59,7 @@ class JobQueue:
             live_from=run.after_session if run else None,
             drifted=self._models.drifted(run) if run else None,
             stale_candidate=self._stale_candidate(run) if run else None,
+            has_guide=self._guides.is_open(),
         )
 
     def _stale_candidate(self, run: LiveRun) -> int | None:

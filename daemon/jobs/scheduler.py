@@ -24,6 +24,7 @@ CHECKS = (JobKind.REPORT, JobKind.COMPARISON)
 CHAIN = (JobKind.GAP, JobKind.RESIDUAL, *CHECKS)
 DRIFT = (JobKind.DRIFT,)
 _QUIET_S = 2.0  # after a session's end: its jobs wait for a next session to begin
+_QUIET_IN_GUIDE_S = 60.0  # the same where a guide is open, which goes on to the next prism by itself
 # An interrupted job waits this long times its attempts and interruptions, so that one that kills the daemon or the
 # computer does not do so without pause.
 _RETRY_AFTER_S = 5.0
@@ -48,6 +49,7 @@ class State:
         drifted: number and id of the check session with which the live model was found to have drifted; None before.
         stale_candidate: the model that waits to be accepted, where its comparison is with another model than the live
             one and none with the live one was queued yet.
+        has_guide: a guide is open.
     """
 
     sessions: Sequence[SessionFacts]
@@ -57,6 +59,7 @@ class State:
     live_from: int | None = None
     drifted: tuple[int, str] | None = None
     stale_candidate: int | None = None
+    has_guide: bool = False
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,8 @@ def due_jobs(state: State, now: Stamp, *, max_attempts: int = 3) -> list[Due]:
         and _passed(job.ended, now, _RETRY_AFTER_S * (job.attempts + job.interruptions))
     ]
     closed = [s for s in state.sessions if s.state == "closed"]
-    if not closed or not _passed(closed[-1].ended, now, _QUIET_S):
+    quiet_s = _QUIET_IN_GUIDE_S if state.has_guide else _QUIET_S
+    if not closed or not _passed(closed[-1].ended, now, quiet_s):
         return due
     training = [s for s in closed if s.kind != CHECK]
     checks = [s for s in closed if s.kind == CHECK]

@@ -90,6 +90,10 @@ class GuideTable:
         request, started = json.loads(row["request_json"]), self._store.stamp(row, "started_")
         return GuideRow(row["id"], row["state"], row["setup_id"], row["operator"], request, row["taps"], started)
 
+    def is_open(self) -> bool:
+        """Return True if a guide is open."""
+        return bool(self._store.rows("SELECT 1 FROM guides WHERE rig = ? AND state = 'open'", (self._rig,)))
+
     def open(self, started: Stamp, setup_id: str, operator: str, request: Mapping[str, Any], **caller: object) -> int:
         """Add an open guide; its number."""
         row = {

@@ -73,6 +73,12 @@ def test_an_aborted_session_triggers_nothing() -> None:
     assert due_jobs(state(session(1, state="aborted")), LATER) == []
 
 
+def test_sessions_of_an_open_guide_wait_longer_for_its_next_prism() -> None:
+    opened = replace(state(session(1)), has_guide=True)
+    assert due_jobs(opened, T0.shifted(30 * NS_PER_S)) == []
+    assert due_jobs(opened, T0.shifted(60 * NS_PER_S)) == [DueChain(CHAIN, "s1", "s1")]
+
+
 def test_sessions_wait_for_the_next_to_begin_after_the_newest() -> None:
     just_now = T0.shifted(NS_PER_S)
     assert due_jobs(state(session(1)), just_now) == []
