@@ -145,7 +145,10 @@ class App {
   }
 
   #listen() {
-    addEventListener("popstate", () => this.show(location.pathname.slice(1), { focus: true }));
+    addEventListener("popstate", () => {
+      const name = location.pathname.slice(1) || "now";
+      if (name !== this.name) this.show(name, { focus: true });  // else a link within the screen was followed
+    });
     document.addEventListener("click", (event) => {
       const link = event.target.closest("a[href]");
       if (!link || link.target || link.origin !== location.origin || event.ctrlKey || event.metaKey) return;
