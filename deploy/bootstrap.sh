@@ -107,7 +107,7 @@ if [ -z "$editable" ] || [ "$(cat "$stamp" 2>/dev/null)" != "$state" ]; then
     rm -f "$stamp"
     echo "Installing $(grep -c '^[a-z]' "$lock") locked packages into $venv (the first time takes a minute or two)"
     # Wheels alone: a source package would run its own build, with tools that no hash covers.
-    "$venv/bin/python" -m pip install --quiet --require-hashes --only-binary :all: -r "$lock" ||
+    "$venv/bin/python" -m pip install --quiet --no-deps --require-hashes --only-binary :all: -r "$lock" ||
         die "pip could not install the locked packages ($lock) for Python $version; its message is above. If it speaks of" \
             "connections or retries, the package index cannot be reached: check the network or pip's proxy and index settings"
     if [ -n "$editable" ]; then
