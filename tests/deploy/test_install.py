@@ -32,7 +32,12 @@ def test_a_second_installation_renews_what_belongs_to_rigcal(installed: Path) ->
 
 
 def test_every_file_of_the_service_is_installed(installed: Path) -> None:
-    ours = {path.name for path in DEPLOY.iterdir() if path.is_file()} - {"README.md", "bootstrap.sh", "install.sh"}
+    ours = {path.name for path in DEPLOY.iterdir() if path.is_file()} - {
+        "README.md",
+        "__init__.py",
+        "bootstrap.sh",
+        "install.sh",
+    }
     assert len([path for path in installed.rglob("*") if path.is_file()]) == len(ours)
 
 

@@ -1,11 +1,11 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from drivers.stations.replies import Frame, Garbage
-from drivers.stations.topcon.framing import GtsFramer, block_check, decode_frame, encode_frame
+from drivers.stations.topcon.framing import RECORD_HEADERS, GtsFramer, block_check, decode_frame, encode_frame
 from tests.drivers.serial_support import ACK_FRAME, SAMPLES, SLOPE_MM, TRACKING, framed
 
 # docs/reference/protocols.md 1.2, 1.3 and 1.6.
@@ -168,6 +168,16 @@ def test_any_bytes_in_any_portions_are_framed_alike_and_all_accounted_for(parts:
         assert decode_frame(framed(item.data)[:-3]) is not None if isinstance(item, Frame) else item.raw
 
 
+def is_one_frame(data: bytes) -> bool:
+    """True unless a record after clutter whose XOR is 0 would have the same block check: the record is taken then."""
+    return all(block_check(data[:at]) != b"000" for at in range(1, len(data)) if data[at] in RECORD_HEADERS)
+
+
+def test_of_two_readings_of_a_frame_the_record_is_taken() -> None:
+    assert pieces(encode_frame(b"  /", crlf=True)) == [("garbage", b"  "), ("frame", b"/")]
+
+
 @given(st.binary(min_size=1, max_size=100).filter(lambda data: all(32 <= byte < 127 for byte in data)))
 def test_what_is_encoded_is_decoded(data: bytes) -> None:
+    assume(is_one_frame(data))
     assert data in frames(encode_frame(data, crlf=True)) or data == b"006"[: len(data)]
