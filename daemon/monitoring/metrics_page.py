@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 
+from calibration.rig.reference import table
 from daemon.monitoring.metrics import FAMILIES
 
 _HEAD = """# Metrics
@@ -41,18 +42,13 @@ run it.
 
 This page is made from the families in `daemon/monitoring/metrics.py`:
 `python -m daemon.monitoring.metrics_page > docs/reference/metrics.md`.
-
-| metric | kind | labels | meaning |
-|---|---|---|---|
 """
 
 
 def page() -> str:
     """Return the text of docs/reference/metrics.md."""
-    rows = (
-        f"| `{f.name}` | {f.kind} | {', '.join(f'`{label}`' for label in f.labels)} | {f.help} |\n" for f in FAMILIES
-    )
-    return _HEAD + "".join(rows)
+    rows = ((f"`{f.name}`", f.kind, ", ".join(f"`{label}`" for label in f.labels), f.help) for f in FAMILIES)
+    return "\n".join((_HEAD, *table(("metric", "kind", "labels", "meaning"), rows))) + "\n"
 
 
 if __name__ == "__main__":
