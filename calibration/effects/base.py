@@ -86,6 +86,8 @@ class Family(ABC):
             always computed; or nothing.
         column: the optional column that it needs, `{where}` in it for its place; empty for none.
         limit_sigma: relative uncertainty of the hard limits, where they follow from a load.
+        shape_sigma: share of the change that a machine may make in another way than the equation says; it decides how
+            far evidence of any size can be trusted beside structure that has no name.
         goes_by_readings: True if its columns depend on the readings alone, whatever the kinematics are.
         goes_by_travel: True if it grows with the path that its joint travels.
         comes_after: families that the same load causes and that are the larger ones as a rule: beside structure without
@@ -103,6 +105,7 @@ class Family(ABC):
     goes_with: ClassVar[Literal["", "torque", "weights"]] = ""
     column: ClassVar[str] = ""
     limit_sigma: ClassVar[float] = 0.0
+    shape_sigma: ClassVar[float] = 0.14
     goes_by_readings: ClassVar[bool] = False
     goes_by_travel: ClassVar[bool] = False
     comes_after: ClassVar[tuple[str, ...]] = ()

@@ -52,6 +52,7 @@ class StepFamily(Family):
     """An effect from an instant on, its variants those of `step_grid` and `refined_steps`."""
 
     column = "time_s"
+    shape_sigma = 0.03  # what has moved stays where it is
 
     def odds(self, settings: Settings) -> float:
         """Return the prior odds of an instant beside the others: the length of time that it stands for."""

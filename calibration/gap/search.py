@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.effects.fitted import Choice
 from calibration.gap.adoption import Adopted, adopted
-from calibration.gap.background.blocks import displacement_blocks, smooth_blocks, time_blocks
+from calibration.gap.background.blocks import displacement_blocks, possible_blocks, smooth_blocks, time_blocks
 from calibration.gap.background.breaks import find_break
 from calibration.gap.background.naming import Names, evidence_alone, names_beside
 from calibration.gap.background.outside import formula_block, is_in_library, what_is_left
@@ -375,7 +375,7 @@ def _names(
             further = what_is_left(problem, names.joint, formulas)
             if not further:
                 return names, formulas
-    return names_beside(problem, smooth, families, known), ()
+    return names_beside(problem, smooth, families, known, lambda: possible_blocks(context, average)), ()
 
 
 def _formulas_suffice(problem: Problem, joint: JointFit, formulas: Sequence[Formula]) -> bool:

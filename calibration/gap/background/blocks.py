@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -64,6 +64,18 @@ def smooth_blocks(context: EffectContext, average: Callable[[Floats], Floats]) -
     return (*(replace(b, columns=b.columns.over(average)) for b in found), *time_blocks(context, average))
 
 
+def possible_blocks(context: EffectContext, average: Callable[[Floats], Floats]) -> Iterator[Block]:
+    """Yield what any two joints may do together, errors of every joint and displacements, and what wanders faster.
+
+    Arguments are those of `smooth_blocks`.
+    """
+    yield from time_blocks(context, average, fine=True)
+    moving = _moving(context)
+    for pair in itertools.combinations(moving, 2):
+        for block in (*(_surface(context, pair, at) for at in moving), _pair(context, pair)):
+            yield replace(block, columns=block.columns.over(average))
+
+
 def displacement_blocks(context: EffectContext, average: Callable[[Floats], Floats]) -> tuple[Block, ...]:
     """Return blocks of displacements by pairs of joints: together with the smooth ones they see any structure.
 
@@ -89,8 +101,9 @@ def time_blocks(
         return ()
     number = np.arange(1, (min(len(at) // _ROWS_PER_WAVE, _MOST_WAVES) if fine else _TIME_WAVES) + 1)
     waves = np.cos(np.pi * number * _unit(at)[:, None])
+    name = "fine time" if fine else "time"
     block = Block(
-        "time", "time", "station", "time", _shifts("time", waves, 1.0 / np.sqrt(number) if fine else 1.0 / number)
+        name, "time", "station", "time", _shifts(name, waves, 1.0 / np.sqrt(number) if fine else 1.0 / number)
     )
     return (replace(block, columns=block.columns.over(average)),)
 

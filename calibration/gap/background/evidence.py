@@ -21,7 +21,8 @@ from calibration.observations import Floats
 Integers = NDArray[np.intp]
 
 _LOG_SCALE = (-9.0, 5.0)  # of plausible sizes
-_ENOUGH = 1e-3  # of a log evidence, which is compared with others that differ by one at least
+_ITERATIONS = 60
+_LEAST_INFORMATION = 0.5  # about the log of a scale: that of the prior knowledge that it is plausible
 _MOST_NOISE = 12.0  # log of its variance, of the one that rows are whitened with
 
 
@@ -83,7 +84,7 @@ def greatest(
     blocks: Mapping[str, Integers],
     start: Mapping[str, float],
     noise: float,
-    iterations: int,
+    enough: float,
 ) -> Scales:
     """Return the scales of blocks and noise that have the greatest evidence.
 
@@ -94,32 +95,35 @@ def greatest(
         blocks: name -> its columns.
         start: name -> log scale to start from.
         noise: to start from.
-        iterations: at most.
+        enough: of log evidence, by which another step has to better it.
     """
     names = list(blocks)
     index = np.concatenate([np.empty(0, dtype=np.intp), *blocks.values()]).astype(np.intp)
     number = np.repeat(np.arange(len(names)), [*map(len, blocks.values())])
     model = FixedAndScaled(products, fixed, fixed_sigma, index)
-
-    def negative(theta: Floats) -> tuple[float, Floats]:
-        value, slope, by_noise = model.evidence(np.exp(theta[number]), float(np.exp(theta[-1])))
-        return -value, -np.append(np.bincount(number, slope, minlength=len(names)), by_noise)
-
     least = float(np.log(products.least_noise))
-    theta = np.append([np.clip(start[name], *_LOG_SCALE) for name in names], max(float(np.log(noise)), least))
-    bounds = [_LOG_SCALE] * len(names) + [(least, _MOST_NOISE)]
+    low, high = (np.array([edge] * len(names) + [last]) for edge, last in zip(_LOG_SCALE, (least, _MOST_NOISE)))
+    theta = np.append([start[name] for name in names], float(np.log(noise))).clip(low, high)
+    # In the axes and units of the information all directions are alike, and a few steps are enough.
+    information = model.information(np.exp(theta[number]), float(np.exp(theta[-1])), number)
+    information[np.diag_indices_from(information)] += _LEAST_INFORMATION
+    turned = np.linalg.inv(np.linalg.cholesky(information)).T
+
+    def negative(z: Floats) -> tuple[float, Floats]:
+        at = theta + turned @ z
+        inside = at.clip(low, high)
+        value, slope, by_noise = model.evidence(np.exp(inside[number]), float(np.exp(inside[-1])))
+        slope = np.append(np.bincount(number, slope, minlength=len(names)), by_noise)
+        return -value, -(turned.T @ np.where(at == inside, slope, 0.0))
+
     # SciPy's tolerance is relative to a value of many thousands; differences of a few are what counts.
-    enough = _ENOUGH / max(abs(negative(theta)[0]), 1.0)
-    found = minimize(
-        negative,
-        theta,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=bounds,
-        options={"maxiter": iterations, "ftol": enough},
-    )
-    scale = dict(zip(names, found.x[:-1].tolist(), strict=True))
-    return Scales(fixed, fixed_sigma, dict(blocks), scale, float(np.exp(found.x[-1])), -float(found.fun))
+    begin = np.zeros_like(theta)
+    relative = enough / max(abs(negative(begin)[0]), 1.0)
+    options = {"maxiter": _ITERATIONS, "ftol": relative}
+    found = minimize(negative, begin, jac=True, method="L-BFGS-B", options=options)
+    best = (theta + turned @ found.x).clip(low, high)
+    scale = dict(zip(names, best[:-1].tolist(), strict=True))
+    return Scales(fixed, fixed_sigma, dict(blocks), scale, float(np.exp(best[-1])), -float(found.fun))
 
 
 class FixedAndScaled:
@@ -145,6 +149,24 @@ class FixedAndScaled:
         self._gram = products.gram[np.ix_(index, index)]
         self._products = products
 
+    def information(self, sigma: Floats, noise: float, number: Integers) -> Floats:
+        """Return Fisher's information (s + 1, s + 1) about the logs of the scales of s blocks and of the noise.
+
+        What the columns that stay take of the noise is left out: it is used to choose axes only.
+
+        Args:
+            sigma: (b,) scales.
+            noise: variance.
+            number: (b,) of the block of each column, in order.
+        """
+        known = np.eye(len(sigma)) - inverse_by(self._beside_fixed(sigma, noise)[2])
+        first = np.flatnonzero(np.diff(number, prepend=-1))
+        squares = np.add.reduceat(np.add.reduceat(known**2, first, axis=0), first, axis=1)
+        kept = np.diag(known) - (known**2).sum(axis=0)
+        with_noise = np.add.reduceat(kept, first)
+        of_noise = self._products.rows - 2.0 * float(np.trace(known)) + float((known**2).sum())
+        return np.block([[2.0 * squares, with_noise[:, None]], [with_noise, np.array([0.5 * of_noise])]])
+
     def evidence(self, sigma: Floats, noise: float) -> tuple[float, Floats, float]:
         """Return the log evidence, its derivatives by the log of every scale (b,), and by that of the noise.
 
@@ -153,16 +175,9 @@ class FixedAndScaled:
             noise: variance.
         """
         products, size = self._products, self._size
-        left = noise / (noise + size)  # share of the prior variance that is left, along the axes of what stays
-        across = self._across * np.sqrt(left / noise)[:, None]
+        left, across, factor = self._beside_fixed(sigma, noise)
         fixed = self._along_fixed * np.sqrt(left / noise)
         outer = sigma * sigma[:, None] / noise
-        matrix = (self._gram - across.T @ across) * outer
-        matrix[np.diag_indices_from(matrix)] += 1.0
-        factor, failed = lapack.dpotrf(matrix, lower=1)
-        if failed:  # of data without noise the difference is all rounding, and no eigenvalue is less than one
-            size_of, axes = np.linalg.eigh(matrix)
-            factor = np.linalg.cholesky(axes * np.maximum(size_of, 1.0) @ axes.T)
         score = sigma * (self._along - across.T @ fixed) / noise
         inverse = inverse_by(factor)
         mean = inverse @ score
@@ -179,3 +194,24 @@ class FixedAndScaled:
         squares = products.squares / noise - explained - float(mean @ mean) - float(mean_fixed @ mean_fixed)
         count = len(size) + len(sigma)
         return value, slope, 0.5 * (squares + count - float(variance.sum()) - of_fixed - products.rows)
+
+    def _beside_fixed(self, sigma: Floats, noise: float) -> tuple[Floats, Floats, Floats]:
+        """Return what the columns that stay leave of the others.
+
+        Args:
+            sigma: (b,) scales.
+            noise: variance.
+
+        Returns:
+            (f,) the share of the prior variance that is left along the axes of what stays; (f, b) products of these
+            axes with the others; the Cholesky factor (b, b) of the others' posterior precision, in prior sigmas.
+        """
+        left = noise / (noise + self._size)
+        across = self._across * np.sqrt(left / noise)[:, None]
+        matrix = (self._gram - across.T @ across) * (sigma * sigma[:, None] / noise)
+        matrix[np.diag_indices_from(matrix)] += 1.0
+        factor, failed = lapack.dpotrf(matrix, lower=1)
+        if failed:  # of data without noise the difference is all rounding, and no eigenvalue is less than one
+            size, axes = np.linalg.eigh(matrix)
+            factor = np.linalg.cholesky(axes * np.maximum(size, 1.0) @ axes.T)
+        return left, across, factor

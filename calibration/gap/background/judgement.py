@@ -12,9 +12,20 @@ from dataclasses import dataclass, replace
 
 from scipy.special import softmax
 
-from calibration.gap.background.search import ODDS, Gain, gains, is_curve, needed
+from calibration.gap.background.blocks import Block
+from calibration.gap.background.search import (
+    ODDS,
+    Gain,
+    gain,
+    grown,
+    is_beyond_limits,
+    is_curve,
+    log_prior,
+    needed,
+    promising,
+    temper,
+)
 from calibration.gap.background.system import Chosen, Model, System
-from calibration.gap.criteria import beyond
 from calibration.gap.screening import ScoredEffect
 
 _CERTAIN = 0.95  # posterior of a family
@@ -22,9 +33,9 @@ _OPEN = 0.02  # posterior of another family
 _ROUNDS = 5
 _BETTER = 1.0  # log odds, to take one effect for another
 _COMPARED = 8
+_BY_SCALES = 20.0  # log Bayes factor that other scales of the background may add
 NEAR = 5.0  # log Bayes factor: places and families this near are not told apart
 _NOT_TOLD = math.exp(-NEAR)
-_TRUE_TO = 25.0  # log Bayes factor beyond which it is true to a share of itself
 _DOMINATES = 4.0  # squares of a curve, of those of surfaces at its joint
 
 
@@ -57,7 +68,10 @@ class Judged:
 
 
 def judged(system: System, model: Model) -> tuple[Model, list[Judged]]:
-    """Return a model in which every effect is the most probable given all others, and the judgement of each."""
+    """Return a model in which every effect is the most probable given all others, and the judgement of each.
+
+    Where an effect had to go, the search goes on beside those that are left.
+    """
     for _ in range(_ROUNDS):
         before = model
         found: list[Judged] = []
@@ -68,7 +82,8 @@ def judged(system: System, model: Model) -> tuple[Model, list[Judged]]:
             changed = rivals.changed()
             model = model if changed is None else changed
             found += [] if changed is not None else [rivals.judgement()]
-        if model is before:
+        model = grown(system, model)
+        if model.effects == before.effects:
             return model, found
     return model, judgements(system, model)
 
@@ -86,27 +101,33 @@ class _Rivals:
         self.effect, self.rest = model.effects[number], model.without(number)
         self.candidate = system.candidates[self.effect[0]]
         self.without = system.fit(self.rest, model.scales)
-        found = gains(system, self.without, _COMPARED, always=self.effect[0])
-        own = next(g for g in found if g.scored.candidate is self.candidate)
-        gain = model.log_evidence - self.without.log_evidence
-        if gain > own.log_likelihood_gain:
-            more = gain - own.log_likelihood_gain
-            own = replace(
-                own,
-                log_bayes_factor=own.log_bayes_factor + more,
-                log_likelihood_gain=gain,
-                log_odds=own.log_odds + more,
-            )
-        self.gains = [own, *(g for g in found if g.scored.candidate is not self.candidate)]
-        # Where the background fits the machine imperfectly, evidence of any size is true to a share of it only.
-        self.temper = max(1.0, own.log_bayes_factor / _TRUE_TO)
+        # Scores at the scales of the whole: found again without the effect, a background takes what it can of it.
+        beside = system.at(self.rest, model.scales)
+        every = system.screen(beside).score()
+        own = self._own(next(w for w in every if w.candidate is self.candidate))
+        self.temper = temper(system, model, self.candidate, own.log_bayes_factor)
+        least = own.scored.log_bayes_factor - NEAR * self.temper - _BY_SCALES
+        near = [w for w in promising(system, beside, every) if w.log_bayes_factor > least]
+        others = [w for w in near if w.candidate is not self.candidate][:_COMPARED]
+        self.gains = [own, *(gain(system, self.without, w, model.scales) for w in others)]
         # A prior probability counts between a candidate and nothing; between families it is that of their places.
         self.odds = [(g.log_bayes_factor - math.log(_places(system, g))) / self.temper for g in self.gains]
+
+    def _own(self, scored: ScoredEffect) -> Gain:
+        """Return what the effect gains, in its present form or in that which is the best one now."""
+        odds = log_prior(self.system, self.without, self.candidate)
+        best = self.model.log_evidence - self.without.log_evidence
+        there = best + scored.form_averaging
+        own = Gain(scored, there, best, there + odds, self.model)
+        if self.system.choice(scored) == self.effect:
+            return own
+        again = gain(self.system, self.without, scored, self.model.scales)
+        return again if again.log_likelihood_gain > best else own
 
     def changed(self) -> Model | None:
         """Return the model without the effect where it is not needed, with a better one where there is one, or None."""
         best = max(range(len(self.gains)), key=self.odds.__getitem__)
-        if not self._is_needed() or beyond(self.system.projection.situation, self.gains[0].scored):
+        if not self._is_needed() or is_beyond_limits(self.system, self.model, self.gains[0].scored):
             return self.system.fit(self.rest, self.without.scales)
         if self.odds[best] > self.odds[0] + _BETTER:
             better = self.gains[best]
@@ -166,12 +187,17 @@ def curves(system: System, model: Model) -> dict[str, float]:
         if size[block.name] < _DOMINATES * sum(size[name] for name in surfaces):
             continue
         without = system.fit(model.effects, model.scales, without={block.name})
-        gain = model.log_evidence - without.log_evidence
-        near = gain - max(NEAR, gain * NEAR / _TRUE_TO)
-        imitated = any(
-            g.scored.candidate.where == block.where and g.log_bayes_factor > near
-            for g in gains(system, without, _COMPARED, without={block.name})
-        )
-        if gain + prior > ODDS and not imitated:
-            found[block.where] = gain + prior
+        added = model.log_evidence - without.log_evidence
+        if added + prior > ODDS and not _is_imitated(system, without, block, added):
+            found[block.where] = added + prior
     return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+def _is_imitated(system: System, without: Model, curve: Block, added: float) -> bool:
+    """True if another effect at its joint does nearly what a curve adds to a model that lacks it."""
+    every = promising(system, without, system.screen(without).score())
+    for scored in [w for w in every if w.candidate.where == curve.where][:_COMPARED]:
+        near = added - NEAR * temper(system, without, scored.candidate, added)
+        if gain(system, without, scored, without.scales, {curve.name}).log_bayes_factor > near:
+            return True
+    return False

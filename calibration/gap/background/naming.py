@@ -18,6 +18,7 @@ from calibration.gap.background.judgement import curves, judged, judgements
 from calibration.gap.background.reading_noise import with_reading_noise
 from calibration.gap.background.search import MAP, ODDS, is_curve, linear_system, search_beside
 from calibration.gap.background.system import Model, System
+from calibration.gap.background.widening import PossibleBlocks
 from calibration.gap.candidates import candidate_at, variants_at
 from calibration.gap.joint_fit import JointFit, Problem
 from calibration.gap.projection import Integers, Projection, rows_of
@@ -55,7 +56,11 @@ class Names:
 
 
 def names_beside(
-    problem: Problem, blocks: Sequence[Block], families: Collection[str], known: Sequence[Choice]
+    problem: Problem,
+    blocks: Sequence[Block],
+    families: Collection[str],
+    known: Sequence[Choice],
+    possible: PossibleBlocks | None = None,
 ) -> Names:
     """Return the effects that are beyond doubt beside a background.
 
@@ -64,12 +69,13 @@ def names_beside(
         blocks: of the background.
         families: of effects that may be named.
         known: effects that were found without a background; they are judged like all others.
+        possible: yields blocks to widen the background by where the errors ask for them; None for none.
     """
     kinematics = problem.with_mild_outliers(problem.kinematics_only())
-    system, model = search_beside(problem, kinematics, blocks, families, known)
+    system, model = search_beside(problem, kinematics, blocks, families, known, possible)
     noisier = with_reading_noise(problem, system, model)
     if noisier is not problem:
-        system, model = search_beside(noisier, kinematics, blocks, families, known)
+        system, model = search_beside(noisier, kinematics, tuple(system.blocks.values()), families, known, possible)
     model, found = judged(system, model)
     evidence, choices = {}, list[Choice]()
     for one, p in zip(found, certificates(system, model, [set(o.places) for o in found], problem.seed), strict=True):

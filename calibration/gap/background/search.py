@@ -14,8 +14,8 @@ from calibration.gap.background.blocks import Block
 from calibration.gap.background.evidence import Scales
 from calibration.gap.background.system import Effect, Model, System
 from calibration.gap.background.weights import reweighted
+from calibration.gap.background.widening import PossibleBlocks, further_blocks
 from calibration.gap.candidates import CandidateEffect, candidate_at, candidate_effects
-from calibration.gap.criteria import beyond
 from calibration.gap.joint_fit import JointFit, Problem
 from calibration.gap.screening import ScoredEffect
 
@@ -48,11 +48,18 @@ class Gain:
 
 
 def search_beside(
-    problem: Problem, joint: JointFit, blocks: Sequence[Block], families: Collection[str], known: Sequence[Choice]
+    problem: Problem,
+    joint: JointFit,
+    blocks: Sequence[Block],
+    families: Collection[str],
+    known: Sequence[Choice],
+    possible: PossibleBlocks | None = None,
 ) -> tuple[System, Model]:
     """Return the linear model with all effects that are beyond doubt beside a background.
 
-    Outliers and scatter are judged again beside what was found, and the search goes on from there.
+    Outliers and scatter are judged again beside what was found, and the search goes on from there. An effect takes on
+    what others explain that are not found yet, so its estimate may be beyond its hard limits until they are: the
+    judgement of effects looks at limits, not the search.
 
     Args:
         problem: the data.
@@ -60,6 +67,7 @@ def search_beside(
         blocks: of the background.
         families: of effects that may be named.
         known: effects to begin with.
+        possible: yields blocks to widen the background by where the errors ask for them; None for none.
     """
     scales: Scales | None = None
     found: tuple[Effect, ...] = ()
@@ -68,11 +76,13 @@ def search_beside(
         joint = replace(joint, fit=fit)
         system, begun = linear_system(problem, joint, blocks, families, known)
         effects = found if number else begun
-        model = _grown(system, system.fit(system.chosen(effects), scales))
+        model = grown(system, system.fit(system.chosen(effects), scales), any_size=True)
         found = tuple((system.candidates[n], option, scale) for n, option, scale in model.effects)
         scales = model.scales
-        if number and len(found) == len(effects):
+        further = further_blocks(system, model, possible) if possible else ()
+        if number and len(found) == len(effects) and not further:
             break
+        blocks = [*blocks, *further]
     return system, model
 
 
@@ -131,9 +141,9 @@ def gains(
     system: System,
     model: Model,
     most: int = _TRIED,
-    always: int | None = None,
     without: Collection[str] = (),
     later: Collection[str] = (),
+    any_size: bool = False,
 ) -> list[Gain]:
     """Return what a model gains by the candidates that promise most, the greatest first.
 
@@ -141,27 +151,69 @@ def gains(
         system: the linear model.
         model: what is there.
         most: candidates.
-        always: number of a candidate that is among them whatever it promises.
         without: names of blocks that the model is to do without.
         later: families whose turn has not come.
+        any_size: candidates whose estimates are beyond their hard limits are among them.
     """
-    every, context = system.screen(model).score(), system.projection.situation
-    scored = sorted(
-        (w for w in every if w.log_bayes_factor > 0.0 and w.candidate.family not in later and not beyond(context, w)),
-        key=lambda w: -w.log_bayes_factor - log_prior(system, model, w.candidate),
-    )[:most]
-    scored += [
-        w
-        for w in every
-        if always is not None and w.candidate is system.candidates[always] and all(w is not v for v in scored)
-    ]
-    found = []
-    for w in scored:
-        tried = system.fit([*model.effects, system.choice(w)], model.scales, without=without, quick=True)
-        best = tried.log_evidence - model.log_evidence
-        gain = best + w.form_averaging
-        found.append(Gain(w, gain, best, gain + log_prior(system, model, w.candidate), tried))
+    every = system.screen(model).score()
+    possible = [w for w in promising(system, model, every, any_size=any_size) if w.candidate.family not in later]
+    found = [gain(system, model, w, model.scales, without) for w in possible[:most]]
     return sorted(found, key=lambda g: -g.log_odds)
+
+
+def promising(
+    system: System, model: Model, scored: Sequence[ScoredEffect], *, any_size: bool = False
+) -> list[ScoredEffect]:
+    """Return the scored candidates that speak for themselves, the most probable first.
+
+    Args:
+        system: the linear model.
+        model: beside which they were scored.
+        scored: candidates.
+        any_size: those whose estimates are beyond their hard limits are among them.
+    """
+    possible = [w for w in scored if w.log_bayes_factor > 0.0 and (any_size or not is_beyond_limits(system, model, w))]
+    return sorted(possible, key=lambda w: -w.log_bayes_factor - log_prior(system, model, w.candidate))
+
+
+def gain(system: System, model: Model, scored: ScoredEffect, start: Scales, without: Collection[str] = ()) -> Gain:
+    """Return what a model gains by a candidate, all scales of the background found again.
+
+    Args:
+        system: the linear model.
+        model: without the candidate.
+        scored: the candidate.
+        start: scales to start from.
+        without: names of blocks that the model is to do without.
+    """
+    tried = system.fit([*model.effects, system.choice(scored)], start, without=without, quick=True)
+    best = tried.log_evidence - model.log_evidence
+    log_bayes_factor = best + scored.form_averaging
+    return Gain(scored, log_bayes_factor, best, log_bayes_factor + log_prior(system, model, scored.candidate), tried)
+
+
+def temper(system: System, model: Model, candidate: CandidateEffect, log_bayes_factor: float) -> float:
+    """Return the factor by which variances are larger, and log odds less, than a model says.
+
+    A machine does not do quite what the equation of an effect says, and a background fits it imperfectly: evidence that
+    is larger than the part that may differ can count is true to a share of it only. How imperfect it all is shows in
+    the noise, as far as station and readings do not account for that.
+
+    Args:
+        system: the linear model.
+        model: beside which the evidence was taken.
+        candidate: the effect.
+        log_bayes_factor: the evidence.
+    """
+    unexplained = max(0.0, 1.0 - system.products.least_noise / model.scales.noise)
+    differs = 2.0 * library()[candidate.family].shape_sigma ** 2 * log_bayes_factor
+    return 1.0 + unexplained * (max(1.0, differs) - 1.0)
+
+
+def is_beyond_limits(system: System, model: Model, scored: ScoredEffect) -> bool:
+    """True if an estimate is beyond its hard limits by more than chance and an imperfect background account for."""
+    error = scored.standard_error * math.sqrt(temper(system, model, scored.candidate, scored.log_bayes_factor))
+    return bool(scored.choice.beyond(system.projection.situation, scored.estimate, error))
 
 
 def log_prior(system: System, model: Model, candidate: CandidateEffect) -> float:
@@ -202,16 +254,21 @@ def needed(system: System, model: Model, candidate: CandidateEffect) -> float:
     return ODDS_OF_TWO if there or is_curve(system, candidate) else ODDS
 
 
-def _grown(system: System, model: Model) -> Model:
+def grown(system: System, model: Model, *, any_size: bool = False) -> Model:
     """Return a model with the effect of the greatest gain added until none is beyond doubt.
 
     One coefficient of an effect that comes after another can stand for several of that one, and would be taken for it:
     it has its turn when none of the others is beyond doubt any more.
+
+    Args:
+        system: the linear model.
+        model: what is there.
+        any_size: effects whose estimates are beyond their hard limits are added too.
     """
     families = {c.family for c in system.candidates}
     for later in ({name for name in families if families & set(library()[name].comes_after)}, set[str]()):
         while len(model.effects) < _MOST:
-            every = gains(system, model, later=later)
+            every = gains(system, model, later=later, any_size=any_size)
             found = [g for g in every if g.log_odds > needed(system, model, g.scored.candidate)]
             if not found:
                 break

@@ -25,7 +25,7 @@ Integers = NDArray[np.intp]
 Chosen = tuple[int, int, float]  # number of a candidate, its variant, scale of plausible sizes
 Effect = tuple[CandidateEffect, int, float]
 
-_ITERATIONS, _FEW = 60, 10
+_ENOUGH, _NEARLY = 0.01, 0.1  # of a log evidence; differences of several are what counts
 _START, _AGAIN = -1.0, -3.0  # log scale of a block at the beginning, and of one that had vanished
 _AT_ONCE = 3000  # rows
 _GONE = -5.0  # log scale of a block that has vanished
@@ -151,7 +151,7 @@ class System:
         }
         fixed, sigma = self._fixed(effects)
         noise = 1.0 if start is None else start.noise
-        scales = greatest(self.products, fixed, sigma, blocks, log_scale, noise, _FEW if quick else _ITERATIONS)
+        scales = greatest(self.products, fixed, sigma, blocks, log_scale, noise, _NEARLY if quick else _ENOUGH)
         return Model(tuple(effects), scales)
 
     def background_log_bayes_factor(self, model: Model) -> float:
