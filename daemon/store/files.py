@@ -117,7 +117,7 @@ class RestoreNote:
 
 
 def restore_note_path(database: Path) -> Path:
-    """Where the note of a restore is while its renames are made."""
+    """Return the path of the note that a restore keeps while it renames files."""
     return _beside(database, ".restoring")
 
 
