@@ -24,7 +24,12 @@ EFFECTS = (  # hidden effects of the machine, beside its build tolerances
 TRAINING_POSES = 22
 CHECK_POSES = 4
 JOB_STEPS = 60  # of progress, beside one for each pose
-_JOBS = {"gap": "identification and missing physics", "residual": "learning what remains", "report": "the report"}
+_JOBS = {
+    "gap": "identification and missing physics",
+    "residual": "learning what remains",
+    "report": "the report",
+    "comparison": "the comparison of models",
+}
 SEED = 1
 _SEEDS = 100_000
 

@@ -17,14 +17,19 @@ def job(kind: str, state: str, progress: float = 0.0, message: str = "") -> dict
     ("jobs", "share", "text"),
     [
         ([], 0.0, "waiting for identification and missing physics"),
-        ([job("gap", "running", 0.5, "solving")], 1 / 6, "identification and missing physics: solving"),
+        ([job("gap", "running", 0.5, "solving")], 1 / 8, "identification and missing physics: solving"),
         (
             [job("gap", "done", 1.0), job("residual", "running"), job("report", "queued")],
-            1 / 3,
+            1 / 4,
             "learning what remains: starting",
         ),
-        ([job("gap", "done", 1.0), job("residual", "done", 1.0)], 2 / 3, "waiting for the report"),
-        ([job("gap", "done"), job("residual", "done"), job("report", "done")], 1.0, "waiting for the jobs to end"),
+        ([job("gap", "done", 1.0), job("residual", "done", 1.0)], 1 / 2, "waiting for the report"),
+        ([job(kind, "done") for kind in ("gap", "residual", "report")], 3 / 4, "waiting for the comparison of models"),
+        (
+            [*(job(kind, "done") for kind in ("gap", "residual", "report")), job("comparison", "done")],
+            1.0,
+            "waiting for the jobs to end",
+        ),
         ([job("gap", "failed", 0.4), job("gap", "queued")], 0.0, "waiting for identification and missing physics"),
     ],
 )
