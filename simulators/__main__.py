@@ -24,6 +24,7 @@ from calibration.errors import RigError
 from drivers.can.ports import Interface
 from drivers.clock import ScaledClock, Stamp, SystemClock
 from drivers.errors import LinkError
+from simulators.blind.effect_draws import require_plausible
 from simulators.blind.hiding import HiddenEffect, draw_hidden_effect
 from simulators.devices.stations.total_station import StationSettings
 from simulators.drive import PlanDriver
@@ -133,7 +134,9 @@ def _build(options: argparse.Namespace, start: Mapping[str, float] | None) -> tu
         mappings=dict(options.map),
     )
     effects = parse_effects(options.effects)
-    truth = RigTruth(load_rig(options.rig), options.seed, perturbation=options.perturbation, effects=effects)
+    rig = load_rig(options.rig)
+    require_plausible(rig, effects)
+    truth = RigTruth(rig, options.seed, perturbation=options.perturbation, effects=effects)
     hidden = None
     if options.secret is not None:
         hidden = draw_hidden_effect(truth, np.random.default_rng([options.seed, 35]))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from calibration.rig.description import Rig
 from simulators.blind.duty_cycle import continue_duty_cycle, draw_duty_cycle
+from simulators.blind.effect_draws import require_plausible
 from simulators.effects.library import parse_effects
 from simulators.plan import PlanRow
 from simulators.rig.dataset import SimulatedObservations, random_poses
@@ -84,9 +85,11 @@ def simulate_campaign(
         recording: another number takes other poses and other noise of the same machine.
 
     Raises:
-        ValueError: unknown effects, effects that the rig has no place for.
+        ValueError: unknown effects, effects that the rig has no place for or that no machine has.
     """
-    truth = RigTruth(rig, seed, effects=parse_effects(effects))
+    hidden = parse_effects(effects)
+    require_plausible(rig, hidden)
+    truth = RigTruth(rig, seed, effects=hidden)
     rng = np.random.default_rng([seed, 44, recording])
     visited = [plan[i % len(plan)] for i in range(poses)] if plan else []
     if visited:

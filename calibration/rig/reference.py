@@ -186,8 +186,12 @@ def _default(field: FieldInfo) -> str:
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
     """Yield the lines of a table in Markdown."""
-    for row in (header, ["---"] * len(header), *rows):
-        yield "| " + " | ".join(cell.replace("|", r"\|") for cell in row) + " |"
+    yield from map(table_row, (header, ["---"] * len(header), *rows))
+
+
+def table_row(cells: Sequence[str]) -> str:
+    """Return a line of a table in Markdown, with the cells' own bars escaped."""
+    return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from daemon.cli.command import json_option
 from daemon.control.protocol import request
 
 DEFAULT_SOCKET = Path("/run/rigcal/control.sock")
+INSTALLED_CONFIG = Path("/etc/rigcal/rigcal.toml")
 
 operator_option = click.option(
     "--operator", default=lambda: os.environ.get("USER", ""), help="Who is responsible; kept with the decision."
@@ -29,6 +30,22 @@ def socket_of(path: Path | None, config: Path | None) -> Path:
 
         return read_config(config).socket_path
     return Path(os.environ.get("RIGCAL_SOCKET", DEFAULT_SOCKET))
+
+
+def config_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add `--config` to a command on a daemon's files; without it, the installed service's is meant."""
+    return click.option(
+        "--config",
+        type=click.Path(path_type=Path),
+        callback=_installed,
+        help=f"Configuration of the daemon.  [default: {INSTALLED_CONFIG}]",
+    )(command)
+
+
+def _installed(_ctx: click.Context, _parameter: click.Parameter, given: Path | None) -> Path:
+    if given is None and not INSTALLED_CONFIG.exists():
+        raise click.UsageError(f"there is no {INSTALLED_CONFIG}: name the daemon's configuration with --config FILE")
+    return given or INSTALLED_CONFIG
 
 
 def client_options(command: Callable[..., Any]) -> Callable[..., Any]:

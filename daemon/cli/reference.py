@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import click
 
+from calibration.rig.reference import table_row
 from daemon.cli.main import main
 from daemon.cli.terminal import echo_text
 
@@ -52,18 +53,18 @@ def _parts(context: click.Context, command: click.Command) -> Iterator[str]:
     ]
     if records:
         lines += ["", "| option | |", "|---|---|"]
-        lines += [f"| `{_cell(names)}` | {_cell(text)} |" for names, text in records]
+        lines += [table_row((f"`{_one_line(names)}`", _one_line(text))) for names, text in records]
     yield "\n".join(lines) + "\n"
 
 
 def _text(command: click.Command) -> str:
     """Return a command's help, a paragraph a line."""
     text = textwrap.dedent(command.help or "").replace("\b\n", "").strip()
-    return "\n\n".join(" ".join(paragraph.split()) for paragraph in text.split("\n\n"))
+    return "\n\n".join(_one_line(paragraph) for paragraph in text.split("\n\n"))
 
 
-def _cell(text: str) -> str:
-    return " ".join(text.split()).replace("|", "\\|")
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
 
 
 if __name__ == "__main__":

@@ -7,12 +7,14 @@ import http.client
 import json
 import os
 import signal
+import socket
 import subprocess
 import threading
 import urllib.error
 import urllib.request
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from email.message import EmailMessage
+from functools import partial
 from typing import IO, Any, Protocol
 from urllib.parse import urlsplit
 
@@ -20,7 +22,7 @@ from daemon.host.safe_output import shown
 from daemon.host.systemd import network_hint
 from daemon.monitoring.notice import Message
 
-WEBHOOK_TIMEOUT_S = 10.0
+WEBHOOK_TIMEOUT_S = 10.0  # of a delivery as a whole, as that of a command
 COMMAND_TIMEOUT_S = 30.0
 _QUOTED = 200  # characters of what a server or a command says
 
@@ -50,6 +52,92 @@ class _NoRedirect(urllib.request.HTTPRedirectHandler):
         return None
 
 
+class _Connection(http.client.HTTPConnection):
+    """Tells of its socket as soon as there is one, also where TLS begins on it afterwards."""
+
+    opened: Callable[[socket.socket], None]
+
+    def connect(self) -> None:
+        super().connect()
+        self.opened(self.sock)
+
+
+class _TlsConnection(http.client.HTTPSConnection, _Connection):
+    """Calls `_Connection.connect`, then begins TLS."""
+
+
+class _Handler(urllib.request.HTTPHandler, urllib.request.HTTPSHandler):
+    """Opens connections that tell of their sockets."""
+
+    def __init__(self, opened: Callable[[socket.socket], None]) -> None:
+        super().__init__()
+        self._opened = opened
+
+    def http_open(self, request: urllib.request.Request) -> http.client.HTTPResponse:
+        return self.do_open(partial(self._made, _Connection), request)
+
+    def https_open(self, request: urllib.request.Request) -> http.client.HTTPResponse:
+        return self.do_open(partial(self._made, _TlsConnection), request)
+
+    def _made(self, kind: type[_Connection], host: str, **more: Any) -> _Connection:
+        connection = kind(host, **more)
+        connection.opened = self._opened
+        return connection
+
+
+class _Post(threading.Thread):
+    """A request that is given up as a whole: a time-out of urllib is one for each read, and a byte starts it anew.
+
+    Args:
+        request: to be sent.
+        longest_s: how long it may take from the name's look-up to the end of the answer.
+    """
+
+    def __init__(self, request: urllib.request.Request, longest_s: float) -> None:
+        super().__init__(name="webhook", daemon=True)
+        self._request, self._longest_s = request, longest_s
+        self._turn = threading.Lock()
+        self._lines: list[socket.socket] = []
+        self._is_over = False
+        self._error: Exception | None = None
+
+    def send(self) -> None:
+        """Send it and wait for the answer; raises what urllib raises, and TimeoutError after `longest_s`."""
+        self.start()
+        self.join(self._longest_s)
+        if self.is_alive():
+            self._give_up()
+            raise TimeoutError(f"no whole answer within {self._longest_s:g} s")
+        if self._error is not None:
+            raise self._error
+
+    def run(self) -> None:
+        opener = urllib.request.build_opener(_NoRedirect, _Handler(self._opened))
+        try:
+            with opener.open(self._request, timeout=self._longest_s) as answer:
+                answer.read(_QUOTED)
+        except Exception as error:  # noqa: BLE001 - raised by `send`, in the thread that waits
+            self._error = error
+        finally:
+            with self._turn:
+                for line in self._lines:
+                    line.close()
+                self._lines.clear()
+
+    def _opened(self, line: socket.socket) -> None:
+        with self._turn:
+            self._lines.append(line.dup())  # TLS takes the socket itself away
+        if self._is_over:
+            self._give_up()
+
+    def _give_up(self) -> None:
+        self._is_over = True
+        with self._turn:
+            for line in self._lines:
+                with contextlib.suppress(OSError):
+                    line.shutdown(socket.SHUT_RDWR)
+
+
 class Webhook:
     """Posts a message as JSON; its key `text` is what chat services show.
 
@@ -62,15 +150,13 @@ class Webhook:
     def __init__(self, url: str) -> None:
         self._url = url
         self._host = urlsplit(url).hostname or ""
-        self._opener = urllib.request.build_opener(_NoRedirect)
 
     def deliver(self, message: Message) -> None:
         body = json.dumps(message.data).encode()
         headers = {"Content-Type": "application/json", "User-Agent": "rigcal"}
         request = urllib.request.Request(self._url, body, headers, method="POST")
         try:
-            with self._opener.open(request, timeout=WEBHOOK_TIMEOUT_S) as answer:
-                answer.read(_QUOTED)
+            _Post(request, WEBHOOK_TIMEOUT_S).send()
         except urllib.error.HTTPError as error:
             with error:
                 raise DeliveryError(f"{self._host} answers {error.code} {shown(error.reason, _QUOTED)}") from None

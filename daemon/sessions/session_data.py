@@ -1,4 +1,4 @@
-"""Contents of a stored session, for calibration and report.
+"""Contents of a stored session and the time of its rows, for calibration, report and export.
 
 Observations come as CSV (docs/reference/formats.md): from here on a session is read exactly as an imported file is.
 """
@@ -9,18 +9,36 @@ import csv
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from calibration.rig.description import Rig
 from calibration.table import LABEL_COLUMNS, POSITION_COLUMNS, SIGMA_COLUMNS
 from daemon.report.calibration.inputs import ControlPoint, SetupLine
-from daemon.sessions.steady_time import SteadyTime
 from daemon.store.queries.sessions import first_observation_ns, moving_observations, observations, session
 from daemon.store.queries.setups import misclosures, setups_of
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S, Stamp
 
 Misclosure = tuple[float, float, float]
+
+
+class SteadyTime:
+    """Puts instants on one axis: UTC as it was at the first instant of each boot, and no boot before the one before.
+
+    So UTC has no steps of a computer's clock: within a boot, time passes as the monotonic clock says.
+    """
+
+    def __init__(self) -> None:
+        self._offsets_ns: dict[str, int] = {}
+        self._latest_ns = -(2**63)
+
+    def of(self, stamp: Stamp) -> Stamp:
+        """The same instant, with steady UTC in place of that of the computer."""
+        if stamp.boot_id not in self._offsets_ns:
+            self._offsets_ns[stamp.boot_id] = max(stamp.utc_ns, self._latest_ns) - stamp.monotonic_ns
+        utc_ns = stamp.monotonic_ns + self._offsets_ns[stamp.boot_id]
+        self._latest_ns = max(self._latest_ns, utc_ns)
+        return replace(stamp, utc_ns=utc_ns)
 
 
 def sessions_csv(reader: Reader, rig: Rig, session_ids: Sequence[str], *, moving: bool = False) -> bytes:

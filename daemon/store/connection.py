@@ -19,7 +19,7 @@ from typing import Any, TypeVar, cast
 from sqlite_utils import Database
 
 from daemon.store.errors import StoreError, is_damage, storage_sentence
-from daemon.store.files import StoreFiles, WriterLock
+from daemon.store.files import StoreFiles, WriterLock, require_no_half_restore
 from daemon.store.migrations import MIGRATIONS, pending_migrations, unknown_migrations
 from daemon.store.reader import Reader
 from daemon.store.rows import SqlValue, sql_value, stamp_of, stored_text
@@ -48,8 +48,8 @@ class Connection:
 
     Raises:
         StoreBusyError: another process writes to it.
-        StoreError: it is no such database, is damaged, was made by a newer rigcal, its directory cannot be used, or
-            the disk is full.
+        StoreError: it is no such database, is damaged or half restored, was made by a newer rigcal, its directory
+            cannot be used, or the disk is full.
     """
 
     def __init__(self, path: Path) -> None:
@@ -60,6 +60,7 @@ class Connection:
         self._turn = threading.RLock()
         self._lock = WriterLock(path)
         try:
+            require_no_half_restore(path)
             # Transactions take turns under `_turn`, so the connection need not belong to one thread.
             connection = sqlite3.connect(path, check_same_thread=False)
             connection.text_factory = stored_text

@@ -1,17 +1,20 @@
 """The files of a store: which they are, whatever they are called, and the lock of the one process that writes.
 
-A name can come to mean another file while a program has the first one open.
+A name can come to mean another file while a program has the first one open. While a restore renames files, a note
+beside the database says so: one that was killed leaves it, and nobody takes half a store for an empty one.
 """
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
+import json
 import os
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from daemon.store.errors import StoreBusyError, storage_errors
+from daemon.host.safe_output import write_file
+from daemon.store.errors import StoreBusyError, StoreError, storage_errors
 
 BESIDE = ("", "-wal", "-shm")  # a database in WAL mode is three files
 
@@ -76,6 +79,61 @@ class StoreFiles:
             if opened is not None and now != opened:
                 return path, now is not None
         return None
+
+
+@dataclass(frozen=True)
+class RestoreNote:
+    """A restore whose renames have begun and have not all been made.
+
+    Attributes:
+        backup: directory that is put in the store's place.
+        aside: name of the directory beside the store that what was there is moved to.
+        replaced: names of files and directories that are moved there.
+    """
+
+    backup: str
+    aside: str
+    replaced: tuple[str, ...]
+
+    @classmethod
+    def of(cls, database: Path) -> RestoreNote | None:
+        """The note beside a database; None where no restore was cut off.
+
+        Raises:
+            StoreError: it cannot be read.
+        """
+        path = restore_note_path(database)
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))
+            return cls(str(found["backup"]), str(found["aside"]), tuple(map(str, found["replaced"])))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, LookupError, TypeError) as error:
+            raise StoreError(f"{path}: the note of a restore that was cut off cannot be read ({error})") from error
+
+    def write(self, database: Path) -> None:
+        """Write the note beside a database, durably; OSError where the file system refuses."""
+        write_file(restore_note_path(database), json.dumps(asdict(self)).encode() + b"\n")
+
+
+def restore_note_path(database: Path) -> Path:
+    """Return the path of the note that a restore keeps while it renames files."""
+    return _beside(database, ".restoring")
+
+
+def require_no_half_restore(database: Path) -> None:
+    """Refuse a store of which a restore has put a part in place and no more.
+
+    Raises:
+        StoreError: a restore was cut off; the message says how to end it.
+    """
+    note = RestoreNote.of(database)
+    if note is not None:
+        raise StoreError(
+            f"{database}: a restore of {note.backup} was cut off, so store and models are not whole; run `rigcal store "
+            f"restore {note.backup}` again, with the same --config (what was replaced is kept in "
+            f"{database.parent / note.aside})"
+        )
 
 
 class WriterLock:

@@ -7,12 +7,15 @@ is removed from the file ends at once what is done with it.
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import hashlib
 import json
 import os
 import secrets
 import threading
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
@@ -106,12 +109,13 @@ class TokenBook:
         """
         if not 1 <= len(name) <= NAME_CHARACTERS or not name.isprintable() or not name.strip():
             raise CommandError(f"a token's name is 1 to {NAME_CHARACTERS} printable characters, not {name!r:.80}")
-        entries = self.entries()
-        if any(entry.name == name for entry in entries):
-            raise CommandError(f"{name!r} has a token already; remove it first, or choose another name")
         token = PREFIX + secrets.token_urlsafe(32)
         entry = _Entry(name=name, role=role.word, sha256=_digest(token), created_utc_ns=created_utc_ns)
-        self._write((*entries, entry))
+        with self._alone():
+            entries = self.entries()
+            if any(entry.name == name for entry in entries):
+                raise CommandError(f"{name!r} has a token already; remove it first, or choose another name")
+            self._write((*entries, entry))
         return token
 
     def remove(self, name: str) -> None:
@@ -120,12 +124,13 @@ class TokenBook:
         Raises:
             CommandError: there is none of that name, or the file cannot be read or written.
         """
-        entries = self.entries()
-        kept = tuple(entry for entry in entries if entry.name != name)
-        if len(kept) == len(entries):
-            known = ", ".join(entry.name for entry in entries) or "none"
-            raise CommandError(f"there is no token of {name!r}; there are: {known}")
-        self._write(kept)
+        with self._alone():
+            entries = self.entries()
+            kept = tuple(entry for entry in entries if entry.name != name)
+            if len(kept) == len(entries):
+                known = ", ".join(entry.name for entry in entries) or "none"
+                raise CommandError(f"there is no token of {name!r}; there are: {known}")
+            self._write(kept)
 
     def entries(self) -> tuple[_Entry, ...]:
         """Return all tokens' names, roles and hashes.
@@ -153,6 +158,22 @@ class TokenBook:
             if secrets.compare_digest(entry.sha256, digest):
                 return Person(entry.name, Role.named(entry.role))
         return None
+
+    @contextlib.contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Hold the lock of the file's directory: of two processes that change the file, one reads what the other wrote.
+
+        The kernel drops the lock when the process ends, however it ends.
+        """
+        try:
+            directory = os.open(self.path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        except OSError as error:
+            raise CommandError(f"{self.path}: cannot be written: {error.strerror}", FAILED) from error
+        try:
+            fcntl.flock(directory, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(directory)
 
     def _read(self) -> tuple[_Entry, ...]:
         try:

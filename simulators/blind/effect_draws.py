@@ -19,6 +19,7 @@ from simulators.rig.truth import RigTruth, replace_effects
 Floats = NDArray[np.float64]
 
 _VOLUME_POSES = 256
+_ROUNDING = 1e-3  # of a bound that was read in a message
 _LEAST_LOAD = 0.05  # of the largest on any joint: less bends nothing
 
 
@@ -103,6 +104,24 @@ class EffectDraws:
         largest_mm = 1e3 * float(np.linalg.norm(moved_mm, axis=1).max())
         return {name: value * (bounds[name] / largest_mm) for name, value in size.items()}
 
+    def limits(self, effect: Effect) -> dict[str, float]:
+        """Return the most that each amplitude of an effect may be asked to be: its hard bound, or its usual size.
+
+        A joint that carries next to nothing has the bounds of one that carries a little.
+        """
+        size = {name: abs(float(getattr(effect, name))) for name in effect.amplitudes}
+        usual = {name: abs(float(getattr(type(effect)(where=effect.where), name))) for name in size}
+        times = max(size[name] / usual[name] for name in size)
+        if times == 0.0:
+            return {}
+        if effect.bounded_at == "largest_load" and not self._carries(effect.where) and effect.where != "base":
+            load = _LEAST_LOAD * max(self._loads.values())
+            bounds = {name: bound / load for name, bound in effect.amplitudes.items()} if load else {}
+        else:
+            usual_size: dict[str, Any] = {name: value / times for name, value in size.items()}  # bounds go by direction
+            bounds = self.bounds(replace(effect, **usual_size))
+        return {name: max(bound, usual[name]) for name, bound in bounds.items()}
+
     def _carries(self, where: str) -> bool:
         return self._loads.get(where, 0.0) >= _LEAST_LOAD * max(self._loads.values(), default=0.0) > 0.0
 
@@ -138,3 +157,21 @@ class EffectDraws:
     def _tip_mm(self, effects: Sequence[Effect]) -> Floats:
         tip = max(self.rig.prisms, key=lambda prism: prism.frame).name
         return replace_effects(self._nominal, effects).prism_mm(tip, self._volume)
+
+
+def require_plausible(rig: Rig, effects: Sequence[Effect]) -> None:
+    """Refuse effects beyond their hard bounds: no machine of the rig has them.
+
+    Raises:
+        ValueError: names the coefficient and its bound.
+    """
+    draws = EffectDraws(rig, rig.prism_names, 0.0, 0.0, 0.0)
+    for effect in effects:
+        effect.check(rig)
+        for name, bound in draws.limits(effect).items():
+            value = getattr(effect, name)
+            if abs(value) > bound * (1.0 + _ROUNDING):
+                raise ValueError(
+                    f"{effect.family}@{effect.where}: {name}={value:g} is beyond {bound:.3g}, the most that such a "
+                    "machine can have"
+                )

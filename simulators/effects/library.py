@@ -43,6 +43,9 @@ _SEEDED_ORDER = (
 )
 
 
+_LARGEST_INTEGER = 1 << 31  # of a seed
+
+
 def _found_in(room: ModuleType) -> dict[str, type[Effect]]:
     """Effects defined in a module, or in the modules of a package, in alphabetical order of their families."""
     names = [f"{room.__name__}.{module.name}" for module in pkgutil.iter_modules(getattr(room, "__path__", []))]
@@ -98,5 +101,7 @@ def _parse_one(part: str) -> Effect:
             raise ValueError(f"{part!r}: {value!r} is not a number") from None
         if not math.isfinite(number):
             raise ValueError(f"{part!r}: {value!r} is not a finite number")
+        if known[name] == "int" and not (number.is_integer() and abs(number) <= _LARGEST_INTEGER):
+            raise ValueError(f"{part!r}: {value!r} is not a whole number up to {_LARGEST_INTEGER}")
         values[name] = int(number) if known[name] == "int" else number
     return kind(where=where, **values)

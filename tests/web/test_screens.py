@@ -107,6 +107,20 @@ def test_the_colours_can_be_changed_and_stay(new_page: NewPage, web: WebProcess)
     assert page.evaluate("document.documentElement.dataset.theme") == "dark"
 
 
+def test_charts_with_nothing_to_show_are_sentences(new_page: NewPage, tmp_path: Path) -> None:
+    (tmp_path / "rigcal.toml").write_text('rig = "swdt82"\nstate_directory = "."\n', encoding="utf-8")
+    with idle_daemon(tmp_path):
+        web = WebProcess(tmp_path / "rigcal.toml")
+        try:
+            page = new_page()
+            open_live(page, f"{web.address}/history")
+            for sentence in ("No check session was held", "Nothing adds up", "No known control point", "No model was"):
+                expect(page.get_by_text(sentence)).to_be_visible()
+            expect(page.locator("canvas, summary:visible, .chart:visible")).to_have_count(0)
+        finally:
+            assert web.stop() == 0
+
+
 # ---- alarms ----------------------------------------------------------------------------------------------------------
 
 
@@ -141,6 +155,10 @@ def test_each_alarm_is_shown_with_what_to_do(new_page: NewPage, months: Config, 
                 expect(alarm).to_contain_text("Critical" if rule.severity == "critical" else "Warning")
             expect(page.get_by_role("button", name="The zeros are checked")).to_be_visible()
             assert violations(page) == []
+            heading, first = page.locator("#alarms-title").bounding_box(), page.locator(".alarm").first.bounding_box()
+            assert heading is not None
+            assert first is not None
+            assert first["y"] - (heading["y"] + heading["height"]) >= 8, "the heading stands clear of the first alarm"
         finally:
             assert web.stop() == 0
 

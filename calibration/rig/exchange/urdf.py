@@ -152,7 +152,9 @@ class _Reader:
         for element in elements:  # a namespace of the whole document says nothing
             element.tag = _plain(element.tag)
         links = self._links(root)
-        joints = _in_own_units([self._joint(e) for e in root.findall("joint")])
+        stated = [self._joint(e) for e in root.findall("joint")]
+        slides = {joint.name: joint.kind == "prismatic" for joint in stated}
+        joints = [_in_own_units(joint, slides) for joint in stated]
         by_child = {joint.child: joint for joint in joints}
         self._check_tree(links, joints, by_child)
         return Urdf(root.get("name") or "robot", links, by_child)
@@ -309,14 +311,14 @@ def _plain(tag: str) -> str:
     return tag.rpartition("}")[2]
 
 
-def _in_own_units(joints: list[UrdfJoint]) -> list[UrdfJoint]:
-    """Return the joints with multipliers of mimics in rad and mm, where the document has rad and m."""
-    slides = {joint.name: joint.kind == "prismatic" for joint in joints}
-    out = []
-    for joint in joints:
-        mimic = joint.mimic
-        if mimic is not None and slides.get(mimic.joint, slides[joint.name]) != slides[joint.name]:
-            scaled = mimic.multiplier * (1e3 if slides[joint.name] else 1e-3)
-            joint = replace(joint, mimic=replace(mimic, multiplier=scaled))  # noqa: PLW2901
-        out.append(joint)
-    return out
+def _in_own_units(joint: UrdfJoint, slides: Mapping[str, bool]) -> UrdfJoint:
+    """Return a joint with the multiplier of its mimic in rad and mm, where the document has rad and m.
+
+    Args:
+        joint: as read.
+        slides: name of each joint -> True if it is prismatic.
+    """
+    mimic, own = joint.mimic, joint.kind == "prismatic"
+    if mimic is None or slides.get(mimic.joint, own) == own:
+        return joint
+    return replace(joint, mimic=replace(mimic, multiplier=mimic.multiplier * (1e3 if own else 1e-3)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,13 @@ EFFECTS = (  # hidden effects of the machine, beside its build tolerances
 )
 TRAINING_POSES = 22
 CHECK_POSES = 4
+JOB_STEPS = 60  # of progress, beside one for each pose
+_JOBS = {
+    "gap": "identification and missing physics",
+    "residual": "learning what remains",
+    "report": "the report",
+    "comparison": "the comparison of models",
+}
 SEED = 1
 _SEEDS = 100_000
 
@@ -80,8 +87,7 @@ def _calibrate(out: Path, rate: float, seed: int, advance: Advance) -> dict[str,
         for kind, poses in (("static_poses", TRAINING_POSES), ("check", CHECK_POSES)):
             for prism in PRISMS:
                 operator.record(prism, kind, poses, advance)
-        advance("identification, residual and report", 0)
-        operator.wait("the jobs", lambda: _jobs_ended(operator))
+        _wait_for_jobs(operator, advance)
         report = [job for job in operator.say("jobs.list") if job["kind"] == "report"][-1]
         if report["state"] != "done":
             failed = next(job for job in operator.say("jobs.list") if job["state"] == "failed")
@@ -91,14 +97,46 @@ def _calibrate(out: Path, rate: float, seed: int, advance: Advance) -> dict[str,
         operator.close()
 
 
-def _jobs_ended(operator: Operator) -> bool:
-    jobs = operator.say("jobs.list")
-    reports = [job for job in jobs if job["kind"] == "report"]
-    return bool(reports) and all(job["state"] not in {"queued", "running"} for job in jobs)
+def _wait_for_jobs(operator: Operator, advance: Advance) -> None:
+    told = 0
+
+    def ended() -> bool:
+        nonlocal told
+        jobs = operator.say("jobs.list")
+        share, text = awaited(jobs)
+        now = max(told, int(JOB_STEPS * share))  # sessions that were closed later queue jobs of their own
+        advance(text, now - told)
+        told = now
+        reports = [job for job in jobs if job["kind"] == "report"]
+        return bool(reports) and all(job["state"] not in {"queued", "running"} for job in jobs)
+
+    operator.wait("the jobs", ended)
+
+
+def awaited(jobs: Sequence[Mapping[str, Any]]) -> tuple[float, str]:
+    """Return the share of the jobs' work that is done, and what is awaited in words.
+
+    Args:
+        jobs: of the demonstration so far, oldest first, as `jobs.list` tells them.
+    """
+    newest = {job["kind"]: job for job in jobs}
+    shares = {kind: _share(newest.get(kind)) for kind in _JOBS}
+    running = next((job for job in jobs if job["state"] == "running"), None)
+    if running is not None:
+        text = f"{_JOBS.get(running['kind'], running['kind'])}: {running['message'] or 'starting'}"
+    else:
+        text = f"waiting for {next((_JOBS[kind] for kind in _JOBS if shares[kind] < 1.0), 'the jobs to end')}"
+    return sum(shares.values()) / len(shares), text
+
+
+def _share(job: Mapping[str, Any] | None) -> float:
+    if job is None or job["state"] == "queued":
+        return 0.0
+    return float(job["progress"]) if job["state"] == "running" else 1.0
 
 
 def _steps() -> int:
-    return len(PRISMS) * (TRAINING_POSES + CHECK_POSES)
+    return len(PRISMS) * (TRAINING_POSES + CHECK_POSES) + JOB_STEPS
 
 
 def _make_room(out: Path) -> None:

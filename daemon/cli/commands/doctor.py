@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from daemon.cli import diagnosis
-from daemon.cli.client import client_options, socket_of
+from daemon.cli.client import INSTALLED_CONFIG, client_options, socket_of
 from daemon.cli.command import DONE, FAILED, Command, Delivered
 from daemon.cli.diagnosis import Finding
 from daemon.cli.terminal import echo
@@ -18,7 +18,6 @@ from daemon.commands import CommandError
 from daemon.control.protocol import request
 from daemon.version import VERSION
 
-CONFIG = Path("/etc/rigcal/rigcal.toml")
 TIMEOUT_S = 10.0
 _COLOURS = {"good": "green", "warning": "yellow", "fault": "red", "unknown": None}
 
@@ -43,14 +42,14 @@ def doctor(socket: Path | None, config: Path | None, as_json: bool) -> Delivered
 
 def _examine(socket: Path | None, path: Path | None) -> Iterator[Finding]:
     config = None
-    if path is None and CONFIG.exists():
-        path = CONFIG
+    if path is None and INSTALLED_CONFIG.exists():
+        path = INSTALLED_CONFIG
     if path is not None:
         config, finding = diagnosis.read_configuration(path)
         yield finding
     else:
         remedy = "`rigcal init` writes one; --config FILE names another"
-        yield Finding("configuration", "unknown", f"there is no {CONFIG}", remedy)
+        yield Finding("configuration", "unknown", f"there is no {INSTALLED_CONFIG}", remedy)
     yield from diagnosis.computer(config)
     at = socket_of(socket, None) if config is None or socket is not None else config.socket_path
     try:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -93,8 +92,6 @@ def plan(
     source = load_rig(rig)
     effects = _effects(separate, source.rig)
     place = _station(station)
-    if floor_mm is not None and not math.isfinite(floor_mm):
-        raise click.BadParameter(f"{floor_mm} is no height in mm", param_hint="--floor")
     if setup is not None and (directory is None or station is not None):
         raise click.BadParameter("it is one of a model's: give --model, and no --station", param_hint="--setup")
     model = None if directory is None else read_model(directory)

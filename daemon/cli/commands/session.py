@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from daemon.cli.client import ask, client_options, operator_option, socket_of, who
+from daemon.cli.client import ask, client_options, config_option, operator_option, socket_of, who
 from daemon.cli.command import Command, json_option
 from daemon.cli.lines.clock import latency_sentence
 from daemon.cli.lines.jobs import show_jobs
@@ -130,7 +130,7 @@ def session_show(name: str, **where: Any) -> Any:
 
 @session.command(cls=Command, name="export")
 @click.argument("name")
-@click.option("--config", type=click.Path(path_type=Path), required=True, help="Configuration of the store's daemon.")
+@config_option
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True, help="Directory for the files.")
 @click.option(
     "--format",

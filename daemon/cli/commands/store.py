@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from daemon.cli.client import utc
+from daemon.cli.client import config_option, utc
 from daemon.cli.command import DONE, FAILED, Command, Delivered, json_option
 from daemon.cli.terminal import echo, echo_error
 
@@ -22,12 +22,6 @@ TIMEOUT_S = 86_400.0  # a command that deletes a year, or decodes a week again; 
 _MIB = 2**20
 
 
-def _config_option(command: Callable[..., Any]) -> Callable[..., Any]:
-    return click.option(
-        "--config", type=click.Path(path_type=Path), required=True, help="Configuration of the store's daemon."
-    )(json_option(command))
-
-
 @click.group()
 def store() -> None:
     """The store: its size, its soundness, its backups, and what it keeps."""
@@ -35,7 +29,8 @@ def store() -> None:
 
 @store.command(cls=Command, name="stats")
 @click.option("--tables", is_flag=True, help="Also the size of each table and index; reads the whole store.")
-@_config_option
+@config_option
+@json_option
 def store_stats(config: Path, *, tables: bool, as_json: bool) -> dict[str, Any]:
     """Show how large the store is and what it holds."""
     from daemon.config import read_config
@@ -56,7 +51,8 @@ def store_stats(config: Path, *, tables: bool, as_json: bool) -> dict[str, Any]:
 
 @store.command(cls=Command, name="describe")
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="The file; standard output by default.")
-@_config_option
+@config_option
+@json_option
 def store_describe(config: Path, out: Path | None, *, as_json: bool) -> dict[str, Any]:
     """Write the metadata.yaml with which Datasette shows the store: titles, meanings of columns, queries."""
     from daemon.config import read_config
@@ -75,7 +71,8 @@ def store_describe(config: Path, out: Path | None, *, as_json: bool) -> dict[str
 
 @store.command(cls=Command, name="check")
 @click.option("--backup", type=click.Path(path_type=Path), help="Check this backup in place of the store.")
-@_config_option
+@config_option
+@json_option
 def store_check(config: Path, backup: Path | None, *, as_json: bool) -> Delivered:
     """Look for damage: the database, every chunk of captures, the live model. The daemon may run.
 
@@ -113,7 +110,8 @@ def store_check(config: Path, backup: Path | None, *, as_json: bool) -> Delivere
 )
 @click.option("--keep", type=click.IntRange(1), help="How many backups stay there; as configured.")
 @click.option("--list", "is_list", is_flag=True, help="List the backups and make none.")
-@_config_option
+@config_option
+@json_option
 def store_backup(config: Path, to: Path | None, keep: int | None, *, is_list: bool, as_json: bool) -> dict[str, Any]:
     """Copy store and models to a backup, verify it, and delete the oldest ones. The daemon may run."""
     from daemon.config import read_config
@@ -147,7 +145,8 @@ def store_backup(config: Path, to: Path | None, keep: int | None, *, is_list: bo
 
 @store.command(cls=Command, name="restore")
 @click.argument("backup", type=click.Path(path_type=Path))
-@_config_option
+@config_option
+@json_option
 def store_restore(backup: Path, config: Path, *, as_json: bool) -> dict[str, Any]:
     """Put BACKUP, a directory that `rigcal store backup` made, in the place of store and models.
 
@@ -167,7 +166,8 @@ def store_restore(backup: Path, config: Path, *, as_json: bool) -> dict[str, Any
 
 @store.command(cls=Command, name="prune")
 @click.option("--days", type=click.FloatRange(1), help="Keep so many days; `keep_days` of the configuration.")
-@_config_option
+@config_option
+@json_option
 def store_prune(config: Path, days: float | None, *, as_json: bool) -> dict[str, Any]:
     """Delete captures and readings outside sessions that are older than so many days. The daemon may run.
 
@@ -200,7 +200,8 @@ def store_prune(config: Path, days: float | None, *, as_json: bool) -> dict[str,
 @click.option("--session", help="All readings and fixes of this session.")
 @click.option("--from", "since", type=click.DateTime(), help="Begin of a time, UTC, in place of a session.")
 @click.option("--to", "until", type=click.DateTime(), help="Its end, UTC.")
-@_config_option
+@config_option
+@json_option
 def store_redecode(
     config: Path, session: str | None, since: datetime | None, until: datetime | None, *, as_json: bool
 ) -> dict[str, Any]:

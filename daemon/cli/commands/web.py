@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from daemon.cli.client import socket_of, utc
+from daemon.cli.client import config_option, socket_of, utc
 from daemon.cli.command import Command, json_option
 from daemon.cli.terminal import echo, echo_table
 
@@ -64,8 +64,7 @@ def token() -> None:
 
 
 def _token_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    command = json_option(command)
-    return click.option("--config", type=_CONFIG, required=True, help="Configuration of the daemon.")(command)
+    return config_option(json_option(command))
 
 
 @token.command(cls=Command, name="add")

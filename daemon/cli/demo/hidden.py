@@ -29,6 +29,7 @@ NO_JOBS = "\n[jobs]\nenabled = false  # the workflow is asked by rigcal gap, bef
 TRAINING_POSES = 22  # of each prism
 CHECKED = ("r", "b")  # prisms of the checks, and of the poses that are proposed
 CHECK_POSES = 4
+GAP_STEPS = 40  # of progress, for what takes about as long as so many poses
 PROPOSED = 20
 STORE = "rigcal.sqlite"
 LONGEST_S = 1800.0  # simulated, that the rounds of the proposed poses may be apart, first to last
@@ -57,7 +58,7 @@ class Truth:
 
 def steps() -> int:
     """Number of progress steps, without poses that a set may ask for."""
-    return len(PRISMS) * TRAINING_POSES + len(CHECKED) * CHECK_POSES
+    return len(PRISMS) * TRAINING_POSES + len(CHECKED) * CHECK_POSES + GAP_STEPS
 
 
 def play(out: Path, rate: float, seed: int, advance: Advance) -> dict[str, Any]:
@@ -81,9 +82,10 @@ def play(out: Path, rate: float, seed: int, advance: Advance) -> dict[str, Any]:
         echo_error(f"An effect is hidden in the machine. {HIDDEN} names it; the analysis is not given that file.")
         training = [operator.record(prism, "static_poses", TRAINING_POSES, advance) for prism in PRISMS]
         checks = [operator.record(prism, "check", CHECK_POSES, advance) for prism in CHECKED]
-        advance("finding the gap", 0)
+        advance("waiting for `rigcal gap`, which looks for missing physics", 0)
         name = "gap"
         found = [_find_gap(out, rig, name, training, checks, seed)]
+        advance("an answer of `rigcal gap`", GAP_STEPS)
         poses = _proposed(found[0])
         if poses:
             echo_error(f"The data cannot tell {_set_of(found[0])} apart. Measuring {len(poses)} poses that can.")
@@ -93,7 +95,7 @@ def play(out: Path, rate: float, seed: int, advance: Advance) -> dict[str, Any]:
                 advance("waiting for the next round", 0)
                 operator.pause(pause_s)
                 training += [operator.record(prism, "static_poses", len(rows), advance, rows) for prism in CHECKED]
-            advance("finding the gap again", 0)
+            advance("waiting for `rigcal gap` again, with the further poses", 0)
             name = "gap-again"
             found.append(_find_gap(out, rig, name, training, checks, seed))
     finally:

@@ -10,9 +10,9 @@ from calibration.rig.description import BEYOND_BUILDING
 from daemon.report import drawing, markup
 from daemon.report.calibration import figures
 from daemon.report.calibration.inputs import STAGES, USUAL, ErrorTable, ReportInput, SetupLine, Stage
+from daemon.report.calibration.timing import timing
 from daemon.report.front import Accuracy, Facts, Verdict, front, judge, signatures
 from daemon.report.plain_names import coefficient_words, constant_words, in_words, joint_words, unit_words
-from daemon.report.timing import timing
 from daemon.report.words import DASH, INTERVAL_SIGMAS, PLUS_MINUS, number, signed
 
 if TYPE_CHECKING:

@@ -12,8 +12,7 @@ from daemon.commands import CommandError
 from daemon.config import Config, ConfigError
 from daemon.host.safe_output import write_file
 from daemon.sessions.export.session_file import DoubtfulCaptures, SessionFile
-from daemon.sessions.session_data import sessions_csv
-from daemon.sessions.steady_time import SteadyTime
+from daemon.sessions.session_data import SteadyTime, sessions_csv
 from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS, prism_confirmations, session
 from daemon.store.queries.setups import control_points
 from daemon.store.reader import Reader

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 
+from calibration.rig.reference import table_row
 from daemon.store.describe.description import StoreDescription, TableDescription
 
 _HEAD = """# The store's tables
@@ -43,12 +44,12 @@ def _table_lines(table: TableDescription) -> Iterator[str]:
     if table.is_view:
         yield "| column | meaning |\n|---|---|"
         for column in table.columns:
-            yield f"| `{column.name}` | {column.meaning} |"
+            yield table_row((f"`{column.name}`", column.meaning))
     else:
         yield "| column | type | meaning | refers to |\n|---|---|---|---|"
         for column in table.columns:
             link = f"[{column.refers_to}](#{column.refers_to})" if column.refers_to else ""
-            yield f"| `{column.name}` | {column.type} | {column.meaning} | {link} |"
+            yield table_row((f"`{column.name}`", column.type, column.meaning, link))
     yield ""
 
 

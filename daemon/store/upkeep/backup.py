@@ -20,7 +20,7 @@ from pathlib import Path
 
 from daemon.host.safe_output import write_file
 from daemon.store.errors import StoreError, storage_errors
-from daemon.store.files import BESIDE, WriterLock
+from daemon.store.files import BESIDE, RestoreNote, WriterLock, restore_note_path
 from daemon.store.upkeep.soundness import Soundness, check_store
 from daemon.version import VERSION
 
@@ -141,6 +141,9 @@ def make_backup(store: Path, models: Path, directory: Path, keep: int, now_utc_n
 def restore_backup(backup: Path, store: Path, models: Path, now_utc_ns: int, go_on: GoOn) -> Path | None:
     """Put a backup in the place of a store and its models; these are kept beside.
 
+    Ends what an earlier restore that was cut off has begun: what that one moved aside stays where it is, what it put in
+    place is written over.
+
     Args:
         backup: its directory.
         store: the database to be replaced, or made.
@@ -169,17 +172,51 @@ def restore_backup(backup: Path, store: Path, models: Path, now_utc_ns: int, go_
                 shutil.copytree(backup, scratch)
                 _give_to_owner_of(store.parent, scratch)
                 _sync_tree(scratch)
-                aside = _new_name(store.parent, f"replaced-{_named(now_utc_ns)}")
-                moves = [(beside, aside / beside.name) for beside in _files_of(store) if beside.exists()]
-                moves += [(models, aside / MODELS)] if models.exists() else []
-                had_some = bool(moves)
-                _move_all([*moves, (scratch / STORE, store), (scratch / MODELS, models)])
+                aside = _exchange(backup, scratch, store, models, f"replaced-{_named(now_utc_ns)}")
             finally:
                 shutil.rmtree(scratch, ignore_errors=True)
-            _sync(store.parent)
     finally:
         lock.release()
-    return aside if had_some else None
+    return aside
+
+
+def _exchange(backup: Path, scratch: Path, store: Path, models: Path, name: str) -> Path | None:
+    """Move a store and its models aside and a copy of the backup into their place, with a note as long as it lasts.
+
+    Returns:
+        The directory with what was replaced, `name` if it is free; None where there was nothing.
+    """
+    parts = {path.name: path for path in _files_of(store)} | {MODELS: models}
+    begun = RestoreNote.of(store)
+    note = begun
+    if note is None:
+        replaced = tuple(part for part, path in parts.items() if path.exists())
+        note = RestoreNote(str(backup.absolute()), _new_name(store.parent, name).name, replaced)
+        note.write(store)
+        _sync(store.parent)
+    aside = store.parent / note.aside
+    left = [part for part in note.replaced if not (aside / part).exists() and parts[part].exists()]
+    for part, path in parts.items():
+        if part not in left:
+            _remove(path)  # of the restore that was cut off
+    moves = [(parts[part], aside / part) for part in left]
+    try:
+        _move_all([*moves, (scratch / STORE, store), (scratch / MODELS, models)])
+    except OSError:
+        if begun is None:
+            restore_note_path(store).unlink()
+        raise
+    _sync(store.parent)
+    restore_note_path(store).unlink()
+    _sync(store.parent)
+    return aside if note.replaced else None
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _named(utc_ns: int) -> str:

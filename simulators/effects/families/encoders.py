@@ -11,6 +11,8 @@ import numpy as np
 from calibration.rig.description import Rig
 from simulators.effects.base import Body, DrawContext, Effect, Floats, step_time_s
 
+_MOST_CYCLES = 10_000  # a turn, far beyond any encoder's lines that a joint could show
+
 
 @dataclass(frozen=True)
 class AngleScale(Effect):
@@ -90,10 +92,11 @@ class JointErrorMap(Effect):
 
     def check(self, rig: Rig) -> None:
         super().check(rig)
-        if self.length_deg <= 0.0 or self.lines < 0 or self.highest < max(3, self.lines + 2) or self.seed < 0:
+        has_room = max(3, self.lines + 2) <= self.highest <= _MOST_CYCLES
+        if self.length_deg <= 0.0 or self.lines < 0 or self.seed < 0 or not has_room:
             raise ValueError(
                 f"{self.family}@{self.where}: length_deg must be positive, lines and seed 0 or more, "
-                f"highest at least 3 and room for {self.lines} lines"
+                f"highest 3 to {_MOST_CYCLES} with room for {self.lines} lines"
             )
 
     def draw_shape(self, data: DrawContext, rng: np.random.Generator) -> Effect:

@@ -142,6 +142,10 @@ def test_an_import_does_not_overwrite_a_rig_file(tmp_path: Path) -> None:
         (("simulate", "--rig", "ur10", "--poses", "3", "--effect", "backlash@q9", "--out", "o"), "it acts at"),
         (("simulate", "--rig", "ur10", "--poses", "3", "--effect", "backlash", "--out", "o"), "as in backlash@JOINT"),
         (("simulate", "--rig", "ur10", "--poses", "3", "--effect", "clock_drift", "--out", "o"), "clock_drift@clock"),
+        (
+            ("simulate", "--rig", "ur10", "--poses", "3", "--effect", "backlash@q2:width_rad=1e30", "--out", "o"),
+            "backlash@q2: width_rad=1e+30 is beyond 0.005, the most that such a machine can have",
+        ),
         (("simulate", "--rig", "ur10", "--poses", "3", "--noise", "nan", "--out", "o"), "'nan' is not a finite number"),
     ],
 )

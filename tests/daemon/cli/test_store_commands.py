@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner, Result
 
+from daemon.cli import client
 from daemon.cli.main import main
 from daemon.store import Store
 from tests.daemon.idle_daemon import idle_daemon
@@ -81,6 +82,17 @@ def test_wrong_use_is_one_sentence_that_says_what_to_do(config: Path, words: lis
     assert result.exit_code != 0
     assert said in result.stderr
     assert "Traceback" not in result.output
+
+
+def test_without_config_the_installed_daemon_is_meant(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client, "INSTALLED_CONFIG", config.with_name("none.toml"))
+    result = CliRunner().invoke(main, ["store", "stats"])
+    assert result.exit_code == 2
+    assert (
+        f"there is no {config.with_name('none.toml')}: name the daemon's configuration with --config" in result.stderr
+    )
+    monkeypatch.setattr(client, "INSTALLED_CONFIG", config)
+    assert str(config.with_name("rigcal.sqlite")) in CliRunner().invoke(main, ["store", "stats"]).stdout
 
 
 def test_no_command_makes_a_store_where_there_is_none(config: Path) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.evaluation.latency import Latency
 from calibration.observations import parse_observations
 from calibration.pipeline.calibrate import identify
 from daemon.cli.lines.clock import latency_sentence
@@ -16,7 +15,6 @@ from daemon.jobs.order import Order
 from daemon.jobs.process import perform
 from daemon.models.model_files import write_model
 from daemon.overview import newest_latency
-from daemon.report.timing import timing
 from daemon.sessions.session_data import sessions_csv
 from daemon.store.reader import Reader
 from simulators.effects.library import parse_effects
@@ -73,22 +71,6 @@ def test_a_report_tells_the_latency_of_each_session(rig: JobRig, tmp_path: Path)
     newest = newest_latency(latency)
     assert newest is not None
     assert newest["session"] == "a"
-
-
-def test_a_report_says_what_to_do_about_a_latency() -> None:
-    found = {
-        "s1": Latency(seconds=0.0424, standard_error_s=0.005, fixes=312, motions=24),
-        "s2": Latency(seconds=-0.03, standard_error_s=0.0001, fixes=40, motions=5),
-        "s3": Latency(seconds=0.002, standard_error_s=0.0001, fixes=40, motions=5),
-    }
-    page = timing(found | {"s4": "the fixes have no times"})
-    for cells in (("s1", "42 \N{PLUS-MINUS SIGN} 5", "312", "24"), ("s3", "2 \N{PLUS-MINUS SIGN} 1", "40", "5")):
-        assert all(f">{cell}</td>" in page for cell in cells), cells
-    assert "In s1 the station is late by 42 ms: add it to link_delay_s of its [[station]]." in page
-    assert "In s2 the bus is late by 30 ms: take it from link_delay_s of the [[station]]." in page
-    assert "In s3" not in page
-    assert "s4: not known, the fixes have no times." in page
-    assert timing({}) == ""
 
 
 def test_sentences_for_people() -> None:

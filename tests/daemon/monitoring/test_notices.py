@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import email
 import email.policy
 import json
@@ -13,6 +14,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from socketserver import BaseRequestHandler, ThreadingTCPServer
 from typing import Any, Literal
 
 import pytest
@@ -218,6 +220,43 @@ def test_one_way_that_fails_does_not_hold_up_the_other(web: WebServer, opened: C
     wait_until(lambda: bool(web.got) and bool(sender.notices.faults()))
     assert sender.notices.faults() == {"command": "/no/such/program: No such file or directory"}
     assert sender.status()["error"] is None
+
+
+@pytest.mark.parametrize(
+    ("scheme", "begin"),
+    [("http", b""), ("http", b"HTTP/1.1 200 OK\r\nX-Slow: "), ("https", b"\x16\x03\x03\x3f\xff")],
+    ids=["status line", "headers", "TLS handshake"],
+)
+def test_a_receiver_that_answers_byte_by_byte_does_not_hold_up_the_other_way(
+    opened: Callable[..., Sender], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, scheme: str, begin: bytes
+) -> None:
+    monkeypatch.setattr(delivery, "WEBHOOK_TIMEOUT_S", 0.5)
+    hung_up = threading.Event()
+
+    class Trickle(BaseRequestHandler):
+        def handle(self) -> None:
+            with contextlib.suppress(OSError):
+                self.request.sendall(begin)
+                while not hung_up.wait(0.05):
+                    self.request.sendall(b"H")
+            hung_up.set()
+
+    with ThreadingTCPServer(("127.0.0.1", 0), Trickle) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+        thread.start()
+        try:
+            mail = tmp_path / "mail"
+            url = f"{scheme}://127.0.0.1:{server.server_address[1]}/hooks/{SECRET}"
+            sender = opened(webhook_url=url, command=[script(tmp_path / "send", f"cat > {mail}")])
+            sender.tell("raised", "boom")
+            wait_until(lambda: mail.exists() and "boom" in mail.read_text(encoding="utf-8"))
+            wait_until(lambda: bool(sender.notices.faults()))
+            assert sender.notices.faults() == {"webhook": "127.0.0.1: no whole answer within 0.5 s"}
+            assert hung_up.wait(10.0), "the connection is closed, not left open"
+        finally:
+            hung_up.set()
+            server.shutdown()
+            thread.join()
 
 
 # ---- restarts, limits, full disks ------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """What the store refuses has not happened: memory never knows more of a session than the store."""
 
 import sqlite3
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,75 +22,71 @@ from tests.daemon.damage import fill_up
 from tests.daemon.session_support import SOURCE, STEP_S, Rig, disk_fails
 
 
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Rig]:
-    made = Rig(tmp_path / "rigcal.sqlite")
-    made.say("setup_new", id="S1")
-    yield made
-    made.store.close()
-
-
 def open_sessions(rig: Rig) -> list[str]:
     return [row["id"] for row in rig.store.rows("SELECT id FROM calibration_sessions WHERE state = 'open'")]
 
 
 @pytest.mark.parametrize("command", ["stop", "abort"])
-def test_a_session_whose_end_cannot_be_stored_stays_open_here_and_there(rig: Rig, command: str) -> None:
-    rig.say("start", prism="r")
-    rig.live(2)
+def test_a_session_whose_end_cannot_be_stored_stays_open_here_and_there(session_rig: Rig, command: str) -> None:
+    session_rig.say("start", prism="r")
+    session_rig.live(2)
     with disk_fails(), pytest.raises(sqlite3.OperationalError):
-        rig.say(command)
+        session_rig.say(command)
     with pytest.raises(CommandError, match="session 's001-r' is open; stop or abort it first"):
-        rig.say("start", prism="b")
-    assert open_sessions(rig) == ["s001-r"]
-    before = rig.say("show", id="s001-r")["observations"]
-    rig.live(2)
-    assert rig.say("show", id="s001-r")["observations"] > before + 30, "its fixes are its observations all along"
-    rig.say(command)
-    assert rig.say("start", prism="b")["id"] == "s002-b"
-    rig.keeper = rig.new_keeper()
-    rig.live(2)
-    assert {row["session_id"] for row in rig.store.rows("SELECT * FROM observations WHERE prism = 'b'")} == {"s002-b"}
-    assert open_sessions(rig) == ["s002-b"]
+        session_rig.say("start", prism="b")
+    assert open_sessions(session_rig) == ["s001-r"]
+    before = session_rig.say("show", id="s001-r")["observations"]
+    session_rig.live(2)
+    assert session_rig.say("show", id="s001-r")["observations"] > before + 30, (
+        "its fixes are its observations all along"
+    )
+    session_rig.say(command)
+    assert session_rig.say("start", prism="b")["id"] == "s002-b"
+    session_rig.keeper = session_rig.new_keeper()
+    session_rig.live(2)
+    assert {row["session_id"] for row in session_rig.store.rows("SELECT * FROM observations WHERE prism = 'b'")} == {
+        "s002-b"
+    }
+    assert open_sessions(session_rig) == ["s002-b"]
 
 
-def test_a_session_whose_start_finds_the_disk_full_is_not_open(rig: Rig) -> None:
-    fill_up(rig.store)
+def test_a_session_whose_start_finds_the_disk_full_is_not_open(session_rig: Rig) -> None:
+    fill_up(session_rig.store)
     with pytest.raises(sqlite3.OperationalError, match="database or disk is full"):
-        rig.say("start", prism="r")
-    assert rig.keeper.open_session() is None
-    assert open_sessions(rig) == []
-    rig.store.rows("PRAGMA max_page_count = 1000000")
-    assert rig.say("start", prism="r")["id"] == "s001-r"
+        session_rig.say("start", prism="r")
+    assert session_rig.keeper.open_session() is None
+    assert open_sessions(session_rig) == []
+    session_rig.store.rows("PRAGMA max_page_count = 1000000")
+    assert session_rig.say("start", prism="r")["id"] == "s001-r"
 
 
 def test_a_full_disk_is_told_in_a_sentence_that_says_what_to_do(
-    rig: Rig, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    session_rig: Rig, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     def start(arguments: Mapping[str, Any]) -> dict[str, Any]:
-        with unwritable_errors(rig.store.path):  # as the daemon carries commands out
-            return rig.keeper.start_command(arguments)
+        with unwritable_errors(session_rig.store.path):  # as the daemon carries commands out
+            return session_rig.keeper.start_command(arguments)
 
     server = ControlServer(tmp_path / "s", {"session.start": start})
     try:
-        fill_up(rig.store)
+        fill_up(session_rig.store)
         with pytest.raises(CommandError) as caught:
             request(tmp_path / "s", "session.start", {"prism": "r"})
     finally:
         server.close()
     assert caught.value.status == 1
     sentence = str(caught.value)
-    assert f"{rig.store.path}: cannot be written, the disk is full (database or disk is full;" in sentence
+    assert f"{session_rig.store.path}: cannot be written, the disk is full (database or disk is full;" in sentence
     assert sentence.endswith("nothing was changed, so give the command again")
     assert "Traceback" not in caplog.text
 
 
-def test_the_store_holds_one_open_session_of_a_rig(rig: Rig) -> None:
-    rig.say("start", prism="r")
-    (row,) = rig.store.rows("SELECT * FROM calibration_sessions")
+def test_the_store_holds_one_open_session_of_a_rig(session_rig: Rig) -> None:
+    session_rig.say("start", prism="r")
+    (row,) = session_rig.store.rows("SELECT * FROM calibration_sessions")
     with pytest.raises(sqlite3.IntegrityError, match="UNIQUE"):
-        rig.store.insert("calibration_sessions", row | {"id": "second"})
-    rig.store.insert("calibration_sessions", row | {"id": "another rig's", "rig": "ur10"})
+        session_rig.store.insert("calibration_sessions", row | {"id": "second"})
+    session_rig.store.insert("calibration_sessions", row | {"id": "another session_rig's", "rig": "ur10"})
 
 
 def test_of_the_open_sessions_of_an_older_store_the_newest_goes_on_and_the_others_say_why_not(tmp_path: Path) -> None:
@@ -119,21 +115,23 @@ def test_of_the_open_sessions_of_an_older_store_the_newest_goes_on_and_the_other
     rig.store.close()
 
 
-def test_what_is_observed_while_the_disk_fails_is_stored_when_it_works_again(rig: Rig) -> None:
-    rig.say("start", prism="r")
-    rig.live(2)
+def test_what_is_observed_while_the_disk_fails_is_stored_when_it_works_again(session_rig: Rig) -> None:
+    session_rig.say("start", prism="r")
+    session_rig.live(2)
     for _ in range(20):
-        rig.clock.advance(STEP_S)
+        session_rig.clock.advance(STEP_S)
         records: list[Record] = [
-            Reading(j.name, rig.clock.now(), rig.values[j.name], j.unit) for j in SOURCE.rig.joints
+            Reading(j.name, session_rig.clock.now(), session_rig.values[j.name], j.unit) for j in SOURCE.rig.joints
         ]
-        records.append(rig.fix())
-        rig.store.insert_records(records)
+        records.append(session_rig.fix())
+        session_rig.store.insert_records(records)
         with disk_fails():
-            rig.keeper.on_records(records)
-    rig.live(2)
-    observed = [row["monotonic_ns"] for row in rig.store.rows("SELECT monotonic_ns FROM observations ORDER BY id")]
-    measured = [row["monotonic_ns"] for row in rig.store.rows("SELECT monotonic_ns FROM fixes ORDER BY id")]
+            session_rig.keeper.on_records(records)
+    session_rig.live(2)
+    observed = [
+        row["monotonic_ns"] for row in session_rig.store.rows("SELECT monotonic_ns FROM observations ORDER BY id")
+    ]
+    measured = [row["monotonic_ns"] for row in session_rig.store.rows("SELECT monotonic_ns FROM fixes ORDER BY id")]
     assert observed == measured[: len(observed)]
     assert len(observed) > 80
 

@@ -1,7 +1,6 @@
 """Which sessions calibration uses: those whose control points held from start to end, and those that were accepted."""
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +20,6 @@ from tests.daemon.session_support import Rig, controlled
 
 CP1 = (9000.0, 500.0, 2000.0)
 ELSEWHERE = (9000.0, 520.0, 2000.0)
-
-
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Rig]:
-    made = Rig(tmp_path / "rigcal.sqlite")
-    made.say("setup_new", id="S1")
-    yield made
-    made.store.close()
 
 
 def uncontrolled(rig: Rig, kind: str = "static_poses") -> str:
@@ -67,30 +58,30 @@ class Jobs:
 # ---- set-ups ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_station_that_moved_is_not_taken_for_where_it_stood_before(rig: Rig) -> None:
-    rig.say("setup_new", id="S2")
-    rig.say("start", prism="r")
-    rig.shoot("cp1", CP1)
-    rig.live(2)
-    assert rig.shoot("cp1", ELSEWHERE)["moved"]
-    rig.say("abort")
+def test_a_station_that_moved_is_not_taken_for_where_it_stood_before(session_rig: Rig) -> None:
+    session_rig.say("setup_new", id="S2")
+    session_rig.say("start", prism="r")
+    session_rig.shoot("cp1", CP1)
+    session_rig.live(2)
+    assert session_rig.shoot("cp1", ELSEWHERE)["moved"]
+    session_rig.say("abort")
     with pytest.raises(CommandError) as caught:
-        rig.say("start", prism="r")
+        session_rig.say("start", prism="r")
     assert caught.value.status == 3
     assert str(caught.value) == (
         "set-up 'S2', the newest, has moved; describe a new one (`rigcal setup new`), or name one with --setup if the "
         "station stands there again"
     )
-    assert rig.setups.current() is None, "nor does the live tip"
-    assert rig.say("start", prism="r", setup="S1")["setup"] == "S1"
+    assert session_rig.setups.current() is None, "nor does the live tip"
+    assert session_rig.say("start", prism="r", setup="S1")["setup"] == "S1"
 
 
-def test_a_shot_that_finds_a_move_says_what_to_do(rig: Rig) -> None:
-    rig.say("start", prism="r")
-    rig.shoot("cp1", CP1)
-    rig.live(2)
-    assert rig.shoot("cp1", CP1)["advice"] == []
-    stop, accept = rig.shoot("cp1", ELSEWHERE)["advice"]
+def test_a_shot_that_finds_a_move_says_what_to_do(session_rig: Rig) -> None:
+    session_rig.say("start", prism="r")
+    session_rig.shoot("cp1", CP1)
+    session_rig.live(2)
+    assert session_rig.shoot("cp1", CP1)["advice"] == []
+    stop, accept = session_rig.shoot("cp1", ELSEWHERE)["advice"]
     assert "stop the session, describe where the station stands now with `rigcal setup new`" in stop
     assert "`rigcal session accept s001-r`" in accept
 
@@ -98,20 +89,20 @@ def test_a_shot_that_finds_a_move_says_what_to_do(rig: Rig) -> None:
 # ---- what is used ----------------------------------------------------------------------------------------------------
 
 
-def test_a_session_whose_control_points_held_is_used(rig: Rig) -> None:
-    name = controlled(rig)
-    assert rig.say("show", id=name)["not_used"] is None
-    assert Jobs(rig).due() == [DueChain(CHAIN, name, name)]
+def test_a_session_whose_control_points_held_is_used(session_rig: Rig) -> None:
+    name = controlled(session_rig)
+    assert session_rig.say("show", id=name)["not_used"] is None
+    assert Jobs(session_rig).due() == [DueChain(CHAIN, name, name)]
 
 
-def test_a_session_without_control_shots_is_stored_and_shown_and_nothing_trains_on_it(rig: Rig) -> None:
-    name = uncontrolled(rig)
-    shown = rig.say("show", id=name)
+def test_a_session_without_control_shots_is_stored_and_shown_and_nothing_trains_on_it(session_rig: Rig) -> None:
+    name = uncontrolled(session_rig)
+    shown = session_rig.say("show", id=name)
     assert shown["observations"] > 10
     assert shown["not_used"].startswith("no control point was shot at its start and again at its end")
-    assert Jobs(rig).due() == []
-    other = controlled(rig)
-    orders = Jobs(rig).run()
+    assert Jobs(session_rig).due() == []
+    other = controlled(session_rig)
+    orders = Jobs(session_rig).run()
     assert [order.session_ids for order in orders if order.kind == "gap"] == [(other,)]
     assert all(name not in (*order.session_ids, *order.train_ids) for order in orders)
 
@@ -125,101 +116,103 @@ def test_a_session_without_control_shots_is_stored_and_shown_and_nothing_trains_
     ],
 )
 def test_a_session_whose_ends_were_not_controlled_is_not_used(
-    rig: Rig, start: tuple[float, float, float] | None, end: tuple[float, float, float] | None, why: str
+    session_rig: Rig, start: tuple[float, float, float] | None, end: tuple[float, float, float] | None, why: str
 ) -> None:
-    rig.say("start", prism="r")
+    session_rig.say("start", prism="r")
     if start:
-        rig.shoot("cp1", start)
-    rig.live(2)
+        session_rig.shoot("cp1", start)
+    session_rig.live(2)
     if end:
-        rig.shoot("cp1", end)
-    assert rig.say("stop")["not_used"].startswith(why)
-    assert Jobs(rig).due() == []
+        session_rig.shoot("cp1", end)
+    assert session_rig.say("stop")["not_used"].startswith(why)
+    assert Jobs(session_rig).due() == []
 
 
-def test_two_shots_at_the_end_do_not_make_up_for_the_one_at_the_start(rig: Rig) -> None:
-    rig.say("start", prism="r")
+def test_two_shots_at_the_end_do_not_make_up_for_the_one_at_the_start(session_rig: Rig) -> None:
+    session_rig.say("start", prism="r")
     for rate in (5.0, -5.0, 5.0, -5.0, 5.0, -5.0):
-        rig.live(1, theta1=rate)
-        rig.live(2)
-    assert rig.shoot("cp1", CP1)["phase"] == "start"
-    rig.live(2)
-    assert rig.shoot("cp1", CP1)["phase"] == "end"
-    assert rig.say("stop")["not_used"].startswith("most of its poses do not lie between a control point's shots")
+        session_rig.live(1, theta1=rate)
+        session_rig.live(2)
+    assert session_rig.shoot("cp1", CP1)["phase"] == "start"
+    session_rig.live(2)
+    assert session_rig.shoot("cp1", CP1)["phase"] == "end"
+    assert session_rig.say("stop")["not_used"].startswith(
+        "most of its poses do not lie between a control point's shots"
+    )
 
 
-def test_a_pose_before_the_first_shot_does_not_spoil_a_session(rig: Rig) -> None:
-    rig.say("start", prism="r")
-    rig.live(30)  # the operator walks to the station
-    rig.shoot("cp1", CP1)
+def test_a_pose_before_the_first_shot_does_not_spoil_a_session(session_rig: Rig) -> None:
+    session_rig.say("start", prism="r")
+    session_rig.live(30)  # the operator walks to the station
+    session_rig.shoot("cp1", CP1)
     for rate in (5.0, -5.0, 5.0):
-        rig.live(1, theta1=rate)
-        rig.live(2)
-    rig.shoot("cp1", CP1)
-    assert rig.say("stop")["not_used"] is None
+        session_rig.live(1, theta1=rate)
+        session_rig.live(2)
+    session_rig.shoot("cp1", CP1)
+    assert session_rig.say("stop")["not_used"] is None
 
 
-def test_a_moving_session_is_controlled_like_any_other(rig: Rig) -> None:
-    rig.say("start", prism="r", kind="multi_joint")
-    rig.shoot("cp1", CP1)
-    rig.live(4, theta1=5.0)
-    rig.shoot("cp1", CP1)
-    summary = rig.say("stop")
+def test_a_moving_session_is_controlled_like_any_other(session_rig: Rig) -> None:
+    session_rig.say("start", prism="r", kind="multi_joint")
+    session_rig.shoot("cp1", CP1)
+    session_rig.live(4, theta1=5.0)
+    session_rig.shoot("cp1", CP1)
+    summary = session_rig.say("stop")
     assert summary["observations"] > 50
     assert summary["not_used"] is None
 
 
-def test_an_aborted_session_is_never_used(rig: Rig) -> None:
-    rig.say("start", prism="r")
-    rig.say("abort")
+def test_an_aborted_session_is_never_used(session_rig: Rig) -> None:
+    session_rig.say("start", prism="r")
+    session_rig.say("abort")
     with pytest.raises(CommandError, match="session 's001-r' is aborted, and stays so"):
-        rig.say("accept", id="s001-r")
-    assert Jobs(rig).due() == []
+        session_rig.say("accept", id="s001-r")
+    assert Jobs(session_rig).due() == []
 
 
 # ---- what is accepted ------------------------------------------------------------------------------------------------
 
 
-def test_an_accepted_session_is_trained_on_and_who_said_so_is_kept(rig: Rig) -> None:
-    name = uncontrolled(rig)
-    told = rig.say("accept", id=name, operator="Ada")
+def test_an_accepted_session_is_trained_on_and_who_said_so_is_kept(session_rig: Rig) -> None:
+    name = uncontrolled(session_rig)
+    told = session_rig.say("accept", id=name, operator="Ada")
     assert told["not_used"] is None
     assert told["accepted"]["by"] == "Ada"
     assert told["accepted"]["despite"].startswith("no control point was shot")
-    assert told["accepted"]["utc_ns"] == rig.clock.now().utc_ns
-    assert [order.session_ids for order in Jobs(rig).run() if order.kind == "gap"] == [(name,)]
+    assert told["accepted"]["utc_ns"] == session_rig.clock.now().utc_ns
+    assert [order.session_ids for order in Jobs(session_rig).run() if order.kind == "gap"] == [(name,)]
 
 
-def test_a_session_that_is_accepted_after_a_later_one_was_trained_on_is_trained_on_with_it(rig: Rig) -> None:
-    early, late = uncontrolled(rig), controlled(rig)
-    jobs = Jobs(rig)
+def test_a_session_that_is_accepted_after_a_later_one_was_trained_on_is_trained_on_with_it(session_rig: Rig) -> None:
+    early, late = uncontrolled(session_rig), controlled(session_rig)
+    jobs = Jobs(session_rig)
     jobs.run()
     assert jobs.due() == []
-    rig.say("accept", id=early)
+    session_rig.say("accept", id=early)
     assert jobs.due() == [DueChain(CHAIN, late, late)]
     assert [order.session_ids for order in jobs.run() if order.kind == "gap"] == [(early, late)]
     assert jobs.due() == []
 
 
-def test_a_job_that_was_queued_before_works_on_what_was_used_then(rig: Rig) -> None:
-    early, late = uncontrolled(rig), controlled(rig)
-    jobs = Jobs(rig)
+def test_a_job_that_was_queued_before_works_on_what_was_used_then(session_rig: Rig) -> None:
+    early, late = uncontrolled(session_rig), controlled(session_rig)
+    jobs = Jobs(session_rig)
     jobs.table.queue(DueChain(CHAIN, late, late))
-    rig.say("accept", id=early)
+    session_rig.say("accept", id=early)
     orders = jobs.run()
     assert [order.session_ids for order in orders if order.kind == "gap"] == [(late,), (early, late)]
 
 
-def test_a_check_session_without_control_shots_judges_nothing_until_it_is_accepted(rig: Rig) -> None:
-    jobs = Jobs(rig)
-    trained = controlled(rig)
+def test_a_check_session_without_control_shots_judges_nothing_until_it_is_accepted(session_rig: Rig) -> None:
+    jobs = Jobs(session_rig)
+    trained = controlled(session_rig)
     jobs.run()
-    check = uncontrolled(rig, "check")
+    check = uncontrolled(session_rig, "check")
     assert jobs.due() == []
     model = jobs.table._models.all()[-1]
     with pytest.raises(CommandError, match="no check session is closed and used"):
         jobs.table.compare(model)
-    rig.say("accept", id=check)
+    session_rig.say("accept", id=check)
     assert jobs.due() == [DueChain(CHECKS, check, check)]
     for order in jobs.run():
         assert (order.session_ids, order.train_ids) == ((check,), (trained,))
@@ -235,26 +228,26 @@ def test_a_check_session_without_control_shots_judges_nothing_until_it_is_accept
         ("s002-r", "session 's002-r' is open; stop it first"),
     ],
 )
-def test_what_cannot_be_accepted_is_refused_in_a_sentence(rig: Rig, name: str, why: str) -> None:
-    controlled(rig)
-    rig.say("start", prism="r")
+def test_what_cannot_be_accepted_is_refused_in_a_sentence(session_rig: Rig, name: str, why: str) -> None:
+    controlled(session_rig)
+    session_rig.say("start", prism="r")
     with pytest.raises((CommandError, NotInStoreError), match=why):
-        rig.say("accept", id=name)
+        session_rig.say("accept", id=name)
 
 
-def test_sessions_of_an_older_store_are_used_as_before(rig: Rig) -> None:
+def test_sessions_of_an_older_store_are_used_as_before(session_rig: Rig) -> None:
     """What was trained on before this rule was there needs no operator's word."""
-    name = uncontrolled(rig)
-    rig.store.update("calibration_sessions", {"id": name}, {"excluded": None})  # as the migration leaves it
-    assert Jobs(rig).due() == [DueChain(CHAIN, name, name)]
+    name = uncontrolled(session_rig)
+    session_rig.store.update("calibration_sessions", {"id": name}, {"excluded": None})  # as the migration leaves it
+    assert Jobs(session_rig).due() == [DueChain(CHAIN, name, name)]
 
 
 # ---- what people are told --------------------------------------------------------------------------------------------
 
 
-def test_people_are_told_that_a_session_is_not_used_and_what_to_type(rig: Rig, tmp_path: Path) -> None:
+def test_people_are_told_that_a_session_is_not_used_and_what_to_type(session_rig: Rig, tmp_path: Path) -> None:
     handlers = {
-        f"session.{name}": getattr(rig.keeper, f"{name}_command")
+        f"session.{name}": getattr(session_rig.keeper, f"{name}_command")
         for name in ("stop", "show", "list", "accept", "shoot")
     }
     server = ControlServer(tmp_path / "s", handlers)
@@ -266,8 +259,8 @@ def test_people_are_told_that_a_session_is_not_used_and_what_to_type(rig: Rig, t
 
     try:
         assert "no sessions yet" in rigcal("session", "list")
-        rig.say("start", prism="r")
-        rig.live(2)
+        session_rig.say("start", prism="r")
+        session_rig.live(2)
         assert "no control point has been shot yet: `rigcal session shoot NAME`" in rigcal("session", "show", "s001-r")
         for text in (rigcal("session", "stop"), rigcal("session", "show", "s001-r")):
             assert "calibration does not use this session: no control point was shot" in text

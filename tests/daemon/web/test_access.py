@@ -1,6 +1,8 @@
 """Tokens are kept hashed, roles rise, and wrong tokens are limited."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -44,6 +46,43 @@ def test_two_tokens_never_have_one_name(tmp_path: Path) -> None:
     book.add("Ada", Role.READ, 1)
     with pytest.raises(CommandError, match="has a token already"):
         book.add("Ada", Role.APPROVE, 1)
+
+
+# Says that it is ready; at a word it adds names of its own, and others that another process adds as well.
+ADDING = """
+import sys
+from pathlib import Path
+from daemon.commands import CommandError
+from daemon.web.access import Role, TokenBook
+book, me = TokenBook(Path(sys.argv[1])), sys.argv[2]
+print("ready", flush=True)
+input()
+for n in range(40):
+    book.add(f"{me}{n}", Role.READ, 1)
+    try:
+        book.add(f"both{n}", Role.READ, 1)
+        print(n)
+    except CommandError as error:
+        assert "has a token already" in str(error)
+"""
+
+
+def test_processes_that_add_tokens_at_once_lose_none_and_share_no_name(tmp_path: Path) -> None:
+    path = tmp_path / "tokens.json"
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    people = [subprocess.Popen([sys.executable, "-c", ADDING, str(path), name], **pipes) for name in ("a", "b")]
+    for person in people:
+        assert person.stdout is not None
+        assert person.stdout.readline() == "ready\n"
+    for person in people:
+        assert person.stdin is not None
+        person.stdin.write("go\n")
+        person.stdin.flush()
+    told = [person.communicate(timeout=60)[0].split() for person in people]
+    assert [person.returncode for person in people] == [0, 0]
+    assert sorted(int(n) for numbers in told for n in numbers) == list(range(40)), "each name was given once"
+    names = {entry.name for entry in TokenBook(path).entries()}
+    assert names == {f"{who}{n}" for who in ("a", "b", "both") for n in range(40)}
 
 
 @pytest.mark.parametrize(

@@ -17,19 +17,21 @@ const times = (_plot, ticks, _axis, _space, apart) => ticks.map((tick) => {
  * @param label what it shows, for those who cannot see it
  * @param unit of the values
  * @param series list of {label, colour (name of a page colour), line (bool)}
+ * @param empty what to say in place of a chart that has nothing to show; "" where the page says it already
  * @param options log: logarithmic values; from: smallest value of the axis
  */
 export class Chart {
-  constructor(label, unit, series, { log = false, zero = true } = {}) {
+  constructor(label, unit, series, empty, { log = false, zero = true } = {}) {
     this.series = series;
     this.options = { label, unit, log, zero };
     this.box = h("div", { class: "chart", role: "img", "aria-label": label });
-    this.element = h("figure", null, this.box);
-    this.data = null;
+    this.empty = h("p", { class: "empty" }, empty);
+    this.element = h("figure", null, this.box, this.empty);
     this.themed = () => this.#build();
     addEventListener("theme", this.themed);
     this.sized = new ResizeObserver(() => this.plot?.setSize(this.#size()));
     this.sized.observe(this.box);
+    this.show([[], ...series.map(() => [])]);
   }
 
   /** Show data: [times in s of UTC, values of each series ...]; null where a series has none. */
@@ -38,6 +40,12 @@ export class Chart {
     if (key === this.key) return;
     this.key = key;
     this.data = data;
+    // A dashed line alone is a limit that nothing is compared with yet.
+    this.isEmpty = !this.series.some((each, i) => !each.dash && data[i + 1].some((value) => value !== null));
+    this.box.hidden = this.isEmpty;
+    this.empty.hidden = !this.isEmpty;
+    this.element.hidden = this.isEmpty && !this.empty.textContent;
+    if (this.isEmpty) return;
     if (this.plot) this.plot.setData(data);
     else this.#build();
   }
@@ -51,7 +59,7 @@ export class Chart {
   #size() { return { width: Math.max(this.box.clientWidth, 200), height: 240 }; }
 
   async #build() {
-    if (!this.data) return;
+    if (this.isEmpty) return;
     const UPlot = await loaded();
     this.plot?.destroy();
     fill(this.box, [], () => []);

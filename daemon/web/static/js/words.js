@@ -38,6 +38,9 @@ export const words = (name) => String(name).replaceAll("_", " ").replaceAll("-",
 
 export const plural = (n, one, more = `${one}s`) => `${n} ${n === 1 ? one : more}`;
 
+/** Poses of a guide's plan as a tile; a session has measured more where the boom stood elsewhere too. */
+export const planned = ({ done, planned: all, skipped }) => ["Planned poses", `${done} of ${all}`, "", skipped ? `${skipped} skipped` : "reached as the guide asks"];
+
 export const JOBS = { gap: "Identification", residual: "Learning what remains", report: "Report", comparison: "Comparison", drift: "Drift of checks" };
 
 /** A clause as the begin of a sentence. */

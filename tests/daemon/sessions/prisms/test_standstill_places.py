@@ -1,23 +1,10 @@
 """Two places in one standstill: the fixes of the minority are excluded, and more fixes may turn the decision."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
-import pytest
-
 from daemon.sessions.prisms.standstill_places import EVERY_FIX, Exclusions, StandstillPlaces
 from tests.daemon.session_support import SOURCE, STEP_S, Rig
 
 JOINTS = {j.column: sum(j.limits) / 2 for j in SOURCE.rig.joints}
 PRISM = (3000.0, 8000.0, 1000.0)
-
-
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Rig]:
-    made = Rig(tmp_path / "rigcal.sqlite")
-    made.say("setup_new", id="S1")
-    yield made
-    made.store.close()
 
 
 def away(metres: float) -> tuple[float, float, float]:
@@ -35,39 +22,41 @@ def stand(rig: Rig, place: tuple[float, float, float], fixes: int) -> None:
     rig.live(fixes * STEP_S)
 
 
-def test_another_prism_too_near_to_be_a_jump_is_excluded_by_name(rig: Rig) -> None:
-    rig.say("start", prism="r")
-    stand(rig, PRISM, 60)
-    stand(rig, away(0.3), 40)
-    stand(rig, PRISM, 60)
+def test_another_prism_too_near_to_be_a_jump_is_excluded_by_name(session_rig: Rig) -> None:
+    session_rig.say("start", prism="r")
+    stand(session_rig, PRISM, 60)
+    stand(session_rig, away(0.3), 40)
+    stand(session_rig, PRISM, 60)
     reason = "another prism or a reflection: more fixes of this standstill lie 0.30 m away"
-    summary = rig.say("stop")
+    summary = session_rig.say("stop")
     assert summary["excluded"][reason] == 40
-    assert {why for y, why in observed(rig) if y == 8000.0} == {None}
-    assert summary["observations"] == sum(y == 8000.0 for y, _ in observed(rig))
+    assert {why for y, why in observed(session_rig) if y == 8000.0} == {None}
+    assert summary["observations"] == sum(y == 8000.0 for y, _ in observed(session_rig))
 
 
-def test_a_place_that_an_operator_confirms_counts_within_its_standstill_and_the_others_are_excluded(rig: Rig) -> None:
-    rig.say("start", prism="r")
-    stand(rig, away(0.5), 60)
-    stand(rig, PRISM, 20)
-    rig.say("confirm_prism", operator="Ada")
-    stand(rig, PRISM, 30)
-    assert {y for y, why in observed(rig) if why is None} == {8000.0}
-    stand(rig, away(0.5), 3)  # and the fixes since then decide, as before
-    excluded = rig.say("stop")["excluded"]
+def test_a_place_that_an_operator_confirms_counts_within_its_standstill_and_the_others_are_excluded(
+    session_rig: Rig,
+) -> None:
+    session_rig.say("start", prism="r")
+    stand(session_rig, away(0.5), 60)
+    stand(session_rig, PRISM, 20)
+    session_rig.say("confirm_prism", operator="Ada")
+    stand(session_rig, PRISM, 30)
+    assert {y for y, why in observed(session_rig) if why is None} == {8000.0}
+    stand(session_rig, away(0.5), 3)  # and the fixes since then decide, as before
+    excluded = session_rig.say("stop")["excluded"]
     assert excluded["another prism or a reflection: more fixes of this standstill lie 0.50 m away"] > 40
-    assert {y for y, why in observed(rig) if why is None} == {8000.0}
+    assert {y for y, why in observed(session_rig) if why is None} == {8000.0}
 
 
-def test_what_came_first_is_excluded_when_it_turns_out_to_be_the_minority(rig: Rig) -> None:
-    rig.say("start", prism="r")
-    stand(rig, away(0.3), 40)
-    stand(rig, PRISM, 35)
-    assert {y for y, why in observed(rig) if why is None} == {8300.0}
-    stand(rig, PRISM, 60)
-    assert {y for y, why in observed(rig) if why is None} == {8000.0}
-    assert all((why is None) == (y == 8000.0) for y, why in observed(rig))
+def test_what_came_first_is_excluded_when_it_turns_out_to_be_the_minority(session_rig: Rig) -> None:
+    session_rig.say("start", prism="r")
+    stand(session_rig, away(0.3), 40)
+    stand(session_rig, PRISM, 35)
+    assert {y for y, why in observed(session_rig) if why is None} == {8300.0}
+    stand(session_rig, PRISM, 60)
+    assert {y for y, why in observed(session_rig) if why is None} == {8000.0}
+    assert all((why is None) == (y == 8000.0) for y, why in observed(session_rig))
 
 
 def test_while_two_places_have_equally_many_fixes_both_are_excluded() -> None:
@@ -93,12 +82,12 @@ def test_a_third_place_is_excluded_with_the_second() -> None:
     ]
 
 
-def test_each_standstill_has_a_place_of_its_own(rig: Rig) -> None:
-    rig.say("start", prism="r")
+def test_each_standstill_has_a_place_of_its_own(session_rig: Rig) -> None:
+    session_rig.say("start", prism="r")
     for metres in (0.0, 0.3, 0.6):
-        rig.live(1, theta1=5.0)
-        stand(rig, away(metres), 60)
-    assert {why for _, why in observed(rig)} == {None}
+        session_rig.live(1, theta1=5.0)
+        stand(session_rig, away(metres), 60)
+    assert {why for _, why in observed(session_rig)} == {None}
 
 
 def test_scatter_sway_and_a_boom_that_sinks_are_one_place() -> None:
@@ -117,12 +106,12 @@ def test_what_the_joints_have_moved_between_two_fixes_is_no_other_place() -> Non
     assert places.add("a standstill", 2, PRISM, crept)[2] is not None
 
 
-def test_fixes_that_are_excluded_for_another_reason_have_no_say(rig: Rig) -> None:
-    rig.say("start", prism="r")
-    rig.shoot("cp1", away(3.0))
-    stand(rig, away(3.0), 80)
-    stand(rig, PRISM, 40)
-    summary = rig.say("stop")
+def test_fixes_that_are_excluded_for_another_reason_have_no_say(session_rig: Rig) -> None:
+    session_rig.say("start", prism="r")
+    session_rig.shoot("cp1", away(3.0))
+    stand(session_rig, away(3.0), 80)
+    stand(session_rig, PRISM, 40)
+    summary = session_rig.say("stop")
     assert "a control point, not the prism" in summary["excluded"]
     assert not [reason for reason in summary["excluded"] if "another prism" in reason]
     assert summary["observations"] > 20

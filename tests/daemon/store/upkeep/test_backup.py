@@ -7,7 +7,10 @@ import hashlib
 import json
 import os
 import shutil
+import signal
 import sqlite3
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -104,6 +107,47 @@ def test_what_was_replaced_is_kept_though_it_was_within_the_same_second(site: Si
     assert second is not None
     assert first != second
     assert (first / "rigcal.sqlite").read_bytes() == b"rust"
+
+
+# Kills itself before a rename, its last argument: those of what is replaced, in turn, and of what takes its place.
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from daemon.store.upkeep.backup import restore_backup
+backup, store, models = map(Path, sys.argv[1:4])
+left = [int(sys.argv[4])]
+rename = Path.rename
+def counted(self, target):
+    if left[0] == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    left[0] -= 1
+    return rename(self, target)
+Path.rename = counted
+restore_backup(backup, store, models, 0, lambda: None)
+"""
+
+
+@pytest.mark.parametrize("renames", range(6))
+def test_a_restore_that_was_killed_is_known_and_goes_on(site: Site, renames: int) -> None:
+    backup = site.back_up()
+    frames = captures(site.path)
+    site.store.mark_decoded(site.store.append_captures([frame(99)]))
+    site.store.close()
+    for name in ("rigcal.sqlite-wal", "rigcal.sqlite-shm"):  # as a daemon leaves them that was killed too
+        site.path.with_name(name).touch()
+    command = [sys.executable, "-c", KILLED, *map(str, (backup, site.path, site.models, renames))]
+    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
+    with pytest.raises(StoreError, match=rf"was cut off.*`rigcal store restore {backup}` again"):
+        Store(site.path)
+    aside = site.restore(backup)
+    assert aside is not None
+    assert sorted(aside.parent.glob("replaced-*")) == [aside]
+    assert captures(aside / "rigcal.sqlite") == frames + 1
+    assert (aside / "models" / ".rigcal-x").is_dir()
+    left = {path.name for path in site.path.parent.iterdir()}
+    assert left == {"rigcal.sqlite", "rigcal.sqlite.lock", "models", aside.name}
+    Store(site.path).close()
+    assert captures(site.path) == frames
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root, as on a rig")

@@ -185,7 +185,7 @@ function coverageOf(coverage, joints) {
 const MARKS = { done: "\u2713", skipped: "\u2013", now: "\u25b6", "to do": "" };
 
 function stepLine(step) {
-  const poses = step.poses ? `: ${step.poses.done} of ${step.poses.planned}` : "";
+  const poses = step.poses ? `: ${step.poses.done} of ${step.poses.planned} planned` : "";
   const reason = step.reason ? ` (skipped: ${step.reason})` : step.state === "skipped" ? " (skipped)" : "";
   return h("li", { class: step.state.replace(" ", "-"), "aria-current": step.state === "now" ? "step" : null },
     h("span", { class: "mark", "aria-hidden": "true" }, MARKS[step.state] ?? ""),

@@ -10,7 +10,7 @@ const JOBS_SHOWN = 8;
 
 export function mount(root, app) {
   const part = (id, title, ...content) => h("section", { class: "card stack", "aria-labelledby": id }, h("h2", { id }, title), ...content);
-  const alarms = h("section", { class: "card", "aria-labelledby": "alarms-title" });
+  const alarms = h("section", { class: "card stack", "aria-labelledby": "alarms-title" });
   const tiles = h("dl", { class: "tiles", "aria-label": "The computer" });
   const links = h("tbody"), channels = h("tbody"), gaps = h("div"), jobs = h("ul", { class: "stack" }), events = h("div");
   const head = (names) => h("thead", null, h("tr", null, names.map((name, i) => h("th", { scope: "col", class: i < 2 ? "text" : null }, name))));

@@ -8,15 +8,17 @@ import { duration, fixed, utc, words } from "../words.js";
 const AGAIN_MS = 15000;
 
 export function mount(root) {
-  const drift = new Chart("Error of check shots divided by what the live model expects, over time", "", [{ label: "check session", colour: "blue" }, { label: "as expected", colour: "control", line: true, dash: [6, 5] }]);
-  const sums = new Chart("Sum that shows a lasting drift, over time, with the value at which it is one", "", [{ label: "worse than expected", colour: "critical", line: true, dots: true }, { label: "drift", colour: "control", line: true, dash: [6, 5] }]);
-  const closure = new Chart("Misclosure of control points over time", "mm", [{ label: "misclosure", colour: "blue" }]);
+  const drift = new Chart("Error of check shots divided by what the live model expects, over time", "", [{ label: "check session", colour: "blue" }, { label: "as expected", colour: "control", line: true, dash: [6, 5] }], "");
+  const sums = new Chart("Sum that shows a lasting drift, over time, with the value at which it is one", "", [{ label: "worse than expected", colour: "critical", line: true, dots: true }, { label: "drift", colour: "control", line: true, dash: [6, 5] }], "Nothing adds up before the first check session against a live model.");
+  const closure = new Chart("Misclosure of control points over time", "mm", [{ label: "misclosure", colour: "blue" }], "No known control point was shot again yet.");
   const part = (id, title, about, chart, rest) => h("section", { class: "card stack", "aria-labelledby": id }, h("h2", { id }, title), about ? h("p", { class: "soft" }, about) : null, chart?.element ?? "", rest ?? "");
   const driftTable = h("div"), closureTable = h("div"), changes = h("div"), alarms = h("div"), sentence = h("p");
+  const checkByCheck = h("details", { hidden: true }, h("summary", null, "Check by check"), driftTable);
+  const shotByShot = h("details", { hidden: true }, h("summary", null, "Shot by shot"), closureTable);
   root.append(
-    part("drift-title", "Does the model still hold?", "Each dot is a check session: the error of its fixes, divided by what the model that was live then expects. 1 is as expected.", drift, h("div", { class: "stack" }, sentence, h("details", null, h("summary", null, "Check by check"), driftTable))),
+    part("drift-title", "Does the model still hold?", "Each dot is a check session: the error of its fixes, divided by what the model that was live then expects. 1 is as expected.", drift, h("div", { class: "stack" }, sentence, checkByCheck)),
     part("sums-title", "Drift over months", "Errors that are larger than expected again and again add up; beyond the dashed line the machine has changed.", sums),
-    part("closure-title", "Control points", "How far each control point was from its known place. 5 mm and more says that the station has moved.", closure, h("details", null, h("summary", null, "Shot by shot"), closureTable)),
+    part("closure-title", "Control points", "How far each control point was from its known place. 5 mm and more says that the station has moved.", closure, shotByShot),
     part("changes-title", "Models that went live and left", "", null, changes),
     part("past-title", "Alarms that are over", "", null, alarms));
 
@@ -36,6 +38,8 @@ export function mount(root) {
     const decision = gap?.drift?.decision ?? null;
     drift.show([at(rated), rated.map((check) => check.ratio), rated.map(() => 1)]);
     sums.show([at(checks), checks.map((check) => check.upper), checks.map(() => decision)]);
+    checkByCheck.hidden = !checks.length;
+    shotByShot.hidden = !misclosures.length;
     closure.show([at(misclosures), misclosures.map((shot) => shot.misclosure_mm)]);
     const empty = "No check session was held against a live model yet; a guided session ends with one.";
     fill(sentence, gap?.drift ?? empty, () => h("span", null, gap?.drift?.checks ? driftSentence(gap.drift) : empty));

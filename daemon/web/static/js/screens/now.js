@@ -2,7 +2,7 @@
 
 import { fill, h, say, tile } from "../dom.js";
 import { alarmList } from "../alarms.js";
-import { fixed, millimetres, percent, plural } from "../words.js";
+import { fixed, millimetres, percent, planned, plural } from "../words.js";
 
 export function mount(root, app) {
   const state = h("span", { role: "status", "aria-live": "polite" });
@@ -10,7 +10,7 @@ export function mount(root, app) {
   const action = h("div", { id: "action" });
   const card = h("section", { class: "card state", "aria-label": "State and next step" }, h("h2", { id: "state" }, state), step, action);
   const tiles = h("dl", { class: "tiles", "aria-label": "Figures" });
-  const alarms = h("section", { class: "card", "aria-labelledby": "alarms-title" });
+  const alarms = h("section", { class: "card stack", "aria-labelledby": "alarms-title" });
   root.append(card, tiles, alarms);
 
   return {
@@ -41,8 +41,8 @@ function figuresOf({ guide, session, models, control_shots: shots, gap }) {
   const open = guide?.state === "open" ? guide : null;
   const found = [];
   if (open?.prism || session) found.push(["Prism", open?.prism ?? session.prism, "", open?.session_kind === "check" || session?.kind === "check" ? "a check" : ""]);
-  if (open?.poses) found.push(["Poses", `${open.poses.done} of ${open.poses.planned}`, "", open.poses.skipped ? `${open.poses.skipped} skipped` : ""]);
-  else if (session) found.push(["Poses", String(session.poses), "", plural(session.observations, "fix", "fixes")]);
+  if (open?.poses) found.push(planned(open.poses));
+  else if (session) found.push(["Poses measured", String(session.poses), "", plural(session.observations, "fix", "fixes")]);
   if (open?.coverage) found.push(["Coverage", percent(open.coverage.prism_volume_share ?? open.coverage.volume_share), "", "of the work volume"]);
   if (open?.accuracy) found.push(["Expected accuracy", millimetres(open.accuracy.now_mm), "mm", open.accuracy.target_mm ? `target ${millimetres(open.accuracy.target_mm)} mm` : `after 5 more ${millimetres(open.accuracy.after_5_mm)} mm`]);
   const worst = Math.max(...shots.map((shot) => shot.misclosure_mm ?? -1));

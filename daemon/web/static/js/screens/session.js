@@ -4,18 +4,19 @@ import { command, get } from "../api.js";
 import { Chart } from "../chart.js";
 import { fill, h, say, table, tile } from "../dom.js";
 import { jobLine } from "../jobs.js";
-import { duration, fixed, millimetres, plural, utc, words } from "../words.js";
+import { duration, fixed, millimetres, planned, plural, utc, words } from "../words.js";
 
 const POLL_MS = 1000;
 
 export function mount(root, app) {
   const select = h("select", { id: "which" });
   const head = h("section", { class: "card stack", "aria-label": "The session" });
-  const chart = new Chart("Distance of each fix from the live model's prediction over time", "mm", [{ label: "used", colour: "blue" }, { label: "excluded", colour: "critical" }]);
+  const chart = new Chart("Distance of each fix from the live model's prediction over time", "mm", [{ label: "used", colour: "blue" }, { label: "excluded", colour: "critical" }], "");
   const note = h("p", { class: "soft" });
   const poses = h("div");
+  const poseByPose = h("details", { hidden: true }, h("summary", null, "Pose by pose"), poses);
   const residuals = h("section", { class: "card stack", "aria-labelledby": "residuals-title" },
-    h("h2", { id: "residuals-title" }, "Fixes and residuals"), note, chart.element, h("details", null, h("summary", null, "Pose by pose"), poses));
+    h("h2", { id: "residuals-title" }, "Fixes and residuals"), note, chart.element, poseByPose);
   const picker = h("section", { class: "card" }, h("label", { for: "which" }, "Which session", select));
   root.append(head, residuals, picker);
 
@@ -49,11 +50,14 @@ export function mount(root, app) {
       return;
     }
     const { session, fixes } = found;
-    fill(head, [session, app.me.role], () => summary(session, app));
+    const guide = app.live.state.guide;
+    const led = guide?.state === "open" && guide.session === session.id ? guide : null;
+    fill(head, [session, led?.poses, app.me.role], () => summary(session, led, app));
+    poseByPose.hidden = !fixes.fixes.length;
     const size = (fix) => (fix.residual_mm ? Math.hypot(...fix.residual_mm) : null);
     const spread = spreads(fixes.fixes);
     const isModel = fixes.fixes.some((fix) => fix.residual_mm);
-    say(note, !fixes.fixes.length ? "No fix has come yet." : [fixes.note, isModel ? `Measured less what model ${fixes.model} predicts.` : "Shown is how far each fix lies from the mean of its pose."].filter(Boolean).join(" "));
+    say(note, !fixes.fixes.length ? (session.state === "open" ? "No fix has come yet." : "No fix came in this session.") : [fixes.note, isModel ? `Measured less what model ${fixes.model} predicts.` : "Shown is how far each fix lies from the mean of its pose."].filter(Boolean).join(" "));
     const value = (fix) => (isModel ? size(fix) : spread.get(fix.id) ?? null);
     chart.box.setAttribute("aria-label", isModel ? "Distance of each fix from the live model's prediction over time" : "Distance of each fix from the mean of its pose over time");
     chart.show([fixes.fixes.map((fix) => fix.utc_ns / 1e9),
@@ -89,12 +93,12 @@ function spreads(fixes) {
 function poseTable(fixes, spread, size) {
   const byPose = [...Map.groupBy(fixes, (fix) => fix.pose ?? "moving")];
   const mean = (values) => { const known = values.filter((value) => value !== null && value !== undefined); return known.length ? known.reduce((a, b) => a + b, 0) / known.length : null; };
-  const rows = byPose.toReversed().slice(0, 60).map(([, group]) => {
+  const rows = byPose.toReversed().slice(0, 60).map(([pose, group]) => {
     const used = group.filter((fix) => fix.excluded === null);
     const why = [...new Set(group.map((fix) => fix.excluded).filter(Boolean))].join("; ");
-    return [utc(group[0].utc_ns), `${used.length} of ${group.length}`, millimetres(mean(used.map((fix) => spread.get(fix.id)))), millimetres(mean(used.map(size))), why];
+    return [pose === "moving" ? "while moving" : utc(group[0].utc_ns), `${used.length} of ${group.length}`, millimetres(mean(used.map((fix) => spread.get(fix.id)))), millimetres(mean(used.map(size))), why];
   });
-  return rows.length ? table("The newest poses first", [["at", true], ["fixes used", false], ["spread, mm", false], ["residual, mm", false], ["excluded because", true]], rows) : h("p", { class: "empty" }, "No fix has come yet.");
+  return table("The newest poses first", [["at", true], ["fixes used", false], ["spread, mm", false], ["residual, mm", false], ["excluded because", true]], rows);
 }
 
 /** What an operator does in a session that no guide leads. */
@@ -114,7 +118,8 @@ function byHand(session, app) {
   ];
 }
 
-function summary(session, app) {
+/** The session in short; `led` is the guide that leads it, null without one. */
+function summary(session, led, app) {
   const state = session.state === "open" ? ["open", "tag good"] : session.not_used ? ["not used", "tag bad"] : [session.state, "tag"];
   const shots = session.control_shots.map((shot) => `${shot.point} at the ${shot.phase}: ${shot.misclosure_mm === null ? "defined" : `${fixed(shot.misclosure_mm, 1)} mm off`}`);
   const accept = async () => {
@@ -124,7 +129,10 @@ function summary(session, app) {
   return [
     h("div", { class: "row" }, h("h2", null, `${session.id}: prism ${session.prism}${session.kind === "check" ? ", a check" : ""}`), h("span", { class: state[1] }, state[0])),
     session.state === "open" && !app.live.state.guide?.session ? h("div", { class: "row" }, byHand(session, app)) : null,
-    h("dl", { class: "tiles" }, tile("Poses", String(session.poses)), tile("Fixes", String(session.observations)), tile("Set-up", session.setup ?? "\u2013"), tile("Started", utc(session.started_utc_ns).slice(11), "", utc(session.started_utc_ns).slice(0, 10))),
+    h("dl", { class: "tiles" },
+      tile("Poses measured", String(session.poses), "", "standstills with usable fixes"),
+      led?.poses ? tile(...planned(led.poses)) : null,
+      tile("Fixes", String(session.observations)), tile("Set-up", session.setup ?? "\u2013"), tile("Started", utc(session.started_utc_ns).slice(11), "", utc(session.started_utc_ns).slice(0, 10))),
     Object.keys(session.excluded).length ? h("div", null, h("h3", null, "Excluded"), h("ul", null, Object.entries(session.excluded).map(([reason, n]) => h("li", null, `${plural(n, "fix", "fixes")}: ${reason}`)))) : null,
     shots.length ? h("div", null, h("h3", null, "Control points"), h("ul", null, shots.map((shot) => h("li", null, shot)))) : h("p", { class: "doubtful" }, "No control point was shot yet."),
     session.clock_steps.map((step) => h("p", { class: "doubtful" }, `The computer's clock was set by ${fixed(step.step_s, 1)} s at ${utc(step.at_utc_ns)}.`)),

@@ -1,4 +1,4 @@
-"""How late the station's fixes are against the bus, for the calibration report."""
+"""Section of the calibration report on how late the station's fixes are against the bus."""
 
 from __future__ import annotations
 
