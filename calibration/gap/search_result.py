@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from calibration.effects.context import EffectContext
 from calibration.effects.fitted import Choice
 from calibration.gap.adoption import Adopted, adopted
 from calibration.gap.background.naming import Names
@@ -368,11 +369,16 @@ def _background_text(names: Names) -> str:
         if rms_mm > _WORTH_TELLING * most
     ]
     nearest = [w for w in names.left if w.log_bayes_factor > 0.0][:1]
-    said = [
-        f"{w.candidate} comes nearest, with too little evidence (log Bayes factor {w.log_bayes_factor:.1f})"
-        for w in nearest
-    ]
-    return "; ".join([f"smooth in {', '.join(parts)}", *(said or ["nothing in the library is like it"])])
+    said = [_why_left(w, names.joint.situation) for w in nearest] or ["nothing in the library is like it"]
+    return "; ".join([f"smooth in {', '.join(parts)}", *said])
+
+
+def _why_left(scored: ScoredEffect, situation: EffectContext) -> str:
+    """Return a clause: that an effect comes nearest to what is left, its evidence, and why it is not named."""
+    evidence = f"log Bayes factor {scored.log_bayes_factor:.1f}"
+    if names := beyond(situation, scored):
+        return f"{scored.candidate} comes nearest ({evidence}), but {', '.join(names)} would be beyond what is physical"
+    return f"{scored.candidate} comes nearest, with too little evidence ({evidence})"
 
 
 def _library_says(found: SearchResult, formula: Formula) -> str:

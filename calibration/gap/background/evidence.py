@@ -102,7 +102,8 @@ def greatest(
     number = np.repeat(np.arange(len(names)), [*map(len, blocks.values())])
     model = FixedAndScaled(products, fixed, fixed_sigma, index)
     least = float(np.log(products.least_noise))
-    low, high = (np.array([edge] * len(names) + [last]) for edge, last in zip(_LOG_SCALE, (least, _MOST_NOISE)))
+    low = np.append(np.full(len(names), _LOG_SCALE[0]), least)
+    high = np.append(np.full(len(names), _LOG_SCALE[1]), _MOST_NOISE)
     theta = np.append([start[name] for name in names], float(np.log(noise))).clip(low, high)
     # In the axes and units of the information all directions are alike, and a few steps are enough.
     information = model.information(np.exp(theta[number]), float(np.exp(theta[-1])), number)
@@ -117,10 +118,14 @@ def greatest(
         return -value, -(turned.T @ np.where(at == inside, slope, 0.0))
 
     # SciPy's tolerance is relative to a value of many thousands; differences of a few are what counts.
-    begin = np.zeros_like(theta)
-    relative = enough / max(abs(negative(begin)[0]), 1.0)
-    options = {"maxiter": _ITERATIONS, "ftol": relative}
-    found = minimize(negative, begin, jac=True, method="L-BFGS-B", options=options)
+    begin = np.zeros(len(theta))
+    found = minimize(
+        negative,
+        begin,
+        jac=True,
+        method="L-BFGS-B",
+        options={"maxiter": _ITERATIONS, "ftol": enough / max(abs(negative(begin)[0]), 1.0)},
+    )
     best = (theta + turned @ found.x).clip(low, high)
     scale = dict(zip(names, best[:-1].tolist(), strict=True))
     return Scales(fixed, fixed_sigma, dict(blocks), scale, float(np.exp(best[-1])), -float(found.fun))

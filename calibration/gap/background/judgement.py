@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from scipy.special import softmax
 
@@ -83,7 +83,7 @@ def judged(system: System, model: Model) -> tuple[Model, list[Judged]]:
             model = model if changed is None else changed
             found += [] if changed is not None else [rivals.judgement()]
         model = grown(system, model)
-        if model.effects == before.effects:
+        if len(found) == len(before.effects) == len(model.effects):
             return model, found
     return model, judgements(system, model)
 
