@@ -2,7 +2,7 @@
 
 WAL with synchronous=FULL: what `transaction` has committed survives power loss. One connection writes and
 checkpoints, because SQLite up to 3.51.2 can corrupt a WAL that two connections reset at once; readers
-(`daemon.store.reader`) are read-only.
+(`daemon.store.reader`, and `rows` outside a transaction) are read-only, and wait for no commit.
 """
 
 from __future__ import annotations
@@ -58,6 +58,8 @@ class Connection:
             wanted = ".".join(map(str, OLDEST_SQLITE))
             raise StoreError(f"SQLite {sqlite3.sqlite_version} is too old; rigcal needs {wanted} or newer")
         self._turn = threading.RLock()
+        self._transactions = threading.local()  # how many of this thread are open, one in the other
+        self._reading = threading.Lock()
         self._lock = WriterLock(path)
         try:
             require_no_half_restore(path)
@@ -67,6 +69,9 @@ class Connection:
             try:
                 self._db = Database(connection)
                 self._prepare(connection)
+                self._reads = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False)
+                self._reads.text_factory = stored_text
+                self._reads.execute("PRAGMA schema_version").fetchall()  # opens its files, whose names may go
             except BaseException:
                 connection.close()
                 raise
@@ -116,6 +121,8 @@ class Connection:
             log.error("%s: a write does not end; the store is left open", self.path)
             return
         try:
+            with self._reading:
+                self._reads.close()  # first: the last one to close tidies the write-ahead log away
             self._db.close()
             self._lock.release()
         finally:
@@ -130,6 +137,8 @@ class Connection:
         Nested transactions are savepoints of the outermost one. Other threads wait for their turn.
         """
         with self._turn:
+            depth = self._depth
+            self._transactions.depth = depth + 1
             try:
                 with self._db.atomic() as db:
                     yield db
@@ -137,6 +146,13 @@ class Connection:
                 self.note_damage(error)
                 self._forget_rows()
                 raise
+            finally:
+                self._transactions.depth = depth
+
+    @property
+    def _depth(self) -> int:
+        """How many transactions this thread is in."""
+        return getattr(self._transactions, "depth", 0)
 
     def _forget_rows(self) -> None:
         """Empty the caches of row numbers: a transaction that made some of these rows was rolled back."""
@@ -176,10 +192,14 @@ class Connection:
             return db.execute(f'UPDATE "{table}" SET {settings} WHERE {conditions}', values).rowcount
 
     def rows(self, sql: str, parameters: Sequence[object] = ()) -> list[dict[str, Any]]:
-        """The rows of a query, on the writing connection: it sees the open transaction's own changes."""
-        with self._turn:
+        """The rows of a query: in a transaction of this thread with its changes, else as last committed, at once.
+
+        What is read outside a transaction waits for no other thread's: a commit takes as long as the disk does.
+        """
+        lock, connection = (self._turn, self._db.conn) if self._depth else (self._reading, self._reads)
+        with lock:
             try:
-                cursor = self._db.execute(sql, [*map(sql_value, parameters)])
+                cursor = connection.execute(sql, [*map(sql_value, parameters)])
                 names = [column[0] for column in cursor.description]
                 return [dict(zip(names, row, strict=True)) for row in cursor]
             except sqlite3.Error as error:

@@ -32,7 +32,18 @@ def fill_up(store: Store) -> None:
     """Let a store have no further page, as on a full disk, and none that is free."""
     with contextlib.closing(sqlite3.connect(store.path)) as other:
         other.execute("VACUUM")
-    store.rows(f"PRAGMA max_page_count = {store.rows('PRAGMA page_count')[0]['page_count']}")
+    limit_pages(store, store.pragma("page_count"))
+
+
+def make_room(store: Store) -> None:
+    """Let a store that was filled up grow again."""
+    limit_pages(store, 1_000_000)
+
+
+def limit_pages(store: Store, pages: int) -> None:
+    """Let the connection that writes have so many pages at most."""
+    with store.transaction():
+        store.rows(f"PRAGMA max_page_count = {pages}")
 
 
 @contextlib.contextmanager

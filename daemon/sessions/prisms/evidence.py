@@ -245,6 +245,8 @@ class PrismEvidence:
                 misfits, verdict, is_sure = alone, by_itself, True
         if len(judged) > 1 and not is_sure:
             return []
+        if len(judged) > 1 and verdict is Verdict.NAMED:  # most are the prism; each that is must fit them by itself
+            return [finding for stretch in judged for finding in self._judge_as_one(identity, [stretch])]
         # Where nothing fits, what was found before stays
         ends_doubt = len(judged) == 1 and judged[0].verdict is Verdict.OTHER and misfits.prism[self._index()] <= 1.0
         if verdict is Verdict.OPEN and not ends_doubt:

@@ -37,7 +37,7 @@ from tests.daemon.acquisition_support import (
     SilenceDecoder,
     wait_until,
 )
-from tests.daemon.damage import fill_up
+from tests.daemon.damage import fill_up, make_room
 from tests.daemon.store_support import at, frame, serial_bytes, table
 
 Make = Callable[..., Acquisition]
@@ -266,7 +266,7 @@ def test_a_full_disk_is_told_and_waited_for_and_nothing_is_lost(
     assert "full" in str(acquisition.status().error)
     assert acquisition.alive(within_s=DEADLINE_S)
     wait_until(link.done.is_set)
-    store.rows("PRAGMA max_page_count = 1000000")
+    make_room(store)
     wait_until(lambda: acquisition.status().error is None)
     acquisition.stop()
     assert raw(path) == frames

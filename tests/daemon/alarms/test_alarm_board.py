@@ -17,7 +17,7 @@ from daemon.store import Store
 from daemon.store.queries.alarms import AlarmTable
 from daemon.store.queries.jobs import FailedJob
 from drivers.clock import ManualClock
-from tests.daemon.damage import fill_up
+from tests.daemon.damage import fill_up, make_room
 from tests.daemon.store_support import at, table
 
 
@@ -109,7 +109,7 @@ def test_an_alarm_shows_although_the_store_cannot_be_written_and_is_written_late
     assert len(rig.stored()) < 200
     rig.pass_s(6, boom="still")
     assert rig.active() == ["boom"]
-    rig.store.rows("PRAGMA max_page_count = 1000000")
+    make_room(rig.store)
     rig.pass_s(1, boom="still")
     stored = rig.stored()
     assert len(stored) == 201

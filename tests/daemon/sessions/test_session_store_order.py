@@ -18,7 +18,7 @@ from daemon.store.errors import unwritable_errors
 from daemon.store.migrations import MIGRATIONS
 from daemon.store.store import Store
 from drivers.readings import Reading, Record
-from tests.daemon.damage import fill_up
+from tests.daemon.damage import fill_up, make_room
 from tests.daemon.session_support import SOURCE, STEP_S, Rig, disk_fails
 
 
@@ -56,7 +56,7 @@ def test_a_session_whose_start_finds_the_disk_full_is_not_open(session_rig: Rig)
         session_rig.say("start", prism="r")
     assert session_rig.keeper.open_session() is None
     assert open_sessions(session_rig) == []
-    session_rig.store.rows("PRAGMA max_page_count = 1000000")
+    make_room(session_rig.store)
     assert session_rig.say("start", prism="r")["id"] == "s001-r"
 
 

@@ -63,8 +63,9 @@ def test_every_table_is_strict_and_commits_survive_power_loss(store: Store) -> N
     ours = [t for t in tables if not str(t["name"]).startswith(("sqlite_", "_sqlite"))]
     assert {"raw_chunks", "observations", "notices"} <= {t["name"] for t in ours}
     assert all(t["strict"] == 1 for t in ours)
-    for pragma, value in (("journal_mode", "wal"), ("synchronous", 2), ("foreign_keys", 1)):
-        assert [*store.rows(f"PRAGMA {pragma}")[0].values()] == [value]
+    with store.transaction():  # of the connection that writes
+        for pragma, value in (("journal_mode", "wal"), ("synchronous", 2), ("foreign_keys", 1)):
+            assert [*store.rows(f"PRAGMA {pragma}")[0].values()] == [value]
 
 
 def test_the_version_of_sqlite_is_logged_at_the_start(path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -218,6 +219,38 @@ def test_transactions_of_several_threads_take_turns(store: Store, path: Path) ->
     for thread in threads:
         thread.join(30)
     assert len(table(path, "links")) == 200
+
+
+def test_what_is_read_waits_for_no_other_thread_s_transaction(store: Store) -> None:
+    store.begin_run(at(0))
+    begun, may_end = threading.Event(), threading.Event()
+
+    def write_slowly() -> None:
+        with store.transaction():
+            store.update("daemon_runs", {"id": 1}, {"pid": 1})
+            begun.set()
+            may_end.wait(60)
+
+    seen: list[int | None] = []
+
+    def pid() -> int | None:
+        return store.number("SELECT pid FROM daemon_runs", [])
+
+    writer = threading.Thread(target=write_slowly)
+    writer.start()
+    try:
+        assert begun.wait(60)
+        reader = threading.Thread(target=lambda: seen.append(pid()), daemon=True)
+        reader.start()
+        reader.join(10)
+        assert seen == [os.getpid()]  # as last committed
+    finally:
+        may_end.set()
+        writer.join()
+    assert pid() == 1
+    with store.transaction():
+        store.update("daemon_runs", {"id": 1}, {"pid": 2})
+        assert pid() == 2  # in a transaction, with its own changes
 
 
 def _setup(store: Store, name: str) -> dict[str, object]:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calibration.identification.prism_identity import PrismIdentity
 from daemon.sessions.prisms.evidence import IdentityLoader, PrismEvidence, Sighting, Verdict, targets
 from drivers.readings import EventKind
 from simulators.rig.truth import RigTruth
@@ -148,22 +149,41 @@ def test_what_an_operator_confirms_the_joints_do_not_overrule(rig: TrueRig) -> N
     assert rig.used(session) > 0
 
 
-def test_an_earlier_session_on_the_wrong_prism_does_not_make_the_right_one_wrong(rig: TrueRig) -> None:
+def seen(target: str, poses: range, slack_mm: float = 0.0) -> list[Sighting]:
+    """What a session of prism r sees of a target at poses."""
+    rows = []
+    for pose in poses:
+        joints = tuple(map(float, POSES[pose]))
+        values = dict(zip(RIG.joint_names, joints, strict=True))
+        x, y, z = map(float, TRUTH.prism_mm(target, arrays(values), setup="S1")[0])
+        rows.append(Sighting("r", joints, (x, y, z), slack_mm))
+    return rows
+
+
+def loaded() -> tuple[IdentityLoader, PrismIdentity]:
     loader = IdentityLoader(RIG)
     loader.start(60)
     identity = loader.now()
     assert identity is not None
+    return loader, identity
 
-    def seen(target: str, poses: range) -> list[Sighting]:
-        rows = []
-        for pose in poses:
-            joints = tuple(map(float, POSES[pose]))
-            x, y, z = map(
-                float, TRUTH.prism_mm(target, arrays(dict(zip(RIG.joint_names, joints, strict=True))), setup="S1")[0]
-            )
-            rows.append(Sighting("r", joints, (x, y, z)))
-        return rows
 
+def test_fixes_of_another_prism_are_not_cleared_by_those_around_them_that_fit(rig: TrueRig) -> None:
+    loader, identity = loaded()
+    evidence = PrismEvidence(RIG, "r", loader)
+    found = []
+    for number, pose in enumerate(range(2, 8)):
+        stretch = evidence.stretch("station", rig.clock.now().shifted(number), False)
+        # Once, while the boom moves, the station is on s, which is 1.5 m from r
+        stretch.sightings += seen("s", range(pose, pose + 1), 400.0) if number == 1 else seen("r", range(pose, pose + 1))
+        evidence._judge(identity, [stretch])
+        found.append(stretch)
+    assert found[1].verdict is Verdict.OTHER
+    assert {stretch.verdict for stretch in found[2:]} == {Verdict.NAMED}
+
+
+def test_an_earlier_session_on_the_wrong_prism_does_not_make_the_right_one_wrong(rig: TrueRig) -> None:
+    loader, identity = loaded()
     evidence = PrismEvidence(RIG, "r", loader, [seen("r", range(3)), seen("b", range(3, 5)), seen("r", range(5, 7))])
     stretch = evidence.stretch("station", rig.clock.now(), False)
     stretch.sightings += seen("r", range(8, 9))
