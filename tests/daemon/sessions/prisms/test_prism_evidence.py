@@ -175,7 +175,8 @@ def test_fixes_of_another_prism_are_not_cleared_by_those_around_them_that_fit(ri
     for number, pose in enumerate(range(2, 8)):
         stretch = evidence.stretch("station", rig.clock.now().shifted(number), False)
         # Once, while the boom moves, the station is on s, which is 1.5 m from r
-        stretch.sightings += seen("s", range(pose, pose + 1), 400.0) if number == 1 else seen("r", range(pose, pose + 1))
+        own = range(pose, pose + 1)
+        stretch.sightings += seen("s", own, 400.0) if number == 1 else seen("r", own)
         evidence._judge(identity, [stretch])
         found.append(stretch)
     assert found[1].verdict is Verdict.OTHER
