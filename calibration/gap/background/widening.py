@@ -22,7 +22,7 @@ PossibleBlocks = Callable[[], Iterator[Block]]
 
 _SAMPLES = 700  # to choose by
 _MOST = 8  # blocks at once
-_LEAST_GAIN = 8.0  # log evidence
+_LEAST_GAIN = 15.0  # log evidence
 _SQUARED_SCALES = np.exp(np.linspace(-8.0, 6.0, 15))[:, None]
 
 

@@ -174,9 +174,9 @@ def test_fixes_of_another_prism_are_not_cleared_by_those_around_them_that_fit(ri
     found = []
     for number, pose in enumerate(range(2, 8)):
         stretch = evidence.stretch("station", rig.clock.now().shifted(number), False)
+        poses = range(pose, pose + 1)
         # Once, while the boom moves, the station is on s, which is 1.5 m from r
-        own = range(pose, pose + 1)
-        stretch.sightings += seen("s", own, 400.0) if number == 1 else seen("r", own)
+        stretch.sightings += seen("s", poses, slack_mm=400.0) if number == 1 else seen("r", poses)
         evidence._judge(identity, [stretch])
         found.append(stretch)
     assert found[1].verdict is Verdict.OTHER
