@@ -38,6 +38,7 @@ _PRIOR_SCALE = (0.1, 300.0)
 _AS_BUILT_SCALE = 30.0
 _DAMPING = (1e-9, 1e-4, 1e9)  # least, first after a refused step, greatest
 _SETTLED = 1e-3
+_SAME_NOISE = 0.01  # share by which it may change before what depends on it little is computed again, half of the work
 _LEAST_EXCESS = 1e-12
 
 
@@ -204,15 +205,20 @@ class _Posterior:
         whitened = self.whitening.whiten(at.error)
         return float((whitened**2).sum() + self.precision @ at.x[self.model.free] ** 2)
 
-    def excess(self, step: Floats) -> float:
+    @property
+    def fitted_share(self) -> float:
+        """Share of tr V^-1 (dV/ds^2) that the parameters fit: tr V^-1 J C J' V^-1 (dV/ds^2), over the former."""
+        jacobian = self.whitening.finish(self.jacobian)
+        return float(np.sum(gram(jacobian) * self.covariance)) / self.whitening.trace[0]
+
+    def excess(self, step: Floats, fitted_share: float) -> float:
         """s^2 after a Fisher scoring step of the restricted likelihood, the parameters moved by `step` meanwhile.
 
         It equates e' V^-1 (dV/ds^2) V^-1 e with tr P (dV/ds^2), P = V^-1 - V^-1 J C J' V^-1.
         """
-        jacobian = self.whitening.finish(self.jacobian)
         error = self.whitening.finish((self.error - self.jacobian @ step)[:, None])
         total, curvature = self.whitening.trace
-        left = total - float(np.sum(gram(jacobian) * self.covariance))
+        left = total * (1.0 - fitted_share)
         if left <= 0.0:
             return self.noise.excess
         change = (float((error**2).sum()) - left) / (curvature * left / total)
@@ -275,6 +281,7 @@ def _fit(
     noise = _first_noise(state, prior) if like is None else _noise_of(like)
     noise = noise if excess_variance is None else replace(noise, excess=excess_variance)
     damping, settled, rounds, weight = 0.0, False, 0, np.ones(len(model.order))
+    fitted_share, computed_at = 0.0, 0.0
     while not settled and rounds < _ROUNDS:
         rounds += 1
         view = _Posterior(model, state, noise)
@@ -285,7 +292,10 @@ def _fit(
         weight = view.weight
         excess, scale = noise.excess, noise.scale
         if excess_variance is None:
-            excess = view.excess(step)
+            precision = view.whitening.trace[0]
+            if abs(precision - computed_at) > _SAME_NOISE * precision:
+                fitted_share, computed_at = view.fitted_share, precision
+            excess = view.excess(step, fitted_share)
             known = float(np.trace(view.of_rows.block, axis1=1, axis2=2).mean()) / 3.0
             change = max(change, abs(excess - noise.excess) / known)
         if prior == "as-built" and model.tolerated.any():

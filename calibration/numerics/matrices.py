@@ -28,8 +28,8 @@ def gram(rows: Floats) -> Floats:
     seldom, often = np.flatnonzero(rare), np.flatnonzero(~rare)
     beside, own = np.zeros((len(seldom), len(often))), np.zeros((len(seldom), len(seldom)))
     _add(np.ascontiguousarray(rows), seldom, often, beside, own)
-    out = np.empty((rows.shape[1], rows.shape[1]))
-    out[np.ix_(often, often)] = rows[:, often].T @ rows[:, often]
+    out, usual = np.empty((rows.shape[1], rows.shape[1])), rows[:, often]
+    out[np.ix_(often, often)] = usual.T @ usual
     out[np.ix_(seldom, often)] = beside
     out[np.ix_(often, seldom)] = beside.T
     out[np.ix_(seldom, seldom)] = own + np.tril(own, -1).T
