@@ -187,7 +187,8 @@ class _Posterior:
         self.jacobian = self.whitening.whiten(state.jacobian if free.all() else state.jacobian[:, :, free])
         self.error = self.whitening.whiten(state.error)[:, 0]
         self.precision = model.precision(noise.scale)
-        self.normal = gram(self.jacobian) + np.diag(self.precision)
+        self.normal = gram(self.jacobian)
+        self.normal[np.diag_indices_from(self.normal)] += self.precision
         _require_finite(self.normal)
         self.gradient = self.jacobian.T @ self.error - self.precision * state.x[free]
 
@@ -209,7 +210,7 @@ class _Posterior:
     def fitted_share(self) -> float:
         """Share of tr V^-1 (dV/ds^2) that the parameters fit: tr V^-1 J C J' V^-1 (dV/ds^2), over the former."""
         jacobian = self.whitening.finish(self.jacobian)
-        return float(np.sum(gram(jacobian) * self.covariance)) / self.whitening.trace[0]
+        return float(np.vdot(gram(jacobian), self.covariance)) / self.whitening.trace[0]
 
     def excess(self, step: Floats, fitted_share: float) -> float:
         """s^2 after a Fisher scoring step of the restricted likelihood, the parameters moved by `step` meanwhile.
@@ -345,7 +346,10 @@ class _Factor:
 
     def __init__(self, matrix: Floats) -> None:
         self._scale = 1.0 / np.sqrt(np.diag(matrix))
-        self._lower, failed = lapack.dpotrf(matrix * self._scale[:, None] * self._scale, lower=1)
+        scaled = matrix * self._scale[:, None]
+        scaled *= self._scale
+        # It is symmetric: its transpose is what LAPACK takes without a copy.
+        self._lower, failed = lapack.dpotrf(scaled.T, lower=1, overwrite_a=1)
         if failed:
             raise LinAlgError("the normal equations are not positive definite")
 
@@ -361,7 +365,9 @@ class _Factor:
 
     def inverse(self) -> Floats:
         """Inverse of the matrix."""
-        whole: Floats = inverse_by(self._lower) * self._scale[:, None] * self._scale
+        whole = inverse_by(self._lower)
+        whole *= self._scale[:, None]
+        whole *= self._scale
         return whole
 
 
