@@ -180,7 +180,7 @@ def same_columns(a: EffectColumns, b: EffectColumns) -> bool:
 
 
 def nearly_same(a: EffectColumns, b: EffectColumns) -> bool:
-    """Return True if two forms of the same coefficients differ by a hundred-thousandth of their largest value at most."""
+    """Return True if two forms of the same coefficients differ by a hundred-thousandth of the largest value at most."""
     if a.shift_mm is None or b.shift_mm is None:
         return _nearly_equal(a.column, b.column)
     return _nearly_equal(a.column, b.column) and _nearly_equal(a.shift_mm, b.shift_mm)

@@ -93,8 +93,8 @@ def joint_fit(
 ) -> JointFit:
     """Refit the kinematics with effects.
 
-    Loads and lever arms depend on the kinematics: where these change effects by more than a hundred-thousandth, a second
-    fit has those of the first one's.
+    Loads and lever arms depend on the kinematics: where these change an effect by more than a hundred-thousandth, a
+    second fit has those of the first one's.
 
     Args:
         solution: of the kinematics, for its chain and samples.

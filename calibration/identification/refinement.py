@@ -38,7 +38,7 @@ _PRIOR_SCALE = (0.1, 300.0)
 _AS_BUILT_SCALE = 30.0
 _DAMPING = (1e-9, 1e-4, 1e9)  # least, first after a refused step, greatest
 _SETTLED = 1e-3
-_SAME_NOISE = 0.01  # share by which it may change before what depends on it little is computed again, half of the work
+_SAME_NOISE = 0.01  # share by which noise or prior may change before what depends little on them is computed again
 _LEAST_EXCESS = 1e-12
 
 
@@ -282,7 +282,7 @@ def _fit(
     noise = _first_noise(state, prior) if like is None else _noise_of(like)
     noise = noise if excess_variance is None else replace(noise, excess=excess_variance)
     damping, settled, rounds, weight = 0.0, False, 0, np.ones(len(model.order))
-    fitted_share, computed_at = 0.0, 0.0
+    fitted_share, computed_at = 0.0, np.zeros(2)
     while not settled and rounds < _ROUNDS:
         rounds += 1
         view = _Posterior(model, state, noise)
@@ -293,9 +293,9 @@ def _fit(
         weight = view.weight
         excess, scale = noise.excess, noise.scale
         if excess_variance is None:
-            precision = view.whitening.trace[0]
-            if abs(precision - computed_at) > _SAME_NOISE * precision:
-                fitted_share, computed_at = view.fitted_share, precision
+            at = np.array([view.whitening.trace[0], scale])
+            if (np.abs(at - computed_at) > _SAME_NOISE * at).any():
+                fitted_share, computed_at = view.fitted_share, at
             excess = view.excess(step, fitted_share)
             known = float(np.trace(view.of_rows.block, axis1=1, axis2=2).mean()) / 3.0
             change = max(change, abs(excess - noise.excess) / known)
