@@ -16,6 +16,7 @@ from calibration.observations import Floats
 Integers = NDArray[np.intp]
 
 NO_JOINT = -1
+_NEARLY = 1e-5
 _FEW = 50  # coefficients that are summed by one small product, with many zeros
 
 
@@ -176,6 +177,18 @@ def same_columns(a: EffectColumns, b: EffectColumns) -> bool:
     if a.shift_mm is None or b.shift_mm is None:
         return a.shift_mm is b.shift_mm
     return np.array_equal(a.shift_mm, b.shift_mm)
+
+
+def nearly_same(a: EffectColumns, b: EffectColumns) -> bool:
+    """Return True if two forms of the same coefficients differ by a hundred-thousandth of the largest value at most."""
+    if a.shift_mm is None or b.shift_mm is None:
+        return _nearly_equal(a.column, b.column)
+    return _nearly_equal(a.column, b.column) and _nearly_equal(a.shift_mm, b.shift_mm)
+
+
+def _nearly_equal(one: Floats, other: Floats) -> bool:
+    largest = float(np.abs(one).max(initial=0.0))
+    return bool(np.abs(other - one).max(initial=0.0) <= _NEARLY * largest)
 
 
 def sharing(parts: Iterable[EffectColumns], known: Iterable[EffectColumns] = ()) -> tuple[EffectColumns, ...]:

@@ -40,11 +40,13 @@ class _AtJoint:
 
     Attributes:
         whitened: (3 m, m) displacements.
+        transposed: (m, 3 m) the same.
         removed: (m, q) their part along the kinematics.
         along: (m,) their products with the target.
     """
 
     whitened: csr_array
+    transposed: csr_array
     removed: Floats
     along: Floats
 
@@ -62,6 +64,7 @@ class ProjectedProducts:
         self._removed_target = projection.without_kinematics.removed(projection.target)
         self._rare = [block.sparse if isinstance(block, RareColumns) else None for block in blocks]
         self._at_joint: dict[int, _AtJoint] = {}
+        self._between_joints: dict[tuple[int, int], csr_array] = {}
         self._kept = dict[int, Floats]()
         self._removed: dict[int, Floats] = {}
         self._along: dict[int, Floats] = {}
@@ -104,11 +107,17 @@ class ProjectedProducts:
         rare_a, rare_b = self._rare[a], self._rare[b]
         if rare_a is None:
             return self._whitened(a).T @ self._whitened(b) if rare_b is None else self._whole_product(b, a).T
-        by_reading = self._at(a).whitened.T
         if rare_b is None:
-            return np.asarray(rare_a.T @ (by_reading @ self._whitened(b)))
-        between = by_reading @ self._at(b).whitened
-        return np.asarray((rare_a.T @ (between @ rare_b)).toarray())
+            return np.asarray(rare_a.T @ (self._at(a).transposed @ self._whitened(b)))
+        # SciPy would first make the larger one's format that of the transposed one.
+        return np.asarray((rare_a.T.tocsr() @ (self._between(a, b) @ rare_b)).toarray())
+
+    def _between(self, a: int, b: int) -> csr_array:
+        """Return (m, m) the products of displacements by a unit of reading at the joints of two blocks."""
+        joints = int(self._blocks[a].joint[0]), int(self._blocks[b].joint[0])
+        if joints not in self._between_joints:
+            self._between_joints[joints] = self._at(a).transposed @ self._at(b).whitened
+        return self._between_joints[joints]
 
     def _at(self, block: int) -> _AtJoint:
         """Return what a unit of the reading does at the joint of a block with rare columns."""
@@ -116,11 +125,13 @@ class ProjectedProducts:
         if joint not in self._at_joint:
             projection = self._projection
             whitened = projection.whitened_by_reading(joint)
-            with_kinematics = whitened.T @ projection.kinematics
+            transposed = whitened.T.tocsr()
+            with_kinematics = transposed @ projection.kinematics
             self._at_joint[joint] = _AtJoint(
                 whitened,
+                transposed,
                 projection.without_kinematics.removed_by(with_kinematics.T).T,
-                whitened.T @ projection.target,
+                transposed @ projection.target,
             )
         return self._at_joint[joint]
 

@@ -25,6 +25,7 @@ from calibration.gap.formulas.grammar import Grammar
 from calibration.gap.formulas.terms import Kind
 from calibration.gap.projection import Integers, Projection
 from calibration.gap.result import Disagreement
+from calibration.numerics.statistics import chance_beyond
 from calibration.observations import Floats
 
 _DRAWS = 999
@@ -110,10 +111,9 @@ def _sign_flip_factor(grammar: Grammar) -> float:
     The fit of the kinematics takes some directions out of the residuals, in which an effect's column has nothing: its
     score is none the smaller for it, but with flipped signs the rest is spread over all directions.
     """
-    kinematics = grammar.projection.kinematics
-    size = np.maximum(np.linalg.eigvalsh(kinematics.T @ kinematics), 0.0)
-    taken = float((size / (1.0 + size)).sum())
-    return 1.0 / math.sqrt(max(1.0 - taken / len(kinematics), 0.5))
+    projection = grammar.projection
+    taken = projection.without_kinematics.degrees_of_freedom
+    return 1.0 / math.sqrt(max(1.0 - taken / len(projection.target), 0.5))
 
 
 def _p_of_largest(scores: Floats, chance: Floats) -> Floats:
@@ -133,10 +133,7 @@ def _p_of_sum(total: float, chance: Floats) -> float:
     share = (beyond + 1.0) / (len(chance) + 1.0)
     if beyond >= _ENOUGH:
         return share
-    from scipy import stats
-
-    tail = stats.pearson3.sf(total, stats.skew(chance), chance.mean(), chance.std())
-    return min(share, float(tail))
+    return min(share, chance_beyond(total, chance))
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.effects.columns import EffectColumns, joined, same_columns
+from calibration.effects.columns import EffectColumns, joined, nearly_same
 from calibration.effects.context import EffectContext
 from calibration.effects.fitted import Choice, FittedEffect
 from calibration.gap.projection import Projection
@@ -93,7 +93,8 @@ def joint_fit(
 ) -> JointFit:
     """Refit the kinematics with effects.
 
-    Loads and lever arms depend on the kinematics: where effects do, a second fit has those of the first one's.
+    Loads and lever arms depend on the kinematics: where these change an effect by more than a hundred-thousandth, a
+    second fit has those of the first one's.
 
     Args:
         solution: of the kinematics, for its chain and samples.
@@ -107,7 +108,7 @@ def joint_fit(
     situation, parts = _parts(solution, observations, choices, x)
     fit = refine(chain, samples, x, prior=prior, additions=along(solution, parts))
     again = _parts(solution, observations, choices, fit.x)
-    if not all(same_columns(a, b) for a, b in zip(parts, again[1], strict=True)):
+    if not all(nearly_same(a, b) for a, b in zip(parts, again[1], strict=True)):
         situation, parts = again
         fit = refine(chain, samples, fit.x, prior=prior, additions=along(solution, parts), like=fit)
     return JointFit(situation, tuple(choices), parts, fit)

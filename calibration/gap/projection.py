@@ -12,10 +12,11 @@ projection of Frisch and Waugh (Econometrica 1, 1933).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import cho_factor, cho_solve, lapack, solve_triangular
 from scipy.sparse import csr_array
 
 from calibration.effects.columns import EffectColumns, joined
@@ -39,16 +40,30 @@ class SoftProjection:
     """
 
     def __init__(self, kinematics: Floats) -> None:
-        # Of a triangular root of I + K'K, whose small singular values do not suffer from the large ones' squares.
-        _, root, axes = np.linalg.svd(np.linalg.cholesky(gram(kinematics) + np.eye(kinematics.shape[1])).T)
         self._kinematics = kinematics
-        self._half = axes.T / root
-        self._middle: Floats = axes.T / (root * (1.0 + root)) @ axes
+        self._root = np.linalg.cholesky(gram(kinematics) + np.eye(kinematics.shape[1]))
 
     def __call__(self, whitened: Floats) -> Floats:
         """Return rows (r, k) or (r,) in units of noise and kinematics together."""
         out: Floats = whitened - self._kinematics @ (self._middle @ (self._kinematics.T @ whitened))
         return out
+
+    @cached_property
+    def _middle(self) -> Floats:
+        # Of a triangular root of I + K'K, whose small singular values do not suffer from the large ones' squares.
+        _, root, axes = np.linalg.svd(self._root.T)
+        middle: Floats = axes.T / (root * (1.0 + root)) @ axes
+        return middle
+
+    @cached_property
+    def _inverse(self) -> Floats:
+        """(q, q) inverse of the triangular root of I + K'K."""
+        return np.asarray(lapack.dtrtri(self._root, lower=1)[0])
+
+    @property
+    def degrees_of_freedom(self) -> float:
+        """Number of directions that the kinematics take out of the rows: trace of K (I + K'K)^-1 K'."""
+        return len(self._inverse) - float((self._inverse**2).sum())
 
     def removed(self, whitened: Floats) -> Floats:
         """Return (q, k) the part of rows (r, k), or (q,) of (r,), along the kinematics.
@@ -59,7 +74,7 @@ class SoftProjection:
 
     def removed_by(self, products: Floats) -> Floats:
         """Return `removed` (..., q, k) of rows whose products with the kinematics (..., q, k) are given."""
-        removed: Floats = self._half.T @ products
+        removed: Floats = self._inverse @ products
         return removed
 
 
@@ -82,7 +97,6 @@ class Projection:
         target: (3 m,) whitened positions that kinematics and effects have to explain.
         kinematics: (3 m, q) whitened displacement by one prior sigma of each parameter and adopted coefficient.
         without_kinematics: the soft projection off `kinematics`.
-        residual: (3 m,) projected target; independent standard normal numbers if nothing is missing.
     """
 
     def __init__(
@@ -104,7 +118,11 @@ class Projection:
         self.target = found.error + found.jacobian @ found.value
         self.kinematics = found.jacobian[:, :kept]
         self.without_kinematics = SoftProjection(self.kinematics)
-        self.residual = self.without_kinematics(self.target)
+
+    @cached_property
+    def residual(self) -> Floats:
+        """(3 m,) projected target; independent standard normal numbers if nothing is missing."""
+        return self.without_kinematics(self.target)
 
     def whitened(self, moved_mm: Floats) -> Floats:
         """Return displacements (m, 3, k), mm in the station's frame, as (3 m, k) in units of the noise."""

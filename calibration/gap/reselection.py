@@ -16,6 +16,7 @@ from calibration.gap.projection import Projection
 from calibration.gap.screening import Screen
 
 _BETTER = 1.0  # log Bayes factor, to change the form of an adopted effect
+_AT_REST = 0.1  # nats; two fits that come to rest at one place differ by less
 _FORMS = 5  # times that the forms of adopted effects are changed, before all candidates are scored again
 
 
@@ -49,7 +50,7 @@ def explain_outliers(problem: Problem, joint: JointFit) -> JointFit:
         return joint
     every = replace(joint, fit=replace(joint.fit, weight=np.ones_like(joint.fit.weight)))
     tried = reselect(problem, every, joint.choices)
-    return tried if tried is not every and tried.fit.cost < joint.fit.cost else joint
+    return tried if tried is not every and tried.fit.cost < joint.fit.cost - _AT_REST else joint
 
 
 def _reselect_once(problem: Problem, joint: JointFit, again: Sequence[Choice]) -> JointFit:

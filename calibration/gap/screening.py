@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.special import chdtrc, logsumexp
+from scipy.special import chdtrc
 
 from calibration.effects.base import FittedCoefficient
 from calibration.effects.columns import EffectColumns
@@ -192,7 +192,7 @@ class Screen:
             pair = [each[i], each[k]]
             prior = sum(w.candidate.log_prior for w in pair) + math.log(2.0) + _SECOND
             models.append(((i, k), self.together(pair) + each[i].form_averaging + each[k].form_averaging + prior))
-        total = logsumexp([value for _, value in models])
+        total = _log_sum([value for _, value in models])
         share, top = dict.fromkeys(each, 0.0), dict.fromkeys(each, -math.inf)
         partner: dict[int, ScoredEffect | None] = dict.fromkeys(each)
         for members, value in models:
@@ -214,7 +214,7 @@ class Screen:
         for together in self.distinct(number):
             of_form = np.full_like(values, -math.inf)
             of_form[list(together)] = values[list(together)]
-            if scored.option not in together and logsumexp(of_form) >= least:
+            if scored.option not in together and _log_sum(of_form) >= least:
                 yield self._score_best(number, of_form, odds, likelihood)
 
     def _score_one(self, number: int) -> ScoredEffect:
@@ -242,7 +242,7 @@ class Screen:
         each = [self._at_scales(number, option) for option in range(len(candidate.options))]
         odds = candidate.log_odds[:, None] + np.array(list(LOG_SCALE_ODDS.values()))
         values = odds + [at_scales for at_scales, _ in each]
-        return values, odds, float(logsumexp(candidate.log_odds + [0.5 * explained for _, explained in each]))
+        return values, odds, _log_sum(candidate.log_odds + [0.5 * explained for _, explained in each])
 
     def _score_best(self, number: int, values: Floats, odds: Floats, log_likelihood: float) -> ScoredEffect:
         """Score a candidate by its best variant and scale; `values` and `odds` are those of `_values`."""
@@ -253,7 +253,7 @@ class Screen:
         size, along = size * SCALES[best] ** 2, along * SCALES[best]
         explained, degrees = _explained(size, along)
         p = float(chdtrc(degrees, explained))
-        together = float(logsumexp(values))
+        together = _log_sum(values)
         tested = len({self._block[number, o] for o in range(len(values))})
         return ScoredEffect(
             candidate,
@@ -325,6 +325,11 @@ class Beside:
         if not len(right):
             return right
         return np.asarray(solve_triangular(self._factor, right, lower=True, check_finite=False))
+
+
+def _log_sum(values: Floats | Sequence[float]) -> float:
+    """Return the logarithm of the sum of exponentials; SciPy's function takes a hundred times as long for so few."""
+    return float(np.logaddexp.reduce(np.ravel(values)))
 
 
 def _explained(size: Floats, along: Floats) -> tuple[float, int]:

@@ -320,6 +320,7 @@ def _beside_background(problem: Problem, families: Collection[str], found: Searc
         f"the data ask for {listed}, whatever else is there" if listed else "nothing is certain beside what wanders"
     )
     return SearchResult(
+        problem,
         adopted(problem.solution, joint, reason),
         joint,
         (

@@ -67,9 +67,10 @@ class SearchResult:
     """The result of the search.
 
     Attributes:
+        problem: the data.
         adopted: kinematics and effects.
         joint: their fit.
-        steps: in their order; the last adopts nothing.
+        steps: in their order, each about the fit at that time; the last adopts nothing.
         alternatives: of the set that is pending, the most probable first; none where nothing is.
         formulas: of the grammar, where they explain the remaining errors better than all of the library.
         outside_library: of the grammar, those that beat the library after all that had been named by then, even if that
@@ -83,6 +84,7 @@ class SearchResult:
         machine_break: an instant after which the machine is another; None for none.
     """
 
+    problem: Problem
     adopted: Adopted
     joint: JointFit
     steps: tuple[SelectionStep, ...]
@@ -96,6 +98,20 @@ class SearchResult:
     evidence: Mapping[str, Evidence] = field(default_factory=dict)
     beside: Names | None = None
     machine_break: Break | None = None
+
+    def refitted_steps(self) -> tuple[SelectionStep, ...]:
+        """Return the steps, each about a fit of what those before it adopted, without what was taken back later."""
+        there, steps = set[str](), list[SelectionStep]()
+        for step in self.steps:
+            before = sorted((c for c in step.fit.choices if str(c) in there), key=str)
+            like = next((own for own in steps if sorted(own.fit.choices, key=str) == before), step)
+            fit, projection = like.fit, like.projection
+            if len(before) < len(fit.choices):
+                fit = self.problem.fit(before, fit.start(before))
+                projection = self.problem.project(fit)
+            steps.append(replace(step, fit=fit, projection=projection))
+            there |= {str(c) for c in step.adopted}
+        return tuple(steps)
 
 
 def conclude(
@@ -127,7 +143,7 @@ def conclude(
     final, outside_library = Grammar(last), formulas
     if against and not alternatives:
         formulas = final.find()
-    kept = _final_steps(problem, steps, alone, joint, against)
+    kept = _final_steps(steps, alone, joint, against)
     kept[-1] = replace(kept[-1], fit=joint, projection=last)
     initial, is_structured = kept[0].projection, bool(formulas)
     if joint.choices and not alternatives and not _closes(problem, initial, final, is_structured=is_structured):
@@ -136,6 +152,7 @@ def conclude(
     if joint.choices:
         outcome = adopted(solution, joint, f"the data ask for {', '.join(map(str, joint.choices))}")
     return SearchResult(
+        problem,
         outcome,
         joint,
         tuple(kept),
@@ -181,22 +198,17 @@ def _without_partial_effects(
 
 
 def _final_steps(
-    problem: Problem,
-    steps: Sequence[SelectionStep],
-    alone: SelectionStep,
-    last: JointFit,
-    against: Mapping[str, str],
+    steps: Sequence[SelectionStep], alone: SelectionStep, last: JointFit, against: Mapping[str, str]
 ) -> list[SelectionStep]:
-    """Return the steps without effects that were taken back, each about a fit of what those before it adopted.
+    """Return the steps without effects that were taken back, the first about the kinematics alone.
 
     Args:
-        problem: the data.
         steps: in their order.
         alone: kinematics alone.
         last: the final fit.
         against: `family@where` -> why it was taken back, a clause; what was found after it by default.
     """
-    kept, there, final = {str(c) for c in last.choices}, set[str](), []
+    kept, final = {str(c) for c in last.choices}, []
     for step in steps:
         own = tuple(c for c in step.adopted if str(c) in kept)
         dropped = {
@@ -204,15 +216,8 @@ def _final_steps(
             for c in step.adopted
             if c not in own
         }
-        before = [c for c in step.fit.choices if str(c) in there]
-        fit, projection = step.fit, step.projection
-        if not before:
-            fit, projection = alone.fit, alone.projection
-        elif len(before) < len(fit.choices):
-            fit = problem.fit(before, fit.start(before))
-            projection = problem.project(fit)
-        final.append(replace(step, fit=fit, projection=projection, adopted=own, reasons={**step.reasons, **dropped}))
-        there |= {str(c) for c in own}
+        final.append(replace(step, adopted=own, reasons={**step.reasons, **dropped}))
+    final[0] = replace(final[0], fit=alone.fit, projection=alone.projection)
     return final
 
 
@@ -225,6 +230,7 @@ def _no_effect(
     solution, final = problem.solution, Grammar(step.projection)
     found = final.find()
     return SearchResult(
+        problem,
         Adopted(solution, solution.fit, reason="what could be named closes a part of the gap only"),
         step.fit,
         (step,),

@@ -38,6 +38,7 @@ _PRIOR_SCALE = (0.1, 300.0)
 _AS_BUILT_SCALE = 30.0
 _DAMPING = (1e-9, 1e-4, 1e9)  # least, first after a refused step, greatest
 _SETTLED = 1e-3
+_SAME_NOISE = 0.01  # share by which noise or prior may change before what depends little on them is computed again
 _LEAST_EXCESS = 1e-12
 
 
@@ -186,7 +187,8 @@ class _Posterior:
         self.jacobian = self.whitening.whiten(state.jacobian if free.all() else state.jacobian[:, :, free])
         self.error = self.whitening.whiten(state.error)[:, 0]
         self.precision = model.precision(noise.scale)
-        self.normal = gram(self.jacobian) + np.diag(self.precision)
+        self.normal = gram(self.jacobian)
+        self.normal[np.diag_indices_from(self.normal)] += self.precision
         _require_finite(self.normal)
         self.gradient = self.jacobian.T @ self.error - self.precision * state.x[free]
 
@@ -204,15 +206,20 @@ class _Posterior:
         whitened = self.whitening.whiten(at.error)
         return float((whitened**2).sum() + self.precision @ at.x[self.model.free] ** 2)
 
-    def excess(self, step: Floats) -> float:
+    @property
+    def fitted_share(self) -> float:
+        """Share of tr V^-1 (dV/ds^2) that the parameters fit: tr V^-1 J C J' V^-1 (dV/ds^2), over the former."""
+        jacobian = self.whitening.finish(self.jacobian)
+        return float(np.vdot(gram(jacobian), self.covariance)) / self.whitening.trace[0]
+
+    def excess(self, step: Floats, fitted_share: float) -> float:
         """s^2 after a Fisher scoring step of the restricted likelihood, the parameters moved by `step` meanwhile.
 
         It equates e' V^-1 (dV/ds^2) V^-1 e with tr P (dV/ds^2), P = V^-1 - V^-1 J C J' V^-1.
         """
-        jacobian = self.whitening.finish(self.jacobian)
         error = self.whitening.finish((self.error - self.jacobian @ step)[:, None])
         total, curvature = self.whitening.trace
-        left = total - float(np.sum(gram(jacobian) * self.covariance))
+        left = total * (1.0 - fitted_share)
         if left <= 0.0:
             return self.noise.excess
         change = (float((error**2).sum()) - left) / (curvature * left / total)
@@ -275,6 +282,7 @@ def _fit(
     noise = _first_noise(state, prior) if like is None else _noise_of(like)
     noise = noise if excess_variance is None else replace(noise, excess=excess_variance)
     damping, settled, rounds, weight = 0.0, False, 0, np.ones(len(model.order))
+    fitted_share, computed_at = 0.0, np.zeros(2)
     while not settled and rounds < _ROUNDS:
         rounds += 1
         view = _Posterior(model, state, noise)
@@ -285,7 +293,10 @@ def _fit(
         weight = view.weight
         excess, scale = noise.excess, noise.scale
         if excess_variance is None:
-            excess = view.excess(step)
+            at = np.array([view.whitening.trace[0], scale])
+            if (np.abs(at - computed_at) > _SAME_NOISE * at).any():
+                fitted_share, computed_at = view.fitted_share, at
+            excess = view.excess(step, fitted_share)
             known = float(np.trace(view.of_rows.block, axis1=1, axis2=2).mean()) / 3.0
             change = max(change, abs(excess - noise.excess) / known)
         if prior == "as-built" and model.tolerated.any():
@@ -335,7 +346,10 @@ class _Factor:
 
     def __init__(self, matrix: Floats) -> None:
         self._scale = 1.0 / np.sqrt(np.diag(matrix))
-        self._lower, failed = lapack.dpotrf(matrix * self._scale[:, None] * self._scale, lower=1)
+        scaled = matrix * self._scale[:, None]
+        scaled *= self._scale
+        # It is symmetric: its transpose is what LAPACK takes without a copy.
+        self._lower, failed = lapack.dpotrf(scaled.T, lower=1, overwrite_a=1)
         if failed:
             raise LinAlgError("the normal equations are not positive definite")
 
@@ -351,7 +365,9 @@ class _Factor:
 
     def inverse(self) -> Floats:
         """Inverse of the matrix."""
-        whole: Floats = inverse_by(self._lower) * self._scale[:, None] * self._scale
+        whole = inverse_by(self._lower)
+        whole *= self._scale[:, None]
+        whole *= self._scale
         return whole
 
 

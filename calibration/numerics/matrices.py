@@ -28,12 +28,27 @@ def gram(rows: Floats) -> Floats:
     seldom, often = np.flatnonzero(rare), np.flatnonzero(~rare)
     beside, own = np.zeros((len(seldom), len(often))), np.zeros((len(seldom), len(seldom)))
     _add(np.ascontiguousarray(rows), seldom, often, beside, own)
-    out = np.empty((rows.shape[1], rows.shape[1]))
-    out[np.ix_(often, often)] = rows[:, often].T @ rows[:, often]
-    out[np.ix_(seldom, often)] = beside
-    out[np.ix_(often, seldom)] = beside.T
-    out[np.ix_(seldom, seldom)] = own + np.tril(own, -1).T
+    usual, out = rows[:, often], np.empty((rows.shape[1], rows.shape[1]))
+    _place(often, seldom, usual.T @ usual, beside, own, out)
     return out
+
+
+@compiled
+def _place(often: Integers, seldom: Integers, usual: Floats, beside: Floats, own: Floats, out: Floats) -> None:
+    """Write products of the columns `often` (p,), `seldom` (s,) and of both into `out` (q, q).
+
+    `usual` is (p, p), `beside` (s, p); of `own` (s, s) only the lower triangle is filled.
+    """
+    for i in range(len(often)):
+        for k in range(len(often)):
+            out[often[i], often[k]] = usual[i, k]
+    for i in range(len(seldom)):
+        for k in range(len(often)):
+            out[seldom[i], often[k]] = beside[i, k]
+            out[often[k], seldom[i]] = beside[i, k]
+        for k in range(i + 1):
+            out[seldom[i], seldom[k]] = own[i, k]
+            out[seldom[k], seldom[i]] = own[i, k]
 
 
 @compiled
@@ -73,7 +88,8 @@ def inverse_by(factor: Floats) -> Floats:
     if not len(factor):
         return factor
     lower = np.tril(lapack.dpotri(factor, lower=1)[0])
-    inverse: Floats = lower + np.tril(lower, -1).T
+    inverse: Floats = lower + lower.T
+    inverse[np.diag_indices_from(inverse)] *= 0.5
     return inverse
 
 

@@ -159,7 +159,7 @@ def _rounds(
     fold, samples = folds(found.initial.groups, _FOLDS, seed), found.initial.samples
     # Repeats of a standstill are one sample of a fit; the noise is that of a fix.
     from_mean = observations.position_mm - samples.position_mm[samples.of_row]
-    for step in found.steps:
+    for step in found.refitted_steps():
         if holdout is None:
             error = step.projection.held_out_mm(fold)[samples.of_row] + from_mean
             counts = step.fit.fit.weight[samples.of_row, None] ** 0.5
