@@ -75,7 +75,9 @@ def names_beside(
     system, model = search_beside(problem, kinematics, blocks, families, known, possible)
     noisier = with_reading_noise(problem, system, model)
     if noisier is not problem:
-        system, model = search_beside(noisier, kinematics, tuple(system.blocks.values()), families, known, possible)
+        found_first = [replace(system.candidates[n].options[option], scale=scale) for n, option, scale in model.effects]
+        wide = tuple(system.blocks.values())
+        system, model = search_beside(noisier, kinematics, wide, families, found_first, possible)
     model, found = judged(system, model)
     evidence, choices = {}, list[Choice]()
     for one, p in zip(found, certificates(system, model, [set(o.places) for o in found], problem.seed), strict=True):

@@ -162,6 +162,7 @@ class PrismGuard:
     _is_new_lock: bool = False
     _is_turning: bool = False
     _turning_until: Stamp | None = None
+    _before_turn: _Seen | None = None  # the last fix before the station was told to turn
 
     @property
     def suspicion(self) -> Suspicion | None:
@@ -231,6 +232,9 @@ class PrismGuard:
             self._intervals_ns.append(seen.stamp.since(last.stamp))
         if self._turning_until is not None and lies_within(self.order, seen.stamp, self._turning_until, None):
             self._is_turning = False
+        before, self._before_turn = self._before_turn, None
+        if before is not None and self._has_jumped(before, seen):
+            self._is_turning = False  # it had turned already: a lock that is lost from now on is no turn
         if is_new_lock or last is None or self._has_turned(last, seen):
             self.turns.append(Turn(seen.stamp, self._is_believed))
             self._is_believed = False
@@ -248,8 +252,10 @@ class PrismGuard:
     def _heed(self, word: Word) -> None:
         self._heeded += 1
         self._end_suspicion(word.at)
+        self._before_turn = self._last if word.is_turning else None
         self._good = self._last = None
-        self._intervals_ns.clear()
+        if not word.is_turning:  # a station that turns goes on measuring as before
+            self._intervals_ns.clear()
         self._is_new_lock, self._is_turning = False, word.is_turning
         self._turning_until = word.at.shifted(TURN_NS)
         self._is_believed = not word.is_turning
@@ -285,7 +291,7 @@ class PrismGuard:
         if good is None or last is None or good.has_circles != seen.has_circles:
             return None
         is_aimed_anew = is_new_lock or (seen.stamp.since(last.stamp) > PAUSE_NS)
-        has_jumped = last.has_circles == seen.has_circles and last.distance_m(seen) > self._reach_m(last, seen)
+        has_jumped = self._has_jumped(last, seen)
         if not (is_aimed_anew or has_jumped):
             return None
         back_m = good.distance_m(seen)
@@ -302,9 +308,12 @@ class PrismGuard:
 
     def _has_turned(self, last: _Seen, seen: _Seen) -> bool:
         """True if a fix may be of another target than the one before although no lock was lost."""
-        if last.has_circles != seen.has_circles or seen.stamp.since(last.stamp) > PAUSE_NS:
-            return True
-        return last.distance_m(seen) > self._reach_m(last, seen)
+        has_paused = last.has_circles != seen.has_circles or seen.stamp.since(last.stamp) > PAUSE_NS
+        return has_paused or self._has_jumped(last, seen)
+
+    def _has_jumped(self, last: _Seen, seen: _Seen) -> bool:
+        """True if a fix is further from the one before than motion can explain."""
+        return last.has_circles == seen.has_circles and last.distance_m(seen) > self._reach_m(last, seen)
 
     def _reach_m(self, earlier: _Seen, later: _Seen) -> float:
         usual_ns = min(USUAL_NS, median_high(self._intervals_ns)) if len(self._intervals_ns) > 2 else USUAL_NS

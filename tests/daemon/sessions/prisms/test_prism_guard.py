@@ -218,6 +218,34 @@ def test_a_station_that_was_told_to_turn_may_still_measure_its_earlier_target() 
         assert not any(watched.fixes(2.0, 5, 30))  # the turn is over
 
 
+def test_a_lock_that_is_lost_after_the_turn_and_found_on_another_prism_is_no_turn() -> None:
+    watched = Watched()
+    watched.fixes(-2.0, 20, 10)
+    watched.say(0.0, is_turning=True)
+    assert all(watched.fixes(0.1, 5, 14)), "the station has turned before its first fix"
+    watched.no_prism(0.8)
+    assert not any(watched.fixes(1.2, 10, 22)), "its own search has found another prism"
+    assert len(watched.told(EventKind.PRISM_JUMP)) == 1
+
+
+def test_a_station_that_had_no_prism_before_it_was_told_to_turn_may_lock_on_any() -> None:
+    watched = Watched()
+    watched.fixes(-2.0, 10, 10)
+    watched.no_prism(-0.5)
+    watched.say(0.0, is_turning=True)
+    watched.no_prism(0.2)
+    assert all(watched.fixes(0.5, 10, 22))
+
+
+def test_a_station_that_measures_its_earlier_target_after_a_pause_may_still_turn() -> None:
+    watched = Watched()
+    watched.fixes(-5.0, 10, 10)
+    watched.say(0.0, is_turning=True)
+    assert all(watched.fixes(0.2, 3, 10.2))
+    assert all(watched.fixes(0.9, 10, 22))
+    assert watched.told(EventKind.PRISM_JUMP) == []
+
+
 def test_after_something_else_on_purpose_the_prism_is_expected_near_its_place() -> None:
     watched = Watched()
     watched.fixes(0, 5, 10)
