@@ -71,7 +71,8 @@ def main() -> None:
             )
             if options.no_jobs:
                 return
-            daemon.wait("the jobs", lambda: _awaiting(daemon)["jobs"] == 0)
+            # A job is due a moment after the last session has ended.
+            daemon.wait("a model", lambda: _awaiting(daemon)["jobs"] == 0 and _awaiting(daemon)["id"] is not None)
             awaiting = _awaiting(daemon)
             try:
                 said = daemon.say("model.accept", id=awaiting["id"], operator="bench")["reason"]
