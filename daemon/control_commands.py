@@ -94,8 +94,8 @@ class Commands:
             "guide.skip": self.guide.skip_command,
             "guide.more": self.guide.more_command,
             "guide.stop": self.guide.stop_command,
-            **({} if self.parts.visit is None else {"simulation.visit": self._visit}),
-            **({} if self.parts.turn is None else {"simulation.aim": self._turn}),
+            "simulation.visit": self._visit,
+            "simulation.aim": self._turn,
         }
         commands |= {name: self.guide.guarding(name, commands[name]) for name in GUARDED}
         return {name: partial(self._carry_out, handler) for name, handler in commands.items()}
@@ -122,7 +122,8 @@ class Commands:
     def _turn(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Turn the simulated station to a prism or a control point."""
         target = text_argument(arguments, "target")
-        assert self.parts.turn is not None  # else there is no such command
+        if self.parts.turn is None:
+            raise _not_by_hand("station")
         self.parts.turn(target)
         return {"target": target}
 
@@ -131,7 +132,8 @@ class Commands:
         rows = arguments.get("poses", [])
         if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
             raise CommandError("poses: the rows of a plan, as `rigcal plan --json` prints them")
-        assert self.parts.visit is not None  # else there is no such command
+        if self.parts.visit is None:
+            raise _not_by_hand("boom")
         return {"left": self.parts.visit(rows)}
 
     def _prune(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -184,3 +186,8 @@ def control_servers(config: Config, commands: Mapping[str, Handler]) -> tuple[li
         except CommandError as error:
             unserved[path.name] = f"members of read_group {config.read_group} cannot look: {error}"
     return servers, unserved
+
+
+def _not_by_hand(what: str) -> CommandError:
+    by_hand = "only a simulated rig that was started with `rigcal run --sim --by-hand` is moved by hand"
+    return CommandError(f"the {what} is not moved from here: {by_hand}", REFUSED)

@@ -83,8 +83,8 @@ def _next_step(status: Mapping[str, Any]) -> NextStep:
         return _of_guide(guide["step"])
     if status["session"] is not None:
         return _in_session(status["session"])
-    if status["jobs"]:
-        return _of_jobs(status["jobs"])
+    if status["jobs"] or status.get("jobs_awaited"):
+        return _of_jobs(status["jobs"], status.get("jobs_awaited"))
     return _between_sessions(status)
 
 
@@ -124,9 +124,9 @@ def _of_session(session: Mapping[str, Any]) -> tuple[str, str]:
     return step, "`rigcal session stop`"
 
 
-def _of_jobs(jobs: Sequence[Mapping[str, Any]]) -> NextStep:
+def _of_jobs(jobs: Sequence[Mapping[str, Any]], awaited_session: str | None) -> NextStep:
     running = next((job for job in jobs if job["state"] == "running"), None)
-    doing = "jobs are queued"
+    doing = "jobs are queued" if jobs else f"the jobs of session {awaited_session} are about to be queued"
     if running is not None:
         doing = f"{_JOBS.get(running['kind'], running['kind'])}, {math.floor(100 * running['progress'])} %"
     step, how = "wait for the jobs; the boom may move", "`rigcal watch` follows them, `rigcal jobs list` has results"

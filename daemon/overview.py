@@ -11,6 +11,7 @@ from daemon.acquisition.status.snapshot import AcquisitionStatus
 from daemon.alarms.board import AlarmBoard
 from daemon.composition import Parts
 from daemon.guide.keeper import GuideKeeper
+from daemon.jobs.runner import JobRunner
 from daemon.models.drift import gap_status
 from daemon.models.registry import ModelRegistry
 from daemon.monitoring.notices import Notices
@@ -43,7 +44,7 @@ class Overview:
         store: open for writing.
         store_health, acquisition: tell of the store and of acquisition.
         clock: tells of the computer's clock; None where it is not known, or is another one.
-        alarms, notices, sessions, guide, jobs, models, model_table: the parts.
+        alarms, notices, sessions, guide, runner, jobs, models, model_table: the parts.
     """
 
     parts: Parts
@@ -55,6 +56,7 @@ class Overview:
     notices: Notices
     sessions: SessionKeeper
     guide: GuideKeeper
+    runner: JobRunner
     jobs: JobTable
     models: ModelRegistry
     model_table: ModelTable
@@ -88,6 +90,7 @@ class Overview:
             "setup": stored("setup", lambda: _setup(setups.newest())),
             "control_shots": stored("control_shots", setups.newest_shots) or [],
             "jobs": stored("jobs", self.jobs.unfinished) or [],
+            "jobs_awaited": stored("jobs_awaited", self.runner.awaited_session),
             "job_counts": stored("job_counts", self.jobs.counts) or [],
             "latency": stored("latency", lambda: newest_latency(self.jobs.latencies())),
             "models": stored("models", self.models.status),

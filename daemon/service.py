@@ -145,7 +145,13 @@ class Daemon:
         self._notices = Notices(notify, NoticeTable(store), alarms.active(), parts.rig.name, parts.clock)
         evidence = Gatherer(parts.clock, before, self._evidence())
         self._alarms = AlarmBoard(alarms, evidence, parts.clock, tell=self._notices.take)
-        self._models = ModelRegistry(models, parts.rig.name, self._live_model, compare=self._jobs.compare)
+        self._models = ModelRegistry(
+            models,
+            parts.rig.name,
+            self._live_model,
+            compare=self._jobs.compare,
+            comparison_job=self._job_table.comparison_of,
+        )
         self._guide = GuideKeeper(
             parts.rig,
             store,
@@ -169,6 +175,7 @@ class Daemon:
             self._notices,
             self._sessions,
             self._guide,
+            self._jobs,
             self._job_table,
             self._models,
             self._model_table,
@@ -301,14 +308,15 @@ class Daemon:
             log.error("the end of this run could not be stored: %s", storage_sentence(self._store.path, error))
 
     def _awaiting_model(self) -> dict[str, Any]:
-        """Return the candidate that awaits for a guide that is finished, and how many jobs are still at work."""
+        """Return the candidate that awaits for a guide that is finished, and how many jobs it still waits for."""
         waiting = self._models.status()["candidate"]
         about = dict.fromkeys(("id", "is_acceptable", "refused_because", "sentence"))
         if waiting is not None:
             compared = waiting["comparison"]
             about = {key: waiting[key] for key in ("id", "is_acceptable", "refused_because")}
             about["sentence"] = compared and compared["sentence"]
-        return about | {"jobs": len(self._job_table.unfinished())}
+        # The jobs of the last session are queued a moment after it has ended.
+        return about | {"jobs": len(self._job_table.unfinished()) or int(self._jobs.awaited_session() is not None)}
 
     def _on_records(self, records: Sequence[Record]) -> None:
         try:

@@ -67,7 +67,7 @@ class Course:
         """Open a guide."""
         self.record.open(request, setup_id, operator)
         self.standstill, self._try_again = None, 0.0
-        self.watch.forget_fixes()
+        self.watch.begin()
         self.advisor.forget()
         self.start_advisor()
 

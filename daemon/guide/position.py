@@ -37,7 +37,7 @@ class BoomPosition:
         age_s: of these readings; None before.
         stands_s: for how long the boom has stood; None while it moves.
         is_fresh: whether they are live.
-        missing: why there are none, a clause; "" where there are.
+        missing: why there are none, a clause; "" where there are, and where they are waited for.
     """
 
     values: Mapping[str, float]
@@ -58,8 +58,14 @@ class PositionWatch:
 
     def __init__(self, rig: Rig, joiner: ObservationJoiner, clock: Clock) -> None:
         self._rig, self._joiner, self._clock = rig, joiner, clock
-        self._state: MachineState | str = "no joint was read yet"
         self._fixes: deque[tuple[int, Place]] = deque(maxlen=_RECOGNISED)
+        self.begin()
+
+    def begin(self) -> None:
+        """Look anew: what was seen before counts no more."""
+        self._state: MachineState | str | None = None
+        self._began_ns = self._clock.now().monotonic_ns
+        self._fixes.clear()
 
     def on_records(self, records: Sequence[Record]) -> None:
         """Take records that the joiner knows already."""
@@ -70,10 +76,12 @@ class PositionWatch:
 
     def boom(self) -> BoomPosition:
         """The joints now."""
-        state = self._state
+        state, now = self._state, self._clock.now()
+        if state is None:  # nothing was read since it looks; readings come within a moment where they come at all
+            waits = self._clock.real_seconds((now.monotonic_ns - self._began_ns) / NS_PER_S) <= FRESH_S
+            return BoomPosition({}, None, None, False, "" if waits else "no joint was read yet")
         if isinstance(state, str):
             return BoomPosition({}, None, None, False, state)
-        now = self._clock.now()
         read = {joint.name: np.array([state.values[joint.column]]) for joint in self._rig.joints}
         values = {name: float(value[0]) for name, value in on_one_turn(self._rig, read).items()}
         if now.boot_id != state.boot_id:

@@ -17,7 +17,7 @@ from daemon.config import Config
 from daemon.jobs.child import JOB_COMMAND, JobChild
 from daemon.jobs.job_queue import CANCELLED, STOPPED, JobQueue
 from daemon.jobs.order import Outcome, Started
-from daemon.jobs.scheduler import DueChain, DueComparison, due_jobs, next_job, spent_jobs
+from daemon.jobs.scheduler import DueChain, DueComparison, awaited_session, due_jobs, next_job, spent_jobs
 from daemon.store.errors import LACKING
 from daemon.store.queries.jobs import JobFacts
 from daemon.store.queries.models import ModelRow
@@ -95,6 +95,10 @@ class JobRunner:
                 REFUSED,
             )
         return self._queue.compare(model)
+
+    def awaited_session(self) -> str | None:
+        """Return the session whose jobs are queued in a moment, unless a next one begins; None without one."""
+        return awaited_session(self._queue.state()) if self._settings.enabled else None
 
     # ---- commands of the operator ------------------------------------------------------------------------------------
 

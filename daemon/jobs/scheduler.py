@@ -111,10 +111,28 @@ def due_jobs(state: State, now: Stamp, *, max_attempts: int = 3) -> list[Due]:
         and not _is_spent(job, max_attempts)
         and _passed(job.ended, now, _RETRY_AFTER_S * (job.attempts + job.interruptions))
     ]
-    closed = [s for s in state.sessions if s.state == "closed"]
+    closed = _closed(state)
     quiet_s = _QUIET_IN_GUIDE_S if state.has_guide else _QUIET_S
-    if not closed or not _passed(closed[-1].ended, now, quiet_s):
-        return due
+    if closed and _passed(closed[-1].ended, now, quiet_s):
+        due += _due_after(closed, state)
+    return due
+
+
+def awaited_session(state: State) -> str | None:
+    """Return the session that has ended and will trigger jobs unless a next one begins; None without one."""
+    if _is_open(state):
+        return None
+    chains = (item for item in _due_after(_closed(state), state) if isinstance(item, DueChain))
+    return next((chain.session_id for chain in chains), None)
+
+
+def _closed(state: State) -> list[SessionFacts]:
+    return [session for session in state.sessions if session.state == "closed"]
+
+
+def _due_after(closed: Sequence[SessionFacts], state: State) -> list[Due]:
+    """Return what the sessions that have ended trigger, once it has been quiet for long enough."""
+    due: list[Due] = []
     training = [s for s in closed if s.kind != CHECK]
     checks = [s for s in closed if s.kind == CHECK]
     if training and not _is_covered(training[-1], JobKind.GAP, state):

@@ -31,6 +31,7 @@ class ModelRegistry:
         rig_name: whose models go live.
         live: the model in use.
         compare: queues the comparison of a model with the live one, and says so.
+        comparison_job: tells the job that is yet to compare a model; None without one.
     """
 
     def __init__(
@@ -40,8 +41,10 @@ class ModelRegistry:
         live: LiveModel,
         *,
         compare: Callable[[ModelRow], str],
+        comparison_job: Callable[[ModelRow], int | None],
     ) -> None:
-        self._table, self._rig, self._live, self._compare = table, rig_name, live, compare
+        self._table, self._rig, self._live = table, rig_name, live
+        self._compare, self._comparison_job = compare, comparison_job
         # The candidate that was last loaded for `status`, its files as they lay there, and why it cannot go live.
         self._loaded: tuple[tuple[int, _Files], str | None] | None = None
 
@@ -69,7 +72,7 @@ class ModelRegistry:
             also = f"; `rigcal model rollback {model.id}` puts it back" if is_back else ""
             raise CommandError(f"model {model.id} is {model.state}; only a candidate can be accepted{also}")
         live = self._table.live()
-        reason = _reason_to_accept(model, live)
+        reason = self._reason_to_accept(model, live)
         self._make_live(model, live, arguments, f"accepted: {reason}")
         return self._changed(model, live) | {"reason": reason}
 
@@ -131,7 +134,7 @@ class ModelRegistry:
         """A model that waits, with whether `accept_command` would take it now, and why it would not."""
         refusal: str | None = None
         try:
-            _reason_to_accept(model, live)
+            self._reason_to_accept(model, live)
             self._require_loads(model)
         except CommandError as error:
             refusal = str(error)
@@ -183,27 +186,27 @@ class ModelRegistry:
         if loaded[1] is not None:
             raise CommandError(loaded[1], REFUSED)
 
+    def _reason_to_accept(self, model: ModelRow, live: ModelRow | None) -> str:
+        """Why a candidate may go live; CommandError, refused, where it may not."""
+        compared = model.comparison
+        is_stale = compared is not None and _is_stale(compared, live)
+        again = f"; `rigcal model compare {model.id}` compares it anew"
+        if (compared is None or is_stale) and (job := self._comparison_job(model)) is not None:
+            again = f"; job {job} is yet to compare it: wait for that job"
+        elif compared is None:
+            again = f": hold a check session (`rigcal session start --kind check`){again}"
+        if compared is None:
+            raise CommandError(f"model {model.id} was not compared with held-out data yet{again}", REFUSED)
+        if is_stale:
+            now = f"model {live.id} is live now" if live else "none is live now"
+            then = "no model was live" if compared["live"] is None else f"model {compared['live']} was live"
+            raise CommandError(f"model {model.id} was compared when {then}, and {now}{again}", REFUSED)
+        if not compared["is_better"]:
+            raise CommandError(f"model {model.id} does not go live: {compared['sentence']}", REFUSED)
+        return str(compared["sentence"])
+
     def _changed(self, model: ModelRow, live: ModelRow | None) -> dict[str, Any]:
         return {"live": model.id, "retired": live and live.id, "path": str(model.path)}
-
-
-def _reason_to_accept(model: ModelRow, live: ModelRow | None) -> str:
-    """Why a candidate may go live; CommandError, refused, where it may not."""
-    again = f"; `rigcal model compare {model.id}` compares it anew"
-    compared = model.comparison
-    if compared is None:
-        raise CommandError(
-            f"model {model.id} was not compared with held-out data yet: hold a check session (`rigcal session start "
-            f"--kind check`){again}",
-            REFUSED,
-        )
-    if _is_stale(compared, live):
-        now = f"model {live.id} is live now" if live else "none is live now"
-        then = "no model was live" if compared["live"] is None else f"model {compared['live']} was live"
-        raise CommandError(f"model {model.id} was compared when {then}, and {now}{again}", REFUSED)
-    if not compared["is_better"]:
-        raise CommandError(f"model {model.id} does not go live: {compared['sentence']}", REFUSED)
-    return str(compared["sentence"])
 
 
 def _is_stale(compared: Mapping[str, Any], live: ModelRow | None) -> bool:

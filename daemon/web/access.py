@@ -204,7 +204,8 @@ class TokenBook:
 class AttemptLimit:
     """Counts wrong tokens: so many a minute from one address, and so many from all of them.
 
-    One that is tried again is none that is guessed: a browser that keeps a removed token asks with it for days.
+    A right token is never kept waiting, whoever else tries wrong ones from its address. A wrong one that is tried again
+    is none that is guessed: a browser that keeps a removed token asks with it for days.
 
     Args:
         clock: of the computer.
@@ -216,21 +217,21 @@ class AttemptLimit:
         self._all: deque[int] = deque(maxlen=_WRONG_IN_ALL)
         self._known: deque[str] = deque(maxlen=_ADDRESSES)
 
-    def note(self, address: str, token: str) -> bool:
-        """Count a wrong token; False where it is one that was counted already."""
-        digest = _digest(token)
-        if digest in self._known:
-            return False
-        self._known.append(digest)
+    def is_known(self, token: str) -> bool:
+        """Return True of a wrong token that was counted already."""
+        return _digest(token) in self._known
+
+    def note(self, address: str, token: str) -> None:
+        """Count a wrong token."""
+        self._known.append(_digest(token))
         now_ns = self._clock.monotonic_ns()
         if address not in self._wrong and len(self._wrong) >= _ADDRESSES:
             self._wrong.pop(next(iter(self._wrong)))
         self._wrong.setdefault(address, deque(maxlen=_WRONG_PER_ADDRESS)).append(now_ns)
         self._all.append(now_ns)
-        return True
 
     def wait_s(self, address: str) -> float:
-        """Return how long this address must wait before another token is looked at; 0 where it need not."""
+        """Return how long this address must wait before another wrong token is answered; 0 where it need not."""
         own = self._wrong.get(address)
         return max(self._left_s(own, _WRONG_PER_ADDRESS) if own else 0.0, self._left_s(self._all, _WRONG_IN_ALL))
 

@@ -81,7 +81,7 @@ class Page:
             Route("/api/rig", self._for(Role.READ, self._rig)),
             Route("/api/history", self._for(Role.READ, self._history)),
             Route("/api/sessions/{id}/fixes", self._for(Role.READ, self._session_fixes)),
-            Route("/report/{job:int}", self._for(Role.READ, self._report)),
+            Route("/report/{job}", self._for(Role.READ, self._report)),
             Mount("/static", StaticFiles(directory=STATIC)),
         ]
         errors = {
@@ -106,16 +106,18 @@ class Page:
         return None if role is None else Person("", role)
 
     async def _of_token(self, request: Request, token: str) -> Person | None:
+        """Return whose token it is; None of a wrong one, until an address has tried too many."""
+        person = self._tokens.find(token) if len(token) <= _TOKEN_CHARACTERS else None
+        if person is not None or self._wrong.is_known(token):
+            return person
         address = request.client.host if request.client else ""
-        wait_s = self._wrong.wait_s(address)
-        if wait_s:
+        if wait_s := self._wrong.wait_s(address):
             raise Refused(
                 429, f"too many wrong tokens; try again in {wait_s:.0f} s", **{"Retry-After": f"{wait_s:.0f}"}
             )
-        person = self._tokens.find(token) if len(token) <= _TOKEN_CHARACTERS else None
-        if person is None and self._wrong.note(address, token):
-            log.warning("a wrong token from %s", address)
-        return person
+        self._wrong.note(address, token)
+        log.warning("a wrong token from %s", address)
+        return None
 
     async def _needs(self, request: Request, role: Role) -> Person:
         person = await self._person(request)
@@ -236,15 +238,18 @@ class Page:
         live = (status["models"] or {}).get("live")
         model = None if live is None else await self._daemon.ask("model.show", {"id": live["id"]})
         session_id = request.path_params["id"]
-        return JSONResponse(await asyncio.to_thread(self._fixes.read, Path(status["store"]), session_id, model))
+        found = await asyncio.to_thread(self._fixes.read, Path(status["store"]), session_id, model)
+        if found is None:
+            raise Refused(404, f"there is no session {session_id!r:.80}")
+        return JSONResponse(found)
 
     async def _report(self, request: Request) -> Response:
         """Send the report of a job, in a sandbox: it is a whole page of its own."""
         jobs = await self._daemon.ask("jobs.list")
         wanted = request.path_params["job"]
-        path = next(((job["result"] or {}).get("report") for job in jobs if job["id"] == wanted), None)
+        path = next(((job["result"] or {}).get("report") for job in jobs if str(job["id"]) == wanted), None)
         if path is None or not Path(path).is_file():
-            raise Refused(404, f"job {wanted} has left no report")
+            raise Refused(404, f"job {wanted:.20} has left no report")
         return FileResponse(path, media_type="text/html", headers={"Content-Security-Policy": REPORT_POLICY})
 
 

@@ -23,8 +23,8 @@ class SessionFixes:
         self._model: tuple[str, Any] | None = None
         self._kept: tuple[_Key, dict[str, Any]] | None = None
 
-    def read(self, store: Path, session_id: str, model: dict[str, Any] | None) -> dict[str, Any]:
-        """Return the fixes of a session, oldest first.
+    def read(self, store: Path, session_id: str, model: dict[str, Any] | None) -> dict[str, Any] | None:
+        """Return the fixes of a session, oldest first; None of a session that there is not.
 
         Args:
             store: the database.
@@ -42,6 +42,8 @@ class SessionFixes:
         sha256 = "" if model is None else str(model["manifest_sha256"])
         with self._turn, Reader(store) as reader, reader.snapshot():
             fixes = session_fixes(reader, session_id)
+            if fixes is None:
+                return None
             key = session_id, hash(tuple((fix["id"], fix["excluded"]) for fix in fixes)), sha256
             if self._kept is None or self._kept[0] != key:
                 self._kept = key, self._beside(reader, session_id, fixes, model)

@@ -61,7 +61,13 @@ class ModelRig:
         self.models = ModelTable(self.store, "swdt82", self.clock)
         self.job_table = JobQueue(self.store, "swdt82", self.clock)
         self.live = LiveModel(self.models, rig)
-        self.registry = ModelRegistry(self.models, "swdt82", self.live, compare=self.job_table.compare)
+        self.registry = ModelRegistry(
+            self.models,
+            "swdt82",
+            self.live,
+            compare=self.job_table.compare,
+            comparison_job=self.job_table.table.comparison_of,
+        )
         self.joiner = joiner(Config(rig="swdt82"), rig)
         self.setup: str | None = None
         self.tip = LiveTip(rig, self.joiner, self.live, lambda: self.setup, self.clock, "r", FRESH_S)

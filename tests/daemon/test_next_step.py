@@ -58,6 +58,11 @@ def guide(**step: Any) -> dict[str, Any]:
             "Calibrating: identifying the model, 99 %",
             "See the jobs",
         ),
+        (
+            status(jobs_awaited="s4-check"),
+            "Calibrating: the jobs of session s4-check are about to be queued",
+            "See the jobs",
+        ),
         (status(jobs=[{"state": "queued", "kind": "gap"}]), "Calibrating: jobs are queued", "See the jobs"),
         (
             status(session=SESSION),

@@ -61,7 +61,7 @@ _DWELL = click.FloatRange(1, 600)
     "--by-hand",
     "is_by_hand",
     is_flag=True,
-    help="Boom and station of the simulated rig move only as the commands simulation.visit and simulation.aim say.",
+    help="Boom and station of the simulated rig move only as `rigcal hand` says: to practise an operator's work.",
 )
 @click.option("-v", "--verbose", is_flag=True, help="Log more.")
 @json_option

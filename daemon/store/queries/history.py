@@ -22,8 +22,10 @@ _CHANGES = """SELECT state.model_id AS model, state.state, state.utc_ns, state.o
     WHERE model.rig = ? ORDER BY state.id DESC LIMIT ?"""
 
 
-def session_fixes(source: RowSource, session_id: str) -> list[dict[str, Any]]:
-    """Return a session's newest fixes with why any is excluded, oldest first."""
+def session_fixes(source: RowSource, session_id: str) -> list[dict[str, Any]] | None:
+    """Return a session's newest fixes with why any is excluded, oldest first; None of a session that there is not."""
+    if not list(source.rows("SELECT 1 FROM calibration_sessions WHERE id = ?", (session_id,))):
+        return None
     return list(source.rows(_FIXES, (session_id, _MOST)))[::-1]
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from daemon.commands import CHECK
 from daemon.store.connection import Connection
 from daemon.store.errors import NotInStoreError
+from daemon.store.queries.models import ModelRow
 from drivers.clock import Stamp
 
 # Scheduling runs twice a second beside acquisition, for months: CROSS JOIN and NOT INDEXED keep SQLite's planner from
@@ -179,6 +180,18 @@ class JobTable:
         """True if a model was ever to be compared with the one that went live by that change."""
         sql = "SELECT 1 FROM jobs WHERE kind = 'comparison' AND model_id = ? AND live_since = ? LIMIT 1"
         return bool(self._store.rows(sql, (model_id, live_since)))
+
+    def comparison_of(self, model: ModelRow) -> int | None:
+        """Return the job that is yet to compare a model on held-out sessions; None without one.
+
+        One that names no model compares that of the job before it, or else the newest one.
+        """
+        sql = """SELECT job.id FROM jobs AS job LEFT JOIN jobs AS made ON made.id = job.depends_on
+            WHERE job.kind = 'comparison' AND job.state IN ('queued', 'running', 'interrupted') AND coalesce(
+                job.model_id = ?, json_extract(made.result_json, '$.model') = ?, job.depends_on IS NULL)
+            ORDER BY job.id LIMIT 1"""
+        found = self._store.rows(sql, (model.id, str(model.path)))
+        return int(found[0]["id"]) if found else None
 
     # ---- one job -----------------------------------------------------------------------------------------------------
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from daemon.commands import CommandError, caller_has_left, reading_socket
+from daemon.commands import REFUSED, CommandError, caller_has_left, reading_socket
 from daemon.control.protocol import request
 from daemon.control.server import ControlServer, Limits
 from daemon.host.systemd import Notifier
@@ -319,3 +319,11 @@ def test_a_server_that_accepts_is_alive(tmp_path: Path) -> None:
         assert server.alive(within_s=DEADLINE_S)
         break_listener(tmp_path / "s")
         wait("its end", lambda: not server.alive(within_s=1.0))
+
+
+def test_a_rig_that_is_not_simulated_is_moved_by_nobodys_command(tmp_path: Path) -> None:
+    with idle_daemon(tmp_path) as config:
+        for command, arguments in (("simulation.visit", {"poses": []}), ("simulation.aim", {"target": "r"})):
+            with pytest.raises(CommandError, match="--by-hand") as refused:
+                request(config.socket_path, command, arguments)
+            assert refused.value.status == REFUSED

@@ -34,7 +34,11 @@ def state(daemon: DaemonProcess) -> dict[str, Any]:
 
 
 def rigcal(daemon: DaemonProcess, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "daemon.cli.main", "session", "guide", "--socket", str(daemon.socket), *arguments]
+    return run("session", "guide", "--socket", str(daemon.socket), *arguments)
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "daemon.cli.main", *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
@@ -146,6 +150,32 @@ def test_skipped_control_points_are_kept_and_the_session_is_not_used(daemon: Dae
     assert "control point" in session["not_used"]
     assert daemon.say("session.start", prism="r")["id"]  # the sessions are the operator's again
     daemon.say("session.abort")
+
+
+@pytest.mark.slow
+def test_a_guide_warns_of_no_joint_while_all_are_read(guide: dict[str, Any]) -> None:
+    assert guide["messages"] == []
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("guide")
+def test_hands_of_a_simulated_rig_aim_and_go_where_the_guide_says(daemon: DaemonProcess) -> None:
+    def hand(*arguments: str) -> str:
+        done = run("hand", *arguments, "--socket", str(daemon.socket))
+        return done.stderr if done.returncode else done.stdout
+
+    assert "no guide asks for a pose now" in hand("move")
+    assert "there is no joint 'elbow'" in hand("move", "elbow=3")
+    assert "write it as theta1=30" in hand("move", "theta1")
+    assert "beyond its limits" in hand("move", "theta1=900")
+    assert "theta1_deg 10.0" in hand("move", "theta1=10")
+    daemon.wait("theta1", lambda: abs(state(daemon)["joints"][0]["now"] - 10.0) < 0.5)
+    daemon.say("guide.skip", reason="fog")
+    assert hand("aim", "r") == "the station is aimed at r\n"
+    daemon.say("guide.done")
+    daemon.wait("a pose", lambda: state(daemon)["step"]["kind"] == "go_to_pose")
+    assert hand("move").startswith("the boom goes to theta1_deg")
+    daemon.wait("the boom", lambda: all(joint["is_there"] for joint in state(daemon)["joints"]))
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ from daemon.jobs.scheduler import (
     DueComparison,
     DueRetry,
     State,
+    awaited_session,
     due_jobs,
     next_job,
     spent_jobs,
@@ -77,6 +78,14 @@ def test_sessions_of_an_open_guide_wait_longer_for_its_next_prism() -> None:
     opened = replace(state(session(1)), has_guide=True)
     assert due_jobs(opened, T0.shifted(30 * NS_PER_S)) == []
     assert due_jobs(opened, T0.shifted(60 * NS_PER_S)) == [DueChain(CHAIN, "s1", "s1")]
+
+
+def test_a_session_whose_jobs_are_not_due_yet_is_told() -> None:
+    assert awaited_session(state()) is None
+    assert awaited_session(state(session(1))) == "s1"
+    assert awaited_session(state(session(1), session(2, state="open"))) is None
+    assert awaited_session(state(session(1), covered=BOTH)) is None
+    assert awaited_session(state(session(1), session(2, "check"), covered=BOTH, has_model=True)) == "s2"
 
 
 def test_sessions_wait_for_the_next_to_begin_after_the_newest() -> None:

@@ -58,6 +58,7 @@ def test_a_candidate_is_compared_on_check_sessions_then_accepted_and_loaded(rig:
     measured(rig, "c", 4, "check")
     model = rig.candidate()
     assert rig.registry.compare_command({"id": model}) == f"job 2 will compare model {model} with the live one"
+    assert "job 2 is yet to compare it: wait" in refusal(rig.registry.accept_command, REFUSED, id=model)
     compared = rig.compare()
     assert compared["against"] == "nominal"
     assert (compared["sessions"], compared["fixes"], compared["standstills"]) == (["c"], 8, 4)

@@ -43,5 +43,6 @@ export const planned = ({ done, planned: all, skipped }) => ["Planned poses", `$
 
 export const JOBS = { gap: "Identification", residual: "Learning what remains", report: "Report", comparison: "Comparison", drift: "Drift of checks" };
 
-/** A clause as the begin of a sentence. */
-export const sentence = (clause) => clause.charAt(0).toUpperCase() + clause.slice(1);
+/** A clause as a sentence of its own: with a capital, unless it begins with a name, and a full stop. */
+export const sentence = (clause) =>
+  clause && `${clause.replace(/^[a-z]{2,}(?=[ ,])/, (word) => word[0].toUpperCase() + word.slice(1))}${/[.?!]$/.test(clause) ? "" : "."}`;

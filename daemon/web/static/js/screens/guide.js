@@ -5,7 +5,7 @@ import { Boom } from "../boom.js";
 import { alarmItem } from "../alarms.js";
 import { bar, fill, h, say, tile } from "../dom.js";
 import { startForm } from "../guide_start.js";
-import { duration, measured, millimetres, percent, plural, unitName, words } from "../words.js";
+import { duration, measured, millimetres, percent, plural, sentence, unitName, words } from "../words.js";
 
 const WHY_SKIP = ["Out of the station's sight", "Not reachable here", "Not safe here"];
 const WHY_STOP = ["The station has moved", "The work goes on", "Something is broken"];
@@ -51,8 +51,8 @@ function openGuide(app) {
   const others = h("div", { class: "row" });
   const joints = h("ul", { class: "joints" });
   const views = h("div", { class: "boom" });
-  const gain = h("div");
-  const coverage = h("div");
+  const gain = h("div", { class: "stack" });
+  const coverage = h("div", { class: "stack" });
   const steps = h("ol", { class: "steps" });
   const rows = new Map();
   let boom = null;
@@ -81,7 +81,7 @@ function openGuide(app) {
       fill(others, [step.id, step.others, step.can_skip, step.kind, app.me.role], () => otherButtons(app, guide));
       fill(alarms, critical.map((alarm) => [alarm.kind, alarm.subject, alarm.text]), () => critical.map((alarm) => alarmItem(alarm, app)));
       fill(messages, guide.messages, () => guide.messages.map((each) =>
-        h("p", { class: each.severity === "warning" ? "alarm" : "soft" }, each.text)));
+        h("p", { class: each.severity === "warning" ? "alarm" : "soft" }, sentence(each.text))));
       fill(hold, guide.hold, () => holding(guide.hold));
       showJoints(joints, rows, guide.joints, app);
       fill(gain, guide.accuracy, () => gainOf(guide.accuracy));
@@ -165,8 +165,8 @@ function gainOf(accuracy) {
   return [
     h("dl", { class: "tiles" }, of("Expected now", accuracy.now_mm), of("After the next pose", accuracy.after_next_mm), of("After 5 more", accuracy.after_5_mm),
       accuracy.target_mm ? of("Target", accuracy.target_mm) : null),
-    h("p", { class: accuracy.is_enough ? "good" : "" }, accuracy.why),
-    h("p", { class: "soft small" }, accuracy.basis),
+    h("p", { class: accuracy.is_enough ? "good" : "" }, sentence(accuracy.why)),
+    h("p", { class: "soft small" }, sentence(accuracy.basis)),
   ];
 }
 

@@ -19,7 +19,7 @@ export function mount(root) {
     part("drift-title", "Does the model still hold?", "Each dot is a check session: the error of its fixes, divided by what the model that was live then expects. 1 is as expected.", drift, h("div", { class: "stack" }, sentence, checkByCheck)),
     part("sums-title", "Drift over months", "Errors that are larger than expected again and again add up; beyond the dashed line the machine has changed.", sums),
     part("closure-title", "Control points", "How far each control point was from its known place. 5 mm and more says that the station has moved.", closure, shotByShot),
-    part("changes-title", "Models that went live and left", "", null, changes),
+    part("changes-title", "Changes of models", "", null, changes),
     part("past-title", "Alarms that are over", "", null, alarms));
 
   let timer = null, closed = false;
@@ -47,7 +47,7 @@ export function mount(root) {
       checks.toReversed().map((check) => [utc(check.utc_ns), check.session, String(check.model), String(check.fixes), fixed(check.ratio, 2), check.reason || { none: "as expected", worse: "worse", better: "better" }[check.alarm]])));
     fill(closureTable, misclosures, () => table("Shots of control points, the newest first", [["when", true], ["point", true], ["set-up", true], ["session", true], ["misclosure, mm", false]],
       misclosures.toReversed().map((shot) => [utc(shot.utc_ns), shot.point, shot.setup, `${shot.session}, ${shot.phase}`, fixed(shot.misclosure_mm, 1)])));
-    fill(changes, changed, () => changed.length ? table("Changes of models, the newest first", [["when", true], ["model", false], ["state", true], ["by", true], ["why", true]],
+    fill(changes, changed, () => changed.length ? table("Every change of a model's state, the newest first", [["when", true], ["model", false], ["state", true], ["by", true], ["why", true]],
       changed.toReversed().map((change) => [utc(change.utc_ns), String(change.model), change.state, change.operator || change.user || "rigcal", change.reason])) : h("p", { class: "empty" }, "No model was made yet."));
     fill(alarms, past, () => past.length ? table("Alarms that are over, the newest first", [["from", true], ["for", false], ["alarm", true]],
       past.slice(0, 50).map((alarm) => [utc(alarm.since_utc_ns), duration((alarm.cleared_utc_ns - alarm.since_utc_ns) / 1e9), `${words(alarm.kind)}, ${alarm.subject}: ${alarm.text}`])) : h("p", { class: "empty" }, "None yet."));

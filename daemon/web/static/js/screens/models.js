@@ -66,7 +66,7 @@ function card(model, jobs, now, app) {
   return h("section", { class: `card stack model ${model.state}`, "data-model": model.id, "aria-labelledby": `model-${model.id}` },
     h("div", { class: "row" }, h("h2", { id: `model-${model.id}` }, `Model ${model.id}`), h("span", { class: state[1] }, state[0]), h("span", { class: "soft" }, STAGES[model.stage] ?? words(model.stage))),
     compared?.before_mm !== undefined ? h("p", null, h("strong", null, `${millimetres(compared.before_mm)} mm before, ${millimetres(compared.after_mm)} mm after`), ` on ${plural(compared.fixes, "fix", "fixes")} that it was not trained on.`) : null,
-    compared ? h("p", { class: compared.is_better ? "good" : "doubtful" }, `${sentence(compared.sentence)}.`) : h("p", { class: "doubtful" }, "It was not compared with held-out check shots yet."),
+    compared ? h("p", { class: compared.is_better ? "good" : "doubtful" }, sentence(compared.sentence)) : h("p", { class: "doubtful" }, "It was not compared with held-out check shots yet."),
     candidate?.refused_because ? h("p", { class: "alarm" }, `It would be refused now: ${candidate.refused_because}`) : null,
     errors(model),
     h("div", { class: "row" },
@@ -85,7 +85,7 @@ function card(model, jobs, now, app) {
 async function accept(model, compared, now, app) {
   const live = now.models.live;
   const reasons = [
-    `${sentence(compared.sentence)}.`,
+    sentence(compared.sentence),
     live ? `Model ${live.id} is live now; it is retired, and can be put back at any time.` : "No model is live now; this is the first.",
     "From then on every corrected position comes from this model.",
   ];
