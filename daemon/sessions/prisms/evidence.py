@@ -174,7 +174,7 @@ class PrismEvidence:
         self._motion: TargetMotion | None = None
 
     def jump_m(self, joined: JoinedFix, place_mm: Place, turn: Turn, *, is_suspected: bool) -> float | None:
-        """Take a fix, in order, moving or not: how far its target jumped, m; None where the joints explain where it is."""
+        """Take a fix, in order, moving or not: how far its target jumped, m; None where the joints explain it."""
         self._motion = self._motion or self._loader.motion()
         if self._motion is None:
             return None

@@ -214,10 +214,10 @@ class PrismGuard:
 
     def may_turn(self, at: Stamp) -> bool:
         """Return True if the station was told to turn before that instant, and nothing shows yet that it has."""
-        words = [word for word in self.words if self.order(word.at) <= self.order(at)]
-        if not words or not words[-1].is_turning or not lies_within(self.order, at, None, words[-1].at.shifted(TURN_NS)):
+        last = next((word for word in reversed(self.words) if self.order(word.at) <= self.order(at)), None)
+        if last is None or not last.is_turning or not lies_within(self.order, at, None, last.at.shifted(TURN_NS)):
             return False
-        return sum(lies_within(self.order, turn.at, words[-1].at, at) for turn in self.turns) <= 1
+        return sum(lies_within(self.order, turn.at, last.at, at) for turn in self.turns) <= 1
 
     def part(self, at: Stamp) -> Turn:
         """Take a turn that fixes alone did not show: what tells of it is known later than they are."""

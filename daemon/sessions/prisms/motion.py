@@ -1,8 +1,8 @@
 """Motion of a target from one fix to the next, held against what the joints did meanwhile.
 
-Two prisms that stand 1.5 m from each other are nearer than a fast prism moves from one fix to the next, so distance alone
-does not tell that a station has changed from one to the other. The joints do: they say how far the prism has moved. A
-distance between two places needs neither the place of the station nor the direction in which it looks.
+Two prisms that stand 1.5 m from each other are nearer than a fast prism moves from one fix to the next, so distance
+alone does not tell that a station has changed from one to the other. The joints do: they say how far the prism has
+moved. A distance between two places needs neither the place of the station nor the direction in which it looks.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class TargetMotion:
             place_mm: of its target.
             prism: that is meant.
             since: the station's last turn: only a fix since then is compared.
-            is_sure: the target before was that prism as far as is known; else it may have been any, or have stood still.
+            is_sure: the target before was that prism as far as is known; else it may have been any, or stood still.
         """
         if not all(joint.column in joined.values for joint in self._joints):
             return None
