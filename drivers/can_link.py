@@ -149,7 +149,7 @@ class CanLink:
         with contextlib.closing(open_port(self._config)) as port:
             session = _Session(self._config, self._clock, self._permission, port, emit, opened)
             # An interface that is down opens all the same, and fails at the first read
-            read = session.read(0.0)
+            read = session.first_read()
             watch.close()
             at_start, self._at_start = self._at_start, []
             self._swap_requests(at_start)
@@ -219,10 +219,11 @@ class _Session:
         self._setup = SetupRunner()
         self._losses: dict[str, int] = {}
         self._stamps = ReceiveStamps(clock, opened)
-        self._stalls = StallDetector(clock)
+        began = clock.of_host(opened)
+        self._stalls = StallDetector(clock, began)
         self._sent: deque[CanCapture] = deque()  # what was received before it may still have to be read
         now = clock.now()
-        self._late = LateReport(config.name, "frames", now)
+        self._late = LateReport(config.name, "frames", began)
         self._check_losses_ns = now.monotonic_ns + LOSS_CHECK_NS
         self._checked = self._heard_then = now  # when losses were last looked for, and the last frame before that
         self._sync: SyncProducer | None = None
@@ -241,6 +242,13 @@ class _Session:
         began = host.now()
         batch = self._port.receive(timeout_s)
         return _Read(batch, began, host.now())
+
+    def first_read(self) -> _Read:
+        """Read what the port has received since it was opened, without waiting."""
+        read = self.read(0.0)
+        if not read.batch.received:
+            self._stalls.found_nothing(self._clock.of_host(read.ended))
+        return read
 
     def take(self, read: _Read) -> None:
         """Stamp and emit the frames of a read; those that may have waited, not stamped before, are marked."""

@@ -18,13 +18,17 @@ class StallDetector:
     a fix would be joined with the joints of another pose. Its stamp must be marked as doubtful, and so must that of
     what an adapter still holds, which follows at once.
 
+    So it is with what a port received while it was opened: adapters that start anew when they are opened are given two
+    seconds for it, and one that a killed program has left open sends on meanwhile.
+
     Args:
         clock: of the stamps; how long the loop stood still counts in real seconds, which is what computers take.
+        opened: just before the port was opened; now by default.
     """
 
-    def __init__(self, clock: Clock) -> None:
+    def __init__(self, clock: Clock, opened: Stamp | None = None) -> None:
         self._clock = clock
-        self._last_read = clock.now()
+        self._last_read = opened or clock.now()
         self._resumed: Stamp | None = None
 
     def is_late(self, now: Stamp, waited_s: float) -> bool:
@@ -38,6 +42,10 @@ class StallDetector:
             self._resumed = now
         self._last_read = now
         return self._resumed is not None and self._real_s(now, self._resumed) <= LATE_S
+
+    def found_nothing(self, now: Stamp) -> None:
+        """Note that nothing waited in a port that has just been opened: what comes from `now` on is new."""
+        self._last_read = now
 
     def _real_s(self, now: Stamp, since: Stamp) -> float:
         return self._clock.real_seconds(now.since(since) / NS_PER_S)

@@ -155,6 +155,9 @@ class SessionKeeper:
         standing = joined.standstill is not None
         excluded = self._exclusion(session, joined, place_mm)
         if excluded is None:
+            self._prisms.follow(session, joined, place_mm)
+            excluded = "moving" if session.kind in STANDING_KINDS and not standing else None
+        if excluded is None:
             changed, excluded = self._which_prism(session, joined, place_mm)
             if changed:
                 self._unstored.append(partial(self._table.exclude, session.id, changed, joined.stamp))
@@ -212,8 +215,6 @@ class SessionKeeper:
                 return f"{joint} jumped: its readings from then on do not fit those before"
         if session.is_control_point(place_mm):
             return "a control point, not the prism"
-        if session.kind in STANDING_KINDS and joined.standstill is None:
-            return "moving"
         return None
 
     # ---- sessions ----------------------------------------------------------------------------------------------------

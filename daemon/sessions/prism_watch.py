@@ -75,6 +75,29 @@ class PrismWatch:
         stretch.instants_ns.append(joined.stamp.monotonic_ns)
         return changed
 
+    def follow(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> None:
+        """Hold a fix that was seen, whether it is used or not, against what the joints did since the one before.
+
+        A target that has moved otherwise is another one, although it is no further than a prism might move. Which of
+        both is meant is left to what the joints say of the whole stretch, or to an operator: its fixes do not count.
+        """
+        guard, evidence = session.guards.get(joined.fix.station), session.evidence
+        turn = None if guard is None else guard.turn(joined.fix.stamp)
+        if guard is None or evidence is None or turn is None:
+            return
+        is_suspected = guard.doubt(joined.fix.stamp) is not None
+        jump_m = evidence.jump_m(joined, place_mm, turn, is_suspected=is_suspected)
+        if jump_m is None:
+            return
+        is_told = guard.may_turn(joined.fix.stamp)
+        turn = guard.part(joined.fix.stamp)
+        if is_told:
+            return
+        text = f"the target moved {jump_m:.2f} m otherwise than the joints moved {session.prism}"
+        if not is_suspected:
+            guard.suspect(turn, jump_m, text)
+        self._tell_of_jump(joined.fix.station, text)
+
     def _heed(self, session: OpenSession, finding: Finding) -> Exclusions:
         """Suspect a stretch, or suspect it no more, as the joints say; its observations for which that is news."""
         stretch, station = finding.stretch, finding.stretch.station
@@ -86,16 +109,21 @@ class PrismWatch:
             fits = f"; it fits {finding.is_like}" if finding.is_like else ""
             evidence = f"{finding.distance_m:.2f} m from where the joints put {session.prism}{fits}"
             reason: str | None = guard.suspect(turn, finding.distance_m, evidence).reason
-            text = f"the target is {evidence}; its fixes do not count until the station is back, or until {CONFIRM}"
-            event = DeviceEvent(station, self._clock.now(), EventKind.PRISM_JUMP, text)
+            self._tell_of_jump(station, f"the target is {evidence}")
         else:
             guard.clear(turn)
             reason = None
             text = f"the target is where the joints put {session.prism}; its fixes count"
-            event = DeviceEvent(station, self._clock.now(), EventKind.LOCK_ACQUIRED, text)
-        log.warning("station %s: %s", station, text)
-        self._store.insert_records([event])
+            self._tell(DeviceEvent(station, self._clock.now(), EventKind.LOCK_ACQUIRED, text))
         return dict.fromkeys(stretch.instants_ns, reason)
+
+    def _tell_of_jump(self, station: str, what: str) -> None:
+        text = f"{what}; its fixes do not count until the station is back, or until {CONFIRM}"
+        self._tell(DeviceEvent(station, self._clock.now(), EventKind.PRISM_JUMP, text))
+
+    def _tell(self, event: DeviceEvent) -> None:
+        log.warning("station %s: %s", event.device, event.text)
+        self._store.insert_records([event])
 
     def doubt(self, session: OpenSession, fix: Fix) -> str | None:
         """Why a fix that was seen must not be used; None when it may."""

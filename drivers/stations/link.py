@@ -48,12 +48,13 @@ class StationLink:
             while not stop.is_set():
                 opened: Stamp | None = None
                 try:
+                    began = self._clock.now()
                     port = SerialPort(self._config.serial, self.name, self._clock.real_seconds(_LONGEST_WRITE_S))
                     with closing(port):
                         watch.close()
                         opened = self._last_read = self._clock.now()
                         outage.end(opened, f"{self._config.serial.path} opened")
-                        self._serve(port, emit, stop)
+                        self._serve(port, emit, stop, began)
                 except LinkError as error:
                     now = self._clock.now()
                     # What came since the last read is lost with the device, however long ago that was.
@@ -68,18 +69,19 @@ class StationLink:
                     else:
                         watch.wait(stop, real_s)
 
-    def _serve(self, port: SerialPort, emit: Emit, stop: threading.Event) -> None:
-        """Talk to the station from the opening of its port to `stop` or a LinkError."""
-        late = LateReport(self.name, "bytes", self._clock.now())
+    def _serve(self, port: SerialPort, emit: Emit, stop: threading.Event, began: Stamp) -> None:
+        """Talk to the station from the opening of its port, which `began` then, to `stop` or a LinkError."""
+        late = LateReport(self.name, "bytes", began)
         try:
-            self._listen(port, emit, stop, late)
+            self._listen(port, emit, stop, late, StallDetector(self._clock, began))
         finally:
             for item in late.end(self._clock.now()):
                 emit(item)
 
-    def _listen(self, port: SerialPort, emit: Emit, stop: threading.Event, late: LateReport) -> None:
+    def _listen(
+        self, port: SerialPort, emit: Emit, stop: threading.Event, late: LateReport, stalls: StallDetector
+    ) -> None:
         poller = start_poller(self._config)
-        stalls = StallDetector(self._clock)
         while not stop.is_set():
             wait_s = _LONGEST_READ_S if poller is None else self._send_due(port, poller, emit)
             timeout_s = self._clock.real_seconds(wait_s)

@@ -36,6 +36,18 @@ def test_a_loop_was_away_if_it_took_longer_than_it_may_have_waited(rate: float) 
     assert not stalls.is_late(back.shifted(round(1.1 * LATE_S * rate * NS_PER_S)), waited_s=0.2)
 
 
+def test_what_waited_in_a_port_that_took_long_to_open_may_be_old_and_what_did_not_wait_is_new() -> None:
+    clock = ScaledClock(1.0, START)
+    opened = clock.now()
+    first = opened.shifted(2 * NS_PER_S)
+    soon = first.shifted(round(0.9 * LATE_S * NS_PER_S))
+    assert StallDetector(clock, opened).is_late(first, waited_s=0.05)
+    emptied = StallDetector(clock, opened)
+    emptied.found_nothing(first)
+    assert not emptied.is_late(first, waited_s=0.05)
+    assert not emptied.is_late(soon, waited_s=0.05)
+
+
 def test_bytes_of_a_station_that_nobody_read_in_time_are_stored_and_marked(tmp_path: Path) -> None:
     clock = StoppedClock()
     passive = config(tmp_path / "tty", profile="passive")

@@ -60,13 +60,14 @@ class Usage:
     Attributes:
         life: number of the process: it is another one after a kill.
         at_s: real seconds since the process was started.
-        private_kib, proportional_kib: memory of its own, and with its share of what it shares.
+        anonymous_kib, proportional_kib: memory of its own, and with its share of what it shares. Pages of libraries are
+            not its own: whether they count as private depends on who else has loaded them at that moment.
         descriptors, threads: how many are open.
     """
 
     life: int
     at_s: float
-    private_kib: int
+    anonymous_kib: int
     proportional_kib: int
     descriptors: int
     threads: int
@@ -182,7 +183,7 @@ class DaemonProcess:
             return Usage(
                 life=self.life,
                 at_s=time.monotonic() - self._started_s,
-                private_kib=kib["Private_Clean"] + kib["Private_Dirty"],
+                anonymous_kib=kib["Anonymous"] + kib["Swap"],
                 proportional_kib=kib["Pss"],
                 descriptors=len(os.listdir(folder / "fd")),
                 threads=len(os.listdir(folder / "task")),

@@ -199,7 +199,7 @@ class Mischief:
             self._expect("station speaks again", (STATION,), STATION)
         # The operator aims anew; after a loss of lock the station may as well have found something itself.
         if kind == "prism_jump" or (kind == "lock_loss" and self._rng.random() < 0.5):
-            self._rig.aim(self._rig.aimed)
+            self._rig.aim_again()
         self._wait(8.0)
 
     def _node_fault(self) -> None:

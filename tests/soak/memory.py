@@ -22,7 +22,7 @@ class Growth:
 
     Attributes:
         warm_s, end_s: from when to when it was looked at, real seconds since its start.
-        base_kib, end_kib, most_kib: private memory at first, at last and at most: medians over a minute.
+        base_kib, end_kib, most_kib: anonymous memory at first, at last and at most: medians over a minute.
         trend: of a straight line through all samples from first to last, as a share of `base_kib`.
         descriptors, threads: at first and at last: the fewest within a minute, as clients come and go.
     """
@@ -74,8 +74,8 @@ def growth(samples: Sequence[Usage], warm_s: float) -> Growth | None:
             min(int((sample.at_s - begin_s) / window_s), int((end_s - begin_s) / window_s) - 1), []
         ).append(sample)
     parts = [windows[number] for number in sorted(windows)]
-    medians = [median(sample.private_kib for sample in part) for part in parts]
-    slope, _ = np.polyfit([s.at_s for s in warm], [s.private_kib for s in warm], 1)
+    medians = [median(sample.anonymous_kib for sample in part) for part in parts]
+    slope, _ = np.polyfit([s.at_s for s in warm], [s.anonymous_kib for s in warm], 1)
     return Growth(
         warm_s=begin_s,
         end_s=end_s,

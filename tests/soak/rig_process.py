@@ -54,6 +54,7 @@ class RigProcess:
         self.origin = f"{stamp.utc_ns},{stamp.monotonic_ns},{stamp.boot_id}"
         self.can_port, self.station_port, self.wire_log = directory / "can", directory / "station", directory / "wire"
         self.aimed, self._aimed_ns = "", 0
+        self._aiming = threading.Lock()
         self.rig_file = _write_rig(directory)
         command = [sys.executable, "-m", "simulators", "--rig", str(self.rig_file), "--seed", str(seed)]
         command += ["--rate", str(rate), "--map", f"{DIAGNOSED}:{'+'.join(f'{word:X}' for word in DIAGNOSED_WORDS)}"]
@@ -87,6 +88,15 @@ class RigProcess:
 
     def aim(self, target: str) -> None:
         """Turn the station to a prism or control point."""
+        with self._aiming:
+            self._aim(target)
+
+    def aim_again(self) -> None:
+        """Turn the station once more to what it was last told to turn to, whoever else turns it at the same time."""
+        with self._aiming:
+            self._aim(self.aimed)
+
+    def _aim(self, target: str) -> None:
         self.do("aim", target=target)
         self.aimed, self._aimed_ns = target, self.now_ns()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from tests.soak.evidence import Blackout, Case, Fact, judge
 from tests.soak.faults import ALARMS, EVIDENCE
 from tests.soak.losses import Gap, Item, Wire, account, read_wire_log, stored_items
 from tests.soak.memory import growth
+from tests.soak.rig_process import RigProcess
 
 RATE = 4.0
 
@@ -238,3 +240,30 @@ def test_wrong_use_of_the_soak_is_told(capsys: pytest.CaptureFixture[str], monke
     with pytest.raises(SystemExit, match="2"):
         main()
     assert "invalid float value: 'long'" in capsys.readouterr().err
+
+
+class ToldToAim(RigProcess):
+    """A rig that is told to aim elsewhere while it is told to aim again."""
+
+    def __init__(self) -> None:
+        self.aimed, self._aiming = "r", threading.Lock()
+        self.told: list[str] = []
+        self.other = threading.Thread(target=self.aim, args=("s",))
+
+    def do(self, what: str, **arguments: object) -> dict[str, object]:
+        self.told.append(str(arguments["target"]))
+        if len(self.told) == 1:
+            self.other.start()
+            self.other.join(0.1)
+        return {}
+
+    def now_ns(self) -> int:
+        return 0
+
+
+def test_aiming_again_never_takes_the_station_from_what_the_daemon_aimed_it_at_meanwhile() -> None:
+    rig = ToldToAim()
+    rig.aim_again()
+    rig.other.join(10)
+    assert rig.told == ["r", "s"]
+    assert rig.aimed == "s"

@@ -20,6 +20,7 @@ import numpy as np
 
 from calibration.rig.description import Rig
 from daemon.acquisition.joiner import JoinedFix
+from daemon.sessions.prisms.guard import Turn
 from daemon.sessions.prisms.standstill_places import travel_mm
 from daemon.sessions.station_setups import Place
 from daemon.warm_up import prepare
@@ -27,6 +28,7 @@ from drivers.clock import Stamp
 
 if TYPE_CHECKING:
     from calibration.identification.prism_identity import Misfits, PrismIdentity, Targets
+    from daemon.sessions.prisms.motion import TargetMotion
 
 log = logging.getLogger(__name__)
 
@@ -119,6 +121,14 @@ class IdentityLoader:
         """Return what tells prisms apart; None while it is being loaded."""
         return self._loaded
 
+    def motion(self) -> TargetMotion | None:
+        """Return what compares fixes with the ones before, anew; None while it is being loaded."""
+        if self._loaded is None:
+            return None
+        from daemon.sessions.prisms.motion import TargetMotion
+
+        return TargetMotion(self._rig)
+
     def start(self, wait_s: float = 0.0) -> None:
         """Begin to load it, and wait for it at most so long."""
         if self._thread is None:
@@ -130,6 +140,7 @@ class IdentityLoader:
     def _load(self) -> None:
         try:
             prepare()
+            import daemon.sessions.prisms.motion  # noqa: F401  # so that nobody waits for it later
             from calibration.identification.prism_identity import PrismIdentity
 
             made = PrismIdentity(self._rig)
@@ -160,6 +171,14 @@ class PrismEvidence:
         self._earlier = [list(group) for group in earlier if group]
         self._stretches: list[Stretch] = []
         self._waits = False
+        self._motion: TargetMotion | None = None
+
+    def jump_m(self, joined: JoinedFix, place_mm: Place, turn: Turn, *, is_suspected: bool) -> float | None:
+        """Take a fix, in order, moving or not: how far its target jumped, m; None where the joints explain it."""
+        self._motion = self._motion or self._loader.motion()
+        if self._motion is None:
+            return None
+        return self._motion.jump_m(joined, place_mm, self._prism, turn.at, is_sure=not is_suspected)
 
     def stretch(self, station: str, since: Stamp, is_believed: bool) -> Stretch:
         """Return the stretch of a station that began then; a new one the first time."""

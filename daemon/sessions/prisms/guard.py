@@ -212,6 +212,20 @@ class PrismGuard:
         number = bisect_right(self.turns, self.order(turn.at), key=lambda one: self.order(one.at))
         return self.turns[number].at if number < len(self.turns) else None
 
+    def may_turn(self, at: Stamp) -> bool:
+        """Return True if the station was told to turn before that instant, and nothing shows yet that it has."""
+        last = next((word for word in reversed(self.words) if self.order(word.at) <= self.order(at)), None)
+        if last is None or not last.is_turning or not lies_within(self.order, at, None, last.at.shifted(TURN_NS)):
+            return False
+        return sum(lies_within(self.order, turn.at, last.at, at) for turn in self.turns) <= 1
+
+    def part(self, at: Stamp) -> Turn:
+        """Take a turn that fixes alone did not show: what tells of it is known later than they are."""
+        made = Turn(at)
+        self.turns.append(made)
+        self.turns.sort(key=lambda turn: self.order(turn.at))
+        return made
+
     def look_away(self) -> None:
         """The station was on something else on purpose: its next fix is compared as after a new lock."""
         self._is_new_lock = True

@@ -17,6 +17,7 @@ from drivers.can.stamps import ReceiveStamps
 from drivers.can_link import CanLink
 from drivers.clock import NS_PER_S, Stamp, SystemClock
 from drivers.readings import CanCapture, EventKind, GapReason
+from drivers.stall_detector import LATE_S
 from tests.drivers.can_support import (
     DEADLINE_S,
     Adapter,
@@ -281,6 +282,47 @@ def test_frames_of_an_adapter_that_nobody_read_in_time_are_stored_and_marked(tmp
     clock = StoppedClock()
     with plugged_adapter(tmp_path / "slcan") as adapter, running(slcan_link(adapter, clock=clock)) as heard:
         _late_frame_is_marked(heard, clock, lambda text: _send_line(adapter, text))
+
+
+def test_frames_that_an_adapter_sent_while_its_port_was_being_opened_are_stored_and_marked(tmp_path: Path) -> None:
+    """A killed rigcal leaves its adapter open, and it sends on while the next one gives it time to start."""
+    with plugged_adapter(tmp_path / "slcan") as adapter:
+        link = slcan_link(adapter, options={"sleep_after_open": 2 * LATE_S})
+        with running(link) as heard:
+            sent = threading.Event()
+
+            def go_on_sending() -> None:
+                while not sent.wait(0.02):
+                    _send_line(adapter, "1A0 01")
+
+            sender = threading.Thread(target=go_on_sending)
+            sender.start()
+            heard.wait_for(EventKind.LINK_UP)
+            sent.set()
+            sender.join()
+            told = heard.wait_for(EventKind.TIME_DOUBTFUL)
+
+            def heard_in_time() -> bool:
+                _send_line(adapter, "1A0 02")
+                return bool(heard.received) and not heard.received[-1].stamp.is_doubtful
+
+            heard.wait(heard_in_time, "a frame that is read in time")
+    assert heard.received[0].stamp.is_doubtful
+    assert not any(frame.stamp.is_doubtful for frame in heard.received if frame.stamp.since(told.stamp) > 0)
+    (gap,) = heard.gaps
+    assert gap.reason is GapReason.TIME_DOUBTFUL
+    assert heard.received[0].stamp.since(gap.start) >= 2 * LATE_S * NS_PER_S
+
+
+def test_the_first_frames_of_an_adapter_that_was_silent_while_it_was_opened_are_in_time(tmp_path: Path) -> None:
+    with plugged_adapter(tmp_path / "slcan") as adapter:
+        link = slcan_link(adapter, options={"sleep_after_open": 2 * LATE_S})
+        with running(link) as heard:
+            heard.wait_for(EventKind.LINK_UP)
+            _send_line(adapter, "1A0 01")
+            heard.wait(lambda: heard.received, "a frame")
+    assert not heard.received[0].stamp.is_doubtful
+    assert heard.events(EventKind.TIME_DOUBTFUL) == []
 
 
 def test_frames_of_a_bus_within_the_process_that_nobody_read_in_time_are_stored_and_marked() -> None:

@@ -1,0 +1,125 @@
+"""A station that changes to a prism no further away than motion reaches: how the joints moved tells."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from daemon.acquisition.joiner import JoinedFix
+from daemon.sessions.prisms.motion import LATE_S, TargetMotion
+from daemon.sessions.station_setups import Place
+from drivers.clock import ManualClock
+from drivers.readings import Fix, LockState, Reading, Record, Status
+from tests.daemon.session_support import SOURCE, STEP_S
+from tests.daemon.sessions.prisms.test_prism_evidence import TRUTH, TrueRig, arrays
+from tests.daemon.store_support import table
+
+RIG = SOURCE.rig
+FIX_PERIOD_S = 0.35  # in which the guard takes any prism for able to move 1.85 m
+
+
+class SlowStation(TrueRig):
+    """A rig whose station gives a fix every seventh step."""
+
+    steps = 0
+
+    def live(self, seconds: float, **rates: float) -> None:
+        for _ in range(round(seconds / STEP_S)):
+            self.clock.advance(STEP_S)
+            for name, rate in rates.items():
+                self.values[name] += rate * STEP_S
+            records: list[Record] = [
+                Reading(j.name, self.clock.now(), self.values[j.name], j.unit) for j in SOURCE.rig.joints
+            ]
+            self.steps += 1
+            if self.steps % round(FIX_PERIOD_S / STEP_S) == 0:
+                records.append(self.fix())
+            self.store.insert_records(records)
+            self.keeper.on_records(records)
+
+    def follow(self, target: str, rate_deg_s: float, fixes: int) -> None:
+        """Slew the boom while the station measures where a true machine has a prism."""
+        for _ in range(fixes * round(FIX_PERIOD_S / STEP_S)):
+            self.values["theta1"] += rate_deg_s * STEP_S
+            self.target_mm = place_mm(target, self.values)
+            self.live(STEP_S)
+
+
+def place_mm(target: str, values: dict[str, float]) -> Place:
+    east, north, up = TRUTH.prism_mm(target, arrays(values), setup="S1")[0]
+    return float(east), float(north), float(up)
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[SlowStation]:
+    made = SlowStation(tmp_path / "rigcal.sqlite")
+    made.say("setup_new", id="S1", instrument="GTS-905A")
+    yield made
+    made.store.close()
+
+
+@pytest.mark.parametrize("kind", ["multi_joint", "static_poses"])
+@pytest.mark.parametrize("rate_deg_s", [0.0, 6.0])
+def test_a_change_to_a_near_prism_between_two_fixes_never_counts(
+    rig: SlowStation, kind: str, rate_deg_s: float
+) -> None:
+    session = rig.say("start", prism="r", kind=kind)["id"]  # the set-up has seen nothing to compare with
+    rig.values["theta1"] = 0.0
+    rig.follow("r", 0.0, 6)
+    rig.follow("r", rate_deg_s, 4)
+    assert rig.keeper.prism_suspicions() == []
+    changed_ns = rig.clock.now().monotonic_ns
+    rig.follow("s", rate_deg_s, 4)
+    rig.follow("s", 0.0, 6)
+    (suspicion,) = rig.keeper.prism_suspicions()
+    assert "otherwise than the joints moved r" in suspicion.reason
+    rows = [row for row in table(rig.store.path, "observations") if row["session_id"] == session]
+    assert not [row for row in rows if row["monotonic_ns"] > changed_ns and row["excluded"] is None]
+    assert [row for row in rows if row["monotonic_ns"] <= changed_ns and row["excluded"] is None]
+
+
+def test_an_operator_s_word_lets_the_fixes_count_again(rig: SlowStation) -> None:
+    rig.say("start", prism="r", kind="multi_joint")
+    rig.follow("r", 0.0, 6)
+    rig.follow("s", 0.0, 4)
+    rig.say("confirm_prism", operator="Ada")
+    rig.follow("s", 0.0, 4)
+    rig.follow("s", 6.0, 4)
+    assert rig.keeper.prism_suspicions() == []
+
+
+def test_a_boom_that_moves_with_its_prism_is_not_suspected_however_fast(rig: SlowStation) -> None:
+    rig.say("start", prism="r", kind="multi_joint")
+    rig.values["theta1"] = -10.0
+    for rate_deg_s in (0.0, 12.0, -12.0, 12.0):
+        rig.follow("r", rate_deg_s, 5)
+    assert rig.keeper.prism_suspicions() == []
+    assert {row["excluded"] for row in table(rig.store.path, "observations")} == {None}
+
+
+def jump_m(target: str, rate_deg_s: float, late_s: float = 0.0) -> float | None:
+    """Of a fix of a target, read late, after one of r, while the boom slews."""
+    clock, motion = ManualClock(), TargetMotion(RIG)
+    values = {joint.name: sum(joint.limits) / 2 for joint in RIG.joints}
+    found = None
+    for number, (name, lag_s) in enumerate([("r", 0.0), (target, late_s)]):
+        values["theta1"] = number * FIX_PERIOD_S * rate_deg_s
+        seen_mm = place_mm(name, values | {"theta1": values["theta1"] - lag_s * rate_deg_s})
+        columns = {joint.column: values[joint.name] for joint in RIG.joints} | {"theta1_rate": rate_deg_s}
+        fix = Fix("station", clock.now(), clock.now(), Status.OK, LockState.LOCKED)
+        joined = JoinedFix(fix, clock.now(), columns, None, None)
+        found = motion.jump_m(joined, seen_mm, "r", ManualClock().now(), is_sure=True)
+    return found
+
+
+def test_a_fix_that_is_read_late_while_the_boom_moves_is_no_jump() -> None:
+    for late_s in (0.0, 0.1, LATE_S):
+        assert jump_m("r", 6.0, late_s) is None
+
+
+@pytest.mark.parametrize("target", ["s", "b", "w"])
+@pytest.mark.parametrize("rate_deg_s", [0.0, 3.0, -3.0, 12.0, -12.0])
+def test_each_other_prism_is_a_jump_at_any_speed(target: str, rate_deg_s: float) -> None:
+    assert jump_m(target, rate_deg_s) is not None
