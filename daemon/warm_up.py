@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from calibration.observations import Observations
     from calibration.rig.description import Rig
-    from calibration.run import Run
+    from calibration.run_settings import Run
 
 _RIG = "swdt82"  # with couplings, rows of beta, prismatic joints and several prisms: all that a rig may have
 _POSES = 30
@@ -166,7 +166,7 @@ def _invented(rig: Rig) -> Observations:
 
 def _one_round() -> Run:
     """Return a run whose search stops after one round, which calls everything."""
-    from calibration.run import Run
+    from calibration.run_settings import Run
 
     return Run(should_stop=itertools.chain([False], itertools.repeat(True)).__next__)
 

@@ -11,8 +11,8 @@ import numpy as np
 from calibration.design.planning import PosePlan, plan_poses
 from calibration.effects.fitted import FittedEffect
 from calibration.evaluation.evaluation import Evaluation, evaluate
-from calibration.evaluation.export import export_files
-from calibration.evaluation.exports import Export
+from calibration.export.formats import export_files
+from calibration.export.model_export import Export
 from calibration.gap.result import GapResult
 from calibration.identification.refinement import Prior
 from calibration.model.files import MANIFEST, model_to_files
@@ -25,7 +25,7 @@ from calibration.pipeline.calibrate import calibrate as calibrate_rig
 from calibration.pipeline.find_gap import find_gap as find_gap_of_rig
 from calibration.residual.selection import Kind
 from calibration.rig.description import Rig
-from calibration.run import Progress, Run
+from calibration.run_settings import Progress, Run
 from daemon.host.safe_output import write_file
 from daemon.models.model_files import read_model, write_model
 

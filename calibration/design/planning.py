@@ -20,7 +20,7 @@ from calibration.kinematics.chain import Chain, Placement
 from calibration.model.model import CalibratedModel
 from calibration.observations import Floats
 from calibration.rig.description import Rig
-from calibration.run import DEFAULT_RUN, Run
+from calibration.run_settings import DEFAULT_RUN, Run
 
 _COVERED = 0.8  # of a joint's range
 _SHARE = 0.03  # of the expected variance

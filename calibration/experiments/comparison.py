@@ -15,7 +15,7 @@ from calibration.identification.refinement import Prior
 from calibration.observations import Floats, Observations
 from calibration.pipeline.calibrate import calibrate, identify, require_known_setups, train_residual
 from calibration.rig.description import Rig
-from calibration.run import DEFAULT_RUN, Run
+from calibration.run_settings import DEFAULT_RUN, Run
 
 NOMINAL = "nominal"
 REFIT_BASE = "its base transform would be a guess. Use --refit-base to fit it on the held-out fixes"

@@ -25,7 +25,7 @@ from calibration.residual.baselines import THETA, CorrectionTable, PaperRbfn, be
 from calibration.residual.features import Features
 from calibration.residual.folds import group_labels
 from calibration.residual.selection import Kind
-from calibration.run import Run
+from calibration.run_settings import Run
 
 EFFECTS, TABLE, PAPER_NETWORK = "effects", "table", "rbfn-paper"
 LEARNERS: tuple[Kind, ...] = tuple(kind for kind in get_args(Kind) if kind not in ("default", "none"))

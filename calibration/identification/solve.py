@@ -34,7 +34,7 @@ from calibration.identification.sweeps.circles import find_axes
 from calibration.kinematics.chain import Chain, Placement
 from calibration.observations import Floats, Observations
 from calibration.rig.description import ANOTHER_VALUE, Rig
-from calibration.run import Run
+from calibration.run_settings import Run
 
 _BETTER = 1.0  # in log evidence; less is rounding
 _MISTAKES = 3  # supposed together where nothing else explains the data

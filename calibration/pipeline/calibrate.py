@@ -23,7 +23,7 @@ from calibration.residual.region import fit_region
 from calibration.residual.selection import Kind, Selection, select_residual, torque_compensation
 from calibration.rig.description import Rig
 from calibration.rig.limits import turns_deg
-from calibration.run import DEFAULT_RUN, Run
+from calibration.run_settings import DEFAULT_RUN, Run
 
 Flags = NDArray[np.bool_]
 

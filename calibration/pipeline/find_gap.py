@@ -30,7 +30,7 @@ from calibration.pipeline.calibrate import require_known_setups
 from calibration.pipeline.methods import effects_rng, find_effects
 from calibration.residual.folds import folds
 from calibration.rig.description import Rig
-from calibration.run import DEFAULT_RUN, Run
+from calibration.run_settings import DEFAULT_RUN, Run
 
 _FOLDS = 10
 _LISTED = 12  # candidates of a round

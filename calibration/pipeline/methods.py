@@ -20,7 +20,7 @@ from calibration.published.first_paper import pde_paper
 from calibration.published.second_paper import km, require_torques, skcm
 from calibration.residual.selection import Kind
 from calibration.rig.description import Rig
-from calibration.run import Run
+from calibration.run_settings import Run
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from calibration.observations import Observations
 from calibration.published.paper_evolution import PaperSettings, evolve_paper
 from calibration.published.paper_objective import PaperObjective
 from calibration.rig.description import Rig
-from calibration.run import Run
+from calibration.run_settings import Run
 
 _WIDTH: Mapping[Prior, Mapping[str, float]] = {  # half-width of the bounds in build tolerances
     "recalibration": {"mm": 4.0, "rad": 4.0},

@@ -19,7 +19,7 @@ from calibration.identification.search.islands import Evolved
 from calibration.identification.search.streams import below, scatter, stream, uniform, word
 from calibration.numerics.jit import compiled
 from calibration.observations import Floats
-from calibration.run import Run
+from calibration.run_settings import Run
 
 _SAVED_EVERY = 20  # generations; a state of the paper's population is nine megabytes
 _LEAST = 4  # a candidate and three others

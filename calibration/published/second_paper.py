@@ -32,7 +32,7 @@ from calibration.kinematics.chain import Chain, Linearisation
 from calibration.kinematics.torques import gravity_torques, loaded_joints
 from calibration.observations import Floats, Observations
 from calibration.rig.description import Rig
-from calibration.run import Run
+from calibration.run_settings import Run
 
 _SEEN = 1e-6  # singular value over the largest, columns scaled to one length; what repeats another is at 1e-16
 _ROUNDS = 100

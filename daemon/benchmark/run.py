@@ -14,7 +14,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-from calibration.run import Progress
+from calibration.run_settings import Progress
 from daemon.benchmark.analyse import Task, answer, oracle, proposed_poses
 from daemon.benchmark.cases import LABELS, Case, draw_cases, measure, read_labels
 from daemon.benchmark.score import Score, Tally, scores, tallies

@@ -21,7 +21,7 @@ from daemon.host.safe_output import json_line, shown, shown_lines
 from drivers.errors import DescriptionError
 
 if TYPE_CHECKING:
-    from calibration.run import Progress
+    from calibration.run_settings import Progress
 
 DONE, FAILED, WRONG_INPUT, REFUSED = 0, 1, 2, 3
 LINE_S = 15.0  # between two lines of progress where no person is watching

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import click
 
-from calibration.rig.reference import table_row
+from calibration.rig.reference import table
 from daemon.cli.main import main
 from daemon.cli.terminal import echo_text
 
@@ -52,8 +52,7 @@ def _parts(context: click.Context, command: click.Command) -> Iterator[str]:
         if "--help" not in parameter.opts and (record := parameter.get_help_record(context)) is not None
     ]
     if records:
-        lines += ["", "| option | |", "|---|---|"]
-        lines += [table_row((f"`{_one_line(names)}`", _one_line(text))) for names, text in records]
+        lines += ["", *table(("option", ""), ((f"`{_one_line(names)}`", _one_line(text)) for names, text in records))]
     yield "\n".join(lines) + "\n"
 
 

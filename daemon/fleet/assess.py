@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from calibration.model.model import CalibratedModel
     from calibration.observations import Observations
     from calibration.rig.description import Rig
-    from calibration.run import Run
+    from calibration.run_settings import Run
 
 _WIDER = 10.0  # than the build tolerances: the prior that rigs are compared by
 FORM = 1  # of the answer; a later one is not read for an earlier one
@@ -109,7 +109,7 @@ def _assessed(task: RigTask, rig: Rig, pool: Executor) -> dict[str, Any]:
     from calibration.observations import parse_observations
     from calibration.pipeline.calibrate import identify
     from calibration.pipeline.find_gap import find_gap
-    from calibration.run import Run
+    from calibration.run_settings import Run
 
     settings = task.settings
     prior: Any = settings.prior

@@ -29,7 +29,7 @@ from calibration.observations import Observations, parse_observations
 from calibration.pipeline.calibrate import train_residual
 from calibration.pipeline.find_gap import find_gap
 from calibration.rig.description import Rig, parse_rig
-from calibration.run import Progress, Run
+from calibration.run_settings import Progress, Run
 from daemon.host.safe_output import write_file
 from daemon.host.systemd import set_up_logging
 from daemon.jobs.checkpoint import FileCheckpoint

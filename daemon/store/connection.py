@@ -151,7 +151,7 @@ class Connection:
 
     @property
     def _depth(self) -> int:
-        """How many transactions this thread is in."""
+        """Number of transactions that this thread is in, one inside the other."""
         return getattr(self._transactions, "depth", 0)
 
     def _forget_rows(self) -> None:

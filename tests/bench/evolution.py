@@ -22,7 +22,7 @@ from scipy.optimize import differential_evolution
 from threadpoolctl import threadpool_limits
 
 from calibration.published.paper_evolution import PaperSettings, evolve_paper
-from calibration.run import Run
+from calibration.run_settings import Run
 from tests.bench.boom import Boom, boom
 
 Floats = NDArray[np.float64]

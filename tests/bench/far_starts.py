@@ -28,7 +28,7 @@ from calibration.identification.start import PRIOR_SCALE, approach
 from calibration.kinematics.chain import Chain, Placement
 from calibration.observations import parse_observations
 from calibration.rig.description import Rig, shipped_rig
-from calibration.run import Run
+from calibration.run_settings import Run
 from simulators.rig.truth import RigTruth
 from tests.bench.boom import NOISE_MM, boom
 from tests.calibration.conftest import rms

@@ -20,7 +20,7 @@ from calibration.gap.screening import Screen
 from calibration.identification.solve import solve
 from calibration.observations import Observations, parse_observations
 from calibration.pipeline.find_gap import find_gap
-from calibration.run import Run
+from calibration.run_settings import Run
 from daemon.rig_files import RigSource, load_rig
 from simulators.blind.scene import SceneSettings, draw_scene
 from simulators.effects.library import parse_effects

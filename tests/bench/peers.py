@@ -29,7 +29,7 @@ from threadpoolctl import threadpool_limits
 
 from calibration.identification.search.islands import Settings, evolve
 from calibration.published.paper_evolution import PaperSettings, evolve_paper
-from calibration.run import Run
+from calibration.run_settings import Run
 from tests.bench.boom import Boom, boom
 
 Floats = NDArray[np.float64]

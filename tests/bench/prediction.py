@@ -31,7 +31,7 @@ from calibration.model.prediction import Predictor
 from calibration.observations import Observations, parse_observations
 from calibration.pipeline.calibrate import identify, train_residual
 from calibration.rig.description import Rig, shipped_rig
-from calibration.run import Run
+from calibration.run_settings import Run
 from simulators.effects.library import parse_effects
 from simulators.rig.truth import RigTruth
 from tests.calibration.conftest import rig_text

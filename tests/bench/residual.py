@@ -33,7 +33,7 @@ from calibration.pipeline.calibrate import identify, train_residual
 from calibration.residual.features import usable_signals
 from calibration.residual.selection import Kind
 from calibration.rig.description import shipped_rig
-from calibration.run import Run
+from calibration.run_settings import Run
 from simulators.effects.library import parse_effects
 from simulators.rig.truth import RigTruth
 from tests.bench.tuned_boosting import tune_boosting

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from calibration.evaluation.correction_grid import Machine, trained_ranges
-from calibration.evaluation.exports import Export, without_parts
+from calibration.export.correction_grid import Machine, trained_ranges
+from calibration.export.model_export import Export, without_parts
 from daemon.models.model_files import read_model
 from tests.robots import ROBOTS, Pinocchio, Robot
 

@@ -24,7 +24,7 @@ from calibration.residual.features import usable_torques
 from calibration.residual.folds import group_labels, standstill_labels
 from calibration.residual.selection import torque_compensation
 from calibration.rig.description import Rig
-from calibration.run import Run
+from calibration.run_settings import Run
 from tests.calibration.conftest import features, rig_text
 from tests.calibration.simulated_ys100 import linear, robot, stiffening
 

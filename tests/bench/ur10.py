@@ -27,7 +27,7 @@ from calibration.identification.solve import solve
 from calibration.model.prediction import Predictor
 from calibration.observations import Observations, format_observations, parse_observations
 from calibration.rig.description import shipped_rig
-from calibration.run import Run
+from calibration.run_settings import Run
 from daemon.models.model_files import read_model
 
 DATA = Path(__file__).parents[1] / "data"

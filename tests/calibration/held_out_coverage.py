@@ -25,7 +25,7 @@ from calibration.observations import Floats, Observations, parse_observations
 from calibration.pipeline.calibrate import identify, train_residual
 from calibration.residual.conformal import Intervals
 from calibration.rig.description import shipped_rig
-from calibration.run import Run
+from calibration.run_settings import Run
 from simulators.effects.library import parse_effects
 from simulators.rig.truth import RigTruth
 from tests.calibration.conftest import DATA, rig_text, split_by_cells

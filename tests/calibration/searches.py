@@ -13,7 +13,7 @@ import numpy as np
 from calibration.identification.search.islands import Evolved, Settings, evolve
 from calibration.observations import Floats
 from calibration.published.paper_evolution import PaperSettings, evolve_paper
-from calibration.run import Checkpoint, Run
+from calibration.run_settings import Checkpoint, Run
 
 LOWER, UPPER = np.full(6, -5.0), np.full(6, 5.0)
 SMALL = Settings(islands=3, population=40, evaluations=3000, epochs=5)

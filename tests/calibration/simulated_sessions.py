@@ -20,7 +20,7 @@ from calibration.evaluation.evaluation import evaluate
 from calibration.observations import Observations, parse_observations
 from calibration.pipeline.calibrate import identify
 from calibration.rig.description import Rig, shipped_rig
-from calibration.run import Run
+from calibration.run_settings import Run
 from simulators.rig.dataset import SimulatedObservations
 from simulators.rig.truth import RigTruth
 from tests.calibration.conftest import rig_text

@@ -1,4 +1,4 @@
-"""Where jobs run in tests."""
+"""A store, and where jobs run in tests."""
 
 from __future__ import annotations
 
@@ -7,7 +7,22 @@ from pathlib import Path
 
 import pytest
 
+from daemon.store import Store
 from tests.daemon.job_support import JobRig
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A place for a store."""
+    return tmp_path / "rigcal.sqlite"
+
+
+@pytest.fixture
+def store(path: Path) -> Iterator[Store]:
+    """A new store."""
+    store = Store(path)
+    yield store
+    store.close()
 
 
 @pytest.fixture

@@ -24,12 +24,19 @@ def idle_daemon(directory: Path, notifier: Notifier | None = None, **settings: A
     store = Store(config.store_path)
     parts = Parts("live", SOURCE.rig, SOURCE.text, SystemClock(), [], {}, joiner(config, SOURCE.rig))
     daemon = Daemon(config, store, parts)
-    stop = threading.Event()
-    running = threading.Thread(target=daemon.run, args=(stop, notifier or Notifier({})))
-    running.start()
-    try:
+    with running(daemon, store, notifier):
         yield config
+
+
+@contextlib.contextmanager
+def running(daemon: Daemon, store: Store, notifier: Notifier | None = None) -> Iterator[None]:
+    """Runs a daemon in a thread while the block does; its store is closed behind it."""
+    stop = threading.Event()
+    thread = threading.Thread(target=daemon.run, args=(stop, notifier or Notifier({})))
+    thread.start()
+    try:
+        yield
     finally:
         stop.set()
-        running.join()
+        thread.join()
         store.close()

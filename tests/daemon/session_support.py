@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_inputs
 from daemon.commands import CommandError
 from daemon.config import SessionsSection
@@ -137,3 +139,15 @@ def controlled(rig: Rig, prism: str = "r", kind: str = "static_poses", seconds: 
     rig.shoot("cp1", (9000.0, 500.0, 2000.0))
     rig.say("stop")
     return name
+
+
+def closed_afterwards(make: Callable[[Path], Rig]) -> Any:
+    """Make a fixture: a rig on a new store, which is closed after the test."""
+
+    @pytest.fixture
+    def rig(tmp_path: Path) -> Iterator[Rig]:
+        made = make(tmp_path / "rigcal.sqlite")
+        yield made
+        made.store.close()
+
+    return rig

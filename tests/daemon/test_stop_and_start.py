@@ -32,11 +32,6 @@ from tests.daemon.store_support import frame, reading, serial_bytes, table
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "rigcal.sqlite"
-
-
-@pytest.fixture
 def store(path: Path) -> Iterator[Store]:
     store = opened(path)
     yield store

@@ -41,7 +41,7 @@ def test_the_commands_call_the_functions_of_the_face() -> None:
         "daemon/cli/commands/plan.py": ["calibration.design.planning"],
         "daemon/cli/commands/predict.py": ["calibration.model.prediction"],
         "daemon/cli/commands/inverse.py": ["calibration.model.inverse"],
-        "daemon/cli/commands/model.py": ["calibration.evaluation.export"],
+        "daemon/cli/commands/model.py": ["calibration.export.formats"],
     }.items():
         command, own = (ROOT / module).read_text(), Path(str(face.__file__)).read_text()
         for name in names:

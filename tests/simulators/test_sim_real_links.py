@@ -22,7 +22,6 @@ from calibration.rig.description import shipped_rig
 from daemon.composition import live
 from daemon.config import parse_config
 from daemon.control.protocol import request
-from daemon.host.systemd import Notifier
 from daemon.rig_files import load_rig
 from daemon.service import Daemon
 from daemon.store import Store
@@ -32,6 +31,7 @@ from simulators.__main__ import main
 from simulators.link_ends import BusEnd, SerialEnd
 from simulators.plan import read_plan
 from tests.daemon.acquisition_support import wait_until
+from tests.daemon.idle_daemon import running as run_daemon
 from tests.drivers.multicast import GROUP, multicast_bus, unused_port
 
 RIG = shipped_rig("swdt82")
@@ -106,16 +106,10 @@ serial.path = "{device}"
 enabled = false
 """
     config = parse_config(text, directory / "rigcal.toml")
-    store, stop = Store(config.store_path), threading.Event()
+    store = Store(config.store_path)
     daemon = Daemon(config, store, live(config, load_rig("swdt82")))
-    thread = threading.Thread(target=daemon.run, args=(stop, Notifier({})))
-    thread.start()
-    try:
+    with run_daemon(daemon, store):
         yield config.socket_path
-    finally:
-        stop.set()
-        thread.join(30.0)
-        store.close()
 
 
 def channels(socket: Path) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from calibration.observations import Floats, Observations
 from calibration.pipeline.calibrate import calibrate, train_residual
 from calibration.residual.selection import Kind
 from calibration.rig.description import Rig
-from calibration.run import Run
+from calibration.run_settings import Run
 
 Integers = NDArray[np.intp]
 

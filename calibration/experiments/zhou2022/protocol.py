@@ -30,7 +30,7 @@ from calibration.observations import Observations
 from calibration.pipeline.calibrate import calibrate, identify, require_known_setups
 from calibration.published.paper_evolution import PaperSettings
 from calibration.rig.description import Rig
-from calibration.run import DEFAULT_RUN, Run
+from calibration.run_settings import DEFAULT_RUN, Run
 
 # Mean absolute errors in mm that the paper reports of its own machine.
 PAPER_BEFORE: Mapping[str, Mapping[str, float]] = {

@@ -26,7 +26,7 @@ from calibration.published.paper_evolution import PaperSettings
 from calibration.published.paper_objective import PaperObjective
 from calibration.residual.folds import folds
 from calibration.rig.description import Rig
-from calibration.run import Run
+from calibration.run_settings import Run
 
 Flags = NDArray[np.bool_]
 DataSet = Literal["single-joint", "multi-joint", "weighted"]

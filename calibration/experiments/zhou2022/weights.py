@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 from calibration.identification.linear_model import FLAT_MM, FLAT_RAD
 from calibration.kinematics.chain import Chain, ChainData, Linearisation
 from calibration.observations import Floats
-from calibration.run import Run
+from calibration.run_settings import Run
 
 _SETTLED = 1e-9  # relative change of the objective
 _ROUNDS = 200

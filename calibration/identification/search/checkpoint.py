@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from calibration.numerics.stored_arrays import read_npz, write_npz
 from calibration.observations import Floats
-from calibration.run import Checkpoint
+from calibration.run_settings import Checkpoint
 
 Arrays = dict[str, NDArray[Any]]
 

@@ -15,7 +15,7 @@ from calibration.identification.start import PRIOR_SCALE, draw_rows
 from calibration.kinematics.chain import Chain
 from calibration.kinematics.fitness import Fitness
 from calibration.observations import Floats
-from calibration.run import Run
+from calibration.run_settings import Run
 
 _SEARCH_ROWS = 400  # enough to tell basins apart
 _SEARCH_WIDTH = {"recalibration": 4.0, "as-built": 60.0}  # half-width of the search in build tolerances

@@ -20,7 +20,7 @@ from calibration.identification.search import lshade
 from calibration.identification.search.checkpoint import Arrays, SavedSearch, problem
 from calibration.identification.search.lshade import Island, Settings
 from calibration.observations import Floats
-from calibration.run import Run
+from calibration.run_settings import Run
 
 __all__ = ["Evolved", "Settings", "evolve"]
 

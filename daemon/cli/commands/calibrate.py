@@ -84,7 +84,7 @@ def calibrate(
     watch = offline.Stopwatch()
     prepare()
     from calibration.pipeline.calibrate import calibrate as calibrate_rig
-    from calibration.run import Run
+    from calibration.run_settings import Run
     from daemon.jobs.checkpoint import FileCheckpoint
     from daemon.models import model_files
     from daemon.report.calibration.from_model import facts_of, report_input

@@ -86,7 +86,7 @@ def compare(
     from calibration.experiments.comparison import compare as compare_methods
     from calibration.experiments.comparison import shared_rows
     from calibration.experiments.zhou2022.protocol import run_protocol
-    from calibration.run import Run
+    from calibration.run_settings import Run
     from daemon.report.comparison import comparison_page
     from daemon.report.front import Facts
     from daemon.report.zhou2022 import protocol_page

@@ -62,7 +62,7 @@ def gap(
     prepare()
     from calibration.experiments.comparison import shared_rows
     from calibration.pipeline.find_gap import find_gap
-    from calibration.run import Run
+    from calibration.run_settings import Run
     from daemon.models.gap_files import REPORT, check_gap_target, gap_answer, write_gap
     from daemon.report.calibration.from_model import facts_of, provenance
     from daemon.report.gap.page import gap_report

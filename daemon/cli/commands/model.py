@@ -17,7 +17,7 @@ from daemon.host.safe_output import write_file
 from daemon.warm_up import prepare
 
 if TYPE_CHECKING:
-    from calibration.evaluation.exports import Format
+    from calibration.export.model_export import Format
 
 _GRIDS = ("grid", "parquet")
 
@@ -104,7 +104,7 @@ class _ExportCommand(Command):
 
 
 def _formats() -> Mapping[str, Format]:
-    from calibration.evaluation.export import formats
+    from calibration.export.formats import formats
 
     return formats()
 
@@ -156,13 +156,13 @@ def model_export(
     if directory is not None and number is not None:
         raise click.UsageError("give either a model's NUMBER or --model DIR")
     prepare()
-    from calibration.evaluation.export import chosen_formats
+    from calibration.export.formats import chosen_formats
 
     chosen = chosen_formats(names)
     if directory is None:
         found = request(socket_of(socket, config), "model.show", {} if number is None else {"id": number})
         directory = Path(found["path"])
-    from calibration.evaluation.exports import Export
+    from calibration.export.model_export import Export
     from daemon.models.model_files import model_sha256, read_model
 
     export = Export(read_model(directory), model_sha256(directory), prisms, rows)

@@ -84,7 +84,7 @@ def plan(
     prepare()
 
     from calibration.design.planning import plan_poses
-    from calibration.run import Run
+    from calibration.run_settings import Run
     from daemon.models.gap_files import poses_csv
     from daemon.models.model_files import read_model
     from daemon.rig_files import load_rig

@@ -146,8 +146,9 @@ def rig_export(path: str, out: Path, *, as_json: bool) -> dict[str, Any]:
     """
     import numpy as np
 
-    from calibration.evaluation.writers.dh_table import dh_text
-    from calibration.evaluation.writers.urdf_text import urdf_text, xacro_text
+    from calibration.export.formats.dh_csv import dh_text
+    from calibration.export.formats.urdf import urdf_text
+    from calibration.export.formats.xacro import xacro_text
     from calibration.kinematics.chain import Chain, Placement
     from daemon.rig_files import load_rig
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 
-from calibration.rig.reference import table_row
+from calibration.rig.reference import table
 from daemon.store.describe.description import StoreDescription, TableDescription
 
 _HEAD = """# The store's tables
@@ -28,9 +28,9 @@ def schema_page(store: StoreDescription) -> str:
     lines = [_HEAD]
     for heading, are_views in (("Views", True), ("Tables", False)):
         lines.append(f"## {heading}\n")
-        for table in store.tables:
-            if table.is_view == are_views:
-                lines += _table_lines(table)
+        for told in store.tables:
+            if told.is_view == are_views:
+                lines += _table_lines(told)
     lines.append("## Queries\n")
     lines.append("The queries that `metadata.yaml` gives to Datasette. `:session` stands for a session's name.\n")
     for query in store.queries:
@@ -38,19 +38,20 @@ def schema_page(store: StoreDescription) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def _table_lines(table: TableDescription) -> Iterator[str]:
-    yield f"### {table.name}\n"
-    yield f"{table.words.title}. {table.words.description}\n"
-    if table.is_view:
-        yield "| column | meaning |\n|---|---|"
-        for column in table.columns:
-            yield table_row((f"`{column.name}`", column.meaning))
+def _table_lines(told: TableDescription) -> Iterator[str]:
+    yield f"### {told.name}\n"
+    yield f"{told.words.title}. {told.words.description}\n"
+    if told.is_view:
+        yield from table(("column", "meaning"), ((f"`{column.name}`", column.meaning) for column in told.columns))
     else:
-        yield "| column | type | meaning | refers to |\n|---|---|---|---|"
-        for column in table.columns:
-            link = f"[{column.refers_to}](#{column.refers_to})" if column.refers_to else ""
-            yield table_row((f"`{column.name}`", column.type, column.meaning, link))
+        rows = ((f"`{column.name}`", column.type, column.meaning, _link(column.refers_to)) for column in told.columns)
+        yield from table(("column", "type", "meaning", "refers to"), rows)
     yield ""
+
+
+def _link(name: str | None) -> str:
+    """Return a link to a table of the page; empty for none."""
+    return f"[{name}](#{name})" if name else ""
 
 
 def datasette_metadata(store: StoreDescription, database: str = "rigcal") -> str:

@@ -38,7 +38,7 @@ from calibration.errors import DataError, UnsafeError
 from calibration.kinematics.chain import Chain, Placement
 from calibration.observations import Floats
 from calibration.rig.description import Rig, parse_rig, shipped_rig
-from calibration.run import Run
+from calibration.run_settings import Run
 from tests.bench.design import at_random, ground, trial
 
 MAST = """

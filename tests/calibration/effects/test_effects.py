@@ -28,7 +28,7 @@ from calibration.pipeline.build_model import with_effects
 from calibration.pipeline.calibrate import identify
 from calibration.published.second_paper import skcm
 from calibration.rig.description import Rig, shipped_rig
-from calibration.run import Run
+from calibration.run_settings import Run
 from simulators.effects.library import parse_effects as simulated_effects
 from simulators.rig.truth import RigTruth
 from tests.calibration.conftest import Session, rig_text, rms

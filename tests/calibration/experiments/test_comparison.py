@@ -24,7 +24,7 @@ from calibration.pipeline.calibrate import calibrate, identify
 from calibration.published.paper_evolution import PaperSettings
 from calibration.residual.selection import Kind
 from calibration.rig.description import Rig, parse_rig, shipped_rig
-from calibration.run import Run
+from calibration.run_settings import Run
 from simulators.effects.library import parse_effects
 from simulators.rig.truth import RigTruth
 from tests.bench.zhou2022 import PATH_POINTS, data_sets, sweeps, table

@@ -11,7 +11,7 @@ import pytest
 
 from calibration.identification.search.islands import Evolved, Settings, evolve
 from calibration.observations import Floats
-from calibration.run import Run
+from calibration.run_settings import Run
 from tests.calibration.searches import (
     LOWER,
     SMALL,

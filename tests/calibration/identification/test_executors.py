@@ -16,7 +16,7 @@ from calibration.model.files import model_to_files
 from calibration.observations import parse_observations
 from calibration.pipeline.calibrate import calibrate
 from calibration.rig.description import shipped_rig
-from calibration.run import Run
+from calibration.run_settings import Run
 from simulators.effects.families.encoders import EncoderHarmonic
 from simulators.rig.truth import RigTruth
 from tests.calibration.conftest import rig_text

@@ -20,7 +20,7 @@ from calibration.kinematics.chain import Chain, Placement, rotation_about
 from calibration.model.prediction import Predictor
 from calibration.observations import Observations, parse_observations
 from calibration.rig.description import Rig, shipped_rig
-from calibration.run import Run
+from calibration.run_settings import Run
 from simulators.rig.truth import RigTruth
 from tests.bench.far_starts import moved
 from tests.calibration.conftest import Session, rms, simulated

@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from calibration.numerics.single_thread import SingleThreaded, one_blas_thread
 from calibration.pipeline.calibrate import calibrate
-from calibration.run import Run
+from calibration.run_settings import Run
 from tests.calibration.conftest import Session, rig_text
 
 

@@ -17,7 +17,7 @@ from calibration.evaluation.evaluation import evaluate
 from calibration.observations import Observations, format_observations, parse_observations
 from calibration.pipeline.calibrate import identify
 from calibration.rig.description import parse_rig, shipped_rig
-from calibration.run import Run
+from calibration.run_settings import Run
 from daemon.cli.main import main as rigcal
 from tests.calibration.conftest import Session, rig_text, rms
 from tests.calibration.identification.test_circles import joined_observations

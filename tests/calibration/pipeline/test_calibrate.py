@@ -17,7 +17,7 @@ from calibration.model.prediction import Predictor
 from calibration.model.warnings import model_warnings
 from calibration.observations import Observations, data_sha256
 from calibration.pipeline.calibrate import calibrate, identify, train_residual
-from calibration.run import Run
+from calibration.run_settings import Run
 from simulators.rig.truth import RigTruth
 from tests.calibration.conftest import Session, rig_text, rms, simulated
 

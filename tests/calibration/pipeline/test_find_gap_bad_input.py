@@ -19,7 +19,7 @@ from calibration.model.prediction import Predictor
 from calibration.model.warnings import model_warnings
 from calibration.observations import Observations, parse_observations
 from calibration.pipeline.find_gap import find_gap
-from calibration.run import Run
+from calibration.run_settings import Run
 from tests.daemon import gap_support as support
 
 

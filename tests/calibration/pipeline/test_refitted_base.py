@@ -18,7 +18,7 @@ from calibration.observations import Observations
 from calibration.pipeline.calibrate import identify, rows_to_learn_from, train_residual
 from calibration.residual.baselines import CorrectionTable
 from calibration.rig.description import shipped_rig
-from calibration.run import Run
+from calibration.run_settings import Run
 from simulators.effects.library import parse_effects
 from simulators.rig.truth import RigTruth
 from tests.calibration.conftest import rig_text, rms, simulated

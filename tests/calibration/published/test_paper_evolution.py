@@ -15,7 +15,7 @@ from calibration.observations import Floats
 from calibration.published.paper_evolution import PaperSettings, evolve_paper
 from calibration.published.paper_objective import PaperObjective
 from calibration.rig.description import shipped_rig
-from calibration.run import Run
+from calibration.run_settings import Run
 from tests.calibration.searches import PAPER, Kept, assert_same, paper_search, rastrigin, sphere, sphere_with_holes
 
 LOWER, UPPER = np.full(6, -5.0), np.full(6, 5.0)

@@ -26,7 +26,7 @@ from calibration.residual.learners import LOADERS
 from calibration.residual.rbf.torque_network import TorqueNetwork, fit_torque_network
 from calibration.residual.selection import torque_compensation
 from calibration.rig.description import ANOTHER_VALUE, Rig, parse_rig, shipped_rig
-from calibration.run import Run
+from calibration.run_settings import Run
 from tests.calibration.conftest import features, rig_text, rms, simulated
 from tests.calibration.simulated_ys100 import linear, robot, stiffening
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calibration.errors import DataError
-from calibration.evaluation.correction_grid import correction_grid
+from calibration.export.correction_grid import correction_grid
 from calibration.model.inverse import inverse
 from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor

@@ -44,11 +44,6 @@ Make = Callable[..., Acquisition]
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "rigcal.sqlite"
-
-
-@pytest.fixture
 def store(path: Path) -> Iterator[Store]:
     store = Store(path)
     store.declare_channels({"theta1": "deg"}, {})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -24,18 +23,6 @@ class SetClock(SystemClock):
     def now(self) -> Stamp:
         now = super().now()
         return Stamp(now.utc_ns + round(self.ahead_s * NS_PER_S), now.monotonic_ns, now.boot_id)
-
-
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "rigcal.sqlite"
-
-
-@pytest.fixture
-def store(path: Path) -> Iterator[Store]:
-    store = Store(path)
-    yield store
-    store.close()
 
 
 def told(watch: ClockWatch, *looks: tuple[float, float]) -> list[tuple[str, int | None]]:

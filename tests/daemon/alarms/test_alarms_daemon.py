@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -19,13 +18,13 @@ import pytest
 from daemon.composition import live
 from daemon.config import parse_config
 from daemon.control.protocol import request
-from daemon.host.systemd import Notifier
 from daemon.rig_files import load_rig
 from daemon.service import Daemon
 from daemon.store import Store
 from tests.daemon.acquisition.test_clock_watch import SetClock
 from tests.daemon.acquisition_support import wait_until
 from tests.daemon.daemon_process import DaemonProcess
+from tests.daemon.idle_daemon import running as run_daemon
 from tests.daemon.store_support import table
 
 CONFIG = """rig = "swdt82"
@@ -44,16 +43,9 @@ def running(directory: Path, clock: SetClock) -> Iterator[Path]:
     """A daemon without devices; its control socket."""
     config = parse_config(CONFIG, directory / "rigcal.toml")
     store = Store(config.store_path)
-    stop = threading.Event()
     daemon = Daemon(config, store, replace(live(config, load_rig("swdt82")), clock=clock))
-    thread = threading.Thread(target=daemon.run, args=(stop, Notifier({})))
-    thread.start()
-    try:
+    with run_daemon(daemon, store):
         yield config.socket_path
-    finally:
-        stop.set()
-        thread.join(30.0)
-        store.close()
 
 
 def active(socket: Path) -> dict[tuple[str, str], dict[str, Any]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import socket
-import threading
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -19,7 +18,7 @@ from daemon.acquisition.status.board import StatusBoard
 from daemon.composition import live
 from daemon.config import ConfigError, parse_config
 from daemon.control.protocol import request
-from daemon.host.systemd import Notifier, network_hint
+from daemon.host.systemd import network_hint
 from daemon.monitoring import metrics_server
 from daemon.monitoring.metrics import FAMILIES
 from daemon.monitoring.metrics_page import page
@@ -30,6 +29,7 @@ from daemon.store import Store
 from drivers.clock import ManualClock
 from drivers.readings import DeviceEvent, EventKind, Gap, GapReason
 from tests.daemon.acquisition_support import wait_until
+from tests.daemon.idle_daemon import running as run_daemon
 
 ROOT = Path(__file__).parents[3]
 GOLDEN = ROOT / "tests" / "golden" / "simulated" / "standing" / "boom.log"
@@ -59,16 +59,10 @@ def free_port() -> int:
 def running(directory: Path, port: int) -> Iterator[Path]:
     """A daemon that reads a captured bus and no station; its control socket."""
     config = parse_config(CONFIG.format(log=GOLDEN, port=port), directory / "rigcal.toml")
-    store, stop = Store(config.store_path), threading.Event()
+    store = Store(config.store_path)
     daemon = Daemon(config, store, live(config, load_rig("swdt82")))
-    thread = threading.Thread(target=daemon.run, args=(stop, Notifier({})))
-    thread.start()
-    try:
+    with run_daemon(daemon, store):
         yield config.socket_path
-    finally:
-        stop.set()
-        thread.join(30.0)
-        store.close()
 
 
 def scrape(port: int, host: str = "127.0.0.1") -> Samples:

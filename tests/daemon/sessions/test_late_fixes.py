@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from pathlib import Path
-
-import pytest
+from collections.abc import Sequence
 
 from daemon.sessions.lifecycle import NOT_ENCLOSED
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import CanCapture, DeviceEvent, EventKind, Reading, Record
-from tests.daemon.session_support import SOURCE, STEP_S, Rig
+from tests.daemon.session_support import SOURCE, STEP_S, Rig, closed_afterwards
 from tests.daemon.sessions.test_prism_watch import ANOTHER_MM, PRISM_MM, WatchedRig, used
 from tests.daemon.sessions.test_sessions import start
 from tests.daemon.store_support import table
@@ -18,11 +15,7 @@ from tests.daemon.store_support import table
 CONTROL_MM = (9000.0, 500.0, 2000.0)
 
 
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Rig]:
-    made = WatchedRig(tmp_path / "rigcal.sqlite")
-    yield made
-    made.store.close()
+rig = closed_afterwards(WatchedRig)
 
 
 def captured(rig: Rig, seconds: float) -> list[list[Record]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from simulators.devices.stations.total_station import StationSettings
 from simulators.faults import parse_faults
 from simulators.rig.truth import RigTruth
 from simulators.rig_simulator import RigSimulator, SimulatorSettings
-from tests.daemon.session_support import disk_fails
+from tests.daemon.session_support import closed_afterwards, disk_fails
 from tests.daemon.sessions.test_sessions import SOURCE, Rig, start
 from tests.daemon.store_support import table
 from tests.simulated.captures import Step, generate
@@ -66,11 +66,7 @@ class WatchedRig(Rig):
         )
 
 
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Rig]:
-    made = WatchedRig(tmp_path / "rigcal.sqlite")
-    yield made
-    made.store.close()
+rig = closed_afterwards(WatchedRig)
 
 
 def used(rig: Rig) -> list[float]:

@@ -136,8 +136,8 @@ def test_what_is_observed_while_the_disk_fails_is_stored_when_it_works_again(ses
     assert len(observed) > 80
 
 
-def test_a_cancellation_is_kept_when_the_jobs_end_cannot_be_stored(tmp_path: Path) -> None:
-    rig = Rig(tmp_path / "rigcal.sqlite")
+def cancelled_while_it_runs(rig: Rig) -> tuple[JobQueue, int]:
+    """The queue with a job of a session that was begun and cancelled; the number of that job."""
     rig.say("setup_new", id="S1")
     name = rig.say("start", prism="r")["id"]
     rig.say("stop")
@@ -147,8 +147,14 @@ def test_a_cancellation_is_kept_when_the_jobs_end_cannot_be_stored(tmp_path: Pat
     assert job is not None
     assert jobs.begin(job, 60.0)
     jobs.cancel(job.id)
+    return jobs, job.id
+
+
+def test_a_cancellation_is_kept_when_the_jobs_end_cannot_be_stored(tmp_path: Path) -> None:
+    rig = Rig(tmp_path / "rigcal.sqlite")
+    jobs, job_id = cancelled_while_it_runs(rig)
     with disk_fails(), pytest.raises(sqlite3.OperationalError):
-        jobs.end(job.id, Outcome("done", result={"model": "m"}))
+        jobs.end(job_id, Outcome("done", result={"model": "m"}))
     jobs.interrupt_running("the daemon could not see it through", is_attempt=False)
     assert {row["state"] for row in rig.store.rows("SELECT state FROM jobs")} == {"cancelled"}
     rig.store.close()
@@ -156,15 +162,7 @@ def test_a_cancellation_is_kept_when_the_jobs_end_cannot_be_stored(tmp_path: Pat
 
 def test_a_cancellation_outlives_a_daemon_that_is_killed_before_the_job_has_ended(tmp_path: Path) -> None:
     rig = Rig(tmp_path / "rigcal.sqlite")
-    rig.say("setup_new", id="S1")
-    name = rig.say("start", prism="r")["id"]
-    rig.say("stop")
-    jobs = JobQueue(rig.store, "swdt82", rig.clock)
-    jobs.queue(DueChain(CHAIN, name, name))
-    job = next_job(jobs.state())
-    assert job is not None
-    assert jobs.begin(job, 60.0)
-    jobs.cancel(job.id)
+    cancelled_while_it_runs(rig)
     rig.store.close()
     again = Store(tmp_path / "rigcal.sqlite")
     JobQueue(again, "swdt82", rig.clock).interrupt_left_over("this boot")

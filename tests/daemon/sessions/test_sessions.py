@@ -1,6 +1,5 @@
 import math
 import socket
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +20,9 @@ from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import DeviceEvent, EventKind
 from tests.daemon import session_support
-from tests.daemon.session_support import SOURCE, STEP_S, Rig
+from tests.daemon.session_support import SOURCE, STEP_S, Rig, closed_afterwards
 
-
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Rig]:
-    made = Rig(tmp_path / "rigcal.sqlite")
-    yield made
-    made.store.close()
+rig = closed_afterwards(Rig)
 
 
 def start(rig: Rig, **more: Any) -> None:

@@ -20,7 +20,6 @@ from daemon.commands import CommandError
 from daemon.composition import Parts, joiner
 from daemon.config import Config
 from daemon.control.protocol import request
-from daemon.host.systemd import Notifier
 from daemon.service import Daemon
 from daemon.store import Reader, Store, StoreError, health
 from daemon.store.files import FileIdentity
@@ -29,14 +28,10 @@ from drivers.clock import ManualClock, SystemClock
 from drivers.readings import Capture
 from tests.daemon.acquisition_support import ListLink, wait_until
 from tests.daemon.damage import fill, small_disk, tear
+from tests.daemon.idle_daemon import running as run_daemon
 from tests.daemon.job_support import SOURCE, JobRig
 from tests.daemon.session_support import disk_fails
 from tests.daemon.store_support import at, fix, frame, table
-
-
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "rigcal.sqlite"
 
 
 @contextlib.contextmanager
@@ -326,15 +321,8 @@ def running(tmp_path: Path, captures: Sequence[Capture] = ()) -> Iterator[tuple[
     except CommandError:
         store.close()
         raise
-    stop = threading.Event()
-    thread = threading.Thread(target=daemon.run, args=(stop, Notifier({})))
-    thread.start()
-    try:
+    with run_daemon(daemon, store):
         yield config, daemon
-    finally:
-        stop.set()
-        thread.join()
-        store.close()
 
 
 def test_the_status_of_a_running_daemon_says_that_its_store_is_gone(tmp_path: Path) -> None:

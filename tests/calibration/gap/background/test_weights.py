@@ -15,7 +15,7 @@ from calibration.gap.joint_fit import Problem
 from calibration.identification.samples import averaged
 from calibration.identification.solve import solve
 from calibration.observations import Observations, parse_observations
-from calibration.run import DEFAULT_RUN
+from calibration.run_settings import DEFAULT_RUN
 from daemon.rig_files import load_rig
 from simulators.rig.truth import RigTruth
 from tests.simulated.observations import simulate_observations

@@ -9,7 +9,7 @@ from calibration.gap.background.widening import further_blocks
 from calibration.gap.joint_fit import Problem
 from calibration.identification.solve import solve
 from calibration.observations import parse_observations
-from calibration.run import DEFAULT_RUN
+from calibration.run_settings import DEFAULT_RUN
 from daemon.rig_files import load_rig
 from simulators.effects.base import Effect
 from simulators.effects.unknown import JointPairError, draw_surface

@@ -5,7 +5,7 @@ import pytest
 
 from calibration.design.visibility import Bodies
 from calibration.errors import RigError
-from calibration.evaluation.writers.dh_table import dh_text
+from calibration.export.formats.dh_csv import dh_text
 from calibration.kinematics.chain import Chain, Placement
 from calibration.rig.description import Rig, shipped_rig
 from calibration.rig.exchange.from_table import draft_of_table

@@ -7,7 +7,7 @@ import pytest
 
 from calibration.design.visibility import Bodies
 from calibration.errors import RigError
-from calibration.evaluation.writers.urdf_text import urdf_text
+from calibration.export.formats.urdf import urdf_text
 from calibration.kinematics.chain import Chain, Placement
 from calibration.rig.description import Rig, shipped_rig
 from calibration.rig.exchange.from_urdf import draft_of_urdf

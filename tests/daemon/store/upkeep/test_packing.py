@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import sqlite3
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,18 +13,6 @@ from daemon.store.reader import CHUNKS
 from daemon.store.upkeep.packing import Packing
 from drivers.readings import Capture
 from tests.daemon.store_support import at, frame, serial_bytes, table
-
-
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "rigcal.sqlite"
-
-
-@pytest.fixture
-def store(path: Path) -> Iterator[Store]:
-    store = Store(path)
-    yield store
-    store.close()
 
 
 def append(store: Store, captures: list[Capture], *, decoded: bool = True) -> None:

@@ -26,11 +26,6 @@ DAY_S = 86_400.0
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "rigcal.sqlite"
-
-
-@pytest.fixture
 def store(path: Path) -> Iterator[Store]:
     with contextlib.closing(Store(path)) as store:
         store.declare_channels({"theta1": "deg"}, {"valve": "mA"})

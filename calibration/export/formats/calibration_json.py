@@ -8,7 +8,7 @@ import numpy as np
 
 from calibration.design.accuracy import expected_accuracy
 from calibration.errors import UnsafeError
-from calibration.evaluation.exports import Export, Format, LeftOut
+from calibration.export.model_export import Export, Format, LeftOut
 from calibration.model.model import CalibratedModel
 
 

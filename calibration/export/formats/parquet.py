@@ -7,8 +7,8 @@ import io
 import numpy as np
 
 from calibration.errors import DataError
-from calibration.evaluation.export.corrections_csv import grid_left_out
-from calibration.evaluation.exports import Export, Format
+from calibration.export.formats.corrections_csv import grid_left_out
+from calibration.export.model_export import Export, Format
 
 
 def _content(export: Export) -> bytes:

@@ -8,9 +8,9 @@ from typing import Any, cast
 import numpy as np
 from scipy.io import savemat
 
-from calibration.evaluation.correction_grid import Machine, trained_ranges
-from calibration.evaluation.exports import Export, Format, without_parts
-from calibration.evaluation.writers.motions import motion_tree
+from calibration.export.correction_grid import Machine, trained_ranges
+from calibration.export.model_export import Export, Format, without_parts
+from calibration.export.motions import motion_tree
 
 _CHECKS = 20
 _USE = """\

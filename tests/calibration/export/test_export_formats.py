@@ -15,10 +15,10 @@ from calibration.effects.context import EffectContext
 from calibration.effects.fitted import Choice
 from calibration.effects.library import library, parse_effects
 from calibration.effects.regime import Regime
-from calibration.evaluation.correction_grid import Machine, trained_ranges
-from calibration.evaluation.export import chosen_formats, export_files
-from calibration.evaluation.export.c_header import written_effects
-from calibration.evaluation.exports import Export, without_parts
+from calibration.export.correction_grid import Machine, trained_ranges
+from calibration.export.formats import chosen_formats, export_files
+from calibration.export.formats.c_header import written_effects
+from calibration.export.model_export import Export, without_parts
 from calibration.kinematics.chain import Chain, Placement
 from calibration.model.model import CalibratedModel
 from calibration.rig.exchange.from_table import draft_of_table

@@ -10,7 +10,7 @@ import io
 
 import numpy as np
 
-from calibration.evaluation.exports import GRID_FILE, Export, Format, LeftOut
+from calibration.export.model_export import GRID_FILE, Export, Format, LeftOut
 
 _DECIMALS = 4  # of mm
 

@@ -19,7 +19,7 @@ from calibration.effects.fitted import FittedEffect
 from calibration.effects.library import library
 from calibration.effects.links import LinkFamily
 from calibration.effects.load_shapes import LoadShapes, gravity_shapes, part_names
-from calibration.evaluation.writers.motions import Carriers
+from calibration.export.motions import Carriers
 from calibration.kinematics.torques import MASS_SIGMA, STANDARD_GRAVITY
 from calibration.observations import Floats
 from calibration.rig.description import Rig

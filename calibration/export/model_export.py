@@ -12,7 +12,7 @@ import numpy as np
 from calibration.design.knowledge import setup_of
 from calibration.effects.fitted import FittedEffect
 from calibration.effects.library import library
-from calibration.evaluation.correction_grid import CorrectionGrid, Machine, correction_grid, trained_ranges
+from calibration.export.correction_grid import CorrectionGrid, Machine, correction_grid, trained_ranges
 from calibration.model.model import CalibratedModel
 
 GRID_FILE = "corrections.csv"

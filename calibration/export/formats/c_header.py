@@ -1,4 +1,8 @@
-"""A model as one C99 header: forward kinematics with effects, and the inverse; no library but the standard one."""
+"""rigcal_model.h: forward kinematics with effects, and the inverse, as C99 for a controller.
+
+It needs no library but the standard one. The learned residual is left out
+(docs/decisions/0032-models-for-other-tools.md).
+"""
 
 from __future__ import annotations
 
@@ -8,9 +12,15 @@ from importlib import resources
 
 import numpy as np
 
+from calibration.effects.context import EffectContext
 from calibration.effects.fitted import FittedEffect
-from calibration.evaluation.writers.c_effects import EffectCode, EffectWriter
-from calibration.evaluation.writers.motions import Carriers
+from calibration.effects.library import library
+from calibration.export.c_effects import EffectCode, EffectWriter
+from calibration.export.correction_grid import Machine
+from calibration.export.model_export import Export, Format, LeftOut
+from calibration.export.motions import Carriers, carriers, motion_tree
+from calibration.kinematics.torques import GravityModel
+from calibration.model.prediction import Predictor
 from calibration.observations import Floats
 from calibration.rig.description import Rig
 
@@ -21,42 +31,6 @@ _USE = """\
    rigcal_inverse(count, prism, target, in, q) for the commands that bring prisms to targets. C99, no memory is taken,
    nothing is kept between calls: any number of threads may call. Joints, in the order of q:
 """
-
-
-def c_header(
-    writer: EffectWriter,
-    down: Floats,
-    effects: Sequence[FittedEffect],
-    remarks: Sequence[str],
-) -> str:
-    """Return the header.
-
-    Args:
-        writer: of the model's effects; gives the rig and its motions.
-        down: (3,) unit vector of gravity in the base frame.
-        effects: those to write; `EffectWriter.can_write` is True of each.
-        remarks: for the comment at its head.
-    """
-    rig, tree = writer.context.rig, writer.tree
-    code = writer.code(dict(enumerate(effects, 1)))
-    engine = resources.files("calibration.evaluation.writers").joinpath(_ENGINE).read_text(encoding="utf-8")
-    joints = "".join(
-        f"     {i}  {j.name}, {j.unit}, {j.limits[0]:g} .. {j.limits[1]:g}\n" for i, j in enumerate(rig.joints)
-    )
-    prisms = "".join(f"     {i}  {name}\n" for i, name in enumerate(rig.prism_names))
-    told = "\n   ".join(line for remark in remarks for line in remark.split("\n")).replace("*/", "* /")
-    head = (
-        f"/* {told}\n\n{_USE}{joints}   Prisms, in the order of the places:\n{prisms}*/\n\n"
-        "#ifndef RIGCAL_MODEL_H\n#define RIGCAL_MODEL_H\n\n#include <math.h>\n#include <stddef.h>\n\n"
-    )
-    return (
-        head
-        + _sizes(rig, tree)
-        + _inputs(code)
-        + "\n".join(_tables(rig, tree, down, code))
-        + "\n\n"
-        + _with_effects(engine, code)
-    )
 
 
 def _with_effects(engine: str, code: EffectCode) -> str:
@@ -139,3 +113,62 @@ def _rows(name: str, size: str, rows: Sequence[Iterable[float]], kind: str = "do
 
 def _numbers(kind: str, values: Iterable[float]) -> str:
     return ", ".join(repr(int(v) if kind == "int" else float(v)) for v in values)
+
+
+def _context(export: Export) -> EffectContext:
+    """Return a pose of the machine as effects see it; the shapes of uncertain loads are of its work volume."""
+    model = export.model
+    rows = Machine(model, export.setup).rows(model.rig.prism_names[0], np.zeros((1, len(model.rig.joints))))
+    return Predictor.of(model).context(rows)
+
+
+def _writer(export: Export) -> EffectWriter:
+    return EffectWriter(_context(export), carriers(motion_tree(export.model.chain, export.model.values)))
+
+
+def written_effects(export: Export) -> tuple[FittedEffect, ...]:
+    """Return the effects of a model that the header has."""
+    writer = _writer(export)
+    moving = [effect for effect in export.model.effects if library()[effect.family].moves_machine]
+    return tuple(effect for effect in moving if writer.can_write(effect))
+
+
+def _left_out(export: Export) -> LeftOut:
+    kept = written_effects(export)
+    return export.without(lambda effect: effect in kept)
+
+
+def _content(export: Export) -> bytes:
+    """Return the header: comment, sizes, inputs of the caller, tables, and the program with its effects."""
+    writer = _writer(export)
+    rig, tree = writer.context.rig, writer.tree
+    down = GravityModel(export.model.chain, export.model.values).down[export.setup]
+    code = writer.code(dict(enumerate(written_effects(export), 1)))
+    remarks = export.heading(_left_out(export))
+    engine = resources.files("calibration.export").joinpath(_ENGINE).read_text(encoding="utf-8")
+    joints = "".join(
+        f"     {i}  {j.name}, {j.unit}, {j.limits[0]:g} .. {j.limits[1]:g}\n" for i, j in enumerate(rig.joints)
+    )
+    prisms = "".join(f"     {i}  {name}\n" for i, name in enumerate(rig.prism_names))
+    told = "\n   ".join(line for remark in remarks for line in remark.split("\n")).replace("*/", "* /")
+    head = (
+        f"/* {told}\n\n{_USE}{joints}   Prisms, in the order of the places:\n{prisms}*/\n\n"
+        "#ifndef RIGCAL_MODEL_H\n#define RIGCAL_MODEL_H\n\n#include <math.h>\n#include <stddef.h>\n\n"
+    )
+    return (
+        head
+        + _sizes(rig, tree)
+        + _inputs(code)
+        + "\n".join(_tables(rig, tree, down, code))
+        + "\n\n"
+        + _with_effects(engine, code)
+    ).encode()
+
+
+FORMAT = Format(
+    "c-header",
+    "rigcal_model.h",
+    "forward kinematics with effects, and the inverse, as one C99 file",
+    _content,
+    _left_out,
+)

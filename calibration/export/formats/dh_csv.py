@@ -1,4 +1,4 @@
-"""A rig's rows at its parameters as a Denavit-Hartenberg table (CSV), which `rigcal rig import` reads back."""
+"""dh.csv: the identified constants as a Denavit-Hartenberg table, mm and deg, which `rigcal rig import` reads too."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import io
 import math
 from collections.abc import Sequence
 
+from calibration.export.model_export import Export, Format
 from calibration.kinematics.chain import ROW_ORDER, Chain
 from calibration.observations import Floats
 from calibration.rig.exchange.from_table import BEFORE, CONSTANTS, DRIVES, JOINT, PRISM
@@ -54,3 +55,13 @@ def dh_text(chain: Chain, x: Floats, remarks: Sequence[str]) -> str:
 
 def _number(value: float) -> str:
     return repr(float(value) + 0.0).removesuffix(".0")
+
+
+def _content(export: Export) -> bytes:
+    model = export.model
+    return dh_text(model.chain, model.values, export.heading(export.kinematics_alone)).encode()
+
+
+FORMAT = Format(
+    "dh-csv", "dh.csv", "the identified Denavit-Hartenberg constants", _content, lambda export: export.kinematics_alone
+)

@@ -7,7 +7,7 @@ import pkgutil
 from collections.abc import Mapping, Sequence
 
 from calibration.errors import DataError
-from calibration.evaluation.exports import Export, Format
+from calibration.export.model_export import Export, Format
 
 
 def formats() -> Mapping[str, Format]:

@@ -12,11 +12,11 @@ from calibration.effects.context import EffectContext
 from calibration.effects.fitted import Choice
 from calibration.effects.library import library, parse_effects
 from calibration.errors import DataError
-from calibration.evaluation import export as folder
-from calibration.evaluation.correction_grid import correction_grid, interpolated
-from calibration.evaluation.export import export_files, formats
-from calibration.evaluation.export.calibration_json import document
-from calibration.evaluation.exports import Export
+from calibration.export import formats as folder
+from calibration.export.correction_grid import correction_grid, interpolated
+from calibration.export.formats import export_files, formats
+from calibration.export.formats.calibration_json import document
+from calibration.export.model_export import Export
 from calibration.kinematics.chain import Chain, Placement
 from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor
@@ -133,7 +133,7 @@ def test_what_makes_no_grid_is_refused(session: Session) -> None:
 
 
 PARAMETERS_TXT = """
-from calibration.evaluation.exports import Export, Format
+from calibration.export.model_export import Export, Format
 
 def content(export: Export) -> bytes:
     return "\\n".join(p.name for p in export.model.parameters).encode()

@@ -1,4 +1,7 @@
-"""A rig as URDF: joints, couplings as mimic joints, prisms as links, masses; lengths m, angles rad."""
+"""model.urdf: the identified kinematics as URDF, for ROS, pinocchio, MoveIt and others; lengths m, angles rad.
+
+Couplings are mimic joints, prisms are links.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,8 @@ from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
-from calibration.evaluation.writers.motions import Motion, MotionTree, motion_tree
+from calibration.export.model_export import Export, Format
+from calibration.export.motions import Motion, MotionTree, motion_tree
 from calibration.kinematics.chain import Chain
 from calibration.observations import Floats
 from calibration.rig.description import Joint, Rig
@@ -22,19 +26,7 @@ _OWN = 1e-12  # a coefficient that near to 1 is the joint itself
 def urdf_text(chain: Chain, x: Floats, remarks: Sequence[str]) -> str:
     """Return a rig at parameters `x` (p,) as a URDF document, with remarks in a comment at its head."""
     body = "\n".join(f"  {line}" for line in urdf_elements(chain, x))
-    return f'<?xml version="1.0"?>\n{_comment(remarks)}<robot name={quoteattr(chain.rig.name)}>\n{body}\n</robot>\n'
-
-
-def xacro_text(chain: Chain, x: Floats, remarks: Sequence[str]) -> str:
-    """Return the same as a xacro document: a macro with a prefix of all names and a parent link, used once."""
-    macro = "rigcal_rig"
-    body = "\n".join(f"    {line}" for line in urdf_elements(chain, x, "${prefix}"))
-    return (
-        f'<?xml version="1.0"?>\n{_comment(remarks)}'
-        f'<robot name={quoteattr(chain.rig.name)} xmlns:xacro="http://www.ros.org/wiki/xacro">\n'
-        f'  <xacro:macro name="{macro}" params="prefix">\n{body}\n  </xacro:macro>\n'
-        f'  <xacro:arg name="prefix" default=""/>\n  <xacro:{macro} prefix="$(arg prefix)"/>\n</robot>\n'
-    )
+    return f'<?xml version="1.0"?>\n{xml_comment(remarks)}<robot name={quoteattr(chain.rig.name)}>\n{body}\n</robot>\n'
 
 
 def urdf_elements(chain: Chain, x: Floats, prefix: str = "") -> Iterator[str]:
@@ -48,7 +40,8 @@ def urdf_elements(chain: Chain, x: Floats, prefix: str = "") -> Iterator[str]:
     return iter(_Elements(chain.rig, motion_tree(chain, x), prefix).lines)
 
 
-def _comment(remarks: Sequence[str]) -> str:
+def xml_comment(remarks: Sequence[str]) -> str:
+    """Return remarks as a comment of XML; empty for none."""
     text = "\n".join(remarks).replace("--", "- -")  # ends a comment in XML
     return f"<!--\n{text}\n-->\n" if remarks else ""
 
@@ -194,3 +187,17 @@ def _origin(transform: Floats) -> str:
 
 def _number(value: float) -> str:
     return repr(float(value) + 0.0).removesuffix(".0")
+
+
+def _content(export: Export) -> bytes:
+    model = export.model
+    return urdf_text(model.chain, model.values, export.heading(export.kinematics_alone)).encode()
+
+
+FORMAT = Format(
+    "urdf",
+    "model.urdf",
+    "the identified kinematics for ROS, pinocchio and others",
+    _content,
+    lambda export: export.kinematics_alone,
+)

@@ -1,1 +1,0 @@
-"""Kinematics as other programs take them: text of URDF, Denavit-Hartenberg tables and C."""

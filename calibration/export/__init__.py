@@ -1,0 +1,1 @@
+"""Export of models: formats, one a file in `formats`, and beside them what several formats share."""
