@@ -18,7 +18,7 @@ from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S
 from tests.soak.consistency import inconsistencies, untruths
 from tests.soak.daemon_process import DaemonProcess, Usage
-from tests.soak.evidence import Watch, judge
+from tests.soak.evidence import Watch, judge, turning, without_session
 from tests.soak.faults import LINK, STATION, Mischief
 from tests.soak.losses import account, read_wire_log, stored_gaps, stored_items
 from tests.soak.memory import growth
@@ -103,13 +103,14 @@ def soak(directory: Path, minutes: float, rate: float, seed: int) -> Report:
         }
         faults = inconsistencies(reader)
         observations, examples = untruths(reader, machine, wire, rate)
+        unwatched = [*mischief.blackouts, *without_session(reader, until_ns), *turning(rig.turns_ns)]
     return Report(
         minutes=minutes,
         rate=rate,
         seed=seed,
         accounts=accounts,
         growth=growth(samples, WARM_UP_S * min(1.0, minutes / USUAL_MINUTES)),
-        verdicts=judge(watch.cases, mischief.blackouts, rate, until_ns),
+        verdicts=judge(watch.cases, unwatched, rate, until_ns),
         inconsistencies=faults,
         observations=observations,
         examples=examples,

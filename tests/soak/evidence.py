@@ -16,9 +16,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from daemon.commands import CommandError
+from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S
 from tests.soak.daemon_process import DaemonProcess
-from tests.soak.rig_process import RigProcess
+from tests.soak.rig_process import SETTLED_S, RigProcess
 
 DEADLINE_S = 5.0
 LOOK_REAL_S = 0.15  # how often the store is looked at
@@ -26,6 +27,7 @@ ASK_REAL_S = 1.0  # how often `status` is asked for
 ALARMS_REAL_S = 1.0  # how often the daemon looks for alarms
 WAIT_NS = 40 * NS_PER_S  # how long evidence is looked for, to tell late from never
 JUST_BEFORE_NS = NS_PER_S // 5
+SESSION = "session"  # in place of a link's name
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,7 @@ class Case:
         link: whose loss would hide it.
         at_ns: when it began.
         expected: any of these will do.
+        of_session: it is shown only while a session is open.
         found: what has shown it.
     """
 
@@ -85,6 +88,7 @@ class Case:
     link: str
     at_ns: int
     expected: tuple[Expected, ...]
+    of_session: bool = False
     found: Fact | None = None
 
     def shows(self, fact: Fact) -> bool:
@@ -227,7 +231,11 @@ def _newest(db: sqlite3.Connection, table: str) -> int:
 
 @dataclass(frozen=True)
 class Blackout:
-    """A stretch in which faults on a link (`*`: any) could not be seen, because the link or the daemon was away."""
+    """A stretch in which faults on a link could not be seen, because the link or the daemon was away.
+
+    Of the link `*` it is for faults on any, of `SESSION` for those that only a station shows that stands on the prism
+    of an open session: none was open, or the station was turning.
+    """
 
     link: str
     from_ns: int
@@ -251,13 +259,30 @@ class Verdict:
     never: int
 
 
+def without_session(reader: Reader, end_ns: int) -> list[Blackout]:
+    """The stretches until `end_ns` in which no session was open."""
+    sessions = reader.rows("SELECT started_monotonic_ns, ended_monotonic_ns FROM calibration_sessions ORDER BY rowid")
+    found, since_ns = [], 0
+    for session in sessions:
+        found.append(Blackout(SESSION, since_ns, session["started_monotonic_ns"]))
+        since_ns = end_ns if session["ended_monotonic_ns"] is None else session["ended_monotonic_ns"]
+    return [*found, Blackout(SESSION, since_ns, end_ns)]
+
+
+def turning(turns_ns: Sequence[int]) -> list[Blackout]:
+    """The stretches in which the station turned: it had no lock to lose, or would soon find another."""
+    return [Blackout(SESSION, at_ns, at_ns + round(SETTLED_S * NS_PER_S)) for at_ns in turns_ns]
+
+
 def judge(cases: Sequence[Case], blackouts: Sequence[Blackout], rate: float, end_ns: int) -> dict[str, Verdict]:
     """Fault's name -> verdict. Faults of the last seconds before `end_ns` are not judged."""
     margin_ns = round(DEADLINE_S * NS_PER_S)
 
     def is_masked(case: Case) -> bool:
         return case.at_ns > end_ns - 2 * margin_ns or any(
-            b.link in ("*", case.link) and b.from_ns <= case.at_ns + margin_ns and b.to_ns >= case.at_ns - NS_PER_S
+            (b.link in ("*", case.link) or (b.link == SESSION and case.of_session))
+            and b.from_ns <= case.at_ns + margin_ns
+            and b.to_ns >= case.at_ns - NS_PER_S
             for b in blackouts
         )
 

@@ -45,6 +45,7 @@ class RigProcess:
         rig_file: describes it.
         can_port, station_port, wire_log: see `simulators.live` and `simulators.wire_log`.
         aimed: what the station was last told to turn to.
+        turns_ns: when it was told to turn, on the rig's clock.
     """
 
     def __init__(self, directory: Path, rate: float, seed: int) -> None:
@@ -53,7 +54,8 @@ class RigProcess:
         stamp = self.clock.origin
         self.origin = f"{stamp.utc_ns},{stamp.monotonic_ns},{stamp.boot_id}"
         self.can_port, self.station_port, self.wire_log = directory / "can", directory / "station", directory / "wire"
-        self.aimed, self._aimed_ns = "", 0
+        self.aimed = ""
+        self.turns_ns: list[int] = []
         self._aiming = threading.Lock()
         self.rig_file = _write_rig(directory)
         command = [sys.executable, "-m", "simulators", "--rig", str(self.rig_file), "--seed", str(seed)]
@@ -98,11 +100,12 @@ class RigProcess:
 
     def _aim(self, target: str) -> None:
         self.do("aim", target=target)
-        self.aimed, self._aimed_ns = target, self.now_ns()
+        self.aimed = target
+        self.turns_ns.append(self.now_ns())
 
     def has_settled(self) -> bool:
         """Whether the station is where it was last told to turn to, and was told so some seconds ago."""
-        return self.tracked() == self.aimed and self.now_ns() - self._aimed_ns > SETTLED_S * NS_PER_S
+        return self.tracked() == self.aimed and self.now_ns() - self.turns_ns[-1] > SETTLED_S * NS_PER_S
 
     def tracked(self) -> str | None:
         """What the station is locked on, as whoever looks through the telescope sees."""

@@ -12,7 +12,7 @@ import pytest
 from calibration.rig.description import shipped_rig
 from daemon.store.reader import Reader
 from daemon.store.store import Store
-from drivers.clock import NS_PER_S, Stamp
+from drivers.clock import NS_PER_S, ScaledClock, Stamp, SystemClock
 from drivers.readings import CanCapture
 from simulators.devices.can.bus import Frame
 from simulators.faults import KINDS
@@ -20,7 +20,7 @@ from simulators.wire_log import WireLog
 from tests.soak.__main__ import main
 from tests.soak.consistency import inconsistencies, untruths
 from tests.soak.daemon_process import Usage
-from tests.soak.evidence import Blackout, Case, Fact, judge
+from tests.soak.evidence import SESSION, Blackout, Case, Fact, judge, without_session
 from tests.soak.faults import ALARMS, EVIDENCE
 from tests.soak.losses import Gap, Item, Wire, account, read_wire_log, stored_items
 from tests.soak.memory import growth
@@ -223,6 +223,23 @@ def test_sessions_and_observations_that_do_not_fit_together_are_found(store: Sto
     ]
 
 
+def test_what_only_a_session_shows_is_judged_while_one_is_open(store: Store) -> None:
+    add_session(store, "s1", 100.0, 150.0)
+    store.close()
+    with Reader(store.path) as reader:
+        unwatched = without_session(reader, 200 * NS_PER_S)
+    turn = [Blackout(SESSION, 130 * NS_PER_S, 133 * NS_PER_S)]
+
+    def never(at_s: float, blackouts: Sequence[Blackout]) -> int:
+        case = node_silent(at_s)
+        case.of_session = True
+        return judge([case], blackouts, RATE, 200 * NS_PER_S)["node_silent"].never
+
+    assert [never(at_s, unwatched) for at_s in (80.0, 120.0, 148.0, 170.0)] == [0, 1, 0, 0]
+    assert [never(at_s, unwatched + turn) for at_s in (120.0, 128.0, 132.0, 140.0)] == [1, 0, 0, 1]
+    assert judge([node_silent(80.0)], unwatched, RATE, 200 * NS_PER_S)["node_silent"].never == 1
+
+
 def test_a_rig_that_nobody_measured_has_no_observations(store: Store) -> None:
     store.close()
     with Reader(store.path) as reader:
@@ -247,7 +264,9 @@ class ToldToAim(RigProcess):
 
     def __init__(self) -> None:
         self.aimed, self._aiming = "r", threading.Lock()
+        self.clock = ScaledClock(RATE, SystemClock().now())
         self.told: list[str] = []
+        self.turns_ns: list[int] = []
         self.other = threading.Thread(target=self.aim, args=("s",))
 
     def do(self, what: str, **arguments: object) -> dict[str, object]:
