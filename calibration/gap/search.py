@@ -294,7 +294,7 @@ def _in_regimes(problem: Problem, families: Collection[str], found: SearchResult
         starts.append(replace(alone, fit=replace(alone.fit, weight=np.ones_like(alone.fit.weight))))
     with_formulas: float | None = None
     for start in starts:
-        one = effect_in_regime(problem, start, families, like)
+        one = effect_in_regime(problem, start, families, like, least_cost - _REGIME)
         if one is None or least_cost - one.joint.fit.cost < _REGIME:
             continue
         with_formulas = _cost_with_formulas(problem, found) if with_formulas is None else with_formulas
