@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from calibration.effects.columns import joined
 from calibration.effects.fitted import Choice
 from calibration.gap.adoption import Adopted, adopted
 from calibration.gap.background.blocks import displacement_blocks, possible_blocks, smooth_blocks, time_blocks
@@ -24,7 +25,7 @@ from calibration.gap.projection import Projection, follows_path
 from calibration.gap.regimes import EffectInRegime, effect_in_regime
 from calibration.gap.reselection import explain_outliers, reselect
 from calibration.gap.screening import ScoredEffect, Screen, by_family
-from calibration.gap.search_result import COMPARED, STRUCTURE, SearchResult, SelectionStep, conclude
+from calibration.gap.search_result import COMPARED, STRUCTURE, SearchResult, SelectionStep, closes_gap, conclude
 from calibration.gap.selection import Selection, select_effect
 from calibration.identification.reading_steps import in_true_steps
 from calibration.identification.refinement import Prior, refine
@@ -128,7 +129,7 @@ class _Search:
             steps.append(replace(alone, adopted=(choice,), posterior={choice.family: self.known.posterior}))
             projection, candidates = self._candidates(joint)
         pending: list[str] = []
-        count = 0
+        count, is_few = 0, True
         while True:
             selection = select_effect(self.problem, joint, projection, candidates)
             count += 1
@@ -158,6 +159,34 @@ class _Search:
             joint = selection.joint
             self.least_cost = min(self.least_cost, joint.fit.cost)
             projection, candidates = self._candidates(joint)
+            was_few, is_few = is_few, len({c.family for c in joint.choices}) < _MOST_FAMILIES
+            if was_few and not is_few and not self._may_explain(joint, alone, projection, candidates):
+                early = self._structured(joint, alone, steps, (), posterior, initial)
+                if early is not None:
+                    return early
+        return self._judged(joint, alone, steps, selection, posterior, pending, initial)
+
+    def _judged(
+        self,
+        joint: JointFit,
+        alone: SelectionStep,
+        steps: list[SelectionStep],
+        selection: Selection,
+        posterior: dict[str, float],
+        pending: Sequence[str],
+        candidates: CandidateEffects,
+    ) -> SearchResult:
+        """Return the result of a search that has come to its end, every effect judged again given all others.
+
+        Args:
+            joint: kinematics and effects.
+            alone: kinematics alone.
+            steps: in their order.
+            selection: the last one.
+            posterior: as of `conclude`.
+            pending: `family@where` of the effects that were adopted for the time being.
+            candidates: all candidates at the beginning.
+        """
         alternatives = selection.alternatives
         for name in pending:
             joint, judged, members = self._judged_again(joint, name)
@@ -173,7 +202,25 @@ class _Search:
             posterior |= {str(c): judged.posterior[c.family] for c in judged.adopted}
         joint = explain_outliers(self.problem, joint)
         self.least_cost = min(self.least_cost, joint.fit.cost)
-        return conclude(self.problem, joint, alone, steps, alternatives, selection.formulas, posterior, initial)
+        return conclude(self.problem, joint, alone, steps, alternatives, selection.formulas, posterior, candidates)
+
+    def _may_explain(
+        self,
+        joint: JointFit,
+        alone: SelectionStep,
+        projection: Projection,
+        candidates: Sequence[CandidateEffect],
+    ) -> bool:
+        """True if the candidates that a fit lacks, together with a few formulas, may explain what it leaves."""
+        every = Screen(projection, candidates).score()
+        choices = [*joint.choices, *(scored.choice for scored in every)]
+        more = joined([scored.scaled_additions for scored in every], len(projection.samples))
+        tried = self.problem.fit(choices, projection.solved(more))
+        final, weight = Grammar(self.problem.project(tried)), self.problem.solution.fit.weight
+        is_structured = detect(final, self.problem.rng()).significant
+        if not closes_gap(alone.projection, final.projection, weight, is_structured=is_structured):
+            return False
+        return not is_structured or _formulas_suffice(self.problem, tried, final.find(1))
 
     def _structured(
         self,
@@ -193,7 +240,7 @@ class _Search:
         if len(joint.choices) < 2:  # there is nothing to judge again
             return None
         found = conclude(self.problem, joint, alone, steps, (), formulas, posterior, candidates)
-        if found.joint.choices or _formulas_suffice(self.problem, found):
+        if found.joint.choices or _formulas_suffice(self.problem, found.joint, _strongest(found)):
             return None
         return replace(found, needs_background=True)
 
@@ -395,7 +442,7 @@ def _names(
         names = names_beside(problem, smooth, families, known)
         left = background_log_bayes_factor(problem, names.joint, wide)
         return replace(names, background_log_bayes_factor=left), ()
-    if not found.needs_background and _formulas_suffice(problem, found):
+    if not found.needs_background and _formulas_suffice(problem, found.joint, _strongest(found)):
         further, formulas = _strongest(found), tuple[Formula, ...]()
         for _ in range(_FORMULAS):
             formulas += tuple(f for f in further if not is_in_library(f, found.candidates.candidates, found.initial))
@@ -411,11 +458,10 @@ def _strongest(found: SearchResult) -> tuple[Formula, ...]:
     return (found.outside_library or found.final.find())[:1]
 
 
-def _formulas_suffice(problem: Problem, found: SearchResult) -> bool:
-    """True if a few formulas explain all that the effects of a result leave, be they effects in words or not."""
-    formulas = _strongest(found)
+def _formulas_suffice(problem: Problem, joint: JointFit, formulas: tuple[Formula, ...]) -> bool:
+    """True if a few formulas more explain all that effects leave, be they effects of the library in words or not."""
     for _ in range(_FORMULAS):
-        further = what_is_left(problem, found.joint, formulas)
+        further = what_is_left(problem, joint, formulas)
         if not further:
             return True
         formulas += further
