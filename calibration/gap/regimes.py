@@ -31,6 +31,7 @@ _MOST_FORMS = 40  # of a candidate: one with more is a step at any time
 _FITTED = 8  # effects that are fitted at a time
 _ROUNDS = 2
 _PASSES = 3  # of a border and the fit that it depends on
+_ON_THE_WAY = 0.5  # of what an effect has to gain: the best of the first round have more
 _OUTLIER = 6.0  # median errors: more is no worse
 _HALF = 0.5
 _AT_ONCE = 1_000_000  # values of products: more than the caches hold costs time, and gigabytes where there are many
@@ -60,7 +61,11 @@ class EffectInRegime:
 
 
 def effect_in_regime(
-    problem: Problem, joint: JointFit, families: Collection[str], like: Sequence[CandidateEffect] = ()
+    problem: Problem,
+    joint: JointFit,
+    families: Collection[str],
+    like: Sequence[CandidateEffect] = (),
+    most_cost: float = math.inf,
 ) -> EffectInRegime | None:
     """Return the effect of greatest evidence in a part of the data, where that is beyond doubt.
 
@@ -69,10 +74,12 @@ def effect_in_regime(
         joint: kinematics and effects that are there, with the weights that count; one of the same name gives way.
         families: of effects that may be there.
         like: candidates about another fit, most of whose columns are the same.
+        most_cost: a fit of greater cost is of no use, nats.
 
     Returns:
-        The effect; None where nothing is certain.
+        The effect; None where nothing is certain, or of use.
     """
+    needed = joint.fit.cost - most_cost
     fitted: dict[str, _Fitted] = {}
     about = problem.project(joint)
     for _ in range(_ROUNDS):
@@ -83,6 +90,8 @@ def effect_in_regime(
         if not fitted:
             return None
         best = min(fitted.values(), key=lambda own: own.joint.fit.cost)
+        if joint.fit.cost - best.joint.fit.cost < _ON_THE_WAY * needed:
+            return None
         # What is near in the noise that kinematics leave may be far apart in the noise that the true effect leaves.
         about = problem.project(best.joint, without_last=True)
     cost = [own.joint.fit.cost for own in fitted.values() if not own.joint.beyond(len(own.joint.choices) - 1)]

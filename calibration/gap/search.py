@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from calibration.effects.columns import joined
 from calibration.effects.fitted import Choice
 from calibration.gap.adoption import Adopted, adopted
 from calibration.gap.background.blocks import displacement_blocks, possible_blocks, smooth_blocks, time_blocks
@@ -15,7 +16,7 @@ from calibration.gap.background.breaks import find_break
 from calibration.gap.background.naming import Names, evidence_alone, names_beside
 from calibration.gap.background.outside import formula_block, is_in_library, what_is_left
 from calibration.gap.background.search import background_log_bayes_factor
-from calibration.gap.candidates import CandidateEffect, candidate_effects
+from calibration.gap.candidates import CandidateEffect, CandidateEffects, candidate_effects
 from calibration.gap.criteria import best_of_each_family, beyond_doubt
 from calibration.gap.detection import detect
 from calibration.gap.formulas.grammar import Formula, Grammar
@@ -24,7 +25,7 @@ from calibration.gap.projection import Projection, follows_path
 from calibration.gap.regimes import EffectInRegime, effect_in_regime
 from calibration.gap.reselection import explain_outliers, reselect
 from calibration.gap.screening import ScoredEffect, Screen, by_family
-from calibration.gap.search_result import COMPARED, STRUCTURE, SearchResult, SelectionStep, conclude
+from calibration.gap.search_result import COMPARED, STRUCTURE, SearchResult, SelectionStep, closes_gap, conclude
 from calibration.gap.selection import Selection, select_effect
 from calibration.identification.reading_steps import in_true_steps
 from calibration.identification.refinement import Prior, refine
@@ -128,20 +129,28 @@ class _Search:
             steps.append(replace(alone, adopted=(choice,), posterior={choice.family: self.known.posterior}))
             projection, candidates = self._candidates(joint)
         pending: list[str] = []
-        count = 0
+        count, is_few = 0, True
         while True:
             selection = select_effect(self.problem, joint, projection, candidates)
             count += 1
             is_set = selection.kind == "set" and len(pending) < _PENDING
+            is_last = selection.joint is None or count > _STEPS or not (is_set or selection.kind == "adopt")
             taken = () if selection.joint is None else selection.joint.choices[len(joint.choices) :]
+            step = _step(joint, projection, selection, taken if selection.kind == "adopt" else ())
             reselected = self._reselected(joint, taken) if count < _STEPS else joint
+            if reselected is joint and not taken and count < _STEPS:
+                early = self._structured(joint, alone, [*steps, step], selection.formulas, posterior, initial)
+                if early is not None:
+                    return early
+                # One that explains outliers as well may be better where nothing more is taken.
+                reselected = explain_outliers(self.problem, joint)
             if reselected is not joint:
                 joint = reselected
                 projection, candidates = self._candidates(joint)
                 continue
             if not is_set:
-                steps.append(_step(joint, projection, selection, taken if selection.kind == "adopt" else ()))
-            if selection.joint is None or count > _STEPS or not (is_set or selection.kind == "adopt"):
+                steps.append(step)
+            if is_last or selection.joint is None:
                 break
             # The first of a set is adopted for the time being: others may stand out in addition to it.
             if is_set:
@@ -150,22 +159,90 @@ class _Search:
             joint = selection.joint
             self.least_cost = min(self.least_cost, joint.fit.cost)
             projection, candidates = self._candidates(joint)
+            was_few, is_few = is_few, len({c.family for c in joint.choices}) < _MOST_FAMILIES
+            if was_few and not is_few and not self._may_explain(joint, alone, projection, candidates):
+                early = self._structured(joint, alone, steps, (), posterior, initial)
+                if early is not None:
+                    return early
+        return self._judged(joint, alone, steps, selection, posterior, pending, initial)
+
+    def _judged(
+        self,
+        joint: JointFit,
+        alone: SelectionStep,
+        steps: list[SelectionStep],
+        selection: Selection,
+        posterior: dict[str, float],
+        pending: Sequence[str],
+        candidates: CandidateEffects,
+    ) -> SearchResult:
+        """Return the result of a search that has come to its end, every effect judged again given all others.
+
+        Args:
+            joint: kinematics and effects.
+            alone: kinematics alone.
+            steps: in their order.
+            selection: the last one.
+            posterior: as of `conclude`.
+            pending: `family@where` of the effects that were adopted for the time being.
+            candidates: all candidates at the beginning.
+        """
         alternatives = selection.alternatives
         for name in pending:
-            joint, step, members = self._judged_again(joint, name)
-            if step is not None and step.adopted:
-                steps.insert(-1, step)
-                posterior |= {str(c): step.posterior[c.family] for c in step.adopted}
-            elif step is not None and members and not alternatives:
-                steps[-1], alternatives = step, members
+            joint, judged, members = self._judged_again(joint, name)
+            if judged is not None and judged.adopted:
+                steps.insert(-1, judged)
+                posterior |= {str(c): judged.posterior[c.family] for c in judged.adopted}
+            elif judged is not None and members and not alternatives:
+                steps[-1], alternatives = judged, members
         certain = [str(c) for c in joint.choices if str(c) not in pending and c.regime is None]
         joint, renamed = self._renamed(joint, certain)
-        for step in renamed:
-            steps.insert(-1, step)
-            posterior |= {str(c): step.posterior[c.family] for c in step.adopted}
+        for judged in renamed:
+            steps.insert(-1, judged)
+            posterior |= {str(c): judged.posterior[c.family] for c in judged.adopted}
         joint = explain_outliers(self.problem, joint)
         self.least_cost = min(self.least_cost, joint.fit.cost)
-        return conclude(self.problem, joint, alone, steps, alternatives, selection.formulas, posterior, initial)
+        return conclude(self.problem, joint, alone, steps, alternatives, selection.formulas, posterior, candidates)
+
+    def _may_explain(
+        self,
+        joint: JointFit,
+        alone: SelectionStep,
+        projection: Projection,
+        candidates: Sequence[CandidateEffect],
+    ) -> bool:
+        """True if the candidates that a fit lacks, together with a few formulas, may explain what it leaves."""
+        every = Screen(projection, candidates).score()
+        choices = [*joint.choices, *(scored.choice for scored in every)]
+        more = joined([scored.scaled_additions for scored in every], len(projection.samples))
+        tried = self.problem.fit(choices, projection.solved(more))
+        final, weight = Grammar(self.problem.project(tried)), self.problem.solution.fit.weight
+        is_structured = detect(final, self.problem.rng()).significant
+        if not closes_gap(alone.projection, final.projection, weight, is_structured=is_structured):
+            return False
+        return not is_structured or _formulas_suffice(self.problem, tried, final.find(1))
+
+    def _structured(
+        self,
+        joint: JointFit,
+        alone: SelectionStep,
+        steps: Sequence[SelectionStep],
+        formulas: tuple[Formula, ...],
+        posterior: Mapping[str, float],
+        candidates: CandidateEffects,
+    ) -> SearchResult | None:
+        """Return the result where more is left than effects and formulas explain, None where they may explain it all.
+
+        Names are sought beside a background then, and which effects seemed likely without one does not matter any more.
+        Arguments are those of `conclude`.
+        """
+        self.least_cost = min(self.least_cost, joint.fit.cost)
+        if len(joint.choices) < 2:  # there is nothing to judge again
+            return None
+        found = conclude(self.problem, joint, alone, steps, (), formulas, posterior, candidates)
+        if found.joint.choices or _formulas_suffice(self.problem, found.joint, _strongest(found)):
+            return None
+        return replace(found, needs_background=True)
 
     def _candidates(self, joint: JointFit) -> tuple[Projection, tuple[CandidateEffect, ...]]:
         """Return the projection about a fit, and the candidates that may be missing in it."""
@@ -182,12 +259,10 @@ class _Search:
     def _reselected(self, joint: JointFit, taken: Sequence[Choice]) -> JointFit:
         """Return the fit with its effects in their best forms, before those `taken` are added.
 
-        An effect may have a better form by now, all the more at the same place; and where nothing more is taken, one
-        that explains outliers as well.
+        An effect may have a better form by now, all the more at the same place.
         """
         places = {c.where for c in taken}
-        reselected = reselect(self.problem, joint, [c for c in joint.choices if not taken or c.where in places])
-        return reselected if taken or reselected is not joint else explain_outliers(self.problem, joint)
+        return reselect(self.problem, joint, [c for c in joint.choices if not taken or c.where in places])
 
     def _renamed(self, joint: JointFit, names: Sequence[str]) -> tuple[JointFit, list[SelectionStep]]:
         """Return the fit with other effects in place of those that were only the best before the others were known.
@@ -266,7 +341,7 @@ def _in_regimes(problem: Problem, families: Collection[str], found: SearchResult
         starts.append(replace(alone, fit=replace(alone.fit, weight=np.ones_like(alone.fit.weight))))
     with_formulas: float | None = None
     for start in starts:
-        one = effect_in_regime(problem, start, families, like)
+        one = effect_in_regime(problem, start, families, like, least_cost - _REGIME)
         if one is None or least_cost - one.joint.fit.cost < _REGIME:
             continue
         with_formulas = _cost_with_formulas(problem, found) if with_formulas is None else with_formulas
@@ -282,7 +357,7 @@ def _in_regimes(problem: Problem, families: Collection[str], found: SearchResult
 
 def _cost_with_formulas(problem: Problem, found: SearchResult) -> float:
     """Return the cost of a result's effects with the formulas that explain what they leave, nats."""
-    formulas = (found.outside_library or found.final.find())[:1]
+    formulas = _strongest(found)
     for _ in range(_FORMULAS):
         formulas += what_is_left(problem, found.joint, formulas)
     solution, joint = problem.solution, found.joint
@@ -367,9 +442,8 @@ def _names(
         names = names_beside(problem, smooth, families, known)
         left = background_log_bayes_factor(problem, names.joint, wide)
         return replace(names, background_log_bayes_factor=left), ()
-    first = (found.outside_library or found.final.find())[:1]
-    if _formulas_suffice(problem, found.joint, first):
-        further, formulas = first, tuple[Formula, ...]()
+    if not found.needs_background and _formulas_suffice(problem, found.joint, _strongest(found)):
+        further, formulas = _strongest(found), tuple[Formula, ...]()
         for _ in range(_FORMULAS):
             formulas += tuple(f for f in further if not is_in_library(f, found.candidates.candidates, found.initial))
             names = names_beside(problem, [formula_block(f, n) for n, f in enumerate(formulas)], families, known)
@@ -379,11 +453,16 @@ def _names(
     return names_beside(problem, smooth, families, known, lambda: possible_blocks(context, average)), ()
 
 
-def _formulas_suffice(problem: Problem, joint: JointFit, formulas: Sequence[Formula]) -> bool:
-    """True if a few formulas explain all that effects leave, be they effects of the library in words or not."""
+def _strongest(found: SearchResult) -> tuple[Formula, ...]:
+    """Return the formula that says most of what a result leaves, if any does."""
+    return (found.outside_library or found.final.find())[:1]
+
+
+def _formulas_suffice(problem: Problem, joint: JointFit, formulas: tuple[Formula, ...]) -> bool:
+    """True if a few formulas more explain all that effects leave, be they effects of the library in words or not."""
     for _ in range(_FORMULAS):
         further = what_is_left(problem, joint, formulas)
         if not further:
             return True
-        formulas = (*formulas, *further)
+        formulas += further
     return False

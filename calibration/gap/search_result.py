@@ -82,6 +82,7 @@ class SearchResult:
         evidence: `family@where` of each adopted effect -> its evidence given all others.
         beside: what is certain beside a background; None where no background was needed.
         machine_break: an instant after which the machine is another; None for none.
+        needs_background: True if it is known that more is left than a few formulas say.
     """
 
     problem: Problem
@@ -98,6 +99,7 @@ class SearchResult:
     evidence: Mapping[str, Evidence] = field(default_factory=dict)
     beside: Names | None = None
     machine_break: Break | None = None
+    needs_background: bool = False
 
     def refitted_steps(self) -> tuple[SelectionStep, ...]:
         """Return the steps, each about a fit of what those before it adopted, without what was taken back later."""

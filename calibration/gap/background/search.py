@@ -140,8 +140,6 @@ def _joined(possible: Sequence[CandidateEffect], known: Sequence[CandidateEffect
 def gains(
     system: System,
     model: Model,
-    most: int = _TRIED,
-    without: Collection[str] = (),
     later: Collection[str] = (),
     any_size: bool = False,
 ) -> list[Gain]:
@@ -150,14 +148,12 @@ def gains(
     Args:
         system: the linear model.
         model: what is there.
-        most: candidates.
-        without: names of blocks that the model is to do without.
         later: families whose turn has not come.
         any_size: candidates whose estimates are beyond their hard limits are among them.
     """
     every = system.screen(model).score()
     possible = [w for w in promising(system, model, every, any_size=any_size) if w.candidate.family not in later]
-    found = [gain(system, model, w, model.scales, without) for w in possible[:most]]
+    found = [gain(system, model, w, model.scales) for w in possible[:_TRIED]]
     return sorted(found, key=lambda g: -g.log_odds)
 
 
