@@ -36,7 +36,7 @@ class BlockProducts(Protocol):
 
 @dataclass(frozen=True)
 class _AtJoint:
-    """What a unit of a joint's reading does in each of m samples.
+    """Effects of a unit of a joint's reading on each of m samples.
 
     Attributes:
         whitened: (3 m, m) displacements.

@@ -42,7 +42,7 @@ def further_blocks(system: System, model: Model, possible: PossibleBlocks) -> tu
 
 @dataclass
 class _Addition:
-    """Where the columns of a block are, and (k, k) and (k,) products of them beside the model."""
+    """Columns of a block in the whole, with their (k, k) and (k,) products beside the model."""
 
     columns: slice
     gram: Floats
