@@ -93,6 +93,8 @@ def _of_guide(step: Mapping[str, Any]) -> NextStep:
     does, how = f"{does[:1].lower()}{does[1:]}", "`rigcal session guide`"
     if step["is_busy"] or step["button"] is None:
         return NextStep(step["title"], "wait" if step["is_busy"] else "busy", does, how, screen="guide")
+    if step["is_detected"]:  # it ends by itself: what counts is where to go, which the guide's screen shows
+        return NextStep(step["title"], "busy", does, how, "Open the guide", screen="guide")
     return NextStep(step["title"], "busy", does, how, step["button"], "guide.done", {"step": step["id"]})
 
 

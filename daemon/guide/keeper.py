@@ -16,7 +16,7 @@ from daemon.guide.advisor import accuracy_view
 from daemon.guide.course import Course
 from daemon.guide.job import Job
 from daemon.guide.meter_link import Place
-from daemon.guide.position import is_there, joints_of
+from daemon.guide.position import FRESH_S, is_there, joints_of
 from daemon.guide.request import request_of, whole_argument
 from daemon.guide.view import Around, headline, state_of
 from daemon.guide.worker import NEEDED_FIXES, Drive, GuideWorker
@@ -258,10 +258,20 @@ class GuideKeeper:
     def _warnings(self, job: Job) -> list[str]:
         found = [job.trouble] if job.trouble else []
         if job.state == "open":
-            found += [f"{s.reason}; {s.remedy}" for s in self._sessions.prism_suspicions()]
+            suspicions = self._sessions.prism_suspicions()
+            found += [f"{s.reason}; {s.remedy}" for s in suspicions]
+            found += [] if suspicions else self._unused_fixes(job)
         if self._course.advisor.trouble and job.state == "open":
             found.append(self._course.advisor.trouble)
         return found
+
+    def _unused_fixes(self, job: Job) -> list[str]:
+        """Why the fixes at a pose do not count, where the boom stands there."""
+        step, stands_s = job.step, self._course.watch.boom().stands_s
+        if step is None or step.kind != "poses" or stands_s is None or stands_s < self._settle_s:
+            return []
+        reason = self._sessions.not_counting(FRESH_S)
+        return [] if reason is None else [f"the fixes do not count: {reason}; is the station on prism {job.run.prism}?"]
 
 
 def _reason(arguments: Mapping[str, Any]) -> str:

@@ -97,6 +97,7 @@ class SessionKeeper:
         self._advice = SessionAdvice(rig, setups, self._table, self._prisms)
         self._unstored: list[Callable[[], object]] = []  # observations that the store has yet to take, in their order
         self._is_waiting = False
+        self._newest: tuple[str, Stamp, str | None] | None = None  # session and instant of a fix; why it does not count
         self._late: set[str] = set()  # sessions that got fixes after their end, and must be judged again
         # Fixes measured in those that have ended may still come, or wait for their joints
         self._open: OpenSession | None = None
@@ -161,6 +162,7 @@ class SessionKeeper:
             changed, excluded = self._which_prism(session, joined, place_mm)
             if changed:
                 self._unstored.append(partial(self._table.exclude, session.id, changed, joined.stamp))
+        self._newest = session.id, joined.stamp, excluded
         row = {
             "session_id": session.id,
             "setup_id": session.setup_id,
@@ -391,6 +393,18 @@ class SessionKeeper:
         """Stations that may be on another prism than that of the open session; from any thread."""
         session = self._open
         return [] if session is None else self._prisms.suspicions(session)
+
+    def not_counting(self, fresh_s: float) -> str | None:
+        """Return why the newest fix of the open session does not count; from any thread.
+
+        Args:
+            fresh_s: how old it may be, real seconds; of an older one nothing is said.
+        """
+        opened, newest = self._open, self._newest
+        if opened is None or newest is None or newest[0] != opened.id:
+            return None
+        age_s = self._clock.now().since(newest[1]) / NS_PER_S
+        return newest[2] if self._clock.real_seconds(age_s) <= fresh_s else None
 
     # ---- parts -------------------------------------------------------------------------------------------------------
 

@@ -11,7 +11,7 @@ from calibration.rig.description import Rig
 from daemon.acquisition.joiner import JoinedFix
 from daemon.commands import caller_columns
 from daemon.sessions.open_session import OpenSession
-from daemon.sessions.prisms.evidence import Finding, IdentityLoader, PrismEvidence, Verdict, sightings_of
+from daemon.sessions.prisms.evidence import Finding, IdentityLoader, PrismEvidence, Stretch, Verdict, sightings_of
 from daemon.sessions.prisms.guard import CONFIRM, MotionLimit, PrismGuard, Suspicion, Turn, Word
 from daemon.sessions.prisms.standstill_places import Exclusions
 from daemon.sessions.station_setups import Place
@@ -72,6 +72,7 @@ class PrismWatch:
         stretch = evidence.stretch(joined.fix.station, turn.at, turn.is_believed)
         for finding in evidence.take(stretch, joined, place_mm):
             changed |= self._heed(session, finding)
+        changed |= self._stray(session, joined, turn, stretch)
         stretch.instants_ns.append(joined.stamp.monotonic_ns)
         return changed
 
@@ -93,10 +94,26 @@ class PrismWatch:
         turn = guard.part(joined.fix.stamp)
         if is_told:
             return
-        text = f"the target moved {jump_m:.2f} m otherwise than the joints moved {session.prism}"
+        text = _moved_otherwise(jump_m, session.prism)
         if not is_suspected:
             guard.suspect(turn, jump_m, text)
         self._tell_of_jump(joined.fix.station, text)
+
+    def _stray(self, session: OpenSession, joined: JoinedFix, turn: Turn, stretch: Stretch) -> Exclusions:
+        """Suspect all since a turn where the target strayed from what the joints did; the turn's observations.
+
+        What strays little by little jumps nowhere: it was another target from the turn on.
+        """
+        guard, station = session.guards[joined.fix.station], joined.fix.station
+        if turn.is_believed or guard.doubt(joined.fix.stamp) is not None or session.evidence is None:
+            return {}
+        stray_m = session.evidence.stray_m(station)
+        if stray_m is None:
+            return {}
+        text = _moved_otherwise(stray_m, session.prism)
+        suspicion = guard.suspect(turn, stray_m, text)
+        self._tell_of_jump(station, text)
+        return dict.fromkeys(stretch.instants_ns, suspicion.reason)
 
     def _heed(self, session: OpenSession, finding: Finding) -> Exclusions:
         """Suspect a stretch, or suspect it no more, as the joints say; its observations for which that is news."""
@@ -213,3 +230,7 @@ def _fix(station: str, row: Mapping[str, Any], stamp: Stamp) -> Fix:
     """As much of a stored fix as a guard looks at."""
     numbers = {name: row[name] for name in _NUMBERS}
     return Fix(station, stamp, stamp, Status(row["status"]), LockState(row["lock"]), **numbers)
+
+
+def _moved_otherwise(distance_m: float, prism: str) -> str:
+    return f"the target moved {distance_m:.2f} m otherwise than the joints moved {prism}"

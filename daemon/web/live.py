@@ -65,6 +65,7 @@ class LiveFeed:
         self._clients += 1
         if self._reader is None or self._reader.done():
             self._newest = (next(self._number), b"")  # what was read before the last client left is old
+            self._answered_ns = None
             self._reader = asyncio.create_task(self._read())
         seen = self._newest[0]
         try:

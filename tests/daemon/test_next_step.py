@@ -32,6 +32,7 @@ def guide(**step: Any) -> dict[str, Any]:
         "instruction": "Move.",
         "button": "Measure here",
         "is_busy": False,
+        "is_detected": False,
     }
     return {"id": 1, "prisms": ["r"], "step": usual | step}
 
@@ -53,6 +54,7 @@ def guide(**step: Any) -> dict[str, Any]:
         ),
         (status(guide=guide()), "Go to pose 3 of 20", "Measure here"),
         (status(guide=guide(is_busy=True)), "Go to pose 3 of 20", None),
+        (status(guide=guide(is_detected=True)), "Go to pose 3 of 20", "Open the guide"),
         (
             status(jobs=[{"state": "running", "kind": "gap", "progress": 0.999}]),
             "Calibrating: identifying the model, 99 %",

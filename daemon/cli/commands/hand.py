@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import click
@@ -11,6 +13,8 @@ from daemon.cli.client import ask, client_options, socket_of
 from daemon.cli.command import Command
 from daemon.cli.terminal import echo
 from daemon.control.protocol import request
+
+_FRESH_S, _AGAIN_S = 5.0, 0.2
 
 
 @click.group()
@@ -36,10 +40,7 @@ def move(places: tuple[str, ...], **where: Any) -> Any:
     """
     socket = socket_of(where["socket"], where["config"])
     wanted = _wanted(places)
-    if wanted:
-        pose = _here(request(socket, "rig.show"), request(socket, "status"), wanted)
-    else:
-        pose = _guided(request(socket, "guide.state")["guide"])
+    pose = _here(socket, wanted) if wanted else _guided(request(socket, "guide.state")["guide"])
     return ask(where, "simulation.visit", lambda _: echo(f"the boom goes to {_told(pose)}"), poses=[pose])
 
 
@@ -48,6 +49,8 @@ def _wanted(places: tuple[str, ...]) -> dict[str, float]:
     wanted = {}
     for place in places:
         name, _, number = place.partition("=")
+        if name in wanted:
+            raise click.BadParameter(f"{name} is given twice", param_hint="JOINT=VALUE")
         try:
             wanted[name] = float(number)
         except ValueError:
@@ -55,25 +58,36 @@ def _wanted(places: tuple[str, ...]) -> dict[str, float]:
     return wanted
 
 
-def _here(shown: Mapping[str, Any], status: Mapping[str, Any], wanted: Mapping[str, float]) -> dict[str, float]:
+def _here(socket: Path, wanted: Mapping[str, float]) -> dict[str, float]:
     """Return the pose where the boom is, but for the joints that are wanted elsewhere."""
     from calibration.rig.description import parse_rig
 
+    shown = request(socket, "rig.show")
     joints = parse_rig(shown["text"], shown["rig"]).joints
     names = [joint.name for joint in joints]
     if unknown := [name for name in wanted if name not in names]:
         raise click.BadParameter(f"there is no joint {unknown[0]!r}; there are {', '.join(names)}", param_hint="JOINT")
-    values = {c["name"]: c["value"] for c in status["acquisition"]["channels"] if c["kind"] == "joint"}
+    read = _read(socket, [name for name in names if name not in wanted])
     pose = {}
     for joint in joints:
-        value = wanted.get(joint.name)
-        if value is None:
-            if values.get(joint.name) is None:
-                raise click.ClickException(f"joint {joint.name} is not read: give its value, too")
-            low, high = joint.limits  # a joint at its stop may read a little beyond
-            value = min(max(float(values[joint.name]), low), high)
-        pose[joint.column] = value
+        low, high = joint.limits  # a joint at its stop may read a little beyond
+        pose[joint.column] = wanted[joint.name] if joint.name in wanted else min(max(read[joint.name], low), high)
     return pose
+
+
+def _read(socket: Path, names: Sequence[str]) -> dict[str, float]:
+    """Return what these joints read; a computer that is busy may have no fresh reading for a moment."""
+    read: dict[str, float] = {}
+    until = time.monotonic() + _FRESH_S
+    while True:
+        channels = request(socket, "status")["acquisition"]["channels"]
+        read |= {c["name"]: c["value"] for c in channels if c["name"] in names and c["value"] is not None}
+        missing = [name for name in names if name not in read]
+        if not missing:
+            return read
+        if time.monotonic() > until:
+            raise click.ClickException(f"joint {missing[0]} is not read: give its value, too")
+        time.sleep(_AGAIN_S)
 
 
 def _guided(guide: Mapping[str, Any] | None) -> dict[str, float]:

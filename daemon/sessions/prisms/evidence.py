@@ -180,6 +180,10 @@ class PrismEvidence:
             return None
         return self._motion.jump_m(joined, place_mm, self._prism, turn.at, is_sure=not is_suspected)
 
+    def stray_m(self, station: str) -> float | None:
+        """Return how far the target of the fix taken last strayed since its turn, m; None where joints explain it."""
+        return None if self._motion is None else self._motion.stray_m(station, self._prism)
+
     def stretch(self, station: str, since: Stamp, is_believed: bool) -> Stretch:
         """Return the stretch of a station that began then; a new one the first time."""
         for known in reversed(self._stretches):

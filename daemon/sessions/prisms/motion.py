@@ -44,7 +44,10 @@ class _Seen:
 
 
 class TargetMotion:
-    """Compares each fix of a station with the one before.
+    """Compares each fix of a station with the one before, and with the first since its last turn.
+
+    What a target moves otherwise than the joints say is little from one fix to the next where the boom moves slowly; it
+    adds up from the first on.
 
     Args:
         rig: the machine; its nominal kinematics are used.
@@ -55,10 +58,11 @@ class TargetMotion:
         self._prisms = rig.prism_names
         self._chain = Chain(rig, {"": Placement.identity()})
         self._x = np.zeros(len(self._chain))
+        self._first: dict[str, _Seen] = {}
         self._latest: dict[str, _Seen] = {}
 
     def jump_m(self, joined: JoinedFix, place_mm: Place, prism: str, since: Stamp, *, is_sure: bool) -> float | None:
-        """Take a fix: how far the target jumped since the fix before, m; None where the joints explain where it is.
+        """Take a fix: how far the target jumped since fixes before, m; None where the joints explain where it is.
 
         Args:
             joined: with all joints.
@@ -69,11 +73,24 @@ class TargetMotion:
         """
         if not all(joint.column in joined.values for joint in self._joints):
             return None
-        seen = self._seen(joined, place_mm, since)
-        before, self._latest[joined.fix.station] = self._latest.get(joined.fix.station), seen
+        seen, station = self._seen(joined, place_mm, since), joined.fix.station
+        before, self._latest[station] = self._latest.get(station), seen
         if before is None or before.since != since:
+            self._first[station] = seen
             return None
-        way_mm = math.dist(before.place_mm, place_mm)
+        return self._between(before, seen, prism, is_sure=is_sure)
+
+    def stray_m(self, station: str, prism: str) -> float | None:
+        """Return how far a station's target has strayed since its last turn, m; None where the joints explain it.
+
+        Of the fix that was taken last, where it is no jump. A target that strays was another one from the turn on.
+        """
+        seen = self._latest[station]
+        return self._between(self._first[station], seen, prism, is_sure=True)
+
+    def _between(self, before: _Seen, seen: _Seen, prism: str, *, is_sure: bool) -> float | None:
+        """Return how far the target jumped between two fixes, m; None where the joints explain where it is."""
+        way_mm = math.dist(before.place_mm, seen.place_mm)
         expected_mm = np.linalg.norm(seen.nominal_mm - before.nominal_mm, axis=1)
         unexplained_mm = np.abs(way_mm - expected_mm)
         slack_mm = before.slack_mm + seen.slack_mm

@@ -176,6 +176,19 @@ def test_hands_of_a_simulated_rig_aim_and_go_where_the_guide_says(daemon: Daemon
     daemon.wait("a pose", lambda: state(daemon)["step"]["kind"] == "go_to_pose")
     assert hand("move").startswith("the boom goes to theta1_deg")
     daemon.wait("the boom", lambda: all(joint["is_there"] for joint in state(daemon)["joints"]))
+    assert "theta1 is given twice" in hand("move", "theta1=1", "theta1=2")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("guide")
+def test_a_station_that_was_left_on_the_control_point_is_told_at_the_pose(daemon: DaemonProcess) -> None:
+    operator = GuidedOperator(daemon.say)
+    operator.follow(lambda s: s["step"]["kind"] == "change_prism")
+    daemon.say("guide.done")  # the station is on the control point still
+    operator.follow(lambda s: s["step"]["kind"] == "hold")
+    daemon.wait("the reason", lambda: any("a control point" in m["text"] for m in state(daemon)["messages"]))
+    daemon.say("simulation.aim", target="r")
+    daemon.wait("a pose", lambda: state(daemon)["poses"]["done"])
 
 
 @pytest.mark.slow

@@ -80,6 +80,26 @@ def test_a_change_to_a_near_prism_between_two_fixes_never_counts(
     assert [row for row in rows if row["monotonic_ns"] <= changed_ns and row["excluded"] is None]
 
 
+def test_a_target_that_strays_little_by_little_was_another_one_since_the_station_was_silent(rig: SlowStation) -> None:
+    session = rig.say("start", prism="w", kind="single_joint")["id"]
+    rig.values["theta1"] = 40.0
+    rig.follow("w", 0.0, 10)
+    rig.clock.advance(8.0)  # the station is silent, and then follows r
+    rig.values["theta1"] = 26.0
+    silent_ns = rig.clock.now().monotonic_ns
+    rig.follow("r", 0.0, 2)
+    for _ in range(20):
+        for _ in range(round(FIX_PERIOD_S / STEP_S)):
+            rig.values["theta7"] += 4.0 * STEP_S
+            rig.values["theta3"] -= 4.0 * STEP_S
+            rig.target_mm = place_mm("r", rig.values)
+            rig.live(STEP_S)
+    assert rig.keeper.prism_suspicions()
+    rows = [row for row in table(rig.store.path, "observations") if row["session_id"] == session]
+    assert not [row for row in rows if row["monotonic_ns"] > silent_ns and row["excluded"] is None]
+    assert [row for row in rows if row["monotonic_ns"] <= silent_ns and row["excluded"] is None]
+
+
 def test_an_operator_s_word_lets_the_fixes_count_again(rig: SlowStation) -> None:
     rig.say("start", prism="r", kind="multi_joint")
     rig.follow("r", 0.0, 6)
