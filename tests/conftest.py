@@ -28,7 +28,7 @@ COUNTED = (
     "tests/daemon/sessions/test_sessions.py",
     *(
         f"tests/calibration/{folder}/"
-        for folder in ("design", "evaluation", "experiments", "identification", "model", "published", "rig")
+        for folder in ("design", "evaluation", "export", "experiments", "identification", "model", "published", "rig")
     ),
     "tests/calibration/gap/background/",
     "tests/calibration/gap/test_discrimination.py",

@@ -133,6 +133,7 @@ GUIDE = {
         "instruction": "Aim the station at prism r and say so.",
         "button": "Station is on prism r",
         "is_busy": False,
+        "is_detected": False,
     },
 }
 
