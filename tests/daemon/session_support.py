@@ -38,10 +38,16 @@ class SharedClock(ManualClock):
 
 
 class Rig:
-    """A machine and a station that can be stood still and moved, on a clock that only moves when told to."""
+    """A machine and a station that can be stood still and moved, on a clock that only moves when told to.
+
+    Attributes:
+        steps_of_fix: the station gives a fix in every so many steps.
+    """
+
+    steps_of_fix = 1
 
     def __init__(self, path: Path) -> None:
-        self.clock = SharedClock()
+        self.clock, self._steps = SharedClock(), 0
         self.store = Store(path)
         self.store.begin_run(self.clock.now())
         self.store.declare_channels({j.name: j.unit for j in SOURCE.rig.joints}, {})
@@ -68,15 +74,17 @@ class Rig:
         )
 
     def live(self, seconds: float, **rates: float) -> None:
-        """Let time pass: every joint sampled and the station shooting at each step, as acquisition would tell it."""
+        """Let time pass: every joint sampled and the station shooting at its steps, as acquisition would tell it."""
         for _ in range(round(seconds / STEP_S)):
             self.clock.advance(STEP_S)
+            self._steps += 1
             for name, rate in rates.items():
                 self.values[name] += rate * STEP_S
             records: list[Record] = [
                 Reading(j.name, self.clock.now(), self.values[j.name], j.unit) for j in SOURCE.rig.joints
             ]
-            records.append(self.fix())
+            if self._steps % self.steps_of_fix == 0:
+                records.append(self.fix())
             self.store.insert_records(records)
             self.keeper.on_records(records)
 

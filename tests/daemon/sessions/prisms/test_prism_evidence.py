@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +10,10 @@ import pytest
 
 from calibration.identification.prism_identity import PrismIdentity
 from daemon.sessions.prisms.evidence import IdentityLoader, PrismEvidence, Sighting, Verdict, targets
+from daemon.sessions.station_setups import Place
 from drivers.readings import EventKind
 from simulators.rig.truth import RigTruth
-from tests.daemon.session_support import SOURCE, Rig
+from tests.daemon.session_support import SOURCE, Rig, closed_afterwards
 from tests.daemon.store_support import table
 
 RIG = SOURCE.rig
@@ -30,11 +31,14 @@ def arrays(joints: Mapping[str, float]) -> dict[str, np.ndarray]:
 class TrueRig(Rig):
     """A rig that stands at poses, and whose station measures where a true machine has its prisms."""
 
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.say("setup_new", id="S1", instrument="GTS-905A")
+
     def stand(self, pose: int, target: str, seconds: float = 2.0) -> None:
         """Drive to a pose, with the station locked on a prism of the machine."""
         self.values = dict(zip(RIG.joint_names, map(float, POSES[pose]), strict=True))
-        east, north, up = TRUTH.prism_mm(target, arrays(self.values), setup="S1")[0]
-        self.target_mm = float(east), float(north), float(up)
+        self.target_mm = place_mm(target, self.values)
         self.live(seconds)
 
     def used(self, session: str) -> int:
@@ -42,12 +46,13 @@ class TrueRig(Rig):
         return sum(row["session_id"] == session and row["excluded"] is None for row in rows)
 
 
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[TrueRig]:
-    made = TrueRig(tmp_path / "rigcal.sqlite")
-    made.say("setup_new", id="S1", instrument="GTS-905A")
-    yield made
-    made.store.close()
+def place_mm(target: str, values: Mapping[str, float]) -> Place:
+    """Return where the true machine has a prism, in the station's frame."""
+    east, north, up = TRUTH.prism_mm(target, arrays(dict(values)), setup="S1")[0]
+    return float(east), float(north), float(up)
+
+
+rig = closed_afterwards(TrueRig)
 
 
 def texts(rig: Rig, kind: EventKind) -> list[str]:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 
 from daemon.acquisition.joiner import JoinedFix
 from daemon.sessions.prisms.motion import LATE_S, TargetMotion
-from daemon.sessions.station_setups import Place
 from drivers.clock import ManualClock
-from drivers.readings import Fix, LockState, Reading, Record, Status
-from tests.daemon.session_support import SOURCE, STEP_S
-from tests.daemon.sessions.prisms.test_prism_evidence import TRUTH, TrueRig, arrays
+from drivers.readings import Fix, LockState, Status
+from tests.daemon.session_support import SOURCE, STEP_S, closed_afterwards
+from tests.daemon.sessions.prisms.test_prism_evidence import TrueRig, place_mm
 from tests.daemon.store_support import table
 
 RIG = SOURCE.rig
@@ -23,21 +19,7 @@ FIX_PERIOD_S = 0.35  # in which the guard takes any prism for able to move 1.85 
 class SlowStation(TrueRig):
     """A rig whose station gives a fix every seventh step."""
 
-    steps = 0
-
-    def live(self, seconds: float, **rates: float) -> None:
-        for _ in range(round(seconds / STEP_S)):
-            self.clock.advance(STEP_S)
-            for name, rate in rates.items():
-                self.values[name] += rate * STEP_S
-            records: list[Record] = [
-                Reading(j.name, self.clock.now(), self.values[j.name], j.unit) for j in SOURCE.rig.joints
-            ]
-            self.steps += 1
-            if self.steps % round(FIX_PERIOD_S / STEP_S) == 0:
-                records.append(self.fix())
-            self.store.insert_records(records)
-            self.keeper.on_records(records)
+    steps_of_fix = round(FIX_PERIOD_S / STEP_S)
 
     def follow(self, target: str, rate_deg_s: float, fixes: int) -> None:
         """Slew the boom while the station measures where a true machine has a prism."""
@@ -47,17 +29,7 @@ class SlowStation(TrueRig):
             self.live(STEP_S)
 
 
-def place_mm(target: str, values: dict[str, float]) -> Place:
-    east, north, up = TRUTH.prism_mm(target, arrays(values), setup="S1")[0]
-    return float(east), float(north), float(up)
-
-
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[SlowStation]:
-    made = SlowStation(tmp_path / "rigcal.sqlite")
-    made.say("setup_new", id="S1", instrument="GTS-905A")
-    yield made
-    made.store.close()
+rig = closed_afterwards(SlowStation)
 
 
 @pytest.mark.parametrize("kind", ["multi_joint", "static_poses"])
