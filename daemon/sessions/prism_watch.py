@@ -102,10 +102,11 @@ class PrismWatch:
     def _stray(self, session: OpenSession, joined: JoinedFix, turn: Turn, stretch: Stretch) -> Exclusions:
         """Suspect all since a turn where the target strayed from what the joints did; the turn's observations.
 
-        What strays little by little jumps nowhere: it was another target from the turn on.
+        What strays little by little jumps nowhere: it was another target from the turn on, also where an operator had
+        confirmed the prism: the lock may have been lost just after.
         """
         guard, station = session.guards[joined.fix.station], joined.fix.station
-        if turn.is_believed or guard.doubt(joined.fix.stamp) is not None or session.evidence is None:
+        if guard.doubt(joined.fix.stamp) is not None or session.evidence is None:
             return {}
         stray_m = session.evidence.stray_m(station)
         if stray_m is None:

@@ -130,7 +130,7 @@ def _pass_time(real_s: float, daemon: DaemonProcess, mischief: Mischief, samples
         time.sleep(min(SAMPLE_S, real_s / 60))
         if not daemon.is_alive():
             return f"the daemon ended by itself; see {daemon.directory}/daemon.log"
-        usage = daemon.usage()
+        usage = daemon.usage(mischief.hanging)
         if usage is not None:
             samples.append(usage)
         if kills and time.monotonic() >= kills[0]:

@@ -63,6 +63,7 @@ class Usage:
         anonymous_kib, proportional_kib: memory of its own, and with its share of what it shares. Pages of libraries are
             not its own: whether they count as private depends on who else has loaded them at that moment.
         descriptors, threads: how many are open.
+        hanging: how many clients that do not behave are connected; each has a descriptor and a thread.
     """
 
     life: int
@@ -71,6 +72,7 @@ class Usage:
     proportional_kib: int
     descriptors: int
     threads: int
+    hanging: int = 0
 
 
 class DaemonProcess:
@@ -171,8 +173,8 @@ class DaemonProcess:
         if self.is_alive():
             self.kill()
 
-    def usage(self) -> Usage | None:
-        """What it uses now; None while there is no process."""
+    def usage(self, hanging: int) -> Usage | None:
+        """What it uses now, with so many clients that hang; None while there is no process."""
         process = self._process
         if process is None or process.poll() is not None:
             return None
@@ -187,6 +189,7 @@ class DaemonProcess:
                 proportional_kib=kib["Pss"],
                 descriptors=len(os.listdir(folder / "fd")),
                 threads=len(os.listdir(folder / "task")),
+                hanging=hanging,
             )
         except (OSError, KeyError):
             return None

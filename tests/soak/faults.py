@@ -21,6 +21,7 @@ from tests.soak.evidence import Blackout, Case, Expected, Watch
 from tests.soak.rig_process import DIAGNOSED, RigProcess
 
 LINK, STATION = "boom", "station"
+CLOSES_S = 4.0  # a connection whose client has gone
 AFTERWARDS_S = 6.0  # after a blackout, until faults can be seen again
 
 _GOES_ON = Expected("fix", ("ok",), after_s=0.5)  # cleared: fixes come as before
@@ -122,7 +123,7 @@ class Mischief:
 
     Attributes:
         blackouts: when faults could not be seen.
-        injected: fault's name -> how often.
+        hanging: how many clients that hang are connected.
     """
 
     def __init__(
@@ -134,6 +135,7 @@ class Mischief:
         self._stop = threading.Event()
         self._process = threading.Lock()  # what is done to the daemon's process comes one after the other
         self.blackouts: list[Blackout] = []
+        self.hanging = 0
         on_bus = [c for c in machine.channels if isinstance(c, Cia406Encoder | Cia406Linear | Cia404Analogue)]
         self._nodes = {channel.node: (channel.name,) for channel in on_bus}
         self._positions = {c.node for c in on_bus if not isinstance(c, Cia404Analogue)}
@@ -304,7 +306,8 @@ class Mischief:
     def _client_fault(self) -> None:
         kind = self._rng.choice(("silent", "half", "deaf"))
         with contextlib.ExitStack() as stack:
-            for _ in range(self._rng.randint(1, 10)):
+            self.hanging = self._rng.randint(1, 10)
+            for _ in range(self.hanging):
                 client = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
                 client.settimeout(1.0)
                 with contextlib.suppress(OSError):
@@ -313,6 +316,8 @@ class Mischief:
                     client.sendall({"silent": b"", "half": asked[:9], "deaf": (asked + b"\n") * 100}[kind])
             self._expect("clients that hang", ("daemon",), "")
             self._wait(self._rng.uniform(5.0, 40.0))
+        self._rig.clock.sleep(CLOSES_S)
+        self.hanging = 0
 
     # ---- parts -------------------------------------------------------------------------------------------------------
 

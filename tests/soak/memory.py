@@ -24,7 +24,8 @@ class Growth:
         warm_s, end_s: from when to when it was looked at, real seconds since its start.
         base_kib, end_kib, most_kib: anonymous memory at first, at last and at most: medians over a minute.
         trend: of a straight line through all samples from first to last, as a share of `base_kib`.
-        descriptors, threads: at first and at last: the fewest within a minute, as clients come and go.
+        descriptors, threads: at first and at last: the fewest within a minute, as clients come and go, while none
+            hangs.
     """
 
     warm_s: float
@@ -83,6 +84,12 @@ def growth(samples: Sequence[Usage], warm_s: float) -> Growth | None:
         end_kib=medians[-1],
         most_kib=max(medians),
         trend=float(slope) * (end_s - begin_s) / medians[0],
-        descriptors=(min(s.descriptors for s in parts[0]), min(s.descriptors for s in parts[-1])),
-        threads=(min(s.threads for s in parts[0]), min(s.threads for s in parts[-1])),
+        descriptors=(_fewest(parts[0], "descriptors"), _fewest(parts[-1], "descriptors")),
+        threads=(_fewest(parts[0], "threads"), _fewest(parts[-1], "threads")),
     )
+
+
+def _fewest(samples: Sequence[Usage], what: str) -> int:
+    """Descriptors or threads of a minute, while no client hangs if there was such a moment."""
+    quiet = [sample for sample in samples if not sample.hanging]
+    return min(getattr(sample, what) for sample in quiet or samples)

@@ -98,8 +98,8 @@ def test_frames_of_the_log_and_of_the_store_compare(tmp_path: Path) -> None:
     assert wire.station == [Item(7, "06"), Item(7, "30")]
 
 
-def usage(at_s: float, kib: float, life: int = 1, descriptors: int = 20) -> Usage:
-    return Usage(life, at_s, round(kib), round(kib), descriptors, 10)
+def usage(at_s: float, kib: float, life: int = 1, descriptors: int = 20, hanging: int = 0) -> Usage:
+    return Usage(life, at_s, round(kib), round(kib), descriptors + hanging, 10 + hanging, hanging)
 
 
 def test_memory_that_grows_is_found() -> None:
@@ -112,6 +112,9 @@ def test_memory_that_grows_is_found() -> None:
     open_files = growth([usage(5.0 * n, 60_000, descriptors=20 + n // 30) for n in range(300)], 300.0)
     assert open_files is not None
     assert open_files.faults() == ["descriptors grew from 22 to 29"]
+    clients = growth([usage(5.0 * n, 60_000, hanging=10 * (n > 280 and n % 12 > 0)) for n in range(300)], 300.0)
+    assert clients is not None
+    assert clients.faults() == []
 
 
 def test_what_a_process_uses_before_its_warm_up_and_before_a_kill_is_not_growth() -> None:

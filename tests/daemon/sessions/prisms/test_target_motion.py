@@ -28,8 +28,24 @@ class SlowStation(TrueRig):
             self.target_mm = place_mm(target, self.values)
             self.live(STEP_S)
 
+    def swing(self, target: str, fixes: int) -> None:
+        """Move the boom slowly in two joints while the station measures a prism."""
+        for _ in range(fixes * round(FIX_PERIOD_S / STEP_S)):
+            self.values["theta7"] += 4.0 * STEP_S
+            self.values["theta3"] -= 4.0 * STEP_S
+            self.target_mm = place_mm(target, self.values)
+            self.live(STEP_S)
+
 
 rig = closed_afterwards(SlowStation)
+
+
+def assert_only_before(rig: SlowStation, session: str, until_ns: int) -> None:
+    """Assert that the target is suspected, and that what was measured until then counts and nothing after it."""
+    assert rig.keeper.prism_suspicions()
+    rows = [row for row in table(rig.store.path, "observations") if row["session_id"] == session]
+    assert not [row for row in rows if row["monotonic_ns"] > until_ns and row["excluded"] is None]
+    assert [row for row in rows if row["monotonic_ns"] <= until_ns and row["excluded"] is None]
 
 
 @pytest.mark.parametrize("kind", ["multi_joint", "static_poses"])
@@ -60,16 +76,18 @@ def test_a_target_that_strays_little_by_little_was_another_one_since_the_station
     rig.values["theta1"] = 26.0
     silent_ns = rig.clock.now().monotonic_ns
     rig.follow("r", 0.0, 2)
-    for _ in range(20):
-        for _ in range(round(FIX_PERIOD_S / STEP_S)):
-            rig.values["theta7"] += 4.0 * STEP_S
-            rig.values["theta3"] -= 4.0 * STEP_S
-            rig.target_mm = place_mm("r", rig.values)
-            rig.live(STEP_S)
-    assert rig.keeper.prism_suspicions()
-    rows = [row for row in table(rig.store.path, "observations") if row["session_id"] == session]
-    assert not [row for row in rows if row["monotonic_ns"] > silent_ns and row["excluded"] is None]
-    assert [row for row in rows if row["monotonic_ns"] <= silent_ns and row["excluded"] is None]
+    rig.swing("r", 20)
+    assert_only_before(rig, session, silent_ns)
+
+
+def test_a_target_that_strays_was_another_one_although_an_operator_had_just_confirmed_it(rig: SlowStation) -> None:
+    session = rig.say("start", prism="w", kind="single_joint")["id"]
+    rig.values["theta1"] = 40.0
+    rig.follow("w", 0.0, 10)
+    rig.say("confirm_prism", operator="Ada")
+    confirmed_ns = rig.clock.now().monotonic_ns  # whoever looked through the telescope saw w; the next fix is of r
+    rig.swing("r", 20)
+    assert_only_before(rig, session, confirmed_ns)
 
 
 def test_an_operator_s_word_lets_the_fixes_count_again(rig: SlowStation) -> None:
