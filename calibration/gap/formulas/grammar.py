@@ -113,11 +113,12 @@ class Grammar:
         order = np.argsort(block, kind="stable")
         first = np.flatnonzero(np.diff(block[order], prepend=-1))
         residual = projection.residual.reshape(-1, 3)
-        seen, by_group = [], []
+        seen, by_group, lengths = [], [], []
         shape = 3 * len(residual), len(possible)
         kept = np.empty(shape, order="F") if math.prod(shape) <= _KEPT else None
         for part in chunks(possible, len(residual)):
             moved, columns, length = columns_of(projection, part)
+            lengths.append(length)
             seen.append(length / np.maximum(np.sqrt((moved**2).sum(axis=(0, 1))), _TINY))
             by_sample = np.einsum("mck,mc->mk", columns.reshape(len(residual), 3, -1), residual)
             by_group.append(np.add.reduceat(by_sample[order], first, axis=0))
@@ -131,6 +132,7 @@ class Grammar:
         self.score: Floats = self.by_group.sum(axis=0)
         self._kept = None if kept is None else _of_shown(kept, shown)
         self._prior = np.array([term.log_prior for term in self.terms])
+        self._largest = np.array([term.largest_coefficient for term in self.terms]) * np.concatenate(lengths)[shown]
 
     def find(self, most: int = _MOST) -> tuple[Formula, ...]:
         """Return the terms that the data ask for together, the strongest first; none if all may be chance.
@@ -167,7 +169,9 @@ class Grammar:
         scale = min(1.0, path.left / noise)
         own = 1.0 - (path.overlap**2).sum(axis=0)
         score = self.score - path.overlap.T @ (path.basis.T @ self.projection.residual)
-        square = np.where(own > _LEAST_OWN, score**2 / np.maximum(own, _LEAST_OWN) / scale, 0.0)
+        coefficient = score / np.maximum(own, _LEAST_OWN)
+        is_possible = (own > _LEAST_OWN) & (np.abs(coefficient) <= self._largest)
+        square = np.where(is_possible, score * coefficient / scale, 0.0)
         return square, _log_bayes_factor(square) + self._prior
 
     def _extended(self, further: Sequence[tuple[_Path, int, float, float]]) -> list[_Path]:

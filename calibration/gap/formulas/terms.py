@@ -44,6 +44,13 @@ class Term:
         return f"{self.variable.text} at {self.source.where}"
 
     @property
+    def largest_coefficient(self) -> float:
+        """Size of the coefficient beyond which the error is physically impossible in these data."""
+        if math.isinf(self.source.most):
+            return math.inf
+        return self.source.most / max(float(np.abs(self.variable.values).max(initial=0.0)), _TINY)
+
+    @property
     def moved_mm(self) -> Floats:
         """(m, 3) displacement of the prism per unit of the coefficient, station's frame."""
         moved: Floats = self.source.moved_mm * self.variable.values[:, None]

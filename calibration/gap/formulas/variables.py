@@ -26,6 +26,8 @@ _STEPS = 16
 _LEAST_KNOWN = 0.5  # share of the rows that have a column
 _INCIDENCE = (1, 2, 3, 6)  # harmonics; six reflectors make a prism that is seen from all round
 _FEW_SIGNALS = 4  # that products take in; each more would add a hundred terms
+_MOST_OF_FIXES = 0.01  # relative error; no instrument and no air is that far off
+_MOST_OF_LENGTHS = 0.05  # nor a structure from its drawing
 _NOTHING: Unit = {}
 
 
@@ -65,6 +67,7 @@ class ErrorSource:
         coupled: True for the rows alone that the joint drives in addition to its own.
         constant: text and topic of a constant error; None where that is a parameter of the kinematics.
         own: variables of this source alone.
+        most: largest error that is physically possible, in its unit.
     """
 
     where: str
@@ -75,6 +78,7 @@ class ErrorSource:
     coupled: bool = False
     constant: tuple[str, str] | None = None
     own: tuple[Variable, ...] = ()
+    most: float = math.inf
 
     def coefficient_unit(self, variable: Variable) -> str:
         """Unit of the number that a variable is multiplied by here."""
@@ -179,12 +183,12 @@ class Variables:
             soft: Unit = {"rad": 1, "N": -1, "m": -1}
             yield ErrorSource("base", "base tilt", soft, average(leaning), constant=("moment of all weights", "torque"))
         grown = situation.to_station(situation.located.prism_mm[:, :, None])[:, :, 0]
-        yield ErrorSource("boom", "relative error of all lengths", _NOTHING, average(grown))
+        yield ErrorSource("boom", "relative error of all lengths", _NOTHING, average(grown), most=_MOST_OF_LENGTHS)
 
     def _station_sources(self) -> Iterator[ErrorSource]:
         situation, average = self._situation, self._samples.average
-        position = average(situation.located.position_mm)
-        yield ErrorSource("station", "relative error of all fixes", _NOTHING, position, constant=("", "distance"))
+        position, scale = average(situation.located.position_mm), "relative error of all fixes"
+        yield ErrorSource("station", scale, _NOTHING, position, constant=("", "distance"), most=_MOST_OF_FIXES)
         velocity = situation.velocity_mm_per_s
         if velocity.any():
             yield ErrorSource("clock", "error of instants", {"s": 1}, average(velocity), constant=("", "velocity"))
