@@ -27,7 +27,7 @@ from calibration.gap.projection import follows_path
 from calibration.gap.regimes import effect_in_regime
 from calibration.gap.screening import by_family
 from calibration.gap.search_result import STRUCTURE, SearchResult
-from calibration.gap.stepwise_search import MANY_OUTLIERS, StepwiseSearch
+from calibration.gap.stepwise.search import MANY_OUTLIERS, StepwiseSearch
 from calibration.identification.reading_steps import in_true_steps
 from calibration.identification.refinement import Prior
 from calibration.identification.solve import Solution

@@ -18,10 +18,10 @@ from calibration.gap.formulas.grammar import Formula, Grammar
 from calibration.gap.joint_fit import OUTLIER, JointFit, Problem
 from calibration.gap.projection import Projection
 from calibration.gap.regimes import EffectInRegime
-from calibration.gap.reselection import explain_outliers, reselect
 from calibration.gap.screening import ScoredEffect, Screen
 from calibration.gap.search_result import COMPARED, SearchResult, SelectionStep, closes_gap, conclude
-from calibration.gap.selection import Selection, select_effect
+from calibration.gap.stepwise.reselection import explain_outliers, reselect
+from calibration.gap.stepwise.selection import Selection, select_effect
 
 _MOST_FAMILIES = 4
 _STEPS = 30  # of the loop; every place of every adopted family
