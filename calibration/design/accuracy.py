@@ -23,6 +23,7 @@ from calibration.design.visibility import site
 from calibration.identification.noise import covariance_by_joints
 from calibration.model.joint_errors import joint_error_sizes
 from calibration.model.model import CalibratedModel
+from calibration.numerics.matrices import traces
 from calibration.observations import Floats
 from calibration.rig.description import Rig
 
@@ -77,7 +78,7 @@ class ExpectedAccuracy:
     @cached_property
     def rms_3d_mm(self) -> Floats:
         """(v, prisms) RMS 3-D error expected in each pose."""
-        return np.asarray(np.sqrt(_traces(self._covariance_mm2)), dtype=np.float64)
+        return np.asarray(np.sqrt(traces(self._covariance_mm2)), dtype=np.float64)
 
     @property
     def rms_mm(self) -> float:
@@ -244,13 +245,9 @@ def accuracy_of_model(model: CalibratedModel, knowledge: Knowledge, root: Floats
     )
 
 
-def _traces(covariance: Floats) -> Floats:
-    return np.asarray(np.trace(covariance, axis1=-2, axis2=-1), dtype=np.float64)
-
-
 def _size_mm(covariance: Floats) -> float:
     """RMS 3-D error of covariances (v, prisms, 3, 3)."""
-    return math.sqrt(float(_traces(covariance).mean()))
+    return math.sqrt(float(traces(covariance).mean()))
 
 
 def _rms(values: Floats) -> float:

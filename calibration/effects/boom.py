@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.effects.base import PrismFamily
-from calibration.effects.context import EffectContext
+from calibration.effects.context import Carried, EffectContext
 from calibration.kinematics.chain import Chain, rotation_about
 from calibration.observations import Floats
 from calibration.rig.description import Rig
@@ -64,17 +64,15 @@ class BoomFamily(PrismFamily):
 
 
 @dataclass(frozen=True)
-class Boom:
-    """The boom in n rows; vectors are of the base frame.
+class Boom(Carried):
+    """The boom, and what its tip carries.
 
     Attributes:
-        context: the rows.
+        context: n rows of observations.
         row: number of the boom's row. Its root is the origin of the frame before, its tip that of its own.
         joint: name of what extends it.
     """
 
-    context: EffectContext
-    row: int
     joint: str
 
     @cached_property
@@ -125,32 +123,10 @@ class Boom:
         return moved
 
     @cached_property
-    def _beyond(self) -> NDArray[np.bool_]:
-        """(rows + 1,) mask of the frames that move with the tip."""
-        rig = self.context.rig
-        return np.array([self.row in rig.path(frame) for frame in range(len(rig.rows) + 1)])
-
-    @cached_property
-    def carries_prism(self) -> NDArray[np.bool_]:
-        """(n,) mask of the rows whose prism moves with the tip."""
-        carried: NDArray[np.bool_] = self._beyond[self.context.prism_frame]
-        return carried
-
-    @cached_property
-    def hanging(self) -> NDArray[np.bool_]:
-        """(points,) mask of the machine's weights that the tip carries."""
-        return self._beyond[self.context.loads.point_frame]
-
-    @cached_property
     def own(self) -> NDArray[np.bool_]:
         """(points,) mask of the weights that are fixed to the boom's root section."""
         own: NDArray[np.bool_] = self.context.loads.point_frame == self.root
         return own
-
-    @cached_property
-    def weights(self) -> tuple[Floats, Floats]:
-        """(n, points, 3) places of the machine's weights, mm, and (n, points) their sizes, N."""
-        return self.context.loads.places(self.context.data.readings, self.context.observations.extra)
 
 
 def boom_in(context: EffectContext) -> Boom | None:

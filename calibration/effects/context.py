@@ -256,3 +256,38 @@ def level_axes(gravity: tuple[float, float, float]) -> Floats:
     x /= np.linalg.norm(x)
     axes: Floats = np.array([x, np.cross(up, x), up])
     return axes
+
+
+@dataclass(frozen=True)
+class Carried:
+    """The part of a machine that moves with a row of its kinematic table; vectors are of the base frame.
+
+    Attributes:
+        context: n rows of observations.
+        row: number of the row of the kinematic table.
+    """
+
+    context: EffectContext
+    row: int
+
+    @cached_property
+    def _beyond(self) -> NDArray[np.bool_]:
+        """(rows + 1,) mask of the frames that move with it."""
+        rig = self.context.rig
+        return np.array([self.row in rig.path(frame) for frame in range(len(rig.rows) + 1)])
+
+    @cached_property
+    def carries_prism(self) -> NDArray[np.bool_]:
+        """(n,) mask of the observations whose prism moves with it."""
+        carried: NDArray[np.bool_] = self._beyond[self.context.prism_frame]
+        return carried
+
+    @cached_property
+    def hanging(self) -> NDArray[np.bool_]:
+        """(points,) mask of the machine's weights that it carries."""
+        return self._beyond[self.context.loads.point_frame]
+
+    @cached_property
+    def weights(self) -> tuple[Floats, Floats]:
+        """(n, points, 3) places of the machine's weights, mm, and (n, points) their sizes, N."""
+        return self.context.loads.places(self.context.data.readings, self.context.observations.extra)

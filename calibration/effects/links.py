@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.effects.base import Coefficient, PrismFamily, Settings
-from calibration.effects.context import EffectContext
+from calibration.effects.context import Carried, EffectContext
 from calibration.effects.load_shapes import (
     UNIT,
     LoadShapes,
@@ -34,16 +33,8 @@ _LEAST_SHARE = 0.01  # of the largest moment; a link that gives way to less of i
 
 
 @dataclass(frozen=True)
-class Link:
-    """Weights that a turning row carries, in n rows of observations; vectors are of the base frame.
-
-    Attributes:
-        context: the rows of observations.
-        row: number of the row of the kinematic table, whose `theta` is driven.
-    """
-
-    context: EffectContext
-    row: int
+class Link(Carried):
+    """A row whose `theta` is driven, and the weights that turn with it."""
 
     @property
     def axis(self) -> Floats:
@@ -54,12 +45,6 @@ class Link:
     def place_mm(self) -> Floats:
         """(n, 3) where it turns: the origin of the frame in which the rotation is made."""
         return self._turning[1]
-
-    @cached_property
-    def carries_prism(self) -> NDArray[np.bool_]:
-        """(n,) mask of the rows of observations whose prism turns with it."""
-        carried: NDArray[np.bool_] = self._beyond[self.context.prism_frame]
-        return carried
 
     @cached_property
     def moment_newton_m(self) -> Floats:
@@ -75,7 +60,7 @@ class Link:
         at_origins = self._moments(origins_mm)
         parts = []
         for index, mass in enumerate(rig.masses):
-            own = self._carried & (loads.point_mass == index)
+            own = self.hanging & (loads.point_mass == index)
             if mass.kg > 0.0 and own.any():
                 parts.append(MASS_SIGMA * self._by_point[:, own].sum(axis=1))
                 if mass.centre_mm is not None and any(mass.centre_mm):
@@ -83,27 +68,12 @@ class Link:
         return np.stack(parts, axis=2) if parts else np.zeros((len(self.context), 3, 0))
 
     @cached_property
-    def _beyond(self) -> NDArray[np.bool_]:
-        """(rows + 1,) mask of the frames that turn with it."""
-        rig = self.context.rig
-        return np.array([self.row in rig.path(frame) for frame in range(len(rig.rows) + 1)])
-
-    @cached_property
-    def _carried(self) -> NDArray[np.bool_]:
-        """(points,) mask of the weights beyond."""
-        return self._beyond[self.context.loads.point_frame]
-
-    @cached_property
-    def _weights(self) -> tuple[Floats, Floats]:
-        return self.context.loads.places(self.context.data.readings, self.context.observations.extra)
-
-    @cached_property
     def _by_point(self) -> Floats:
-        return self._moments(self._weights[0])
+        return self._moments(self.weights[0])
 
     def _moments(self, places_mm: Floats) -> Floats:
         """Return the moments (n, points, 3) of the weights beyond, hung at these places (n, points, 3)."""
-        newton = self._weights[1] * self._carried
+        newton = self.weights[1] * self.hanging
         arm_mm = places_mm - self.place_mm[:, None]
         moments: Floats = np.cross(arm_mm * (newton[:, :, None] / 1e3), self.context.down[:, None])
         return moments

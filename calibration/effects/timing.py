@@ -11,7 +11,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calibration.effects.base import Family, FittedCoefficient, JointFamily, Settings
+from calibration.effects.base import (
+    Family,
+    FittedCoefficient,
+    JointFamily,
+    Settings,
+    SizedFamily,
+    check_sizes,
+    sizes,
+)
 from calibration.effects.context import EffectContext
 from calibration.observations import Floats
 
@@ -104,6 +112,34 @@ class JointStepFamily(StepFamily, JointFamily):
     def _in_readings(self, values: Floats) -> Floats:
         """Return rad or mm as the unit of the joint's readings, deg or mm."""
         return np.degrees(values) if self.kind == "revolute" else values
+
+
+class SizedStepFamily(StepFamily, SizedFamily):
+    """A base or a prism that stands elsewhere from an instant on."""
+
+    def time_s(self, context: EffectContext, where: str) -> Floats:
+        """Return the times (n,) of the rows that may show it, NaN in all others."""
+        del where
+        return context.extra("time_s")
+
+    def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
+        return self.sized(context, where, step_grid(self.time_s(context, where)))
+
+    def refined(self, context: EffectContext, where: str, settings: Settings) -> tuple[Settings, ...]:
+        return self.sized(context, where, refined_steps(self.time_s(context, where), settings))
+
+    def check_settings(self, settings: Settings) -> None:
+        check_sizes(settings, STEP_SETTINGS, len(self.fixed))
+        check_step(settings)
+
+    def after(self, context: EffectContext, where: str, settings: Settings) -> Floats:
+        """Return (n,) 1 in the rows after the step, 0 in those before; rows without a time stand as before."""
+        return (self.time_s(context, where) > settings["time_s"]).astype(np.float64)
+
+    def sized(self, context: EffectContext, where: str, steps: Sequence[Settings]) -> tuple[Settings, ...]:
+        """Return steps together with the sizes of their columns."""
+        known = self.known(context, where)
+        return tuple({**step, **sizes(self.shift_mm(context, where, step)[known])} for step in steps)
 
 
 class _Instants(NamedTuple):

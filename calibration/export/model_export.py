@@ -13,7 +13,9 @@ from calibration.design.knowledge import setup_of
 from calibration.effects.fitted import FittedEffect
 from calibration.effects.library import library
 from calibration.export.correction_grid import CorrectionGrid, Machine, correction_grid, trained_ranges
+from calibration.kinematics.chain import Chain
 from calibration.model.model import CalibratedModel
+from calibration.observations import Floats
 
 GRID_FILE = "corrections.csv"
 _POSES = 1000
@@ -204,6 +206,28 @@ class Format:
     content: Callable[[Export], bytes]
     left_out: Callable[[Export], LeftOut] = lambda _: LeftOut(())
     is_default: bool = False
+
+
+def kinematics_format(name: str, file: str, about: str, text: Callable[[Chain, Floats, Sequence[str]], str]) -> Format:
+    """Return a format that has the identified kinematics as text, and nothing else of the model.
+
+    Args:
+        name: as of `Format`.
+        file: as of `Format`.
+        about: as of `Format`.
+        text: makes the text of a chain, its parameters (p,) and remarks.
+    """
+
+    def content(export: Export) -> bytes:
+        model = export.model
+        return text(model.chain, model.values, export.heading(export.kinematics_alone)).encode()
+
+    return Format(name, file, about, content, lambda export: export.kinematics_alone)
+
+
+def shortest(value: float) -> str:
+    """Return the shortest decimal number that is read as `value`, without a sign of zero."""
+    return repr(float(value) + 0.0).removesuffix(".0")
 
 
 def _needs(effect: FittedEffect) -> str:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 from scipy.special import stdtr
 
 Floats = NDArray[np.float64]
@@ -23,7 +24,7 @@ Flags = NDArray[np.bool_]
 LEAST_RIGS = 5  # fewer tell no spread
 _ROUNDS = 20
 _LEVEL = 0.01  # chance that any of the rigs is taken for an outlier where none is
-_BISECTIONS = 200
+_TINY = float(np.finfo(np.float64).tiny)
 _GRID = 200  # spreads that are averaged over
 _REACH = 3.0  # standard deviations of the values: larger spreads are out of the question
 _MAD = 1.4826  # of a normal distribution: sigma over MAD
@@ -119,16 +120,11 @@ def _fit(y: Floats, s: Floats) -> tuple[float, float, float]:
         mean = float((w * y).sum() / w.sum())
         return float((w * (y - mean) ** 2).sum()) - (len(y) - 1)
 
-    low, high = 0.0, float(np.var(y, ddof=1)) + 1e-300
-    if excess(0.0) <= 0.0:
-        between = 0.0
-    else:
-        while excess(high) > 0.0:
-            high *= 2.0
-        for _ in range(_BISECTIONS):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if excess(middle) > 0.0 else (low, middle)
-        between = 0.5 * (low + high)
+    between, most = 0.0, float(np.var(y, ddof=1)) + _TINY
+    if excess(0.0) > 0.0:
+        while excess(most) > 0.0:  # by rounding
+            most *= 2.0
+        between = brentq(excess, 0.0, most, xtol=_TINY, maxiter=1000)
     w = 1.0 / (s**2 + between)
     return float((w * y).sum() / w.sum()), float(1.0 / w.sum()), between
 

@@ -101,6 +101,11 @@ class SearchResult:
     machine_break: Break | None = None
     needs_background: bool = False
 
+    @property
+    def strongest_formula(self) -> tuple[Formula, ...]:
+        """The formula that says most of what is left, if any does."""
+        return (self.outside_library or self.final.find())[:1]
+
     def refitted_steps(self) -> tuple[SelectionStep, ...]:
         """Return the steps, each about a fit of what those before it adopted, without what was taken back later."""
         there, steps = set[str](), list[SelectionStep]()

@@ -19,6 +19,7 @@ from calibration.identification.samples import Samples, averaged
 from calibration.kinematics.chain import Integers
 from calibration.model.model import CalibratedModel
 from calibration.model.prediction import OUTLIER_SIGMA, Predictor
+from calibration.numerics.matrices import traces
 from calibration.observations import Floats, Observations
 from calibration.rig.description import Rig
 
@@ -92,7 +93,7 @@ class _Groups:
     @cached_property
     def least(self) -> Floats:
         """(g, 1) variance that any combination of a group's coordinates keeps."""
-        least: Floats = _FLOOR * _traces(self.known)[:, None] / self.error.shape[1]
+        least: Floats = _FLOOR * traces(self.known)[:, None] / self.error.shape[1]
         return least
 
     def cost(self, even: float, lever: float) -> float:
@@ -157,8 +158,4 @@ def _likeliest(groups: list[_Groups], excess_sigma_mm: float) -> tuple[float, fl
 
 def _mean_variance(groups: list[_Groups], part: Literal["known", "by_joint"]) -> float:
     """Of a coordinate, mm^2."""
-    return sum(float(_traces(getattr(g, part)).sum()) for g in groups) / sum(g.error.size for g in groups)
-
-
-def _traces(covariance: Floats) -> Floats:
-    return np.asarray(np.trace(covariance, axis1=-2, axis2=-1), dtype=np.float64)
+    return sum(float(traces(getattr(g, part)).sum()) for g in groups) / sum(g.error.size for g in groups)

@@ -102,6 +102,11 @@ def root_of(covariance: Floats) -> Floats:
     return root
 
 
+def traces(matrices: Floats) -> Floats:
+    """Return the traces (...) of matrices (..., q, q)."""
+    return np.asarray(np.trace(matrices, axis1=-2, axis2=-1), dtype=np.float64)
+
+
 def triangular(root: Floats) -> Floats:
     """Return the lower triangular root (q, q) of the same covariance as another root (q, q)."""
     return np.ascontiguousarray(np.linalg.qr(root.T).R.T)

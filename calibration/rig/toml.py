@@ -1,4 +1,4 @@
-"""TOML texts that someone else may have written: tomllib with bounds on time, depth and numbers.
+"""TOML: texts that someone else may have written, by tomllib with bounds on time, depth and numbers; and quoting.
 
 tomllib takes the square of the number of parts of a dotted key, and Python's integers have no end.
 """
@@ -35,6 +35,11 @@ def parse_toml(text: str) -> dict[str, Any]:
         raise ValueError("nested too deeply") from error
     _check_integers(document)
     return document
+
+
+def quoted(text: str) -> str:
+    """Return a text as a TOML string; what cannot be seen is escaped."""
+    return '"' + "".join(c if c.isprintable() and c not in '"\\' else f"\\U{ord(c):08x}" for c in text) + '"'
 
 
 def _check_integers(document: dict[str, Any]) -> None:

@@ -16,6 +16,7 @@ from pydantic import ValidationError
 
 from calibration.rig.columns import LABELS, POSITION, names
 from calibration.rig.description import Rig
+from calibration.rig.toml import quoted
 from drivers.errors import DescriptionError
 from drivers.files import read_whole
 from drivers.stations.delimited import cells_of, lines_of, number_of
@@ -69,21 +70,16 @@ def read_map(path: Path) -> ColumnMap:
 def map_text(columns: ColumnMap, source: str) -> str:
     """Return a map as TOML."""
     told = columns.model_dump(exclude_defaults=True)
-    lines = [f"# How `rigcal import` read {_quoted(source)}. Edit it, and give it with --map."]
+    lines = [f"# How `rigcal import` read {quoted(source)}. Edit it, and give it with --map."]
     lines += [f"{key} = {_toml(value)}" for key, value in told.items() if not isinstance(value, dict)]
     for section in ("columns", "prisms"):
         if told.get(section):
-            lines += ["", f"[{section}]", *(f"{_quoted(key)} = {_toml(value)}" for key, value in told[section].items())]
+            lines += ["", f"[{section}]", *(f"{quoted(key)} = {_toml(value)}" for key, value in told[section].items())]
     return "\n".join(lines) + "\n"
 
 
 def _toml(value: object) -> str:
-    return _quoted(value) if isinstance(value, str) else str(value)
-
-
-def _quoted(text: str) -> str:
-    escaped = "".join(c if c.isprintable() and c not in '"\\' else f"\\u{ord(c):04x}" for c in text)
-    return f'"{escaped}"'
+    return quoted(value) if isinstance(value, str) else str(value)
 
 
 # ---- joints ----------------------------------------------------------------------------------------------------------

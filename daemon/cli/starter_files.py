@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from calibration.rig.toml import quoted
 from daemon.cli.listening import HeardBus
 from drivers.stations.serial_port import SerialConfig
 
@@ -49,7 +50,7 @@ def configuration(
 # Every key is described at [[can]], [[station]], ... in the configuration that the package installs.
 
 # A rig that ships with rigcal (swdt82, ys100, ur10), or the path of a rig file, relative to this file.
-rig = {_quoted(rig)}
+rig = {quoted(rig)}
 
 # Where store, models and reports are kept; the service keeps them in /var/lib/rigcal where this is left out.
 # state_directory = "/var/lib/rigcal"
@@ -60,25 +61,25 @@ rig = {_quoted(rig)}
 # The boom's bus. rigcal sends nothing on it unless allow_transmit = true stands here, with the nodes it may set up.
 [[can]]
 name = "boom" # the `link` of the rig's channels
-interface = {_quoted(interface)}
-channel = {_quoted(channel)}
+interface = {quoted(interface)}
+channel = {quoted(channel)}
 {rate}# allow_transmit = true
 # transmit_nodes = [32, 33, 34]
 """
     if station is not None:
         profile, family, serial = station
-        listen = f"listen_to = {_quoted(family)}\n" if profile == "passive" else ""
+        listen = f"listen_to = {quoted(family)}\n" if profile == "passive" else ""
         text += f"""
 # The total station: topcon_gts8 (tracking), topcon_classic, sokkia_set, or passive, which never sends anything.
 [[station]]
-profile = {_quoted(profile)}
+profile = {quoted(profile)}
 {listen}
 # Its port, best by a name that stays the adapter's (/dev/rigcal-station by the udev rule); the rest as it is set.
 [station.serial]
-path = {_quoted(serial.path)}
+path = {quoted(serial.path)}
 baud = {serial.baud}
 bytesize = {serial.bytesize}
-parity = {_quoted(serial.parity)}
+parity = {quoted(serial.parity)}
 stopbits = {serial.stopbits}
 """
     return (
@@ -104,7 +105,7 @@ def rig_file(name: str, joints: Sequence[JointChoice], prisms: Sequence[str], he
         f"""# A rig file: docs/how-to/rig-files.md says how to write one, docs/reference/rig-keys.md lists every key.
 # FILL IN what the drawings say: numbers of [[row]], offsets of prisms, zeros of encoders. Lengths mm, angles deg.
 {_heard_comment(heard)}
-name = {_quoted(name)}
+name = {quoted(name)}
 convention = "mdh_beta_after"
 gravity = [0, 0, -1]      # direction in the base frame
 
@@ -126,7 +127,7 @@ target_sigma_mm = 1.0
     parts += [
         f"""
 [[prism]]
-name = {_quoted(prism)}
+name = {quoted(prism)}
 frame = {len(joints)}                 # it sits on the link after that row
 offset_mm = [0, 0, {100 * (place + 1)}]   # FILL IN, in that frame
 """
@@ -151,8 +152,8 @@ def _joint(joint: JointChoice) -> str:
     sigma = 0.005 if joint.kind == "revolute" else 0.2
     return f"""
 [[joint]]
-name = {_quoted(joint.name)}
-kind = {_quoted(joint.kind)}
+name = {quoted(joint.name)}
+kind = {quoted(joint.kind)}
 limits = [{low:g}, {high:g}]      # {joint.unit}
 sigma = {sigma}             # random error of a reading, {joint.unit}
 """
@@ -176,13 +177,7 @@ def _channel(joint: JointChoice) -> str:
         what = 'device = "cia406_linear"\nstep_nm = 100000  # object 6005h'
     return f"""
 [[channel]]
-name = {_quoted(joint.name)}
+name = {quoted(joint.name)}
 {what}
 node = {joint.node}
 """
-
-
-def _quoted(text: str) -> str:
-    """Return a TOML basic string."""
-    escaped = "".join(c if c.isprintable() and c not in '"\\' else f"\\u{ord(c):04x}" for c in text)
-    return f'"{escaped}"'

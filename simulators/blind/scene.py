@@ -21,6 +21,8 @@ Floats = NDArray[np.float64]
 Strings = NDArray[np.str_]
 Flags = NDArray[np.bool_]
 
+_MISJUDGED = 0.05  # the stated sigma is wrong by a factor from 1 - this to 1 + this
+
 
 @dataclass(frozen=True)
 class SceneSettings:
@@ -223,7 +225,7 @@ def draw_scene(rig: Rig, seed: int, settings: SceneSettings | None = None) -> Sc
     is_training = np.zeros(total, dtype=bool)
     is_training[[0, total - 1, *(1 + rng.permutation(total - 2)[: settings.poses - 2])]] = True
     travelled = _travelled(rig, duty, is_training)
-    misjudged = 1.0 + settings.noise.misjudged * float(rng.uniform(-1.0, 1.0))
+    misjudged = 1.0 + _MISJUDGED * float(rng.uniform(-1.0, 1.0))
     training = _measure(truth, duty, travelled, is_training, settings, misjudged, rng)
     taken = training.columns
     draws = EffectDraws(

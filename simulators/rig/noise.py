@@ -27,7 +27,6 @@ class NoiseSettings:
         excess_wander: standard deviation of a further error that wanders likewise, in units of the noise; neither the
             covariance nor the stated sigma includes it.
         outliers: share of the fixes that are 8 to 60 times the noise off.
-        misjudged: the stated sigma is wrong by a factor from 1 - this to 1 + this.
         encoder_step_deg: encoders read in steps of this size, whatever the rig file says; 0 as the rig file says.
         jitter_s: standard deviation of the instant at which joints are read, against that of the fix.
     """
@@ -37,7 +36,6 @@ class NoiseSettings:
     wander_poses: float = 3.0
     excess_wander: float = 0.0
     outliers: float = 0.015
-    misjudged: float = 0.05
     encoder_step_deg: float = 0.0
     jitter_s: float = 0.005
 
@@ -135,7 +133,7 @@ def read_joints(
 
 
 def _check(settings: NoiseSettings) -> None:
-    shares = settings.common_share, settings.wander_share, settings.outliers, settings.misjudged
+    shares = settings.common_share, settings.wander_share, settings.outliers
     if min(shares) < 0.0 or settings.common_share + settings.wander_share > 1.0 or settings.outliers > 1.0:
         raise ValueError("shares of noise are from 0 to 1, those of the variance together at most 1")
     if min(settings.encoder_step_deg, settings.jitter_s, settings.excess_wander) < 0.0 or settings.wander_poses <= 0.0:

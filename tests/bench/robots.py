@@ -7,44 +7,35 @@ exported, all by the commands of `rigcal`; the exported URDF is compared with th
 from __future__ import annotations
 
 import argparse
-import json
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from calibration.export.correction_grid import Machine, trained_ranges
 from calibration.export.model_export import Export, without_parts
 from daemon.models.model_files import read_model
+from tests.commands import answer_apart
 from tests.robots import ROBOTS, Pinocchio, Robot
 
 POSES, HELD_OUT, COMPARED = 300, 200, 50
 RATIO_BAR, EXACT_MM = 1.06, 1e-9
 
 
-def rigcal(*arguments: str) -> dict[str, Any]:
-    """The JSON object of a command."""
-    command = [sys.executable, "-m", "daemon.cli.main", *arguments, "--json"]
-    found: dict[str, Any] = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout)
-    return found
-
-
 def run(name: str, robot: Robot, directory: Path, seed: int) -> bool:
     """Print the line of a robot; True if it is within the bars."""
     rig, model = str(directory / f"{name}.toml"), str(directory / name)
     train, test = (str(directory / f"{name}-{part}.csv") for part in ("train", "test"))
-    rigcal("rig", "import", str(robot.path), *robot.options, "--out", rig)
-    checked = rigcal("rig", "check", rig)["identifiability"]
+    answer_apart("rig", "import", str(robot.path), *robot.options, "--out", rig)
+    checked = answer_apart("rig", "check", rig)["identifiability"]
     machine = ["simulate", "--rig", rig, "--seed", str(seed)]
-    rigcal(*machine, "--poses", str(POSES), "--out", train)
-    noise_mm = rigcal(*machine, "--poses", str(HELD_OUT), "--recording", "1", "--out", test)["noise_rms_mm"]
+    answer_apart(*machine, "--poses", str(POSES), "--out", train)
+    noise_mm = answer_apart(*machine, "--poses", str(HELD_OUT), "--recording", "1", "--out", test)["noise_rms_mm"]
     plain = ["--effects", "none", "--residual", "none"]
-    found = rigcal("calibrate", "--rig", rig, "--data", train, *plain, "--out", model)
-    stages = {s["stage"]: s["rms_mm"] for s in rigcal("evaluate", "--model", model, "--data", test)["stages"]}
-    rigcal("model", "export", "--model", model, "--format", "urdf", "--out", model)
+    found = answer_apart("calibrate", "--rig", rig, "--data", train, *plain, "--out", model)
+    stages = {s["stage"]: s["rms_mm"] for s in answer_apart("evaluate", "--model", model, "--data", test)["stages"]}
+    answer_apart("model", "export", "--model", model, "--format", "urdf", "--out", model)
     off_mm = _against_pinocchio(Path(model))
     ratio = stages["geometric"] / noise_mm
     print(

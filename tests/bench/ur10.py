@@ -12,9 +12,6 @@ moves the prism.
 from __future__ import annotations
 
 import argparse
-import json
-import subprocess
-import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -29,6 +26,7 @@ from calibration.observations import Observations, format_observations, parse_ob
 from calibration.rig.description import shipped_rig
 from calibration.run_settings import Run
 from daemon.models.model_files import read_model
+from tests.commands import answer_apart
 
 DATA = Path(__file__).parents[1] / "data"
 SHARE = 0.7
@@ -106,9 +104,9 @@ def main() -> None:
 
 def _print_line(label: str, training: Path, held_out: Path, effects: str, model: Path) -> None:
     started = time.monotonic()
-    _rigcal("calibrate", "--rig", "ur10", "--data", str(training), "--out", str(model), "--effects", effects)
+    answer_apart("calibrate", "--rig", "ur10", "--data", str(training), "--out", str(model), "--effects", effects)
     seconds = time.monotonic() - started
-    stages = _rigcal("evaluate", "--model", str(model), "--data", str(held_out))["stages"]
+    stages = answer_apart("evaluate", "--model", str(model), "--data", str(held_out))["stages"]
     figures = "  ".join(f"{stage['stage']} {stage['rms_mm']:.3f}" for stage in stages)
     megabytes = sum(file.stat().st_size for file in model.rglob("*") if file.is_file()) / 1e6
     print(
@@ -116,14 +114,6 @@ def _print_line(label: str, training: Path, held_out: Path, effects: str, model:
         f"{MANY:,} predictions take {1e3 * predict_seconds(model, held_out):.0f} ms",
         flush=True,
     )
-
-
-def _rigcal(*arguments: str) -> dict[str, list[dict[str, float]]]:
-    command = [sys.executable, "-m", "daemon.cli.main", *arguments, "--json"]
-    result: dict[str, list[dict[str, float]]] = json.loads(
-        subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout
-    )
-    return result
 
 
 if __name__ == "__main__":

@@ -3,8 +3,6 @@
 import json
 import math
 import sqlite3
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ import pytest
 
 from daemon.store.reader import Reader
 from drivers.readings import CanCapture
+from tests.commands import run_apart
 from tests.daemon.daemon_process import DaemonProcess
 
 SIM = ("--sim", "--rate", "25", "--seed", "3", "--dwell", "2.5")
@@ -25,12 +24,6 @@ allow_transmit = true
 prism = "r"
 can = { link = "boom", arbitration_id = 0x680 }
 """
-
-
-def rigcal(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "daemon.cli.main", *arguments], capture_output=True, text=True, check=False
-    )
 
 
 def record(daemon: DaemonProcess, prism: str, kind: str, poses: int) -> dict[str, Any]:
@@ -78,9 +71,11 @@ def test_closed_sessions_become_a_model_and_a_report(finished: DaemonProcess) ->
 def test_the_model_in_the_store_is_the_one_on_the_disk(finished: DaemonProcess) -> None:
     out = finished.directory / "evaluated.csv"
     model = next(j for j in finished.say("jobs.list") if j["kind"] == "residual")["result"]["model"]
-    exported = rigcal("session", "export", "s001-r", "--config", str(finished.config), "--out", str(out.parent / "x"))
+    exported = run_apart(
+        "session", "export", "s001-r", "--config", str(finished.config), "--out", str(out.parent / "x")
+    )
     assert exported.returncode == 0, exported.stderr
-    evaluated = rigcal("evaluate", "--model", model, "--data", str(out.parent / "x" / "s001-r.csv"), "--json")
+    evaluated = run_apart("evaluate", "--model", model, "--data", str(out.parent / "x" / "s001-r.csv"), "--json")
     assert evaluated.returncode == 0, evaluated.stderr
     assert json.loads(evaluated.stdout)["n"] > 12
 
@@ -90,10 +85,10 @@ def test_an_exported_session_replays_to_the_same_observations(finished: DaemonPr
     for suffix in ("log", "blf"):
         out = tmp_path / suffix
         options = ("--config", str(finished.config), "--out", str(out), "--format", suffix, "--json")
-        exported = rigcal("session", "export", "s002-s", *options)
+        exported = run_apart("session", "export", "s002-s", *options)
         assert exported.returncode == 0, exported.stderr
         logs = [name for name in json.loads(exported.stdout)["files"] if not name.endswith((".csv", ".json"))]
-        replayed = rigcal(
+        replayed = run_apart(
             *("replay", *logs, "--config", str(finished.config), "--store", str(out / "again.sqlite")),
             *("--session", str(out / "s002-s.json"), "--json"),
         )
@@ -111,7 +106,7 @@ def test_an_exported_session_replays_to_the_same_observations(finished: DaemonPr
 
 
 def test_status_says_what_every_channel_reads(finished: DaemonProcess) -> None:
-    status = rigcal("status", "--socket", str(finished.socket), "--json")
+    status = run_apart("status", "--socket", str(finished.socket), "--json")
     assert status.returncode == 0, status.stderr
     told = json.loads(status.stdout)
     assert told["mode"] == "simulated"
@@ -120,13 +115,15 @@ def test_status_says_what_every_channel_reads(finished: DaemonProcess) -> None:
     assert channels["theta1"]["unit"] == "deg"
     assert all(link["dropped"] == 0 for link in told["acquisition"]["links"])
     # At many times real time a moment without the processor is a silent second, and told as such.
-    finished.wait("all joints", lambda: "9 of 9 joints ok" in rigcal("status", "--socket", str(finished.socket)).stdout)
-    assert "theta1" in rigcal("status", "--all", "--socket", str(finished.socket)).stdout
+    finished.wait(
+        "all joints", lambda: "9 of 9 joints ok" in run_apart("status", "--socket", str(finished.socket)).stdout
+    )
+    assert "theta1" in run_apart("status", "--all", "--socket", str(finished.socket)).stdout
 
 
 def test_every_list_is_shown_to_people_too(finished: DaemonProcess) -> None:
     for command in (("session", "list"), ("session", "show", "s001-r"), ("setup", "list"), ("jobs", "list")):
-        shown = rigcal(*command, "--socket", str(finished.socket))
+        shown = run_apart(*command, "--socket", str(finished.socket))
         assert shown.returncode == 0, shown.stderr
         assert shown.stdout.strip()
 
@@ -138,16 +135,16 @@ def test_commands_that_make_no_sense_are_refused_with_the_contracts_status(finis
         ("jobs", "retry", "1"),
         ("jobs", "cancel", "99"),
     ):
-        refused = rigcal(*command, "--socket", str(finished.socket))
+        refused = run_apart(*command, "--socket", str(finished.socket))
         assert refused.returncode == 2, refused.stderr
         assert len(refused.stderr.strip().splitlines()) <= 3
-    parked = rigcal("devices", "configure", "--socket", str(finished.socket))
+    parked = run_apart("devices", "configure", "--socket", str(finished.socket))
     assert parked.returncode == 2
     assert "parked" in parked.stderr
 
 
 def test_a_second_daemon_on_the_same_store_refuses_and_touches_nothing(finished: DaemonProcess) -> None:
-    second = rigcal("run", "--config", str(finished.config), *SIM)
+    second = run_apart("run", "--config", str(finished.config), *SIM)
     assert second.returncode == 1
     assert str(finished.process.pid) in second.stderr
     fixes = finished.say("status")["acquisition"]["stations"][0]["fixes"]
@@ -156,7 +153,7 @@ def test_a_second_daemon_on_the_same_store_refuses_and_touches_nothing(finished:
 
 def test_a_target_that_is_not_there_is_refused_at_once_and_the_rig_goes_on(finished: DaemonProcess) -> None:
     finished.say("session.start", prism="w", id="lost")
-    refused = rigcal("session", "shoot", "nowhere", "--socket", str(finished.socket))
+    refused = run_apart("session", "shoot", "nowhere", "--socket", str(finished.socket))
     assert refused.returncode == 2
     assert "no target 'nowhere'" in refused.stderr
     finished.wait("a pose", lambda: finished.say("session.show", id="lost")["poses"] >= 2)
@@ -165,11 +162,11 @@ def test_a_target_that_is_not_there_is_refused_at_once_and_the_rig_goes_on(finis
 
 def test_an_operator_confirms_the_prism_and_status_says_whether_it_is_suspected(finished: DaemonProcess) -> None:
     socket = ("--socket", str(finished.socket))
-    refused = rigcal("session", "confirm-prism", *socket)
+    refused = run_apart("session", "confirm-prism", *socket)
     assert refused.returncode == 2
     assert "no session is open" in refused.stderr
     finished.say("session.start", prism="r", id="confirmed")
-    confirmed = rigcal("session", "confirm-prism", "--operator", "Ada", *socket)
+    confirmed = run_apart("session", "confirm-prism", "--operator", "Ada", *socket)
     assert confirmed.returncode == 0, confirmed.stderr
     assert "Ada confirms that the station is on prism r" in confirmed.stdout
     assert finished.say("status")["session"]["prism_suspicions"] == []
@@ -182,13 +179,13 @@ def test_an_accepted_model_gives_the_live_tip_on_the_socket_and_on_the_bus(finis
     early, best = finished.say("model.list")
     assert (early["comparison"], best["comparison"]["live"]) == (None, None)
     assert best["comparison"]["is_better"], best
-    assert json.loads(rigcal("tip", *socket, "--json").stdout)["status"] == "no_model"
-    refused = rigcal("model", "accept", str(early["id"]), *socket)
+    assert json.loads(run_apart("tip", *socket, "--json").stdout)["status"] == "no_model"
+    refused = run_apart("model", "accept", str(early["id"]), *socket)
     assert refused.returncode == 3
     assert "was not compared with held-out data yet" in refused.stderr
-    accepted = rigcal("model", "accept", str(best["id"]), "--operator", "Ada", *socket)
+    accepted = run_apart("model", "accept", str(best["id"]), "--operator", "Ada", *socket)
     assert accepted.returncode == 0, accepted.stderr
-    assert f"model {best['id']} (hybrid) is live" in rigcal("status", *socket).stdout
+    assert f"model {best['id']} (hybrid) is live" in run_apart("status", *socket).stdout
     finished.wait("the model", lambda: finished.say("tip")["status"] != "no_model")
 
     name = finished.say("session.start", prism="r", kind="check")["id"]
@@ -204,7 +201,7 @@ def test_an_accepted_model_gives_the_live_tip_on_the_socket_and_on_the_bus(finis
     sent = _sent(finished.directory, 0x680)
     assert {frame.data[7] for frame in sent} >= {16, 0}, "no model at first, then positions"
     for command in (("tip",), ("model", "show"), ("model", "list")):
-        shown = rigcal(*command, *socket)
+        shown = run_apart(*command, *socket)
         assert shown.returncode == 0, shown.stderr
         assert shown.stdout.strip()
 
@@ -300,7 +297,7 @@ def test_a_malformed_log_is_refused_before_anything_runs(tmp_path: Path) -> None
         ("run", "--config", config, "--replay", str(bad)),
         ("replay", str(bad), "--config", config, "--store", str(tmp_path / "new.sqlite")),
     ):
-        refused = rigcal(*command)
+        refused = run_apart(*command)
         assert refused.returncode == 2
         assert "bad.log:" in refused.stderr
     assert not (tmp_path / "new.sqlite").exists()

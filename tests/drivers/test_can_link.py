@@ -37,7 +37,6 @@ from tests.drivers.can_support import (
     Adapter,
     Heard,
     message,
-    plugged_adapter,
     running,
     slcan_link,
     unused_channel,
@@ -278,12 +277,6 @@ def test_settings_that_open_nothing_are_a_link_error(
 
 def settings(interface: Interface, channel: str, options: dict[str, object]) -> CanLinkConfig:
     return CanLinkConfig(name="boom", interface=interface, channel=channel, bitrate=250_000, options=options)
-
-
-@pytest.fixture
-def adapter(tmp_path: Path) -> Iterator[Adapter]:
-    with plugged_adapter(tmp_path / "slcan") as plugged:
-        yield plugged
 
 
 def test_an_slcan_adapter_is_opened_listen_only_by_default(adapter: Adapter) -> None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from calibration.effects.base import Coefficient, FittedCoefficient, Settings, SizedFamily, check_sizes, sizes
+from calibration.effects.base import Coefficient, FittedCoefficient, Settings, check_sizes
 from calibration.effects.context import EffectContext
-from calibration.effects.timing import STEP_SETTINGS, StepFamily, check_step, refined_steps, step_grid
+from calibration.effects.timing import STEP_SETTINGS, SizedStepFamily, check_step, refined_steps, step_grid
 from calibration.observations import Floats
 
 _ON_THE_SPOT = "on_the_spot"
@@ -14,7 +12,7 @@ _ON_THE_SPOT_ODDS = 0.25
 _HEADING = Coefficient("heading_rad", "rad", 1e-3, -10e-3, 10e-3)
 
 
-class BaseShift(StepFamily, SizedFamily):
+class BaseShift(SizedStepFamily):
     """The base stands elsewhere on the ground, and points elsewhere, in all rows after one instant.
 
     Tilts and the rise are `base_step`'s: a carrier that slips off a jack does both. A pedestal that turns in its foot
@@ -33,12 +31,12 @@ class BaseShift(StepFamily, SizedFamily):
     def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
         steps = step_grid(context.extra("time_s"))
         turns = tuple({**step, _ON_THE_SPOT: 1.0} for step in steps)
-        return self._sized(context, where, (*steps, *turns))
+        return self.sized(context, where, (*steps, *turns))
 
     def refined(self, context: EffectContext, where: str, settings: Settings) -> tuple[Settings, ...]:
         form = {_ON_THE_SPOT: 1.0} if _ON_THE_SPOT in settings else {}
         finer = refined_steps(context.extra("time_s"), settings)
-        return self._sized(context, where, tuple({**step, **form} for step in finer))
+        return self.sized(context, where, [{**step, **form} for step in finer])
 
     def odds(self, settings: Settings) -> float:
         return super().odds(settings) * (_ON_THE_SPOT_ODDS if _ON_THE_SPOT in settings else 1.0)
@@ -69,15 +67,8 @@ class BaseShift(StepFamily, SizedFamily):
         return listed
 
     def shift_mm(self, context: EffectContext, where: str, settings: Settings) -> Floats:
-        del where
-        # A comparison with NaN is false: rows without a time stand as before.
-        after = context.extra("time_s") > settings["time_s"]
-        moved = context.base_shift_mm(after.astype(np.float64))
+        moved = context.base_shift_mm(self.after(context, where, settings))
         return moved[:, :, 2:] if _ON_THE_SPOT in settings else moved
-
-    def _sized(self, context: EffectContext, where: str, steps: tuple[Settings, ...]) -> tuple[Settings, ...]:
-        known = self.known(context, where)
-        return tuple({**step, **sizes(self.shift_mm(context, where, step)[known])} for step in steps)
 
 
 def _coefficients(settings: Settings) -> tuple[Coefficient, ...]:

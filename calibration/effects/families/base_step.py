@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from calibration.effects.base import Coefficient, Settings, SizedFamily, check_sizes, sizes
+from calibration.effects.base import Coefficient, Settings, sizes
 from calibration.effects.context import EffectContext
-from calibration.effects.timing import STEP_SETTINGS, StepFamily, check_step, refined_steps, step_grid
+from calibration.effects.timing import SizedStepFamily
 from calibration.observations import Floats
 
 
-class BaseStep(StepFamily, SizedFamily):
+class BaseStep(SizedStepFamily):
     """The base stands otherwise, as a rigid body, in all rows after one instant."""
 
     name = "base_step"
@@ -26,22 +28,10 @@ class BaseStep(StepFamily, SizedFamily):
     place = "base"
     moves_machine = False
 
-    def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
-        return self._sized(context, where, step_grid(context.extra("time_s")))
-
-    def refined(self, context: EffectContext, where: str, settings: Settings) -> tuple[Settings, ...]:
-        return self._sized(context, where, refined_steps(context.extra("time_s"), settings))
-
-    def check_settings(self, settings: Settings) -> None:
-        check_sizes(settings, STEP_SETTINGS, len(self.fixed))
-        check_step(settings)
-
     def shift_mm(self, context: EffectContext, where: str, settings: Settings) -> Floats:
-        del where
-        # A comparison with NaN is false: rows without a time stand as before.
-        return context.base_motion_mm((context.extra("time_s") > settings["time_s"]).astype(np.float64))
+        return context.base_motion_mm(self.after(context, where, settings))
 
-    def _sized(self, context: EffectContext, where: str, steps: tuple[Settings, ...]) -> tuple[Settings, ...]:
+    def sized(self, context: EffectContext, where: str, steps: Sequence[Settings]) -> tuple[Settings, ...]:
         if not steps:
             return ()
         known = self.known(context, where)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.effects.base import Coefficient, Settings, SizedFamily, check_sizes, sizes
+from calibration.effects.base import Coefficient, Settings
 from calibration.effects.context import EffectContext
-from calibration.effects.timing import STEP_SETTINGS, StepFamily, check_step, refined_steps, step_grid
+from calibration.effects.timing import SizedStepFamily
 from calibration.observations import Floats
 from calibration.rig.description import Rig
 
 
-class PrismSeatStep(StepFamily, SizedFamily):
+class PrismSeatStep(SizedStepFamily):
     """From an instant on a prism sits elsewhere in the frame that it is fixed to."""
 
     name = "prism_seat_step"
@@ -24,29 +24,13 @@ class PrismSeatStep(StepFamily, SizedFamily):
     def places(self, rig: Rig) -> tuple[str, ...]:
         return rig.prism_names
 
-    def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
-        return self._sized(context, where, step_grid(_own_time_s(context, where)))
-
-    def refined(self, context: EffectContext, where: str, settings: Settings) -> tuple[Settings, ...]:
-        return self._sized(context, where, refined_steps(_own_time_s(context, where), settings))
-
-    def check_settings(self, settings: Settings) -> None:
-        check_sizes(settings, STEP_SETTINGS, len(self.fixed))
-        check_step(settings)
+    def time_s(self, context: EffectContext, where: str) -> Floats:
+        """Return the times (n,) of the prism's rows, NaN in those of others."""
+        return np.where(context.rows_of_prism(where), context.extra("time_s"), np.nan)
 
     def shift_mm(self, context: EffectContext, where: str, settings: Settings) -> Floats:
-        # A comparison with NaN is false: rows without a time, as those of other prisms, stay as they are.
-        after = _own_time_s(context, where) > settings["time_s"]
+        after = self.after(context, where, settings)
         return context.to_station(context.facing.axes.transpose(0, 2, 1) * after[:, None, None])
-
-    def _sized(self, context: EffectContext, where: str, steps: tuple[Settings, ...]) -> tuple[Settings, ...]:
-        known = self.known(context, where)
-        return tuple({**step, **sizes(self.shift_mm(context, where, step)[known])} for step in steps)
-
-
-def _own_time_s(context: EffectContext, prism: str) -> Floats:
-    """Return the time (n,) of the rows of one prism; NaN in all others."""
-    return np.where(context.rows_of_prism(prism), context.extra("time_s"), np.nan)
 
 
 FAMILY = PrismSeatStep()

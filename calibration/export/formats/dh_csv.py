@@ -7,7 +7,7 @@ import io
 import math
 from collections.abc import Sequence
 
-from calibration.export.model_export import Export, Format
+from calibration.export.model_export import kinematics_format, shortest
 from calibration.kinematics.chain import ROW_ORDER, Chain
 from calibration.observations import Floats
 from calibration.rig.exchange.from_table import BEFORE, CONSTANTS, DRIVES, JOINT, PRISM
@@ -29,39 +29,28 @@ def dh_text(chain: Chain, x: Floats, remarks: Sequence[str]) -> str:
     writer = csv.DictWriter(out, header, lineterminator="\n")
     writer.writeheader()
     for joint in rig.joints:
-        limits = (_number(value) for value in (*joint.limits, joint.max_rate))
+        limits = (shortest(value) for value in (*joint.limits, joint.max_rate))
         writer.writerow(dict(zip(JOINT, (joint.name, joint.kind, *limits), strict=True)))
     corrections = {parameter.name: float(value) for parameter, value in zip(chain.parameters, x, strict=True)}
     for number, row in enumerate(rig.rows, 1):
         cells: dict[str, object] = {"after": (0, *rig.path(number))[-2]}
         if row.before is not None:
-            cells |= {key: _number(value) for key, value in row.before.model_dump().items()}
+            cells |= {key: shortest(value) for key, value in row.before.model_dump().items()}
         for name in names:
             column, correction = f"{name}_{CONSTANTS[name]}", corrections.get(f"row{number}.{name}", 0.0)
             unit = math.degrees(1.0) if CONSTANTS[name] == "deg" else 1.0
-            cells[column] = _number(getattr(row, column) + correction * unit)
+            cells[column] = shortest(getattr(row, column) + correction * unit)
         for driven, terms in row.drive.items():
             cells[f"{driven}_drive"] = " ".join(
-                f"{'-' if c < 0.0 else '+'} {_number(abs(c))}*{name}" for name, c in terms.items()
+                f"{'-' if c < 0.0 else '+'} {shortest(abs(c))}*{name}" for name, c in terms.items()
             ).removeprefix("+ ")
         cells["identify"] = " ".join(row.identify) or "-"
         writer.writerow(cells)
     for prism, offsets in zip(rig.prisms, chain.prism_ops, strict=True):
         place = [op.constant + (float(x[op.parameter]) if op.parameter >= 0 else 0.0) for op in offsets]
-        named = dict(zip(PRISM, (prism.name, prism.frame, *map(_number, place)), strict=True))
+        named = dict(zip(PRISM, (prism.name, prism.frame, *map(shortest, place)), strict=True))
         writer.writerow(named)
     return out.getvalue()
 
 
-def _number(value: float) -> str:
-    return repr(float(value) + 0.0).removesuffix(".0")
-
-
-def _content(export: Export) -> bytes:
-    model = export.model
-    return dh_text(model.chain, model.values, export.heading(export.kinematics_alone)).encode()
-
-
-FORMAT = Format(
-    "dh-csv", "dh.csv", "the identified Denavit-Hartenberg constants", _content, lambda export: export.kinematics_alone
-)
+FORMAT = kinematics_format("dh-csv", "dh.csv", "the identified Denavit-Hartenberg constants", dh_text)

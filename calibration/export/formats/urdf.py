@@ -11,7 +11,7 @@ from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
-from calibration.export.model_export import Export, Format
+from calibration.export.model_export import kinematics_format, shortest
 from calibration.export.motions import Motion, MotionTree, motion_tree
 from calibration.kinematics.chain import Chain
 from calibration.observations import Floats
@@ -130,11 +130,11 @@ class _Elements:
         kind = "revolute" if rotates else "prismatic"
         follows = ""
         if ratio is not None:
-            follows = f'<mimic joint="{self._prefix}{own.name}" multiplier="{_number(ratio)}" offset="0"/>'
+            follows = f'<mimic joint="{self._prefix}{own.name}" multiplier="{shortest(ratio)}" offset="0"/>'
         self.lines.append(
             f'<joint name="{self._prefix}{name}" type="{kind}">{self._between(parent, child)}{_origin(origin)}'
-            f'<axis xyz="{axis}"/><limit lower="{_number(low)}" upper="{_number(high)}" effort="0" '
-            f'velocity="{_number(rate)}"/>{follows}</joint>'
+            f'<axis xyz="{axis}"/><limit lower="{shortest(low)}" upper="{shortest(high)}" effort="0" '
+            f'velocity="{shortest(rate)}"/>{follows}</joint>'
         )
 
     def _fixed(self, name: str, parent: str, child: str, origin: Floats) -> None:
@@ -159,12 +159,12 @@ class _Elements:
                 name = f"mass{number}" + (f"_{part + 1}" if mass.midway else "")
                 tensor = mass.inertia_kg_m2 or (0.0,) * 6
                 keys = zip(("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), tensor, strict=True)
-                inertia = " ".join(f'{key}="{_number(value)}"' for key, value in keys)
+                inertia = " ".join(f'{key}="{shortest(value)}"' for key, value in keys)
                 self.lines.append(f"<!-- {name}: {escape(mass.name.replace('--', '- -'))} -->")
                 self._fixed(f"to_{name}", links[tree.frames[frame]], name, np.eye(4))
                 self._link(
                     name,
-                    f'<inertial>{_origin(_at(centre_mm))}<mass value="{_number(kg)}"/><inertia {inertia}/></inertial>',
+                    f'<inertial>{_origin(_at(centre_mm))}<mass value="{shortest(kg)}"/><inertia {inertia}/></inertial>',
                 )
 
 
@@ -181,23 +181,8 @@ def _at(place_mm: Floats) -> Floats:
 
 def _origin(transform: Floats) -> str:
     yaw, pitch, roll = angles_zyx(transform[:3, :3])
-    xyz = " ".join(_number(x / 1e3) for x in transform[:3, 3].tolist())
-    return f'<origin xyz="{xyz}" rpy="{_number(roll)} {_number(pitch)} {_number(yaw)}"/>'
+    xyz = " ".join(shortest(x / 1e3) for x in transform[:3, 3].tolist())
+    return f'<origin xyz="{xyz}" rpy="{shortest(roll)} {shortest(pitch)} {shortest(yaw)}"/>'
 
 
-def _number(value: float) -> str:
-    return repr(float(value) + 0.0).removesuffix(".0")
-
-
-def _content(export: Export) -> bytes:
-    model = export.model
-    return urdf_text(model.chain, model.values, export.heading(export.kinematics_alone)).encode()
-
-
-FORMAT = Format(
-    "urdf",
-    "model.urdf",
-    "the identified kinematics for ROS, pinocchio and others",
-    _content,
-    lambda export: export.kinematics_alone,
-)
+FORMAT = kinematics_format("urdf", "model.urdf", "the identified kinematics for ROS, pinocchio and others", urdf_text)

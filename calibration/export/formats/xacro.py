@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from xml.sax.saxutils import quoteattr
 
 from calibration.export.formats.urdf import urdf_elements, xml_comment
-from calibration.export.model_export import Export, Format
+from calibration.export.model_export import kinematics_format
 from calibration.kinematics.chain import Chain
 from calibration.observations import Floats
 
@@ -23,15 +23,4 @@ def xacro_text(chain: Chain, x: Floats, remarks: Sequence[str]) -> str:
     )
 
 
-def _content(export: Export) -> bytes:
-    model = export.model
-    return xacro_text(model.chain, model.values, export.heading(export.kinematics_alone)).encode()
-
-
-FORMAT = Format(
-    "xacro",
-    "model.xacro",
-    "the same with a prefix that the caller gives",
-    _content,
-    lambda export: export.kinematics_alone,
-)
+FORMAT = kinematics_format("xacro", "model.xacro", "the same with a prefix that the caller gives", xacro_text)

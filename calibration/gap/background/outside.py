@@ -12,11 +12,12 @@ from calibration.gap.background.blocks import Block
 from calibration.gap.candidates import CandidateEffect
 from calibration.gap.detection import detect
 from calibration.gap.formulas.grammar import Formula, Grammar
-from calibration.gap.joint_fit import JointFit, Problem
+from calibration.gap.joint_fit import JointFit, Problem, along
 from calibration.gap.projection import Projection
 from calibration.identification.refinement import refine
 from calibration.observations import Floats
 
+MOST_FORMULAS = 3  # that may explain all that is left
 _SAME = 0.995  # share of a formula's squares that an effect which is the same explains
 
 
@@ -53,14 +54,40 @@ def what_is_left(problem: Problem, joint: JointFit, formulas: Sequence[Formula])
         joint: kinematics and effects.
         formulas: any number.
     """
-    solution = problem.solution
-    along = problem
+    solution, explained = problem.solution, problem
     if formulas:
         chain, additions = solution.chain, _columns(formulas)
         fit = refine(chain, solution.samples, solution.fit.x[: len(chain)], prior=problem.prior, additions=additions)
-        along = replace(problem, solution=replace(solution, fit=fit, additions=additions))
-    grammar = Grammar(along.project(along.fit(joint.choices, along.solution.fit.x)))
+        explained = replace(problem, solution=replace(solution, fit=fit, additions=additions))
+    grammar = Grammar(explained.project(explained.fit(joint.choices, explained.solution.fit.x)))
     return grammar.find(1) if detect(grammar, problem.rng()).significant else ()
+
+
+def formulas_suffice(problem: Problem, joint: JointFit, formulas: tuple[Formula, ...]) -> bool:
+    """True if a few formulas more explain all that effects leave, be they effects of the library in words or not."""
+    for _ in range(MOST_FORMULAS):
+        further = what_is_left(problem, joint, formulas)
+        if not further:
+            return True
+        formulas += further
+    return False
+
+
+def cost_with_formulas(problem: Problem, joint: JointFit, formulas: tuple[Formula, ...]) -> float:
+    """Return the cost of effects together with the formulas that explain what they leave, nats.
+
+    Args:
+        problem: the data.
+        joint: kinematics and effects.
+        formulas: those that count already; a few more are added.
+    """
+    for _ in range(MOST_FORMULAS):
+        formulas += what_is_left(problem, joint, formulas)
+    solution = problem.solution
+    columns = [formula_block(formula, number).columns for number, formula in enumerate(formulas)]
+    start = np.append(joint.fit.x, np.zeros(sum(map(len, columns))))
+    additions = along(solution, [*joint.parts, *columns])
+    return refine(solution.chain, solution.samples, start, prior=problem.prior, additions=additions).cost
 
 
 def _columns(formulas: Sequence[Formula]) -> EffectColumns:

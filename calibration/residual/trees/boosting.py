@@ -50,14 +50,12 @@ class Settings:
         rate: learning rate.
         leaves: of a tree.
         bins: distinct values of a column that splits tell apart.
-        l2: added to the number of rows in a leaf when its value is computed.
         column_share: of the columns, drawn at random for each tree.
     """
 
     rate: float = _SCREEN_RATE
     leaves: int = 15
     bins: int = 255
-    l2: float = 0.1
     column_share: float = 1.0
 
     def parameters(self, rows: int, seed: int) -> dict[str, Any]:
@@ -73,7 +71,7 @@ class Settings:
             "feature_fraction": self.column_share,
             "bagging_fraction": 0.8,
             "bagging_freq": 1,
-            "lambda_l2": self.l2,
+            "lambda_l2": 0.1,  # added to the number of rows in a leaf when its value is computed
             "seed": seed,
             "deterministic": True,
             "force_row_wise": True,

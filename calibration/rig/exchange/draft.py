@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from calibration.rig.description import Convention, Rig, parse_rig
+from calibration.rig.toml import quoted
 
 _ASSUMED = """\
 [tolerances]            # assumed, 1 sigma: how far the machine may be from these numbers
@@ -100,11 +100,11 @@ def free_name(wanted: str, taken: Collection[str]) -> str:
 
 
 def _value(value: object) -> str:
-    """Return a value as TOML has it; control characters of a foreign name are escaped as in JSON."""
+    """Return a value as TOML has it."""
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{key} = {_value(item)}" for key, item in value.items()) + " }"
     if isinstance(value, str):
-        return json.dumps(value)
+        return quoted(value)
     if isinstance(value, Sequence):
         return "[" + ", ".join(_value(item) for item in value) + "]"
     if isinstance(value, bool):

@@ -58,7 +58,7 @@ def store_describe(config: Path, out: Path | None, *, as_json: bool) -> dict[str
     from daemon.config import read_config
     from daemon.host.safe_output import write_file
     from daemon.store.describe.description import describe_store
-    from daemon.store.describe.pages import datasette_metadata
+    from daemon.store.describe.metadata import datasette_metadata
 
     path = read_config(config).store_path
     text = datasette_metadata(describe_store(path), path.stem)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sqlite3
-import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +15,6 @@ from daemon.store.describe.view_words import VIEWS, channel_meaning
 from daemon.store.describe.words import Words
 from daemon.store.errors import StoreError
 from daemon.store.queries.canned_queries import Query, canned_queries
-from daemon.store.store import Store
 from daemon.store.views import Channel, channels_of
 
 
@@ -81,20 +79,6 @@ def describe_store(path: Path) -> StoreDescription:
         views = [_described(db, name, channels, is_view=True) for name in sorted(db.view_names())]
         tables = [_described(db, name, channels, is_view=False) for name in sorted(db.table_names())]
     return StoreDescription((*views, *tables), canned_queries(channels))
-
-
-def describe_new(joints: Iterable[tuple[str, str]], signals: Iterable[tuple[str, str]]) -> StoreDescription:
-    """Describe the store that a rig has at its start.
-
-    Args:
-        joints: name and unit of each joint.
-        signals: name and unit of each other channel.
-    """
-    with tempfile.TemporaryDirectory() as directory:
-        path = Path(directory) / "rigcal.sqlite"
-        with contextlib.closing(Store(path)) as store:
-            store.declare_channels(dict(joints), dict(signals))
-        return describe_store(path)
 
 
 def _described(db: Database, name: str, channels: Sequence[Channel], *, is_view: bool) -> TableDescription:

@@ -3,34 +3,21 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
-from click.testing import CliRunner, Result
 
 from calibration.observations import format_observations
 from calibration.rig.description import parse_rig
-from daemon.cli.main import main as rigcal
 from simulators.rig.truth import RigTruth
 from tests.bench.zhou2022 import sweeps, table
 from tests.calibration.simulated_ys100 import robot, stiffening
+from tests.commands import answer, run
 from tests.simulated.observations import simulate_observations
 
 TORSO = Path(__file__).parents[2] / "rigs" / "torso.toml"
 RESIDUALS = ["effects", "table", "rbfn-paper", "rbfn", "lightgbm", "chain", "gp"]
 METHODS = ["nominal", "km", "skcm", "rbf-tcm", *RESIDUALS, "default", "pde-paper"]
 FIGURES = ["mean_mm", "max_mm", "std_mm", "rms_mm", "training_mean_mm"]
-
-
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(rigcal, ["compare", *(str(a) for a in arguments)])
-
-
-def answer(*arguments: object) -> dict[str, Any]:
-    result = run(*arguments, "--json")
-    assert result.exit_code == 0, result.stderr
-    found: dict[str, Any] = json.loads(result.stdout)
-    return found
 
 
 @pytest.fixture
@@ -61,7 +48,7 @@ def pictures(page: str) -> int:
 
 @pytest.mark.slow
 def test_the_answer_has_a_row_for_every_method_and_a_page(ys100: list[object]) -> None:
-    found = answer(*ys100, "--time-limit", 0.2)
+    found = answer("compare", *ys100, "--time-limit", 0.2)
     assert list(found) == ["rig", "n", "n_holdout", "noise_mm", "methods", "warnings", "page"]
     assert (found["rig"], found["n"], found["n_holdout"]) == ("ys100", 50, 50)
     assert [row["method"] for row in found["methods"]] == METHODS
@@ -83,7 +70,7 @@ def test_a_person_gets_a_table_reasons_shared_rows_and_the_page_s_path(torso: li
     train, test = tmp_path / "train.csv", tmp_path / "test.csv"
     shared = train.read_text(encoding="utf-8").splitlines()[1]
     test.write_text(test.read_text(encoding="utf-8") + shared + "\n", encoding="utf-8")
-    result = run(*torso, "--time-limit", 0.2)
+    result = run("compare", *torso, "--time-limit", 0.2)
     assert result.exit_code == 0, result.stderr
     lines = result.stdout.splitlines()
     assert [column in lines[1] for column in ("method", "mean", "max", "std", "rms", "training", "seconds")] == [
@@ -99,7 +86,7 @@ def test_a_person_gets_a_table_reasons_shared_rows_and_the_page_s_path(torso: li
 
 @pytest.mark.long
 def test_the_protocol_prints_its_tables_and_draws_its_plots(torso: list[object], tmp_path: Path) -> None:
-    result = run(*torso, "--protocol", "zhou2022", "--time-limit", 0.1)
+    result = run("compare", *torso, "--protocol", "zhou2022", "--time-limit", 0.1)
     assert result.exit_code == 0, result.stderr
     for title in ("Before calibration", "Table 3", "Chosen weights", "Learning curve", "Trajectory", "Please note"):
         assert title in result.stdout
@@ -112,12 +99,12 @@ def test_the_protocol_prints_its_tables_and_draws_its_plots(torso: list[object],
 
 
 def test_wrong_use_is_refused_in_a_sentence(torso: list[object], tmp_path: Path) -> None:
-    result = run(*torso, "--protocol", "zhou2022", "--refit-base")
+    result = run("compare", *torso, "--protocol", "zhou2022", "--refit-base")
     assert result.exit_code == 2
     assert "leave --refit-base out" in result.stderr
     test = tmp_path / "test.csv"
     test.write_text(test.read_text(encoding="utf-8").replace("east", "west"), encoding="utf-8")
     for protocol in ([], ["--protocol", "zhou2022"]):
-        result = run(*torso, *protocol, "--json")
+        result = run("compare", *torso, *protocol, "--json")
         assert result.exit_code == 3
         assert "set-up 'west'" in json.loads(result.stdout)["error"]

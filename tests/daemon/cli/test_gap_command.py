@@ -9,15 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner, Result
 
 from calibration.effects.library import library
 from calibration.errors import ModelError
 from daemon.cli.commands.gap import show_gap
-from daemon.cli.main import main as rigcal
 from daemon.host.safe_output import write_file
 from daemon.models.gap_files import check_gap_target, gap_answer, write_gap
 from daemon.models.model_files import read_model
+from tests.commands import run
 from tests.daemon import gap_support as support
 
 CONTRACT = [
@@ -25,10 +24,6 @@ CONTRACT = [
     "noise_mm", "holdout", "disagreements", "experiments", "seconds",
 ]  # fmt: skip
 FILES = ["gap.json", "model", "report.html"]
-
-
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(rigcal, [str(a) for a in arguments])
 
 
 @pytest.fixture(scope="module")

@@ -9,19 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
-from daemon.cli.main import main as rigcal
 from daemon.models.model_files import write_model
+from tests.commands import run
 from tests.daemon.offline_support import held_out_csv, small_calibration
 
 Table = list[dict[str, str]]
 JOINTS = [f"q{i}_deg" for i in range(1, 7)]
 PLACE = ["x_mm", "y_mm", "z_mm"]
-
-
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(rigcal, [str(a) for a in arguments])
 
 
 def parsed(text: str) -> Table:

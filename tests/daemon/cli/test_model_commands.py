@@ -26,6 +26,7 @@ from daemon.rig_files import load_rig
 from daemon.service import tip_sender
 from drivers.can.tip_frames import TipMessage, TipStatus, encode_tip
 from drivers.errors import TransmitForbiddenError
+from tests.commands import run_apart
 from tests.daemon.model_support import SOURCE, ModelRig, written
 from tests.daemon.test_config import GOOD, check
 
@@ -37,12 +38,6 @@ link = "boom"
 arbitration_id = 0x680
 """
 MAY_SEND = GOOD.replace('channel = "can0"', 'channel = "can0"\nallow_transmit = true')
-
-
-def rigcal(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "daemon.cli.main", *arguments], capture_output=True, text=True, check=False
-    )
 
 
 # ---- export ----------------------------------------------------------------------------------------------------------
@@ -155,7 +150,7 @@ def test_following_the_tip_prints_a_json_object_a_line_until_it_is_stopped(socke
 
 
 def test_a_tip_without_a_position_says_why(socket: Path) -> None:
-    shown = rigcal("tip", "--prism", "s", "--socket", str(socket))
+    shown = run_apart("tip", "--prism", "s", "--socket", str(socket))
     assert (shown.returncode, shown.stdout) == (1, "")
     assert shown.stderr == "Error: prism s: stale: L2: no reading yet\n"
 

@@ -14,13 +14,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
 from calibration.pipeline import methods
 from daemon.cli.commands.calibrate import METHODS
 from daemon.cli.commands.predict import INTERVAL_COLUMNS, PREDICTED_COLUMNS
-from daemon.cli.main import main as rigcal
 from daemon.models.model_files import write_model
+from tests.commands import run
 from tests.daemon.offline_support import held_out_csv, small_calibration, train_csv
 
 KEYS = [
@@ -29,10 +28,6 @@ KEYS = [
 ]  # fmt: skip
 STAGES = ["nominal", "geometric", "effects", "hybrid"]
 STAGE_KEYS = ["stage", "mean_mm", "rms_mm", "max_mm", "std_mm"]
-
-
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(rigcal, [str(a) for a in arguments])
 
 
 @pytest.fixture(scope="module")

@@ -4,17 +4,15 @@ import csv
 import io
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
 from calibration.observations import parse_observations
 from calibration.rig.description import Rig, shipped_rig
-from daemon.cli.main import main as rigcal
 from daemon.models.model_files import write_model
 from simulators.rig.truth import RigTruth
+from tests.commands import answer, run
 from tests.daemon.offline_support import small_calibration
 from tests.simulated.observations import simulate_observations
 
@@ -25,24 +23,13 @@ KEYS = [
 STATISTICS = ["rms_mm", "mean_mm", "median_mm", "p95_mm", "p99_mm"]
 
 
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(rigcal, ["plan", *(str(a) for a in arguments)])
-
-
-def answer(*arguments: object) -> dict[str, Any]:
-    result = run(*arguments, "--json")
-    assert result.exit_code == 0, result.stderr
-    found: dict[str, Any] = json.loads(result.stdout)
-    return found
-
-
 def columns(rig: Rig) -> list[str]:
     return [joint.column for joint in rig.joints]
 
 
 def test_the_answer_has_poses_motion_and_accuracy() -> None:
     rig = shipped_rig("ys100")
-    found = answer("--rig", "ys100", "--poses", 15)
+    found = answer("plan", "--rig", "ys100", "--poses", 15)
     assert list(found) == KEYS
     assert [row["pose"] for row in found["poses"]] == list(range(1, 16))
     for row in found["poses"]:
@@ -62,7 +49,7 @@ def test_the_answer_has_poses_motion_and_accuracy() -> None:
 def test_the_file_of_poses_can_be_driven(tmp_path: Path) -> None:
     rig = shipped_rig("swdt82")
     out = tmp_path / "poses.csv"
-    found = answer("--rig", "swdt82", "--poses", 8, "--station", "0,-6000,1000", "--floor", -2000, "--out", out)
+    found = answer("plan", "--rig", "swdt82", "--poses", 8, "--station", "0,-6000,1000", "--floor", -2000, "--out", out)
     assert found["out"] == str(out)
     assert found["station_mm"] == [0.0, -6000.0, 1000.0]
     rows = list(csv.DictReader(io.StringIO(out.read_text())))
@@ -74,7 +61,7 @@ def test_the_file_of_poses_can_be_driven(tmp_path: Path) -> None:
 
 
 def test_people_get_a_table_that_is_not_cut_and_sentences() -> None:
-    result = run("--rig", "ys100", "--poses", 4)
+    result = run("plan", "--rig", "ys100", "--poses", 4)
     assert result.exit_code == 0
     for text in (
         "theta6",
@@ -92,7 +79,7 @@ def test_people_get_a_table_that_is_not_cut_and_sentences() -> None:
 def test_two_effects_are_told_apart_and_the_approach_is_part_of_the_plan(tmp_path: Path) -> None:
     out = tmp_path / "poses.csv"
     pair = "backlash@theta3,joint_compliance@theta3"
-    result = run("--rig", "ys100", "--poses", 10, "--separate", pair, "--out", out)
+    result = run("plan", "--rig", "ys100", "--poses", 10, "--separate", pair, "--out", out)
     assert result.exit_code == 0, result.stderr
     assert "theta3 from" in result.stdout
     assert "below" in result.stdout
@@ -103,16 +90,18 @@ def test_two_effects_are_told_apart_and_the_approach_is_part_of_the_plan(tmp_pat
 
 def test_after_a_session_it_says_what_else_to_measure(tmp_path: Path) -> None:
     write_model(tmp_path / "model", small_calibration()[0])
-    found = answer("--rig", "ur10", "--model", tmp_path / "model", "--poses", 12)
+    found = answer("plan", "--rig", "ur10", "--model", tmp_path / "model", "--poses", 12)
     assert list(found["present_accuracy_mm"]) == list(found["predicted_accuracy_mm"])
     assert found["predicted_accuracy_mm"]["parameters_mm"] < found["present_accuracy_mm"]["parameters_mm"]
     assert any("would lower the expected error over the work volume" in sentence for sentence in found["advice"])
     assert any("q1 was measured only at" in sentence for sentence in found["advice"])
-    elsewhere = answer("--rig", "ur10", "--model", tmp_path / "model", "--poses", 12, "--station", "0,-3000,500")
+    elsewhere = answer(
+        "plan", "--rig", "ur10", "--model", tmp_path / "model", "--poses", 12, "--station", "0,-3000,500"
+    )
     assert elsewhere["station_mm"] == [0.0, -3000.0, 500.0]
     assert "at the new set-up" in elsewhere["advice"][0]
     assert elsewhere["present_accuracy_mm"]["rms_mm"] == pytest.approx(found["present_accuracy_mm"]["rms_mm"], rel=0.05)
-    refused = run("--rig", "ys100", "--model", tmp_path / "model", "--poses", 5)
+    refused = run("plan", "--rig", "ys100", "--model", tmp_path / "model", "--poses", 5)
     assert refused.exit_code == 3
     assert "the model is of rig 'ur10', not of 'ys100'" in refused.stderr
 
@@ -133,13 +122,13 @@ def test_after_a_session_it_says_what_else_to_measure(tmp_path: Path) -> None:
     ],
 )
 def test_wrong_use_is_one_sentence(arguments: tuple[str, ...], sentence: str) -> None:
-    result = run("--rig", "ys100", *arguments)
+    result = run("plan", "--rig", "ys100", *arguments)
     assert result.exit_code == 2
     assert sentence in result.stderr
     assert "Traceback" not in result.stderr
 
 
 def test_a_station_that_sees_nothing_is_refused() -> None:
-    result = run("--rig", "ys100", "--poses", "5", "--station", "0,0,900000", "--json")
+    result = run("plan", "--rig", "ys100", "--poses", "5", "--station", "0,0,900000", "--json")
     assert result.exit_code == 3
     assert "none is reachable with a prism in view of the station" in json.loads(result.stdout)["error"]

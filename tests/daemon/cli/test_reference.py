@@ -12,19 +12,13 @@ import pytest
 from click.testing import CliRunner
 
 from daemon.cli.main import main
-from daemon.cli.reference import reference
 from deploy.release.debian import completion
 
 REPOSITORY = Path(__file__).parents[3]
 
 
-def test_the_page_of_all_commands_is_current() -> None:
-    page = (REPOSITORY / "docs" / "reference" / "commands.md").read_text(encoding="utf-8")
-    assert page == reference(), "python -m daemon.cli.reference > docs/reference/commands.md"
-
-
 def test_every_command_and_option_is_documented() -> None:
-    page = reference()
+    page = (REPOSITORY / "docs" / "reference" / "commands.md").read_text(encoding="utf-8")
     for line in ("## rigcal status", "### rigcal session start", "`--refit-base`", "`rigcal completion [OPTIONS]"):
         assert line in page or line.strip("`") in page, line
     for name in main.list_commands(None):  # type: ignore[arg-type] # of no context

@@ -8,28 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
 from calibration.rig.description import parse_rig
 from daemon.acquisition.channels import decoder_factories
 from daemon.acquisition.simulated_channels import with_simulated_channels
-from daemon.cli.main import main
 from daemon.rig_files import load_rig
 from drivers.readings import Reading
 from simulators.rig.truth import RigTruth
 from simulators.rig_simulator import RigSimulator
+from tests.commands import answer, run
 from tests.robots import ROBOTS
-
-
-def rigcal(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(main, [*map(str, arguments)])
-
-
-def told(*arguments: str | Path) -> dict[str, Any]:
-    done = rigcal(*arguments, "--json")
-    assert done.exit_code == 0, done.stderr
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -41,7 +29,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 def panda(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A rig file of a robot with a joint that mimics another one."""
     path = tmp_path_factory.mktemp("rigs") / "panda.toml"
-    told("rig", "import", ROBOTS["panda"].path, "--out", path)
+    answer("rig", "import", ROBOTS["panda"].path, "--out", path)
     return path
 
 
@@ -49,7 +37,7 @@ def panda(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_check_shows_places_reach_radii_and_what_data_can_show(tmp_path: Path) -> None:
-    found = told("rig", "check", "ur10", "--svg", tmp_path / "ur10.svg")
+    found = answer("rig", "check", "ur10", "--svg", tmp_path / "ur10.svg")
     places = found["zero_pose"]
     np.testing.assert_allclose(places["prisms_mm"]["tmac"], [-1184.3, -256.141, 11.6], atol=1e-6)
     assert len(places["frames_mm"]) == found["rows"] + 1
@@ -61,7 +49,7 @@ def test_check_shows_places_reach_radii_and_what_data_can_show(tmp_path: Path) -
 
 
 def test_check_draws_the_chain_for_people() -> None:
-    shown = rigcal("rig", "check", "swdt82").stdout
+    shown = run("rig", "check", "swdt82").stdout
     assert "swdt82: good: 9 rows, 9 joints, 4 prisms" in shown
     side = shown.split("From the side")[1].split("From above")[0]
     assert side.count("*") >= 3
@@ -71,10 +59,10 @@ def test_check_draws_the_chain_for_people() -> None:
 def test_a_radius_of_a_row_is_what_plan_keeps_clear_of(tmp_path: Path) -> None:
     text = load_rig("ur10").text.replace("a_mm = -612", "a_mm = -612\nradius_mm = 75")
     (tmp_path / "thick.toml").write_text(text, encoding="utf-8")
-    links = {link["row"]: link for link in told("rig", "check", tmp_path / "thick.toml")["links"]}
+    links = {link["row"]: link for link in answer("rig", "check", tmp_path / "thick.toml")["links"]}
     assert (links[2]["radius_mm"], links[2]["assumed"]) == (75.0, False)
     assert links[3]["assumed"]
-    planned = told("plan", "--rig", tmp_path / "thick.toml", "--poses", "3")
+    planned = answer("plan", "--rig", tmp_path / "thick.toml", "--poses", "3")
     assert any("75 mm of row 2" in sentence for sentence in planned["assumptions"])
 
 
@@ -94,8 +82,8 @@ def test_check_asks_about_numbers_that_would_fit_another_unit(
     text = load_rig("ur10").text.replace("a_mm = -612", "a_mm = -612\nradius_mm = 75")
     text = re.sub(pattern, lambda found: ", ".join(f"{float(x) * scale:.7f}" for x in found[0].split(",")), text)
     (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
-    assert any(said in sentence for sentence in told("rig", "check", tmp_path / "mine.toml")["warnings"])
-    assert not any("here, convert" in text or "quarter" in text for text in told("rig", "check", "ur10")["warnings"])
+    assert any(said in sentence for sentence in answer("rig", "check", tmp_path / "mine.toml")["warnings"])
+    assert not any("here, convert" in text or "quarter" in text for text in answer("rig", "check", "ur10")["warnings"])
 
 
 def test_check_tells_every_fault_with_its_line(tmp_path: Path) -> None:
@@ -103,7 +91,7 @@ def test_check_tells_every_fault_with_its_line(tmp_path: Path) -> None:
     lines[lines.index("d_mm = 127.3")] = "d_mm = 'x'"
     lines[lines.index('name = "tmac"')] = 'nam = "tmac"'
     (tmp_path / "bad.toml").write_text("\n".join(lines), encoding="utf-8")
-    done = rigcal("rig", "check", tmp_path / "bad.toml")
+    done = run("rig", "check", tmp_path / "bad.toml")
     assert done.exit_code == 2
     for key, line in (("row.1.d_mm", lines.index("d_mm = 'x'")), ("prism.1.nam", lines.index('nam = "tmac"'))):
         assert any(key in told and f"(line {line + 1})" in told for told in done.stderr.splitlines()), done.stderr
@@ -111,12 +99,12 @@ def test_check_tells_every_fault_with_its_line(tmp_path: Path) -> None:
 
 def test_a_rig_survives_the_way_out_and_in(panda: Path, tmp_path: Path) -> None:
     for name in ("panda.urdf", "panda.csv"):
-        told("rig", "export", panda, "--out", tmp_path / name)
+        answer("rig", "export", panda, "--out", tmp_path / name)
         tips = [] if name.endswith("csv") else ["--tip", "panda_leftfinger", "--tip", "panda_rightfinger"]
         copy = tmp_path / f"{name}.toml"
-        again = told("rig", "import", tmp_path / name, *tips, "--out", copy)
+        again = answer("rig", "import", tmp_path / name, *tips, "--out", copy)
         assert again["joints"] == [joint.name for joint in load_rig(str(panda)).rig.joints]
-        wanted, found = (told("rig", "check", path)["zero_pose"] for path in (panda, copy))
+        wanted, found = (answer("rig", "check", path)["zero_pose"] for path in (panda, copy))
         for prism, place in wanted["prisms_mm"].items():
             np.testing.assert_allclose(found["prisms_mm"][prism], place, atol=1e-5)
 
@@ -125,7 +113,7 @@ def test_an_import_does_not_overwrite_a_rig_file(tmp_path: Path) -> None:
     mine, table = tmp_path / "mine.toml", tmp_path / "t.csv"
     mine.write_text("# a day's work\n", encoding="utf-8")
     table.write_text("joint,a_mm\nq1,1\n", encoding="utf-8")
-    done = rigcal("rig", "import", table, "--out", mine)
+    done = run("rig", "import", table, "--out", mine)
     assert (done.exit_code, "is there already" in done.stderr) == (2, True), done.stderr
     assert mine.read_text(encoding="utf-8") == "# a day's work\n"
 
@@ -152,7 +140,7 @@ def test_an_import_does_not_overwrite_a_rig_file(tmp_path: Path) -> None:
 def test_wrong_use_is_refused(tmp_path: Path, arguments: tuple[str, ...], reason: str) -> None:
     (tmp_path / "t.csv").write_text("joint,a_mm\nq1,1\n", encoding="utf-8")
     places = {"{csv}": str(tmp_path / "t.csv"), "{urdf}": str(ROBOTS["ur5"].path)}
-    done = rigcal(*(places.get(word, word) for word in arguments))
+    done = run(*(places.get(word, word) for word in arguments))
     assert (done.exit_code, reason in done.stderr) == (2, True), done.stderr
 
 
@@ -162,12 +150,12 @@ def test_wrong_use_is_refused(tmp_path: Path, arguments: tuple[str, ...], reason
 def test_a_seed_is_a_machine_and_a_recording_its_poses(tmp_path: Path) -> None:
     out, truth = tmp_path / "a.csv", tmp_path / "truth.json"
     machine = ("simulate", "--rig", "ur10", "--poses", "20", "--seed", "4", "--truth", truth)
-    first = told(*machine, "--out", out)
+    first = answer(*machine, "--out", out)
     built, text = json.loads(truth.read_text(encoding="utf-8")), out.read_text(encoding="utf-8")
     assert first["fixes"] == len(rows_of(out)) == 20
-    told(*machine, "--out", out)
+    answer(*machine, "--out", out)
     assert out.read_text(encoding="utf-8") == text
-    told(*machine, "--recording", "1", "--out", out)
+    answer(*machine, "--recording", "1", "--out", out)
     other = json.loads(truth.read_text(encoding="utf-8"))
     assert out.read_text(encoding="utf-8") != text
     assert (other["rows"], other["prisms"], other["base"]) == (built["rows"], built["prisms"], built["base"])
@@ -178,8 +166,8 @@ def test_a_seed_is_a_machine_and_a_recording_its_poses(tmp_path: Path) -> None:
 def test_noise_is_stated_and_an_effect_moves_what_is_measured(tmp_path: Path) -> None:
     plain, bent = tmp_path / "plain.csv", tmp_path / "bent.csv"
     machine = ("simulate", "--rig", "swdt82", "--poses", "10", "--noise", "0.5")
-    assert told(*machine, "--out", plain)["noise_rms_mm"] > 0.5
-    told(*machine, "--effect", "angle_scale@theta3:scale=1e-3", "--out", bent)
+    assert answer(*machine, "--out", plain)["noise_rms_mm"] > 0.5
+    answer(*machine, "--effect", "angle_scale@theta3:scale=1e-3", "--out", bent)
     one, other = rows_of(plain), rows_of(bent)
     assert {row["sigma_x_mm"] for row in one} == {"0.5"}
     moved = [
@@ -194,14 +182,14 @@ def test_a_plan_is_visited_pose_by_pose(tmp_path: Path) -> None:
     columns = [joint.column for joint in load_rig("ur10").rig.joints]
     lines = [",".join(["pose", *columns, "q1_dir"]), "1,10,20,30,40,50,60,1", "2,-10,-20,-30,-40,-50,-60,-1"]
     plan.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    told("simulate", "--rig", "ur10", "--poses", "4", "--plan", plan, "--out", out)
+    answer("simulate", "--rig", "ur10", "--poses", "4", "--plan", plan, "--out", out)
     rows = rows_of(out)
     np.testing.assert_allclose([float(row["q2_deg"]) for row in rows], [20, -20, 20, -20], atol=0.01)
     assert [row["q1_dir"] for row in rows] == ["1.0", "-1.0", "1.0", "-1.0"]
     plan.write_text("\n".join(lines[:1]) + "\n1,10,20,30,40,50,900\n", encoding="utf-8")
     assert (
         "line 2: q6 = 900 deg is beyond its limits"
-        in rigcal("simulate", "--rig", "ur10", "--poses", "4", "--plan", plan, "--out", out).stderr
+        in run("simulate", "--rig", "ur10", "--poses", "4", "--plan", plan, "--out", out).stderr
     )
 
 

@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
 from calibration.rig.description import shipped_rig
-from daemon.cli.main import main as rigcal
+from tests.commands import run
 from tests.daemon.offline_support import held_out_csv, train_csv
 
 MM_PER_DEG = 0.8
@@ -21,10 +20,6 @@ SAID = (
     "column 'tilt_x_deg' holds numbers and is not used; to use it, add --signal tilt_x_deg, or to the rig file the "
     'three lines [[signal]], name = "tilt_x" and unit = "deg"'
 )
-
-
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(rigcal, [str(a) for a in arguments])
 
 
 def tilted(data: bytes, seed: int) -> str:

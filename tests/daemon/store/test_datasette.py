@@ -15,7 +15,7 @@ import pytest
 
 from daemon.store import Store
 from daemon.store.describe.description import StoreDescription, describe_store
-from daemon.store.describe.pages import datasette_metadata
+from daemon.store.describe.metadata import datasette_metadata
 from daemon.store.queries.sessions import SessionTable
 from tests.daemon.store_support import at, fix, reading
 

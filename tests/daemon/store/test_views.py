@@ -14,14 +14,13 @@ import pytest
 from sqlite_utils import Database
 
 from daemon.store import Reader, Store, StoreError
-from daemon.store.describe.__main__ import example
-from daemon.store.describe.pages import datasette_metadata, schema_page
 from daemon.store.describe.table_words import TABLES
 from daemon.store.describe.view_words import VIEWS
 from daemon.store.migrations import MIGRATIONS
 from daemon.store.queries.canned_queries import canned_queries
 from daemon.store.queries.sessions import SessionTable, session
 from daemon.store.views import Channel, channels_of
+from docs.references.schema import example
 from drivers.readings import Status
 from tests.daemon.store_support import at, fix, reading
 
@@ -164,12 +163,6 @@ def test_rig_files_of_an_older_store_are_moved(tmp_path: Path) -> None:
 
 
 # ---- in words --------------------------------------------------------------------------------------------------------
-
-
-def test_the_pages_are_current() -> None:
-    store = example()
-    assert (DOCS / "schema.md").read_text() == schema_page(store), "python -m daemon.store.describe schema"
-    assert (DOCS / "metadata.yaml").read_text() == datasette_metadata(store), "python -m daemon.store.describe metadata"
 
 
 def test_no_words_are_of_what_the_store_lacks() -> None:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import can
 import pytest
 
@@ -14,7 +11,6 @@ from drivers.errors import DeviceError, TransmitForbiddenError
 from drivers.readings import EventKind
 from tests.drivers.can_support import (
     Adapter,
-    plugged_adapter,
     running,
     slcan_link,
     unused_channel,
@@ -36,12 +32,6 @@ def setup(node: int = 32, name: str = "theta1") -> NodeSetup:
 
 
 BOTH = {"allow_transmit": True, "transmit_nodes": (32, 33), "setups": [setup(), setup(33, "theta3")]}
-
-
-@pytest.fixture
-def adapter(tmp_path: Path) -> Iterator[Adapter]:
-    with plugged_adapter(tmp_path / "slcan") as plugged:
-        yield plugged
 
 
 def test_a_request_before_the_link_is_open_fails_and_is_not_kept_for_later() -> None:

@@ -1,17 +1,13 @@
-"""docs/reference/effects.md, made from the code: every effect of the library.
-
-python -m calibration.effects.reference > docs/reference/effects.md
-"""
+"""docs/reference/effects.md: every effect of the library."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 
 from calibration.effects.base import Family, JointFamily
 from calibration.effects.library import library
 from calibration.rig.description import shipped_rig
-from calibration.rig.reference import table
+from docs.references.markdown import table
 
 _HEAD = """# Effects
 
@@ -21,7 +17,7 @@ the effect. `rigcal effects NAME --rig RIG` shows places and sizes for a rig of 
 machine](../explanation/gap.md#the-library) says how one of them is chosen, [Extend rigcal](../how-to/extend.md) how to
 add one.
 
-This page is made from the code: `python -m calibration.effects.reference > docs/reference/effects.md`.
+This page is made from the code: `python -m docs.references`.
 """
 
 
@@ -78,7 +74,3 @@ def _sentences(family: Family) -> list[str]:
     """Return the paragraphs of a family's docstring, up to its attributes."""
     text = (type(family).__doc__ or "").partition("Attributes:")[0]
     return [" ".join(paragraph.split()) for paragraph in text.strip().split("\n\n")]
-
-
-if __name__ == "__main__":
-    sys.stdout.write(page())

@@ -1,15 +1,9 @@
-"""docs/reference/configuration.md, made from the code: every key of the daemon's configuration.
-
-python -m daemon.config_reference > docs/reference/configuration.md
-"""
+"""docs/reference/configuration.md: every key of the daemon's configuration."""
 
 from __future__ import annotations
 
-import sys
-
 from pydantic import BaseModel
 
-from calibration.rig.reference import keys
 from daemon.config import (
     CanSection,
     Config,
@@ -23,6 +17,7 @@ from daemon.config import (
     TipSection,
     WebSection,
 )
+from docs.references.rig_keys import keys
 from drivers.stations.config import StationConfig
 from drivers.stations.serial_port import SerialConfig
 
@@ -32,7 +27,7 @@ Every key of the configuration, `/etc/rigcal/rigcal.toml` of the installed servi
 and relative paths count from the file's own directory. `rigcal config check FILE` reads it without opening a device,
 `rigcal init` writes a first one, and [Connect bus and station](../how-to/connect.md) leads through it.
 
-This page is made from the code: `python -m daemon.config_reference > docs/reference/configuration.md`.
+This page is made from the code: `python -m docs.references`.
 """
 _TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("The file", Config),
@@ -59,7 +54,3 @@ def page() -> str:
     for title, model in _TABLES:
         lines += [f"## {title}", "", *keys(model, own if model is Config else model.model_fields)]
     return "\n".join(lines).rstrip() + "\n"
-
-
-if __name__ == "__main__":
-    sys.stdout.write(page())

@@ -1,13 +1,9 @@
-"""docs/reference/python.md, made from the code: every public name with its signature and docstring.
-
-python -m rigcal.reference > docs/reference/python.md
-"""
+"""docs/reference/python.md: every public name with its signature and docstring."""
 
 from __future__ import annotations
 
 import inspect
 import re
-import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -20,7 +16,7 @@ _HEAD = """# Python
 Every public name of `import rigcal`. [Notebook or program](../how-to/notebook.md) is a worked example. These names
 follow Semantic Versioning; everything below them in the other packages may change. `rigcal.__version__` is a string.
 
-This page is made from the code: `python -m rigcal.reference > docs/reference/python.md`.
+This page is made from the code: `python -m docs.references`.
 """
 _QUOTED = re.compile(r"(?<=: )'(.*?)'(?= = |$)")
 """An annotation that is kept as text."""
@@ -91,7 +87,3 @@ def _text(thing: Any) -> Iterator[str]:
             continue
         pairs = zip(entries[1::2], entries[2::2], strict=True)
         yield from (*(f"- `{names}`: {' '.join(words.split())}" for names, words in pairs), "")
-
-
-if __name__ == "__main__":
-    sys.stdout.write(page())

@@ -1,4 +1,4 @@
-"""The page of all commands and options, made from the commands themselves: `python -m daemon.cli.reference`."""
+"""docs/reference/commands.md: every command with its arguments and options, made from the commands themselves."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ from collections.abc import Iterator
 
 import click
 
-from calibration.rig.reference import table
 from daemon.cli.main import main
-from daemon.cli.terminal import echo_text
+from docs.references.markdown import table
 
-HEAD = """# Commands
+_HEAD = """# Commands
 
-Every command with its arguments and options. This page is made from the commands: `python -m daemon.cli.reference >
-docs/reference/commands.md`. Each command says the same with `--help`.
+Every command with its arguments and options. Each command says the same with `--help`.
+This page is made from the code: `python -m docs.references`.
 
 Exit status of all commands: 0 done, 1 failed, 2 wrong use or bad input, 3 refused because the result would be unsafe
 to use; `rigcal health` alone has those of monitoring systems. With `--json`, standard output holds one JSON object and
@@ -26,10 +25,10 @@ key; the Debian package and `deploy/install.sh` put all three in place.
 """
 
 
-def reference() -> str:
-    """Return the whole page."""
+def page() -> str:
+    """Return the text of docs/reference/commands.md."""
     context = click.Context(main, info_name="rigcal")
-    return HEAD + "".join(f"\n{part}" for part in _parts(context, main))
+    return _HEAD + "".join(f"\n{part}" for part in _parts(context, main))
 
 
 def _parts(context: click.Context, command: click.Command) -> Iterator[str]:
@@ -64,7 +63,3 @@ def _text(command: click.Command) -> str:
 
 def _one_line(text: str) -> str:
     return " ".join(text.split())
-
-
-if __name__ == "__main__":
-    echo_text(reference().rstrip("\n"))

@@ -1,12 +1,11 @@
-"""docs/reference/rig-keys.md, made from the code: every column of observations and every key of rig files."""
+"""docs/reference/rig-keys.md: every column of observations and every key of rig files."""
 
 from __future__ import annotations
 
 import itertools
 import json
 import re
-import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin
@@ -27,13 +26,14 @@ from calibration.rig.channels import (
 )
 from calibration.rig.columns import READ, WRITTEN, Column
 from calibration.rig.description import FixedTransform, Joint, Mass, Prism, Rig, Row, Station, Tolerances
+from docs.references.markdown import table
 
 _HEAD = """# Columns and rig keys
 
 Every column of observations and every key of a rig file. What they are for is in [files and outputs](formats.md) and
 [rig files](../how-to/rig-files.md).
 
-This page is made from the code: `python -m calibration.rig.reference > docs/reference/rig-keys.md`.
+This page is made from the code: `python -m docs.references`.
 
 ## Columns of observations
 
@@ -182,17 +182,3 @@ def _default(field: FieldInfo) -> str:
     if value is None or value == () or isinstance(value, BaseModel):
         return ""
     return f"`{json.dumps(value, default=str)}`" if value != {} else "`{}`"
-
-
-def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
-    """Yield the lines of a table in Markdown."""
-    yield from map(table_row, (header, ["---"] * len(header), *rows))
-
-
-def table_row(cells: Sequence[str]) -> str:
-    """Return a line of a table in Markdown, with the cells' own bars escaped."""
-    return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"
-
-
-if __name__ == "__main__":
-    sys.stdout.write(page())

@@ -1,11 +1,9 @@
-"""The page of all metrics, made from their families: `python -m daemon.monitoring.metrics_page`."""
+"""docs/reference/metrics.md: every family of metrics."""
 
 from __future__ import annotations
 
-import sys
-
-from calibration.rig.reference import table
 from daemon.monitoring.metrics import FAMILIES
+from docs.references.markdown import table
 
 _HEAD = """# Metrics
 
@@ -40,8 +38,7 @@ A monitoring system that runs commands asks `rigcal health`: one line a finding 
 the Nagios plugin interface (0 good, 1 warning, 2 critical, 3 the daemon cannot be asked). A member of `read_group` may
 run it.
 
-This page is made from the families in `daemon/monitoring/metrics.py`:
-`python -m daemon.monitoring.metrics_page > docs/reference/metrics.md`.
+This page is made from the code: `python -m docs.references`.
 """
 
 
@@ -49,7 +46,3 @@ def page() -> str:
     """Return the text of docs/reference/metrics.md."""
     rows = ((f"`{f.name}`", f.kind, ", ".join(f"`{label}`" for label in f.labels), f.help) for f in FAMILIES)
     return "\n".join((_HEAD, *table(("metric", "kind", "labels", "meaning"), rows))) + "\n"
-
-
-if __name__ == "__main__":
-    sys.stdout.write(page())
