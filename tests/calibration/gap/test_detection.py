@@ -197,6 +197,18 @@ def test_two_effects_are_two_terms_with_their_sizes() -> None:
         assert abs(f.coefficient - size) < 4.0 * f.standard_error < 0.5 * size
 
 
+def test_an_error_larger_than_physics_allows_is_no_formula() -> None:
+    rig = shipped_rig("swdt82")
+    observations = measured(rig, "", 1)
+
+    def found(relative: float) -> str:
+        enlarged = replace(observations, position_mm=observations.position_mm * (1.0 + relative))
+        return describe(Grammar(projected(rig, enlarged)).find())
+
+    assert "relative error of all fixes = 3.1e-03" in found(0.003)
+    assert "relative error" not in found(0.03)
+
+
 def test_a_term_shows_no_more_beside_the_effect_of_the_library_behind_it_but_beside_any_other() -> None:
     words = grammar("backlash@theta4:width_rad=4e-3")
     (first, *_) = words.find()
