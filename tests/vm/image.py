@@ -18,7 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.deploy.packages import BUILD, PROJECT, Root, install, of_version, run, system_directories
+from tests.deploy.packages import BUILD, PROJECT, Root, install, of_version, run
 
 CACHE = PROJECT / ".cache" / "vm"
 HERE = Path(__file__).parent
@@ -107,15 +107,13 @@ def image(say: Callable[[str], None], cpu_of: Callable[[Image], dict[str, str]])
     root = Root(scratch / "root")
     root.place.mkdir()
     run("tar", "-x", "--numeric-owner", "--exclude=./dev/*", "-f", base / "root.tar", "-C", root.place)
-    with system_directories(root.place):
-        say(f"installing {package.name} without a network")
-        install(root, package)
-        _set_up(root, base)
+    say(f"installing {package.name} without a network")
+    install(root, package)
+    _set_up(root, base)
     _write_disk(root, scratch / "root.img")
-    with system_directories(root.place):
-        cpu = _cpu(cpu_of, Image(scratch / "root.img", made.kernel, made.initrd, next_package), say)
-        say("compiling kernels for the machine's processor")
-        root.run(*SERVICE, "env", *(f"{k}={v}" for k, v in cpu.items()), PYTHON, "-I", "-m", "daemon.warm_up")
+    cpu = _cpu(cpu_of, Image(scratch / "root.img", made.kernel, made.initrd, next_package), say)
+    say("compiling kernels for the machine's processor")
+    root.run(*SERVICE, "env", *(f"{k}={v}" for k, v in cpu.items()), PYTHON, "-I", "-m", "daemon.warm_up")
     _write_disk(root, scratch / "root.img")
     shutil.rmtree(root.place)
     package.unlink()
