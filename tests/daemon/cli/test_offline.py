@@ -60,7 +60,7 @@ def assert_contract(answer: dict[str, Any], n: int) -> None:
 
 @pytest.mark.slow
 def test_calibrate_then_evaluate_as_programs(work: Path, tmp_path: Path) -> None:
-    program = "from tests.daemon.cli.test_offline import rigcal; rigcal()"
+    program = "from daemon.cli.main import main; main()"
 
     def command(*arguments: object) -> subprocess.CompletedProcess[str]:
         return subprocess.run(

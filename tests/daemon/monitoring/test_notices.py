@@ -311,7 +311,7 @@ def test_beyond_the_limit_of_an_hour_notices_wait_and_are_told_in_one(
     for n in range(2):
         sender.clock.advance(1.0)
         sender.tell("raised", f"first{n}")
-        wait_until(lambda n=n: len(web.got) == n + 1)
+        wait_until(lambda n=n: sender.status()["sent"] == n + 1)
     for n in range(3):
         sender.tell("raised", f"more{n}")
     wait_until(lambda: len(table(sender.path, "notices")) == 5)
