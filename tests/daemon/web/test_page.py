@@ -3,6 +3,7 @@
 import json
 import socket
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -13,7 +14,6 @@ import pytest
 
 from daemon.config import Config
 from daemon.store.reader import Reader
-from tests.commands import run_apart
 from tests.daemon.idle_daemon import idle_daemon
 from tests.daemon.web.web_support import WebProcess, wait_for
 
@@ -46,8 +46,14 @@ def page(config: Path) -> Iterator[WebProcess]:
     assert web.stop() == 0, config.with_name("web.log").read_text()
 
 
+def rigcal(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "daemon.cli.main", *arguments], capture_output=True, text=True, check=False
+    )
+
+
 def token_of(config: Path, name: str, role: str) -> str:
-    made = run_apart("web", "token", "add", name, "--role", role, "--config", str(config), "--json")
+    made = rigcal("web", "token", "add", name, "--role", role, "--config", str(config), "--json")
     assert made.returncode == 0, made.stderr
     return str(json.loads(made.stdout)["token"])
 
@@ -179,7 +185,7 @@ def test_roles_end_where_they_must(config: Path) -> None:
         refused = web.command("model.accept", cookie=operator, id=1)
         assert (refused.status, "the token of Bo has the role operate" in refused.data["error"]) == (403, True)
         assert web.command("model.accept", cookie=approver, id=1).status == 400, "asked, and there is no such model"
-        removed = run_apart("web", "token", "remove", "Bo", "--config", str(config))
+        removed = rigcal("web", "token", "remove", "Bo", "--config", str(config))
         assert removed.returncode == 0, removed.stderr
         assert web.command("setup.new", cookie=operator, id="S3").status == 403
     finally:
@@ -204,7 +210,7 @@ def test_who_signs_in_is_kept_with_what_is_done(config: Path, daemon: Config, pa
 
 
 def test_other_computers_need_tls_and_a_token(config: Path, tmp_path: Path) -> None:
-    refused = run_apart("web", "--config", str(config), "--host", "0.0.0.0")
+    refused = rigcal("web", "--config", str(config), "--host", "0.0.0.0")
     assert refused.returncode == 2
     assert "needs TLS" in refused.stderr
     certificate, key = self_signed(tmp_path)
@@ -238,7 +244,7 @@ def test_guessing_tokens_is_slow_and_keeps_nobody_out_who_has_one(config: Path) 
 
 
 def test_an_address_that_is_taken_is_said(config: Path, page: WebProcess) -> None:
-    refused = run_apart("web", "--config", str(config), "--port", str(page.port))
+    refused = rigcal("web", "--config", str(config), "--port", str(page.port))
     assert refused.returncode == 1
     assert "another program listens there" in refused.stderr
 
@@ -315,7 +321,7 @@ def test_the_stream_of_a_removed_token_ends(config: Path, tmp_path: Path) -> Non
     try:
         events = web.events(Cookie=signed_in(web, token_of(config, "Fay", "approve")))
         next(events)
-        run_apart("web", "token", "remove", "Fay", "--config", str(config))
+        rigcal("web", "token", "remove", "Fay", "--config", str(config))
         for _ in events:
             pass  # until the stream ends by itself
     finally:
