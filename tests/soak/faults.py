@@ -316,7 +316,7 @@ class Mischief:
                     client.sendall({"silent": b"", "half": asked[:9], "deaf": (asked + b"\n") * 100}[kind])
             self._expect("clients that hang", ("daemon",), "")
             self._wait(self._rng.uniform(5.0, 40.0))
-        self._rig.clock.sleep(CLOSES_S)
+        self._wait(CLOSES_S)
         self.hanging = 0
 
     # ---- parts -------------------------------------------------------------------------------------------------------
