@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import reprlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -105,9 +106,9 @@ def _row(rig: Rig, row: Mapping[str, Any]) -> PlanRow:
         try:
             conditions[name] = float(row[name])
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{asked}, and for its conditions; {name} is {row[name]!r}") from error
+            raise ValueError(f"{asked}, and for its conditions; {name} is {reprlib.repr(row[name])}") from error
         if not math.isfinite(conditions[name]):
-            raise ValueError(f"{asked}, and for its conditions; {name} is {row[name]!r}")
+            raise ValueError(f"{asked}, and for its conditions; {name} is {reprlib.repr(row[name])}")
     beyond = next((j for j in rig.joints if not j.limits[0] <= joints[j.name] <= j.limits[1]), None)
     if beyond is not None:
         raise ValueError(f"{beyond.name} = {joints[beyond.name]:g} {beyond.unit} is beyond its limits")

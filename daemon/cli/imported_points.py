@@ -57,11 +57,11 @@ def read_map(path: Path) -> ColumnMap:
         found = ColumnMap.model_validate(tomllib.loads(read_whole(path, 1 << 20).decode("utf-8-sig")))
     except OSError as error:
         raise DescriptionError(str(path), f"cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise DescriptionError(str(path), f"is not a TOML file: {error}") from error
     except ValidationError as error:
         first = error.errors()[0]
         raise DescriptionError(str(path), f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+    except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, a number of thousands of digits
+        raise DescriptionError(str(path), f"is not a TOML file: {error}") from error
     if found.format not in export_formats():
         raise DescriptionError(str(path), f"format: {found.format!r} is unknown; known: {', '.join(export_formats())}")
     return found

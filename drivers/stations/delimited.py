@@ -53,6 +53,7 @@ _ANGLE_WORDS: dict[str, AngleUnit] = {
 }
 _UNIT = re.compile(r"[\[(]\s*([^\])]+?)\s*[\])]|_(mm|cm|m|in|ft|deg|gon|rad)$")
 _BEFORE_UNIT = re.compile(r"\s+(?=[\[(])")  # blanks between a name and its unit
+_LARGEST = 1e12  # of coordinates, angles and seconds in any unit
 _WHOLE = re.compile(r"[+-]?\d+", re.ASCII)
 _TWO_MEANINGS = (
     "{} cells where {} are due: commas separate columns and are decimal signs as well; export with decimal points, or "
@@ -98,11 +99,17 @@ def cells_of(line: str, separator: str) -> list[str]:
 
 
 def number_of(cell: str, decimal: str) -> float | None:
-    """Return the number in a cell; None where there is none, or it is not finite."""
+    """Return the number in a cell; None where there is none, or one beyond what any instrument measures."""
     if not _NUMBER.fullmatch(cell) or (decimal == "." and "," in cell):
         return None
     value = float(cell.replace(",", "."))
-    return value if math.isfinite(value) else None
+    return value if abs(value) < _LARGEST else None
+
+
+def why_no_number(cell: str) -> str:
+    """Return what is wrong with a cell that `number_of` finds no number in."""
+    is_too_large = _NUMBER.fullmatch(cell) and number_of(cell, ",") is None
+    return f"{cell!r} is {'beyond what any instrument measures' if is_too_large else 'not a number'}"
 
 
 def decimal_of(cells: Iterable[str]) -> str:
@@ -319,9 +326,7 @@ def read_table(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
             cell = _cell(cells, places[role], columns.columns[role], number, source)
             value = number_of(cell, columns.decimal)
             if value is None:
-                said = (
-                    f"{cell!r} is not a number" if cell else "the cell is empty; leave out lines without a measurement"
-                )
+                said = why_no_number(cell) if cell else "the cell is empty; leave out lines without a measurement"
                 refuse(source, said, number, columns.columns[role])
             return value
 

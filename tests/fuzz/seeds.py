@@ -30,7 +30,9 @@ from daemon.store.packed_captures import CaptureColumns, packed
 from drivers.logs.can_log import read_can_log, write_can_log
 from drivers.logs.serial_log import read_serial_log
 from drivers.readings import CanCapture, SerialCapture
+from tests.calibration.rig.exchange import test_from_table, test_from_urdf
 from tests.daemon.offline_support import held_out_csv, train_csv
+from tests.drivers.stations.exports import test_exports
 from tests.fuzz.streams import pack_frames, pack_pieces
 from tests.fuzz.target import CORPUS
 from tests.fuzz.targets.control import commands
@@ -65,6 +67,7 @@ def seeds() -> Iterator[tuple[str, str, bytes]]:
     yield from _of_frames()
     yield from _of_descriptions()
     yield from _of_texts()
+    yield from _of_imports()
     yield from _of_stored()
     yield from _of_models()
     for number, command in enumerate(commands()):
@@ -316,6 +319,53 @@ def _plan() -> bytes:
         [*(f"{low + share * (high - low):.3f}" for low, high in (j.limits for j in joints))] for share in (0.3, 0.6)
     ]
     return "\n".join(",".join(row) for row in (head, [*poses[0], "1", ""], [*poses[1], "-1", "7.5"])).encode()
+
+
+def _of_imports() -> Iterator[tuple[str, str, bytes]]:
+    yield "urdf", "mixed", test_from_urdf.MIXED.encode()
+    yield "dh-table", "ur10", test_from_table.UR10.encode()
+    yield (
+        "dh-table",
+        "sum",
+        b"joint,a_mm,theta_drive,lower,upper,max_rate\nq1,100,,-90,90,5\nq2,100,,,,\n,100,-q1 + 0.5*q2,,,\n",
+    )
+    exports = {
+        "gts": test_exports.gts_download(),
+        "sdr": test_exports.SDR_HEAD + test_exports.sdr("09F1", "0003", "0004", 10.0, 100.0, 50.0, "r"),
+        "leica": test_exports.LEICA,
+        "faro": test_exports.FARO,
+        "vicon": test_exports.VICON,
+        "angles": test_exports.ANGLES,
+    }
+    for name, text in exports.items():
+        yield "exports", name, text.encode()
+    yield "import-map", "written", _MAP
+    for key, cells in {
+        "pose": ("P1", "P2"),
+        "time_s": ("0.0", "0.5"),
+        "time": ("2026-11-24T10:00:00Z", "2026-11-24T10:00:01Z"),
+    }.items():
+        head = f"{key},q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n"
+        yield "joint-values", key, (head + "".join(f"{cell},1,2,3,4,5,6.5\n" for cell in cells)).encode()
+
+
+_MAP = b"""format = "leica_csv"
+separator = ","
+header_line = 1
+first_line = 2
+length_unit = "m"
+
+[columns]
+point = "PtID"
+x = "East [m]"
+y = "North [m]"
+z = "Height [m]"
+prism = "Code"
+date = "Date/Time"
+
+[prisms]
+w = "tool"
+"""
 
 
 def _packed(*, is_serial: bool) -> bytes:

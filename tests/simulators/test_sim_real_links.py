@@ -195,6 +195,11 @@ def test_a_plan_says_how_long_to_stand_and_from_which_side(tmp_path: Path) -> No
         read_plan(tmp_path / "broken.csv", RIG, 5.0)
 
 
+def test_a_plan_with_a_number_of_thousands_of_digits_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"line 2: .*dwell_s is '9{12}\.\.\.9{13}'$"):
+        read_plan(plan(tmp_path / "plan.csv", {}, dwell_s="9" * 5000), RIG, 5.0)
+
+
 def test_the_end_of_a_bus_hears_others_and_not_itself_and_sends_no_error_frames() -> None:
     port = unused_port()
     end = BusEnd("udp_multicast", GROUP, {"port": port, "hop_limit": 0})

@@ -20,6 +20,7 @@ Floats = NDArray[np.float64]
 
 LONGEST = 1 << 24  # characters; a humanoid with its meshes' names has some 200,000
 _MOST_ELEMENTS = 20_000
+_LARGEST = 1e9  # of metres, radians and directions
 _TURNING, _SLIDING, _FREE = ("revolute", "continuous"), ("prismatic",), ("floating", "planar")
 
 
@@ -263,8 +264,8 @@ class _Reader:
             numbers = [float(part) for part in text.split()]
         except ValueError:
             numbers = []
-        if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
-            raise self._fault(where, f"{key}={text!r} is not three numbers")
+        if len(numbers) != 3 or not all(abs(number) < _LARGEST for number in numbers):
+            raise self._fault(where, f"{key}={text!r} is not three numbers below {_LARGEST:g}")
         return np.array(numbers)
 
     def _number(self, element: ET.Element, key: str, where: str, default: float) -> float:

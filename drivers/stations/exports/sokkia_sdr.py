@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 
-from drivers.stations.delimited import number_of
+from drivers.stations.delimited import number_of, why_no_number
 from drivers.stations.export_format import (
     MM_PER,
     RAD_PER,
@@ -100,7 +100,7 @@ def _number(cells: list[str], place: int, code: str, line: int, source: str) -> 
     text = _name(cells, place)
     value = number_of(text, ".")
     if value is None:
-        refuse(source, f"{text!r} is not a number, in column {place + 1} of a record {code}", line)
+        refuse(source, f"{why_no_number(text)}, in column {place + 1} of a record {code}", line)
     return value
 
 

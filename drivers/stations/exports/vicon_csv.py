@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import re
 
-from drivers.stations.delimited import cells_of, decimal_of, line_at, lines_of, number_of
+from drivers.stations.delimited import cells_of, decimal_of, line_at, lines_of, number_of, why_no_number
 from drivers.stations.export_format import MM_PER, ColumnMap, ExportedFix, ExportFormat, Guess, refuse
 
 _KINDS = {"trajectories", "objects", "devices", "joints", "segments", "model outputs"}
@@ -83,11 +83,11 @@ def _read(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
             if len(own) < 3 or not any(own):
                 continue
             values = [number_of(cell, columns.decimal) for cell in own]
+            marker = names[start] if start < len(names) and names[start] else f"column {start + 1}"
             for axis, value, cell in zip("XYZ", values, own, strict=True):
                 if value is None:
-                    refuse(source, f"{cell!r} is not a number", number, f"{names[start]} {axis}")
+                    refuse(source, why_no_number(cell), number, f"{marker} {axis}")
             x, y, z = (mm * value for value in values if value is not None)
-            marker = names[start] if start < len(names) and names[start] else f"column {start + 1}"
             fixes.append(ExportedFix(number, f"{frame:g}", marker, (x, y, z), frame / columns.rate_hz))
     if not fixes:
         refuse(source, "no marker was seen in any frame")

@@ -128,10 +128,17 @@ def test_joints_that_do_not_fit_are_refused(tmp_path: Path, change: tuple[str, s
     assert not (tmp_path / "out.csv").exists()
 
 
-def test_a_wrong_map_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ('length_unit = "furlong"', "map.toml: length_unit: Input should be"),
+        (f"first_line = {'9' * 5000}", "map.toml: is not a TOML file: Exceeds the limit"),
+    ],
+)
+def test_a_wrong_map_is_refused(tmp_path: Path, line: str, said: str) -> None:
     survey, columns = tmp_path / "survey.csv", tmp_path / "map.toml"
     survey.write_text(SURVEY)
-    columns.write_text('format = "leica_csv"\nlength_unit = "furlong"\n')
+    columns.write_text(f'format = "leica_csv"\n{line}\n')
     result = run(survey, "--map", columns, "--out", tmp_path / "out.csv")
     assert result.exit_code == 2
-    assert "map.toml: length_unit: Input should be" in result.stderr
+    assert said in result.stderr

@@ -120,6 +120,7 @@ JOINT = '<joint name="j" type="{}"><parent link="a"/><child link="b"/>{}</joint>
         ("<robot>" + LINKS + JOINT.format("spherical", "") + "</robot>", "no type of joint: 'spherical'"),
         ("<robot>" + LINKS + JOINT.format("revolute", '<axis xyz="0 0 0"/>') + "</robot>", "no direction"),
         ("<robot>" + LINKS + JOINT.format("revolute", '<axis xyz="0 1"/>') + "</robot>", "not three numbers"),
+        ("<robot>" + LINKS + JOINT.format("revolute", '<axis xyz="0 1e308 0"/>') + "</robot>", "numbers below 1e"),
         ("<robot>" + LINKS + JOINT.format("fixed", '<origin xyz="0 nan 1"/>') + "</robot>", "not three numbers"),
         ("<robot>" + LINKS + JOINT.format("revolute", '<mimic joint="k"/>') + "</robot>", "no joint"),
         ("<robot>" + LINKS + JOINT.format("revolute", '<mimic joint="j"/>') + "</robot>", "mimics itself"),
