@@ -43,7 +43,7 @@ _KNOWN = frozenset(
     )
 )
 _CONVENTION = re.compile(r"#\s*convention:\s*(\w+)\s*")
-_TERM = re.compile(r"\s*([+-]?)\s*(?:((?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*\*\s*)?([A-Za-z]\w*)", re.ASCII)
+_TERM = re.compile(r"\s*([+-]?)\s*(?:((?:\d++\.?\d*+|\.\d++)(?:[eE][+-]?\d++)?)\s*\*\s*)?([A-Za-z]\w*)", re.ASCII)
 _ASSUMED_LIMITS = {"revolute": (-180.0, 180.0), "prismatic": (0.0, 1000.0)}
 _MOST_LINES = 1000
 
