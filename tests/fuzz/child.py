@@ -71,7 +71,11 @@ def main() -> None:
         end_ns = time.monotonic_ns() + seconds * 1_000_000_000
         number = first
         while number < first + count and time.monotonic_ns() < end_ns:
-            data = an_input(target, corpus, seed, number)
+            try:
+                data = an_input(target, corpus, seed, number)
+            except MemoryError:  # of the change, not of the target
+                number += 1
+                continue
             shared[HEADER.size : HEADER.size + len(data)] = data
             began_ns = time.process_time_ns()
             shared[: HEADER.size] = HEADER.pack(number, time.monotonic_ns(), began_ns, len(data))
