@@ -51,8 +51,8 @@ _ANGLE_WORDS: dict[str, AngleUnit] = {
     **dict.fromkeys(("gon", "gons", "grad", "grads"), "gon"),
     **dict.fromkeys(("rad", "radian", "radians"), "rad"),
 }
-_UNIT = re.compile(r"[\[(]\s*([^\])]+?)\s*[\])]|_(mm|cm|m|in|ft|deg|gon|rad)$")
-_BEFORE_UNIT = re.compile(r"\s+(?=[\[(])")  # blanks between a name and its unit
+_UNIT = re.compile(r"[\[(]\s*+([^\[\]()\s][^\[\]()]*+)[\])]|_(mm|cm|m|in|ft|deg|gon|rad)$")
+_BEFORE_UNIT = re.compile(r"(?<!\s)\s++(?=[\[(])")  # blanks between a name and its unit
 _LARGEST = 1e12  # of coordinates, angles and seconds in any unit
 _WHOLE = re.compile(r"[+-]?\d+", re.ASCII)
 _TWO_MEANINGS = (

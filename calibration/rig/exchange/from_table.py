@@ -166,7 +166,9 @@ class _Table:
         return kind
 
     def _add_joint(self, line: int, cells: Mapping[str, str], kind: str) -> None:
-        name = cells["joint"]
+        name = cells.get("joint", "")
+        if not name:
+            raise RigError(self._source, "joint", "the line has limits, and names no joint that they are of", line)
         if name in self._kinds:
             given = next(t.keys["limits"] for t in self._draft.sections["joint"] if t.keys["name"] == name)
             assert isinstance(given, list)

@@ -21,7 +21,7 @@ _KINDS = {"trajectories", "objects", "devices", "joints", "segments", "model out
 
 
 def _recognises(text: str) -> bool:
-    return bool(re.search(r"^\s*\"?Trajectories\"?[;,\t]*\s*$", text, re.MULTILINE))
+    return bool(re.search(r"^[ \t]*\"?Trajectories\"?[;,\t ]*\r?$", text, re.MULTILINE))
 
 
 def _head(text: str, source: str) -> int:

@@ -67,6 +67,7 @@ def test_a_row_may_be_driven_by_a_sum() -> None:
         ("joint,a_mm\nq1,1,2\n", "3 cells, the header has 2"),
         ("joint,kind\nq1,screw\n", "neither revolute nor prismatic"),
         ("joint,theta_drive\nq1,q1 q2\n", "no sum such as"),
+        ("joint,a_mm,theta_drive,lower\nq1,9,,\n,,,-90\n", r"names no joint that they are of \(line 3\)"),
         ("joint,theta_drive\nq1,0.5.5*q1\n", "no sum such as"),
         ("a_mm\n1\n", "no row names a joint"),
         ("joint;a_mm\nq1;1,5\n", "separate columns by commas"),

@@ -242,6 +242,14 @@ def test_a_map_of_another_file_is_refused(text: str, change: dict[str, object], 
         known.read(text, columns.model_copy(update=change), "file")
 
 
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("endless", [" " * 500_000, "(" * 500_000, "( " * 250_000, "\n" * 500_000])
+def test_what_never_closes_is_read_in_linear_time(endless: str) -> None:
+    assert refused(f"name,x [mm,{endless}\n1,2\n")
+    assert refused(f"name x [mm {endless}\n1 2\n")
+    assert refused(f"Trajectories{endless}x")
+
+
 def test_an_empty_file_is_of_no_format() -> None:
     assert "the format is not known" in refused("\n")
 
