@@ -29,6 +29,7 @@ class Passed:
     ) -> None:
         self.path = root / "tests" / name
         self._root, self._tested, self._is_test = root, tuple(tested), is_test
+        self._asked: str | None = None
 
     def state(self) -> str:
         """Return the SHA-256 of the names and contents of all files that the tests are about, and of the tests."""
@@ -42,11 +43,15 @@ class Passed:
 
     def holds(self) -> bool:
         """Return True if the tests have passed in the present state."""
-        return self.path.exists() and self.path.read_text("utf-8").strip() == self.state()
+        self._asked = self.state()
+        return self.path.exists() and self.path.read_text("utf-8").strip() == self._asked
 
     def note(self) -> None:
-        """Remember that the tests have passed in the present state."""
-        self.path.write_text(f"{self.state()}\n", "utf-8")
+        """Remember that the tests have passed, unless something has changed since `holds` was asked."""
+        if self._asked == self.state():
+            self.path.write_text(f"{self._asked}\n", "utf-8")
+        else:
+            print(f"Not noted in {self.path.name}: sources have changed while the tests ran.")
 
 
 def _files(place: Path) -> list[Path]:

@@ -25,5 +25,14 @@ def test_it_holds_until_a_file_that_is_tested_or_a_test_changes(tmp_path: Path) 
     (tmp_path / "tests/test_long.py").write_text("changed")
     assert not passed.holds()
     passed.note()
+    assert passed.holds()
     (tmp_path / "daemon/new.py").write_text("")
     assert not passed.holds()
+
+
+def test_what_changes_while_the_tests_run_has_not_passed(tmp_path: Path) -> None:
+    passed = sources(tmp_path)
+    assert not passed.holds()
+    (tmp_path / "daemon/service.py").write_text("two")
+    passed.note()
+    assert not passed.path.exists()

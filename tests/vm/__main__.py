@@ -113,7 +113,7 @@ def _options() -> argparse.Namespace:
 def main() -> int:
     """Command line."""
     options = _options()
-    if not options.only and options.cuts is None and PASSED.holds():
+    if PASSED.holds() and not options.only and options.cuts is None:
         print("The tests in a virtual machine passed in this state of the sources (tests/vm.passed).")
         return 0
     if missing() and os.geteuid() == 0:
