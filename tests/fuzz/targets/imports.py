@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 
 from calibration.errors import RigError
+from calibration.rig.exchange.draft import Draft
 from calibration.rig.exchange.from_table import draft_of_table
 from calibration.rig.exchange.from_urdf import draft_of_urdf
 from calibration.rig.exchange.urdf import parse_urdf
@@ -13,7 +16,8 @@ from daemon.cli.imported_points import map_text, read_export, read_joints, read_
 from daemon.rig_files import load_rig
 from drivers.errors import DescriptionError
 from drivers.stations.exports import format_of
-from tests.fuzz.target import Run, Target, check_refusal, scratch_directory
+from tests.fuzz.target import CORPUS, Run, Target, check_refusal, scratch_directory
+from tests.fuzz.targets.logs import on_file
 
 _URDF = (
     *(
@@ -74,62 +78,29 @@ _MAP = (
 )
 
 
-def _urdf() -> Run:
+def _rig_of(draft_of: Callable[[str], Draft]) -> Run:
     def run(data: bytes) -> None:
         with suppress(UnicodeDecodeError):
             try:
-                draft_of_urdf(parse_urdf(data.decode(), "arm.urdf"), "arm.urdf").rig()
+                draft_of(data.decode()).rig()
             except RigError as error:
                 check_refusal(error)
 
     return run
 
 
-def _table() -> Run:
-    def run(data: bytes) -> None:
-        with suppress(UnicodeDecodeError):
-            try:
-                draft_of_table(data.decode(), "arm.csv").rig()
-            except RigError as error:
-                check_refusal(error)
-
-    return run
+def _export(path: Path) -> None:
+    text = read_export(path)
+    known = format_of(text, str(path))
+    guess = known.guess(text, str(path))
+    map_text(guess.map, str(path))
+    for fix in known.read(text, guess.map, str(path)):
+        assert all(map(math.isfinite, (*fix.position_mm, fix.time_s or 0.0))), fix
 
 
-def _exports() -> Run:
-    path = scratch_directory() / "survey.txt"
-
-    def run(data: bytes) -> None:
-        path.write_bytes(data)
-        try:
-            text = read_export(path)
-            known = format_of(text, path.name)
-            guess = known.guess(text, path.name)
-            map_text(guess.map, path.name)
-            fixes = known.read(text, guess.map, path.name)
-        except DescriptionError as error:
-            check_refusal(error, path.name)
-        else:
-            for fix in fixes:
-                assert all(map(math.isfinite, (*fix.position_mm, fix.time_s or 0.0))), fix
-
-    return run
-
-
-def _maps() -> Run:
-    path = scratch_directory() / "survey.map.toml"
-    table = "PtID,East [m],North [m],Height [m],Code,Date/Time\nP1,1.5,2.5,3.5,w,2026-11-24T10:00:00\nP2,1,2,3,b,\n"
-
-    def run(data: bytes) -> None:
-        path.write_bytes(data)
-        try:
-            columns = read_map(path)
-            known = format_of(table, "survey.csv")
-            known.read(table, columns, "survey.csv")
-        except DescriptionError as error:
-            check_refusal(error, "survey.")
-
-    return run
+def _map(path: Path) -> None:
+    table = (CORPUS / "exports" / "seed-leica").read_text(encoding="utf-8")
+    format_of(table, str(path)).read(table, read_map(path), str(path))
 
 
 def _joints() -> Run:
@@ -149,10 +120,12 @@ def _joints() -> Run:
 
 
 TARGETS = [
-    Target("urdf", _urdf, "text", _URDF, is_slow=True),
-    Target("dh-table", _table, "text", _TABLE, is_slow=True),
-    Target("exports", _exports, "text", _EXPORT, is_slow=True),
-    Target("import-map", _maps, "text", _MAP, is_slow=True),
+    Target(
+        "urdf", lambda: _rig_of(lambda text: draft_of_urdf(parse_urdf(text, "arm"), "arm")), "text", _URDF, is_slow=True
+    ),
+    Target("dh-table", lambda: _rig_of(lambda text: draft_of_table(text, "arm")), "text", _TABLE, is_slow=True),
+    Target("exports", lambda: on_file(".txt", _export), "text", _EXPORT, is_slow=True),
+    Target("import-map", lambda: on_file(".toml", _map), "text", _MAP, is_slow=True),
     Target(
         "joint-values", _joints, "text", (b"pose", b"time_s", b"time", b"q1_deg", b"nan", b"1e308", b","), is_slow=True
     ),
