@@ -1,7 +1,8 @@
 """The package on a real Debian 12 in QEMU, without KVM: `make vmtest`, `python -m tests.vm --only NAME`.
 
-Boots the image once for all checks, and once more for power cuts. Prints a line for each with its figure, and ends with
-status 1 where one failed. Where the sources are those of tests/vm.passed there is nothing to show.
+Boots the image once for each row of checks, and once more for power cuts: as many machines at once as there are
+processors. Prints a line for each check with its figure, and ends with status 1 where one failed. Where the sources are
+those of tests/vm.passed there is nothing to show.
 """
 
 from __future__ import annotations
@@ -12,13 +13,15 @@ import os
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
 from tests.passed import Passed
-from tests.vm.checks import CHECKS, Check
+from tests.vm.checks import ROWS, Check
 from tests.vm.image import CACHE, PYTHON, Image, NoDebianError, image, missing, packaged_changes
 from tests.vm.machine import Machine, MachineError
 from tests.vm.power_cuts import power_cuts
@@ -33,7 +36,7 @@ print(llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten())"""
 
 
 class Table:
-    """Lines with a name, what came of it, how long it took here, and a figure.
+    """Lines with a name, what came of it, how long it took here, and a figure; several threads may show some.
 
     Args:
         until_s: when nothing is begun any more, on the monotonic clock.
@@ -47,19 +50,22 @@ class Table:
         self._until_s = until_s
         self.failed: list[str] = []
         self.left_out = 0
+        self._one_at_a_time = threading.Lock()
 
     def show(self, name: str, work: Callable[[], str]) -> bool:
         """Do something that is a line; returns whether it succeeded."""
         began = time.monotonic()
         if began > self._until_s:
-            self.left_out += 1
+            with self._one_at_a_time:
+                self.left_out += 1
             return True
         try:
             verdict, figure = "ok", work()
         except (MachineError, LookupError, TypeError, ValueError, OSError, subprocess.SubprocessError) as error:
             verdict, figure = "FAILED", f"{type(error).__name__}: {error}"
-            self.failed.append(name)
-        print(f"{name.replace('_', ' '):<55} {verdict:<6} {time.monotonic() - began:5.0f} s  {figure}", flush=True)
+        with self._one_at_a_time:
+            self.failed += [name] if verdict == "FAILED" else []
+            print(f"{name.replace('_', ' '):<55} {verdict:<6} {time.monotonic() - began:5.0f} s  {figure}", flush=True)
         return verdict == "ok"
 
 
@@ -75,21 +81,31 @@ def processor_of(made: Image) -> dict[str, str]:
     return {"name": name, "features": features}
 
 
-def show_all(made: Image, checks: Sequence[Check], cuts: int, table: Table) -> None:
-    """Boot, and show everything."""
+def show_all(made: Image, rows: Sequence[Sequence[Check]], cuts: int, table: Table) -> None:
+    """Show everything, in as many machines at once as there are processors."""
     with tempfile.TemporaryDirectory(dir=CACHE, prefix="run-") as scratch:
-        if checks:
-            with Machine(made, Path(scratch) / "checks") as machine:
-                say(f"booted in {machine.booted_s:.0f} s")
-                service = Service(machine)
-                service.install()
-                for check in checks:
-                    if not table.show(check.__name__, partial(check, service)):
-                        service.mend()
-                if table.failed:
-                    print(machine.tried("journalctl -b -u rigcal -n 60 --no-pager -o short-monotonic").output)
+        parts = [partial(_row, made, Path(scratch) / f"row-{n}", row, table) for n, row in enumerate(rows) if row]
         if cuts:
-            table.show(POWER_CUTS, lambda: _cuts(made, Path(scratch) / "power", cuts))
+            work = partial(_cuts, made, Path(scratch) / "power", cuts)
+            parts.append(partial(table.show, POWER_CUTS, work))
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:
+            for shown in [threads.submit(part) for part in parts]:
+                shown.result()
+
+
+def _row(made: Image, scratch: Path, checks: Sequence[Check], table: Table) -> None:
+    """Boot a machine, and show checks in it one after the other."""
+    with Machine(made, scratch) as machine:
+        say(f"booted in {machine.booted_s:.0f} s")
+        service = Service(machine)
+        service.install()
+        shown = []
+        for check in checks:
+            shown.append(table.show(check.__name__, partial(check, service)))
+            if not shown[-1]:
+                service.mend()
+        if not all(shown):
+            print(machine.tried("journalctl -b -u rigcal -n 60 --no-pager -o short-monotonic").output, flush=True)
 
 
 def _cuts(made: Image, scratch: Path, cuts: int) -> str:
@@ -127,7 +143,7 @@ def main() -> int:
         return 2
     began = time.monotonic()
     wanted = [name.replace(" ", "_") for name in options.only] or [""]
-    checks = [check for check in CHECKS if any(word in check.__name__ for word in wanted)]
+    rows = [[check for check in row if any(word in check.__name__ for word in wanted)] for row in ROWS]
     cuts = (options.cuts or CUTS) if any(word in POWER_CUTS for word in wanted) else 0
     table = Table(time.monotonic() + 60.0 * options.minutes)
     try:
@@ -135,7 +151,7 @@ def main() -> int:
     except NoDebianError as error:
         print(f"skipped: the tests in a virtual machine need a Debian: {error}")
         return 0
-    show_all(made, checks, cuts, table)
+    show_all(made, rows, cuts, table)
     took_min = (time.monotonic() - began) / 60
     print(f"{len(table.failed)} failed, {table.left_out} left out for want of time, in {took_min:.0f} min", flush=True)
     if not options.only and not table.failed and not table.left_out:

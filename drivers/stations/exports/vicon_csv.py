@@ -83,7 +83,7 @@ def _read(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
             if len(own) < 3 or not any(own):
                 continue
             values = [number_of(cell, columns.decimal) for cell in own]
-            marker = names[start] if start < len(names) and names[start] else f"column {start + 1}"
+            marker = names[start] if start < len(names) and names[start] else f"unnamed {start + 1}"
             for axis, value, cell in zip("XYZ", values, own, strict=True):
                 if value is None:
                     refuse(source, why_no_number(cell), number, f"{marker} {axis}")

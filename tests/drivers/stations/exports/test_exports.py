@@ -206,7 +206,7 @@ def test_what_is_not_named_is_guessed_and_said() -> None:
         ("point,x,y,z\n1,2,3,4\n2,5\n", "survey.txt, line 3, column y: the line has 2 columns only"),
         (VICON.replace("2,0,", "two,0,"), "survey.txt, line 7, column Frame: 'two' is not the number of a frame"),
         (VICON.replace("mm", "deg"), "units are deg"),
-        (VICON.replace(",,rig:base,,", ",").replace("4.5", "x"), "line 7, column column 6 X: 'x' is not a number"),
+        (VICON.replace(",,rig:base,,", ",").replace("4.5", "x"), "line 7, column unnamed 6 X: 'x' is not a number"),
         (LEICA.replace("1.5,2.5", "1e308,2.5"), "column East [m]: '1e308' is beyond what any instrument measures"),
         ("some text\nand more\n", "no line names columns x, y, z"),
         (
