@@ -75,8 +75,12 @@ style: environment
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 
+# What no test runs to its end: a benchmark that cannot start is found here.
+PROGRAMS := deploy tests.bench tests.deploy tests.fuzz tests.soak tests.vm
+
 types: environment
 	$(BIN)/mypy
+	$(BIN)/mypy --cache-dir .mypy_cache/programs --follow-imports=silent --ignore-missing-imports $(addprefix -p ,$(PROGRAMS))
 
 imports: environment
 	$(BIN)/lint-imports

@@ -179,7 +179,7 @@ def bill_of_materials(home: Path, source: Source, python: str) -> str:
         name = found.name.lower().replace("_", "-")
         metadata = HeaderParser().parsestr(found.read_text("METADATA") or "")
         licence = metadata.get("License-Expression") or metadata.get("License") or ""
-        component = {
+        component: dict[str, object] = {
             "type": "application" if name == "rigcal" else "library",
             "bom-ref": f"pkg:pypi/{name}@{found.version}",
             "name": name,

@@ -79,7 +79,7 @@ def refusal(root: Path = ROOT) -> str | None:
 
 def git(root: Path, *arguments: str) -> str:
     """Return what git says about a repository."""
-    command = ["git", "-C", root, *arguments]
+    command = ["git", "-C", str(root), *arguments]
     return subprocess.run(command, check=True, capture_output=True, text=True).stdout.rstrip()
 
 

@@ -139,5 +139,6 @@ def boom(seed: int, poses: int = 200, reach_mm: float = 400.0, reach_deg: float 
         0.0,
         np.ones(n),
         np.zeros(len(rig.joints)),
+        np.arange(n),
     )
     return Boom(chain, samples, truth, free, reach[free])

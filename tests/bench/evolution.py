@@ -13,12 +13,13 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any
 
 import numba
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from scipy.optimize import differential_evolution
+from scipy.optimize import Bounds, differential_evolution
 from threadpoolctl import threadpool_limits
 
 from calibration.published.paper_evolution import PaperSettings, evolve_paper
@@ -81,9 +82,13 @@ def scipys(problem: Boom, objective: Callable[[Floats], Floats], population: int
     width = problem.width
     start = np.random.default_rng(0).uniform(-1.0, 1.0, (population, len(width))) * width
     clock = _Clock(lambda: None)
+
+    def transposed(x: Floats) -> Any:  # with `vectorized` scipy wants a row of them, which its types do not know
+        return objective(np.ascontiguousarray(x.T))
+
     differential_evolution(
-        lambda x: objective(np.ascontiguousarray(x.T)),
-        list(zip(-width, width, strict=True)),
+        transposed,
+        Bounds(-width, width),
         strategy="rand1bin",
         mutation=0.5,
         recombination=1.0,

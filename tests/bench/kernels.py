@@ -30,6 +30,7 @@ from calibration.kinematics.fitness import Fitness, evaluate
 from calibration.observations import Floats
 from calibration.published.paper_evolution import PaperSettings
 from calibration.rig.description import shipped_rig
+from calibration.rig.parts import Row
 from tests.calibration.kinematics.numpy_chain import NumpyChain
 
 POSES = 200
@@ -108,11 +109,12 @@ class Problem:
         transform = np.eye(4)
         for number, row in enumerate(rig.rows, 1):
 
-            def size(constant: str, unit: float, number: int = number, row: object = row) -> Floats:
-                nominal = getattr(row, f"{constant}_{'deg' if unit != 1.0 else 'mm'}")
-                drive = getattr(row, "drive").get(constant, {})  # noqa: B009 - `row` is typed as an object
+            def size(constant: str, unit: float, number: int = number, row: Row = row) -> Floats:
+                nominal = float(getattr(row, f"{constant}_{'deg' if unit != 1.0 else 'mm'}"))
+                drive = {str(driven): sums for driven, sums in row.drive.items()}.get(constant, {})
                 driven = sum((c * joint[name] for name, c in drive.items()), np.zeros(1))
-                return (nominal + driven) * unit + value.get(f"row{number}.{constant}", zero)
+                own: Floats = (nominal + driven) * unit + value.get(f"row{number}.{constant}", zero)
+                return own
 
             degree = np.radians(1.0)
             a, d = size("a", 1.0), size("d", 1.0)

@@ -19,6 +19,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+from playwright.sync_api import ViewportSize
+
 from tests.bench.year_store import build
 from tests.daemon.daemon_process import DaemonProcess
 from tests.daemon.web.web_support import WebProcess
@@ -94,7 +96,7 @@ def measure(daemon: DaemonProcess, web: WebProcess, seconds: float, table: Table
     """Measure the page of a rig that measures."""
     if chromium() is not None:
         with launched() as browser:
-            page = browser.new_context(viewport=TABLET).new_page()
+            page = browser.new_context(viewport=ViewportSize(width=TABLET["width"], height=TABLET["height"])).new_page()
             for screen in ("now", "health", "history"):
                 page.goto(f"{web.address}/{screen}")
                 paint_s = page.evaluate(PAINT) / 1e3

@@ -18,13 +18,14 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import Any
 
 import numba
 import numpy as np
 import pygmo
 import scipy
 from numpy.typing import NDArray
-from scipy.optimize import differential_evolution
+from scipy.optimize import Bounds, differential_evolution
 from threadpoolctl import threadpool_limits
 
 from calibration.identification.search.islands import Settings, evolve
@@ -76,12 +77,12 @@ def ours(problem: Boom, watch: _Watch, executor: Executor, seed: int) -> None:
 
 
 def scipy_de(problem: Boom, watch: _Watch, executor: Executor, seed: int) -> None:
-    def both_cores(x: Floats) -> Floats:
+    def both_cores(x: Floats) -> Any:  # with `vectorized` scipy wants a row of them, which its types do not know
         return np.concatenate(list(executor.map(watch, np.array_split(np.atleast_2d(x.T), WORKERS))))
 
     differential_evolution(
         both_cores,
-        list(zip(-problem.width, problem.width, strict=True)),
+        Bounds(-problem.width, problem.width),
         rng=seed,
         x0=np.zeros(len(problem.width)),
         maxiter=10**6,

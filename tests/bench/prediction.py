@@ -19,8 +19,9 @@ import os
 import statistics
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -30,6 +31,7 @@ from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor
 from calibration.observations import Observations, parse_observations
 from calibration.pipeline.calibrate import identify, train_residual
+from calibration.residual.selection import Kind
 from calibration.rig.description import Rig, shipped_rig
 from calibration.run_settings import Run
 from simulators.effects.library import parse_effects
@@ -48,7 +50,7 @@ WHAT = ("one_us", "many_ms", "many_one_thread_ms")
 TARGETS = 30
 BARS = {"one_us": 200.0, "many_ms": 50.0, "inverse_ms": 5.0}
 PRISMS = (("r",), ("r", "s"))
-KINDS = ("rbfn", "lightgbm", "chain", "default")
+KINDS: tuple[Kind, ...] = ("rbfn", "lightgbm", "chain", "default")
 
 
 def observations(rig: Rig, poses: int, seed: int, signals: int) -> Observations:
@@ -59,6 +61,11 @@ def observations(rig: Rig, poses: int, seed: int, signals: int) -> Observations:
     columns |= {f"signal{i}_mA": drawn.normal(size=poses) for i in range(signals)}
     data = simulate_observations(truth, poses, seed, prisms=("r", "s"), prisms_per_pose="one", columns=columns)
     return parse_observations(data.csv_text().encode(), rig, "simulated.csv")
+
+
+def one_call(model: CalibratedModel, rows: Observations, pool: Executor | None = None) -> object:
+    """Predict as a program does that is given a model."""
+    return Predictor.of(model).predict(rows, pool)
 
 
 def median_and_least(
@@ -128,12 +135,12 @@ def main() -> None:
             times = {
                 "one_us": (
                     1e6,
-                    lambda m=model, o=one: Predictor.of(m).predict(o),
+                    partial(one_call, model, one),
                     options.repetitions,
                     time.thread_time,
                 ),
-                "many_ms": (1e3, lambda m=model: Predictor.of(m).predict(rows, pool), few, time.perf_counter),
-                "many_one_thread_ms": (1e3, lambda m=model: Predictor.of(m).predict(rows), few, time.thread_time),
+                "many_ms": (1e3, partial(one_call, model, rows, pool), few, time.perf_counter),
+                "many_one_thread_ms": (1e3, partial(one_call, model, rows), few, time.thread_time),
             }
             result[name] = {"learner": model.residual.learner.kind if model.residual else "none"}
             for what, (unit, run, repetitions, clock) in times.items():
@@ -152,10 +159,10 @@ def main() -> None:
         print(f"{name:28s} {cells[0]:>18s} {cells[1]:>20s} {cells[2]:>20s}  {found['learner']}")
     print(f"{'bar':28s} {BARS['one_us']:18.0f} {BARS['many_ms']:20.0f}")
     print(f"\n{'inverse, one pose':38s} {'ms':>8s} {'worst':>8s} {'worst closure, mm':>18s} {'reached':>8s}")
-    for name, found in inverted.items():
+    for name, seen in inverted.items():
         print(
-            f"{name:38s} {found['ms']:8.2f} {found['worst_ms']:8.2f} {found['worst_closure_mm']:18.4f} "
-            f"{found['reached']:8.0%}"
+            f"{name:38s} {seen['ms']:8.2f} {seen['worst_ms']:8.2f} {seen['worst_closure_mm']:18.4f} "
+            f"{seen['reached']:8.0%}"
         )
     print(f"{'bar':38s} {BARS['inverse_ms']:8.0f} {'':8s} {CLOSURE_MM:18.2f}")
 

@@ -14,6 +14,7 @@ import json
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -83,7 +84,7 @@ def main() -> None:
     }
     runs: dict[str, Callable[[], object]] = {"refine": lambda: refine(chain, samples, nominal)}
     for name, residuals in peers.items():
-        runs[name] = lambda r=residuals: least_squares(r, nominal, jac=r.jacobian, x_scale="jac")
+        runs[name] = partial(least_squares, residuals, nominal, jac=residuals.jacobian, x_scale="jac")
     runs["linearise_numpy"] = lambda: in_numpy.linearise(nominal, samples.data)
     runs["linearise_compiled"] = lambda: chain.linearise(nominal, samples.data)
     times: dict[str, list[float]] = {name: [] for name in runs}

@@ -34,7 +34,7 @@ from drivers.can.ports import OVERFLOW, CanLinkConfig
 from drivers.can_link import CanLink
 from drivers.clock import SystemClock
 from drivers.logs.can_log import read_can_log
-from drivers.readings import CanCapture, EventKind, LinkItem
+from drivers.readings import CanCapture, DeviceEvent, EventKind, LinkItem
 from simulators.devices.can.bus import Frame
 from tests.bench.acquisition import SETTLE_S, START_S, Child, cpu_s
 from tests.bench.traffic import FRAMES_PER_MS, MULTICAST_GROUP, Bus, MulticastSender, frame_at, number_of, send_all
@@ -131,11 +131,13 @@ def run_rigcal(transport: Transport, parent: Connection) -> None:
             utc_ns.append(item.stamp.utc_ns)
             monotonic_ns.append(item.stamp.monotonic_ns)
             doubtful += item.stamp.is_doubtful
-        elif getattr(item, "kind", None) is EventKind.LINK_UP:
+        elif not isinstance(item, DeviceEvent):
+            return
+        elif item.kind is EventKind.LINK_UP:
             is_up.set()
-        elif getattr(item, "kind", None) is EventKind.FRAMES_DROPPED and OVERFLOW in item.text:
-            overflowed += item.code
-        elif hasattr(item, "text"):
+        elif item.kind is EventKind.FRAMES_DROPPED and OVERFLOW in item.text:
+            overflowed += item.code or 0
+        else:
             events.append(item.text)
 
     config = CanLinkConfig(

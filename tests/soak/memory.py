@@ -92,4 +92,4 @@ def growth(samples: Sequence[Usage], warm_s: float) -> Growth | None:
 def _fewest(samples: Sequence[Usage], what: str) -> int:
     """Descriptors or threads of a minute, while no client hangs if there was such a moment."""
     quiet = [sample for sample in samples if not sample.hanging]
-    return min(getattr(sample, what) for sample in quiet or samples)
+    return int(min(getattr(sample, what) for sample in quiet or samples))

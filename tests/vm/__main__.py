@@ -84,10 +84,11 @@ def processor_of(made: Image) -> dict[str, str]:
 def show_all(made: Image, rows: Sequence[Sequence[Check]], cuts: int, table: Table) -> None:
     """Show everything, in as many machines at once as there are processors."""
     with tempfile.TemporaryDirectory(dir=CACHE, prefix="run-") as scratch:
-        parts = [partial(_row, made, Path(scratch) / f"row-{n}", row, table) for n, row in enumerate(rows) if row]
+        parts: list[Callable[[], object]] = [
+            partial(_row, made, Path(scratch) / f"row-{n}", row, table) for n, row in enumerate(rows) if row
+        ]
         if cuts:
-            work = partial(_cuts, made, Path(scratch) / "power", cuts)
-            parts.append(partial(table.show, POWER_CUTS, work))
+            parts.append(partial(table.show, POWER_CUTS, partial(_cuts, made, Path(scratch) / "power", cuts)))
         with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:
             for shown in [threads.submit(part) for part in parts]:
                 shown.result()
