@@ -23,7 +23,7 @@ from daemon.store.upkeep.housekeeping import BACKUP_AFTER_S, Housekeeping, Keepi
 from daemon.store.upkeep.soundness import MANIFEST, check_store
 from drivers.clock import NS_PER_S, ManualClock
 from tests.daemon.damage import small_disk
-from tests.daemon.store_support import UTC_0, at, frame, table
+from tests.daemon.store_support import BOOT, UTC_0, at, frame, table
 
 
 def nothing() -> None:
@@ -220,6 +220,32 @@ def test_the_oldest_backups_go_once_a_new_one_is_sound(site: Site) -> None:
     site.store.update("raw_chunks", {"id": 3}, {"chunk": table(made[2] / "rigcal.sqlite", "raw_chunks")[2]["chunk"]})
     earlier = site.back_up(-100, keep=2)  # the clock was set back: it stays all the same
     assert [backup.path for backup in backups(site.backups)] == [earlier, made[2]]
+
+
+def test_backups_of_the_store_that_was_here_before_stay_though_a_new_one_has_its_own(site: Site) -> None:
+    before = [site.back_up(day) for day in range(3)]
+    site.store.close()
+    for path in site.path.parent.glob("rigcal.sqlite*"):
+        path.unlink()
+    site.store = Store(site.path)
+    site.store.insert("boots", {"kernel_boot_id": BOOT, "booted_utc_ns": UTC_0 + 1})
+    shutil.rmtree(site.models)
+    made = [site.back_up(day, keep=2) for day in range(3, 7)]
+    assert [backup.path for backup in backups(site.backups)] == [*before, *made[-2:]]
+
+
+def test_two_backups_at_once_do_not_take_each_others_files_away(site: Site) -> None:
+    tried: list[str] = []
+
+    def second() -> None:
+        if not tried:
+            with pytest.raises(StoreError) as caught:
+                site.back_up(1)
+            tried.append(str(caught.value))
+
+    first = make_backup(site.path, site.models, site.backups, 3, UTC_0, second)
+    assert tried == [f"{site.backups}: another backup is being made there; wait for its end"]
+    assert [backup.path for backup in backups(site.backups)] == [first.path]
 
 
 def test_a_backup_that_is_given_up_or_killed_leaves_nothing_that_counts(site: Site) -> None:
