@@ -197,13 +197,18 @@ class Housekeeping:
     def _forget_old(self) -> bool:
         if self._keeping.keep_days is None:
             return False
-        limit_ns = cutoff_ns(self._clock.now().utc_ns, self._keeping.keep_days)
+        now_ns = self._clock.now().utc_ns
+        limit_ns = cutoff_ns(now_ns, self._keeping.keep_days)
         if limit_ns is None:
             return False
         if self._aged_until is None or self._running_s() >= self._aged_until[0]:
+            today = now_ns // round(DAY_S * NS_PER_S)
+            if self._retention.aged_on() == today:  # by an earlier run
+                return False
             oldest = self._retention.oldest_ns()
             if oldest is None:
                 return False
+            self._retention.note_aged(today)
             self._aged_until = self._running_s() + DAY_S, oldest + round(AGED_DAYS * DAY_S * NS_PER_S)
         return self._retention.delete_oldest(min(limit_ns, self._aged_until[1])) is not None
 
