@@ -1,4 +1,4 @@
-"""The web server of the metrics: whoever asks on this computer, and does not go on, takes nothing that the daemon needs."""
+"""The web server of the metrics: a caller who does not go on takes nothing that the daemon needs."""
 
 from __future__ import annotations
 

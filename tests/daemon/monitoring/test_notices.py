@@ -219,9 +219,7 @@ def test_a_command_that_hangs_is_ended_with_its_children(
 def test_a_command_that_says_gigabytes_takes_no_memory_and_its_last_line_is_told(
     tmp_path: Path, opened: Callable[..., Sender]
 ) -> None:
-    program = script(
-        tmp_path / "send", "head -c 100000000 /dev/zero; echo; echo 'no route to host' >&2; exit 75"
-    )
+    program = script(tmp_path / "send", "head -c 100000000 /dev/zero; echo; echo 'no route to host' >&2; exit 75")
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     sender = opened(command=[program])
     sender.tell("raised", "boom")
