@@ -81,6 +81,8 @@ def read_backup(path: Path) -> Backup:
         raise StoreError(f"{path}: no backup of rigcal, or one that was never finished ({why})") from error
     if form > FORM:
         raise StoreError(f"{path}: a backup of form {form}, made by rigcal {backup.rigcal!r}; install that version")
+    if missing := [part for part in (STORE, MODELS) if not (path / part).exists()]:
+        raise StoreError(f"{path}: no backup of rigcal any more: {' and '.join(missing)} missing")
     return backup
 
 
