@@ -205,6 +205,7 @@ class NotifySection(_Section):
         try:
             parts = urlsplit(url or "http://none")
             is_good = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+            (parts.hostname or "").encode("idna")  # as the name is looked up: a label may be too long, or empty
         except ValueError:
             is_good = False
         is_plain = all("!" <= letter <= "~" for letter in url or "")
@@ -343,6 +344,7 @@ def parse_config(text: str, source: Path) -> Config:
         raw = parse_toml(text)
     except ValueError as error:
         raise ConfigError(f"{source}: not valid TOML: {error}") from error
+    _require_no_zero_bytes(raw, source)
     try:
         config = Config.model_validate(raw)
     except ValidationError as error:
@@ -372,6 +374,15 @@ def parse_config(text: str, source: Path) -> Config:
             "path may have; set `socket` to a shorter one"
         )
     return config
+
+
+def _require_no_zero_bytes(value: object, source: Path, key: str = "") -> None:
+    """Refuse texts that no path, name or argument of a program can have: the system takes them to end there."""
+    if isinstance(value, str) and "\0" in value:
+        raise ConfigError(f"{source}: {key}: holds a zero byte (\\u0000); take it out")
+    items = value.items() if isinstance(value, dict) else enumerate(value, 1) if isinstance(value, list) else ()
+    for name, inner in items:
+        _require_no_zero_bytes(inner, source, f"{key}.{name!s:.{_QUOTED}}".lstrip("."))
 
 
 def read_config(path: Path) -> Config:

@@ -6,13 +6,14 @@ import contextlib
 import http.client
 import json
 import os
+import select
 import signal
 import socket
 import subprocess
 import threading
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from email.message import EmailMessage
 from functools import partial
 from typing import IO, Any, Protocol
@@ -21,10 +22,13 @@ from urllib.parse import urlsplit
 from daemon.host.safe_output import shown
 from daemon.host.systemd import network_hint
 from daemon.monitoring.notice import Message
+from drivers.clock import NS_PER_S, SystemClock
 
 WEBHOOK_TIMEOUT_S = 10.0  # of a delivery as a whole, as that of a command
 COMMAND_TIMEOUT_S = 30.0
 _QUOTED = 200  # characters of what a server or a command says
+_KEPT_BYTES = 4096  # of the end of what a command says
+_PIPE_BYTES = 65536  # that a pipe holds
 
 
 class DeliveryError(Exception):
@@ -189,31 +193,53 @@ class Command:
     def deliver(self, message: Message) -> None:
         program = self._arguments[0]
         try:
-            with _memory_file() as given, _memory_file() as said:
+            with _memory_file() as given:
                 given.write(_email(message))
                 given.seek(0)
                 with self._turn:
                     if self._is_cancelled:
                         raise DeliveryError("rigcal is being stopped")
                     self._process = subprocess.Popen(
-                        self._arguments, stdin=given, stdout=said, stderr=subprocess.STDOUT, start_new_session=True
+                        self._arguments,
+                        stdin=given,
+                        stdout=subprocess.PIPE,
+                        stderr=subprocess.STDOUT,
+                        start_new_session=True,
                     )
-                status = self._wait(self._process)
-                said.seek(0)
-                output = said.read().decode(errors="replace").strip()
+                output = self._last_said(self._process).decode(errors="replace").strip()
         except OSError as error:
             raise DeliveryError(f"{program}: {_reason(error)}") from None
+        status = self._process.wait()
         if status != 0:
             last = shown(output.rpartition("\n")[2], _QUOTED)
             raise DeliveryError(f"{program} ended with status {status}" + (f": {last}" if last else ""))
 
-    def _wait(self, process: subprocess.Popen[bytes]) -> int:
-        try:
-            return process.wait(COMMAND_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            self._kill()
-            process.wait()
-            raise DeliveryError(f"{self._arguments[0]} did not end within {COMMAND_TIMEOUT_S:g} s") from None
+    def _last_said(self, process: subprocess.Popen[bytes]) -> bytes:
+        """Wait for the end of a process, and return the last of what it said: it may say gigabytes.
+
+        What it has left running may hold its output open, so the end of the process counts, not that of the output.
+        """
+        assert process.stdout is not None
+        clock = SystemClock()
+        until_ns = clock.monotonic_ns() + round(COMMAND_TIMEOUT_S * NS_PER_S)
+        said = b""
+        with process.stdout, _end_of(process) as end:
+            output = process.stdout.fileno()
+            either = select.poll()
+            either.register(output, select.POLLIN)
+            either.register(end, select.POLLIN)
+            while (left_ns := until_ns - clock.monotonic_ns()) > 0:
+                ready = {descriptor for descriptor, _ in either.poll(left_ns / 1e6)}
+                if output in ready:
+                    new = os.read(output, _PIPE_BYTES)
+                    said = (said + new)[-_KEPT_BYTES:]
+                    if not new:
+                        either.unregister(output)
+                if end in ready:
+                    return said
+        self._kill()
+        process.wait()
+        raise DeliveryError(f"{self._arguments[0]} did not end within {COMMAND_TIMEOUT_S:g} s")
 
     def cancel(self) -> None:
         with self._turn:
@@ -225,6 +251,16 @@ class Command:
         if process is not None and process.poll() is None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
+
+
+@contextlib.contextmanager
+def _end_of(process: subprocess.Popen[bytes]) -> Iterator[int]:
+    """A descriptor that is readable once a process has ended."""
+    end = os.pidfd_open(process.pid)
+    try:
+        yield end
+    finally:
+        os.close(end)
 
 
 def _email(message: Message) -> bytes:

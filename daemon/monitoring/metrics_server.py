@@ -6,7 +6,6 @@ import logging
 import threading
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
-from wsgiref.simple_server import WSGIServer
 
 from daemon.host.systemd import network_hint
 from daemon.monitoring.metrics import FAMILIES, Status
@@ -14,6 +13,8 @@ from drivers.clock import NS_PER_S, SystemClock
 
 if TYPE_CHECKING:
     from prometheus_client.metrics_core import Metric
+
+    from daemon.monitoring.scrape_server import ScrapeServer
 
 log = logging.getLogger(__name__)
 
@@ -68,7 +69,7 @@ class MetricsServer:
         ProcessCollector(registry=self._registry)
         self._clock = SystemClock()  # ports and people wait in real time
         self._next_ns = 0
-        self._served: tuple[WSGIServer, threading.Thread] | None = None
+        self._served: tuple[ScrapeServer, threading.Thread] | None = None
         self._trouble: str | None = None
         self.look()
 
@@ -86,10 +87,10 @@ class MetricsServer:
         now_ns = self._clock.monotonic_ns()
         if self._served is not None or now_ns < self._next_ns:
             return
-        from prometheus_client import start_http_server
+        from daemon.monitoring.scrape_server import ScrapeServer
 
         try:
-            self._served = start_http_server(self._wanted, addr=HOST, registry=self._registry)
+            server = ScrapeServer(HOST, self._wanted, self._registry)
         except OSError as error:
             self._next_ns = now_ns + round(RETRY_S * NS_PER_S)
             was_told = self._trouble is not None
@@ -97,8 +98,11 @@ class MetricsServer:
             if not was_told:
                 log.error("%s", self._trouble)
         else:
+            thread = threading.Thread(target=server.serve_forever, name="metrics", daemon=True)
+            thread.start()
+            self._served = server, thread
             self._trouble = None
-            log.info("metrics are served at http://%s:%d/metrics", HOST, self._served[0].server_port)
+            log.info("metrics are served at http://%s:%d/metrics", HOST, server.server_port)
 
     def stop(self) -> None:
         """Serve no more."""

@@ -66,7 +66,9 @@ def store_short_of_room(evidence: Evidence) -> Iterator[Finding]:
 
 @rule("warning", "Look at the disk of the backups; `rigcal store backup` makes one now and says what is wrong.")
 def backup_overdue(evidence: Evidence) -> Iterator[Finding]:
-    """The last backup failed, or the newest is older than 3 days. Cleared by the next one that is made.
+    """The last backup failed, has not ended for 6 hours, or the newest is older than 3 days.
+
+    Cleared by the next one that is made.
 
     Only where `backup_directory` is configured.
     """

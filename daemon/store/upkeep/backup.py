@@ -1,12 +1,14 @@
 """Backups of a store and its models, made while the daemon writes; verified, rotated, and put back.
 
 A backup is a directory, `rigcal-<UTC>`: `rigcal.sqlite`, `models/`, and `backup.json`, which is written last. A backup
-without it was never finished.
+without it was never finished. A directory may hold the backups of several stores: that of another rig, or the one that
+was here before. Stores differ by the first boot that they have seen.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import itertools
 import json
 import os
@@ -28,6 +30,7 @@ STORE, MODELS, ABOUT = "rigcal.sqlite", "models", "backup.json"
 FORM = 1
 RESERVE_BYTES = 256 * 2**20  # stays free where a backup is written
 STEP_PAGES = 4096
+_FIRST_BOOT = "SELECT kernel_boot_id, booted_utc_ns FROM boots ORDER BY id LIMIT 1"
 _NAME = re.compile(r"rigcal-\d{8}T\d{6}Z")
 _UNFINISHED = ".unfinished"
 _ABOUT_MOST = 1 << 16  # characters of backup.json, which has some hundred
@@ -78,6 +81,8 @@ def read_backup(path: Path) -> Backup:
         raise StoreError(f"{path}: no backup of rigcal, or one that was never finished ({why})") from error
     if form > FORM:
         raise StoreError(f"{path}: a backup of form {form}, made by rigcal {backup.rigcal!r}; install that version")
+    if missing := [part for part in (STORE, MODELS) if not (path / part).exists()]:
+        raise StoreError(f"{path}: no backup of rigcal any more: {' and '.join(missing)} missing")
     return backup
 
 
@@ -89,18 +94,19 @@ def _count(value: object) -> int:
 
 
 def make_backup(store: Path, models: Path, directory: Path, keep: int, now_utc_ns: int, go_on: GoOn) -> Backup:
-    """Copy a store and its models, verify the copy, and delete the oldest backups.
+    """Copy a store and its models, verify the copy, and delete the oldest backups of this store.
 
     Args:
         store: the database; the daemon may write to it, and what it had committed is copied.
         models: directory of the models.
         directory: where backups are; made if need be.
-        keep: how many stay, this one among them.
+        keep: how many of this store stay, this one among them.
         now_utc_ns: the instant that it is named by.
         go_on: called again and again; what it raises ends the work and leaves no backup.
 
     Raises:
-        StoreError: there is no room, the file system refuses, or the copy is not sound; earlier backups stay.
+        StoreError: there is no room, the file system refuses, the copy is not sound, or another backup is being made
+            there; earlier backups stay.
     """
     name = f"rigcal-{_named(now_utc_ns)}"
     target, scratch = directory / name, directory / f".{name}{_UNFINISHED}"
@@ -108,34 +114,68 @@ def make_backup(store: Path, models: Path, directory: Path, keep: int, now_utc_n
         raise StoreError(f"{directory} is among the models, and would be in every backup: name another directory")
     with storage_errors(directory):
         directory.mkdir(parents=True, exist_ok=True)
-        for left in directory.glob(f".rigcal-*{_UNFINISHED}"):  # of one that was killed
-            shutil.rmtree(left)
-        if target.exists():
-            raise StoreError(f"{target} exists: a backup was made within the last second")
-        _require_room(directory, _size(store) + _size(models))
-        scratch.mkdir()
-        try:
-            _copy_store(store, scratch / STORE, go_on)
-            _copy_models(models, scratch / MODELS, go_on)
-            _require_sound(check_store(scratch / STORE, scratch / MODELS, go_on), scratch / STORE)
-            size = _size(scratch)
-            about = {
-                "form": FORM,
-                "made_utc_ns": now_utc_ns,
-                "size_bytes": size,
-                "rigcal": VERSION,
-            }
-            write_file(scratch / ABOUT, json.dumps(about).encode() + b"\n")
-            _sync_tree(scratch)
-            scratch.rename(target)
-        except BaseException:
-            shutil.rmtree(scratch, ignore_errors=True)
-            raise
-        _sync(directory)
-        others = [made for made in backups(directory) if made.path != target]  # whatever the clock showed then
-        for old in others[: max(0, len(others) + 1 - keep)]:
-            shutil.rmtree(old.path)
+        with _alone_in(directory):
+            for left in directory.glob(f".rigcal-*{_UNFINISHED}"):  # of one that was killed
+                shutil.rmtree(left)
+            if target.exists():
+                raise StoreError(f"{target} exists: a backup was made within the last second")
+            _require_room(directory, _size(store) + _size(models))
+            scratch.mkdir()
+            try:
+                _copy_store(store, scratch / STORE, go_on)
+                _copy_models(models, scratch / MODELS, go_on)
+                _require_sound(check_store(scratch / STORE, scratch / MODELS, go_on), scratch / STORE)
+                size = _size(scratch)
+                about = {
+                    "form": FORM,
+                    "made_utc_ns": now_utc_ns,
+                    "size_bytes": size,
+                    "rigcal": VERSION,
+                }
+                write_file(scratch / ABOUT, json.dumps(about).encode() + b"\n")
+                _sync_tree(scratch)
+                scratch.rename(target)
+            except BaseException:
+                shutil.rmtree(scratch, ignore_errors=True)
+                raise
+            _sync(directory)
+            _forget_oldest(directory, target, keep)
     return read_backup(target)
+
+
+@contextlib.contextmanager
+def _alone_in(directory: Path) -> Iterator[None]:
+    """Keep a second backup out of a directory: it would take what this one has not finished for a killed one's."""
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):  # a file system of a network may have no such locks
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise StoreError(f"{directory}: another backup is being made there; wait for its end") from None
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _forget_oldest(directory: Path, newest: Path, keep: int) -> None:
+    """Delete the oldest backups of the store that `newest` is of, so that `keep` stay, whatever the clock showed."""
+    own = _origin(newest)
+    others = [made for made in backups(directory) if made.path != newest and _origin(made.path) == own]
+    for old in others[: max(0, len(others) + 1 - keep)]:
+        shutil.rmtree(old.path)
+
+
+def _origin(backup: Path) -> tuple[str, int] | None:
+    """Return the first boot that a backup's store has seen, by its name and its time; None where it cannot be read.
+
+    The time tells two stores apart that were made in one boot: each is computed anew, to the nanosecond.
+    """
+    uri = f"{(backup / STORE).resolve().as_uri()}?mode=ro"
+    with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(uri, uri=True)) as db:
+        first: tuple[str, int] | None = db.execute(_FIRST_BOOT).fetchone()
+        return first
+    return None
 
 
 def restore_backup(backup: Path, store: Path, models: Path, now_utc_ns: int, go_on: GoOn) -> Path | None:

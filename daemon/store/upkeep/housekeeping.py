@@ -1,13 +1,12 @@
 """Looks after a store while the daemon writes to it: packs captures, deletes what may go, and makes backups.
 
-All of it is done in one thread of low priority, a bounded step at a time: acquisition comes first.
+All of it is done in threads of low priority, packing and deletion a bounded step at a time: acquisition comes first.
+Backups have a thread of their own, for their disk may not answer for ever.
 """
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
 import sqlite3
 import threading
 from collections.abc import Callable, Mapping
@@ -18,7 +17,7 @@ from typing import Any
 from daemon.commands import CommandError, number_argument
 from daemon.store.errors import StoreError, storage_sentence
 from daemon.store.store import Store
-from daemon.store.upkeep.backup import Backup, backups, make_backup
+from daemon.store.upkeep.daily_backups import DailyBackups, be_nice
 from daemon.store.upkeep.packing import Packing
 from daemon.store.upkeep.retention import Retention, cutoff_ns, room
 from drivers.clock import NS_PER_S, Clock, SystemClock
@@ -29,17 +28,10 @@ LOOK_S = 10.0  # real seconds between looks
 PAUSE_S = 0.2  # between one step and the next
 ROOM_S = 60.0  # between two looks at the room
 STOP_S = 5.0
-NICE = 15
 DAY_S = 86_400.0
 LEAST_DAYS, MOST_DAYS = 1.0, 36_500.0  # that a command keeps
 # By age, no more than this many days of records go in one day: a clock that is set wrongly must not cost a year.
 AGED_DAYS = 7.0
-BACKUP_AFTER_S = 600.0  # of running: not in the midst of a start
-BACKUP_RETRY_S = 3600.0
-
-
-class _StoppedError(Exception):
-    """The daemon stops; a backup in work is given up."""
 
 
 @dataclass(frozen=True)
@@ -84,15 +76,12 @@ class KeepingState:
 
 
 class Housekeeping:
-    """Looks after a store, in a thread of its own.
+    """Looks after a store, in threads of its own.
 
     Args:
         store: open for writing.
         clock: for the age of captures, and names of backups.
         keeping: what is kept.
-
-    Attributes:
-        state: how it goes; to be read from any thread.
     """
 
     def __init__(self, store: Store, clock: Clock, keeping: Keeping) -> None:
@@ -105,43 +94,57 @@ class Housekeeping:
         self._thread: threading.Thread | None = None
         self._began_ns = self._real.monotonic_ns()
         self._next_room_s = 0.0
-        self._next_backup_s = BACKUP_AFTER_S
         self._aged_until: tuple[float, int] | None = None  # running time of the next pass by age, and where it ends
-        directory = keeping.backup_directory
-        self.state = KeepingState(has_backups=directory is not None, newest_backup_utc_ns=self._newest_backup())
+        self._room = KeepingState(has_backups=keeping.backup_directory is not None)
+        self._backups = (
+            None
+            if keeping.backup_directory is None
+            else DailyBackups(store.path, keeping.models, keeping.backup_directory, keeping.backups, clock)
+        )
+
+    @property
+    def state(self) -> KeepingState:
+        """How it goes; to be read from any thread."""
+        made = self._backups
+        if made is None:
+            return self._room
+        return replace(self._room, newest_backup_utc_ns=made.newest_utc_ns, backup_error=made.error())
 
     def start(self) -> None:
         """Begin."""
+        if self._backups is not None:
+            self._backups.start()
         self._thread = threading.Thread(target=self._run, name="housekeeping", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
         """End after the step in work. Harmless when not started."""
         self._stopping.set()
+        if self._backups is not None:
+            self._backups.stop()
         if self._thread is not None:
             self._thread.join(STOP_S)
 
     def _run(self) -> None:
-        with contextlib.suppress(OSError):  # this thread alone
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
+        be_nice()
         pause_s = LOOK_S
         while not self._stopping.wait(pause_s):
             pause_s = PAUSE_S if self.step() else LOOK_S
 
     def step(self) -> bool:
-        """Do a bounded piece of what is due; only a backup takes as long as it takes.
+        """Do a bounded piece of what is due.
 
         Returns:
             Whether there may be more.
         """
         try:
             with self._turn:
-                return self._make_room() or self._packing.pack_next() or self._forget_old() or self._back_up()
+                return self._make_room() or self._packing.pack_next() or self._forget_old()
         except sqlite3.Error as error:
             log.warning("the store is not looked after for now: %s", storage_sentence(self._store.path, error))
         except (StoreError, OSError) as error:
             log.warning("the store is not looked after for now: %s", error)
-        except Exception as error:  # a fault of rigcal must not end the packing and the backups of months
+        except Exception as error:  # a fault of rigcal must not end the packing of months
             if str(error) != self._told:
                 log.exception("the store is not looked after for now")
             self._told = str(error)
@@ -179,64 +182,35 @@ class Housekeeping:
             return False
         found = room(self._store, self._keeping.free_bytes)
         if not found.is_short:
-            if self.state.is_short:
+            if self._room.is_short:
                 log.info("%s: there is room again", self._store.path)
-                self.state = replace(self.state, is_short=False, has_nothing_left=False)
+                self._room = replace(self._room, is_short=False, has_nothing_left=False)
             self._next_room_s = self._running_s() + ROOM_S
             return False
-        if not self.state.is_short:
+        if not self._room.is_short:
             log.warning("%s: little room is left; the oldest captures outside sessions are deleted", self._store.path)
         deleted = self._retention.delete_oldest()
         if deleted is None:
-            self.state = replace(self.state, is_short=True, has_nothing_left=True)
+            self._room = replace(self._room, is_short=True, has_nothing_left=True)
             self._next_room_s = self._running_s() + ROOM_S
             return False
-        self.state = replace(self.state, is_short=True, has_nothing_left=False, deleted_until_utc_ns=deleted)
+        self._room = replace(self._room, is_short=True, has_nothing_left=False, deleted_until_utc_ns=deleted)
         return True
 
     def _forget_old(self) -> bool:
         if self._keeping.keep_days is None:
             return False
-        limit_ns = cutoff_ns(self._clock.now().utc_ns, self._keeping.keep_days)
+        now_ns = self._clock.now().utc_ns
+        limit_ns = cutoff_ns(now_ns, self._keeping.keep_days)
         if limit_ns is None:
             return False
         if self._aged_until is None or self._running_s() >= self._aged_until[0]:
+            today = now_ns // round(DAY_S * NS_PER_S)
+            if self._retention.aged_on() == today:  # by an earlier run
+                return False
             oldest = self._retention.oldest_ns()
             if oldest is None:
                 return False
+            self._retention.note_aged(today)
             self._aged_until = self._running_s() + DAY_S, oldest + round(AGED_DAYS * DAY_S * NS_PER_S)
         return self._retention.delete_oldest(min(limit_ns, self._aged_until[1])) is not None
-
-    # ---- backups ---------------------------------------------------------------------------------------------------
-
-    def _newest_backup(self) -> int | None:
-        directory = self._keeping.backup_directory
-        made: list[Backup] = [] if directory is None else backups(directory)
-        return made[-1].made_utc_ns if made else None
-
-    def _back_up(self) -> bool:
-        directory = self._keeping.backup_directory
-        if directory is None or self._running_s() < self._next_backup_s:
-            return False
-        now_ns = self._clock.now().utc_ns
-        newest = self.state.newest_backup_utc_ns
-        if newest is not None and abs(now_ns - newest) < DAY_S * NS_PER_S:
-            return False
-        self._next_backup_s = self._running_s() + BACKUP_RETRY_S
-        keep = self._keeping.backups
-        try:
-            made = make_backup(self._store.path, self._keeping.models, directory, keep, now_ns, self._go_on)
-        except _StoppedError:
-            return False
-        except (StoreError, OSError) as error:
-            if str(error) != self.state.backup_error:
-                log.error("no backup was made: %s", error)
-            self.state = replace(self.state, backup_error=str(error))
-            return False
-        log.info("backup %s made and verified, %.0f MiB", made.path, made.size_bytes / 2**20)
-        self.state = replace(self.state, backup_error="", newest_backup_utc_ns=made.made_utc_ns)
-        return False
-
-    def _go_on(self) -> None:
-        if self._stopping.is_set():
-            raise _StoppedError

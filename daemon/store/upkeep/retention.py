@@ -131,6 +131,15 @@ class Retention:
                     return int(row["last_utc_ns"])
         return None
 
+    def aged_on(self) -> int:
+        """Day, counted from 1970, on which records last went by age; 0 where none did."""
+        return self._store.pragma("user_version")
+
+    def note_aged(self, day: int) -> None:
+        """Note that records go by age on a day, in the number that the file's header has for its program."""
+        with self._store.transaction() as db:
+            db.execute(f"PRAGMA user_version = {day:d}")
+
     @staticmethod
     def _older(chunks: list[dict[str, int]], than_ns: int) -> list[dict[str, int]]:
         """Return the first chunks that are old, and those between them whose clock was not set."""

@@ -8,6 +8,8 @@ import email.policy
 import json
 import logging
 import os
+import resource
+import signal
 import stat
 import threading
 from collections.abc import Callable, Iterator
@@ -214,6 +216,30 @@ def test_a_command_that_hangs_is_ended_with_its_children(
     wait_until(is_gone)
 
 
+def test_a_command_that_says_gigabytes_takes_no_memory_and_its_last_line_is_told(
+    tmp_path: Path, opened: Callable[..., Sender]
+) -> None:
+    program = script(tmp_path / "send", "head -c 100000000 /dev/zero; echo; echo 'no route to host' >&2; exit 75")
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    sender = opened(command=[program])
+    sender.tell("raised", "boom")
+    wait_until(lambda: bool(sender.notices.faults()))
+    assert sender.notices.faults() == {"command": f"{program} ended with status 75: no route to host"}
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000, "kB"
+
+
+def test_a_command_has_delivered_when_it_has_ended_whatever_it_leaves_running(
+    tmp_path: Path, opened: Callable[..., Sender]
+) -> None:
+    program = script(tmp_path / "send", f"sleep 600 & echo $! > {tmp_path}/left")
+    sender = opened(command=[program])
+    sender.tell("raised", "boom")
+    try:
+        wait_until(lambda: sender.status()["sent"] == 1)
+    finally:
+        os.kill(int((tmp_path / "left").read_text(encoding="utf-8")), signal.SIGKILL)
+
+
 def test_one_way_that_fails_does_not_hold_up_the_other(web: WebServer, opened: Callable[..., Sender]) -> None:
     sender = opened(webhook_url=web.url, command=["/no/such/program"])
     sender.tell("raised", "boom")
@@ -402,6 +428,9 @@ def test_a_daemon_tells_of_its_alarms_and_of_a_test(
 def test_a_way_that_leads_nowhere_is_refused(tmp_path: Path) -> None:
     for section, complaint in (
         ('webhook_url = "file:///etc/passwd"', "notify.webhook_url: give the address of a web server"),
+        ('webhook_url = "http://chat..example.com/"', "notify.webhook_url: give the address of a web server"),
+        (f'webhook_url = "http://{"a" * 64}.example.com/"', "notify.webhook_url: give the address of a web server"),
+        ('command = ["/bin/true", "a\\u0000"]', "notify.command.2: holds a zero byte"),
         ('command = ["mail"]', "notify.command: the program needs its whole path"),
         ("", "notify: give webhook_url, command, or both"),
         ('webhook = "x"', "notify.webhook: unknown key; allowed here: command, least, webhook_url"),

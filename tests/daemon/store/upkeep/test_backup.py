@@ -18,12 +18,15 @@ from pathlib import Path
 import pytest
 
 from daemon.store import Reader, Store, StoreBusyError, StoreError
+from daemon.store.upkeep import daily_backups
 from daemon.store.upkeep.backup import backups, make_backup, restore_backup
-from daemon.store.upkeep.housekeeping import BACKUP_AFTER_S, Housekeeping, Keeping
+from daemon.store.upkeep.daily_backups import DailyBackups
+from daemon.store.upkeep.housekeeping import Housekeeping, Keeping
 from daemon.store.upkeep.soundness import MANIFEST, check_store
 from drivers.clock import NS_PER_S, ManualClock
+from tests.daemon.acquisition_support import wait_until
 from tests.daemon.damage import small_disk
-from tests.daemon.store_support import UTC_0, at, frame, table
+from tests.daemon.store_support import BOOT, UTC_0, at, frame, table
 
 
 def nothing() -> None:
@@ -185,7 +188,7 @@ def test_a_backup_of_a_newer_program_is_refused_by_name(site: Site) -> None:
     assert captures(site.path) == 20
 
 
-@pytest.mark.parametrize("damage", ["page", "chunk", "model", "unfinished", "form"])
+@pytest.mark.parametrize("damage", ["page", "chunk", "model", "models", "unfinished", "form"])
 def test_a_damaged_backup_takes_no_good_stores_place(site: Site, damage: str) -> None:
     backup = site.back_up()
     if damage == "page":
@@ -197,6 +200,11 @@ def test_a_damaged_backup_takes_no_good_stores_place(site: Site, damage: str) ->
             db.execute("UPDATE raw_chunks SET chunk = zeroblob(200) WHERE id = 7")
     elif damage == "model":
         (backup / "models" / "00001-gap" / MANIFEST).write_text('{"a": 2}')
+    elif damage == "models":
+        site.store.update("models", {"id": 1}, {"state": "retired"})
+        shutil.rmtree(backup)
+        backup = site.back_up()
+        shutil.rmtree(backup / "models")
     elif damage == "unfinished":
         (backup / "backup.json").unlink()
     else:
@@ -222,6 +230,32 @@ def test_the_oldest_backups_go_once_a_new_one_is_sound(site: Site) -> None:
     assert [backup.path for backup in backups(site.backups)] == [earlier, made[2]]
 
 
+def test_backups_of_the_store_that_was_here_before_stay_though_a_new_one_has_its_own(site: Site) -> None:
+    before = [site.back_up(day) for day in range(3)]
+    site.store.close()
+    for path in site.path.parent.glob("rigcal.sqlite*"):
+        path.unlink()
+    site.store = Store(site.path)
+    site.store.insert("boots", {"kernel_boot_id": BOOT, "booted_utc_ns": UTC_0 + 1})
+    shutil.rmtree(site.models)
+    made = [site.back_up(day, keep=2) for day in range(3, 7)]
+    assert [backup.path for backup in backups(site.backups)] == [*before, *made[-2:]]
+
+
+def test_two_backups_at_once_do_not_take_each_others_files_away(site: Site) -> None:
+    tried: list[str] = []
+
+    def second() -> None:
+        if not tried:
+            with pytest.raises(StoreError) as caught:
+                site.back_up(1)
+            tried.append(str(caught.value))
+
+    first = make_backup(site.path, site.models, site.backups, 3, UTC_0, second)
+    assert tried == [f"{site.backups}: another backup is being made there; wait for its end"]
+    assert [backup.path for backup in backups(site.backups)] == [first.path]
+
+
 def test_a_backup_that_is_given_up_or_killed_leaves_nothing_that_counts(site: Site) -> None:
     left = site.backups / ".rigcal-20200101T000000Z.unfinished"
     left.mkdir(parents=True)
@@ -242,25 +276,45 @@ def test_a_disk_without_room_for_a_backup_is_told_before_it_is_filled(site: Site
         make_backup(site.path, site.models, place / "backups", 3, UTC_0, nothing)
 
 
-def test_the_daemon_makes_one_a_day_and_tells_when_it_cannot(
-    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("daemon.store.upkeep.housekeeping.BACKUP_RETRY_S", 0.0)
+def test_the_daemon_makes_one_a_day_and_tells_when_it_cannot(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(daily_backups, "BACKUP_RETRY_S", 0.0)
     clock = ManualClock(at(0.0))
-    keeping = Keeping(None, 0, site.models, site.backups, 3)
-    housekeeping = Housekeeping(site.store, clock, keeping)
-    housekeeping._began_ns -= round(BACKUP_AFTER_S * NS_PER_S)
+    daily = DailyBackups(site.path, site.models, site.backups, 3, clock)
+    daily.step()
+    assert not site.backups.exists(), "it comes after some minutes"
+    monkeypatch.setattr(daily_backups, "BACKUP_AFTER_S", 0.0)
+    daily = DailyBackups(site.path, site.models, site.backups, 3, clock)
     for _ in range(3):
-        housekeeping.step()
+        daily.step()
     assert len(backups(site.backups)) == 1
     clock.advance(90_000.0)
     (site.models / "00001-gap" / MANIFEST).unlink()
-    while housekeeping.step():
-        pass
-    assert "manifest.json cannot be read" in housekeeping.state.backup_error
+    daily.step()
+    assert "manifest.json cannot be read" in daily.error()
     assert len(backups(site.backups)) == 1
-    again = Housekeeping(site.store, clock, keeping)
-    assert again.state.newest_backup_utc_ns == at(0.0).utc_ns // NS_PER_S * NS_PER_S
+    again = DailyBackups(site.path, site.models, site.backups, 3, clock)
+    again.step()
+    assert again.newest_utc_ns == at(0.0).utc_ns // NS_PER_S * NS_PER_S
+
+
+def test_a_disk_of_backups_that_does_not_answer_holds_up_nothing_else_and_is_told(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(daily_backups, "LOOK_S", 0.01)
+    monkeypatch.setattr(daily_backups, "STOP_S", 0.01)
+    monkeypatch.setattr(daily_backups, "LONGEST_S", 0.1)
+    silent = site.backups / "rigcal-20260101T000000Z" / "backup.json"
+    silent.parent.mkdir(parents=True)
+    os.mkfifo(silent)  # its reader waits, as that of a network's disk does whose server is gone
+    housekeeping = Housekeeping(site.store, ManualClock(at(0.0)), Keeping(None, 0, site.models, site.backups, 3))
+    housekeeping.start()
+    try:
+        wait_until(lambda: "does not answer" in housekeeping.state.backup_error)
+        site.store.mark_decoded(site.store.append_captures([frame(20, seconds=100.0)]))
+        assert housekeeping.step(), "captures are packed"
+    finally:
+        housekeeping.stop()
+        silent.write_text("{}")  # the reader's end
 
 
 def test_a_check_names_what_is_damaged(site: Site) -> None:
