@@ -33,6 +33,10 @@ class CommandError(Exception):
         self.status = status
 
 
+INSTALLED_CONFIG = Path("/etc/rigcal/rigcal.toml")  # of the service
+INSTALLED_SOCKET = Path("/run/rigcal/control.sock")
+
+
 def reading_socket(control_path: Path) -> Path:
     """Return the socket beside the control socket that takes only commands that read."""
     return control_path.with_name("status.sock")

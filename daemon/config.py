@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from calibration.rig.toml import LONGEST, parse_toml
-from daemon.commands import CommandError, reading_socket
+from daemon.commands import INSTALLED_CONFIG, INSTALLED_SOCKET, CommandError, reading_socket
 from drivers.can.tip_frames import FRAMES
 from drivers.canopen.transmit import is_free
 from drivers.files import read_text
@@ -259,7 +259,8 @@ class Config(_Section):
     Attributes:
         rig: a shipped rig's name or a path to a rig file.
         state_directory: where store, models and reports live.
-        socket: the control socket; `control.sock` in the runtime or state directory when absent.
+        socket: the control socket; when absent `control.sock` in the service's runtime directory, for another daemon in
+            its state directory.
         read_group: whose members may look at the daemon's state and not change it, by a socket `status.sock` beside the
             control socket; no one when absent.
         metrics: where metrics are served; nowhere when absent.
@@ -355,7 +356,7 @@ def parse_config(text: str, source: Path) -> Config:
         update={
             "rig": rig,
             "state_directory": base / config.state_directory,
-            "socket": base / config.socket if config.socket else None,
+            "socket": base / config.socket if config.socket else _installed_socket(source),
             "web": config.web.beside(base),
             "store": config.store.model_copy(
                 update={
@@ -374,6 +375,12 @@ def parse_config(text: str, source: Path) -> Config:
             "path may have; set `socket` to a shorter one"
         )
     return config
+
+
+def _installed_socket(source: Path) -> Path | None:
+    """Return where the installed service listens, for whoever reads its configuration; systemd tells the service."""
+    is_client = source == INSTALLED_CONFIG.resolve() and "RUNTIME_DIRECTORY" not in os.environ
+    return INSTALLED_SOCKET if is_client else None
 
 
 def _require_no_zero_bytes(value: object, source: Path, key: str = "") -> None:

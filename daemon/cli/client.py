@@ -11,10 +11,8 @@ from typing import Any
 import click
 
 from daemon.cli.command import json_option
+from daemon.commands import INSTALLED_CONFIG, INSTALLED_SOCKET
 from daemon.control.protocol import request
-
-DEFAULT_SOCKET = Path("/run/rigcal/control.sock")
-INSTALLED_CONFIG = Path("/etc/rigcal/rigcal.toml")
 
 operator_option = click.option(
     "--operator", default=lambda: os.environ.get("USER", ""), help="Who is responsible; kept with the decision."
@@ -29,7 +27,7 @@ def socket_of(path: Path | None, config: Path | None) -> Path:
         from daemon.config import read_config
 
         return read_config(config).socket_path
-    return Path(os.environ.get("RIGCAL_SOCKET", DEFAULT_SOCKET))
+    return Path(os.environ.get("RIGCAL_SOCKET", INSTALLED_SOCKET))
 
 
 def config_option(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -55,7 +55,7 @@ class Finding:
 
 
 def computer(config: Config | None) -> Iterator[Finding]:
-    """Look at the clock, the disk, and whether the kernels are compiled.
+    """Look at the clock, the disk, the place of the backups, and whether the kernels are compiled.
 
     Args:
         config: of the daemon; None where there is none.
@@ -63,6 +63,7 @@ def computer(config: Config | None) -> Iterator[Finding]:
     yield _clock()
     if config is not None:
         yield _disk(config)
+        yield _backups(config)
     from daemon.warm_up import is_compiled
 
     if is_compiled():
@@ -100,6 +101,22 @@ def _disk(config: Config) -> Finding:
         why = f"{text}; captures outside sessions are deleted below {config.store.free_gb:g} GiB or a tenth of the disk"
         return Finding("disk", "warning", why, f"`du -xh --max-depth=2 {existing} | sort -h` shows what takes it")
     return Finding("disk", "good", text)
+
+
+def _backups(config: Config) -> Finding:
+    directory = config.store.backup_directory
+    if directory is None:
+        why = "none are made: a disk that breaks takes every session and every model with it"
+        return Finding("backups", "warning", why, "`backup_directory = ...` in [store] of the configuration")
+    remedy = f"`install -d -o rigcal -g rigcal -m 0750 {directory}`, once the disk that they go to is mounted"
+    try:
+        owner = directory.stat().st_uid
+        if config.state_directory.exists() and owner != config.state_directory.stat().st_uid:
+            why = f"{directory} is not of the user of {config.state_directory}, who has to write there"
+            return Finding("backups", "warning", why, remedy)
+    except OSError as error:
+        return Finding("backups", "warning", f"{directory}: {error.strerror}", remedy)
+    return Finding("backups", "good", f"go to {directory}")
 
 
 # ---- the configuration -----------------------------------------------------------------------------------------------

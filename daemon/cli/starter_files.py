@@ -47,7 +47,7 @@ def configuration(
     """
     rate = f"bitrate = {bitrate}\n" if bitrate is not None else ""
     text = f"""# The daemon's configuration. Check it after every change:  rigcal config check FILE
-# Every key is described at [[can]], [[station]], ... in the configuration that the package installs.
+# All keys: docs/reference/configuration.md. The package installs a configuration with an example of each table.
 
 # A rig that ships with rigcal (swdt82, ys100, ur10), or the path of a rig file, relative to this file.
 rig = {quoted(rig)}

@@ -70,12 +70,13 @@ _TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ('`device = "raw"`', RawSignal),
 )
 _ENDINGS = ("mm", "m", "deg", "kg", "s", "ms", "nm", "arcsec", "ppm", "counts", "bits", "hz")
-_UNITS = {  # of keys whose names have none: they go with the kind of the joint
+_UNITS = {  # of keys whose names do not end with it; most go with the kind of the joint
     "limits": "deg or mm",
     "sigma": "deg or mm",
     "resolution": "deg or mm",
     "linearity": "deg or share",
     "max_rate": "deg/s or mm/s",
+    "max_speed_m_s": "m/s",
 }
 _WORDS = {float: "number", int: "whole number", str: "text", bool: "true or false", Path: "path"}
 _ENTRY = re.compile(r"        (\w+(?:, \w+)*): (.+)")

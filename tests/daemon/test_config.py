@@ -2,6 +2,7 @@ from pathlib import Path
 
 import pytest
 
+from daemon.commands import INSTALLED_CONFIG
 from daemon.config import ConfigError, parse_config, read_config
 
 GOOD = """
@@ -33,6 +34,17 @@ def test_relative_paths_start_at_the_file(tmp_path: Path) -> None:
     config = parse_config(GOOD.replace("swdt82", "rigs/mine.toml"), tmp_path / "rigcal.toml")
     assert config.store_path == tmp_path / "state" / "rigcal.sqlite"
     assert config.rig == str(tmp_path / "rigs/mine.toml")
+
+
+def test_whoever_reads_the_installed_configuration_looks_where_the_service_listens(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    assert parse_config(GOOD, INSTALLED_CONFIG).socket_path == Path("/run/rigcal/control.sock")
+    assert parse_config(GOOD, tmp_path / "rigcal.toml").socket_path == tmp_path / "state" / "control.sock"
+    assert parse_config(f'socket = "own"\n{GOOD}', INSTALLED_CONFIG).socket_path == INSTALLED_CONFIG.with_name("own")
+    monkeypatch.setenv("RUNTIME_DIRECTORY", "/run/of-the-service")  # by systemd, for the service itself
+    assert parse_config(GOOD, INSTALLED_CONFIG).socket_path == Path("/run/of-the-service/control.sock")
 
 
 def test_no_tolerance_is_assumed_and_a_stated_one_is_positive(tmp_path: Path) -> None:

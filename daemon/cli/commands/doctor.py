@@ -10,11 +10,11 @@ from pathlib import Path
 import click
 
 from daemon.cli import diagnosis
-from daemon.cli.client import INSTALLED_CONFIG, client_options, socket_of
+from daemon.cli.client import client_options, socket_of
 from daemon.cli.command import DONE, FAILED, Command, Delivered
 from daemon.cli.diagnosis import Finding
 from daemon.cli.terminal import echo
-from daemon.commands import CommandError
+from daemon.commands import INSTALLED_CONFIG, CommandError
 from daemon.control.protocol import request
 from daemon.version import VERSION
 

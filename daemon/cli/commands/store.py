@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -241,19 +242,21 @@ def store_redecode(
 def _on_store(
     settings: Config, work: Callable[[Store], dict[str, Any]], command: str, arguments: dict[str, Any]
 ) -> dict[str, Any]:
-    """Change the store: through the daemon where one writes to it, else here."""
+    """Change the store: through the daemon where one writes to it, or where it alone may; else here."""
     from daemon.control.protocol import request
     from daemon.store import Store, StoreBusyError, StoreError
 
-    if not settings.store_path.is_file():
-        raise StoreError(f"{settings.store_path}: there is no store")
-    try:
-        opened = Store(settings.store_path)
-    except StoreBusyError:
+    path, opened = settings.store_path, None
+    if not path.parent.exists() or os.access(path.parent, os.W_OK):
+        if not path.is_file():
+            raise StoreError(f"{path}: there is no store")
+        with contextlib.suppress(StoreBusyError):
+            opened = Store(path)
+    if opened is None:
         given = {key: value for key, value in arguments.items() if value is not None}
         answer: dict[str, Any] = request(settings.socket_path, command, given, timeout_s=TIMEOUT_S)
         return answer
-    with contextlib.closing(opened), _told(settings.store_path):
+    with contextlib.closing(opened), _told(path):
         return work(opened)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,22 @@ def test_without_a_daemon_each_fault_says_what_to_type(tmp_path: Path) -> None:
     shown = CliRunner().invoke(main, ["doctor", "--config", str(config)])
     assert shown.exit_code == 1
     assert shown.stdout.count("-> ") == sum(bool(finding["remedy"]) for finding in findings.values())
+
+
+def test_backups_go_where_the_daemon_may_write(tmp_path: Path) -> None:
+    config, place = tmp_path / "rigcal.toml", tmp_path / "backups"
+    config.write_text(CONFIG.format("none"), encoding="utf-8")
+    (tmp_path / "state").mkdir()
+    assert "none are made" in examine("--config", str(config))[1]["backups"]["text"]
+    config.write_text(f"{CONFIG.format('none')}[store]\nbackup_directory = 'backups'\n", encoding="utf-8")
+    missing = examine("--config", str(config))[1]["backups"]
+    assert missing["state"] == "warning"
+    assert f"install -d -o rigcal -g rigcal -m 0750 {place}" in missing["remedy"]
+    place.mkdir()
+    assert examine("--config", str(config))[1]["backups"]["state"] == "good"
+    if os.geteuid() == 0:
+        os.chown(place, 65534, -1)
+        assert "is not of the user" in examine("--config", str(config))[1]["backups"]["text"]
 
 
 def test_a_wrong_configuration_is_the_first_finding(tmp_path: Path) -> None:

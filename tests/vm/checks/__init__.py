@@ -25,6 +25,7 @@ ROWS: tuple[tuple[Check, ...], ...] = (
         faults.a_full_disk_is_told_and_nothing_is_lost,
         links.all_that_is_sent_between_cards_is_stored,
         people.operators_lookers_and_others_have_their_rights,
+        people.what_reads_its_configuration_finds_the_service,
         links.an_adapter_is_known_by_its_serial_number,
         links.an_interface_that_went_down_is_read_again,
         links.a_card_that_was_pulled_is_read_again,

@@ -38,6 +38,38 @@ def operators_lookers_and_others_have_their_rights(service: Service) -> str:
     return f"`rigcal status` takes {seen.ended_s - seen.began_s:.1f} s"
 
 
+def what_reads_its_configuration_finds_the_service(service: Service) -> str:
+    """Doctor, the commands on the store and the page are told by the installed configuration where the service is."""
+    service.on("cards")
+    examined = service.command_line(OPERATOR, "doctor", "--json")
+    about = {finding["subject"]: finding for finding in json.loads(examined.output)["findings"]}
+    expect(about["daemon"]["state"] == "good", about["daemon"])
+    pruned = service.command_line(OPERATOR, "store", "prune", "--days", "3000", "--json")
+    expect(pruned.status == 0, pruned.output)
+    service.machine.run("systemctl start rigcal-web", 900.0)
+
+    def first_state() -> str:
+        return service.machine.tried(f"python3 -I -c '{_PAGE}'").output.strip()
+
+    try:
+        live = service.wait("the page", first_state)
+        expect("acquisition" in json.loads(live), live)
+    finally:
+        service.machine.run("systemctl stop rigcal-web")
+    return f"doctor has {len(about)} findings; the page shows what it measures"
+
+
+# The first state that the page is sent; nothing while it is not served yet.
+_PAGE = """
+import urllib.request
+try:
+    with urllib.request.urlopen("http://127.0.0.1:8370/api/live", timeout=100) as events:
+        print(next(line[6:].decode() for line in events if line.startswith(b"data: ")))
+except OSError:
+    pass
+"""
+
+
 def the_journal_has_priorities(service: Service) -> str:
     """Warnings can be told from the rest of what the service says."""
     service.on("cards")
