@@ -22,7 +22,7 @@ LAST: Place = (2**63 - 1, 2**63 - 1)
 NEWEST_KEPT_NS = 3600 * NS_PER_S  # a session that begins now needs the last minute, and people look at the last hour
 TRUE_SINCE_NS = 1_735_689_600 * NS_PER_S  # 2025: a clock that shows an earlier time is not set
 STEP_CHUNKS = 20
-LOOKED_AT = 200  # chunks, to tell how old those are whose clock was not set
+LOOKED_AT = 200  # chunks, of which the first ones go
 STEP_ROWS = 5000
 LOW_SHARE = 0.1
 _DAY_NS = 86_400 * NS_PER_S
@@ -32,9 +32,10 @@ _WINDOWS = """SELECT started_boot_id, started_monotonic_ns, ended_boot_id, ended
 # In the order of their ends, which the index has. One that waits to be decoded stays.
 _CHUNKS = """SELECT id, first_boot_id, first_monotonic_ns, last_boot_id, last_monotonic_ns, last_utc_ns FROM raw_chunks
     WHERE (last_boot_id, last_monotonic_ns) >= (?1, ?2) AND (last_boot_id, last_monotonic_ns) < (?3, ?4)
-        AND (first_boot_id, first_monotonic_ns) >= (?1, ?2)
+        AND (first_boot_id, first_monotonic_ns) >= (?1, ?2) AND last_utc_ns >= ?6
         AND id NOT IN (SELECT chunk_id FROM undecoded_chunks)
     ORDER BY last_boot_id, last_monotonic_ns LIMIT ?5"""
+_ANY_NS = -(2**63)
 _NEWEST = """SELECT last_boot_id, last_monotonic_ns FROM raw_chunks
     ORDER BY last_boot_id DESC, last_monotonic_ns DESC LIMIT 1"""
 _ROWS = """DELETE FROM {0} WHERE id IN (SELECT id FROM {0}
@@ -113,7 +114,10 @@ class Retention:
         for begin, end in free_stretches(self._store):
             if begin >= limit:
                 return None
-            found = self._store.rows(_CHUNKS, [*begin, *min(end, limit), LOOKED_AT])
+            span = [*begin, *min(end, limit)]
+            found = self._store.rows(_CHUNKS, [*span, LOOKED_AT, _ANY_NS])
+            if older_than_ns is not None and all(row["last_utc_ns"] < TRUE_SINCE_NS for row in found):
+                found += self._store.rows(_CHUNKS, [*span, 1, TRUE_SINCE_NS])  # which tells how old they are
             old = (found if older_than_ns is None else self._older(found, older_than_ns))[:STEP_CHUNKS]
             if old:
                 last = old[-1]
@@ -126,9 +130,8 @@ class Retention:
     def oldest_ns(self) -> int | None:
         """UTC in ns of the oldest capture that may go, by a clock that was set; None where there is none."""
         for begin, end in free_stretches(self._store):
-            for row in self._store.rows(_CHUNKS, [*begin, *end, LOOKED_AT]):
-                if row["last_utc_ns"] >= TRUE_SINCE_NS:
-                    return int(row["last_utc_ns"])
+            for row in self._store.rows(_CHUNKS, [*begin, *end, 1, TRUE_SINCE_NS]):
+                return int(row["last_utc_ns"])
         return None
 
     def aged_on(self) -> int:

@@ -59,7 +59,7 @@ _AT = "(boot_id,monotonic_ns)"
 @pytest.mark.parametrize(
     ("sql", "parameters", "searched"),
     [
-        (retention._CHUNKS, 5, f"raw_chunks_by_end ({_END}>(?,?) AND {_END}<(?,?))"),
+        (retention._CHUNKS, 6, f"raw_chunks_by_end ({_END}>(?,?) AND {_END}<(?,?))"),
         (retention._ROWS.format("joint_samples"), 5, f"joint_samples_by_instant ({_AT}>(?,?) AND {_AT}<(?,?))"),
         (retention._ROWS.format("signals"), 5, f"signals_by_instant ({_AT}>(?,?) AND {_AT}<(?,?))"),
         (retention._FIXES, 6, f"fixes_by_instant (station=? AND {_AT}>(?,?) AND {_AT}<(?,?))"),

@@ -117,6 +117,15 @@ def test_captures_of_a_clock_that_was_not_set_are_as_old_as_those_after_them(pat
     assert minutes_left(path)[0] == 60
 
 
+def test_captures_of_a_clock_that_was_not_set_for_days_go_as_well(path: Path, store: Store) -> None:
+    fill(store, retention.LOOKED_AT + 50, utc_ns=0)
+    fill(store, 100, begin_s=10 * DAY_S)
+    assert delete_all(store, NOW_NS + round(5 * DAY_S * NS_PER_S)) == 0, "no older than what follows"
+    fill(store, 100, begin_s=20 * DAY_S)
+    assert delete_all(store, NOW_NS + round(15 * DAY_S * NS_PER_S)) > 0
+    assert minutes_left(path)[0] == round(20 * DAY_S / 60)
+
+
 def test_what_waits_to_be_decoded_stays(path: Path, store: Store) -> None:
     waiting = store.append_captures([frame(0, 0.0)])
     fill(store, 120, begin_s=10.0)
@@ -149,7 +158,7 @@ def test_freed_pages_are_used_again_and_are_room(path: Path, store: Store) -> No
 def test_deleting_reads_by_indexes(store: Store) -> None:
     fill(store, 3)
     statements = {
-        retention._CHUNKS: (0, 0, 9, 9, 20),
+        retention._CHUNKS: (0, 0, 9, 9, 20, 0),
         retention._ROWS.format("joint_samples"): (0, 0, 9, 9, 20),
         retention._ROWS.format("signals"): (0, 0, 9, 9, 20),
         retention._ROWS.format("decode_failures"): (0, 0, 9, 9, 20),
