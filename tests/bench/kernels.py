@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from typing import cast
 
 import numba
 import numpy as np
@@ -30,7 +31,7 @@ from calibration.kinematics.fitness import Fitness, evaluate
 from calibration.observations import Floats
 from calibration.published.paper_evolution import PaperSettings
 from calibration.rig.description import shipped_rig
-from calibration.rig.parts import Row
+from calibration.rig.parts import Driven, Row
 from tests.calibration.kinematics.numpy_chain import NumpyChain
 
 POSES = 200
@@ -111,7 +112,7 @@ class Problem:
 
             def size(constant: str, unit: float, number: int = number, row: Row = row) -> Floats:
                 nominal = float(getattr(row, f"{constant}_{'deg' if unit != 1.0 else 'mm'}"))
-                drive = {str(driven): sums for driven, sums in row.drive.items()}.get(constant, {})
+                drive = row.drive.get(cast("Driven", constant), {})  # of alpha and beta there is none
                 driven = sum((c * joint[name] for name, c in drive.items()), np.zeros(1))
                 own: Floats = (nominal + driven) * unit + value.get(f"row{number}.{constant}", zero)
                 return own
