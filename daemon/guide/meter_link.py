@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import os
 import subprocess
 import sys
 import threading
@@ -13,6 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from daemon.host.priority import METER_NICE, lower_priority
 from daemon.host.systemd import parse_line
 from daemon.store.queries.models import ModelRow
 from daemon.store.store import Store
@@ -21,7 +21,6 @@ log = logging.getLogger(__name__)
 
 # -P keeps the current directory off the process's path: what lies there is no code of ours.
 METER_COMMAND = (sys.executable, "-P", "-m", "daemon.guide.meter")
-NICE = 5  # acquisition comes first, then the meter, then jobs
 MAX_LOGGED_BYTES = 4096
 
 Answer = Mapping[str, Any]
@@ -86,8 +85,7 @@ class MeterLink:
             METER_COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
         )
         self.pid = self._process.pid
-        with contextlib.suppress(ProcessLookupError):  # it has ended already
-            os.setpriority(os.PRIO_PROCESS, self.pid, max(NICE, os.getpriority(os.PRIO_PROCESS, 0)))
+        lower_priority(METER_NICE, self.pid)
         self._waiting: dict[str, tuple[Mapping[str, Any], Callable[[Answer], None]]] = {}
         self._asked = threading.Condition()
         self._is_closing = False

@@ -15,8 +15,9 @@ import subprocess
 from collections.abc import Sequence
 from typing import IO, Protocol
 
+from daemon.host.priority import JOB_NICE, lower_priority
+
 JOBS_SOCKET = "RIGCAL_JOBS_SOCKET"  # environment variable: where systemd listens for jobs
-NICE = 10  # of a child and all that it starts: acquisition comes first
 END_TIMEOUT_S = 5.0  # from the end of a process's output to its own
 CONNECT_TIMEOUT_S = 5.0
 
@@ -66,8 +67,7 @@ class ChildProcess:
         self.orders: IO[bytes] = self._process.stdin
         self.messages: IO[bytes] = self._process.stdout
         self.errors: IO[bytes] | None = self._process.stderr
-        with contextlib.suppress(ProcessLookupError, PermissionError):  # it has ended already; the host forbids it
-            os.setpriority(os.PRIO_PROCESS, self._process.pid, max(NICE, os.getpriority(os.PRIO_PROCESS, 0)))
+        lower_priority(JOB_NICE, self._process.pid)
 
     def identify(self, pid: int) -> None:
         """Nothing to take: the number of a child is known."""

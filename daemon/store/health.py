@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from daemon.host.priority import UPKEEP_NICE, lower_priority
 from daemon.store.errors import storage_sentence
 from daemon.store.files import FileIdentity
 from daemon.store.store import Store
@@ -31,7 +32,6 @@ LOW_BYTES = 2**30
 LOW_SHARE = 0.05
 LOW_SHARE_MOST_BYTES = 10 * 2**30
 FINDINGS = 5
-NICE = 15
 RETRY_S = 5.0
 # What keeps a check from being made and says nothing of the store: no descriptors, no memory, a lock, a full disk.
 _HINDRANCES = {
@@ -180,8 +180,7 @@ class StoreWatch:
         return bool(checks) and checks[0]["result"] != SOUND
 
     def _search(self) -> None:
-        with contextlib.suppress(OSError):  # this thread alone: acquisition comes first
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
+        lower_priority(UPKEEP_NICE)
         check = _CheckRow(self._store)
         check.note(self._clock.now(), "started_")  # without a result, until there is one
         while (findings := self._damage()) is None:

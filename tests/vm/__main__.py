@@ -64,7 +64,8 @@ class Table:
         except (MachineError, LookupError, TypeError, ValueError, OSError, subprocess.SubprocessError) as error:
             verdict, figure = "FAILED", f"{type(error).__name__}: {error}"
         with self._one_at_a_time:
-            self.failed += [name] if verdict == "FAILED" else []
+            if verdict == "FAILED":
+                self.failed.append(name)
             print(f"{name.replace('_', ' '):<55} {verdict:<6} {time.monotonic() - began:5.0f} s  {figure}", flush=True)
         return verdict == "ok"
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
 import threading
 from pathlib import Path
 
+from daemon.host.priority import UPKEEP_NICE, lower_priority
 from daemon.host.safe_output import duration
 from daemon.store.errors import StoreError
 from daemon.store.upkeep.backup import backups, make_backup
@@ -15,7 +14,6 @@ from drivers.clock import NS_PER_S, Clock, SystemClock
 
 log = logging.getLogger(__name__)
 
-NICE = 15
 LOOK_S = 10.0  # real seconds between looks
 STOP_S = 5.0
 DAY_S = 86_400.0
@@ -85,13 +83,10 @@ class DailyBackups:
                 self._make()
         except _StoppedError:
             pass
-        except (StoreError, OSError) as error:
+        except Exception as error:  # a fault of rigcal, too: it must not end the backups of months
             if str(error) != self._error:
-                log.error("no backup was made: %s", error)
-            self._error = str(error)
-        except Exception as error:  # a fault of rigcal must not end the backups of months
-            if str(error) != self._error:
-                log.exception("no backup was made")
+                is_told = isinstance(error, StoreError | OSError)
+                log.error("no backup was made: %s", error, exc_info=None if is_told else error)
             self._error = str(error)
         finally:
             self._since_ns = None
@@ -114,12 +109,6 @@ class DailyBackups:
             raise _StoppedError
 
     def _run(self) -> None:
-        be_nice()
+        lower_priority(UPKEEP_NICE)
         while not self._stopping.wait(LOOK_S):
             self.step()
-
-
-def be_nice() -> None:
-    """Give the thread that calls this a low priority, and no other."""
-    with contextlib.suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)

@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from daemon.commands import CommandError, number_argument
+from daemon.host.priority import UPKEEP_NICE, lower_priority
 from daemon.store.errors import StoreError, storage_sentence
 from daemon.store.store import Store
-from daemon.store.upkeep.daily_backups import DailyBackups, be_nice
+from daemon.store.upkeep.daily_backups import DailyBackups
 from daemon.store.upkeep.packing import Packing
 from daemon.store.upkeep.retention import Retention, cutoff_ns, room
 from drivers.clock import NS_PER_S, Clock, SystemClock
@@ -126,7 +127,7 @@ class Housekeeping:
             self._thread.join(STOP_S)
 
     def _run(self) -> None:
-        be_nice()
+        lower_priority(UPKEEP_NICE)
         pause_s = LOOK_S
         while not self._stopping.wait(pause_s):
             pause_s = PAUSE_S if self.step() else LOOK_S
