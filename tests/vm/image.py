@@ -25,8 +25,9 @@ HERE = Path(__file__).parent
 SUITE = "bookworm"
 RELEASE = 12
 SIZE = "6G"  # sparse
-# QEMU carries out some of AVX2 wrongly: numpy's sort of numbers with ties, which uses it, ends in a segmentation fault.
-CPU = "max,-avx2"
+# With the instructions of an Atom, as in many a rig's computer. QEMU carries out some of AVX2 wrongly: numpy's sort of
+# numbers with ties, which uses it, ends in a segmentation fault.
+CPU = "Nehalem"
 PACKAGES = "systemd,systemd-sysv,dbus,udev,kmod,iproute2,can-utils,e2fsprogs,python3,libgomp1,passwd,"
 PACKAGES += "util-linux,ca-certificates"
 # With what each of them needs. linux-image-cloud-amd64 has no CAN.
