@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 from urllib.parse import urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from calibration.rig.toml import LONGEST, parse_toml
 from daemon.commands import INSTALLED_CONFIG, INSTALLED_SOCKET, CommandError, reading_socket
@@ -27,6 +27,18 @@ class ConfigError(CommandError):
 
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _is_of_its_kind(cls, value: object, info: ValidationInfo) -> object:
+        """Refuse what pydantic would take for a number or a path: true for 1, an empty text for a directory."""
+        annotation = cls.model_fields[str(info.field_name)].annotation
+        kinds = (annotation, *get_args(annotation))
+        if isinstance(value, bool) and bool not in kinds:
+            raise ValueError("cannot be true or false")
+        if value == "" and Path in kinds:
+            raise ValueError("is empty; give a path, or leave the key out")
+        return value
 
 
 class CanSection(_Section):

@@ -187,7 +187,7 @@ def add_learned(
     excess: Floats,
     position: Floats,
     sigma: Floats,
-) -> None:
+) -> bool:
     """Fill positions with a residual learner's correction, and the standard deviation of a fix about them.
 
     Args:
@@ -203,7 +203,11 @@ def add_learned(
         excess: (2, 3) variance in mm^2 that the model lacks along the base frame's axes, without a learner and with it.
         position: (n, 3) mm in the station's frame, filled.
         sigma: (n, 3) mm in the station's frame, filled.
+
+    Returns:
+        True if all of them are finite.
     """
+    total = 0.0  # hides neither infinity nor NaN
     for n in range(len(setup)):
         base, counts = bases[setup[n]], weight[n]
         for i in range(3):
@@ -213,3 +217,5 @@ def add_learned(
                 place += base[i, j] * estimate[n, j]
                 variance += base[i, j] * base[i, j] * ((1.0 - counts) * excess[0, j] + counts * excess[1, j])
             position[n, i], sigma[n, i] = place, math.sqrt(variance)
+            total += place + sigma[n, i]
+    return math.isfinite(total)

@@ -117,9 +117,14 @@ class Predictor:
             observations: n rows; their positions, if any, are not looked at.
             executor: threads among which many rows are divided; the result does not depend on it.
         """
-        found = self._in_pieces(observations, executor)
-        _refuse_infinite(observations, found.position_mm, found.sigma_mm)
-        return found
+        if len(observations) <= _PIECE or self._effects.goes_by_order:
+            return self._predict(observations)
+        rows = np.arange(len(observations))
+        pieces = [observations.select(rows[first : first + _PIECE]) for first in range(0, len(rows), _PIECE)]
+        found = list((executor.map if executor is not None else map)(self._predict, pieces))
+        return Prediction(
+            np.concatenate([piece.position_mm for piece in found]), np.concatenate([piece.sigma_mm for piece in found])
+        )
 
     def nominal_mm(self, observations: Observations) -> Floats:
         """(n, 3) positions of the nominal rig, in the station's frame."""
@@ -272,22 +277,12 @@ class Predictor:
         """
         return min(1.0, variance_mm2 / max(self._model.effects_noise_mm**2, 1e-12))
 
-    def _in_pieces(self, observations: Observations, executor: Executor | None) -> Prediction:
-        if len(observations) <= _PIECE or self._effects.goes_by_order:
-            return self._predict(observations)
-        rows = np.arange(len(observations))
-        pieces = [observations.select(rows[first : first + _PIECE]) for first in range(0, len(rows), _PIECE)]
-        found = list((executor.map if executor is not None else map)(self._predict, pieces))
-        return Prediction(
-            np.concatenate([piece.position_mm for piece in found]), np.concatenate([piece.sigma_mm for piece in found])
-        )
-
     def _predict(self, observations: Observations) -> Prediction:
         rows = self._rows(observations)
         located, of_fix, of_parameters = self._spread(rows, jacobian=self._model.residual is not None)
         estimate, weight = self._learned(rows, located)
         position_mm, sigma_mm = np.empty((len(rows.data), 3)), np.empty((len(rows.data), 3))
-        fix_loops.add_learned(
+        is_finite = fix_loops.add_learned(
             rows.data.setup,
             self._machine.bases,
             np.ascontiguousarray(located.position_mm + rows.shift_mm),
@@ -301,6 +296,8 @@ class Predictor:
             position_mm,
             sigma_mm,
         )
+        if not is_finite:
+            _refuse_infinite(observations, position_mm, sigma_mm)
         return Prediction(position_mm, sigma_mm)
 
     def _covariances(self, observations: Observations) -> tuple[Floats, Floats, Floats]:

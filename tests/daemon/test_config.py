@@ -89,6 +89,19 @@ def test_a_number_that_no_clock_disk_or_generator_takes_is_refused(tmp_path: Pat
 
 
 @pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("[store]\nfree_gb = true", "store.free_gb: cannot be true or false, found True"),
+        ("[sessions]\nfixes_per_shot = false", "sessions.fixes_per_shot: cannot be true or false, found False"),
+        ('[store]\nbackup_directory = ""', "store.backup_directory: is empty; give a path, or leave the key out"),
+        ('state_directory = ""', "state_directory: is empty; give a path, or leave the key out"),
+    ],
+)
+def test_neither_is_true_a_number_nor_an_empty_text_a_directory(tmp_path: Path, text: str, told: str) -> None:
+    assert told in check(f'rig = "swdt82"\n{text}\n', tmp_path)
+
+
+@pytest.mark.parametrize(
     "url", ["http://user:SECRET@host/x", "http://host/SECRET x", "http://host:99999/", "ftp://host"]
 )
 def test_an_address_that_no_client_takes_is_no_webhook(tmp_path: Path, url: str) -> None:

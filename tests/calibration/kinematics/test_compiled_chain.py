@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from calibration.effects.columns import NO_JOINT
+from calibration.errors import CalibrationError
 from calibration.identification.noise import covariance_by_joints, reading_covariance, station_covariance
 from calibration.kinematics import fix_loops
 from calibration.kinematics.chain import Chain, ChainData, Placement, X, Y, Z, rotation_about
@@ -142,3 +143,13 @@ def test_a_prediction_follows_the_model_that_was_replaced(session: Session) -> N
     before = Predictor.of(session.model).predict(session.held_out)
     wider = replace(session.model, excess_sigma_mm=session.model.excess_sigma_mm + 10.0)
     assert (Predictor.of(wider).predict(session.held_out).sigma_mm > before.sigma_mm).all()
+
+
+@pytest.mark.parametrize("count", [40, 4000], ids=["few", "many"])
+def test_a_prediction_that_is_not_finite_is_refused_with_its_row(session: Session, count: int) -> None:
+    rows = session.held_out.select(np.arange(count) % len(session.held_out))
+    rates = np.zeros(count)
+    rates[count - 3] = 1e200  # its square is infinite, and so is the uncertainty
+    rows = replace(rows, extra={**rows.extra, f"{session.model.rig.joint_names[0]}_rate": rates})
+    with pytest.raises(CalibrationError, match=f"of {rows.row_name(count - 3)} is not a finite number; look for"):
+        Predictor.of(session.model).predict(rows)
