@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import math
 import reprlib
@@ -94,25 +95,25 @@ def stops_of(rig: Rig, rows: Iterable[Mapping[str, Any]], dwell_s: float) -> lis
 
 def _row(rig: Rig, row: Mapping[str, Any]) -> PlanRow:
     asked = f"a pose has a number for each of {', '.join(j.column for j in rig.joints)}"
-    try:
-        joints = {joint.name: float(row[joint.column]) for joint in rig.joints}
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(asked) from error
-    if not all(map(math.isfinite, joints.values())):
-        raise ValueError(asked)
-    sides = {f"{joint.name}_dir" for joint in rig.joints}
-    conditions = {}
-    for name in {*row} & {*sides, *_CONDITIONS}:
-        try:
-            conditions[name] = float(row[name])
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{asked}, and for its conditions; {name} is {reprlib.repr(row[name])}") from error
-        if not math.isfinite(conditions[name]):
-            raise ValueError(f"{asked}, and for its conditions; {name} is {reprlib.repr(row[name])}")
+    joints = {joint.name: _finite(row.get(joint.column), asked) for joint in rig.joints}
+    known = {*row} & {*(f"{joint.name}_dir" for joint in rig.joints), *_CONDITIONS}
+    conditions = {
+        name: _finite(row[name], f"{asked}, and for its conditions; {name} is {reprlib.repr(row[name])}")
+        for name in known
+    }
     beyond = next((j for j in rig.joints if not j.limits[0] <= joints[j.name] <= j.limits[1]), None)
     if beyond is not None:
         raise ValueError(f"{beyond.name} = {joints[beyond.name]:g} {beyond.unit} is beyond its limits")
     return PlanRow(joints, conditions)
+
+
+def _finite(value: Any, asked: str) -> float:
+    """Return a finite number; ValueError says what was asked for."""
+    with contextlib.suppress(TypeError, ValueError, OverflowError):
+        number = float(value)
+        if math.isfinite(number):
+            return number
+    raise ValueError(asked)
 
 
 def _stops(rig: Rig, row: PlanRow, dwell_s: float) -> list[Stop]:
