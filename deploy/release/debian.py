@@ -131,6 +131,8 @@ def _fill_environment(home: Path, source: Source, wheel: Path, python: str) -> N
         run([*pip, *where, "--require-hashes", "-r", lock.name])
         run([*pip, *where, str(wheel)])
     shutil.rmtree(site / "bin", ignore_errors=True)  # scripts that name this machine's Python
+    for suite in [path for path in site.rglob("tests") if path.is_dir()]:
+        shutil.rmtree(suite, ignore_errors=True)  # the libraries' own tests, every fourth file to compile on a rig
     for record in [*site.glob("*.dist-info/direct_url.json"), *site.glob("*.dist-info/RECORD")]:
         record.unlink()  # where the wheel lay; and lists with the scripts in them
     _put(home / "pyvenv.cfg", f"home = /usr/bin\ninclude-system-site-packages = false\nversion = {python}\n".encode())

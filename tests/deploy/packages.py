@@ -120,7 +120,8 @@ def of_version(package: Path, version: str, out: Path) -> Path:
     for script in (tree / "DEBIAN").iterdir():
         if script.name != "md5sums":
             script.write_text(script.read_text(encoding="utf-8").replace(was, version), encoding="utf-8")
-    run("dpkg-deb", "--root-owner-group", "-Znone", "-b", tree, target)
+    # Quickly made, and small: apt reads the whole several times.
+    run("dpkg-deb", "--root-owner-group", "-Zzstd", "-z1", "-b", tree, target)
     shutil.rmtree(tree)
     return target
 
