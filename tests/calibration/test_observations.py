@@ -209,7 +209,7 @@ def test_columns_of_a_data_frame_that_nothing_uses_are_told_apart() -> None:
 
 def test_a_missing_column_is_told_with_those_that_may_be_it_under_another_name() -> None:
     renamed = {("height" if name == "z_mm" else name): column for name, column in frame().items()}
-    with pytest.raises(DataError, match="column z_mm: column missing for rig .*; found beside them: .*'height'"):
+    with pytest.raises(DataError, match=r"column z_mm: column missing for rig .*; found beside them: .*'height'"):
         Observations.from_frame(Frame(renamed), RIG)
 
 
