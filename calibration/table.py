@@ -32,6 +32,8 @@ LABEL_COLUMNS = names(LABELS)
 _LONGEST = 200  # characters of a label or a number; every row's label takes as much memory as the longest
 _LONGEST_ROW = 1 << 20
 _MOST_COLUMNS = 1000
+_MOST_COLUMNS_NAMED = 8  # by a message, each by as many of its characters as the next line says
+_LONGEST_NAME_TOLD = 40
 _MOST_LABEL_BYTES = 64 << 20
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _NO_NUMBERS = {"nan", "na", "n/a", "null", "none", "inf", "-inf", "+inf", "infinity", "-"}
@@ -213,7 +215,11 @@ class Table:
         if missing:
             alike = [name for name in header if _plain(name).casefold() == missing[0].casefold()]
             hint = f" (there is {alike[0]!a})" if alike else ""
-            self._refuse_header(f"column missing{hint} for rig {rig.name!r}; needed: {', '.join(needed)}", missing[0])
+            others = [ascii(name[:_LONGEST_NAME_TOLD]) for name in header if name not in needed][:_MOST_COLUMNS_NAMED]
+            found = f"; found beside them: {', '.join(others)}" if others else ""
+            self._refuse_header(
+                f"column missing{hint} for rig {rig.name!r}; needed: {', '.join(needed)}{found}", missing[0]
+            )
         sigmas = [name for name in SIGMA_COLUMNS if name in header]
         if 0 < len(sigmas) < len(SIGMA_COLUMNS):
             self._refuse_header(f"needs the other two of {', '.join(SIGMA_COLUMNS)} beside it", sigmas[0])

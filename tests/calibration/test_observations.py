@@ -207,6 +207,12 @@ def test_columns_of_a_data_frame_that_nothing_uses_are_told_apart() -> None:
     assert Observations.from_frame(made, rig).extra["tilt_deg"].tolist() == [1.0, 2.5]
 
 
+def test_a_missing_column_is_told_with_those_that_may_be_it_under_another_name() -> None:
+    renamed = {("height" if name == "z_mm" else name): column for name, column in frame().items()}
+    with pytest.raises(DataError, match=r"column z_mm: column missing for rig .*; found beside them: .*'height'"):
+        Observations.from_frame(Frame(renamed), RIG)
+
+
 def test_a_data_frame_must_have_the_columns_and_a_row() -> None:
     whole = frame()
     with pytest.raises(DataError, match="data frame, column z_mm: column missing for rig"):
