@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from typing import Any
 
 from daemon.commands import CommandError, caller_columns
 from daemon.host.time_service import ClockState
@@ -53,8 +54,11 @@ class SessionLifecycle:
         self.table = SessionTable(store, rig_name)
         self._jobs = JobTable(store, rig_name)
 
-    def unfinished(self) -> tuple[OpenSession | None, list[OpenSession]]:
-        """The rig's open session, and those that have ended and whose last captures were not decoded yet."""
+    def unfinished(self, rig_text: str) -> tuple[OpenSession | None, list[OpenSession]]:
+        """The rig's open session, and those that have ended and whose last captures were not decoded yet.
+
+        A session is of one rig file: one that was started with another is closed, and gets no more fixes.
+        """
         opened: OpenSession | None = None
         ended: list[OpenSession] = []
         for row in self.table.unfinished():
@@ -64,6 +68,10 @@ class SessionLifecycle:
                         "session %s of rig %s is open; it goes on when rigcal runs that rig", row["id"], row["rig"]
                     )
                 continue
+            if row["rig_sha256"] != self._store.rig_file(self._rig, rig_text):
+                if row["state"] == "open":
+                    self._close_of_another_file(row)
+                continue
             since, until = self._store.stamp(row, "started_"), self._store.stamp_or_none(row, "ended_")
             order = self._store.order
             session = OpenSession(row["id"], row["setup_id"], row["prism"], row["kind"], order, since, until)
@@ -72,6 +80,21 @@ class SessionLifecycle:
             else:
                 ended.append(session)
         return opened, ended
+
+    def _close_of_another_file(self, row: Mapping[str, Any]) -> None:
+        """Close a session that was open when the last run ended, as of then, since the rig's file has changed."""
+        why = "closed by rigcal: the rig file was changed while it was open"
+        last = self._store.previous_end or self._clock.now()
+        ended = max(self._store.stamp(row, "started_"), last, key=self._store.order)
+        with self._store.transaction():
+            self.table.change(
+                row["id"],
+                state="closed",
+                note="; ".join(filter(None, (row["note"], why))),
+                excluded=self._why_not_used(row["id"]),
+                **self._store.instant(ended, "ended_"),
+            )
+        log.warning("session %s (prism %s): %s; start another one", row["id"], row["prism"], why)
 
     def jumped(self, session: OpenSession) -> dict[str, Stamp]:
         """Devices whose encoders have jumped in a session, since when."""

@@ -93,7 +93,7 @@ class SessionKeeper:
         self._commands = threading.Lock()
         self._shot: Shot | None = None
         self._places = StandstillPlaces(rig)
-        self._prisms = PrismWatch(store, rig, clock, limits or {})
+        self._prisms = PrismWatch(store, rig, clock, limits or {}, self._tell_of_prism)
         self._advice = SessionAdvice(rig, setups, self._table, self._prisms)
         self._unstored: list[Callable[[], object]] = []  # observations that the store has yet to take, in their order
         self._is_waiting = False
@@ -133,9 +133,10 @@ class SessionKeeper:
     def _watch_prism(self, fix: Fix) -> None:
         for session in self._taking():
             if session.lasted(fix.stamp):
-                event = self._prisms.see(session, fix)
-                if event is not None:
-                    self._unstored.append(partial(self._store.insert_records, [event]))
+                self._prisms.see(session, fix)
+
+    def _tell_of_prism(self, event: DeviceEvent) -> None:
+        self._unstored.append(partial(self._store.insert_records, [event]))
 
     def _taking(self) -> list[OpenSession]:
         """The sessions that may have measured what comes now, oldest first."""
@@ -193,7 +194,7 @@ class SessionKeeper:
         return changed | here, excluded
 
     def _store_observations(self) -> None:
-        """Store what was observed; while the disk is full it waits, with what comes after it."""
+        """Store what was observed; while the store refuses it for now it waits, with what comes after it."""
         try:
             with self._store.transaction():
                 for store in self._unstored:
@@ -423,7 +424,7 @@ class SessionKeeper:
 
     def _go_on(self) -> None:
         """Ready the sessions that an earlier run left to take fixes: of those that ended, what it did not decode."""
-        self._open, self._ended = self._lifecycle.unfinished()
+        self._open, self._ended = self._lifecycle.unfinished(self._rig_text)
         for session in self._taking():
             session.control_points = self._setups.control_points(session.setup_id)
             session.jumped = self._lifecycle.jumped(session)

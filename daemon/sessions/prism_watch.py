@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from calibration.rig.description import Rig
@@ -34,10 +34,18 @@ class PrismWatch:
         rig: whose sessions are watched.
         clock: for when they were given.
         limits: station -> what motion can do to its prism.
+        tell: takes what there is to tell an operator, to be stored.
     """
 
-    def __init__(self, store: Store, rig: Rig, clock: Clock, limits: Mapping[str, MotionLimit]) -> None:
-        self._store, self._rig, self._clock, self._limits = store, rig, clock, limits
+    def __init__(
+        self,
+        store: Store,
+        rig: Rig,
+        clock: Clock,
+        limits: Mapping[str, MotionLimit],
+        tell: Callable[[DeviceEvent], None],
+    ) -> None:
+        self._store, self._rig, self._clock, self._limits, self._keep = store, rig, clock, limits, tell
         self._table = SessionTable(store, rig.name)
         self._loader = IdentityLoader(rig)
 
@@ -55,12 +63,11 @@ class PrismWatch:
         earlier = [sightings_of(self._rig, rows) for rows in groups.values()]
         session.evidence = PrismEvidence(self._rig, session.prism, self._loader, earlier)
 
-    def see(self, session: OpenSession, fix: Fix) -> DeviceEvent | None:
-        """Take a fix of the session, in order; what there is to tell an operator."""
+    def see(self, session: OpenSession, fix: Fix) -> None:
+        """Take a fix of the session, in order."""
         event = self._take(session, fix)
         if event is not None:
-            log.warning("station %s: %s", fix.station, event.text)
-        return event
+            self._tell(event)
 
     def ask_joints(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> Exclusions:
         """Ask the joints of a fix that was seen; why earlier observations must not be used, where that has changed."""
@@ -141,7 +148,7 @@ class PrismWatch:
 
     def _tell(self, event: DeviceEvent) -> None:
         log.warning("station %s: %s", event.device, event.text)
-        self._store.insert_records([event])
+        self._keep(event)
 
     def doubt(self, session: OpenSession, fix: Fix) -> str | None:
         """Why a fix that was seen must not be used; None when it may."""

@@ -18,7 +18,15 @@ _NO_PLACE = {errno.ENOENT, errno.ENOTDIR, errno.EACCES, errno.EPERM}
 # What a busy computer lacks for a while, whatever is asked of it.
 LACKING = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM, errno.EAGAIN})
 NOTHING_BYTES = 2**20  # a disk with less than this has no room
-_UNWRITABLE = {sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN}
+_UNWRITABLE = {
+    sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_IOERR,
+    sqlite3.SQLITE_READONLY,
+    sqlite3.SQLITE_CANTOPEN,
+    sqlite3.SQLITE_BUSY,
+    sqlite3.SQLITE_LOCKED,
+    sqlite3.SQLITE_NOMEM,
+}
 
 
 class StoreError(Exception):
@@ -45,7 +53,7 @@ class StoreBusyError(StoreError):
 
 
 def is_unwritable(error: BaseException) -> bool:
-    """True if the disk refused: it is full, faulty or read-only. The transaction was rolled back."""
+    """True if the disk, memory or another program's lock refused, for now. The transaction was rolled back."""
     code = getattr(error, "sqlite_errorcode", None) if isinstance(error, sqlite3.Error) else None
     return code is not None and code & 0xFF in _UNWRITABLE  # the low byte; the rest says which read or write it was
 
@@ -114,13 +122,13 @@ def storage_errors(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def unwritable_errors(path: Path) -> Iterator[None]:
-    """Raise a refusal of the disk as a StoreError that says what to do before a command is given again.
+    """Raise what refuses for now as a StoreError that says what to do before a command is given again.
 
     Args:
         path: of the store.
 
     Raises:
-        StoreError: in place of the sqlite3.Error of a disk that is full, faulty or read-only.
+        StoreError: in place of a sqlite3.Error that `is_unwritable`.
     """
     try:
         yield

@@ -60,7 +60,7 @@ class StoreFiles:
     def of(cls, path: Path) -> StoreFiles:
         """The files of the store at `path`, which is open."""
         path = path.absolute()
-        return cls(path, tuple(FileIdentity.of(_beside(path, suffix)) for suffix in BESIDE))
+        return cls(path, tuple(map(FileIdentity.of, _files(path))))
 
     @property
     def database(self) -> FileIdentity | None:
@@ -73,8 +73,7 @@ class StoreFiles:
         Raises:
             OSError: the file system does not tell.
         """
-        for suffix, opened in zip(BESIDE, self.identities, strict=True):
-            path = _beside(self.path, suffix)
+        for path, opened in zip(_files(self.path), self.identities, strict=True):
             now = FileIdentity.of(path)
             if opened is not None and now != opened:
                 return path, now is not None
@@ -148,7 +147,7 @@ class WriterLock:
     """
 
     def __init__(self, database: Path) -> None:
-        path = database.with_name(database.name + ".lock")
+        path = _beside(database.resolve(), ".lock")  # one lock, whatever links lead to the database
         with storage_errors(path):
             self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         try:
@@ -169,6 +168,11 @@ class WriterLock:
                 os.ftruncate(self._file, 0)
             os.close(self._file)
             self._file = -1
+
+
+def _files(database: Path) -> list[Path]:
+    """The files of a database: SQLite has the other two beside the file itself, whatever links lead to it."""
+    return [database, *(_beside(database.resolve(), suffix) for suffix in BESIDE[1:])]
 
 
 def _beside(path: Path, suffix: str) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import resource
+import sqlite3
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -42,9 +43,13 @@ class Rig:
 
     Attributes:
         steps_of_fix: the station gives a fix in every so many steps.
+        machine: what a new keeper takes for the machine.
+        observing: surrounds the making of observations from records that are stored.
     """
 
     steps_of_fix = 1
+    machine = SOURCE.rig
+    observing: Callable[[], contextlib.AbstractContextManager[object]] = staticmethod(contextlib.nullcontext)
 
     def __init__(self, path: Path) -> None:
         self.clock, self._steps = SharedClock(), 0
@@ -59,10 +64,10 @@ class Rig:
         self.keeper = self.new_keeper()
 
     def new_keeper(self, aim: Callable[[str], None] | None = None) -> SessionKeeper:
-        joiner = ObservationJoiner(joint_inputs(SOURCE.rig), signal_inputs(SOURCE.rig), settle_s=0.5)
+        joiner = ObservationJoiner(joint_inputs(self.machine), signal_inputs(self.machine), settle_s=0.5)
         return SessionKeeper(
-            SOURCE.rig,
-            SOURCE.text,
+            self.machine,
+            self.machine.text,
             self.store,
             self.setups,
             joiner,
@@ -86,7 +91,8 @@ class Rig:
             if self._steps % self.steps_of_fix == 0:
                 records.append(self.fix())
             self.store.insert_records(records)
-            self.keeper.on_records(records)
+            with self.observing():
+                self.keeper.on_records(records)
 
     def fix(self) -> Fix:
         east, north, up = (v / 1000 for v in self.target_mm)
@@ -137,6 +143,15 @@ def disk_fails() -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@contextlib.contextmanager
+def another_program_writes(path: Path) -> Iterator[None]:
+    """Another program holds the write lock of a store, as a `sqlite3` shell does in a transaction."""
+    with contextlib.closing(sqlite3.connect(path)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        yield
+        other.rollback()
 
 
 def controlled(rig: Rig, prism: str = "r", kind: str = "static_poses", seconds: float = 2.0) -> str:

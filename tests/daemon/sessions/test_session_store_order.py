@@ -1,13 +1,17 @@
 """What the store refuses has not happened: memory never knows more of a session than the store."""
 
+import contextlib
+import hashlib
 import sqlite3
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 from sqlite_utils import Database
 
+from calibration.rig.description import parse_rig
 from daemon.commands import CommandError
 from daemon.control.protocol import request
 from daemon.control.server import ControlServer
@@ -17,9 +21,8 @@ from daemon.jobs.scheduler import CHAIN, DueChain, next_job
 from daemon.store.errors import unwritable_errors
 from daemon.store.migrations import MIGRATIONS
 from daemon.store.store import Store
-from drivers.readings import Reading, Record
 from tests.daemon.damage import fill_up, make_room
-from tests.daemon.session_support import SOURCE, STEP_S, Rig, disk_fails
+from tests.daemon.session_support import SOURCE, Rig, another_program_writes, disk_fails
 
 
 def open_sessions(rig: Rig) -> list[str]:
@@ -95,11 +98,19 @@ def test_of_the_open_sessions_of_an_older_store_the_newest_goes_on_and_the_other
     with old.atomic():
         old["boots"].insert({"id": 1, "kernel_boot_id": "manual", "booted_utc_ns": 0})
         instant = {"utc_ns": 1, "monotonic_ns": 1, "boot_id": 1}
+        sha256 = hashlib.sha256(SOURCE.text.encode()).hexdigest()
         setup = {"id": "S1", "instrument": "", "serial": "", "state": "ok"}
         old["station_setups"].insert({**setup, **{f"created_{name}": value for name, value in instant.items()}})
         for number, (name, rig, note) in enumerate([("a", "swdt82", "windy"), ("b", "swdt82", ""), ("x", "ur10", "")]):
-            session: dict[str, Any] = {"id": name, "rig": rig, "rig_sha256": "", "rig_text": "", "setup_id": "S1"}
-            session |= {"prism": "r", "operator": "", "kind": "static_poses", "state": "open", "note": note}
+            session: dict[str, Any] = {"id": name, "rig": rig, "rig_sha256": sha256, "rig_text": SOURCE.text}
+            session |= {
+                "setup_id": "S1",
+                "prism": "r",
+                "operator": "",
+                "kind": "static_poses",
+                "state": "open",
+                "note": note,
+            }
             session |= {f"started_{key}": value + number * (key != "boot_id") for key, value in instant.items()}
             old["calibration_sessions"].insert(session)
     old.close()
@@ -115,18 +126,34 @@ def test_of_the_open_sessions_of_an_older_store_the_newest_goes_on_and_the_other
     rig.store.close()
 
 
-def test_what_is_observed_while_the_disk_fails_is_stored_when_it_works_again(session_rig: Rig) -> None:
+def test_a_session_whose_rig_file_is_changed_under_it_is_closed_and_gets_no_fix_of_the_other_rig(
+    session_rig: Rig,
+) -> None:
     session_rig.say("start", prism="r")
     session_rig.live(2)
-    for _ in range(20):
-        session_rig.clock.advance(STEP_S)
-        records: list[Record] = [
-            Reading(j.name, session_rig.clock.now(), session_rig.values[j.name], j.unit) for j in SOURCE.rig.joints
-        ]
-        records.append(session_rig.fix())
-        session_rig.store.insert_records(records)
-        with disk_fails():
-            session_rig.keeper.on_records(records)
+    before = session_rig.say("list")[0]["observations"]
+    session_rig.machine = parse_rig(SOURCE.text.replace('name = "r"', 'name = "rod"'), "rig.toml")
+    aimed: list[str] = []
+    session_rig.keeper = session_rig.new_keeper(aimed.append)
+    session_rig.live(2)
+    assert session_rig.keeper.open_session() is None
+    assert aimed == [], "the rig has no such prism any more"
+    (session,) = session_rig.say("list")
+    assert (session["state"], session["observations"]) == ("closed", before)
+    assert "the rig file was changed" in session["note"]
+    assert session_rig.say("start", prism="rod")["id"] == "s002-rod"
+
+
+@pytest.mark.parametrize("by", ["the disk", "another program"])
+def test_what_is_observed_while_the_store_is_refused_is_stored_later(session_rig: Rig, by: str) -> None:
+    with session_rig.store.transaction() as db:
+        db.execute("PRAGMA busy_timeout = 10")
+    path = session_rig.store.path
+    session_rig.say("start", prism="r")
+    session_rig.live(2)
+    session_rig.observing = disk_fails if by == "the disk" else partial(another_program_writes, path)
+    session_rig.live(1)
+    session_rig.observing = contextlib.nullcontext
     session_rig.live(2)
     observed = [
         row["monotonic_ns"] for row in session_rig.store.rows("SELECT monotonic_ns FROM observations ORDER BY id")

@@ -80,6 +80,17 @@ def test_a_second_store_of_the_same_process_is_refused_too(store: Store, path: P
         Store(path)
 
 
+def test_a_store_that_was_moved_and_linked_to_is_held_by_either_name(store: Store, path: Path, tmp_path: Path) -> None:
+    link = tmp_path / "elsewhere" / "rigcal.sqlite"
+    link.parent.mkdir()
+    link.symlink_to(path)
+    with pytest.raises(StoreBusyError, match=f"process {os.getpid()}"):
+        Store(link)
+    store.close()
+    with contextlib.closing(Store(link)), pytest.raises(StoreBusyError):
+        Store(path)
+
+
 def test_closing_lets_others_in_and_may_be_repeated(path: Path) -> None:
     first = Store(path)
     first.close()

@@ -240,6 +240,17 @@ def test_a_file_of_the_store_that_another_takes_the_place_of_is_noticed_until_it
         assert (watch.health.state, watch.health.text) == ("ok", "")
 
 
+def test_the_log_of_a_store_that_is_a_link_is_watched_and_saved_too(path: Path, tmp_path: Path) -> None:
+    disk = tmp_path / "larger_disk"
+    disk.mkdir()
+    path.symlink_to(disk / "rigcal.sqlite")
+    with watched(path) as (_, watch):
+        (disk / "rigcal.sqlite-wal").rename(disk / "aside")
+        watch.look()
+        assert watch.health.state == "missing"
+        assert "saved.sqlite-wal" in watch.health.text
+
+
 def test_a_reader_that_wants_the_daemons_store_refuses_another_file_of_that_name(path: Path) -> None:
     with watched(path) as (store, _):
         ours = store.files.database

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from daemon.sessions.prisms.evidence import IdentityLoader, PrismEvidence, Sight
 from daemon.sessions.station_setups import Place
 from drivers.readings import EventKind
 from simulators.rig.truth import RigTruth
-from tests.daemon.session_support import SOURCE, Rig, closed_afterwards
+from tests.daemon.session_support import SOURCE, Rig, closed_afterwards, disk_fails
 from tests.daemon.store_support import table
 
 RIG = SOURCE.rig
@@ -105,6 +106,24 @@ def test_another_prism_that_is_found_on_the_way_back_from_a_control_point_is_exc
         rig.stand(pose, "r")
     assert rig.keeper.prism_suspicions() == []
     assert rig.used(session) > 80
+
+
+def test_another_prism_that_is_told_while_the_disk_fails_is_excluded_once_it_works_again(rig: TrueRig) -> None:
+    session = rig.say("start", prism="r")["id"]
+    rig.stand(0, "r", 0.0)
+    rig.shoot("cp1", CONTROL_MM)
+    rig.stand(0, "s")
+    assert rig.used(session) > 0, "there is nothing to compare it with yet"
+    rig.observing = disk_fails
+    for pose in range(1, 5):
+        rig.stand(pose, "s")
+    rig.observing = contextlib.nullcontext
+    rig.stand(4, "s")
+    assert rig.used(session) == 0
+    assert any("where the joints put r" in text for text in texts(rig, EventKind.PRISM_JUMP))
+    observed = [row["monotonic_ns"] for row in table(rig.store.path, "observations")]
+    assert len(observed) > 190, "none of those that waited is lost"
+    assert observed == sorted(observed)
 
 
 def test_a_reflector_that_stands_beside_the_machine_is_no_prism(rig: TrueRig) -> None:
