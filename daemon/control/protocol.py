@@ -188,7 +188,7 @@ def unreachable(path: Path, error: OSError) -> CommandError:
     """Return the error of a client that finds no daemon at a socket."""
     return CommandError(
         f"no daemon is listening at {path} ({error.strerror or error}); start one with `rigcal run`, "
-        "or name its socket with --socket",
+        "or name its socket with --socket (that of `rigcal run --sim` is rigcal-sim/control.sock)",
         FAILED,
     )
 
