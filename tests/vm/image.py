@@ -25,9 +25,6 @@ HERE = Path(__file__).parent
 SUITE = "bookworm"
 RELEASE = 12
 SIZE = "6G"  # sparse
-# With the instructions of an Atom, as in many a rig's computer. QEMU carries out some of AVX2 wrongly: numpy's sort of
-# numbers with ties, which uses it, ends in a segmentation fault.
-CPU = "Nehalem"
 PACKAGES = "systemd,systemd-sysv,dbus,udev,kmod,iproute2,can-utils,e2fsprogs,python3,libgomp1,passwd,"
 PACKAGES += "util-linux,ca-certificates"
 # With what each of them needs. linux-image-cloud-amd64 has no CAN.
@@ -259,7 +256,7 @@ def _cpu(cpu_of: Callable[[Image], dict[str, str]], made: Image, say: Callable[[
     Compiled there they would take a quarter of an hour. The rig's own processor compiles for itself.
     """
     qemu = run("qemu-system-x86_64", "--version")
-    known = CACHE / f"cpu-{_digest(qemu, CPU, platform.processor(), _text(PROJECT / 'requirements.lock'))}.json"
+    known = CACHE / f"cpu-{_digest(qemu, platform.processor(), _text(PROJECT / 'requirements.lock'))}.json"
     if not known.exists():
         say("asking the machine for its processor")
         known.write_text(json.dumps(cpu_of(made)))

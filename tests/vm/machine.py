@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.vm.image import CPU, Image
+from tests.vm.image import Image
 
 ADAPTER = "RIG-4711"  # serial number of the station's adapter
 BOOT_S = 900.0
@@ -220,7 +220,7 @@ class _Qmp:
 def _command(image: Image, directory: Path, disk: Path) -> list[str]:
     device = ["-device"]
     line = directory / "line"  # from ttyS1 to the adapter
-    command = ["qemu-system-x86_64", "-M", "pc", "-accel", "tcg,thread=single", "-cpu", CPU, "-m", "2048", *CLOCK]
+    command = ["qemu-system-x86_64", "-M", "pc", "-accel", "tcg,thread=single", "-cpu", "max", "-m", "2048", *CLOCK]
     command += ["-nodefaults", "-no-user-config", "-display", "none", "-no-reboot"]
     command += ["-kernel", str(image.kernel), "-initrd", str(image.initrd), "-append", OPTIONS]
     # First and explicit, so that it is /dev/vda whatever disks are added.
