@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 from urllib.parse import urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from calibration.rig.toml import LONGEST, parse_toml
 from daemon.commands import INSTALLED_CONFIG, INSTALLED_SOCKET, CommandError, reading_socket
 from drivers.can.tip_frames import FRAMES
 from drivers.canopen.transmit import is_free
 from drivers.files import read_text
+from drivers.settings import Settings
 from drivers.stations.config import StationConfig
 
 _QUOTED = 100  # characters of a key
@@ -25,20 +26,8 @@ class ConfigError(CommandError):
     """The configuration cannot be used; the message names file, key, what was found and what is allowed."""
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    @field_validator("*", mode="before")
-    @classmethod
-    def _is_of_its_kind(cls, value: object, info: ValidationInfo) -> object:
-        """Refuse what pydantic would take for a number or a path: true for 1, an empty text for a directory."""
-        annotation = cls.model_fields[str(info.field_name)].annotation
-        kinds = (annotation, *get_args(annotation))
-        if isinstance(value, bool) and bool not in kinds:
-            raise ValueError("cannot be true or false")
-        if value == "" and Path in kinds:
-            raise ValueError("is empty; give a path, or leave the key out")
-        return value
+class _Section(Settings):
+    model_config = ConfigDict(allow_inf_nan=False)
 
 
 class CanSection(_Section):

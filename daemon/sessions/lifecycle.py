@@ -14,6 +14,7 @@ from typing import Any
 from daemon.commands import CommandError, caller_columns
 from daemon.host.time_service import ClockState
 from daemon.sessions.open_session import OpenSession
+from daemon.store.connection import rig_sha256
 from daemon.store.queries.jobs import JobTable
 from daemon.store.queries.sessions import SessionTable, preset_jumps
 from daemon.store.store import Store
@@ -61,6 +62,7 @@ class SessionLifecycle:
         """
         opened: OpenSession | None = None
         ended: list[OpenSession] = []
+        sha256 = rig_sha256(rig_text)
         for row in self.table.unfinished():
             if row["rig"] != self._rig:
                 if row["state"] == "open":
@@ -68,7 +70,7 @@ class SessionLifecycle:
                         "session %s of rig %s is open; it goes on when rigcal runs that rig", row["id"], row["rig"]
                     )
                 continue
-            if row["rig_sha256"] != self._store.rig_file(self._rig, rig_text):
+            if row["rig_sha256"] != sha256:
                 if row["state"] == "open":
                     self._close_of_another_file(row)
                 continue

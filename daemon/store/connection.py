@@ -271,7 +271,7 @@ class Connection:
 
     def rig_file(self, rig: str, text: str) -> str:
         """The SHA-256 of a rig file, which is stored on first sight."""
-        sha256 = hashlib.sha256(text.encode()).hexdigest()
+        sha256 = rig_sha256(text)
         with self.transaction() as db:
             row = [sha256, rig, text]
             db.execute("INSERT INTO rig_files (sha256, rig, text) VALUES (?, ?, ?) ON CONFLICT DO NOTHING", row)
@@ -280,3 +280,8 @@ class Connection:
     def order(self, stamp: Stamp) -> tuple[int, int]:
         """Place of an instant among all that the store knows (`drivers.clock.Order`)."""
         return self.boot_row(stamp), stamp.monotonic_ns
+
+
+def rig_sha256(text: str) -> str:
+    """Return the SHA-256 by which a rig file is known in the store."""
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -60,7 +60,7 @@ class StoreFiles:
     def of(cls, path: Path) -> StoreFiles:
         """The files of the store at `path`, which is open."""
         path = path.absolute()
-        return cls(path, tuple(map(FileIdentity.of, _files(path))))
+        return cls(path, tuple(map(FileIdentity.of, database_files(path))))
 
     @property
     def database(self) -> FileIdentity | None:
@@ -73,7 +73,7 @@ class StoreFiles:
         Raises:
             OSError: the file system does not tell.
         """
-        for path, opened in zip(_files(self.path), self.identities, strict=True):
+        for path, opened in zip(database_files(self.path), self.identities, strict=True):
             now = FileIdentity.of(path)
             if opened is not None and now != opened:
                 return path, now is not None
@@ -170,8 +170,8 @@ class WriterLock:
             self._file = -1
 
 
-def _files(database: Path) -> list[Path]:
-    """The files of a database: SQLite has the other two beside the file itself, whatever links lead to it."""
+def database_files(database: Path) -> list[Path]:
+    """Return the files of a database: SQLite has the other two beside the file itself, whatever links lead to it."""
     return [database, *(_beside(database.resolve(), suffix) for suffix in BESIDE[1:])]
 
 

@@ -12,16 +12,17 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from drivers.clock import NS_PER_S
 from drivers.readings import EventKind, SerialCapture
+from drivers.settings import Settings
 from drivers.stations.replies import ReplyKind, ReplyReader
 
 _IDLE_NS = NS_PER_S  # a record that stops for longer than this is broken off
 
 
-class PollTiming(BaseModel):
+class PollTiming(Settings):
     """Time-outs in seconds, from programs that have driven these instruments.
 
     Attributes:
@@ -32,8 +33,6 @@ class PollTiming(BaseModel):
         relock_after_s: off target for longer than this, the station is told once more to track; until then its own
             prediction, waiting and search are left to work.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     poll_interval_s: float = Field(default=0.1, ge=0)
     ack_timeout_s: float = Field(default=2.0, gt=0)

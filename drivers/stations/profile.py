@@ -9,13 +9,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
+from drivers.settings import Settings
 from drivers.stations.poller import CommandPlan
 from drivers.stations.replies import Framer, Parser
 
 
-class ProfileOptions(BaseModel):
+class ProfileOptions(Settings):
     """Options of a station that its profile reads.
 
     Attributes:
@@ -27,8 +28,6 @@ class ProfileOptions(BaseModel):
         ppm_scale: ppm per count of the atmospheric correction, see `drivers.stations.topcon.records.CorrectionScales`.
         prism_scale_mm: mm per count of the prism constant, see there.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     init: tuple[str, ...] = ()
     crlf: bool = True

@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Literal
 
 import serial
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from drivers.errors import LinkError
+from drivers.settings import Settings
 
 _PARITY = {"none": serial.PARITY_NONE, "even": serial.PARITY_EVEN, "odd": serial.PARITY_ODD}
 
@@ -25,7 +26,7 @@ _PARITY = {"none": serial.PARITY_NONE, "even": serial.PARITY_EVEN, "odd": serial
 _FAILURES = (serial.SerialException, OSError, termios.error, ValueError, TypeError)
 
 
-class SerialConfig(BaseModel):
+class SerialConfig(Settings):
     """Settings of a serial port.
 
     Attributes:
@@ -35,8 +36,6 @@ class SerialConfig(BaseModel):
         parity: `none`, `even` or `odd`.
         stopbits: 1 or 2.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     path: str = Field(min_length=1)
     baud: int = Field(default=9600, ge=50, le=4_000_000)

@@ -95,6 +95,8 @@ def test_a_number_that_no_clock_disk_or_generator_takes_is_refused(tmp_path: Pat
         ("[sessions]\nfixes_per_shot = false", "sessions.fixes_per_shot: cannot be true or false, found False"),
         ('[store]\nbackup_directory = ""', "store.backup_directory: is empty; give a path, or leave the key out"),
         ('state_directory = ""', "state_directory: is empty; give a path, or leave the key out"),
+        ('[[station]]\nserial.path = "/dev/x"\nmax_range_m = true', "max_range_m: cannot be true or false, found True"),
+        ('[[station]]\nserial = { path = "/dev/x", baud = true }', "serial.baud: cannot be true or false, found True"),
     ],
 )
 def test_neither_is_true_a_number_nor_an_empty_text_a_directory(tmp_path: Path, text: str, told: str) -> None:

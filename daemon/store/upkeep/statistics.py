@@ -7,7 +7,7 @@ import sqlite3
 from pathlib import Path
 from typing import Any
 
-from daemon.store.files import BESIDE
+from daemon.store.files import database_files
 from daemon.store.reader import Reader
 
 # Each of them by an index or a small table.
@@ -45,7 +45,7 @@ def statistics(path: Path, *, tables: bool = False) -> dict[str, Any]:
                 sizes = {row["name"]: row["bytes"] for row in reader.rows(_TABLES)}
             except sqlite3.OperationalError:  # built without dbstat
                 sizes = None
-    files = [path.with_name(path.name + suffix) for suffix in BESIDE]
+    files = database_files(path)
     return {
         "store": str(path),
         "file_bytes": sum(file.stat().st_size for file in files if file.exists()),

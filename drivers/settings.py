@@ -1,0 +1,26 @@
+"""What all sections of a configuration have in common."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import get_args
+
+from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator
+
+
+class Settings(BaseModel):
+    """A section of a configuration: its keys are all known, and each value is of its key's kind."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _is_of_its_kind(cls, value: object, info: ValidationInfo) -> object:
+        """Refuse what pydantic would take for a number or a path: true for 1, an empty text for a directory."""
+        annotation = cls.model_fields[str(info.field_name)].annotation
+        kinds = (annotation, *get_args(annotation))
+        if isinstance(value, bool) and bool not in kinds:
+            raise ValueError("cannot be true or false")
+        if value == "" and Path in kinds:
+            raise ValueError("is empty; give a path, or leave the key out")
+        return value
