@@ -1,4 +1,4 @@
-"""What all sections of a configuration have in common."""
+"""Base of all sections of a configuration."""
 
 from __future__ import annotations
 
