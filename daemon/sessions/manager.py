@@ -30,7 +30,7 @@ from daemon.host.time_service import ClockState
 from daemon.sessions.advice import SessionAdvice, after_a_move
 from daemon.sessions.control_shot import Shot
 from daemon.sessions.lifecycle import SessionLifecycle
-from daemon.sessions.open_session import OpenSession
+from daemon.sessions.open_session import CONTROL_POINT_RADIUS_MM, OpenSession
 from daemon.sessions.prism_watch import PrismWatch, as_dict
 from daemon.sessions.prisms.guard import MotionLimit, Suspicion
 from daemon.sessions.prisms.standstill_places import Exclusions, StandstillPlaces
@@ -38,6 +38,7 @@ from daemon.sessions.station_setups import AXES, Place, SetupBook
 from daemon.sessions.without_job import why_no_job
 from daemon.store.errors import is_unwritable
 from daemon.store.queries.jobs import JobTable
+from daemon.store.queries.sessions import OF_CONTROL_POINT
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, Clock, Stamp, lies_within
 from drivers.readings import DeviceEvent, EventKind, Fix, Record
@@ -217,7 +218,7 @@ class SessionKeeper:
             if joint in session.jumped and lies_within(session.order, joined.stamp, session.jumped[joint], None):
                 return f"{joint} jumped: its readings from then on do not fit those before"
         if session.is_control_point(place_mm):
-            return "a control point, not the prism"
+            return OF_CONTROL_POINT
         return None
 
     # ---- sessions ----------------------------------------------------------------------------------------------------
@@ -310,8 +311,10 @@ class SessionKeeper:
                 result = self._setups.store_shot(
                     session.setup_id, session.id, name, phase, shot.fixes, shot.places_mm, most_off_mm=most_off_mm
                 )
-                # Before the shot is over: fixes that come late are of the point, and known to be
+                # Before the shot is over: fixes that come late are of the point, and known to be, and so are those
+                # that came before anything told where it is.
                 session.control_points = self._setups.control_points(session.setup_id)
+                self._table.exclude_near(session.id, [result[axis] for axis in AXES], CONTROL_POINT_RADIUS_MM)
             finally:
                 self._shot = None
                 if self._aim is not None:

@@ -18,6 +18,7 @@ from drivers.clock import NS_PER_S, Stamp
 
 BEFORE_NS = 60 * NS_PER_S  # dwell and direction of a session's first fixes come from motion before it
 AFTER_NS = 2 * NS_PER_S  # its last fixes are interpolated between joints
+OF_CONTROL_POINT = "a control point, not the prism"  # why an observation must not be used
 CLOCK_STEP_NS = NS_PER_S // 20  # less may be the time between reading the one clock and the other
 
 # Fixes of these may still come: of the open ones, and of those that ended after the oldest capture that waits to be
@@ -72,7 +73,11 @@ _BETWEEN = """SELECT 1 FROM observations AS o JOIN control_shots AS c ON c.sessi
 # A boot's number rises from boot to boot, and monotonic_ns within one; utc_ns may step.
 _JUMPS = """SELECT id, device, utc_ns, monotonic_ns, boot_id FROM device_events
     WHERE kind = 'preset_jump' AND (boot_id, monotonic_ns) >= (?, ?) AND id > ? ORDER BY boot_id, monotonic_ns, id"""
-_EXCLUDE = "UPDATE observations SET excluded = ? WHERE session_id = ? AND boot_id = ? AND monotonic_ns = ?"
+# A control point is none of the rig's prisms, whatever is found of those later.
+_EXCLUDE = f"""UPDATE observations SET excluded = ? WHERE session_id = ? AND boot_id = ? AND monotonic_ns = ?
+    AND excluded IS NOT '{OF_CONTROL_POINT}'"""
+_EXCLUDE_NEAR = f"""UPDATE observations SET excluded = '{OF_CONTROL_POINT}' WHERE session_id = ?1 AND excluded IS NULL
+    AND (x_mm - ?2) * (x_mm - ?2) + (y_mm - ?3) * (y_mm - ?3) + (z_mm - ?4) * (z_mm - ?4) < ?5 * ?5"""
 _OBSERVATIONS = """SELECT session_id, setup_id, prism, pose, utc_ns, monotonic_ns, boot_id, x_mm, y_mm, z_mm,
         sigma_x_mm, sigma_y_mm, sigma_z_mm, dwell_s, values_json
     FROM observations WHERE excluded IS NULL AND session_id IN ({}) ORDER BY id"""
@@ -288,6 +293,11 @@ class SessionTable:
             boot = self._store.boot_row(newest)
             rows = [(excluded, session_id, boot, at_ns) for at_ns, excluded in exclusions.items()]
             db.conn.executemany(_EXCLUDE, rows)
+
+    def exclude_near(self, session_id: str, point_mm: Sequence[float], radius_mm: float) -> None:
+        """Exclude the observations of a session that lie near a control point and might have been used."""
+        with self._store.transaction() as db:
+            db.conn.execute(_EXCLUDE_NEAR, (session_id, *point_mm, radius_mm))
 
     def standing(self, setup_id: str, since: Stamp | None) -> list[dict[str, Any]]:
         """The newest observation of each standstill at a set-up that calibration may use, oldest first.

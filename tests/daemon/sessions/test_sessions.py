@@ -298,6 +298,21 @@ def test_fixes_on_a_control_point_are_no_observations(rig: Rig) -> None:
     assert summary["excluded"]["a control point, not the prism"] > 10
 
 
+def test_fixes_on_a_control_point_before_its_first_shot_are_no_observations(rig: Rig) -> None:
+    """Its place is not known yet while they come: the operator aims first, and gives the commands then."""
+    rig.target_mm = (9000.0, 500.0, 2000.0)
+    start(rig)
+    rig.live(3)
+    rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    rig.live(1, theta1=5.0)
+    rig.target_mm = (3000.0, 8000.0, 1000.0)
+    rig.live(3)
+    summary = rig.say("stop")
+    kept = rig.store.rows("SELECT x_mm FROM observations WHERE excluded IS NULL")
+    assert {round(row["x_mm"]) for row in kept} <= {3000}
+    assert summary["excluded"]["a control point, not the prism"] > 10
+
+
 def test_a_control_point_that_is_not_there_is_told(rig: Rig) -> None:
     start(rig)
     rig.keeper._settings = SessionsSection(fixes_per_shot=10_000, shot_timeout_s=1.0)
