@@ -5,6 +5,7 @@ The operator's commands (`keeper`) and the guide's own thread (`worker`) make th
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -25,6 +26,9 @@ from daemon.store.queries.setups import control_points
 from daemon.store.store import Store
 from drivers.clock import Clock
 
+log = logging.getLogger(__name__)
+
+_WITHOUT_SESSION = "its session was closed when rigcal started again, as it is where the rig file has changed"
 RETRY_S = 5.0  # after something failed that is tried again by itself
 
 
@@ -72,8 +76,12 @@ class Course:
         self.start_advisor()
 
     def restore(self) -> None:
-        """Go on with the guide that an earlier run left."""
+        """Go on with the guide that an earlier run left, unless that is without its session."""
         self.record.restore()
+        guide = self.record.opened()
+        if guide is not None and self._is_without_session(guide[1]):
+            log.warning("guide %d is abandoned: %s", guide[0].id, _WITHOUT_SESSION)
+            self.abandon(_WITHOUT_SESSION)
         # Fixes that were captured and are not decoded yet must not count where the station was on no prism.
         for since, until in self.record.times_away():
             self._sessions.look_away(since, until)
@@ -82,6 +90,13 @@ class Course:
             self._sessions.look_away(guide[0].started)
         if self.record.is_open:
             self.start_advisor()
+
+    def _is_without_session(self, job: Job) -> bool:
+        """Return True if the run's session has ended before the run; the daemon closes it in the last step."""
+        if not job.run.session or job.step is None or job.step.kind == "close":
+            return False
+        opened = self._sessions.open_session()
+        return opened is None or opened["id"] != job.run.session
 
     @property
     def is_waiting(self) -> bool:
