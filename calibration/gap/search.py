@@ -10,6 +10,7 @@ import numpy as np
 from calibration.gap.adoption import Adopted, adopted
 from calibration.gap.background.blocks import displacement_blocks, possible_blocks, smooth_blocks, time_blocks
 from calibration.gap.background.breaks import find_break
+from calibration.gap.background.causes import names_beside_cause
 from calibration.gap.background.naming import Names, evidence_alone, names_beside
 from calibration.gap.background.outside import (
     MOST_FORMULAS,
@@ -125,8 +126,11 @@ def _beside_background(problem: Problem, families: Collection[str], found: Searc
         found: without a background; it stays as it is where it leaves nothing but noise, or nothing more is certain.
     """
     names, formulas = _names(problem, families, found)
+    known = found.joint.choices if names is None else names.joint.choices or found.joint.choices
+    of_cause = names_beside_cause(problem, families, known, is_open=names is not None)
+    names, formulas = (names, formulas) if of_cause is None else (of_cause, ())
     is_doubted = names is not None and follows_path(problem.solution.samples)
-    if names is None or not (names.joint.choices or is_doubted):
+    if names is None or not (names.joint.choices or of_cause or is_doubted):
         smooth = None if formulas else names
         return replace(found, evidence=evidence_alone(problem, found.joint, families), beside=smooth)
     joint, first = names.joint, found.steps[0]

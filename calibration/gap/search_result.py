@@ -374,16 +374,17 @@ def remaining(found: SearchResult, rng: np.random.Generator) -> Remaining:
 
 
 def _background_text(names: Names) -> str:
-    """Return a clause: on what the rest depends smoothly, and the nearest effect of the library with its evidence."""
-    most = names.background[0][2]
+    """Return a clause: on what the rest depends, and the nearest effect of the library with its evidence."""
+    most = names.background[0][1]
     parts = [
-        f"{text if where == 'station' else f'{where} error by {text}'} ({rms_mm:.2g} mm RMS)"
-        for where, text, rms_mm in names.background[:_LISTED]
+        f"{block.clause} ({rms_mm:.2g} mm RMS)"
+        for block, rms_mm in names.background[:_LISTED]
         if rms_mm > _WORTH_TELLING * most
     ]
+    is_smooth = names.background[0][0].kind not in ("event", "elastic")
     nearest = [w for w in names.left if w.log_bayes_factor > 0.0][:1]
     said = [_why_left(w, names.joint.situation) for w in nearest] or ["nothing in the library is like it"]
-    return "; ".join([f"smooth in {', '.join(parts)}", *said])
+    return "; ".join([f"{'smooth in ' if is_smooth else ''}{', '.join(parts)}", *said])
 
 
 def _why_left(scored: ScoredEffect, situation: EffectContext) -> str:

@@ -10,13 +10,15 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.effects.columns import NO_JOINT, EffectColumns
+from calibration.effects.columns import NO_JOINT, EffectColumns, joined
 from calibration.effects.context import EffectContext
+from calibration.effects.links import Link, own_rows, turning_rows
+from calibration.effects.timing import step_grid
 from calibration.observations import Floats
 
 _CURVE_WAVES = 10  # half waves of a joint's own reading
@@ -27,6 +29,7 @@ _TIME_WAVES, _MOST_WAVES = 8, 60
 _LEAST_TURN_DEG, _LEAST_STROKE_MM = 0.5, 2.0  # a joint that moves less has no curve
 _ROWS_PER_WAVE = 8
 _WHOLE_TURN_DEG = 300.0  # who covers more meets himself at the other end, or nearly
+_LEAST_NM = 1e-6
 _JOINT_SIGMA = {"revolute": 1e-3, "prismatic": 1.0}  # rad or mm
 
 
@@ -36,10 +39,12 @@ class Block:
 
     Attributes:
         name: of the block.
-        kind: `curve` of a joint's own reading, `surface` of two; `pair`, `place`, `time` for displacements; `formula`.
+        kind: `curve` of a joint's own reading, `surface` of two; `pair`, `place`, `time` for displacements; `event` for
+            all that is another from an instant on; `elastic` for all that gives way to loads; `formula`.
         where: the joint that errs, else `station`.
-        text: on what it depends, for people.
+        text: on what it depends, or what has happened, for people.
         columns: of the samples; prior sigmas are those of amounts of plausible size.
+        since_s: instant of an event; NaN for all others.
     """
 
     name: str
@@ -47,6 +52,12 @@ class Block:
     where: str
     text: str
     columns: EffectColumns
+    since_s: float = math.nan
+
+    @property
+    def clause(self) -> str:
+        """What it says, for people."""
+        return self.text if self.where == "station" else f"{self.where} error by {self.text}"
 
 
 def smooth_blocks(context: EffectContext, average: Callable[[Floats], Floats]) -> tuple[Block, ...]:
@@ -106,6 +117,56 @@ def time_blocks(
         name, "time", "station", "time", _shifts(name, waves, 1.0 / np.sqrt(number) if fine else 1.0 / number)
     )
     return (replace(block, columns=block.columns.over(average)),)
+
+
+def event_blocks(
+    context: EffectContext, average: Callable[[Floats], Floats], instants_s: Collection[float]
+) -> Iterator[Block]:
+    """Yield what may be another from an instant on: zeros of all joints, and displacements linear in the place.
+
+    Args:
+        context: of n observations.
+        average: as of `smooth_blocks`.
+        instants_s: to look at beside those of a grid over the rows.
+    """
+    time_s = context.extra("time_s")
+    grid = {step["time_s"] for step in step_grid(time_s)}
+    u = np.stack([np.ones(len(context)), *(2.0 * _unit(axis) - 1.0 for axis in context.located.prism_mm.T)], axis=1)
+    for at_s in sorted(grid | set(instants_s)):
+        name = f"event({at_s})"
+        after = (time_s > at_s).astype(np.float64)[:, None]
+        zeros = [_at_joint(context, joint, name, after, np.ones(1)) for joint in _moving(context)]
+        columns = joined([_shifts(name, after * u, np.ones(u.shape[1])), *zeros], len(context))
+        text = f"more has changed at time_s = {at_s:g} than one effect says"
+        yield Block(name, "event", "station", text, columns.over(average), at_s)
+
+
+def elastic_blocks(context: EffectContext, average: Callable[[Floats], Floats]) -> tuple[Block, ...]:
+    """Return what links and bearings do that give way in proportion to load, one block for each row that joints turn.
+
+    It turns a little further about its axis by the moment of the weights beyond about it, and about the axes across by
+    the rest of that moment.
+
+    Arguments are those of `smooth_blocks`.
+    """
+    joint_of = {row: joint for joint, row in own_rows(context.rig).items()}
+    found = []
+    for row in turning_rows(context.rig) if context.rig.masses else ():
+        link, where = Link(context, row), joint_of.get(row, f"row{row}")
+        moment = link.moment_newton_m
+        most = float(np.linalg.norm(moment, axis=1).max(initial=0.0))
+        if most < _LEAST_NM or not link.carries_prism.any():
+            continue
+        about = link.axis * (link.axis * moment).sum(axis=1)[:, None]
+        turns = np.stack([about, moment - about], axis=1) * (_JOINT_SIGMA["revolute"] / most)
+        arm_mm = (context.located.prism_mm - link.place_mm) * link.carries_prism[:, None]
+        shift_mm = context.to_station(np.cross(turns, arm_mm[:, None]).transpose(0, 2, 1))
+        name = f"elastic({where})"
+        columns = EffectColumns(
+            (f"{name}:about", f"{name}:across"), np.full(2, NO_JOINT), np.zeros((len(context), 2)), np.ones(2), shift_mm
+        )
+        found.append(Block(name, "elastic", where, "load", columns.over(average)))
+    return tuple(found)
 
 
 def _moving(context: EffectContext) -> list[str]:

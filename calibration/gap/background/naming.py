@@ -29,6 +29,7 @@ from calibration.residual.folds import folds
 
 _FOLDS = 10
 _FALSE = 0.05  # p-value of a certificate, where the evidence leaves a doubt
+_NEEDED = 5.0  # log Bayes factor of a block
 _HARM = 1e-3  # share by which held-out squares may grow: rounding, and no more
 
 
@@ -42,8 +43,9 @@ class Names:
         open_set: an effect whose family is open and what it may be instead; empty for none.
         harmful: effects that would raise errors of held-out groups, and so are not named.
         left: what the library explains of the rest, the most probable first.
-        background: source, variables, RMS in mm of each part of the background, the largest first.
+        background: each part of the background and its RMS in mm, the largest first.
         background_log_bayes_factor: of the background against noise alone.
+        needed: blocks among those that names were sought beside at first which no effect makes superfluous.
     """
 
     joint: JointFit
@@ -51,8 +53,9 @@ class Names:
     open_set: tuple[ScoredEffect, ...]
     harmful: tuple[str, ...]
     left: tuple[ScoredEffect, ...]
-    background: tuple[tuple[str, str, float], ...]
+    background: tuple[tuple[Block, float], ...]
     background_log_bayes_factor: float
+    needed: tuple[Block, ...]
 
 
 def names_beside(
@@ -103,7 +106,13 @@ def names_beside(
         system.screen(model).score(),
         _parts(system, model),
         system.background_log_bayes_factor(model),
+        tuple(block for block in blocks if _is_needed(system, model, block)),
     )
+
+
+def _is_needed(system: System, model: Model, block: Block) -> bool:
+    without = system.fit(model.effects, model.scales, without={block.name})
+    return model.log_evidence - without.log_evidence > _NEEDED
 
 
 def evidence_alone(problem: Problem, joint: JointFit, families: Collection[str]) -> dict[str, Evidence]:
@@ -126,13 +135,13 @@ def evidence_alone(problem: Problem, joint: JointFit, families: Collection[str])
     }
 
 
-def _parts(system: System, model: Model) -> tuple[tuple[str, str, float], ...]:
-    """Return where each part of the background is, on what it depends, and its RMS in mm, the largest first."""
+def _parts(system: System, model: Model) -> tuple[tuple[Block, float], ...]:
+    """Return each part of the background and its RMS in mm, the largest first."""
     amounts, parts = system.amounts(model), []
     for name, block in system.blocks.items():
         moved = system.projection.moved_mm(block.columns) @ (amounts[system.of_block(name)] * block.columns.prior_sigma)
-        parts.append((block.where, block.text, float(np.sqrt((moved**2).sum(axis=1).mean()))))
-    return tuple(sorted(parts, key=lambda part: -part[2]))
+        parts.append((block, float(np.sqrt((moved**2).sum(axis=1).mean()))))
+    return tuple(sorted(parts, key=lambda part: -part[1]))
 
 
 def _refined(problem: Problem, joint: JointFit) -> JointFit:

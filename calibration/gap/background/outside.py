@@ -54,13 +54,18 @@ def what_is_left(problem: Problem, joint: JointFit, formulas: Sequence[Formula])
         joint: kinematics and effects.
         formulas: any number.
     """
+    grammar = grammar_beside(problem, joint, _columns(formulas) if formulas else None)
+    return grammar.find(1) if detect(grammar, problem.rng()).significant else ()
+
+
+def grammar_beside(problem: Problem, joint: JointFit, additions: EffectColumns | None) -> Grammar:
+    """Return the grammar of what is left when further columns are fitted along with kinematics and effects."""
     solution, explained = problem.solution, problem
-    if formulas:
-        chain, additions = solution.chain, _columns(formulas)
+    if additions is not None:
+        chain = solution.chain
         fit = refine(chain, solution.samples, solution.fit.x[: len(chain)], prior=problem.prior, additions=additions)
         explained = replace(problem, solution=replace(solution, fit=fit, additions=additions))
-    grammar = Grammar(explained.project(explained.fit(joint.choices, explained.solution.fit.x)))
-    return grammar.find(1) if detect(grammar, problem.rng()).significant else ()
+    return Grammar(explained.project(explained.fit(joint.choices, explained.solution.fit.x)))
 
 
 def formulas_suffice(problem: Problem, joint: JointFit, formulas: tuple[Formula, ...]) -> bool:

@@ -1,0 +1,167 @@
+"""Causes that the library lacks, and that effects of it imitate: an event, and links that give way to loads.
+
+What happens at one instant has one cause: where the library lacks it, steps of something else at that instant imitate
+it, each beyond doubt. Likewise a link that gives way in a way of its own is imitated by others. Such effects are not
+named where a cause of that kind, whatever it is in particular, explains everything without them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+from calibration.effects.columns import joined
+from calibration.effects.fitted import Choice
+from calibration.effects.library import library
+from calibration.effects.timing import StepFamily
+from calibration.gap.background.blocks import Block, elastic_blocks, event_blocks
+from calibration.gap.background.naming import Names, names_beside
+from calibration.gap.background.outside import grammar_beside
+from calibration.gap.background.search import ODDS_OF_TWO, linear_system
+from calibration.gap.background.weights import reweighted
+from calibration.gap.background.widening import further_blocks
+from calibration.gap.detection import Detection, detect
+from calibration.gap.joint_fit import JointFit, Problem
+
+_APART = 4.0  # standard deviations of instants
+_MOST = 2  # events that may explain all
+_MORE = 15.0  # log Bayes factor of an event against steps at its instant
+_FAR = 1e-12  # p-value of what is left, beyond which no few names more explain it
+_ANY_SIZE = 10.0  # factor on plausible sizes
+
+
+def names_beside_cause(
+    problem: Problem, families: Collection[str], known: Sequence[Choice], *, is_open: bool
+) -> Names | None:
+    """Return the names beside a cause that is in general what some effects imitate, where these leave only noise.
+
+    Args:
+        problem: the data.
+        families: of effects that may be named.
+        known: effects that were found without it.
+        is_open: they leave more than noise.
+
+    Returns:
+        None where no effect imitates such a cause, or where more is left.
+    """
+    steps = [choice for choice in known if _is_step(choice)]
+    if steps and (is_open or _coincide(steps)):
+        cause, imitating = _event(problem, known, steps)
+        names = _names(problem, families, known, imitating, cause)
+        if names is not None:
+            return _without_parts(problem, names)
+    yielding = [choice for choice in known if library()[choice.family].goes_with]
+    if yielding and is_open:
+        cause, imitating = _links(problem, known, yielding)
+        return _names(problem, families, known, imitating, cause)
+    return None
+
+
+def _names(
+    problem: Problem,
+    families: Collection[str],
+    known: Sequence[Choice],
+    imitating: Sequence[Choice],
+    cause: Sequence[Block],
+) -> Names | None:
+    """Return the names beside a cause in place of what imitates it; None where nothing does, or more is left."""
+    others = [choice for choice in known if choice not in imitating]
+    if not imitating or _left(problem, problem.fit(others, problem.solution.fit.x), cause).p < _FAR:
+        return None
+    names = names_beside(problem, cause, families, others)
+    return None if _left(problem, names.joint, cause).significant else names
+
+
+def _left(problem: Problem, joint: JointFit, blocks: Sequence[Block]) -> Detection:
+    """Test whether more than noise is left when blocks are fitted along with kinematics and effects."""
+    columns = joined([block.columns for block in blocks], len(problem.solution.samples))
+    columns = replace(columns, prior_sigma=_ANY_SIZE * columns.prior_sigma)
+    return detect(grammar_beside(problem, joint, columns), problem.rng())
+
+
+class _Evidence:
+    """Log evidence of some of the known effects beside some blocks, by weights that count beside all of them."""
+
+    def __init__(self, problem: Problem, known: Sequence[Choice], blocks: Sequence[Block]) -> None:
+        kinematics = problem.with_mild_outliers(problem.kinematics_only())
+        _, effects = linear_system(problem, kinematics, (), (), known)
+        fit, _ = reweighted(problem, kinematics, blocks, effects, None)
+        self.system, effects = linear_system(problem, replace(kinematics, fit=fit), blocks, (), known)
+        self._effects = dict(zip(map(str, known), self.system.chosen(effects), strict=True))
+
+    def of(self, choices: Sequence[Choice], without: Collection[Block] = ()) -> float:
+        """Return the log evidence of effects beside all blocks but some."""
+        effects = [self._effects[str(choice)] for choice in choices]
+        return self.system.fit(effects, None, without={block.name for block in without}).log_evidence
+
+
+def _event(
+    problem: Problem, known: Sequence[Choice], steps: Sequence[Choice]
+) -> tuple[Sequence[Block], Sequence[Choice]]:
+    """Return the events that the errors ask for in place of steps, and the steps that are parts of them."""
+    kinematics, average = problem.with_mild_outliers(problem.kinematics_only()), problem.solution.samples.average
+    others = [choice for choice in known if choice not in steps]
+    system, begun = linear_system(problem, kinematics, (), (), others)
+    instants_s = [step.settings["time_s"] for step in steps]
+    model = system.fit(system.chosen(begun), None)
+    events = further_blocks(system, model, lambda: event_blocks(kinematics.situation, average, instants_s))
+    if len(events) > _MOST:
+        return (), ()
+    imitating: list[Choice] = []
+    evidence = _Evidence(problem, known, events)
+    for event in events:
+        parts = [step for step in steps if _is_part(step, [event])]
+        without = [choice for choice in known if choice not in parts]
+        if len(parts) > 1 or (parts and evidence.of(without) - evidence.of(known, [event]) > _MORE):
+            imitating += parts
+    return events, imitating
+
+
+def _links(
+    problem: Problem, known: Sequence[Choice], yielding: Sequence[Choice]
+) -> tuple[Sequence[Block], Sequence[Choice]]:
+    """Return links that give way to loads, and the effects of loads for which any of the other links does as well.
+
+    The links at the places of effects that are there in their own right are left out: they could do the same.
+    """
+    links = elastic_blocks(problem.kinematics_only().situation, problem.solution.samples.average)
+    if not links:
+        return (), ()
+    evidence, imitating = _Evidence(problem, known, links), list[Choice]()
+    for choice in yielding:
+        own = [link for link in links if link.where == choice.where]
+        without = [other for other in known if other is not choice]
+        if evidence.of(known, own) - evidence.of(without, own) < ODDS_OF_TWO:
+            imitating.append(choice)
+    sound = {choice.where for choice in yielding if choice not in imitating}
+    return [link for link in links if link.where not in sound], imitating
+
+
+def _without_parts(problem: Problem, names: Names) -> Names:
+    """Return names without the steps at whose instant more has happened."""
+    parts = [step for step in names.joint.choices if _is_part(step, names.needed)]
+    if not parts:
+        return names
+    kept = [choice for choice in names.joint.choices if choice not in parts]
+    evidence = {str(choice): names.evidence[str(choice)] for choice in kept}
+    return replace(names, joint=problem.fit(kept, names.joint.start(kept)), evidence=evidence)
+
+
+def _coincide(steps: Sequence[Choice]) -> bool:
+    """Return True if several steps may have happened at the same time."""
+    every = sorted((step.settings["time_s"], step.settings["time_error_s"]) for step in steps)
+    return any(later - at <= _APART * math.hypot(a, b) for (at, a), (later, b) in itertools.pairwise(every))
+
+
+def _is_part(choice: Choice, events: Sequence[Block]) -> bool:
+    """Return True for a step that may have happened at the instant of an event."""
+    if not _is_step(choice):
+        return False
+    apart = _APART * choice.settings["time_error_s"]
+    return any(abs(choice.settings["time_s"] - event.since_s) <= apart for event in events)
+
+
+def _is_step(choice: Choice) -> bool:
+    return isinstance(library()[choice.family], StepFamily)

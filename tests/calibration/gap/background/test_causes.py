@@ -1,0 +1,59 @@
+"""What the library lacks is not told under the name of what imitates it: an event, and a link that gives way."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calibration.effects.library import library
+from calibration.gap.result import GapResult
+from calibration.observations import parse_observations
+from calibration.pipeline.find_gap import find_gap
+from daemon.rig_files import load_rig
+from simulators.effects.library import parse_effects
+from simulators.rig.truth import RigTruth
+from tests.simulated.observations import simulate_observations
+
+SOURCE = load_rig("swdt82")
+TIME_S = 100.0 * np.arange(160.0)
+
+
+def answer(effects: str, without: str = "") -> GapResult:
+    """Return the answer to 160 rows of a machine with effects, by a library that may lack one of them."""
+    truth = RigTruth(SOURCE.rig, 21, effects=parse_effects(effects))
+    data = simulate_observations(truth, 160, 21, noise_mm=1.0, prisms=["r"], columns={"time_s": TIME_S})
+    rows = parse_observations(data.csv_text().encode(), SOURCE.rig, "machine.csv")
+    return find_gap(SOURCE.rig, SOURCE.text, rows, families=[name for name in library() if name != without])
+
+
+def test_what_happens_at_one_instant_is_not_told_as_steps_of_something_else() -> None:
+    gap = answer("prism_seat_step@r:x_mm=12:y_mm=-14:z_mm=30:time_s=8000", without="prism_seat_step")
+    assert gap.effects == ()
+    assert "time_s = 8" in str(gap.description)
+
+
+def test_a_step_is_named_where_nothing_else_happened() -> None:
+    gap = answer("zero_step@theta5:jump_rad=6e-3:time_s=8000", without="prism_seat_step")
+    assert [(e.family, e.where) for e in gap.effects] == [("zero_step", "theta5")]
+
+
+def test_a_link_that_gives_way_otherwise_than_the_library_knows_is_not_told_as_another_one() -> None:
+    gap = answer("lateral_compliance@theta7:compliance_rad_per_Nm=8e-7", without="lateral_compliance")
+    assert gap.effects == ()
+    assert "theta7 error by load" in str(gap.description)
+
+
+@pytest.mark.long
+def test_a_step_keeps_its_name_beside_an_event_at_another_instant() -> None:
+    event = "prism_seat_step@r:x_mm=12:y_mm=-14:z_mm=30:time_s=11000"
+    gap = answer(f"zero_step@theta5:jump_rad=4e-3:time_s=4000,{event}", without="prism_seat_step")
+    assert [(e.family, e.where) for e in gap.effects] == [("zero_step", "theta5")]
+    assert "more has changed at time_s = 110" in str(gap.description)
+
+
+@pytest.mark.long
+def test_a_joint_that_gives_way_keeps_its_name_beside_a_link_that_gives_way_otherwise() -> None:
+    link = "lateral_compliance@theta7:compliance_rad_per_Nm=8e-7"
+    gap = answer(f"joint_compliance@theta5:compliance_rad_per_Nm=3e-7,{link}", without="lateral_compliance")
+    assert [(e.family, e.where) for e in gap.effects] == [("joint_compliance", "theta5")]
+    assert "theta7 error by load" in str(gap.description)
