@@ -56,7 +56,7 @@ class Block:
 
     @property
     def clause(self) -> str:
-        """What it says, for people."""
+        """Clause that describes the block in an answer."""
         return self.text if self.where == "station" else f"{self.where} error by {self.text}"
 
 
