@@ -142,10 +142,10 @@ def event_blocks(
 
 
 def elastic_blocks(context: EffectContext, average: Callable[[Floats], Floats]) -> tuple[Block, ...]:
-    """Return what links and bearings do that give way in proportion to load, one block for each row that joints turn.
+    """Return what links and bearings do that give way in proportion to load, a block for each row that joints turn.
 
     It turns a little further about its axis by the moment of the weights beyond about it, and about the axes across by
-    the rest of that moment.
+    the rest of that moment. The first of them is also what the base does.
 
     Arguments are those of `smooth_blocks`.
     """

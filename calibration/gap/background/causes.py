@@ -28,6 +28,7 @@ from calibration.gap.joint_fit import JointFit, Problem
 _APART = 4.0  # standard deviations of instants
 _MOST = 2  # events that may explain all
 _MORE = 15.0  # log Bayes factor of an event against steps at its instant
+_BASE = "base"  # its compliance is that of the first row that turns
 _FAR = 1e-12  # p-value of what is left, beyond which no few names more explain it
 _ANY_SIZE = 10.0  # factor on plausible sizes
 
@@ -129,14 +130,15 @@ def _links(
     links = elastic_blocks(problem.kinematics_only().situation, problem.solution.samples.average)
     if not links:
         return (), ()
-    evidence, imitating = _Evidence(problem, known, links), list[Choice]()
+    evidence, imitating, alike = _Evidence(problem, known, links), list[Choice](), set[str]()
     for choice in yielding:
-        own = [link for link in links if link.where == choice.where]
+        own = [link for link in links if choice.where == link.where or (choice.where == _BASE and link is links[0])]
         without = [other for other in known if other is not choice]
         if evidence.of(known, own) - evidence.of(without, own) < ODDS_OF_TWO:
             imitating.append(choice)
-    sound = {choice.where for choice in yielding if choice not in imitating}
-    return [link for link in links if link.where not in sound], imitating
+        else:
+            alike |= {link.name for link in own}
+    return [link for link in links if link.name not in alike], imitating
 
 
 def _without_parts(problem: Problem, names: Names) -> Names:

@@ -52,8 +52,15 @@ def test_a_step_keeps_its_name_beside_an_event_at_another_instant() -> None:
 
 
 @pytest.mark.long
-def test_a_joint_that_gives_way_keeps_its_name_beside_a_link_that_gives_way_otherwise() -> None:
+@pytest.mark.parametrize(
+    ("name", "coefficients"),
+    [
+        ("joint_compliance@theta5", "compliance_rad_per_Nm=3e-7"),
+        ("base_compliance@base", "x_rad_per_Nm=2e-8:y_rad_per_Nm=2e-8"),
+    ],
+)
+def test_what_gives_way_keeps_its_name_beside_a_link_that_gives_way_otherwise(name: str, coefficients: str) -> None:
     link = "lateral_compliance@theta7:compliance_rad_per_Nm=8e-7"
-    gap = answer(f"joint_compliance@theta5:compliance_rad_per_Nm=3e-7,{link}", without="lateral_compliance")
-    assert [(e.family, e.where) for e in gap.effects] == [("joint_compliance", "theta5")]
+    gap = answer(f"{name}:{coefficients},{link}", without="lateral_compliance")
+    assert [f"{e.family}@{e.where}" for e in gap.effects] == [name]
     assert "theta7 error by load" in str(gap.description)
