@@ -89,13 +89,13 @@ class _Evidence:
         kinematics = problem.with_mild_outliers(problem.kinematics_only())
         _, effects = linear_system(problem, kinematics, (), (), known)
         fit, _ = reweighted(problem, kinematics, blocks, effects, None)
-        self.system, effects = linear_system(problem, replace(kinematics, fit=fit), blocks, (), known)
-        self._effects = dict(zip(map(str, known), self.system.chosen(effects), strict=True))
+        self._system, effects = linear_system(problem, replace(kinematics, fit=fit), blocks, (), known)
+        self._effects = dict(zip(map(str, known), self._system.chosen(effects), strict=True))
 
     def of(self, choices: Sequence[Choice], without: Collection[Block] = ()) -> float:
         """Return the log evidence of effects beside all blocks but some."""
         effects = [self._effects[str(choice)] for choice in choices]
-        return self.system.fit(effects, None, without={block.name for block in without}).log_evidence
+        return self._system.fit(effects, None, without={block.name for block in without}).log_evidence
 
 
 def _event(
@@ -143,7 +143,7 @@ def _links(
 
 def _without_parts(problem: Problem, names: Names) -> Names:
     """Return names without the steps at whose instant more has happened."""
-    parts = [step for step in names.joint.choices if _is_part(step, names.needed)]
+    parts = [step for step in names.joint.choices if _is_part(step, names.events)]
     if not parts:
         return names
     kept = [choice for choice in names.joint.choices if choice not in parts]

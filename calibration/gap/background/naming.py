@@ -45,7 +45,7 @@ class Names:
         left: what the library explains of the rest, the most probable first.
         background: each part of the background and its RMS in mm, the largest first.
         background_log_bayes_factor: of the background against noise alone.
-        needed: blocks among those that names were sought beside at first which no effect makes superfluous.
+        events: those of the background that no effect makes superfluous.
     """
 
     joint: JointFit
@@ -55,7 +55,7 @@ class Names:
     left: tuple[ScoredEffect, ...]
     background: tuple[tuple[Block, float], ...]
     background_log_bayes_factor: float
-    needed: tuple[Block, ...]
+    events: tuple[Block, ...]
 
 
 def names_beside(
@@ -106,11 +106,12 @@ def names_beside(
         system.screen(model).score(),
         _parts(system, model),
         system.background_log_bayes_factor(model),
-        tuple(block for block in blocks if _is_needed(system, model, block)),
+        tuple(block for block in blocks if block.kind == "event" and _is_needed(system, model, block)),
     )
 
 
 def _is_needed(system: System, model: Model, block: Block) -> bool:
+    """True if a model is plainly less probable without a block."""
     without = system.fit(model.effects, model.scales, without={block.name})
     return model.log_evidence - without.log_evidence > _NEEDED
 
