@@ -11,7 +11,8 @@ from calibration.errors import DataError
 from calibration.observations import Observations
 from calibration.rig.description import Rig, parse_rig
 from daemon.sessions.session_data import sessions_csv
-from daemon.store.queries.sessions import all_observations, all_sessions, session
+from daemon.store.queries.observations import all_observations
+from daemon.store.queries.sessions import all_sessions, session
 from daemon.store.reader import Reader
 
 if TYPE_CHECKING:

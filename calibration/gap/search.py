@@ -127,9 +127,10 @@ def _beside_background(problem: Problem, families: Collection[str], found: Searc
     """
     names, formulas = _names(problem, families, found)
     known = found.joint.choices if names is None else names.joint.choices or found.joint.choices
-    of_cause = names_beside_cause(problem, families, known, is_open=names is not None)
+    is_path = follows_path(problem.solution.samples)  # what wanders along it imitates causes, too
+    of_cause = None if is_path else names_beside_cause(problem, families, known, is_open=names is not None)
     names, formulas = (names, formulas) if of_cause is None else (of_cause, ())
-    is_doubted = names is not None and follows_path(problem.solution.samples)
+    is_doubted = is_path and names is not None
     if names is None or not (names.joint.choices or of_cause or is_doubted):
         smooth = None if formulas else names
         return replace(found, evidence=evidence_alone(problem, found.joint, families), beside=smooth)

@@ -19,7 +19,6 @@ from daemon.store.queries.jobs import JobTable
 from daemon.store.queries.sessions import SessionTable, preset_jumps
 from daemon.store.store import Store
 from drivers.clock import Clock, Stamp
-from drivers.readings import Fix
 
 log = logging.getLogger(__name__)
 
@@ -162,10 +161,6 @@ class SessionLifecycle:
                 **self._store.instant(self._clock.now(), "accepted_"),
             )
         return despite
-
-    def add_observation(self, row: Mapping[str, object], fix: Fix, measured: Stamp) -> None:
-        """Add an observation that a fix gives."""
-        self.table.add_observation(self._store.fix_id(fix), measured, **row)
 
     def _why_not_used(self, session_id: str) -> str | None:
         """Why calibration must not use a session, a clause; None where a control point shows that it may."""

@@ -38,7 +38,7 @@ from daemon.sessions.station_setups import AXES, Place, SetupBook
 from daemon.sessions.without_job import why_no_job
 from daemon.store.errors import is_unwritable
 from daemon.store.queries.jobs import JobTable
-from daemon.store.queries.sessions import OF_CONTROL_POINT
+from daemon.store.queries.observations import OF_CONTROL_POINT, ObservationTable
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, Clock, Stamp, lies_within
 from drivers.readings import DeviceEvent, EventKind, Fix, Record
@@ -89,7 +89,8 @@ class SessionKeeper:
         self._store, self._joiner, self._settings, self._clock = store, joiner, settings, clock
         self._setups, self._run_id, self._are_jobs_enabled = setups, run_id, are_jobs_enabled
         self._lifecycle = SessionLifecycle(store, rig.name, clock, settings.control_tolerance_mm, clock_state)
-        self._table, self._jobs = self._lifecycle.table, JobTable(store, rig.name)
+        self._table, self._observations = self._lifecycle.table, ObservationTable(store)
+        self._jobs = JobTable(store, rig.name)
         self._aim = aim
         self._commands = threading.Lock()
         self._shot: Shot | None = None
@@ -163,7 +164,7 @@ class SessionKeeper:
         if excluded is None:
             changed, excluded = self._which_prism(session, joined, place_mm)
             if changed:
-                self._unstored.append(partial(self._table.exclude, session.id, changed, joined.stamp))
+                self._unstored.append(partial(self._observations.exclude, session.id, changed, joined.stamp))
         self._newest = session.id, joined.stamp, excluded
         row = {
             "session_id": session.id,
@@ -176,8 +177,11 @@ class SessionKeeper:
             "values_json": joined.values,
             "excluded": excluded,
         }
-        self._unstored.append(partial(self._lifecycle.add_observation, row, joined.fix, joined.stamp))
+        self._unstored.append(partial(self._add_observation, row, joined))
         return session
+
+    def _add_observation(self, row: Mapping[str, object], joined: JoinedFix) -> None:
+        self._observations.add(self._store.fix_id(joined.fix), joined.stamp, **row)
 
     def _which_prism(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> tuple[Exclusions, str | None]:
         """Why a fix must not be used since it may be of another prism, and earlier ones for which that has changed."""
@@ -314,7 +318,10 @@ class SessionKeeper:
                 # Before the shot is over: fixes that come late are of the point, and known to be, and so are those
                 # that came before anything told where it is.
                 session.control_points = self._setups.control_points(session.setup_id)
-                self._table.exclude_near(session.id, [result[axis] for axis in AXES], CONTROL_POINT_RADIUS_MM)
+                if result["misclosure_mm"] is None:  # nothing told before
+                    self._observations.exclude_near(
+                        session.id, [result[axis] for axis in AXES], CONTROL_POINT_RADIUS_MM
+                    )
             finally:
                 self._shot = None
                 if self._aim is not None:

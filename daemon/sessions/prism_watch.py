@@ -15,7 +15,8 @@ from daemon.sessions.prisms.evidence import Finding, IdentityLoader, PrismEviden
 from daemon.sessions.prisms.guard import CONFIRM, MotionLimit, PrismGuard, Suspicion, Turn, Word
 from daemon.sessions.prisms.standstill_places import Exclusions
 from daemon.sessions.station_setups import Place
-from daemon.store.queries.sessions import SessionTable, fixes_since_used, preset_jumps, prism_confirmations
+from daemon.store.queries.observations import fixes_since_used
+from daemon.store.queries.sessions import SessionTable, preset_jumps, prism_confirmations
 from daemon.store.store import Store
 from drivers.clock import Clock, Stamp
 from drivers.readings import DeviceEvent, EventKind, Fix, LockState, Status

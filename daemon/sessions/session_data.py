@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 from calibration.rig.description import Rig
 from calibration.table import LABEL_COLUMNS, POSITION_COLUMNS, SIGMA_COLUMNS
 from daemon.report.calibration.inputs import ControlPoint, SetupLine
-from daemon.store.queries.sessions import first_observation_ns, moving_observations, observations, session
+from daemon.store.queries.observations import first_observation_ns, moving_observations, observations
+from daemon.store.queries.sessions import session
 from daemon.store.queries.setups import misclosures, setups_of
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S, Stamp

@@ -22,7 +22,7 @@ from daemon.store.errors import StoreError, is_damage, storage_sentence
 from daemon.store.files import StoreFiles, WriterLock, require_no_half_restore
 from daemon.store.migrations import MIGRATIONS, pending_migrations, unknown_migrations
 from daemon.store.reader import Reader
-from daemon.store.rows import SqlValue, sql_value, stamp_of, stored_text
+from daemon.store.rows import SqlValue, marks, sql_value, stamp_of, stored_text
 from daemon.store.views import drop_views, make_views
 from drivers.clock import Stamp
 
@@ -174,9 +174,10 @@ class Connection:
             its rowid.
         """
         names = ", ".join(f'"{name}"' for name in row)
-        marks = ", ".join("?" * len(row))
         with self.transaction() as db:
-            cursor = db.execute(f'INSERT INTO "{table}" ({names}) VALUES ({marks})', [*map(sql_value, row.values())])
+            cursor = db.execute(
+                f'INSERT INTO "{table}" ({names}) VALUES ({marks(row)})', [*map(sql_value, row.values())]
+            )
             return cast(int, cursor.lastrowid)  # None only before a connection's first INSERT
 
     def update(self, table: str, where: Mapping[str, object], changes: Mapping[str, object]) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -42,6 +42,11 @@ FIX_COLUMNS = (
     *("status", "lock", "reason", "raw", "face", "tilt_ok", "edm_level"),
     *FIX_NUMBERS,
 )
+
+
+def marks(values: Collection[object]) -> str:
+    """Return the question marks of a query that stand for values."""
+    return ", ".join("?" * len(values))
 
 
 def stored_text(data: bytes) -> str:

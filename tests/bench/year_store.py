@@ -30,7 +30,8 @@ from daemon.service import declare_channels
 from daemon.sessions.export.captured_logs import export_session
 from daemon.store import Reader, Store
 from daemon.store.captures import Chunk, decode_run, encode_captures
-from daemon.store.queries.sessions import SessionTable, all_observations
+from daemon.store.queries.observations import ObservationTable, all_observations
+from daemon.store.queries.sessions import SessionTable
 from daemon.store.upkeep.packing import SPAN_NS, packed_run
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import Capture, Fix, Reading
@@ -147,7 +148,7 @@ def add_minute(db: sqlite3.Connection, own: Traffic, minute: int, boot: int, *, 
 def add_sessions(store: Store, minutes: int) -> None:
     """Add a closed session of eight minutes where all was stored, with an observation a second."""
     rig = load_rig("swdt82")
-    table = SessionTable(store, "swdt82")
+    table, observations = SessionTable(store, "swdt82"), ObservationTable(store)
     joints = {f"{joint.name}_{joint.unit}": 1.0 for joint in rig.rig.joints}
     for number in itertools.count(1):
         last = number * SESSION_EVERY - 1
@@ -160,7 +161,7 @@ def add_sessions(store: Store, minutes: int) -> None:
             for second in range(60 * (MINUTES - 2)):
                 place = {"x_mm": 1000.0 + second, "y_mm": 2000.0, "z_mm": 3000.0, "moving": 0}
                 row = {"session_id": name, "prism": "r", "pose": f"1.{second // 10}", **place, "values_json": joints}
-                table.add_observation(None, begin.shifted(second * NS_PER_S), **row)
+                observations.add(None, begin.shifted(second * NS_PER_S), **row)
             ended = store.instant(begin.shifted(60 * (MINUTES - 2) * NS_PER_S), "ended_")
             table.change(name, state="closed", **ended)
 

@@ -19,8 +19,7 @@ from calibration.effects.timing import StepFamily
 from calibration.gap.background.blocks import Block, elastic_blocks, event_blocks
 from calibration.gap.background.naming import Names, names_beside
 from calibration.gap.background.outside import grammar_beside
-from calibration.gap.background.search import ODDS_OF_TWO, linear_system
-from calibration.gap.background.weights import reweighted
+from calibration.gap.background.search import ODDS_OF_TWO, linear_system, system_beside
 from calibration.gap.background.widening import further_blocks
 from calibration.gap.detection import Detection, detect
 from calibration.gap.joint_fit import JointFit, Problem
@@ -86,11 +85,8 @@ class _Evidence:
     """Log evidence of some of the known effects beside some blocks, by weights that count beside all of them."""
 
     def __init__(self, problem: Problem, known: Sequence[Choice], blocks: Sequence[Block]) -> None:
-        kinematics = problem.with_mild_outliers(problem.kinematics_only())
-        _, effects = linear_system(problem, kinematics, (), (), known)
-        fit, _ = reweighted(problem, kinematics, blocks, effects, None)
-        self._system, effects = linear_system(problem, replace(kinematics, fit=fit), blocks, (), known)
-        self._effects = dict(zip(map(str, known), self._system.chosen(effects), strict=True))
+        self._system, effects, _ = system_beside(problem, blocks, known)
+        self._effects = dict(zip(map(str, known), effects, strict=True))
 
     def of(self, choices: Sequence[Choice], without: Collection[Block] = ()) -> float:
         """Return the log evidence of effects beside all blocks but some."""
@@ -110,13 +106,15 @@ def _event(
     events = further_blocks(system, model, lambda: event_blocks(kinematics.situation, average, instants_s))
     if len(events) > _MOST:
         return (), ()
-    imitating: list[Choice] = []
-    evidence = _Evidence(problem, known, events)
-    for event in events:
-        parts = [step for step in steps if _is_part(step, [event])]
-        without = [choice for choice in known if choice not in parts]
-        if len(parts) > 1 or (parts and evidence.of(without) - evidence.of(known, [event]) > _MORE):
-            imitating += parts
+    parts = {event.name: [step for step in steps if _is_part(step, [event])] for event in events}
+    imitating = [step for own in parts.values() if len(own) > 1 for step in own]
+    alone = [(event, *parts[event.name]) for event in events if len(parts[event.name]) == 1]
+    if alone:
+        evidence = _Evidence(problem, known, events)
+        for event, step in alone:
+            without = [choice for choice in known if choice is not step]
+            if evidence.of(without) - evidence.of(known, [event]) > _MORE:
+                imitating.append(step)
     return events, imitating
 
 

@@ -12,7 +12,7 @@ from calibration.effects.fitted import Choice
 from calibration.effects.library import library
 from calibration.gap.background.blocks import Block
 from calibration.gap.background.evidence import Scales
-from calibration.gap.background.system import Effect, Model, System
+from calibration.gap.background.system import Chosen, Effect, Model, System
 from calibration.gap.background.weights import reweighted
 from calibration.gap.background.widening import PossibleBlocks, further_blocks
 from calibration.gap.candidates import CandidateEffect, candidate_at, candidate_effects
@@ -94,11 +94,28 @@ def background_log_bayes_factor(problem: Problem, joint: JointFit, blocks: Seque
         joint: kinematics and effects.
         blocks: of the background.
     """
+    system, effects, scales = system_beside(problem, blocks, joint.choices)
+    return system.background_log_bayes_factor(system.fit(effects, scales))
+
+
+def system_beside(
+    problem: Problem, blocks: Sequence[Block], known: Sequence[Choice]
+) -> tuple[System, list[Chosen], Scales]:
+    """Return the linear model with known effects beside a background, by weights that count beside all of these.
+
+    Args:
+        problem: the data.
+        blocks: of the background.
+        known: effects.
+
+    Returns:
+        The model, the effects in it, in their order, and the scales of the background beside them.
+    """
     kinematics = problem.with_mild_outliers(problem.kinematics_only())
-    _, known = linear_system(problem, kinematics, (), (), joint.choices)
-    fit, scales = reweighted(problem, kinematics, blocks, known, None)
-    system, known = linear_system(problem, replace(kinematics, fit=fit), blocks, (), joint.choices)
-    return system.background_log_bayes_factor(system.fit(system.chosen(known), scales))
+    _, effects = linear_system(problem, kinematics, (), (), known)
+    fit, scales = reweighted(problem, kinematics, blocks, effects, None)
+    system, effects = linear_system(problem, replace(kinematics, fit=fit), blocks, (), known)
+    return system, system.chosen(effects), scales
 
 
 def linear_system(

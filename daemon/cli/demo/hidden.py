@@ -21,7 +21,7 @@ from daemon.cli.demo.operator import DEADLINE_S, PRISMS, RIG, Advance, DemoError
 from daemon.cli.terminal import echo, echo_error, echo_table
 from daemon.rig_files import load_rig
 from daemon.sessions.session_data import sessions_csv
-from daemon.store.queries.sessions import first_observation_ns
+from daemon.store.queries.observations import first_observation_ns
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S
 

@@ -12,6 +12,7 @@ from daemon.commands import CHECK
 from daemon.store.connection import Connection
 from daemon.store.errors import NotInStoreError
 from daemon.store.queries.models import ModelRow
+from daemon.store.rows import marks
 from drivers.clock import Stamp
 
 # Scheduling runs twice a second beside acquisition, for months: CROSS JOIN and NOT INDEXED keep SQLite's planner from
@@ -263,7 +264,7 @@ class JobTable:
 
     def first_on(self, session_id: str, *kinds: JobKind) -> dict[str, Any] | None:
         """Id and session_id of the first job of some kinds that works on a session; None where there is none."""
-        sql = _FIRST_ON.format(kinds=", ".join("?" * len(kinds)))
+        sql = _FIRST_ON.format(kinds=marks(kinds))
         return next(iter(self._store.rows(sql, (session_id, *kinds))), None)
 
     def failed(self) -> list[FailedJob]:

@@ -15,7 +15,8 @@ from typing import Any
 
 from daemon.store.connection import Connection
 from daemon.store.errors import NotInStoreError
-from daemon.store.queries.sessions import SessionTable, first_observation_ns, newest_observation_ns, preset_jumps
+from daemon.store.queries.observations import first_observation_ns, newest_observation_ns
+from daemon.store.queries.sessions import SessionTable, preset_jumps
 from drivers.clock import Clock
 
 _MODELS = """SELECT model.id, model.rig, model.path, model.manifest_sha256, model.stage, model.state,

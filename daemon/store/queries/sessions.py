@@ -1,24 +1,21 @@
-"""The tables of calibration sessions: sessions, observations, confirmations of their prism, and encoder jumps."""
+"""The tables of calibration sessions: sessions, confirmations of their prism, and encoder jumps."""
 
 from __future__ import annotations
 
 import itertools
-import json
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from daemon.host.time_service import ClockState
 from daemon.store.connection import Connection
 from daemon.store.errors import NotInStoreError
-from daemon.store.places import since
-from daemon.store.rows import RowSource
+from daemon.store.rows import RowSource, marks
 from daemon.store.views import in_session
 from drivers.clock import NS_PER_S, Stamp
 
 BEFORE_NS = 60 * NS_PER_S  # dwell and direction of a session's first fixes come from motion before it
 AFTER_NS = 2 * NS_PER_S  # its last fixes are interpolated between joints
-OF_CONTROL_POINT = "a control point, not the prism"  # why an observation must not be used
 CLOCK_STEP_NS = NS_PER_S // 20  # less may be the time between reading the one clock and the other
 
 # Fixes of these may still come: of the open ones, and of those that ended after the oldest capture that waits to be
@@ -73,23 +70,6 @@ _BETWEEN = """SELECT 1 FROM observations AS o JOIN control_shots AS c ON c.sessi
 # A boot's number rises from boot to boot, and monotonic_ns within one; utc_ns may step.
 _JUMPS = """SELECT id, device, utc_ns, monotonic_ns, boot_id FROM device_events
     WHERE kind = 'preset_jump' AND (boot_id, monotonic_ns) >= (?, ?) AND id > ? ORDER BY boot_id, monotonic_ns, id"""
-# A control point is none of the rig's prisms, whatever is found of those later.
-_EXCLUDE = f"""UPDATE observations SET excluded = ? WHERE session_id = ? AND boot_id = ? AND monotonic_ns = ?
-    AND excluded IS NOT '{OF_CONTROL_POINT}'"""
-_EXCLUDE_NEAR = f"""UPDATE observations SET excluded = '{OF_CONTROL_POINT}' WHERE session_id = ?1 AND excluded IS NULL
-    AND (x_mm - ?2) * (x_mm - ?2) + (y_mm - ?3) * (y_mm - ?3) + (z_mm - ?4) * (z_mm - ?4) < ?5 * ?5"""
-_OBSERVATIONS = """SELECT session_id, setup_id, prism, pose, utc_ns, monotonic_ns, boot_id, x_mm, y_mm, z_mm,
-        sigma_x_mm, sigma_y_mm, sigma_z_mm, dwell_s, values_json
-    FROM observations WHERE excluded IS NULL AND session_id IN ({}) ORDER BY id"""
-# Fixes of a moving boom; those of poses leave them out, for that reason alone.
-_MOVING = _OBSERVATIONS.replace("excluded IS NULL", "moving AND coalesce(excluded, 'moving') = 'moving'")
-# All that a station gave in a session from the last fix that calibration may use, or from the session's start.
-_FIXES = f"""SELECT fixes.* FROM calibration_sessions AS session CROSS JOIN boots CROSS JOIN fixes
-    WHERE session.id = ?1 AND station = ?2
-        AND {since("fixes.", ("session.started_boot_id", "session.started_monotonic_ns"))}
-        AND fixes.id >= coalesce((SELECT max(fix_id) FROM observations JOIN fixes AS used ON used.id = fix_id
-            WHERE session_id = ?1 AND excluded IS NULL AND used.station = ?2), 0)
-    ORDER BY fixes.id"""
 # The newest fix of each standstill, by session, from an instant on.
 _STANDING = """SELECT max(o.id) AS id, o.session_id, o.prism, o.x_mm, o.y_mm, o.z_mm, o.values_json
     FROM calibration_sessions AS s JOIN observations AS o ON o.session_id = s.id
@@ -220,7 +200,7 @@ class SessionTable:
 
     def rig_of(self, session_ids: Sequence[str]) -> str | None:
         """SHA-256 of the rig file of the newest of some sessions; None without any of them."""
-        sql = f"SELECT rig_sha256 FROM calibration_sessions WHERE id IN ({_marks(session_ids)}) ORDER BY rowid DESC"
+        sql = f"SELECT rig_sha256 FROM calibration_sessions WHERE id IN ({marks(session_ids)}) ORDER BY rowid DESC"
         return next((row["rig_sha256"] for row in self._store.rows(sql, session_ids)), None)
 
     def state_and_exclusion(self, session_id: str) -> tuple[str, str | None]:
@@ -275,29 +255,7 @@ class SessionTable:
         (found,) = self._store.rows(_ENCLOSED, (session_id,))
         return found["poses"], found["enclosed"]
 
-    # ---- observations ------------------------------------------------------------------------------------------------
-
-    def add_observation(self, fix_id: int | None, measured: Stamp, **columns: object) -> None:
-        """Add an observation that a fix gives."""
-        self._store.insert("observations", {**columns, "fix_id": fix_id, **self._store.instant(measured)})
-
-    def exclude(self, session_id: str, exclusions: Mapping[int, str | None], newest: Stamp) -> None:
-        """Change why observations of a session must not be used.
-
-        Args:
-            session_id: the session.
-            exclusions: instant of a fix, monotonic ns -> why calibration must not use it, None when it may.
-            newest: instant of the newest fix; the others are of its boot.
-        """
-        with self._store.transaction() as db:
-            boot = self._store.boot_row(newest)
-            rows = [(excluded, session_id, boot, at_ns) for at_ns, excluded in exclusions.items()]
-            db.conn.executemany(_EXCLUDE, rows)
-
-    def exclude_near(self, session_id: str, point_mm: Sequence[float], radius_mm: float) -> None:
-        """Exclude the observations of a session that lie near a control point and might have been used."""
-        with self._store.transaction() as db:
-            db.conn.execute(_EXCLUDE_NEAR, (session_id, *point_mm, radius_mm))
+    # ---- their prism ------------------------------------------------------------------------------------------------
 
     def standing(self, setup_id: str, since: Stamp | None) -> list[dict[str, Any]]:
         """The newest observation of each standstill at a set-up that calibration may use, oldest first.
@@ -326,16 +284,6 @@ def session(source: RowSource, session_id: str) -> dict[str, Any] | None:
     return next(iter(source.rows(_SESSION, (session_id,))), None)
 
 
-def observations(source: RowSource, session_ids: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the observations of sessions that calibration may use, oldest first."""
-    return list(source.rows(_OBSERVATIONS.format(_marks(session_ids)), session_ids))
-
-
-def moving_observations(source: RowSource, session_ids: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the observations of sessions that were made while the boom moved and have no other fault."""
-    return list(source.rows(_MOVING.format(_marks(session_ids)), session_ids))
-
-
 def all_sessions(source: RowSource) -> list[dict[str, Any]]:
     """Return every session without its rig file, oldest first."""
     return list(
@@ -355,29 +303,6 @@ def sessions_of_use(source: RowSource) -> tuple[list[str], list[str]]:
     return [name for name, is_check in found if not is_check], [name for name, is_check in found if is_check]
 
 
-def all_observations(source: RowSource, session_ids: Sequence[str] = ()) -> list[dict[str, Any]]:
-    """Return the observations of sessions, or of all, oldest first, used or excluded; joints and signals as columns."""
-    where = f"WHERE session_id IN ({_marks(session_ids)})" if session_ids else ""
-    rows = source.rows(
-        "SELECT session_id, setup_id, prism, pose, utc_ns, x_mm, y_mm, z_mm, sigma_x_mm, sigma_y_mm, sigma_z_mm, "
-        f"dwell_s, excluded, values_json FROM observations {where} ORDER BY id",
-        session_ids,
-    )
-    return [{**row, **json.loads(row.pop("values_json"))} for row in rows]
-
-
-def first_observation_ns(source: RowSource) -> int:
-    """Return UTC, ns, of the first observation that calibration may use; 0 without one."""
-    rows = source.rows("SELECT utc_ns FROM observations WHERE excluded IS NULL ORDER BY id LIMIT 1")
-    return next((int(row["utc_ns"]) for row in rows), 0)
-
-
-def newest_observation_ns(source: RowSource, session_ids: Sequence[str]) -> int:
-    """Return UTC, ns, of the newest observation of sessions that calibration may use; 0 without one."""
-    sql = "SELECT coalesce(max(utc_ns), 0) AS utc_ns FROM observations WHERE excluded IS NULL AND session_id IN ({})"
-    return next(int(row["utc_ns"]) for row in source.rows(sql.format(_marks(session_ids)), session_ids))
-
-
 def prism_confirmations(source: RowSource, session_id: str) -> list[dict[str, Any]]:
     """Return the rows of words that a session's stations are on its prism, oldest first."""
     return list(source.rows("SELECT * FROM prism_confirmations WHERE session_id = ? ORDER BY id", (session_id,)))
@@ -393,11 +318,6 @@ def fixes_measured(source: RowSource, session_id: str) -> Iterator[dict[str, Any
     return iter(source.rows(_FIXES_MEASURED, (session_id,)))
 
 
-def fixes_since_used(source: RowSource, session_id: str, station: str) -> Iterator[dict[str, Any]]:
-    """Return a station's fixes in a session, from the last one that calibration may use, or from its start."""
-    return iter(source.rows(_FIXES, (session_id, station)))
-
-
 def preset_jumps(store: Connection, since: Stamp | None, after_number: int = 0) -> list[Jump]:
     """Return the encoder jumps from an instant on, in their order.
 
@@ -409,10 +329,6 @@ def preset_jumps(store: Connection, since: Stamp | None, after_number: int = 0) 
     first = (0, 0) if since is None else store.order(since)
     rows = store.rows(_JUMPS, (*first, after_number))
     return [Jump(row["id"], row["device"], store.stamp(row)) for row in rows]
-
-
-def _marks(values: Sequence[object]) -> str:
-    return ",".join("?" * len(values))
 
 
 def _summary(source: RowSource, session_id: str) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from daemon.store.connection import Connection
-from daemon.store.rows import RowSource
+from daemon.store.rows import RowSource, marks
 from drivers.clock import Stamp
 
 _OF_SESSIONS = """SELECT id, instrument, state FROM station_setups
@@ -101,7 +101,7 @@ def control_points(source: RowSource, setup_id: str) -> list[dict[str, Any]]:
 
 def setups_of(source: RowSource, session_ids: Sequence[str]) -> list[dict[str, Any]]:
     """Return id, instrument and state of the set-ups of sessions, oldest first."""
-    return list(source.rows(_OF_SESSIONS.format(",".join("?" * len(session_ids))), session_ids))
+    return list(source.rows(_OF_SESSIONS.format(marks(session_ids)), session_ids))
 
 
 def misclosures(source: RowSource, setup_id: str, session_ids: Sequence[str]) -> list[dict[str, Any]]:
@@ -110,5 +110,4 @@ def misclosures(source: RowSource, setup_id: str, session_ids: Sequence[str]) ->
     Returns:
         name, phase, and x, y, z: how far off the point's known place it was, mm in the station's frame.
     """
-    marks = ",".join("?" * len(session_ids))
-    return list(source.rows(_MISCLOSURES.format(marks), (setup_id, *session_ids)))
+    return list(source.rows(_MISCLOSURES.format(marks(session_ids)), (setup_id, *session_ids)))

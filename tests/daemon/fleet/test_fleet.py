@@ -22,6 +22,7 @@ from daemon.fleet.comparison import compare, gains
 from daemon.fleet.run import RESULTS, Cluster, Here, assess_all, local_workers
 from daemon.fleet.sources import find_rigs
 from daemon.store import Store
+from daemon.store.queries.observations import ObservationTable
 from daemon.store.queries.sessions import SessionTable
 from tests.daemon.store_support import at
 from tests.simulated.fleet import COMMON, ODD, drawing, simulated_rig, write_rig
@@ -127,14 +128,14 @@ def store_of(path: Path, csv: bytes, rig_text: str) -> None:
     header, *rows = csv.decode().splitlines()
     names = header.split(",")
     with contextlib.closing(Store(path)) as store:
-        table = SessionTable(store, "swdt82")
+        table, observations = SessionTable(store, "swdt82"), ObservationTable(store)
         table.start(at(0.0), rig_text, id="s001", prism="r", operator="", kind="static_poses")
         for number, row in enumerate(rows):
             cells = dict(zip(names, row.split(","), strict=True))
             values = {name: float(cells[name]) for name in names if name.endswith(("_deg", "_mm")) and name[1] != "_"}
             place = {name: float(cells[name]) for name in ("x_mm", "y_mm", "z_mm")}
             about = {"session_id": "s001", "prism": cells["prism"], "pose": cells["pose"], "moving": 0}
-            table.add_observation(None, at(float(number)), **about, **place, values_json=values)
+            observations.add(None, at(float(number)), **about, **place, values_json=values)
         table.change("s001", state="closed", **store.instant(at(1000.0), "ended_"))
 
 

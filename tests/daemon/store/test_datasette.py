@@ -16,6 +16,7 @@ import pytest
 from daemon.store import Store
 from daemon.store.describe.description import StoreDescription, describe_store
 from daemon.store.describe.metadata import datasette_metadata
+from daemon.store.queries.observations import ObservationTable
 from daemon.store.queries.sessions import SessionTable
 from tests.daemon.store_support import at, fix, reading
 
@@ -33,10 +34,10 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
         store.insert_records([reading("theta1", 1.0, 5.0), fix(1.0)])
         created = store.instant(at(0.0), "created_")
         store.insert("station_setups", {"id": "S1", "instrument": "GTS", "serial": "1", "state": "ok", **created})
-        table = SessionTable(store, "swdt82")
+        table, observations = SessionTable(store, "swdt82"), ObservationTable(store)
         table.start(at(0.0), "name = 1\n", id="s001-r", setup_id="S1", prism="r", operator="", kind="static_poses")
         place = {"x_mm": 1.0, "y_mm": 2.0, "z_mm": 3.0, "moving": 0, "values_json": {"theta1_deg": 5.0}}
-        table.add_observation(1, at(1.0), session_id="s001-r", setup_id="S1", prism="r", pose="1", **place)
+        observations.add(1, at(1.0), session_id="s001-r", setup_id="S1", prism="r", pose="1", **place)
         table.change("s001-r", state="closed", **store.instant(at(2.0), "ended_"))
         job = {"kind": "gap", "session_id": "s001-r", "through_session_id": "s001-r", "state": "done", **created}
         job_id = store.insert("jobs", job)

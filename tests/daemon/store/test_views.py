@@ -18,6 +18,7 @@ from daemon.store.describe.table_words import TABLES
 from daemon.store.describe.view_words import VIEWS
 from daemon.store.migrations import MIGRATIONS
 from daemon.store.queries.canned_queries import canned_queries
+from daemon.store.queries.observations import ObservationTable
 from daemon.store.queries.sessions import SessionTable, session
 from daemon.store.views import Channel, channels_of
 from docs.references.schema import example
@@ -38,14 +39,14 @@ def path(tmp_path: Path) -> Path:
         records.append(reading("L2", 4.0, 1500.0, "mm"))
         records.append(reading("theta1", 4.05, None, status=Status.MALFORMED))
         store.insert_records([*records, fix(4.0), fix(90.0)])
-        table = SessionTable(store, "swdt82")
+        table, observations = SessionTable(store, "swdt82"), ObservationTable(store)
         table.start(at(3.0), "name = 1\n", id="s001-r", prism="r", operator="Ada", kind="static_poses")
         values = {"theta1_deg": 40.0, "theta1_dir": 1.0, "L2_mm": 1500.0, "oil_degC": 61.5, "flow_l_per_min": 12.0}
         place = {"x_mm": 1.0, "y_mm": 2.0, "z_mm": 3.0, "moving": 0}
         row = {"session_id": "s001-r", "prism": "r", "pose": "1", "values_json": values, **place}
-        table.add_observation(1, at(4.0), **row)
-        table.add_observation(None, at(5.0), **{**row, "x_mm": 3.0})
-        table.add_observation(None, at(6.0), **row, excluded="moving")
+        observations.add(1, at(4.0), **row)
+        observations.add(None, at(5.0), **{**row, "x_mm": 3.0})
+        observations.add(None, at(6.0), **row, excluded="moving")
         table.change("s001-r", state="closed", **store.instant(at(13.0), "ended_"))
     return path
 

@@ -17,6 +17,7 @@ from calibration.observations import Observations
 from calibration.rig.description import shipped_rig
 from daemon.cli.main import main
 from daemon.store import Store
+from daemon.store.queries.observations import ObservationTable
 from daemon.store.queries.sessions import SessionTable
 from tests.daemon.store_support import at, fix, reading
 
@@ -37,11 +38,11 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
         store.insert("links", {"name": "station", "kind": "serial"})
         store.insert_records([reading("theta1", n / 10, float(n)) for n in range(-10, 50)])
         store.insert_records([fix(n, station="station") for n in (-1.0, 1.0, 2.0)])
-        table = SessionTable(store, "swdt82")
+        table, observations = SessionTable(store, "swdt82"), ObservationTable(store)
         table.start(at(0.0), text, id="s001-r", prism="r", operator="", kind="static_poses")
         for n in (1, 2):
             place = {"x_mm": 100.0 * n, "y_mm": 2.0, "z_mm": 3.0, "moving": 0, "values_json": JOINTS}
-            table.add_observation(n + 1, at(n), session_id="s001-r", prism="r", pose=f"1.{n}", **place)
+            observations.add(n + 1, at(n), session_id="s001-r", prism="r", pose=f"1.{n}", **place)
         table.change("s001-r", state="closed", **store.instant(at(2.95), "ended_"))
     return path
 

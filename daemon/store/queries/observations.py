@@ -1,0 +1,106 @@
+"""The table of observations: fixes of a session's prism with the joints at their instants."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from daemon.store.connection import Connection
+from daemon.store.places import since
+from daemon.store.rows import RowSource, marks
+from drivers.clock import Stamp
+
+OF_CONTROL_POINT = "a control point, not the prism"  # why an observation must not be used
+
+# A control point is none of the rig's prisms, whatever is found of those later.
+_EXCLUDE = f"""UPDATE observations SET excluded = ? WHERE session_id = ? AND boot_id = ? AND monotonic_ns = ?
+    AND excluded IS NOT '{OF_CONTROL_POINT}'"""
+_EXCLUDE_NEAR = f"""UPDATE observations SET excluded = '{OF_CONTROL_POINT}' WHERE session_id = ?1 AND excluded IS NULL
+    AND (x_mm - ?2) * (x_mm - ?2) + (y_mm - ?3) * (y_mm - ?3) + (z_mm - ?4) * (z_mm - ?4) < ?5 * ?5"""
+_OBSERVATIONS = """SELECT session_id, setup_id, prism, pose, utc_ns, monotonic_ns, boot_id, x_mm, y_mm, z_mm,
+        sigma_x_mm, sigma_y_mm, sigma_z_mm, dwell_s, values_json
+    FROM observations WHERE excluded IS NULL AND session_id IN ({}) ORDER BY id"""
+# Fixes of a moving boom; those of poses leave them out, for that reason alone.
+_MOVING = _OBSERVATIONS.replace("excluded IS NULL", "moving AND coalesce(excluded, 'moving') = 'moving'")
+# All that a station gave in a session from the last fix that calibration may use, or from the session's start.
+_FIXES = f"""SELECT fixes.* FROM calibration_sessions AS session CROSS JOIN boots CROSS JOIN fixes
+    WHERE session.id = ?1 AND station = ?2
+        AND {since("fixes.", ("session.started_boot_id", "session.started_monotonic_ns"))}
+        AND fixes.id >= coalesce((SELECT max(fix_id) FROM observations JOIN fixes AS used ON used.id = fix_id
+            WHERE session_id = ?1 AND excluded IS NULL AND used.station = ?2), 0)
+    ORDER BY fixes.id"""
+
+
+class ObservationTable:
+    """The observations of a store.
+
+    Args:
+        store: the database.
+    """
+
+    def __init__(self, store: Connection) -> None:
+        self._store = store
+
+    def add(self, fix_id: int | None, measured: Stamp, **columns: object) -> None:
+        """Add an observation that a fix gives."""
+        self._store.insert("observations", {**columns, "fix_id": fix_id, **self._store.instant(measured)})
+
+    def exclude(self, session_id: str, exclusions: Mapping[int, str | None], newest: Stamp) -> None:
+        """Change why observations of a session must not be used.
+
+        Args:
+            session_id: the session.
+            exclusions: instant of a fix, monotonic ns -> why calibration must not use it, None when it may.
+            newest: instant of the newest fix; the others are of its boot.
+        """
+        with self._store.transaction() as db:
+            boot = self._store.boot_row(newest)
+            rows = [(excluded, session_id, boot, at_ns) for at_ns, excluded in exclusions.items()]
+            db.conn.executemany(_EXCLUDE, rows)
+
+    def exclude_near(self, session_id: str, point_mm: Sequence[float], radius_mm: float) -> None:
+        """Exclude the observations of a session that lie near a control point and might have been used."""
+        with self._store.transaction() as db:
+            db.conn.execute(_EXCLUDE_NEAR, (session_id, *point_mm, radius_mm))
+
+
+# ---- for the writing connection and for readers ----------------------------------------------------------------------
+
+
+def observations(source: RowSource, session_ids: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the observations of sessions that calibration may use, oldest first."""
+    return list(source.rows(_OBSERVATIONS.format(marks(session_ids)), session_ids))
+
+
+def moving_observations(source: RowSource, session_ids: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the observations of sessions that were made while the boom moved and have no other fault."""
+    return list(source.rows(_MOVING.format(marks(session_ids)), session_ids))
+
+
+def all_observations(source: RowSource, session_ids: Sequence[str] = ()) -> list[dict[str, Any]]:
+    """Return the observations of sessions, or of all, oldest first, used or excluded; joints and signals as columns."""
+    where = f"WHERE session_id IN ({marks(session_ids)})" if session_ids else ""
+    rows = source.rows(
+        "SELECT session_id, setup_id, prism, pose, utc_ns, x_mm, y_mm, z_mm, sigma_x_mm, sigma_y_mm, sigma_z_mm, "
+        f"dwell_s, excluded, values_json FROM observations {where} ORDER BY id",
+        session_ids,
+    )
+    return [{**row, **json.loads(row.pop("values_json"))} for row in rows]
+
+
+def first_observation_ns(source: RowSource) -> int:
+    """Return UTC, ns, of the first observation that calibration may use; 0 without one."""
+    rows = source.rows("SELECT utc_ns FROM observations WHERE excluded IS NULL ORDER BY id LIMIT 1")
+    return next((int(row["utc_ns"]) for row in rows), 0)
+
+
+def newest_observation_ns(source: RowSource, session_ids: Sequence[str]) -> int:
+    """Return UTC, ns, of the newest observation of sessions that calibration may use; 0 without one."""
+    sql = "SELECT coalesce(max(utc_ns), 0) AS utc_ns FROM observations WHERE excluded IS NULL AND session_id IN ({})"
+    return next(int(row["utc_ns"]) for row in source.rows(sql.format(marks(session_ids)), session_ids))
+
+
+def fixes_since_used(source: RowSource, session_id: str, station: str) -> Iterator[dict[str, Any]]:
+    """Return a station's fixes in a session, from the last one that calibration may use, or from its start."""
+    return iter(source.rows(_FIXES, (session_id, station)))
