@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import select
 import sys
 import threading
 import traceback
@@ -91,6 +92,8 @@ class Command(click.Command):
         except (click.exceptions.Exit, click.Abort):
             raise
         except Exception as error:  # noqa: BLE001 - the last place where a failure can become a sentence
+            if isinstance(error, BrokenPipeError) and _reader_has_ended():
+                raise  # click ends the command without a word
             _end_badly(error, as_json=as_json)
         delivered = returned if isinstance(returned, Delivered) else Delivered(returned, DONE)
         if as_json:
@@ -98,6 +101,13 @@ class Command(click.Command):
         if delivered.status != DONE:
             raise click.exceptions.Exit(delivered.status)
         return None
+
+
+def _reader_has_ended() -> bool:
+    """True if nothing reads standard output any more, as after `| head`."""
+    poll = select.poll()
+    poll.register(1, 0)
+    return any(event & select.POLLERR for _, event in poll.poll(0))
 
 
 def _end_badly(error: Exception, *, as_json: bool) -> NoReturn:

@@ -9,6 +9,7 @@ import click
 
 from daemon.cli.command import Command, json_option
 from daemon.cli.terminal import echo
+from daemon.commands import INSTALLED_CONFIG
 
 
 @click.group()
@@ -17,10 +18,13 @@ def config() -> None:
 
 
 @config.command("check", cls=Command)
-@click.argument("path", type=click.Path(path_type=Path))
+@click.argument("path", type=click.Path(path_type=Path), default=INSTALLED_CONFIG)
 @json_option
 def config_check(path: Path, *, as_json: bool) -> dict[str, Any]:
-    """Check a configuration, its rig, and the DBC and EDS files they name, without opening any device."""
+    """Check a configuration, its rig, and the DBC and EDS files they name, without opening any device.
+
+    PATH is /etc/rigcal/rigcal.toml where none is given.
+    """
     from daemon.composition import decoders
     from daemon.config import read_config
     from daemon.rig_files import load_rig

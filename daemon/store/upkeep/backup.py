@@ -196,8 +196,14 @@ def restore_backup(backup: Path, store: Path, models: Path, now_utc_ns: int, go_
 
     Raises:
         StoreBusyError: a daemon runs on the store.
-        StoreError: the backup is damaged, or made by a newer rigcal, or the file system refuses; all is as it was.
+        StoreError: the backup is damaged, or made by a newer rigcal, the store is a link, or the file system refuses;
+            all is as it was.
     """
+    if store.is_symlink():
+        raise StoreError(
+            f"{store} is a link to {store.resolve()}, and a restore would put a file in its place: remove the link and "
+            "restore, or let `state_directory` of the configuration name the directory that it leads to"
+        )
     read_backup(backup)
     with storage_errors(store):
         store.parent.mkdir(parents=True, exist_ok=True)

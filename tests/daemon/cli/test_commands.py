@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 import subprocess
 import sys
@@ -51,6 +52,18 @@ def test_a_new_file_in_the_folder_is_a_new_command(tmp_path: Path, monkeypatch: 
 def test_no_command_uses_another_commands_module() -> None:
     for path in Path(commands.__path__[0]).glob("*.py"):
         assert "daemon.cli.commands" not in path.read_text(encoding="utf-8"), path
+
+
+def test_a_reader_that_has_ended_is_no_error(tmp_path: Path) -> None:
+    config = tmp_path / "rigcal.toml"
+    config.write_text('rig = "swdt82"\n[[can]]\nchannel = "can0"\n', encoding="utf-8")
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-m", "daemon.cli.main", "config", "check", str(config)]
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert done.returncode == 1
+    assert done.stderr == ""
 
 
 def test_help_loads_nothing_heavy() -> None:

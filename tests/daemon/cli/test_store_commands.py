@@ -56,6 +56,18 @@ def test_a_store_is_told_checked_backed_up_damaged_and_restored(config: Path) ->
     assert told(config, "check")["captures"] == 10
 
 
+def test_a_store_that_is_a_link_is_not_restored_in_the_place_of_the_link(config: Path, tmp_path: Path) -> None:
+    backup = told(config, "backup")["backup"]
+    store, elsewhere = config.with_name("rigcal.sqlite"), tmp_path / "elsewhere.sqlite"
+    store.rename(elsewhere)
+    store.symlink_to(elsewhere)
+    refused = say(config, "restore", backup)
+    assert refused.exit_code == 1
+    assert f"is a link to {elsewhere}" in refused.output
+    assert store.is_symlink()
+    assert told(config, "check")["captures"] == 10
+
+
 def test_while_a_daemon_runs_it_is_asked_and_only_a_restore_is_refused(config: Path) -> None:
     with idle_daemon(config.parent):
         assert told(config, "check")["is_sound"]
