@@ -108,7 +108,7 @@ def _event(
         return (), ()
     parts = {event.name: [step for step in steps if _is_part(step, [event])] for event in events}
     imitating = [step for own in parts.values() if len(own) > 1 for step in own]
-    alone = [(event, *parts[event.name]) for event in events if len(parts[event.name]) == 1]
+    alone = [(event, parts[event.name][0]) for event in events if len(parts[event.name]) == 1]
     if alone:
         evidence = _Evidence(problem, known, events)
         for event, step in alone:
