@@ -91,7 +91,7 @@ class Command(click.Command):
                 returned = super().invoke(ctx)
         except (click.exceptions.Exit, click.Abort):
             raise
-        except Exception as error:  # noqa: BLE001 - the last place where a failure can become a sentence
+        except Exception as error:  # the last place where a failure can become a sentence
             if isinstance(error, BrokenPipeError) and _reader_has_ended():
                 raise  # click ends the command without a word
             _end_badly(error, as_json=as_json)
