@@ -40,7 +40,8 @@ class Block:
     Attributes:
         name: of the block.
         kind: `curve` of a joint's own reading, `surface` of two; `pair`, `place`, `time` for displacements; `event` for
-            all that is another from an instant on; `elastic` for all that gives way to loads; `formula`.
+            all that is another from an instant on, `drift` for all that changes slowly with time; `elastic` for all
+            that gives way to loads; `formula`.
         where: the joint that errs, else `station`.
         text: on what it depends, or what has happened, for people.
         columns: of the samples; prior sigmas are those of amounts of plausible size.
@@ -131,14 +132,21 @@ def event_blocks(
     """
     time_s = context.extra("time_s")
     grid = {step["time_s"] for step in step_grid(time_s)}
-    u = np.stack([np.ones(len(context)), *(2.0 * _unit(axis) - 1.0 for axis in context.located.prism_mm.T)], axis=1)
     for at_s in sorted(grid | set(instants_s)):
         name = f"event({at_s})"
         after = (time_s > at_s).astype(np.float64)[:, None]
-        zeros = [_at_joint(context, joint, name, after, np.ones(1)) for joint in _moving(context)]
-        columns = joined([_shifts(name, after * u, np.ones(u.shape[1])), *zeros], len(context))
         text = f"more has changed at time_s = {at_s:g} than one effect says"
-        yield Block(name, "event", "station", text, columns.over(average), at_s)
+        yield Block(name, "event", "station", text, _of_all(context, name, after, np.ones(1)).over(average), at_s)
+
+
+def drift_block(context: EffectContext, average: Callable[[Floats], Floats]) -> Block:
+    """Return what may change steadily with time: zeros of all joints, and displacements linear in the place.
+
+    Arguments are those of `smooth_blocks`.
+    """
+    t = 2.0 * _unit(context.extra("time_s")) - 1.0
+    columns = _of_all(context, "drift", np.stack([t, t * t], axis=1), np.ones(2))
+    return Block("drift", "drift", "station", "time, at all joints and all places", columns.over(average))
 
 
 def elastic_blocks(context: EffectContext, average: Callable[[Floats], Floats]) -> tuple[Block, ...]:
@@ -234,6 +242,14 @@ def _unit(values: Floats) -> Floats:
     """Return values (n,) scaled to the range from 0 to 1."""
     low, high = float(values.min()), float(values.max())
     return (values - low) / max(high - low, 1e-12)
+
+
+def _of_all(context: EffectContext, name: str, waves: Floats, sizes: Floats) -> EffectColumns:
+    """Return zeros of all joints and displacements linear in the place, each times waves (n, k) of sizes (k,)."""
+    u = np.stack([np.ones(len(context)), *(2.0 * _unit(axis) - 1.0 for axis in context.located.prism_mm.T)], axis=1)
+    places = (waves[:, :, None] * u[:, None, :]).reshape(len(u), -1)
+    zeros = [_at_joint(context, joint, name, waves, sizes) for joint in _moving(context)]
+    return joined([_shifts(name, places, np.repeat(sizes, u.shape[1])), *zeros], len(context))
 
 
 def _at_joint(context: EffectContext, joint: str, name: str, values: Floats, sizes: Floats) -> EffectColumns:

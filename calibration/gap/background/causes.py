@@ -1,8 +1,9 @@
-"""Causes that the library lacks, and that effects of it imitate: an event, and links that give way to loads.
+"""Causes that the library lacks, and that effects of it imitate: a drift, an event, and links that give way to loads.
 
 What happens at one instant has one cause: where the library lacks it, steps of something else at that instant imitate
-it, each beyond doubt. Likewise a link that gives way in a way of its own is imitated by others. Such effects are not
-named where a cause of that kind, whatever it is in particular, explains everything without them.
+it, each beyond doubt. So do steps at any instants of what changes steadily. Likewise a link that gives way in a way of
+its own is imitated by others. Such effects are not named where a cause of that kind, whatever it is in particular,
+explains everything without them.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from calibration.effects.columns import joined
 from calibration.effects.fitted import Choice
 from calibration.effects.library import library
 from calibration.effects.timing import StepFamily
-from calibration.gap.background.blocks import Block, elastic_blocks, event_blocks
+from calibration.gap.background.blocks import Block, drift_block, elastic_blocks, event_blocks
 from calibration.gap.background.naming import Names, names_beside
 from calibration.gap.background.outside import grammar_beside
 from calibration.gap.background.search import ODDS_OF_TWO, linear_system, system_beside
@@ -26,7 +27,7 @@ from calibration.gap.joint_fit import JointFit, Problem
 
 _APART = 4.0  # standard deviations of instants
 _MOST = 2  # events that may explain all
-_MORE = 15.0  # log Bayes factor of an event against steps at its instant
+_MORE = 15.0  # log Bayes factor of an event or a drift against steps
 _BASE = "base"  # its compliance is that of the first row that turns
 _FAR = 1e-12  # p-value of what is left, beyond which no few names more explain it
 _ANY_SIZE = 10.0  # factor on plausible sizes
@@ -48,10 +49,11 @@ def names_beside_cause(
     """
     steps = [choice for choice in known if _is_step(choice)]
     if steps and (is_open or _coincide(steps)):
-        cause, imitating = _event(problem, known, steps)
-        names = _names(problem, families, known, imitating, cause)
-        if names is not None:
-            return _without_parts(problem, names)
+        for cause_of in (_drift, _event):
+            cause, imitating = cause_of(problem, known, steps)
+            names = _names(problem, families, known, imitating, cause)
+            if names is not None:
+                return _without_parts(problem, names)
     yielding = [choice for choice in known if library()[choice.family].goes_with]
     if yielding and is_open:
         cause, imitating = _links(problem, known, yielding)
@@ -92,6 +94,19 @@ class _Evidence:
         """Return the log evidence of effects beside all blocks but some."""
         effects = [self._effects[str(choice)] for choice in choices]
         return self._system.fit(effects, None, without={block.name for block in without}).log_evidence
+
+
+def _drift(
+    problem: Problem, known: Sequence[Choice], steps: Sequence[Choice]
+) -> tuple[Sequence[Block], Sequence[Choice]]:
+    """Return the drift that the errors ask for in place of steps, and the steps that it makes superfluous."""
+    drift = drift_block(problem.kinematics_only().situation, problem.solution.samples.average)
+    evidence = _Evidence(problem, known, [drift])
+    whole = evidence.of(known)
+    imitating = [step for step in steps if whole - evidence.of([c for c in known if c is not step]) < ODDS_OF_TWO]
+    without = [choice for choice in known if choice not in imitating]
+    is_asked_for = evidence.of(without) - evidence.of(known, [drift]) > _MORE
+    return ([drift], imitating) if is_asked_for else ((), ())
 
 
 def _event(

@@ -1,4 +1,4 @@
-"""What the library lacks is not told under the name of what imitates it: an event, and a link that gives way."""
+"""What the library lacks is not told under the name of what imitates it: events, drifts, and links that give way."""
 
 from __future__ import annotations
 
@@ -64,3 +64,11 @@ def test_what_gives_way_keeps_its_name_beside_a_link_that_gives_way_otherwise(na
     gap = answer(f"{name}:{coefficients},{link}", without="lateral_compliance")
     assert [f"{e.family}@{e.where}" for e in gap.effects] == [name]
     assert "theta7 error by load" in str(gap.description)
+
+
+@pytest.mark.long
+def test_what_changes_steadily_is_not_told_as_a_step_beside_one_that_is_there() -> None:
+    settles = "base_settlement@base:tilt_x_rad_per_h=-3e-4:tilt_y_rad_per_h=4.7e-4:z_mm_per_h=-1.3"
+    gap = answer(f"zero_step@theta5:jump_rad=-4e-3:time_s=6000,{settles}", without="base_settlement")
+    assert [(e.family, e.where) for e in gap.effects] == [("zero_step", "theta5")]
+    assert "time, at all joints and all places" in str(gap.description)
