@@ -14,6 +14,7 @@
 from calibration.errors import CalibrationError, DataError, ModelError, RigError, UnsafeError
 from calibration.observations import Observations
 from calibration.rig.description import Rig
+from daemon.store.errors import StoreError
 from daemon.version import VERSION
 from rigcal.calibration_api import Model, calibrate, find_gap, plan
 from rigcal.store_api import Store, open_store
@@ -29,6 +30,7 @@ __all__ = [
     "Rig",
     "RigError",
     "Store",
+    "StoreError",
     "UnsafeError",
     "__version__",
     "calibrate",

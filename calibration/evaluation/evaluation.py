@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -21,11 +21,13 @@ from calibration.model.prediction import Predictor
 from calibration.model.rebase import with_refitted_base
 from calibration.model.warnings import model_warnings
 from calibration.numerics.single_thread import one_blas_thread
-from calibration.observations import Floats, Observations, data_sha256, originals
+from calibration.observations import Floats, Observations, are_among, data_sha256, originals
 from calibration.residual.learners import tree_importance
 
 _STRANGE = 3.0  # times the expected error, in the median; a right model's are 0.9
+_STRANGE_BODY = 30.0  # times the scatter of the training; models far from home reach some 10
 _LEAST_TO_JUDGE = 10
+_NAMED = 5  # rows
 _FEATURES_SHOWN = 10  # as in Zhou et al. 2022, Fig. 10
 STAGES = ("nominal", "geometric", "effects", "hybrid")
 
@@ -40,6 +42,7 @@ class Evaluation:
         errors_mm: stage -> (n, 3) measured minus modelled, in the station's frame.
         sigma_mm: (n, 3) standard deviation that the model expects of the hybrid stage's errors.
         outliers: rows farther off than noise explains.
+        fitted: how many of the rows the model was fitted to.
         warnings: about model and data.
         axes: the model held against the axes that single-joint sweeps among the rows show.
         expected: accuracy that the model expects over the work volume; None where the rig can take no pose.
@@ -50,6 +53,7 @@ class Evaluation:
     errors_mm: Mapping[str, Floats]
     sigma_mm: Floats
     outliers: tuple[Outlier, ...]
+    fitted: int
     warnings: tuple[str, ...]
     axes: tuple[AxisCheck, ...]
     expected: ExpectedAccuracy | None
@@ -67,6 +71,7 @@ class Evaluation:
         return {
             "rig": self.model.rig.name,
             "n": len(self),
+            "fitted": self.fitted,
             "seconds": seconds,
             "stages": self.stages(),
             "per_prism": {prism: self.stages(prism) for prism in np.unique(self.observations.prism).tolist()},
@@ -125,7 +130,16 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
     warnings += [
         w for w in (*row_warnings(model.rig, observations), *([rounded] if rounded else [])) if w not in warnings
     ]
-    warnings += _strange(errors["hybrid"], prediction.sigma_mm)
+    fitted = int(are_among(observations, model.fitted_rows).sum())
+    if model.provenance.get("data_sha256") == data_sha256(observations, model.rig):
+        fitted = len(observations)
+    strange = list(_strange(errors["hybrid"], prediction.sigma_mm))
+    if refit_base and not strange:
+        strange = list(_strange_body(errors["hybrid"], model.noise_mm))
+    outliers = Predictor.of(effects).find_outliers(observations)
+    warnings += strange
+    if outliers and not strange and fitted < len(observations):
+        warnings.append(_far_off(observations, outliers))
     axes = _axes(effects, observations)
     warnings += [w for w in disagreements(axes) if w not in warnings]
     return Evaluation(
@@ -133,7 +147,8 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
         observations,
         errors,
         prediction.sigma_mm,
-        Predictor.of(effects).find_outliers(observations),
+        outliers,
+        fitted,
         tuple(warnings),
         axes,
         _expected(model),
@@ -155,6 +170,31 @@ def _strange(error_mm: Floats, sigma_mm: Floats) -> Iterator[str]:
             f"the model does not describe this data: half of the fixes are off by more than {times:,.0f} times the "
             f"expected; another machine or rig file, a moved base or prism, or a column that was read differently"
         )
+
+
+def _strange_body(error_mm: Floats, noise_mm: float) -> Iterator[str]:
+    """Warn of errors that a base fitted to these very rows leaves, far beyond the scatter of the training.
+
+    The base's own uncertainty counts that scatter, so that it explains errors of any size.
+    """
+    times = float(np.median(sizes_mm(error_mm))) / noise_mm
+    if len(error_mm) >= _LEAST_TO_JUDGE and times > _STRANGE_BODY:
+        yield (
+            f"the model does not describe this data, wherever its base stands: half of the fixes are off by more than "
+            f"{times:,.0f} times the scatter of its training; another machine or rig file, a moved prism, or a column "
+            f"that was read differently"
+        )
+
+
+def _far_off(observations: Observations, outliers: Sequence[Outlier]) -> str:
+    """Return a sentence on the rows that are farther off than noise explains, the farthest first."""
+    worst = sorted(outliers, key=lambda outlier: -outlier.sigma)
+    named = observations.row_name(*(outlier.row for outlier in worst[:_NAMED]))
+    more = f" and {len(worst) - _NAMED} more" if len(worst) > _NAMED else ""
+    return (
+        f"{len(worst)} of {len(observations)} fixes are farther off than noise explains, up to {worst[0].sigma:,.0f} "
+        f"sigma, in {named}{more}: the errors count them"
+    )
 
 
 def _axes(model: CalibratedModel, observations: Observations) -> tuple[AxisCheck, ...]:

@@ -12,7 +12,7 @@ from calibration.errors import CalibrationError
 from calibration.evaluation.evaluation import Evaluation, evaluate, instrument_noise_mm, sizes_mm
 from calibration.experiments.residual_comparison import RESIDUALS, MethodResult, compare_residuals, families
 from calibration.identification.refinement import Prior
-from calibration.observations import Floats, Observations
+from calibration.observations import Floats, Observations, are_among, row_digests
 from calibration.pipeline.calibrate import calibrate, identify, require_known_setups, train_residual
 from calibration.rig.description import Rig
 from calibration.run_settings import DEFAULT_RUN, Run
@@ -191,8 +191,7 @@ def shared_rows(training: Observations, held_out: Observations, names: tuple[str
     """
     joints = tuple(training.joints)
     readings = [_keys(o.setup, *(o.joints[name] for name in joints)) for o in (training, held_out)]
-    rows = [_keys(key, o.prism, *o.position_mm.T) for key, o in zip(readings, (training, held_out), strict=True)]
-    same = np.isin(rows[1], rows[0])
+    same = are_among(held_out, row_digests(training))
     pose = np.isin(readings[1], readings[0]) & ~same
     found = []
     first_same, first_pose = (held_out.row_name(int(np.argmax(rows))) for rows in (same, pose))

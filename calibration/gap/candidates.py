@@ -63,10 +63,12 @@ class CandidateEffects:
     Attributes:
         candidates: effects that these data can show.
         disabled: family -> what the data or the rig lack for it.
+        partly_known: sentences on effects that were not looked for at a place, as most rows lack what they need there.
     """
 
     candidates: tuple[CandidateEffect, ...]
     disabled: Mapping[str, str]
+    partly_known: tuple[str, ...] = ()
 
 
 def candidate_effects(
@@ -94,6 +96,7 @@ def candidate_effects(
             for name, where, choices in found
         ),
         disabled,
+        tuple(_partly_known(situation, families)),
     )
 
 
@@ -132,6 +135,23 @@ def _possible(
             disabled[name] = "these poses show nothing of it"
         found += [one for one in here if one[2]]
     return found, disabled
+
+
+def _partly_known(situation: EffectContext, families: Collection[str]) -> Iterator[str]:
+    """Yield a sentence for each need that most rows lack and some have: what goes by it may bear another name."""
+    lacking: dict[tuple[str, int], list[str]] = {}
+    for name in sorted(families):
+        family = library()[name]
+        for where in family.places(situation.rig):
+            known = family.known(situation, where)
+            if 0.0 < known.mean() < LEAST_KNOWN:
+                need = family.needs(where), int(known.sum())
+                lacking.setdefault(need, []).append(f"{name}@{where}")
+    for (needs, rows), names in lacking.items():
+        yield (
+            f"not looked for: {', '.join(names)}; it needs {needs}, which {rows} of {len(situation)} rows have, fewer "
+            "than half: what these do may be told under another name"
+        )
 
 
 def _log_priors(names: Sequence[str], again: Collection[str]) -> dict[str, float]:

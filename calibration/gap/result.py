@@ -213,6 +213,7 @@ class GapResult:
         observations, error_before_mm, error_after_mm: the rows with (n, 3) errors, station's frame.
         warnings: sentences.
         machine_break: an instant after which the machine is another; None for none.
+        shared: how many of the held-out rows are rows that were fitted.
     """
 
     verdict: Verdict
@@ -239,6 +240,7 @@ class GapResult:
     error_after_mm: Floats
     warnings: tuple[str, ...] = ()
     machine_break: Break | None = None
+    shared: int = 0
 
     @property
     def raises_held_out(self) -> bool:

@@ -168,6 +168,7 @@ class _Document(_Part):
     residual_reason: str
     intervals: _Intervals
     warnings: tuple[str, ...]
+    fitted_rows: tuple[str, ...] = ()  # models from before have none
     provenance: dict[str, str | int | Finite]
 
 

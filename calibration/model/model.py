@@ -139,6 +139,7 @@ class CalibratedModel:
         residual_reason: why there is a learner or none.
         intervals: how many standard deviations hold 90 % of errors.
         warnings: about the training data and the fit.
+        fitted_rows: digests of the rows that were fitted (`observations.row_digests`); none of a model from before.
         provenance: data hash, versions, seed, search; text or numbers.
         prepared: objects made from the model once and kept with it, by their class; see `Predictor.of`.
     """
@@ -167,6 +168,7 @@ class CalibratedModel:
     intervals: Intervals = field(default_factory=Intervals)
     base_covariance: Floats | None = None
     warnings: tuple[str, ...] = ()
+    fitted_rows: tuple[str, ...] = ()
     provenance: Mapping[str, str | int | float] = field(default_factory=dict)
     prepared: dict[type, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 

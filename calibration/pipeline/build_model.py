@@ -21,7 +21,7 @@ from calibration.model.intervals import with_intervals
 from calibration.model.joint_errors import joint_error_scale
 from calibration.model.model import CalibratedModel, Coverage
 from calibration.model.prediction import Predictor
-from calibration.observations import Observations, data_sha256, is_original
+from calibration.observations import Observations, data_sha256, is_original, row_digests
 from calibration.pipeline.training_warnings import training_warnings
 from calibration.rig.description import Rig
 
@@ -74,6 +74,7 @@ def build_model(
             _payload(observations),
             _loads(adopted, situation),
         ),
+        fitted_rows=tuple(row_digests(distinct)),
         provenance={
             "data_sha256": data_sha256(observations, rig),
             "rig_sha256": hashlib.sha256(rig_text.encode()).hexdigest(),

@@ -24,7 +24,7 @@ from calibration.identification.samples import Samples
 from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor
 from calibration.model.warnings import model_warnings
-from calibration.observations import Floats, Observations
+from calibration.observations import Floats, Observations, are_among
 from calibration.pipeline.build_model import build_model
 from calibration.pipeline.calibrate import require_known_setups
 from calibration.pipeline.methods import effects_rng, find_effects
@@ -144,6 +144,7 @@ def _answer(
         error_before_mm=error_before,
         error_after_mm=error_after,
         warnings=tuple(_warnings(rest, model, holdout)),
+        shared=0 if holdout is None else int(are_among(holdout, model.fitted_rows).sum()),
     )
 
 
@@ -228,6 +229,7 @@ def _warnings(
     found = rest.found
     yield from model.warnings
     yield from rest.open_places()
+    yield from found.candidates.partly_known
     if holdout is not None:
         yield from (f"in the held-out rows: {warning}" for warning in model_warnings(model, holdout))
     if found.formulas and found.adopted.effects:

@@ -20,6 +20,7 @@ from drivers.clock import NS_PER_S, SystemClock
 if TYPE_CHECKING:
     from calibration.observations import Floats, Observations
     from calibration.rig.description import Rig
+    from daemon.report.front import Verdict
 
 DATA_MAX_BYTES = 128 << 20  # half a million fixes
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
@@ -264,9 +265,14 @@ def judged(
     if verdict is None:
         return result
     if not as_json:
-        colour = {"passed": "green", "failed": "red", "not judged": "yellow"}[verdict.outcome]
-        echo(verdict.sentence, fg=colour, bold=True)
+        show_verdict(verdict)
     return result | {"tolerance": verdict.as_dict()}
+
+
+def show_verdict(verdict: Verdict) -> None:
+    """Print the verdict on a tolerance, in its colour."""
+    colour = {"passed": "green", "failed": "red", "not judged": "yellow"}[verdict.outcome]
+    echo(verdict.sentence, fg=colour, bold=True)
 
 
 def _show_axes(axes: Sequence[Mapping[str, Any]]) -> None:

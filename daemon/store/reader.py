@@ -57,7 +57,7 @@ class Reader:
                 "ran; `rigcal status` says what to do"
             )
         if not path.is_file():
-            raise StoreError(f"{path}: there is no store; start the daemon, or give the file with --store")
+            raise StoreError(f"{path}: there is no store; the daemon makes one when it starts")
         # Never immutable=1: the file changes under a live daemon.
         self._connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
         self._connection.row_factory = sqlite3.Row

@@ -86,6 +86,7 @@ def compare(
     from calibration.experiments.comparison import compare as compare_methods
     from calibration.experiments.comparison import shared_rows
     from calibration.experiments.zhou2022.protocol import run_protocol
+    from calibration.observations import are_among, row_digests
     from calibration.run_settings import Run
     from daemon.report.comparison import comparison_page
     from daemon.report.front import Facts
@@ -149,8 +150,9 @@ def compare(
     if own is None or own.error_mm is None:
         return result
     rms_mm = float((own.error_mm**2).mean() ** 0.5)
-    rows = f"on {len(held_out)} held-out fixes by rigcal"
-    return offline.judged(result, tolerance_mm, rms_mm, rows, is_held_out=True, as_json=as_json)
+    shared = int(are_among(held_out, row_digests(training)).sum())
+    rows = f"on {len(held_out)} held-out fixes by rigcal" + (f", {shared} of which it was fitted to" if shared else "")
+    return offline.judged(result, tolerance_mm, rms_mm, rows, is_held_out=not shared, as_json=as_json)
 
 
 def show_comparison(comparison: Comparison) -> None:

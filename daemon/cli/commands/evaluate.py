@@ -18,6 +18,8 @@ from daemon.cli.offline import (
 )
 from daemon.warm_up import prepare
 
+_FIXES_OF_A_BASE = 8  # of a set-up, below which a base of six parameters fits most of their errors
+
 
 @click.command(cls=Command)
 @model_option
@@ -36,16 +38,20 @@ def evaluate(
     watch = Stopwatch()
     prepare()
     from calibration.evaluation.evaluation import evaluate as evaluate_model
-    from calibration.observations import data_sha256
     from daemon.models.model_files import read_model
 
     model = read_model(directory)
     observations, _ = read_observations(data, model.rig)
     evaluation = evaluate_model(model, observations, refit_base=refit_base)
     result = evaluation.as_dict(watch.seconds)
-    if not as_json:
-        show_evaluation(result, f"the {len(evaluation)} fixes of {data.name}")
-    is_held_out = data_sha256(observations, model.rig) != model.provenance.get("data_sha256")
-    rms_mm = float(evaluation.stages()[-1]["rms_mm"])
     rows = f"on the {len(evaluation)} fixes of {data.name}"
+    if evaluation.fitted:
+        rows += f", {evaluation.fitted} of which it was fitted to"
+    if not as_json:
+        show_evaluation(result, rows.removeprefix("on "))
+    rms_mm = float(evaluation.stages()[-1]["rms_mm"])
+    is_base_free = refit_base and len(evaluation) < _FIXES_OF_A_BASE * len(evaluation.model.placements)
+    is_held_out = not (evaluation.fitted or is_base_free)
+    if is_base_free:
+        rows += ", too few beside the base that was fitted on them"
     return judged(result, tolerance_mm, rms_mm, rows, is_held_out=is_held_out, as_json=as_json)

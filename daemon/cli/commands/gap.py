@@ -66,6 +66,7 @@ def gap(
     from daemon.models.gap_files import REPORT, check_gap_target, gap_answer, write_gap
     from daemon.report.calibration.from_model import facts_of, provenance
     from daemon.report.gap.page import gap_report
+    from daemon.report.gap.words import tolerance_verdict
     from daemon.rig_files import load_rig
 
     source = load_rig(rig, signals)
@@ -86,10 +87,13 @@ def gap(
         found = replace(found, warnings=(*overlap, *found.warnings))
         facts = facts_of(observations, found.model, name=out.name, made_utc_ns=watch.utc_ns, tolerance_mm=tolerance_mm)
         document = gap_report(found, provenance(found.model, watch.utc_ns, files), facts)
-        result = gap_answer(found, watch.seconds)
+        verdict = tolerance_verdict(found, tolerance_mm)
+        result = gap_answer(found, watch.seconds) | ({} if verdict is None else {"tolerance": verdict.as_dict()})
         write_gap(out, found, result, document)
     if not as_json:
         show_gap(found)
+        if verdict is not None:
+            offline.show_verdict(verdict)
         echo(f"Model: {out / 'model'}   report: {out / REPORT}   {result['seconds']} s")
     return result
 

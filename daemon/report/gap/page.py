@@ -15,16 +15,16 @@ from calibration.effects.library import library
 from calibration.gap.result import Candidate, Forecast, GapResult
 from daemon.report import drawing, markup
 from daemon.report.calibration.from_model import facts_of
-from daemon.report.front import Accuracy, Facts, front, judge, signatures
+from daemon.report.front import Accuracy, Facts, front, signatures
 from daemon.report.gap import figures
 from daemon.report.gap.figures import Bar, Interval
 from daemon.report.gap.words import (
-    HELD_OUT_IN_TURN,
     before_and_after,
     closed_share,
     dependence,
     gap_headline,
     remaining,
+    tolerance_verdict,
 )
 from daemon.report.plain_names import coefficient_words, in_words, unit_words
 from daemon.report.words import (
@@ -120,8 +120,7 @@ def coefficient_bounds(gap: GapResult, effect: FittedEffect) -> dict[str, tuple[
 
 def _head(gap: GapResult, facts: Facts) -> str:
     before, after, rows = before_and_after(gap)
-    is_held_out = gap.held_out is not None or rows == HELD_OUT_IN_TURN
-    verdict = judge(facts.tolerance_mm, after, is_held_out=is_held_out, rows=rows)
+    verdict = tolerance_verdict(gap, facts.tolerance_mm)
     accuracy = Accuracy(
         f"Accuracy: {number(after)} mm root mean square {rows}; the noise is {number(gap.noise_mm)} mm."
     )

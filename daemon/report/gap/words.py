@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from calibration.gap.result import GapResult
+from daemon.report.front import Verdict, judge
 from daemon.report.words import number, place_name, spoken
-
-HELD_OUT_IN_TURN = "on poses held out in turn"
 
 
 def gap_headline(gap: GapResult) -> str:
@@ -21,7 +20,8 @@ def _verdict(gap: GapResult) -> str:
     if gap.verdict == "named":
         return f"The simulation lacked {spoken([(e.family, e.where) for e in gap.effects])}."
     if gap.verdict == "none":
-        return "Simulation and measurement agree within the noise."
+        but = f", but for {_outliers(gap)}: look at these first" if gap.model.outliers else ""
+        return f"Simulation and measurement agree within the noise{but}."
     if gap.verdict == "indistinguishable":
         one_of = " or ".join(place_name(c.family, c.where) for c in gap.indistinguishable)
         return f"The simulation lacks {one_of}: this data cannot tell which."
@@ -31,10 +31,32 @@ def _verdict(gap: GapResult) -> str:
 def before_and_after(gap: GapResult) -> tuple[float, float, str]:
     """Return the error in mm without and with the effects, and its rows: held-out ones if there are any."""
     if gap.held_out is not None:
-        return *gap.held_out, "on the held-out file"
+        shared = f", {gap.shared} rows of which were fitted" if gap.shared else ""
+        return *gap.held_out, f"on the held-out file{shared}"
     if gap.rounds and not gap.rounds[-1].adopted:
-        return gap.rounds[0].held_out_mm, gap.rounds[-1].held_out_mm, HELD_OUT_IN_TURN
+        left_out = f", {_outliers(gap)} left out" if gap.model.outliers else ""
+        return gap.rounds[0].held_out_mm, gap.rounds[-1].held_out_mm, f"on poses held out in turn{left_out}"
     return gap.before_mm, gap.after_mm, "on the fixes themselves"
+
+
+def tolerance_verdict(gap: GapResult, tolerance_mm: float | None) -> Verdict | None:
+    """Hold the error with the effects against a tolerance; only rows that nothing was fitted to can pass, all of them.
+
+    Args:
+        gap: the answer.
+        tolerance_mm: root mean square error that the machine may have; None where none is stated.
+    """
+    _, after_mm, rows = before_and_after(gap)
+    in_turn = gap.held_out is None and bool(gap.rounds) and not gap.rounds[-1].adopted and not gap.model.outliers
+    is_held_out = in_turn or (gap.held_out is not None and not gap.shared)
+    return judge(tolerance_mm, after_mm, is_held_out=is_held_out, rows=rows)
+
+
+def _outliers(gap: GapResult) -> str:
+    """Return how many outliers there are, and how far off."""
+    worst = max(outlier.sigma for outlier in gap.model.outliers)
+    some = f"{len(gap.model.outliers)} of {len(gap.observations)} fixes"
+    return f"{some} that are up to {worst:,.0f} sigma off"
 
 
 def closed_share(before_mm: float, after_mm: float, noise_mm: float) -> float | None:

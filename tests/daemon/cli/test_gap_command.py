@@ -39,7 +39,7 @@ def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def found(directory: Path) -> dict[str, Any]:
     """What the command finds in a session of a boom with a backlash at theta4."""
     files = ("--data", directory / "session.csv", "--holdout", directory / "held_out.csv", "--out", directory / "out")
-    result = run("gap", "--rig", "swdt82", *files, "--json")
+    result = run("gap", "--rig", "swdt82", *files, "--tolerance", "1000", "--json")
     assert result.exit_code == 0, result.stderr
     answer: dict[str, Any] = json.loads(result.stdout)
     return answer
@@ -76,6 +76,7 @@ def test_the_files_hold_the_answer_the_report_and_a_model_that_can_be_used(
 
 def test_held_out_rows_that_are_training_rows_are_named(found: dict[str, Any]) -> None:
     assert found["warnings"][0].startswith("1 of the 41 rows of held_out.csv are rows of session.csv as well")
+    assert found["tolerance"]["verdict"] == "not judged"
 
 
 def test_people_get_the_verdict_the_size_and_what_could_not_be_looked_for(capsys: pytest.CaptureFixture[str]) -> None:

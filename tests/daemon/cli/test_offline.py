@@ -23,7 +23,7 @@ from tests.commands import run
 from tests.daemon.offline_support import held_out_csv, small_calibration, train_csv
 
 KEYS = [
-    "rig", "n", "seconds", "stages", "per_prism", "effects", "residual", "residual_reason", "noise_mm",
+    "rig", "n", "fitted", "seconds", "stages", "per_prism", "effects", "residual", "residual_reason", "noise_mm",
     "identifiability", "warnings", "ignored_columns", "expected_accuracy", "axes", "importance", "intervals",
 ]  # fmt: skip
 STAGES = ["nominal", "geometric", "effects", "hybrid"]
@@ -122,6 +122,47 @@ def test_evaluate_holds_the_error_against_a_tolerance(work: Path, tolerance_mm: 
     answer = json.loads(run(*asked, "--json").stdout)
     assert answer["tolerance"]["verdict"] == verdict
     assert answer["tolerance"]["rms_mm"] == answer["stages"][-1]["rms_mm"]
+
+
+def test_no_rewritten_file_of_the_training_passes(work: Path, tmp_path: Path) -> None:
+    head, *rows = train_csv().decode().splitlines()
+    other = held_out_csv().decode().splitlines()[1:]
+    for name, kept in {"turned.csv": rows[::-1], "mixed.csv": [*rows[:5], *other]}.items():
+        (tmp_path / name).write_text("\n".join([head, *kept]) + "\n", encoding="utf-8")
+    for name, fitted in {"turned.csv": len(rows), "mixed.csv": 5}.items():
+        asked = ("evaluate", "--model", work / "model", "--data", tmp_path / name, "--tolerance", "1000")
+        answer = json.loads(run(*asked, "--json").stdout)
+        assert (answer["fitted"], answer["tolerance"]["verdict"]) == (fitted, "not judged")
+    assert f"{fitted} of which it was fitted to" in " ".join(run(*asked).stdout.split())
+
+
+def test_a_base_that_was_fitted_on_few_fixes_passes_no_tolerance(work: Path, tmp_path: Path) -> None:
+    rows = held_out_csv().decode().splitlines()[:6]
+    (tmp_path / "few.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    asked = (
+        "evaluate",
+        "--model",
+        work / "model",
+        "--data",
+        tmp_path / "few.csv",
+        "--refit-base",
+        "--tolerance",
+        "1000",
+    )
+    assert json.loads(run(*asked, "--json").stdout)["tolerance"]["verdict"] == "not judged"
+
+
+def test_gross_errors_are_told_by_their_lines(work: Path, tmp_path: Path) -> None:
+    head, *rows = held_out_csv().decode().splitlines()
+    at = head.split(",").index("x_mm")
+    cells = [row.split(",") for row in rows]
+    for row in (3, 7):
+        cells[row][at] = str(float(cells[row][at]) + 3000.0)
+    (tmp_path / "gross.csv").write_text("\n".join([head, *map(",".join, cells)]) + "\n", encoding="utf-8")
+    answer = json.loads(run("evaluate", "--model", work / "model", "--data", tmp_path / "gross.csv", "--json").stdout)
+    (told,) = [text for text in answer["warnings"] if "farther off than noise explains" in text]
+    assert told.startswith("2 of 60 fixes")
+    assert "lines 5, 9" in told or "lines 9, 5" in told
 
 
 def test_evaluate_answers_with_the_contract(work: Path) -> None:

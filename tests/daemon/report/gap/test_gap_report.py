@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from calibration.gap.result import Disagreement, GapResult, Round
+from calibration.model.model import Outlier
 from daemon.report.drawing import picture, styled
 from daemon.report.gap.figures import apparent, error_maps
 from daemon.report.gap.page import bars, gap_report, intervals
-from daemon.report.gap.words import before_and_after, closed_share, gap_headline
+from daemon.report.gap.words import before_and_after, closed_share, gap_headline, tolerance_verdict
 from daemon.report.words import odds, readable_unit, spoken
 from tests.daemon import gap_support as support
 from tests.daemon.report.calibration.test_report import Outline
@@ -39,6 +40,19 @@ def pending() -> Outline:
     """A set, of data with a temperature, with a held-out file."""
     gap = replace(support.pending(), observations=support.of_time(support.named()), held_out=(11.0, 10.9))
     return outline(gap)
+
+
+def test_what_leaves_fixes_out_does_not_pass_and_says_so() -> None:
+    gap = support.nothing()
+    with_outliers = replace(gap, model=replace(gap.model, outliers=(Outlier(3, 120.0), Outlier(9, 4000.0))))
+    verdicts = [tolerance_verdict(found, 1e3) for found in (gap, with_outliers)]
+    assert [verdict and verdict.outcome for verdict in verdicts] == ["passed", "not judged"]
+    assert "but for 2 of 120 fixes that are up to 4,000 sigma off" in gap_headline(with_outliers)
+    shared = replace(gap, held_out=(2.0, 2.0), shared=4)
+    assert [(v := tolerance_verdict(g, 1e3)) and v.outcome for g in (shared, replace(shared, shared=0))] == [
+        "not judged",
+        "passed",
+    ]
 
 
 def test_the_report_of_a_named_effect_has_every_section(named: Outline) -> None:
