@@ -133,18 +133,30 @@ def event_blocks(
     time_s = context.extra("time_s")
     grid = {step["time_s"] for step in step_grid(time_s)}
     for at_s in sorted(grid | set(instants_s)):
-        name = f"event({at_s})"
-        after = (time_s > at_s).astype(np.float64)[:, None]
-        text = f"more has changed at time_s = {at_s:g} than one effect says"
-        yield Block(name, "event", "station", text, _of_all(context, name, after, np.ones(1)).over(average), at_s)
+        yield event_block(context, average, time_s, at_s)
 
 
-def drift_block(context: EffectContext, average: Callable[[Floats], Floats]) -> Block:
-    """Return what may change steadily with time: zeros of all joints, and displacements linear in the place.
+def event_block(context: EffectContext, average: Callable[[Floats], Floats], of_row: Floats, border: float) -> Block:
+    """Return what may be another beyond a border: zeros of all joints, and displacements linear in the place.
 
-    Arguments are those of `smooth_blocks`.
+    Args:
+        context: of n observations.
+        average: as of `smooth_blocks`.
+        of_row: (n,) time in s, or whatever else the rows are ordered by.
+        border: of it.
     """
-    t = 2.0 * _unit(context.extra("time_s")) - 1.0
+    name = f"event({border})"
+    after = (of_row > border).astype(np.float64)[:, None]
+    text = f"more has changed at time_s = {border:g} than one effect says"
+    return Block(name, "event", "station", text, _of_all(context, name, after, np.ones(1)).over(average), border)
+
+
+def drift_block(context: EffectContext, average: Callable[[Floats], Floats], of_row: Floats) -> Block:
+    """Return what may change steadily: zeros of all joints, and displacements linear in the place.
+
+    Arguments are those of `event_block`.
+    """
+    t = 2.0 * _unit(of_row) - 1.0
     columns = _of_all(context, "drift", np.stack([t, t * t], axis=1), np.ones(2))
     return Block("drift", "drift", "station", "time, at all joints and all places", columns.over(average))
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.gap.background.blocks import time_blocks
+from calibration.gap.background.blocks import drift_block, event_block, time_blocks
 from calibration.gap.background.search import ODDS, background_log_bayes_factor
 from calibration.gap.joint_fit import JointFit, Problem
 from calibration.gap.projection import Projection, from_products, rows_of
@@ -45,19 +45,33 @@ def find_break(problem: Problem, joint: JointFit) -> Break | None:
     weight = np.minimum(1.0, (_GROSS * np.median(size) / np.maximum(size, 1e-9)) ** 2)
     counted = replace(joint, fit=replace(joint.fit, weight=weight))
     projection, values = problem.project(counted), samples.average(of_row[:, None])[:, 0]
-    found = max(_two_machines(projection, values), default=None)
+    coarse = borders(values, _BORDERS)
+    found = max(_two_machines(projection, values, coarse), default=None)
     if found is None or found[0] < ODDS:
         return None
-    wandering = time_blocks(joint.situation, samples.average, fine=True)
-    if found[0] < background_log_bayes_factor(problem, joint, wandering) + ODDS:
+    found = max(_two_machines(projection, values, _between_neighbours(values, coarse, found[1])))
+    # The scatter of one machine is what two would explain: all that is compared is given scatter of its own.
+    context, border = joint.situation, found[1]
+    another = event_block(context, samples.average, of_row, border)
+    wandering = [*time_blocks(context, samples.average, fine=True), drift_block(context, samples.average, of_row)]
+    evidence = max(found[0], background_log_bayes_factor(problem, joint, [another]))
+    if evidence < background_log_bayes_factor(problem, joint, wandering) + ODDS:
         return None
-    before = int((values <= found[1]).sum())
-    return Break(variable, found[1], before, len(values) - before, found[0])
+    before = int((values <= border).sum())
+    return Break(variable, border, before, len(values) - before, evidence)
 
 
-def _two_machines(projection: Projection, values: Floats) -> list[tuple[float, float]]:
-    """Return log Bayes factor and border of two machines for every border between values (m,)."""
-    each = borders(values, _BORDERS)
+def _between_neighbours(values: Floats, coarse: Floats, border: float) -> Floats:
+    """Return all borders between values (m,) from the coarse border before one to that after it."""
+    at = int(np.searchsorted(coarse, border))
+    first, last = coarse[max(at - 1, 0)], coarse[min(at + 1, len(coarse) - 1)]
+    distinct = np.unique(values)
+    every = 0.5 * (distinct[:-1] + distinct[1:])
+    return every[(every >= first) & (every <= last)]
+
+
+def _two_machines(projection: Projection, values: Floats, each: Floats) -> list[tuple[float, float]]:
+    """Return log Bayes factor and border of two machines for every one of some borders between values (m,)."""
     slice_of = np.searchsorted(each, values)
     kinematics = projection.kinematics[:, : projection.jacobian.shape[2]]
     index = [rows_of(np.flatnonzero(slice_of == number)) for number in range(len(each) + 1)]

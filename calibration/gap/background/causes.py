@@ -100,7 +100,8 @@ def _drift(
     problem: Problem, known: Sequence[Choice], steps: Sequence[Choice]
 ) -> tuple[Sequence[Block], Sequence[Choice]]:
     """Return the drift that the errors ask for in place of steps, and the steps that it makes superfluous."""
-    drift = drift_block(problem.kinematics_only().situation, problem.solution.samples.average)
+    context = problem.kinematics_only().situation
+    drift = drift_block(context, problem.solution.samples.average, context.extra("time_s"))
     evidence = _Evidence(problem, known, [drift])
     whole = evidence.of(known)
     imitating = [step for step in steps if whole - evidence.of([c for c in known if c is not step]) < ODDS_OF_TWO]

@@ -82,6 +82,20 @@ def test_a_machine_that_is_another_from_an_instant_on_is_found_and_told() -> Non
     assert gap.as_dict()["break"] == gap.machine_break.as_dict()
 
 
+def test_a_base_that_moved_far_in_rows_without_times_is_a_break_at_its_row() -> None:
+    rows = drawn("null", 0.0, 1945)
+    moved_mm = np.where(np.arange(len(rows)) < len(rows) // 2, 0.0, 300.0)
+    rows = replace(
+        rows,
+        position_mm=rows.position_mm + moved_mm[:, None] * [1.0, 0.0, 0.0],
+        extra={name: column for name, column in rows.extra.items() if name != "time_s"},
+    )
+    gap = find_gap(SOURCE.rig, SOURCE.text, rows)
+    assert gap.machine_break is not None
+    assert (gap.machine_break.variable, gap.machine_break.border) == ("row", len(rows) // 2 - 0.5)
+    assert "column setup" in (gap.description or "")
+
+
 def test_one_machine_has_no_break() -> None:
     gap = find_gap(SOURCE.rig, SOURCE.text, drawn("null", 0.0, 1945))
     assert (gap.verdict, gap.machine_break) == ("none", None)
