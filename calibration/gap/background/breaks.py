@@ -66,8 +66,9 @@ def _between_neighbours(values: Floats, coarse: Floats, border: float) -> Floats
     at = int(np.searchsorted(coarse, border))
     first, last = coarse[max(at - 1, 0)], coarse[min(at + 1, len(coarse) - 1)]
     distinct = np.unique(values)
-    every = 0.5 * (distinct[:-1] + distinct[1:])
-    return every[(every >= first) & (every <= last)]
+    every: Floats = 0.5 * (distinct[:-1] + distinct[1:])
+    found: Floats = every[(every >= first) & (every <= last)]
+    return found
 
 
 def _two_machines(projection: Projection, values: Floats, each: Floats) -> list[tuple[float, float]]:
