@@ -16,6 +16,7 @@ from calibration.gap.background.outside import (
     MOST_FORMULAS,
     cost_with_formulas,
     formula_block,
+    formulas_log_bayes_factor,
     formulas_suffice,
     is_in_library,
     what_is_left,
@@ -62,7 +63,7 @@ def search(
     found = _beside_background(problem, families, found)
     broken = find_break(problem, found.joint)
     if broken is not None:
-        by_formulas = found.joint.fit.cost - cost_with_formulas(problem, found.joint, found.strongest_formula)
+        by_formulas = formulas_log_bayes_factor(problem, found.joint, found.strongest_formula)
         found = replace(found, machine_break=broken if broken.log_bayes_factor > by_formulas else None)
     if seen is solution:
         return found

@@ -9,6 +9,7 @@ import numpy as np
 
 from calibration.effects.columns import NO_JOINT, EffectColumns
 from calibration.gap.background.blocks import Block
+from calibration.gap.background.search import background_log_bayes_factor
 from calibration.gap.candidates import CandidateEffect
 from calibration.gap.detection import detect
 from calibration.gap.formulas.grammar import Formula, Grammar
@@ -86,10 +87,27 @@ def cost_with_formulas(problem: Problem, joint: JointFit, formulas: tuple[Formul
         joint: kinematics and effects.
         formulas: those that count already; a few more are added.
     """
+    return _cost(problem, joint, _blocks(problem, joint, formulas))
+
+
+def formulas_log_bayes_factor(problem: Problem, joint: JointFit, formulas: tuple[Formula, ...]) -> float:
+    """Return the log Bayes factor of formulas beside effects, by the scatter of the fit or by what they leave of it.
+
+    Arguments are those of `cost_with_formulas`.
+    """
+    blocks = _blocks(problem, joint, formulas)
+    gained = joint.fit.cost - _cost(problem, joint, blocks)
+    return max(gained, background_log_bayes_factor(problem, joint, blocks))
+
+
+def _blocks(problem: Problem, joint: JointFit, formulas: tuple[Formula, ...]) -> list[Block]:
     for _ in range(MOST_FORMULAS):
         formulas += what_is_left(problem, joint, formulas)
-    solution = problem.solution
-    columns = [formula_block(formula, number).columns for number, formula in enumerate(formulas)]
+    return [formula_block(formula, number) for number, formula in enumerate(formulas)]
+
+
+def _cost(problem: Problem, joint: JointFit, blocks: Sequence[Block]) -> float:
+    solution, columns = problem.solution, [block.columns for block in blocks]
     start = np.append(joint.fit.x, np.zeros(sum(map(len, columns))))
     additions = along(solution, [*joint.parts, *columns])
     return refine(solution.chain, solution.samples, start, prior=problem.prior, additions=additions).cost
