@@ -138,7 +138,7 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
         strange = list(_strange_body(errors["hybrid"], model.noise_mm))
     outliers = Predictor.of(effects).find_outliers(observations)
     warnings += strange
-    if outliers and not strange and fitted < len(observations):
+    if outliers and not (strange or rounded) and fitted < len(observations):
         warnings.append(_far_off(observations, outliers))
     axes = _axes(effects, observations)
     warnings += [w for w in disagreements(axes) if w not in warnings]

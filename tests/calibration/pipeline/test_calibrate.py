@@ -48,6 +48,7 @@ def test_the_report_is_the_contracts_json_object(session: Session) -> None:
     assert list(report) == [
         "rig",
         "n",
+        "fitted",
         "seconds",
         "stages",
         "per_prism",
