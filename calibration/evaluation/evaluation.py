@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -19,15 +19,14 @@ from calibration.identification.sweeps.cross_check import AxisCheck, cross_check
 from calibration.model.model import CalibratedModel, Outlier
 from calibration.model.prediction import Predictor
 from calibration.model.rebase import with_refitted_base
-from calibration.model.warnings import model_warnings
+from calibration.model.warnings import farthest, model_warnings
 from calibration.numerics.single_thread import one_blas_thread
 from calibration.observations import Floats, Observations, are_among, data_sha256, originals
 from calibration.residual.learners import tree_importance
 
 _STRANGE = 3.0  # times the expected error, in the median; a right model's are 0.9
-_STRANGE_BODY = 30.0  # times the scatter of the training; models far from home reach some 10
+_STRANGE_BODY = 30.0  # times the scatter of the training: more than calibrated models leave far from home; not measured
 _LEAST_TO_JUDGE = 10
-_NAMED = 5  # rows
 _FEATURES_SHOWN = 10  # as in Zhou et al. 2022, Fig. 10
 STAGES = ("nominal", "geometric", "effects", "hybrid")
 
@@ -111,7 +110,9 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
         effects = with_refitted_base(replace(model, residual=None), observations)
         model = effects if model.residual is None else with_refitted_base(model, observations)
     prediction = Predictor.of(model).predict(observations)
-    warnings = _of_training(model, observations)
+    fitted = _fitted(model, observations)
+    is_training = fitted == len(observations)
+    warnings = [w if is_training else f"in training: {w}" for w in model.warnings]
     if refit_base:
         names = ", ".join(repr(s) for s in model.placements)
         fixes = len(np.unique(originals(observations)))
@@ -130,16 +131,14 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
     warnings += [
         w for w in (*row_warnings(model.rig, observations), *([rounded] if rounded else [])) if w not in warnings
     ]
-    fitted = int(are_among(observations, model.fitted_rows).sum())
-    if model.provenance.get("data_sha256") == data_sha256(observations, model.rig):
-        fitted = len(observations)
-    strange = list(_strange(errors["hybrid"], prediction.sigma_mm))
-    if refit_base and not strange:
-        strange = list(_strange_body(errors["hybrid"], model.noise_mm))
+    strange = list(_strange(errors["hybrid"], prediction.sigma_mm, model.noise_mm, refit_base=refit_base))
     outliers = Predictor.of(effects).find_outliers(observations)
     warnings += strange
-    if outliers and not (strange or rounded) and fitted < len(observations):
-        warnings.append(_far_off(observations, outliers))
+    if outliers and not (strange or rounded or is_training):
+        warnings.append(
+            f"{len(outliers)} of {len(observations)} fixes are farther off than noise explains, "
+            f"{farthest(observations, outliers)}: the errors count them"
+        )
     axes = _axes(effects, observations)
     warnings += [w for w in disagreements(axes) if w not in warnings]
     return Evaluation(
@@ -155,46 +154,31 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
     )
 
 
-def _of_training(model: CalibratedModel, observations: Observations) -> list[str]:
-    """The model's own warnings, told apart where the rows are not those that it was fitted to."""
-    if not model.warnings or model.provenance.get("data_sha256") == data_sha256(observations, model.rig):
-        return list(model.warnings)
-    return [f"in training: {warning}" for warning in model.warnings]
+def _fitted(model: CalibratedModel, observations: Observations) -> int:
+    """How many of the rows the model was fitted to; models from before know their rows by the whole table alone."""
+    if model.fitted_rows:
+        return int(are_among(observations, model.fitted_rows).sum())
+    is_same = model.provenance.get("data_sha256") == data_sha256(observations, model.rig)
+    return len(observations) if is_same else 0
 
 
-def _strange(error_mm: Floats, sigma_mm: Floats) -> Iterator[str]:
-    """Warn of errors far beyond the expected: the model is not of this machine, or no longer."""
-    times = float(np.median(sizes_mm(error_mm) / sizes_mm(sigma_mm)))
-    if len(error_mm) >= _LEAST_TO_JUDGE and times > _STRANGE:
-        yield (
-            f"the model does not describe this data: half of the fixes are off by more than {times:,.0f} times the "
-            f"expected; another machine or rig file, a moved base or prism, or a column that was read differently"
-        )
+def _strange(error_mm: Floats, sigma_mm: Floats, noise_mm: float, *, refit_base: bool) -> Iterator[str]:
+    """Warn of errors far beyond the expected: the model is not of this machine, or no longer.
 
-
-def _strange_body(error_mm: Floats, noise_mm: float) -> Iterator[str]:
-    """Warn of errors that a base fitted to these very rows leaves, far beyond the scatter of the training.
-
-    The base's own uncertainty counts that scatter, so that it explains errors of any size.
+    A base that was fitted to these very rows counts their scatter in its own uncertainty, which then explains errors
+    of any size: they are held against the scatter of the training as well.
     """
-    times = float(np.median(sizes_mm(error_mm))) / noise_mm
-    if len(error_mm) >= _LEAST_TO_JUDGE and times > _STRANGE_BODY:
+    size_mm = sizes_mm(error_mm)
+    times, most = float(np.median(size_mm / sizes_mm(sigma_mm))), _STRANGE
+    where, moved, scale = "", "a moved base or prism", "the expected"
+    if times <= most and refit_base:
+        times, most = float(np.median(size_mm)) / noise_mm, _STRANGE_BODY
+        where, moved, scale = ", wherever its base stands", "a moved prism", "the scatter of its training"
+    if len(error_mm) >= _LEAST_TO_JUDGE and times > most:
         yield (
-            f"the model does not describe this data, wherever its base stands: half of the fixes are off by more than "
-            f"{times:,.0f} times the scatter of its training; another machine or rig file, a moved prism, or a column "
-            f"that was read differently"
+            f"the model does not describe this data{where}: half of the fixes are off by more than {times:,.0f} times "
+            f"{scale}; another machine or rig file, {moved}, or a column that was read differently"
         )
-
-
-def _far_off(observations: Observations, outliers: Sequence[Outlier]) -> str:
-    """Return a sentence on the rows that are farther off than noise explains, the farthest first."""
-    worst = sorted(outliers, key=lambda outlier: -outlier.sigma)
-    named = observations.row_name(*(outlier.row for outlier in worst[:_NAMED]))
-    more = f" and {len(worst) - _NAMED} more" if len(worst) > _NAMED else ""
-    return (
-        f"{len(worst)} of {len(observations)} fixes are farther off than noise explains, up to {worst[0].sigma:,.0f} "
-        f"sigma, in {named}{more}: the errors count them"
-    )
 
 
 def _axes(model: CalibratedModel, observations: Observations) -> tuple[AxisCheck, ...]:

@@ -181,13 +181,16 @@ class _Task:
         return replace(run, should_stop=lambda: limit_s is not None and self.clock() - began > limit_s)
 
 
-def shared_rows(training: Observations, held_out: Observations, names: tuple[str, str]) -> tuple[str, ...]:
-    """Sentences about held-out rows that are no test, because the training rows have them or their standstill.
+def shared_rows(training: Observations, held_out: Observations, names: tuple[str, str]) -> tuple[int, tuple[str, ...]]:
+    """Look for held-out rows that are no test, because the training rows have them or their standstill.
 
     Args:
         training: rows that are fitted.
         held_out: rows that judge the fit.
         names: what to call either of them.
+
+    Returns:
+        How many held-out rows are training rows as well, and a sentence on each of both kinds.
     """
     joints = tuple(training.joints)
     readings = [_keys(o.setup, *(o.joints[name] for name in joints)) for o in (training, held_out)]
@@ -205,7 +208,7 @@ def shared_rows(training: Observations, held_out: Observations, names: tuple[str
             f"{pose.sum()} of the {len(held_out)} rows of {names[1]} were measured in poses of {names[0]}, all joints "
             f"reading the same, the first in {first_pose}: they share the errors of those readings"
         )
-    return tuple(found)
+    return int(same.sum()), tuple(found)
 
 
 def _keys(*columns: NDArray[np.str_] | Floats) -> NDArray[np.str_]:

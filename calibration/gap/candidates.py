@@ -63,12 +63,10 @@ class CandidateEffects:
     Attributes:
         candidates: effects that these data can show.
         disabled: family -> what the data or the rig lack for it.
-        partly_known: sentences on effects that were not looked for at a place, as most rows lack what they need there.
     """
 
     candidates: tuple[CandidateEffect, ...]
     disabled: Mapping[str, str]
-    partly_known: tuple[str, ...] = ()
 
 
 def candidate_effects(
@@ -96,7 +94,6 @@ def candidate_effects(
             for name, where, choices in found
         ),
         disabled,
-        tuple(_partly_known(situation, families)),
     )
 
 
@@ -137,7 +134,7 @@ def _possible(
     return found, disabled
 
 
-def _partly_known(situation: EffectContext, families: Collection[str]) -> Iterator[str]:
+def partly_known(situation: EffectContext, families: Collection[str]) -> Iterator[str]:
     """Yield a sentence for each need that most rows lack and some have: what goes by it may bear another name."""
     lacking: dict[tuple[str, int], list[str]] = {}
     for name in sorted(families):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from calibration.effects.context import EffectContext
 from calibration.effects.fitted import left_out
 from calibration.effects.library import library
 from calibration.kinematics.torques import torque_columns
-from calibration.model.model import CalibratedModel
+from calibration.model.model import CalibratedModel, Outlier
 from calibration.model.prediction import Predictor
 from calibration.observations import Floats, Observations
 from calibration.residual.features import DEFLECTION, missing_signals
@@ -30,6 +30,7 @@ _NEAR = 2.0  # times a unit: that unit
 _LEAST_ROWS = 10
 _LEAST_LOAD = 0.01  # of the largest load of any joint: less is nothing to compare with
 _SIGMAS = 3.0  # standard errors that a factor must have
+_LISTED = 5  # rows
 
 
 def model_warnings(model: CalibratedModel, observations: Observations) -> tuple[str, ...]:
@@ -152,6 +153,14 @@ def _of_residual(model: CalibratedModel, observations: Observations) -> Iterator
     strange = sorted(set(observations.prism.tolist()) - set(residual.prisms))
     if strange:
         yield f"the residual was not trained on prism {', '.join(strange)} and is left out there"
+
+
+def farthest(observations: Observations, outliers: Sequence[Outlier]) -> str:
+    """Return a clause on outliers, of which there are some: how far off they are, and where the farthest were read."""
+    worst = sorted(outliers, key=lambda outlier: -outlier.sigma)
+    rows = observations.row_name(*(outlier.row for outlier in worst[:_LISTED]))
+    more = f" and {len(worst) - _LISTED} more" if len(worst) > _LISTED else ""
+    return f"up to {worst[0].sigma:,.0f} sigma off, in {rows}{more}"
 
 
 def times_computed(context: EffectContext) -> Mapping[str, float]:

@@ -10,6 +10,7 @@ import numpy as np
 from calibration.effects.fitted import AppliedEffects
 from calibration.effects.library import library
 from calibration.evaluation.evaluation import require_positions
+from calibration.gap.candidates import partly_known
 from calibration.gap.detection import detect
 from calibration.gap.discrimination import propose_experiments
 from calibration.gap.forecast import forecasts
@@ -74,15 +75,16 @@ def find_gap(
         remedy = "hold out rows of those, or judge the model on these afterwards with evaluate --refit-base"
         require_known_setups(observations, holdout, remedy)
     observations = observations.numbered()
+    families = library() if families is None else families
     with run.workers() as pool:
         run = replace(run, executor=pool)
         rng = effects_rng(run.seed)
-        rest = find_effects(
-            rig, observations, library() if families is None else families, prior, run.part(0.0, 0.9), rng
-        )
+        rest = find_effects(rig, observations, families, prior, run.part(0.0, 0.9), rng)
         run.progress(0.9, "building the model")
         model = build_model(rig, rig_text, observations, rest.adopted, prior, {"seed": run.seed, "method": "gap"})
-        return _answer(rest, model, observations, holdout, run.seed, rng)
+        found = _answer(rest, model, observations, holdout, run.seed, rng)
+        unsought = partly_known(rest.found.joint.situation, families)
+        return replace(found, warnings=(*found.warnings, *unsought))
 
 
 def _answer(
@@ -229,7 +231,6 @@ def _warnings(
     found = rest.found
     yield from model.warnings
     yield from rest.open_places()
-    yield from found.candidates.partly_known
     if holdout is not None:
         yield from (f"in the held-out rows: {warning}" for warning in model_warnings(model, holdout))
     if found.formulas and found.adopted.effects:

@@ -13,7 +13,7 @@ from calibration.identification.reading_steps import rounding
 from calibration.identification.solve import Solution
 from calibration.model.model import CalibratedModel, Outlier
 from calibration.model.prediction import Predictor
-from calibration.model.warnings import times_computed, torque_unit_warnings
+from calibration.model.warnings import farthest, times_computed, torque_unit_warnings
 from calibration.observations import Observations
 from calibration.rig.description import ANOTHER_VALUE, BEYOND_BUILDING
 from calibration.rig.limits import beyond_limits, never_moved
@@ -120,15 +120,12 @@ def _seen_mm(model: CalibratedModel, observations: Observations, setup: str) -> 
 def _of_outliers(model: CalibratedModel, observations: Observations, solution: Solution) -> Iterator[str]:
     outliers = Predictor.of(model).find_outliers(observations)
     if outliers:
-        worst = sorted(outliers, key=lambda o: -o.sigma)
-        rows = observations.row_name(*(o.row for o in worst[:_LISTED]))
-        more = f" and {len(worst) - _LISTED} more" if len(worst) > _LISTED else ""
         share = (
             "were weighted out" if (solution.fit.weight < 1.0).any() else "count as much as all others in this method"
         )
         yield (
-            f"{len(worst)} of {len(observations)} training fixes are outliers and {share}, up to {worst[0].sigma:.0f} "
-            f"sigma off, in {rows}{more}{_where_together(observations, outliers)}"
+            f"{len(outliers)} of {len(observations)} training fixes are outliers and {share}, "
+            f"{farthest(observations, outliers)}{_where_together(observations, outliers)}"
         )
 
 

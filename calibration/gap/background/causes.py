@@ -14,6 +14,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 from calibration.effects.columns import joined
+from calibration.effects.families.base_compliance import BaseCompliance
 from calibration.effects.fitted import Choice
 from calibration.effects.library import library
 from calibration.effects.timing import StepFamily
@@ -28,7 +29,6 @@ from calibration.gap.joint_fit import JointFit, Problem
 _APART = 4.0  # standard deviations of instants
 _MOST = 2  # events that may explain all
 _MORE = 15.0  # log Bayes factor of an event or a drift against steps
-_BASE = "base"  # its compliance is that of the first row that turns
 _FAR = 1e-12  # p-value of what is left, beyond which no few names more explain it
 _ANY_SIZE = 10.0  # factor on plausible sizes
 
@@ -146,7 +146,11 @@ def _links(
         return (), ()
     evidence, imitating, alike = _Evidence(problem, known, links), list[Choice](), set[str]()
     for choice in yielding:
-        own = [link for link in links if choice.where == link.where or (choice.where == _BASE and link is links[0])]
+        own = [
+            link
+            for link in links
+            if choice.where == link.where or (choice.where == BaseCompliance.place and link is links[0])
+        ]
         without = [other for other in known if other is not choice]
         if evidence.of(known, own) - evidence.of(without, own) < ODDS_OF_TWO:
             imitating.append(choice)

@@ -86,7 +86,6 @@ def compare(
     from calibration.experiments.comparison import compare as compare_methods
     from calibration.experiments.comparison import shared_rows
     from calibration.experiments.zhou2022.protocol import run_protocol
-    from calibration.observations import are_among, row_digests
     from calibration.run_settings import Run
     from daemon.report.comparison import comparison_page
     from daemon.report.front import Facts
@@ -100,7 +99,7 @@ def compare(
     held_out, held_out_raw = offline.read_observations(holdout, source.rig)
     page = out / f"comparison-{re.sub(r'[^A-Za-z0-9._-]+', '-', source.rig.name)}.html"
     out.mkdir(parents=True, exist_ok=True)
-    overlap = shared_rows(training, held_out, (data.name, holdout.name))
+    shared, overlap = shared_rows(training, held_out, (data.name, holdout.name))
     sources = {
         "training rows": offline.source_line(data, raw),
         "held-out rows": offline.source_line(holdout, held_out_raw),
@@ -150,7 +149,6 @@ def compare(
     if own is None or own.error_mm is None:
         return result
     rms_mm = float((own.error_mm**2).mean() ** 0.5)
-    shared = int(are_among(held_out, row_digests(training)).sum())
     rows = f"on {len(held_out)} held-out fixes by rigcal" + (f", {shared} of which it was fitted to" if shared else "")
     return offline.judged(result, tolerance_mm, rms_mm, rows, is_held_out=not shared, as_json=as_json)
 

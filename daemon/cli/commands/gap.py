@@ -78,7 +78,7 @@ def gap(
     overlap: tuple[str, ...] = ()
     if holdout is not None:
         held_out, held_out_raw = offline.read_observations(holdout, source.rig)
-        overlap = shared_rows(observations, held_out, (data.name, holdout.name))
+        _, overlap = shared_rows(observations, held_out, (data.name, holdout.name))
         files["held-out data"] = offline.source_line(holdout, held_out_raw)
     with progress_display(as_json=as_json) as progress:
         run = Run(seed, progress=progress)
@@ -106,7 +106,7 @@ def show_gap(found: GapResult) -> None:
     echo(gap_headline(found), bold=True)
     if found.description:
         echo(dependence(found))
-    before, after, where = before_and_after(found)
+    before, after, where, _ = before_and_after(found)
     change = (
         f"{number(before)} mm before, {number(after)} mm with the effects" if found.effects else f"{number(before)} mm"
     )

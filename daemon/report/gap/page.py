@@ -119,7 +119,7 @@ def coefficient_bounds(gap: GapResult, effect: FittedEffect) -> dict[str, tuple[
 
 
 def _head(gap: GapResult, facts: Facts) -> str:
-    before, after, rows = before_and_after(gap)
+    before, after, rows, _ = before_and_after(gap)
     verdict = tolerance_verdict(gap, facts.tolerance_mm)
     accuracy = Accuracy(
         f"Accuracy: {number(after)} mm root mean square {rows}; the noise is {number(gap.noise_mm)} mm."
@@ -168,7 +168,7 @@ def _steps(gap: GapResult) -> str:
         drawing.picture(
             figures.steps(list(bars(gap)), gap.noise_mm),
             "Held-out error round by round, and the noise floor",
-            f"Root mean square error {before_and_after(gap)[2]}. The noise floor is {gap.noise_source}.",
+            f"Root mean square error {before_and_after(gap).rows}. The noise floor is {gap.noise_source}.",
         ),
     )
 

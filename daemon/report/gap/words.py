@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from calibration.gap.result import GapResult
 from daemon.report.front import Verdict, judge
 from daemon.report.words import number, place_name, spoken
@@ -28,15 +30,33 @@ def _verdict(gap: GapResult) -> str:
     return "The simulation lacks something that no effect of the library explains."
 
 
-def before_and_after(gap: GapResult) -> tuple[float, float, str]:
-    """Return the error in mm without and with the effects, and its rows: held-out ones if there are any."""
+class ShownError(NamedTuple):
+    """The error that is shown for an answer.
+
+    Attributes:
+        before_mm: root mean square without the effects.
+        after_mm: with them.
+        rows: which fixes.
+        can_pass: nothing was fitted to these fixes, and none of them was left out.
+    """
+
+    before_mm: float
+    after_mm: float
+    rows: str
+    can_pass: bool
+
+
+def before_and_after(gap: GapResult) -> ShownError:
+    """Return the error without and with the effects: on held-out rows if there are any."""
     if gap.held_out is not None:
         shared = f", {gap.shared} rows of which were fitted" if gap.shared else ""
-        return *gap.held_out, f"on the held-out file{shared}"
+        return ShownError(*gap.held_out, f"on the held-out file{shared}", can_pass=not gap.shared)
     if gap.rounds and not gap.rounds[-1].adopted:
         left_out = f", {_outliers(gap)} left out" if gap.model.outliers else ""
-        return gap.rounds[0].held_out_mm, gap.rounds[-1].held_out_mm, f"on poses held out in turn{left_out}"
-    return gap.before_mm, gap.after_mm, "on the fixes themselves"
+        rows = f"on poses held out in turn{left_out}"
+        before_mm, after_mm = gap.rounds[0].held_out_mm, gap.rounds[-1].held_out_mm
+        return ShownError(before_mm, after_mm, rows, can_pass=not gap.model.outliers)
+    return ShownError(gap.before_mm, gap.after_mm, "on the fixes themselves", can_pass=False)
 
 
 def tolerance_verdict(gap: GapResult, tolerance_mm: float | None) -> Verdict | None:
@@ -46,10 +66,8 @@ def tolerance_verdict(gap: GapResult, tolerance_mm: float | None) -> Verdict | N
         gap: the answer.
         tolerance_mm: root mean square error that the machine may have; None where none is stated.
     """
-    _, after_mm, rows = before_and_after(gap)
-    in_turn = gap.held_out is None and bool(gap.rounds) and not gap.rounds[-1].adopted and not gap.model.outliers
-    is_held_out = in_turn or (gap.held_out is not None and not gap.shared)
-    return judge(tolerance_mm, after_mm, is_held_out=is_held_out, rows=rows)
+    error = before_and_after(gap)
+    return judge(tolerance_mm, error.after_mm, is_held_out=error.can_pass, rows=error.rows)
 
 
 def _outliers(gap: GapResult) -> str:

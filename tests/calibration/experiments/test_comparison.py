@@ -197,14 +197,16 @@ def test_without_a_residual_the_figures_are_those_of_the_effects(
 def test_rows_and_poses_that_training_and_held_out_data_share_are_named() -> None:
     rig = shipped_rig("swdt82")
     data = parsed(simulate_observations(RigTruth(rig, 1), 10, 1).csv_text(), rig)  # four prisms in each pose
-    assert shared_rows(data.select(np.arange(20)), data.select(np.arange(20, 40)), ("a.csv", "b.csv")) == ()
-    same, pose = shared_rows(data.select(np.arange(22)), data.select(np.arange(19, 40)), ("a.csv", "b.csv"))
+    assert shared_rows(data.select(np.arange(20)), data.select(np.arange(20, 40)), ("a.csv", "b.csv")) == (0, ())
+    count, (same, pose) = shared_rows(data.select(np.arange(22)), data.select(np.arange(19, 40)), ("a.csv", "b.csv"))
+    assert count == 3
     assert "3 of the 21 rows of b.csv are rows of a.csv" in same
     assert "the first in line 21: " in same
     assert "2 of the 21 rows of b.csv were measured in poses of a.csv" in pose
     assert "the first in line 24: " in pose
     moved = replace(data, position_mm=data.position_mm + 0.1)
-    assert len(shared_rows(data, moved, ("a.csv", "b.csv"))) == 1
+    count, found = shared_rows(data, moved, ("a.csv", "b.csv"))
+    assert (count, len(found)) == (0, 1)
 
 
 # -- the first paper's section 4 -------------------------------------------------------------------------------------
