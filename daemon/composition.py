@@ -39,6 +39,7 @@ from simulators.plan import plan_rows, stops_of
 from simulators.replay import ReplayLink
 
 SIMULATED_SYNC_MS = 200
+SIMULATED_RIG = "simulated-rig.toml"  # where joints of the configured one are read from nowhere
 
 Mode = Literal["live", "simulated", "replayed"]
 _SIMULATED_BOOT = "simulated-"
@@ -193,7 +194,7 @@ def _with_devices(source: RigSource, config: Config) -> tuple[RigSource, Config]
     text = with_simulated_channels(source.rig, source.text)
     if text == source.text:
         return source, config
-    path = config.state_directory / "simulated-rig.toml"
+    path = config.state_directory / SIMULATED_RIG
     path.write_text(text, encoding="utf-8")
     return RigSource(parse_rig(text, path.name), text, source.directory), config.model_copy(update={"rig": str(path)})
 

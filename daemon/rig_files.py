@@ -28,17 +28,23 @@ class RigSource:
     directory: Path
 
 
-def load_rig(name_or_path: str, signals: Sequence[str] = ()) -> RigSource:
+def load_rig(name_or_path: str, signals: Sequence[str] = (), *, named_in: Path | None = None) -> RigSource:
     """Load a shipped rig by its name, or any rig by the path of its file.
 
     Args:
         name_or_path: of the rig.
         signals: columns of further signals, as `Rig.with_signals` takes them.
+        named_in: the configuration whose key `rig` names it, for messages.
 
     Raises:
         RigError: no such rig or file, or the file is malformed.
     """
-    text, name, directory = read_rig_text(name_or_path)
+    try:
+        text, name, directory = read_rig_text(name_or_path)
+    except RigError as error:
+        if named_in is None:
+            raise
+        raise RigError(str(named_in), "rig", str(error)) from error
     rig = parse_rig(text, name)
     if signals:
         rig = rig.with_signals(*signals)

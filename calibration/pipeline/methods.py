@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from calibration.effects.library import library
+from calibration.effects.library import library, parse_effects
 from calibration.gap.adoption import Adopted, adopt
 from calibration.gap.search import search
 from calibration.gap.search_result import Remaining, remaining
@@ -104,6 +104,8 @@ def identify_by(method: str, task: Task) -> Adopted:
     chosen = METHODS[method]
     if not chosen.takes_effects and task.effects not in ("auto", "none"):
         raise ValueError(f"method {method!r} takes no effects; leave {task.effects!r} out, or use the default method")
+    if task.effects not in ("auto", "none"):
+        parse_effects(task.effects, task.rig)  # a wrong name is told before the search, which takes its time
     return chosen.identify(task)
 
 

@@ -238,12 +238,16 @@ class Rig(Part):
         return tuple(reversed(numbers))
 
     def joint(self, name: str) -> Joint:
-        """Return the joint called `name`; KeyError if there is none."""
-        return {j.name: j for j in self.joints}[name]
+        """Return the joint called `name`; KeyError, which names those that there are, if there is none."""
+        if name not in self.joint_names:
+            raise KeyError(f"rig {self.name!r} has no joint {name!r}; it has {', '.join(self.joint_names)}")
+        return self.joints[self.joint_names.index(name)]
 
     def prism(self, name: str) -> Prism:
-        """Return the prism called `name`; KeyError if there is none."""
-        return {p.name: p for p in self.prisms}[name]
+        """Return the prism called `name`; KeyError, which names those that there are, if there is none."""
+        if name not in self.prism_names:
+            raise KeyError(f"rig {self.name!r} has no prism {name!r}; it has {', '.join(self.prism_names)}")
+        return self.prisms[self.prism_names.index(name)]
 
     @property
     def joint_names(self) -> tuple[str, ...]:

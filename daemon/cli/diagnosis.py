@@ -15,6 +15,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from daemon.host.load import overload
+
 if TYPE_CHECKING:
     from daemon.config import CanSection, Config
 
@@ -61,6 +63,7 @@ def computer(config: Config | None) -> Iterator[Finding]:
         config: of the daemon; None where there is none.
     """
     yield _clock()
+    yield _processor()
     if config is not None:
         yield _disk(config)
         yield _backups(config)
@@ -90,6 +93,13 @@ def _clock() -> Finding:
             "`timedatectl set-ntp true`, or give the network a time server (/etc/systemd/timesyncd.conf)",
         )
     return Finding("clock", "good", "is synchronised")
+
+
+def _processor() -> Finding:
+    if busy := overload():
+        remedy = "`top` shows what keeps it busy; a simulated rig runs slower with a lower --rate"
+        return Finding("processor", "warning", f"{busy}: devices may look silent that are not", remedy)
+    return Finding("processor", "good", "has time for more")
 
 
 def _disk(config: Config) -> Finding:
@@ -134,7 +144,7 @@ def read_configuration(path: Path) -> tuple[Config | None, Finding]:
     config = None
     try:
         config = read_config(path)
-        source = load_rig(config.rig)
+        source = load_rig(config.rig, named_in=path)
         decoders(config, source)
     except (CommandError, RigError, DescriptionError) as error:
         return config, Finding(

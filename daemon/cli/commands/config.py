@@ -30,7 +30,7 @@ def config_check(path: Path, *, as_json: bool) -> dict[str, Any]:
     from daemon.rig_files import load_rig
 
     settings = read_config(path)
-    source = load_rig(settings.rig)
+    source = load_rig(settings.rig, named_in=path)
     links = decoders(settings, source)
     if not as_json:
         echo(f"{path}: good: rig {source.rig.name}, links {', '.join(links) or 'none'}")

@@ -228,7 +228,7 @@ def _check(path: Path) -> None:
 
     try:
         settings = read_config(path)
-        decoders(settings, load_rig(settings.rig))
+        decoders(settings, load_rig(settings.rig, named_in=path))
     except RigError as error:
         raise CommandError(f"the files are written, and do not pass `rigcal config check {path}`: {error}") from error
 

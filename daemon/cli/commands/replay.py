@@ -67,7 +67,7 @@ def replay(
     from daemon.store.reader import Reader
 
     settings = read_config(config)
-    source = load_rig(settings.rig)
+    source = load_rig(settings.rig, named_in=config)
     if path.exists():
         raise click.UsageError(f"{path} exists; a replay writes a store of its own, name a new file with --store")
     if prism is not None and session_file is not None:

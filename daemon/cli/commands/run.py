@@ -19,9 +19,10 @@ if TYPE_CHECKING:
     from daemon.config import Config
     from daemon.store.store import Store
 
-SIMULATED_CONFIG = """
-rig = "swdt82"
-state_directory = "rigcal-sim"
+SIMULATED_CONFIG = """# Written by `rigcal run --sim` at each start, for commands that ask for --config.
+# The simulated rig takes the place of the two ports.
+rig = {rig}
+state_directory = "."
 
 [[can]]
 channel = "can0"
@@ -29,6 +30,8 @@ channel = "can0"
 [[station]]
 serial.path = "/dev/rigcal-station"
 """
+
+SIMULATED_FILE = Path("rigcal-sim", "rigcal.toml")
 
 _RATE = click.FloatRange(0.1, 100)
 _DWELL = click.FloatRange(1, 600)
@@ -88,7 +91,7 @@ def run(
     """
     if not sim and (is_by_hand or rig is not None):
         raise click.UsageError("--rig and --by-hand are for a simulated rig: give --sim as well")
-    from daemon.composition import live, replayed, simulated
+    from daemon.composition import SIMULATED_RIG, live, replayed, simulated
     from daemon.config import parse_config, read_config
     from daemon.rig_files import load_rig
     from daemon.service import Daemon, stop_on_signals
@@ -101,12 +104,11 @@ def run(
     if config is not None:
         settings = read_config(config)
     elif sim:
-        settings = parse_config(SIMULATED_CONFIG, Path("simulated").resolve())
+        settings = parse_config(SIMULATED_CONFIG.format(rig='"swdt82"'), SIMULATED_FILE.resolve())
     else:
         raise click.UsageError("give --config FILE (only --sim runs without one)")
-    if rig is not None:
-        settings = settings.model_copy(update={"rig": rig})
-    source = load_rig(settings.rig)
+    source = load_rig(rig or settings.rig, named_in=None if rig else config)
+    settings = settings.model_copy(update={"rig": rig or settings.rig})
     if is_replay:
         settings = _apart(settings)
     stop, notifier = threading.Event(), Notifier()
@@ -128,6 +130,9 @@ def run(
                     is_by_hand=is_by_hand,
                 )
                 parts = stack.enter_context(machine)
+                if config is None:
+                    is_changed = parts.rig_text != source.text
+                    _write_config(settings, settings.state_directory / SIMULATED_RIG if is_changed else settings.rig)
             elif is_replay:
                 parts = replayed(settings, source, files, rate)
             else:
@@ -151,6 +156,17 @@ def _store(settings: Config, *, is_simulated: bool) -> Store:
         store.close()
         raise
     return store
+
+
+def _write_config(settings: Config, rig: str | Path) -> None:
+    """Write the configuration of a simulated rig beside its store."""
+    from calibration.rig.description import shipped_rigs
+    from calibration.rig.toml import quoted
+    from daemon.host.safe_output import write_file
+
+    named = rig if rig in shipped_rigs() else Path(rig).resolve()
+    text = SIMULATED_CONFIG.format(rig=quoted(str(named)))
+    write_file(settings.state_directory / SIMULATED_FILE.name, text.encode())
 
 
 def _make_directory(settings: Config) -> None:

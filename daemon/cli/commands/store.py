@@ -208,7 +208,8 @@ def store_redecode(
 ) -> dict[str, Any]:
     """Make every reading and fix of a session, or of some time, again from raw captures. The daemon may run.
 
-    Outside sessions the store has one reading a second and channel; raw captures have them all.
+    Outside sessions the store has one reading a second and channel; raw captures have them all. A time is taken with
+    the whole chunks of captures that it touches, so that more than it may be decoded.
     """
     from daemon.acquisition.redecoding import redecode_command
     from daemon.composition import decoders
@@ -218,7 +219,7 @@ def store_redecode(
     if (session is None) == (since is None or until is None):
         raise click.UsageError("give either --session, or --from and --to")
     settings = read_config(config)
-    source = load_rig(settings.rig)
+    source = load_rig(settings.rig, named_in=config)
     arguments = {
         "session": session,
         "first_utc_ns": None if since is None else _utc_ns(since),

@@ -11,6 +11,7 @@ from typing import Any
 
 from daemon.commands import CommandError
 from daemon.control.protocol import request
+from daemon.host.load import overload
 
 RIG = "swdt82"
 CONFIG = """# Written by rigcal demo. The simulated rig takes the place of the two ports.
@@ -31,6 +32,7 @@ PRISMS = ("r", "s", "b", "w")
 CONTROL_POINTS = ("cp1", "cp2")
 DWELL_S = 3.5
 DEADLINE_S = 600.0
+STUCK_S = 30.0  # without a new pose
 
 Advance = Callable[[str, int], None]
 """Receives a sentence on the progress, and the number of steps done since."""
@@ -79,8 +81,15 @@ class Operator:
             if self._daemon.poll() is not None:
                 raise DemoError(f"the daemon ended while waiting for {what}; see {self._log.name}")
             if time.monotonic() > deadline:
-                raise DemoError(f"waited {limit_s:.0f} s for {what}; see {self._log.name}")
+                raise DemoError(f"waited {limit_s:.0f} s for {what}{self._why()}; see {self._log.name}")
             time.sleep(0.2)
+
+    def _why(self) -> str:
+        """Return a clause on why it takes so long, where that is known."""
+        busy = overload()
+        return (
+            f": {busy}, too few for --rate {self._rate:g}; a lower one takes longer and comes through" if busy else ""
+        )
 
     def pause(self, simulated_s: float) -> None:
         """Let simulated time pass with no session open; the boom goes on moving."""
@@ -110,6 +119,7 @@ class Operator:
         name = str(self.say("session.start", prism=prism, kind=kind, operator="demo")["id"])
         self._shoot_control_points()
         seen = early = 0
+        moved_at = time.monotonic()
 
         def recorded() -> int:
             return int(self.say("session.show", id=name)["poses"]) - early
@@ -122,11 +132,14 @@ class Operator:
             self.say("simulation.visit", poses=list(planned))
 
         def enough() -> bool:
-            nonlocal seen
+            nonlocal seen, moved_at
             now = min(recorded(), poses)
+            text = f"{kind.replace('_', ' ')} of prism {prism}: {now} of {poses}"
             if now > seen:
-                advance(f"{kind.replace('_', ' ')} of prism {prism}: {now} of {poses}", now - seen)
-                seen = now
+                advance(text, now - seen)
+                seen, moved_at = now, time.monotonic()
+            elif time.monotonic() - moved_at > STUCK_S:
+                advance(f"{text}, none for a while{self._why()}", 0)
             return now >= poses and not (planned and self.say("simulation.visit")["left"])
 
         stands_s = sum(float(row.get("dwell_s", 0.0)) for row in planned)

@@ -248,7 +248,7 @@ def test_what_is_not_there_is_refused_by_name(session: Session) -> None:
     with pytest.raises(ValueError, match="method 'km' takes no effects"):
         identify(session.rig, TEXT, session.training, method="km", effects="angle_scale@theta1")
     with pytest.raises(ValueError, match="effect 'witchcraft' is unknown; there are"):
-        calibrate(session.rig, TEXT, session.training, effects="witchcraft@theta1")
+        calibrate(session.rig, TEXT, session.training.select(np.arange(5)), effects="witchcraft@theta1")
 
 
 def test_a_residual_is_not_used_for_a_prism_it_never_saw(session: Session) -> None:

@@ -97,6 +97,19 @@ def test_a_wrong_configuration_is_the_first_finding(tmp_path: Path) -> None:
     assert done.exit_code == 1
     assert next(iter(findings)) == "configuration"
     assert "unknown key" in findings["configuration"]["text"]
+    config.write_text('rig = "digger"\n', encoding="utf-8")
+    _, findings = examine("--config", str(config), "--socket", str(tmp_path / "none"))
+    assert f"{config}: rig: digger: neither a shipped rig (" in findings["configuration"]["text"]
+
+
+def test_a_busy_computer_is_told_beside_what_looks_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "getloadavg", lambda: (1e3, 0.0, 0.0))
+    _, findings = examine("--socket", str(tmp_path / "none"))
+    assert findings["processor"]["state"] == "warning"
+    assert "1000 processes want to run on" in findings["processor"]["text"]
+    assert "--rate" in findings["processor"]["remedy"]
+    monkeypatch.setattr(os, "getloadavg", lambda: (0.0, 0.0, 0.0))
+    assert examine("--socket", str(tmp_path / "none"))[1]["processor"]["state"] == "good"
 
 
 def test_a_running_daemon_tells_of_store_and_channels(tmp_path: Path) -> None:
