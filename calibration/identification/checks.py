@@ -24,6 +24,8 @@ _FAR_MM = 5e5  # from the instrument: nobody measures a boom from there
 _LIGHT, _HEAVY = 1e-3, 10.0  # of the machine, between which its payload is
 _TOO_FAST = 3.0  # times the fastest motion of a joint
 _LISTED = 5  # columns
+_FEW_TIMES = 10
+_SLOW_S = 3600.0  # between fixes: nobody measures so slowly
 _UNORDERED = 0.25  # of the rows; a clock is not set as often
 
 # Of a fit.
@@ -151,9 +153,18 @@ def _warn_of_setups(observations: Observations) -> Iterator[str]:
 
 
 def _warn_of_clock(observations: Observations) -> Iterator[str]:
-    """Warn of a clock that was set back or began anew; a table sorted by something else is no sign of one."""
+    """Warn of a clock that was set back or began anew, or that counts other than seconds.
+
+    A table sorted by something else is no sign of the first.
+    """
     time_s = observations.extra.get("time_s", np.full(len(observations), np.nan))
     known = np.flatnonzero(np.isfinite(time_s))
+    apart_s = np.diff(np.unique(time_s[known]))
+    if len(apart_s) >= _FEW_TIMES and np.median(apart_s) > _SLOW_S:
+        yield (
+            f"time_s: half of the fixes are more than {np.median(apart_s) / 3600.0:.2g} h apart, as if it were in "
+            f"milliseconds; what depends on time takes it as seconds, so divide it by 1000 if so"
+        )
     # By prism and set-up tables are often sorted.
     order = known[np.lexsort((observations.prism[known], observations.setup[known]))]
     same = (observations.prism[order][1:] == observations.prism[order][:-1]) & (

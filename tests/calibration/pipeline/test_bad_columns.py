@@ -102,6 +102,13 @@ def test_a_clock_that_was_set_back_is_told_and_a_sorted_table_is_not(session: Se
         assert evaluate(session.model, good).warnings == ()
 
 
+def test_a_clock_in_milliseconds_is_told(session: Session) -> None:
+    time_s = session.held_out.extra["time_s"]
+    (warning,) = evaluate(session.model, at_times(1e3 * time_s)(session.held_out)).warnings
+    assert warning.startswith("time_s: half of the fixes are more than ")
+    assert warning.endswith("so divide it by 1000 if so")
+
+
 def test_a_base_that_few_fixes_place_says_how_well_they_do(session: Session) -> None:
     many = replace(session.training, setup=np.full(250, "S1"))
     few, later = (simulated(session.truth, n, seed, setup="S2") for n, seed in ((3, 9), (250, 10)))
