@@ -10,6 +10,7 @@ from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.observations import Floats
 from daemon.host.safe_output import shown
@@ -82,6 +83,7 @@ RASTER_DPI = 150
 WIDTH_IN = 9.6
 LABEL_CHARACTERS = 60  # of a name beside an axis
 _DOTS_MAX = 4000  # in a map
+_ABOVE_IN, _BELOW_IN, _BESIDE_IN = 0.6, 0.5, 0.6  # legend and title; ticks and label of an x axis; those of a y axis
 FLOOR_MM = 1e-3  # below this an error has no place on a logarithmic axis
 
 
@@ -97,6 +99,27 @@ def new_figure(height_in: float) -> Figure:
     from matplotlib.figure import Figure
 
     return Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+
+
+def even_grid(lines: int, columns: int, *, line_in: float) -> tuple[Figure, NDArray[np.object_]]:
+    """Return a figure with a legend's room above (lines, columns) axes that share y, and these.
+
+    The margins are given: to find out those of many axes, matplotlib draws them all once more.
+    """
+    from matplotlib.figure import Figure
+
+    height_in = _ABOVE_IN + line_in * lines
+    figure = Figure(figsize=(WIDTH_IN, height_in))
+    grid = figure.subplots(lines, columns, sharey=True, squeeze=False)
+    figure.subplots_adjust(
+        left=_BESIDE_IN / WIDTH_IN,
+        right=1.0 - 0.1 / WIDTH_IN,
+        top=1.0 - _ABOVE_IN / height_in,
+        bottom=_BELOW_IN / height_in,
+        wspace=0.06,
+        hspace=_BELOW_IN / (line_in - _BELOW_IN),
+    )
+    return figure, grid
 
 
 def picture(figure: Figure, description: str, caption: str) -> str:

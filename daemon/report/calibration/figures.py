@@ -85,8 +85,7 @@ def residual_by_joint(report: ReportInput) -> Figure:
         stages.append(("hybrid", drawing.AFTER, "hybrid"))
     limit = max(drawing.robust_reach(table.errors_mm[stage]) for stage, _, _ in stages)
     joints = [joint for joint in report.joints if joint.name in table.joints]
-    figure = drawing.new_figure(0.75 + 1.25 * len(joints))
-    grid = figure.subplots(len(joints), 3, sharey=True, squeeze=False)
+    figure, grid = drawing.even_grid(len(joints), 3, line_in=1.25)
     for line, joint in enumerate(joints):
         values = table.joints[joint.name]
         for column, component in enumerate("xyz"):
@@ -98,9 +97,7 @@ def residual_by_joint(report: ReportInput) -> Figure:
             if column == 0:
                 axes.set_ylabel("mm")
             axes.set_xlabel(f"{joint_words(joint)}, {unit_words(joint.unit)}", labelpad=1, color=drawing.INK)
-    figure.legend(
-        handles=[drawing.key(colour, label) for _, colour, label in stages], loc="outside upper left", ncols=2
-    )
+    figure.legend(handles=[drawing.key(colour, label) for _, colour, label in stages], loc="upper left", ncols=2)
     return figure
 
 
