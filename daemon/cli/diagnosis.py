@@ -15,8 +15,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from daemon.host.load import overload
-
 if TYPE_CHECKING:
     from daemon.config import CanSection, Config
 
@@ -28,6 +26,7 @@ _USUAL_RATE = 250_000  # bit/s
 _RULES_FILE = "/etc/udev/rules.d/99-rigcal-station.rules"
 _OFTEN = 10  # silences of one channel since the start, from which on its time-out may be too short
 _LEAST_FREE = 0.1  # of the disk
+_BUSY = 1.5  # processes that want to run, for each processor, over the last minute
 _TIME_ERROR = 5  # adjtimex(2): the clock is not synchronised
 _TOOL_TIMEOUT_S = 10.0
 
@@ -93,6 +92,18 @@ def _clock() -> Finding:
             "`timedatectl set-ntp true`, or give the network a time server (/etc/systemd/timesyncd.conf)",
         )
     return Finding("clock", "good", "is synchronised")
+
+
+def overload() -> str | None:
+    """Return a clause on a computer that has more to run than its processors can; None where they can.
+
+    What looks like a fault of a cable may be a processor that does not get round to it.
+    """
+    processors = len(os.sched_getaffinity(0))
+    wanting = os.getloadavg()[0]
+    if wanting <= _BUSY * processors:
+        return None
+    return f"{wanting:.0f} processes want to run on {processors} processor{'s' if processors != 1 else ''}"
 
 
 def _processor() -> Finding:

@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from daemon.cli.diagnosis import overload
 from daemon.commands import CommandError
 from daemon.control.protocol import request
-from daemon.host.load import overload
 
 RIG = "swdt82"
 CONFIG = """# Written by rigcal demo. The simulated rig takes the place of the two ports.
