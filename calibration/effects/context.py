@@ -199,6 +199,11 @@ class EffectContext:
         return greatest if greatest > _LEAST_NM else 0.0
 
     @cached_property
+    def greatest_moments(self) -> dict[int, float]:
+        """Row -> the largest moment beyond it in the work volume, N m, as far as links have asked for it."""
+        return {}
+
+    @cached_property
     def overturning_Nm(self) -> Floats:  # noqa: N802 - the unit is N m
         """(n, 2) moments of all weights about the level axes through the base's origin; see `level_axes`."""
         lever_mm, newton = self.loads.places(self.data.readings, self.observations.extra)

@@ -172,8 +172,10 @@ def _greatest(context: EffectContext, row: int) -> float:
     """Return the largest moment of the weights beyond a row in the work volume, N m; 0 where there is none."""
     if not context.rig.masses:
         return 0.0
-    most = float(np.linalg.norm(Link(context.work_volume, row).moment_newton_m, axis=1).max(initial=0.0))
-    return most if most > _LEAST_NM else 0.0
+    if row not in context.greatest_moments:
+        most = float(np.linalg.norm(Link(context.work_volume, row).moment_newton_m, axis=1).max(initial=0.0))
+        context.greatest_moments[row] = most if most > _LEAST_NM else 0.0
+    return context.greatest_moments[row]
 
 
 def own_rows(rig: Rig) -> dict[str, int]:

@@ -13,6 +13,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import chdtrc
 
@@ -239,10 +240,15 @@ class Screen:
     def _values(self, number: int) -> tuple[Floats, Floats, float]:
         """Return (options, scales) log evidence and prior odds of a candidate, and its log likelihood ratio."""
         candidate = self.candidates[number]
-        each = [self._at_scales(number, option) for option in range(len(candidate.options))]
+        by_size: dict[int, list[int]] = {}
+        for option, additions in enumerate(candidate.additions):
+            by_size.setdefault(len(additions.prior_sigma), []).append(option)
         odds = candidate.log_odds[:, None] + np.array(list(LOG_SCALE_ODDS.values()))
-        values = odds + [at_scales for at_scales, _ in each]
-        return values, odds, _log_sum(candidate.log_odds + [0.5 * explained for _, explained in each])
+        values, explained = odds.copy(), np.empty(len(candidate.options))
+        for alike in by_size.values():
+            at_scales, explained[alike] = self._at_scales(number, alike)
+            values[alike] += at_scales
+        return values, odds, _log_sum(candidate.log_odds + 0.5 * explained)
 
     def _score_best(self, number: int, values: Floats, odds: Floats, log_likelihood: float) -> ScoredEffect:
         """Score a candidate by its best variant and scale; `values` and `odds` are those of `_values`."""
@@ -267,12 +273,31 @@ class Screen:
             min(p * tested, 1.0),
         )
 
-    def _at_scales(self, number: int, option: int) -> tuple[Floats, float]:
-        """Return (scales,) log Bayes factors of a variant by itself, and the squares that it explains at most."""
-        one, _, along_one = self._eigen(number, option)
-        size, squares = one * _SQUARED_SCALES, along_one**2 * _SQUARED_SCALES
-        values: Floats = 0.5 * (squares / (1.0 + size) - np.log1p(size)).sum(axis=1)
-        return values, _explained(one, along_one)[0]
+    def _at_scales(self, number: int, options: Sequence[int]) -> tuple[Floats, Floats]:
+        """Return (v, scales) log Bayes factors of v variants with equally many coefficients, each by itself.
+
+        With them come the (v,) squares that each explains at most.
+        """
+        self._factor(number, options)
+        found = [self._eigen(number, option) for option in options]
+        one, along_one = np.array([size for size, _, _ in found]), np.array([along for _, _, along in found])
+        size, squares = one[:, None] * _SQUARED_SCALES, along_one[:, None] ** 2 * _SQUARED_SCALES
+        values: Floats = 0.5 * (squares / (1.0 + size) - np.log1p(size)).sum(axis=2)
+        seen = _is_seen(one)
+        return values, (along_one**2 / np.where(seen, one, np.inf)).sum(axis=1)
+
+    def _factor(self, number: int, options: Sequence[int]) -> None:
+        """Compute at once what `_eigen` returns of variants with the same number of coefficients."""
+        new = {self._block[number, option]: self.candidates[number].additions[option] for option in reversed(options)}
+        blocks = [block for block in new if block not in self._eigen_of]
+        if not blocks:
+            return
+        sigma = np.array([new[block].prior_sigma for block in blocks])
+        gram = np.array([self._products.product(block, block) for block in blocks])
+        sizes, axes = np.linalg.eigh(gram * sigma[:, None] * sigma[:, :, None])
+        for place, block in enumerate(blocks):
+            along = axes[place].T @ (self._products.along(block) * sigma[place])
+            self._eigen_of[block] = sigma[place], np.maximum(sizes[place], 0.0), axes[place], along
 
     def _eigen(self, number: int, option: int) -> tuple[Floats, Floats, Floats]:
         """Return eigenvalues (k,) and axes (k, k) of a variant's G'G in prior sigmas, and G'r along these axes."""
@@ -281,7 +306,7 @@ class Screen:
         if block in self._eigen_of:  # variants that differ in one factor on their sigmas have the same axes
             of, size, axes, along = self._eigen_of[block]
             factor = sigma[0] / of[0]
-            if np.allclose(sigma, factor * of, rtol=_ROUNDING, atol=0.0):
+            if (np.abs(sigma - factor * of) <= _ROUNDING * factor * of).all():
                 return size * factor**2, axes, along * factor
         size, axes = np.linalg.eigh(self._products.product(block, block) * sigma * sigma[:, None])
         size, along = np.maximum(size, 0.0), axes.T @ (self._products.along(block) * sigma)
@@ -334,8 +359,13 @@ def _log_sum(values: Floats | Sequence[float]) -> float:
 
 def _explained(size: Floats, along: Floats) -> tuple[float, int]:
     """Return the squares that columns explain and their rank, from the eigenvalues (k,) of G'G and G'r along these."""
-    seen = size > _SEEN * max(float(size[-1]), _TINY)
+    seen = _is_seen(size)
     return float((along[seen] ** 2 / size[seen]).sum()), int(seen.sum())
+
+
+def _is_seen(size: Floats) -> NDArray[np.bool_]:
+    """Return which of rising eigenvalues (..., k) are more than rounding."""
+    return size > _SEEN * np.maximum(size[..., -1:], _TINY)
 
 
 def by_family(scored: Iterable[ScoredEffect]) -> dict[str, float]:

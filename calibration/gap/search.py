@@ -193,8 +193,11 @@ def _names(
         return replace(names, background_log_bayes_factor=left), ()
     if not found.needs_background and formulas_suffice(problem, found.joint, found.strongest_formula):
         further, formulas = found.strongest_formula, tuple[Formula, ...]()
-        for _ in range(MOST_FORMULAS):
-            formulas += tuple(f for f in further if not is_in_library(f, found.candidates.candidates, found.initial))
+        for number in range(MOST_FORMULAS):
+            new = tuple(f for f in further if not is_in_library(f, found.candidates.candidates, found.initial))
+            if number and not new:  # what is left is of the library, which has been asked beside these
+                break
+            formulas += new
             names = names_beside(problem, [formula_block(f, n) for n, f in enumerate(formulas)], families, known)
             further = what_is_left(problem, names.joint, formulas)
             if not further:
