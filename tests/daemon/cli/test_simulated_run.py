@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 import subprocess
 import sys
@@ -11,15 +10,9 @@ from pathlib import Path
 
 import pytest
 
-RIGCAL = (sys.executable, "-m", "daemon.cli.main")
+from tests.commands import answer_apart
+
 DEADLINE_S = 120.0
-
-
-def ask(*words: str, cwd: Path) -> dict[str, object]:
-    """Return the JSON answer of a command."""
-    done = subprocess.run([*RIGCAL, *words, "--json"], cwd=cwd, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return dict(json.loads(done.stdout))
 
 
 @pytest.mark.parametrize("rig", ["swdt82", "ur10"])
@@ -27,18 +20,17 @@ def test_a_simulated_rig_leaves_a_configuration_for_commands_on_its_store(rig: s
     """Joints that ur10's file reads from nowhere have simulated channels, which the configuration knows too."""
     config = tmp_path / "rigcal-sim" / "rigcal.toml"
     with (tmp_path / "log").open("w") as log:
-        daemon = subprocess.Popen(
-            [*RIGCAL, "run", "--sim", "--rig", rig, "--rate", "5"], cwd=tmp_path, stdout=log, stderr=log
-        )
+        command = [sys.executable, "-m", "daemon.cli.main", "run", "--sim", "--rig", rig, "--rate", "5"]
+        daemon = subprocess.Popen(command, cwd=tmp_path, stdout=log, stderr=log)
     try:
         deadline = time.monotonic() + DEADLINE_S
         while not (config.exists() and (config.parent / "control.sock").exists()):
             assert daemon.poll() is None, (tmp_path / "log").read_text()
             assert time.monotonic() < deadline
             time.sleep(0.1)
-        assert ask("status", "--config", str(config), cwd=tmp_path)["mode"] == "simulated"
+        assert answer_apart("status", "--config", str(config))["mode"] == "simulated"
     finally:
         daemon.send_signal(signal.SIGINT)
         assert daemon.wait(timeout=60) == 0
-    assert ask("config", "check", str(config), cwd=tmp_path) == {"rig": rig, "links": ["boom", "station"]}
-    assert ask("store", "check", "--config", str(config), cwd=tmp_path)
+    assert answer_apart("config", "check", str(config)) == {"rig": rig, "links": ["boom", "station"]}
+    assert answer_apart("store", "check", "--config", str(config))
