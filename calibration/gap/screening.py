@@ -278,26 +278,17 @@ class Screen:
 
         With them come the (v,) squares that each explains at most.
         """
-        self._factor(number, options)
+        blocks = {self._block[number, option]: option for option in reversed(options)}
+        new = {block: option for block, option in blocks.items() if block not in self._eigen_of}
+        if new:
+            additions = self.candidates[number].additions
+            self._factor({block: additions[option].prior_sigma for block, option in new.items()})
         found = [self._eigen(number, option) for option in options]
         one, along_one = np.array([size for size, _, _ in found]), np.array([along for _, _, along in found])
         size, squares = one[:, None] * _SQUARED_SCALES, along_one[:, None] ** 2 * _SQUARED_SCALES
         values: Floats = 0.5 * (squares / (1.0 + size) - np.log1p(size)).sum(axis=2)
         seen = _is_seen(one)
         return values, (along_one**2 / np.where(seen, one, np.inf)).sum(axis=1)
-
-    def _factor(self, number: int, options: Sequence[int]) -> None:
-        """Compute at once what `_eigen` returns of variants with the same number of coefficients."""
-        new = {self._block[number, option]: self.candidates[number].additions[option] for option in reversed(options)}
-        blocks = [block for block in new if block not in self._eigen_of]
-        if not blocks:
-            return
-        sigma = np.array([new[block].prior_sigma for block in blocks])
-        gram = np.array([self._products.product(block, block) for block in blocks])
-        sizes, axes = np.linalg.eigh(gram * sigma[:, None] * sigma[:, :, None])
-        for place, block in enumerate(blocks):
-            along = axes[place].T @ (self._products.along(block) * sigma[place])
-            self._eigen_of[block] = sigma[place], np.maximum(sizes[place], 0.0), axes[place], along
 
     def _eigen(self, number: int, option: int) -> tuple[Floats, Floats, Floats]:
         """Return eigenvalues (k,) and axes (k, k) of a variant's G'G in prior sigmas, and G'r along these axes."""
@@ -308,10 +299,17 @@ class Screen:
             factor = sigma[0] / of[0]
             if (np.abs(sigma - factor * of) <= _ROUNDING * factor * of).all():
                 return size * factor**2, axes, along * factor
-        size, axes = np.linalg.eigh(self._products.product(block, block) * sigma * sigma[:, None])
-        size, along = np.maximum(size, 0.0), axes.T @ (self._products.along(block) * sigma)
-        self._eigen_of[block] = sigma, size, axes, along
-        return size, axes, along
+        self._factor({block: sigma})
+        return self._eigen_of[block][1:]
+
+    def _factor(self, sigma_of: Mapping[int, Floats]) -> None:
+        """Compute at once what `_eigen` returns of blocks with equally many columns, each with its prior sigmas."""
+        sigma = np.array(list(sigma_of.values()))
+        gram = np.array([self._products.product(block, block) for block in sigma_of])
+        sizes, axes = np.linalg.eigh(gram * sigma[:, None] * sigma[:, :, None])
+        for place, block in enumerate(sigma_of):
+            along = axes[place].T @ (self._products.along(block) * sigma[place])
+            self._eigen_of[block] = sigma[place], np.maximum(sizes[place], 0.0), axes[place], along
 
 
 class Beside:

@@ -82,14 +82,13 @@ def find_gap(
         rest = find_effects(rig, observations, families, prior, run.part(0.0, 0.9), rng)
         run.progress(0.9, "building the model")
         model = build_model(rig, rig_text, observations, rest.adopted, prior, {"seed": run.seed, "method": "gap"})
-        found = _answer(rest, model, observations, holdout, run.seed, rng)
-        unsought = partly_known(rest.found.joint.situation, families)
-        return replace(found, warnings=(*found.warnings, *unsought))
+        return _answer(rest, model, families, observations, holdout, run.seed, rng)
 
 
 def _answer(
     rest: Remaining,
     model: CalibratedModel,
+    families: Collection[str],
     observations: Observations,
     holdout: Observations | None,
     seed: int,
@@ -145,7 +144,7 @@ def _answer(
         observations=observations,
         error_before_mm=error_before,
         error_after_mm=error_after,
-        warnings=tuple(_warnings(rest, model, holdout)),
+        warnings=tuple(_warnings(rest, model, families, holdout)),
         shared=0 if holdout is None else int(are_among(holdout, model.fitted_rows).sum()),
     )
 
@@ -226,6 +225,7 @@ def _noise(
 def _warnings(
     rest: Remaining,
     model: CalibratedModel,
+    families: Collection[str],
     holdout: Observations | None,
 ) -> Iterator[str]:
     found = rest.found
@@ -235,3 +235,4 @@ def _warnings(
         yield from (f"in the held-out rows: {warning}" for warning in model_warnings(model, holdout))
     if found.formulas and found.adopted.effects:
         yield "what is left over depends on what no effect of the library explains"
+    yield from partly_known(found.joint.situation, families)

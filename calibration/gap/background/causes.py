@@ -21,14 +21,14 @@ from calibration.effects.timing import StepFamily
 from calibration.gap.background.blocks import Block, drift_block, elastic_blocks, event_blocks
 from calibration.gap.background.naming import Names, names_beside
 from calibration.gap.background.outside import grammar_beside
-from calibration.gap.background.search import ODDS_OF_TWO, linear_system, system_beside
+from calibration.gap.background.search import ODDS_OF_TWO, grown, joint_beside, linear_system, system_beside
 from calibration.gap.background.widening import further_blocks
 from calibration.gap.detection import Detection, detect
 from calibration.gap.joint_fit import JointFit, Problem
 
 _APART = 4.0  # standard deviations of instants
 _MOST = 2  # events that may explain all
-_MORE = 15.0  # log Bayes factor of an event or a drift against steps
+_MORE = 15.0  # log Bayes factor of a cause against the effects that imitate it
 _FAR = 1e-12  # p-value of what is left, beyond which no few names more explain it
 _ANY_SIZE = 10.0  # factor on plausible sizes
 
@@ -57,7 +57,8 @@ def names_beside_cause(
     yielding = [choice for choice in known if library()[choice.family].goes_with]
     if yielding and is_open:
         cause, imitating = _links(problem, known, yielding)
-        return _names(problem, families, known, imitating, cause)
+        if _explains_more(problem, cause, families, known, imitating):
+            return _names(problem, families, known, imitating, cause)
     return None
 
 
@@ -157,6 +158,28 @@ def _links(
         else:
             alike |= {link.name for link in own}
     return [link for link in links if link.name not in alike], imitating
+
+
+def _explains_more(
+    problem: Problem,
+    cause: Sequence[Block],
+    families: Collection[str],
+    known: Sequence[Choice],
+    imitating: Sequence[Choice],
+) -> bool:
+    """True if a cause is plainly more probable than what imitates it along with all that the library has beside that.
+
+    Links that give way in general can do whatever effects of loads do, also where the library has all of these: they
+    are not asked for then.
+    """
+    if not imitating:
+        return False
+    joint, scales = joint_beside(problem, cause, known)
+    others = [choice for choice in known if choice not in imitating]
+    beside, effects = linear_system(problem, joint, cause, (), others)
+    alone, begun = linear_system(problem, joint, (), families, known)
+    of_library = grown(alone, alone.fit(alone.chosen(begun), None))
+    return beside.fit(beside.chosen(effects), scales).log_evidence - of_library.log_evidence > _MORE
 
 
 def _without_parts(problem: Problem, names: Names) -> Names:

@@ -111,11 +111,20 @@ def system_beside(
     Returns:
         The model, the effects in it, in their order, and the scales of the background beside them.
     """
+    joint, scales = joint_beside(problem, blocks, known)
+    system, effects = linear_system(problem, joint, blocks, (), known)
+    return system, system.chosen(effects), scales
+
+
+def joint_beside(problem: Problem, blocks: Sequence[Block], known: Sequence[Choice]) -> tuple[JointFit, Scales]:
+    """Return the kinematics alone by weights that count beside known effects and a background, and its scales.
+
+    Arguments are those of `system_beside`.
+    """
     kinematics = problem.with_mild_outliers(problem.kinematics_only())
     _, effects = linear_system(problem, kinematics, (), (), known)
     fit, scales = reweighted(problem, kinematics, blocks, effects, None)
-    system, effects = linear_system(problem, replace(kinematics, fit=fit), blocks, (), known)
-    return system, system.chosen(effects), scales
+    return replace(kinematics, fit=fit), scales
 
 
 def linear_system(
