@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 
 _IRB120 = [(0, -90, 290, 0), (270, 0, 0, -90), (70, -90, 0, 0), (0, 90, 302, 0), (0, -90, 0, 0), (0, 0, 72, 180)]
 _IRB120_MASSES = [(1, 3.909), (2, 2.944), (3, 1.328), (4, 0.546), (5, 0.4)]
-_IIWA = [
+IIWA = [
     (0, -90, 340, 0),
     (0, 90, 0, 0),
     (0, 90, 400, 0),
@@ -41,7 +41,7 @@ _IIWA = [
     (0, 90, 0, 0),
     (0, 0, 126, 0),
 ]
-_IIWA_MASSES = [(2, 7.54), (4, 5.65), (6, 3.13)]
+IIWA_MASSES = [(2, 7.54), (4, 5.65), (6, 3.13)]
 _IIWA_RUNS = {
     "0 kg": ("0kg/20161216_run1_0kg.csv", 1),
     "1.25 kg": ("1.25kg/20161216_run2_1.25kg.csv", 1),
@@ -89,7 +89,7 @@ def rig_text(
 
 def iiwa(folder: Path, split: int) -> Iterator[Case]:
     """Yield the runs of the 7-joint arm, with measured torques and with those that follow from its masses."""
-    text = rig_text("iiwa7", _IIWA, _IIWA_MASSES, ["tool"])
+    text = rig_text("iiwa7", IIWA, IIWA_MASSES, ["tool"])
     for title, (path, first) in _IIWA_RUNS.items():
         lines = list(csv.reader((folder / path).read_text().splitlines()))[1:]
         values = np.array([[float(v) for v in line] for line in lines if len(line) > 20][first:])

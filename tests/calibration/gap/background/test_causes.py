@@ -9,9 +9,11 @@ from calibration.effects.library import library
 from calibration.gap.result import GapResult
 from calibration.observations import parse_observations
 from calibration.pipeline.find_gap import find_gap
+from calibration.rig.description import parse_rig
 from daemon.rig_files import load_rig
 from simulators.effects.library import parse_effects
 from simulators.rig.truth import RigTruth
+from tests.bench.measured_arms import IIWA, IIWA_MASSES, rig_text
 from tests.simulated.observations import simulate_observations
 
 SOURCE = load_rig("swdt82")
@@ -72,3 +74,17 @@ def test_what_changes_steadily_is_not_told_as_a_step_beside_one_that_is_there() 
     gap = answer(f"zero_step@theta5:jump_rad=-4e-3:time_s=6000,{settles}", without="base_settlement")
     assert [(e.family, e.where) for e in gap.effects] == [("zero_step", "theta5")]
     assert "time, at all joints and all places" in str(gap.description)
+
+
+@pytest.mark.long
+def test_links_that_give_way_as_the_library_knows_take_no_name_away() -> None:
+    # The links of an arm of seven joints can do for one another: others explain what a link that is named does.
+    text = rig_text("iiwa7", IIWA, IIWA_MASSES, ["tool"])
+    rig = parse_rig(text, "iiwa7.toml")
+    effects = (
+        "joint_compliance@q4:compliance_rad_per_Nm=1e-5,joint_compliance@q3:compliance_rad_per_Nm=2e-5,"
+        "lateral_compliance@q3:compliance_rad_per_Nm=2e-5,base_compliance@base:x_rad_per_Nm=3e-6:y_rad_per_Nm=4e-6"
+    )
+    data = simulate_observations(RigTruth(rig, 1, effects=parse_effects(effects)), 100, 1, noise_mm=0.2)
+    gap = find_gap(rig, text, parse_observations(data.csv_text().encode(), rig, "machine.csv"))
+    assert [f"{e.family}@{e.where}" for e in gap.effects] == ["lateral_compliance@q3"]
