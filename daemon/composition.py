@@ -39,7 +39,7 @@ from simulators.plan import plan_rows, stops_of
 from simulators.replay import ReplayLink
 
 SIMULATED_SYNC_MS = 200
-SIMULATED_RIG = "simulated-rig.toml"  # where joints of the configured one are read from nowhere
+_SIMULATED_RIG = "simulated-rig.toml"  # where joints of the configured one are read from nowhere
 
 Mode = Literal["live", "simulated", "replayed"]
 _SIMULATED_BOOT = "simulated-"
@@ -67,6 +67,7 @@ class Parts:
             operator does.
         turn: turns the simulated station as an operator's hand would; None where it turns by itself, or is real.
         is_over: True when a replay has ended.
+        rig_name: shipped name, or path of the file that describes the machine.
     """
 
     mode: Mode
@@ -81,6 +82,7 @@ class Parts:
     turn: Callable[[str], None] | None = None
     can_links: Sequence[CanLink] = ()
     is_over: Callable[[], bool] = _never
+    rig_name: str = ""
 
 
 def live(
@@ -194,7 +196,7 @@ def _with_devices(source: RigSource, config: Config) -> tuple[RigSource, Config]
     text = with_simulated_channels(source.rig, source.text)
     if text == source.text:
         return source, config
-    path = config.state_directory / SIMULATED_RIG
+    path = config.state_directory / _SIMULATED_RIG
     path.write_text(text, encoding="utf-8")
     return RigSource(parse_rig(text, path.name), text, source.directory), config.model_copy(update={"rig": str(path)})
 
@@ -337,6 +339,7 @@ def _parts(
         aim=aim,
         can_links=can_links if links is None else (),
         is_over=is_over,
+        rig_name=config.rig,
     )
 
 

@@ -19,6 +19,16 @@ from drivers.settings import Settings
 from drivers.stations.config import StationConfig
 
 _QUOTED = 100  # characters of a key
+SIMULATED_CONFIG = """# Written by {written_by}. The simulated rig takes the place of the two ports.
+rig = {rig}
+state_directory = "."
+
+[[can]]
+channel = "can0"
+
+[[station]]
+serial.path = "/dev/rigcal-station"
+"""
 MAX_SOCKET_PATH_BYTES = 107  # unix(7): sun_path holds 108 bytes with the closing zero
 
 

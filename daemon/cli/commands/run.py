@@ -19,18 +19,6 @@ if TYPE_CHECKING:
     from daemon.config import Config
     from daemon.store.store import Store
 
-SIMULATED_CONFIG = """# Written by `rigcal run --sim` at each start, for commands that ask for --config.
-# The simulated rig takes the place of the two ports.
-rig = {rig}
-state_directory = "."
-
-[[can]]
-channel = "can0"
-
-[[station]]
-serial.path = "/dev/rigcal-station"
-"""
-
 SIMULATED_FILE = Path("rigcal-sim", "rigcal.toml")
 
 _RATE = click.FloatRange(0.1, 100)
@@ -91,8 +79,8 @@ def run(
     """
     if not sim and (is_by_hand or rig is not None):
         raise click.UsageError("--rig and --by-hand are for a simulated rig: give --sim as well")
-    from daemon.composition import SIMULATED_RIG, live, replayed, simulated
-    from daemon.config import parse_config, read_config
+    from daemon.composition import live, replayed, simulated
+    from daemon.config import read_config
     from daemon.rig_files import load_rig
     from daemon.service import Daemon, stop_on_signals
 
@@ -104,7 +92,7 @@ def run(
     if config is not None:
         settings = read_config(config)
     elif sim:
-        settings = parse_config(SIMULATED_CONFIG.format(rig='"swdt82"'), SIMULATED_FILE.resolve())
+        settings = _simulated_settings()
     else:
         raise click.UsageError("give --config FILE (only --sim runs without one)")
     source = load_rig(rig or settings.rig, named_in=None if rig else config)
@@ -131,8 +119,7 @@ def run(
                 )
                 parts = stack.enter_context(machine)
                 if config is None:
-                    is_changed = parts.rig_text != source.text
-                    _write_config(settings, settings.state_directory / SIMULATED_RIG if is_changed else settings.rig)
+                    _write_config(settings, parts.rig_name)
             elif is_replay:
                 parts = replayed(settings, source, files, rate)
             else:
@@ -158,15 +145,27 @@ def _store(settings: Config, *, is_simulated: bool) -> Store:
     return store
 
 
-def _write_config(settings: Config, rig: str | Path) -> None:
+def _simulated_settings() -> Config:
+    from daemon.config import parse_config
+
+    return parse_config(_simulated_config("swdt82"), SIMULATED_FILE.resolve())
+
+
+def _write_config(settings: Config, rig: str) -> None:
     """Write the configuration of a simulated rig beside its store."""
     from calibration.rig.description import shipped_rigs
-    from calibration.rig.toml import quoted
     from daemon.host.safe_output import write_file
 
-    named = rig if rig in shipped_rigs() else Path(rig).resolve()
-    text = SIMULATED_CONFIG.format(rig=quoted(str(named)))
-    write_file(settings.state_directory / SIMULATED_FILE.name, text.encode())
+    named = rig if rig in shipped_rigs() else str(Path(rig).resolve())
+    write_file(settings.state_directory / SIMULATED_FILE.name, _simulated_config(named).encode())
+
+
+def _simulated_config(rig: str) -> str:
+    from calibration.rig.toml import quoted
+    from daemon.config import SIMULATED_CONFIG
+
+    by = "`rigcal run --sim` at each start, for commands that ask for --config"
+    return SIMULATED_CONFIG.format(written_by=by, rig=quoted(rig))
 
 
 def _make_directory(settings: Config) -> None:

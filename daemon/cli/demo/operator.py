@@ -11,19 +11,11 @@ from typing import Any
 
 from daemon.cli.diagnosis import overload
 from daemon.commands import CommandError
+from daemon.config import SIMULATED_CONFIG
 from daemon.control.protocol import request
 
 RIG = "swdt82"
-CONFIG = """# Written by rigcal demo. The simulated rig takes the place of the two ports.
-rig = "swdt82"
-state_directory = "."
-
-[[can]]
-channel = "can0"
-
-[[station]]
-serial.path = "/dev/rigcal-station"
-poll_interval_s = 0.25
+_REST = """poll_interval_s = 0.25
 
 [sessions]
 settle_s = 2.0  # simulated time runs fast: the computer's own delays are this much longer in it
@@ -59,7 +51,8 @@ class Operator:
         self._socket = directory / "control.sock"
         self._rate = rate
         config = directory / "rigcal.toml"
-        config.write_text(CONFIG + settings, encoding="utf-8")
+        written = SIMULATED_CONFIG.format(written_by="rigcal demo", rig=f'"{RIG}"')
+        config.write_text(written + _REST + settings, encoding="utf-8")
         command = [sys.executable, "-m", "daemon.cli.main", "run", "--sim", "--config", str(config)]
         command += ["--rate", str(rate), "--seed", str(seed), "--dwell", str(DWELL_S), *options]
         self._log = (directory / "daemon.log").open("w", encoding="utf-8")
