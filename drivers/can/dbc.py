@@ -24,11 +24,11 @@ _NO_VALUE_TEXT = re.compile(r"^(sna|(signal )?not available|invalid)$", re.IGNOR
 
 _MESSAGE_MAX_BYTES = 1785  # of J1939's transport protocol
 # cantools takes a second or two for each of these
-_WORDS_MAX = 600_000
-_MESSAGES_MAX = 20_000
+_WORDS_MAX = 400_000
+_MESSAGES_MAX = 10_000
 _NODES_MAX = 10_000
-_BIT_CHECKS_MAX = 500_000_000
-_BRANCH_CHECKS_MAX = 5_000_000
+_BIT_CHECKS_MAX = 300_000_000
+_BRANCH_CHECKS_MAX = 300_000
 
 _STRING = re.compile(r'"(?:[^"\\]|\\.)*"', re.DOTALL)
 _WORD = re.compile(r"\w+|[^\s\w]")
@@ -185,6 +185,7 @@ class _Size:
         length_bytes: as the file says.
         signals: how many it has.
         values: how many values its multiplexers may have.
+        named: how many values of its signals have names, those of multiplexers among them.
         nested: multiplexers behind multiplexers.
         repeats: how often these are looked at, for the values of those before them.
     """
@@ -192,6 +193,7 @@ class _Size:
     length_bytes: int = 0
     signals: int = 0
     values: int = 1
+    named: int = 0
     nested: set[str] = field(default_factory=set)
     repeats: int = 1
 
@@ -203,7 +205,8 @@ class _Size:
     @property
     def branch_checks(self) -> int:
         """Signals and bytes that are looked at, over all ways through the multiplexers."""
-        return self.values * self.repeats * (self.signals + self.length_bytes) if self.values > 1 else 0
+        each = self.repeats * (self.signals + self.length_bytes)
+        return (self.values + self.named) * each if self.values > 1 else 0
 
 
 def _check_sizes(text: str, where: str) -> None:
@@ -229,7 +232,7 @@ def _check_sizes(text: str, where: str) -> None:
         elif found["signal"]:
             _add_signal(size, found, where)
     for found in _VALUES.finditer(text):
-        sizes.setdefault(found["of"], _Size()).values += found["named"].count('""')
+        sizes.setdefault(found["of"], _Size()).named += found["named"].count('""')
     for found in _RANGES.finditer(text):
         _add_ranges(sizes.setdefault(found["of"], _Size()), found, where)
     words = sum(1 for _ in _WORD.finditer(text))

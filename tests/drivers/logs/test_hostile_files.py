@@ -168,6 +168,10 @@ def signal(name: str, mux: str = "", start: int = 0, bits: int = 8) -> str:
             "signal 'S': its multiplexers",
         ),
         (
+            ["BO_ 512 X: 8 A", signal("M", "M "), signal("S", "m0 ", 8), "SG_MUL_VAL_ 512 S M 0-40000;"],
+            "signal 'S': its multiplexers",
+        ),
+        (
             [
                 "SG_MUL_VAL_ 512 M1 M0 0-99;",
                 "SG_MUL_VAL_ 512 M2 M1 0-99;",
@@ -185,9 +189,9 @@ def signal(name: str, mux: str = "", start: int = 0, bits: int = 8) -> str:
         ),
         (["BO_ 512 X: 1785 A", *(signal(f"S{i}", start=8 * i) for i in range(400))], "describes too much"),
         (["BO_ 512 X: 1785 A", *(signal(f"S{i}") for i in range(400)), "BO_ 512 Y: 8 A"], "describes too much"),
-        ([f"BO_ {2**31 + i} X{i}: 8 A" for i in range(20_001)], "describes too much"),
+        ([f"BO_ {2**31 + i} X{i}: 8 A" for i in range(10_001)], "describes too much"),
         (["BU_: " + "A " * 10_001], "describes too much"),
-        (["A " * 600_001], "describes too much"),
+        (["A " * 400_001], "describes too much"),
         (["A" * (3 << 20)], "cannot be read: it is larger than the 2,097,152 bytes"),
     ],
 )
