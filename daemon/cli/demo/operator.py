@@ -11,7 +11,6 @@ from typing import Any
 
 from daemon.cli.diagnosis import overload
 from daemon.commands import CommandError
-from daemon.config import SIMULATED_CONFIG
 from daemon.control.protocol import request
 
 RIG = "swdt82"
@@ -48,6 +47,8 @@ class Operator:
     def __init__(
         self, directory: Path, rate: float, seed: int, options: Sequence[str] = (), settings: str = ""
     ) -> None:
+        from daemon.config import SIMULATED_CONFIG
+
         self._socket = directory / "control.sock"
         self._rate = rate
         config = directory / "rigcal.toml"
