@@ -18,6 +18,8 @@ from calibration.effects.columns import EffectColumns
 from calibration.effects.fitted import Choice
 from calibration.effects.regime import Regime, variables
 from calibration.gap.candidates import CandidateEffect, candidate_at, each_candidate, variants_at
+from calibration.gap.detection import FAR, detect
+from calibration.gap.formulas.grammar import Grammar
 from calibration.gap.joint_fit import JointFit, Problem
 from calibration.gap.projection import Integers, Projection, SoftProjection, rows_of
 from calibration.gap.screening import Screen
@@ -29,6 +31,7 @@ _SCREENED = 500  # samples that choose which effects are fitted
 _LEAST = 0.05  # share of the samples on either side of a border
 _MOST_FORMS = 40  # of a candidate: one with more is a step at any time
 _FITTED = 8  # effects that are fitted at a time
+_FIRST = 3  # of them, before one that must be the last is given up
 _ROUNDS = 2
 _PASSES = 3  # of a border and the fit that it depends on
 _ON_THE_WAY = 0.5  # of what an effect has to gain: the best of the first round have more
@@ -66,6 +69,8 @@ def effect_in_regime(
     families: Collection[str],
     like: Sequence[CandidateEffect] = (),
     most_cost: float = math.inf,
+    *,
+    is_last: bool = False,
 ) -> EffectInRegime | None:
     """Return the effect of greatest evidence in a part of the data, where that is beyond doubt.
 
@@ -75,6 +80,7 @@ def effect_in_regime(
         families: of effects that may be there.
         like: candidates about another fit, most of whose columns are the same.
         most_cost: a fit of greater cost is of no use, nats.
+        is_last: nor is one that leaves more than noise.
 
     Returns:
         The effect; None where nothing is certain, or of use.
@@ -84,7 +90,9 @@ def effect_in_regime(
     about = problem.project(joint)
     for _ in range(_ROUNDS):
         promising = [choice for choice, log_odds in _screened(about, families, like) if log_odds > _BETTER]
-        for choice in promising[:_FITTED]:
+        for number, choice in enumerate(promising[:_FITTED]):
+            if is_last and number == _FIRST and _leaves_much(problem, fitted.values()):
+                return None
             if str(choice) not in fitted:
                 fitted[str(choice)] = _fitted(problem, joint, choice)
         if not fitted:
@@ -113,6 +121,12 @@ class _Fitted:
 
     joint: JointFit
     posterior: float
+
+
+def _leaves_much(problem: Problem, fitted: Collection[_Fitted]) -> bool:
+    """True if the best of some fits leaves so much that none of less promise can leave noise."""
+    best = min(fitted, key=lambda own: own.joint.fit.cost)
+    return detect(Grammar(problem.project(best.joint)), problem.rng()).p < FAR
 
 
 def _fitted(problem: Problem, joint: JointFit, choice: Choice) -> _Fitted:

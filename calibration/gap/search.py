@@ -97,14 +97,15 @@ def _in_regimes(problem: Problem, families: Collection[str], found: SearchResult
         starts.append(replace(alone, fit=replace(alone.fit, weight=np.ones_like(alone.fit.weight))))
     with_formulas: float | None = None
     for start in starts:
-        one = effect_in_regime(problem, start, families, like, least_cost - _REGIME)
+        is_last = start is found.joint
+        one = effect_in_regime(problem, start, families, like, least_cost - _REGIME, is_last=is_last)
         if one is None or least_cost - one.joint.fit.cost < _REGIME:
             continue
         if with_formulas is None:
             with_formulas = cost_with_formulas(problem, found.joint, found.strongest_formula)
         if with_formulas - one.joint.fit.cost < _REGIME:
             continue
-        if start is found.joint and detect(Grammar(problem.project(one.joint)), problem.rng()).significant:
+        if is_last and detect(Grammar(problem.project(one.joint)), problem.rng()).significant:
             continue  # all others are there already
         tried = StepwiseSearch(problem, families, one).run()
         if tried.joint.choices and _leaves_noise(problem, tried):

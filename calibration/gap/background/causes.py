@@ -23,13 +23,12 @@ from calibration.gap.background.naming import Names, names_beside
 from calibration.gap.background.outside import grammar_beside
 from calibration.gap.background.search import ODDS_OF_TWO, grown, joint_beside, linear_system, system_beside
 from calibration.gap.background.widening import further_blocks
-from calibration.gap.detection import Detection, detect
+from calibration.gap.detection import FAR, Detection, detect
 from calibration.gap.joint_fit import JointFit, Problem
 
 _APART = 4.0  # standard deviations of instants
 _MOST = 2  # events that may explain all
 _MORE = 15.0  # log Bayes factor of a cause against the effects that imitate it
-_FAR = 1e-12  # p-value of what is left, beyond which no few names more explain it
 _ANY_SIZE = 10.0  # factor on plausible sizes
 
 
@@ -71,7 +70,7 @@ def _names(
 ) -> Names | None:
     """Return the names beside a cause in place of what imitates it; None where nothing does, or more is left."""
     others = [choice for choice in known if choice not in imitating]
-    if not imitating or _left(problem, problem.fit(others, problem.solution.fit.x), cause).p < _FAR:
+    if not imitating or _left(problem, problem.fit(others, problem.solution.fit.x), cause).p < FAR:
         return None
     names = names_beside(problem, cause, families, others)
     return None if _left(problem, names.joint, cause).significant else names
