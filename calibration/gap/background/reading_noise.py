@@ -65,9 +65,12 @@ def _shared_variance(system: System, model: Model) -> Floats:
     of_first = np.einsum("pcj,pck->pjk", moved[first], moved[first])
     of_second = np.einsum("pcj,pck->pjk", moved[second], moved[second])
     along = np.einsum("pcj,pc->pj", moved[first], left[first]) * np.einsum("pcj,pc->pj", moved[second], left[second])
-    unit = np.maximum(np.sqrt(np.einsum("pjj,pjj->j", of_first, of_second)), 1e-300)
-    matrix = np.einsum("pjk,pjk->jk", of_first, of_second) / (unit * unit[:, None])
-    variance: Floats = nnls(matrix, along.sum(axis=0) / unit)[0] / unit
+    unit = np.sqrt(np.einsum("pjj,pjj->j", of_first, of_second))
+    is_shared = unit > 0.0  # one that moves only either of two arms is in no product
+    unit = unit[is_shared]
+    matrix = np.einsum("pjk,pjk->jk", of_first, of_second)[np.ix_(is_shared, is_shared)] / (unit * unit[:, None])
+    variance = np.zeros(count)
+    variance[is_shared] = nnls(matrix, along.sum(axis=0)[is_shared] / unit)[0] / unit
     return variance
 
 

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from calibration.gap.background.naming import without_harmful
+from calibration.gap.candidates import variants_at
+from calibration.gap.joint_fit import Problem
 from calibration.gap.result import GapResult
+from calibration.identification.solve import solve
 from calibration.observations import Observations, parse_observations
 from calibration.pipeline.find_gap import find_gap
+from calibration.rig.description import parse_rig
+from calibration.run_settings import Run
 from daemon.rig_files import load_rig
 from simulators.effects.library import parse_effects
 from simulators.rig.truth import RigTruth
@@ -87,3 +94,35 @@ def test_structure_alone_is_given_no_name() -> None:
     assert gap.effects == ()
     assert gap.remaining_significant
     assert gap.description
+
+
+def test_a_torso_whose_arms_share_no_joint_s_errors_has_an_answer() -> None:
+    # The two prisms of a standstill have no joint of an arm in common, so nothing tells its random errors.
+    path = Path(__file__).parents[3] / "rigs" / "torso.toml"
+    rig = parse_rig(path.read_text(encoding="utf-8"), path.name)
+    data = simulate_observations(RigTruth(rig, 3), 120, 3, noise_mm=0.3, prisms=["left", "right"])
+    rows = parse_observations(data.csv_text().encode(), rig, "torso.csv")
+    q = {name: np.deg2rad(values) for name, values in rows.joints.items()}
+    errors_deg = {"left1": 0.1 * np.sin(q["left1"] + q["left2"]), "right2": 0.1 * np.cos(q["right1"] - q["right2"])}
+    rows = replace(rows, joints={name: v + errors_deg.get(name, 0.0) for name, v in rows.joints.items()})
+    gap = find_gap(rig, path.read_text(encoding="utf-8"), rows)
+    assert gap.verdict != "none"
+    assert {effect.where for effect in gap.effects} <= set(errors_deg)
+
+
+@pytest.mark.parametrize(("share", "harmful"), [(0.1, ()), (0.25, ("zero_step@q3",))])
+def test_what_makes_outliers_of_many_fixes_is_judged_with_these(share: float, harmful: tuple[str, ...]) -> None:
+    data = simulate_observations(RigTruth(RIG, 11), 160, 11, noise_mm=NOISE_MM, columns={"time_s": np.arange(160.0)})
+    rows = parse_observations(data.csv_text().encode(), RIG, "machine.csv")
+    is_late = np.arange(160) >= 80
+    is_contrary = is_late & (np.random.default_rng(1).random(160) < share)
+    step_deg = np.where(is_contrary, -0.1, np.where(is_late, 0.1, 0.0))
+    rows = replace(rows, joints={**rows.joints, "q3": rows.joints["q3"] - step_deg})
+    solution = solve(RIG, rows, prior="recalibration", run=Run(0))
+    problem = Problem(solution, rows, "recalibration", 0)
+    forms = variants_at(problem.kinematics_only().situation, "zero_step", "q3")
+    step = min(forms, key=lambda form: abs(form.settings["time_s"] - 79.5))
+    joint = problem.fit([step], solution.fit.x)
+    outliers = joint.fit.weight < 0.5
+    assert outliers[is_contrary].all()
+    assert without_harmful(problem, joint)[1] == harmful
