@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import math
-import tomllib
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from pydantic import ValidationError
 
 from calibration.rig.columns import LABELS, POSITION, names
 from calibration.rig.description import Rig
-from calibration.rig.toml import quoted
+from calibration.rig.toml import parse_toml, quoted
 from drivers.errors import DescriptionError
 from drivers.files import read_whole
 from drivers.stations.delimited import cells_of, lines_of, number_of
@@ -54,13 +53,13 @@ def read_map(path: Path) -> ColumnMap:
         DescriptionError: it cannot be read, or a key of it is wrong.
     """
     try:
-        found = ColumnMap.model_validate(tomllib.loads(read_whole(path, 1 << 20).decode("utf-8-sig")))
+        found = ColumnMap.model_validate(parse_toml(read_whole(path, 1 << 20).decode("utf-8-sig")))
     except OSError as error:
         raise DescriptionError(str(path), f"cannot be read: {error.strerror}") from error
     except ValidationError as error:
         first = error.errors()[0]
         raise DescriptionError(str(path), f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
-    except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, a number of thousands of digits
+    except ValueError as error:  # no TOML, no UTF-8
         raise DescriptionError(str(path), f"is not a TOML file: {error}") from error
     if found.format not in export_formats():
         raise DescriptionError(str(path), f"format: {found.format!r} is unknown; known: {', '.join(export_formats())}")

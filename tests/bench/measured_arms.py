@@ -1,12 +1,13 @@
-"""Two measured arms from public repositories: what is named, and errors of held-out rows stage by stage.
+"""Measured robots from public repositories: what is named, and errors of held-out rows stage by stage.
 
-    python -m tests.bench.measured_arms --iiwa DIR --irb120 DIR [--splits K]
+    python -m tests.bench.measured_arms --iiwa DIR --irb120 DIR --drilling-robot DIR [--splits K]
 
 DIR is a checkout of github.com/Zhangzhongqiu/robot-calibration (KUKA iiwa 7 with joint torques, two runs without a load
-and two with one) and of github.com/icelinker/Robot-Calibration-LaserTracker (ABB IRB 120, three reflectors). Neither
-has a licence, so none of their data is here; an arm whose checkout is not given is skipped. A random half of the poses
-trains, the other half is held out. `--splits` takes so many halves, as halves differ by more than a few
-hundredths of a millimetre.
+and two with one), of github.com/icelinker/Robot-Calibration-LaserTracker (ABB IRB 120, three reflectors), and of
+github.com/Hilti-Research/construction_robot_stationing_datasets (a drilling robot: an arm on a lifting column, two
+inclinometers, a total station, on a level floor and on six other floors). None has a licence by which their data could
+be here; a robot whose checkout is not given is skipped. A random half of the poses trains, the other half is held out.
+`--splits` takes so many halves, as halves differ by more than a few hundredths of a millimetre.
 """
 
 from __future__ import annotations
@@ -48,6 +49,49 @@ _IIWA_RUNS = {
     "2.5 kg": ("2.5kg/20161216_run3_2.5kg.csv", 1),
     "all joints": ("20161118_run_1.csv", 20),
 }
+_DRILLING_ROBOT = """name = "drilling robot"
+convention = "mdh_beta_after"
+gravity = [0, 0, -1]
+tolerances = { length_mm = 1.0, angle_deg = 0.2, beta_deg = 0.1, prism_mm = 100.0 }
+station = { angle_sigma_arcsec = 10.0, distance_sigma_mm = 0.75, distance_sigma_ppm = 2.0, target_sigma_mm = 0.3 }
+prism = [{ name = "tool", frame = 7, offset_mm = [-100.91, -1.02, 335.66], offset_known = false }]
+signal = [
+    { name = "tilt_base_x", unit = "deg" },
+    { name = "tilt_base_y", unit = "deg" },
+    { name = "tilt_tip_x", unit = "deg" },
+    { name = "tilt_tip_y", unit = "deg" },
+]
+joint = [
+    { name = "column", kind = "prismatic", limits = [1480, 3972], sigma = 0.1, max_rate = 200.0 },
+    { name = "q1", kind = "revolute", limits = [-360, 360], sigma = 0.002, max_rate = 120.0 },
+    { name = "q2", kind = "revolute", limits = [-360, 360], sigma = 0.002, max_rate = 120.0 },
+    { name = "q3", kind = "revolute", limits = [-160, 160], sigma = 0.002, max_rate = 180.0 },
+    { name = "q4", kind = "revolute", limits = [-360, 360], sigma = 0.002, max_rate = 225.0 },
+    { name = "q5", kind = "revolute", limits = [-360, 360], sigma = 0.002, max_rate = 225.0 },
+    { name = "q6", kind = "revolute", limits = [-360, 360], sigma = 0.002, max_rate = 225.0 },
+]
+row = [
+    { d_mm = 231, theta_deg = 90, drive = { d = { column = 1.0 } } },
+    { alpha_deg = 90, d_mm = 256.5, drive = { theta = { q1 = 1.0 } } },
+    { alpha_deg = -90, d_mm = 34.5, theta_deg = -90, drive = { theta = { q2 = 1.0 } } },
+    { a_mm = 620, theta_deg = 90, drive = { theta = { q3 = 1.0 } } },
+    { alpha_deg = 90, d_mm = 559, drive = { theta = { q4 = 1.0 } } },
+    { alpha_deg = -90, drive = { theta = { q5 = 1.0 } } },
+    { alpha_deg = 90, d_mm = 121, drive = { theta = { q6 = 1.0 } } },
+]
+mass = [
+    { name = "column top", frame = 1, kg = 14, centre_mm = [0, 0, -841] },
+    { name = "tip mount", frame = 1, kg = 6, centre_mm = [0, 0, -15] },
+    { name = "arm base", frame = 1, kg = 4.12, centre_mm = [0, -152.5, -4.8] },
+    { name = "link 1", frame = 2, kg = 7.8, centre_mm = [0.119, 42.8, -6.383] },
+    { name = "link 2", frame = 3, kg = 10.83, centre_mm = [259.73, -0.053, 157.82] },
+    { name = "link 3", frame = 4, kg = 3.68, centre_mm = [-0.015, -6.702, 44.608] },
+    { name = "link 4", frame = 5, kg = 3.82, centre_mm = [0.071, 91.879, -182.52] },
+    { name = "link 5", frame = 6, kg = 2.82, centre_mm = [-0.273, 3.651, 32.088] },
+    { name = "link 6", frame = 7, kg = 1.16, centre_mm = [-0.292, 0.007, -53.9] },
+    { name = "tool", frame = 7, kg = 3, centre_mm = [0, 0, 250] },
+]
+"""
 _COVERAGE = 1.6448536269514722  # sigmas of a two-sided 90 % interval
 
 
@@ -116,6 +160,29 @@ def irb120(folder: Path, split: int) -> Iterator[Case]:
         yield _case(f"IRB 120, {title}", text, seen, split)
 
 
+def drilling_robot(folder: Path, split: int) -> Iterator[Case]:
+    """Yield the drilling robot on its level floor, in the order of time."""
+    import yaml
+
+    text = (folder / "data/datasets/flat.yaml").read_text(encoding="utf-8")
+    heights = yaml.load(text, yaml.CSafeLoader)["column_heights"].values()
+    every = [space for height in heights for space in height["solution_spaces"].values()]
+    kinds = ("stationing_measurements", "evaluation_measurements")
+    taken = sorted((m for space in every for kind in kinds for m in space[kind]), key=lambda m: float(m["time"]))
+    joints = np.array([m["joint_states"] for m in taken])
+    time_s = np.array([m["time"] for m in taken])
+    columns = {"time_s": time_s - time_s[0], "column_mm": 1e3 * joints[:, 0]}
+    columns |= {f"q{n}_deg": np.rad2deg(joints[:, n]) for n in range(1, 7)}
+    for name, sensor in (("base", "tilt_sensor_base_accel"), ("tip", "tilt_sensor_column_accel")):
+        x, y, z = np.array([m[sensor] for m in taken]).T
+        columns |= {
+            f"tilt_{name}_x_deg": np.rad2deg(np.arctan2(x, z)),
+            f"tilt_{name}_y_deg": np.rad2deg(np.arctan2(y, z)),
+        }
+    position_mm = 1e3 * np.array([m["prism_position"] for m in taken])
+    yield _case("drilling robot, level floor", _DRILLING_ROBOT, [("tool", columns, position_mm)], split)
+
+
 def _case(title: str, text: str, prisms: Sequence[tuple[str, dict[str, Floats], Floats]], split: int) -> Case:
     """Return a data set of (prism, columns, positions) of the same poses, split by poses, number `split`."""
     rig = parse_rig(text, title)
@@ -138,16 +205,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--iiwa", type=Path, metavar="DIR")
     parser.add_argument("--irb120", type=Path, metavar="DIR")
+    parser.add_argument("--drilling-robot", type=Path, metavar="DIR")
     parser.add_argument("--only", default="", help="data sets whose title has this")
     parser.add_argument("--splits", type=int, default=1, metavar="K", help="how many halves (default: 1)")
     given = parser.parse_args()
-    if not (given.iiwa or given.irb120):
-        print("skipped: no checkout is given (--iiwa DIR, --irb120 DIR)")
+    if not (given.iiwa or given.irb120 or given.drilling_robot):
+        print("skipped: no checkout is given (--iiwa DIR, --irb120 DIR, --drilling-robot DIR)")
     print("held-out RMS in mm: n as designed, g geometry, e with effects, h with the residual; share in 90 % intervals")
     hybrid: dict[str, list[float]] = {}
     for split in range(1, given.splits + 1):
         cases = [iiwa(given.iiwa, split)] if given.iiwa else []
         cases += [irb120(given.irb120, split)] if given.irb120 else []
+        cases += [drilling_robot(given.drilling_robot, split)] if given.drilling_robot else []
         for case in chain.from_iterable(cases):
             if given.only in case.title:
                 line, h_mm = _measured(case)
