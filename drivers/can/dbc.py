@@ -34,7 +34,7 @@ _STRING = re.compile(r'"(?:[^"\\]|\\.)*"', re.DOTALL)
 _WORD = re.compile(r"\w+|[^\s\w]")
 _NODES = re.compile(r"\bBU_\s*:((?:\s+(?!BU_\s*:)\w+)*)")
 _BEYOND = re.compile(r"(?<![\w.])[\d.]+[eE][+-]?\d{4,}")
-_MESSAGE = r"\bBO_\s+(?P<id>\d+)\s+(?P<message>\w+)\s*:\s*(?P<bytes>\w+)"
+_MESSAGE = r"\bBO_\s+(?P<id>\d+)\s+(?P<message>\w+)\s*:\s*(?P<bytes>[-+]?\w+)"
 _SIGNAL = r"\bSG_\s+(?P<signal>\w+)(?:\s+(?P<mux>\w+))?\s*:\s*(?P<start>\d+)\s*\|\s*(?P<bits>\d+)"
 _RANGES = re.compile(r"\bSG_MUL_VAL_\s+(?P<of>\d+)\s+(?P<multiplexed>\w+)\s+\w+(?P<ranges>[\s\d,-]*)")
 _VALUES = re.compile(r"\bVAL_\s+(?P<of>\d+)\s+\w+(?P<named>[^;]*)")
@@ -205,7 +205,7 @@ class _Size:
     @property
     def branch_checks(self) -> int:
         """Signals and bytes that are looked at, over all ways through the multiplexers."""
-        each = self.repeats * (self.signals + self.length_bytes)
+        each = self.repeats * max(1, self.signals + self.length_bytes)
         return (self.values + self.named) * each if self.values > 1 else 0
 
 

@@ -162,6 +162,7 @@ def signal(name: str, mux: str = "", start: int = 0, bits: int = 8) -> str:
     ("lines", "reason"),
     [
         (["BO_ 512 X: 16000 A", signal("S")], "message 'X' has 16000 bytes; the longest has 1785"),
+        (["BO_ 512 X: -65 A", signal("S")], "message 'X' has -65 bytes"),
         (["BO_ 512 X: 99999999999999 A"], "message 'X' has 99999999999999 bytes"),
         (
             ["BO_ 512 X: 8 A", signal("M", "M "), signal("S", "m0 ", 8), "SG_MUL_VAL_ 512 S M 0-4294967295;"],
