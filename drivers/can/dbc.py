@@ -36,10 +36,10 @@ _NODES = re.compile(r"\bBU_\s*:((?:\s+(?!BU_\s*:)\w+)*)")
 _BEYOND = re.compile(r"(?<![\w.])[\d.]+[eE][+-]?\d{4,}")
 _MESSAGE = r"\bBO_\s+(?P<id>\d+)\s+(?P<message>\w+)\s*:\s*(?P<bytes>[-+]?\w+)"
 _SIGNAL = r"\bSG_\s+(?P<signal>\w+)(?:\s+(?P<mux>\w+))?\s*:\s*(?P<start>\d+)\s*\|\s*(?P<bits>\d+)"
-_RANGES = re.compile(r"\bSG_MUL_VAL_\s+(?P<of>\d+)\s+(?P<multiplexed>\w+)\s+\w+(?P<ranges>[\s\d,-]*)")
+_RANGES = re.compile(r"\bSG_MUL_VAL_\s+(?P<of>\d+)\s+(?P<multiplexed>\w+)\s+\w+(?P<ranges>[\s\d,+-]*)")
 _VALUES = re.compile(r"\bVAL_\s+(?P<of>\d+)\s+\w+(?P<named>[^;]*)")
 _SIZES = re.compile(f"{_MESSAGE}|{_SIGNAL}")
-_RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
+_RANGE = re.compile(r"([-+]?\d+)\s*-\s*([-+]?\d+)")
 _NESTED = re.compile(r"m\d+M")
 
 

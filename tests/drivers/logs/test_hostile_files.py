@@ -173,6 +173,10 @@ def signal(name: str, mux: str = "", start: int = 0, bits: int = 8) -> str:
             "signal 'S': its multiplexers",
         ),
         (
+            ["BO_ 512 X: 8 A", signal("M", "M "), signal("S", "m0 ", 8), "SG_MUL_VAL_ 512 S M -16777216-0;"],
+            "signal 'S': its multiplexers",
+        ),
+        (
             [
                 "SG_MUL_VAL_ 512 M1 M0 0-99;",
                 "SG_MUL_VAL_ 512 M2 M1 0-99;",
