@@ -173,7 +173,7 @@ def signal(name: str, mux: str = "", start: int = 0, bits: int = 8) -> str:
             "signal 'S': its multiplexers",
         ),
         (
-            ["BO_ 512 X: 8 A", signal("M", "M "), signal("S", "m0 ", 8), "SG_MUL_VAL_ 512 S M -16777216-0;"],
+            ["BO_ 512 X: 8 A", signal("M", "M "), signal("S", "m0 ", 8), "SG_MUL_VAL_ -8 S M -16777216-0;"],
             "signal 'S': its multiplexers",
         ),
         (
