@@ -30,16 +30,21 @@ _NODES_MAX = 10_000
 _BIT_CHECKS_MAX = 300_000_000
 _BRANCH_CHECKS_MAX = 300_000
 
-_STRING = re.compile(r'"(?:[^"\\]|\\.)*"', re.DOTALL)
+# As cantools splits a text, so that nothing goes by unseen: a comment, a string, a number with its sign, a word, a mark
+_TOKEN = re.compile(r'//[^\n]*|"(?:\\"|[^"])*?"|[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?|[A-Za-z0-9_]+|\S')
 _WORD = re.compile(r"\w+|[^\s\w]")
 _NODES = re.compile(r"\bBU_\s*:((?:\s+(?!BU_\s*:)\w+)*)")
 _BEYOND = re.compile(r"(?<![\w.])[\d.]+[eE][+-]?\d{4,}")
-_MESSAGE = r"\bBO_\s+(?P<id>[-+]?\d+)\s+(?P<message>\w+)\s*:\s*(?P<bytes>[-+]?\w+)"
-_SIGNAL = r"\bSG_\s+(?P<signal>\w+)(?:\s+(?P<mux>\w+))?\s*:\s*(?P<start>\d+)\s*\|\s*(?P<bits>\d+)"
-_RANGES = re.compile(r"\bSG_MUL_VAL_\s+(?P<of>[-+]?\d+)\s+(?P<multiplexed>\w+)\s+\w+(?P<ranges>[\s\d,+-]*)")
-_VALUES = re.compile(r"\bVAL_\s+(?P<of>[-+]?\d+)\s+\w+(?P<named>[^;]*)")
+_INTEGER = r"[-+]?\d+"
+_MESSAGE = rf"\bBO_\s+(?P<id>{_INTEGER})\s+(?P<message>\w+)\s*:\s*(?P<bytes>[-+]?\w+)"
+_SIGNAL = (
+    r"\bSG_\s+(?P<signal>\w+)(?:\s+(?P<mux>\w+))?\s*:"
+    rf"\s*(?P<start>{_INTEGER})\s*\|\s*(?P<bits>{_INTEGER})"
+)
+_RANGES = re.compile(rf"\bSG_MUL_VAL_\s+(?P<of>{_INTEGER})\s+(?P<multiplexed>\w+)\s+\w+(?P<ranges>[\s\d,+-]*)")
+_VALUES = re.compile(rf"\bVAL_\s+(?P<of>{_INTEGER})\s+\w+(?P<named>[^;]*)")
 _SIZES = re.compile(f"{_MESSAGE}|{_SIGNAL}")
-_RANGE = re.compile(r"([-+]?\d+)\s*-\s*([-+]?\d+)")
+_RANGE = re.compile(rf"({_INTEGER}) [-+]?(\d+)")
 _NESTED = re.compile(r"m\d+M")
 
 
@@ -219,7 +224,8 @@ def _check_sizes(text: str, where: str) -> None:
     Raises:
         DescriptionError: it would; the message names the message or signal where it is one.
     """
-    text = _STRING.sub('""', text)
+    tokens = (found[0] for found in _TOKEN.finditer(text) if not found[0].startswith("//"))
+    text = " ".join('""' if token[0] == '"' else token for token in tokens)
     beyond = _BEYOND.search(text)
     if beyond is not None:
         raise DescriptionError(where, f"{beyond[0][:40]} is beyond what a number can be")

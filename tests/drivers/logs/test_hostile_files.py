@@ -177,6 +177,14 @@ def signal(name: str, mux: str = "", start: int = 0, bits: int = 8) -> str:
             "signal 'S': its multiplexers",
         ),
         (
+            ["BO_ 512 X: 8 A", signal("M", "M "), signal("S", "m0 ", 8), "SG_MUL_VAL_ 512 S M -167772+0;"],
+            "signal 'S': its multiplexers",
+        ),
+        (
+            ["BO_ 512 X: 8 A", signal("M", "M "), signal("S", "m0 ", 8), "SG_MUL_VAL_ // 512", "512S M 0-167772;"],
+            "signal 'S': its multiplexers",
+        ),
+        (
             [
                 "SG_MUL_VAL_ 512 M1 M0 0-99;",
                 "SG_MUL_VAL_ 512 M2 M1 0-99;",
@@ -194,6 +202,7 @@ def signal(name: str, mux: str = "", start: int = 0, bits: int = 8) -> str:
         ),
         (["BO_ 512 X: 1785 A", *(signal(f"S{i}", start=8 * i) for i in range(400))], "describes too much"),
         (["BO_ 512 X: 1785 A", *(signal(f"S{i}") for i in range(400)), "BO_ 512 Y: 8 A"], "describes too much"),
+        (["BO_ 512 X: 1785 A", *(signal(f"S{i}", start=-1) for i in range(400))], "describes too much"),
         ([f"BO_ {2**31 + i} X{i}: 8 A" for i in range(10_001)], "describes too much"),
         (["BU_: " + "A " * 10_001], "describes too much"),
         (["A " * 400_001], "describes too much"),
