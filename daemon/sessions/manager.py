@@ -177,10 +177,18 @@ class SessionKeeper:
             "values_json": joined.values,
             "excluded": excluded,
         }
-        self._unstored.append(partial(self._add_observation, row, joined))
+        self._unstored.append(partial(self._add_observation, session, row, joined, place_mm))
         return session
 
-    def _add_observation(self, row: Mapping[str, object], joined: JoinedFix) -> None:
+    def _add_observation(
+        self, session: OpenSession, row: Mapping[str, object], joined: JoinedFix, place_mm: Place
+    ) -> None:
+        """Add it, unless a shot has told meanwhile that a control point is there.
+
+        The shot excludes what is stored by then. Both are transactions, so that one sees what the other did.
+        """
+        if row["excluded"] is None and session.is_control_point(place_mm):
+            row = {**row, "excluded": OF_CONTROL_POINT}
         self._observations.add(self._store.fix_id(joined.fix), joined.stamp, **row)
 
     def _which_prism(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> tuple[Exclusions, str | None]:

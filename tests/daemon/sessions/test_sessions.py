@@ -1,5 +1,7 @@
 import math
 import socket
+import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +9,7 @@ import numpy as np
 import pytest
 
 from calibration.observations import parse_observations
+from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_inputs
 from daemon.acquisition.status.present import expected_of
 from daemon.cli.lines.state import show_session
 from daemon.commands import CommandError
@@ -14,11 +17,12 @@ from daemon.config import Config, SessionsSection
 from daemon.control.server import ControlServer
 from daemon.host.time_service import ClockState
 from daemon.rig_files import load_rig
+from daemon.sessions.manager import SessionKeeper
 from daemon.sessions.session_data import sessions_csv, setup_lines
 from daemon.store.errors import NotInStoreError
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S, Stamp
-from drivers.readings import DeviceEvent, EventKind
+from drivers.readings import DeviceEvent, EventKind, Record
 from tests.daemon import session_support
 from tests.daemon.session_support import SOURCE, STEP_S, Rig, closed_afterwards
 
@@ -310,6 +314,29 @@ def test_fixes_on_a_control_point_before_its_first_shot_are_no_observations(rig:
     summary = rig.say("stop")
     kept = rig.store.rows("SELECT x_mm FROM observations WHERE excluded IS NULL")
     assert {round(row["x_mm"]) for row in kept} <= {3000}
+    assert summary["excluded"]["a control point, not the prism"] > 10
+
+
+class OvertakenJoiner(ObservationJoiner):
+    """Joins as usual; when a shot has its fixes, what was joined is stored only after that of the command."""
+
+    keeper: SessionKeeper
+
+    def feed(self, records: Iterable[Record]) -> Any:
+        yield from super().feed(records)
+        while (shot := self.keeper._shot) is not None and shot.done.done():
+            time.sleep(0.001)
+
+
+def test_a_shot_that_ends_between_the_making_of_an_observation_and_its_storing_excludes_it(rig: Rig) -> None:
+    rig.target_mm = (9000.0, 500.0, 2000.0)
+    joiner = OvertakenJoiner(joint_inputs(rig.machine), signal_inputs(rig.machine), settle_s=0.5)
+    joiner.keeper, rig.keeper._joiner = rig.keeper, joiner
+    start(rig)
+    rig.live(3)
+    rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    summary = rig.say("stop")
+    assert summary["observations"] == 0
     assert summary["excluded"]["a control point, not the prism"] > 10
 
 
