@@ -15,8 +15,9 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -39,11 +40,11 @@ class Table:
     """Lines with a name, what came of it, how long it took here, and a figure; several threads may show some.
 
     Args:
-        until_s: when nothing is begun any more, on the monotonic clock.
+        until_s: when all ends, on the monotonic clock.
 
     Attributes:
         failed: names of those that failed.
-        left_out: how many were not begun.
+        left_out: how many were not shown to their end by then.
     """
 
     def __init__(self, until_s: float = math.inf) -> None:
@@ -52,16 +53,41 @@ class Table:
         self.left_out = 0
         self._one_at_a_time = threading.Lock()
 
+    @property
+    def is_over(self) -> bool:
+        """Whether its time is."""
+        return time.monotonic() > self._until_s
+
+    @contextmanager
+    def running(self, machine: Machine) -> Iterator[None]:
+        """Cut a machine's power when the time is over."""
+        if math.isinf(self._until_s):
+            yield
+            return
+        timer = threading.Timer(self._until_s - time.monotonic(), machine.end)
+        timer.start()
+        try:
+            yield
+        finally:
+            timer.cancel()
+
+    def leave_out(self, number: int) -> None:
+        """Count some that are not shown for want of time."""
+        with self._one_at_a_time:
+            self.left_out += number
+
     def show(self, name: str, work: Callable[[], str]) -> bool:
-        """Do something that is a line; returns whether it succeeded."""
-        began = time.monotonic()
-        if began > self._until_s:
-            with self._one_at_a_time:
-                self.left_out += 1
+        """Do something that is a line; returns whether it succeeded, or was left out for want of time."""
+        if self.is_over:
+            self.leave_out(1)
             return True
+        began = time.monotonic()
         try:
             verdict, figure = "ok", work()
         except (MachineError, LookupError, TypeError, ValueError, OSError, subprocess.SubprocessError) as error:
+            if self.is_over:
+                self.leave_out(1)
+                return True
             verdict, figure = "FAILED", f"{type(error).__name__}: {error}"
         with self._one_at_a_time:
             if verdict == "FAILED":
@@ -97,10 +123,17 @@ def show_all(made: Image, rows: Sequence[Sequence[Check]], cuts: int, table: Tab
 
 def _row(made: Image, scratch: Path, checks: Sequence[Check], table: Table) -> None:
     """Boot a machine, and show checks in it one after the other."""
-    with Machine(made, scratch) as machine:
+    if table.is_over:
+        table.leave_out(len(checks))
+        return
+    with Machine(made, scratch) as machine, table.running(machine):
         say(f"booted in {machine.booted_s:.0f} s")
         service = Service(machine)
-        service.install()
+        try:
+            service.install()
+        except MachineError:
+            if not table.is_over:
+                raise
         shown = []
         for check in checks:
             shown.append(table.show(check.__name__, partial(check, service)))
@@ -123,7 +156,7 @@ def _cuts(made: Image, scratch: Path, cuts: int) -> str:
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m tests.vm", description=__doc__)
     parser.add_argument("--only", action="append", metavar="NAME", default=[], help="checks whose name has this in it")
-    parser.add_argument("--minutes", type=float, default=math.inf, help="begin nothing after so many")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="end after so many, whatever has been shown")
     parser.add_argument("--cuts", type=int, metavar="N", help=f"power cuts ({CUTS})")
     return parser.parse_args()
 
