@@ -67,7 +67,7 @@ test: ## the test suite; needs no hardware (GATES=yes: with the gates of its cov
 	@$(BOOTSTRAP) -t systemd-analyze=systemd -t udevadm=udev -t $(PANGO) .venv requirements-dev.lock
 	$(BIN)/python -m pytest -m "not long and not browser" -n auto --dist loadfile --no-loadscope-reorder $(if $(GATES),$(GATED))
 
-long: setup ## tests that take a quarter of an hour, if what they test has changed since they passed
+long: setup ## tests that take over four seconds, if what they test has changed since they passed; half an hour
 	$(BIN)/python -m tests.long
 
 lint: style types imports ## style, types and import floors

@@ -33,6 +33,7 @@ COUNTED = (
     "tests/calibration/gap/background/",
     "tests/calibration/gap/test_discrimination.py",
     "tests/calibration/gap/test_detection.py",
+    "tests/calibration/residual/test_gaussian_process.py",
     "tests/calibration/test_observations.py",
 )
 assert all((Path(__file__).parents[1] / place).exists() for place in COUNTED)

@@ -143,6 +143,11 @@ class Family(ABC):
         """Return the form that a model keeps, given the posterior probabilities (m,) of the `refined` forms."""
         return forms[int(np.argmax(probability))]
 
+    def elsewhere(self, context: EffectContext, where: str, settings: Settings) -> Settings:
+        """Return the settings at set-ups whose bases are fitted anew on the observations of a context."""
+        del context, where
+        return settings
+
     def check_settings(self, settings: Settings) -> None:
         """Raise ValueError for settings that are none of this family's, as a damaged model file may have them."""
         if settings:

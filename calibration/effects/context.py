@@ -136,6 +136,22 @@ class EffectContext:
         moved = np.stack([*tilts, np.tile(axes[2], (len(self), 1))], axis=2)
         return self.to_station(moved * amount[:, None, None])
 
+    def mast_tilt_mm(self, share: float) -> Floats:
+        """Return (n, 3, 2) displacements in the station's frame, mm per rad, as all above a point of the mast tilts.
+
+        Args:
+            share: where the point is, from the base frame's origin, 0, to the frame that the first joint moves, 1.
+
+        The columns are tilts about the level axes x and y through that point; see `level_axes`.
+        """
+        first = self.rig.joint_names[0]
+        moved_row = next(
+            number for number, row in enumerate(self.rig.rows, 1) if any(first in drive for drive in row.drive.values())
+        )
+        lever_mm = self.located.prism_mm - share * self.located.frames_mm[:, moved_row]
+        tilts = [np.cross(axis, lever_mm) for axis in level_axes(self.rig.gravity)[:2]]
+        return self.to_station(np.stack(tilts, axis=2))
+
     def base_shift_mm(self, amount: Floats) -> Floats:
         """Return (n, 3, 3) displacements in the station's frame as the base moves over the ground by `amount` (n,).
 

@@ -51,6 +51,10 @@ class FittedEffect:
             "regime": None if self.regime is None else self.regime.as_dict(),
         }
 
+    def elsewhere(self, context: EffectContext) -> FittedEffect:
+        """The effect at set-ups whose bases are fitted anew on the observations of a context."""
+        return replace(self, settings=library()[self.family].elsewhere(context, self.where, self.settings))
+
     @property
     def form(self) -> str:
         """A phrase that names its form; empty where there is nothing to tell."""

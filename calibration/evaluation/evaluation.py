@@ -16,12 +16,14 @@ from calibration.identification.reading_steps import rounding
 from calibration.identification.samples import averaged
 from calibration.identification.sweeps.circles import find_axes
 from calibration.identification.sweeps.cross_check import AxisCheck, cross_check, disagreements
+from calibration.model.intervals import SetupErrors
 from calibration.model.model import CalibratedModel, Outlier
 from calibration.model.prediction import Predictor
 from calibration.model.rebase import with_refitted_base
 from calibration.model.warnings import farthest, model_warnings
 from calibration.numerics.single_thread import one_blas_thread
 from calibration.observations import Floats, Observations, are_among, data_sha256, originals
+from calibration.residual.conformal import Coverage
 from calibration.residual.learners import tree_importance
 
 _STRANGE = 3.0  # times the expected error, in the median; a right model's are 0.9
@@ -40,6 +42,8 @@ class Evaluation:
         observations: the rows.
         errors_mm: stage -> (n, 3) measured minus modelled, in the station's frame.
         sigma_mm: (n, 3) standard deviation that the model expects of the hybrid stage's errors.
+        coverage: share of the hybrid stage's errors inside their intervals; where the base was refitted on these rows,
+            intervals that were counted on the other half of them.
         outliers: rows farther off than noise explains.
         fitted: how many of the rows the model was fitted to.
         warnings: about model and data.
@@ -51,6 +55,7 @@ class Evaluation:
     observations: Observations
     errors_mm: Mapping[str, Floats]
     sigma_mm: Floats
+    coverage: Coverage
     outliers: tuple[Outlier, ...]
     fitted: int
     warnings: tuple[str, ...]
@@ -84,7 +89,7 @@ class Evaluation:
             "expected_accuracy": self.expected.as_dict() if self.expected else None,
             "axes": [asdict(axis) for axis in self.axes],
             "importance": self._importance(),
-            "intervals": self.model.intervals.coverage(self.errors_mm["hybrid"], self.sigma_mm).as_dict(),
+            "intervals": self.coverage.as_dict(),
         }
 
     def _importance(self) -> list[dict[str, str | float]] | None:
@@ -105,7 +110,7 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
         UnsafeError: a set-up that the model does not know, or whose base cannot be placed with these rows.
     """
     require_positions(observations)
-    effects, learned = model, model.residual is not None
+    effects, learned, home = model, model.residual is not None, model.intervals.at_other_setups()
     if refit_base:
         effects = with_refitted_base(replace(model, residual=None), observations)
         model = effects if model.residual is None else with_refitted_base(model, observations)
@@ -139,6 +144,9 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
             f"{len(outliers)} of {len(observations)} fixes are farther off than noise explains, "
             f"{farthest(observations, outliers)}: the errors count them"
         )
+    coverage = model.intervals.coverage(errors["hybrid"], prediction.sigma_mm)
+    if refit_base:
+        coverage = SetupErrors.of(model, observations).coverage(home)
     axes = _axes(effects, observations)
     warnings += [w for w in disagreements(axes) if w not in warnings]
     return Evaluation(
@@ -146,6 +154,7 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
         observations,
         errors,
         prediction.sigma_mm,
+        coverage,
         outliers,
         fitted,
         tuple(warnings),

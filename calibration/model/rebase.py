@@ -15,6 +15,7 @@ from calibration.identification.refinement import Fit, refine
 from calibration.identification.samples import Samples, averaged
 from calibration.identification.start import rough_start
 from calibration.kinematics.chain import Chain, Placement
+from calibration.model.intervals import SetupErrors
 from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor
 from calibration.observations import Floats, Observations
@@ -54,7 +55,9 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
     start = rough_start(blank, samples, extended(model.values), offsets=False)
     chain = Chain(model.rig, start.placements)
     free = np.arange(len(chain)) >= body
-    additions = fitted_columns(model.effects, EffectContext(chain, extended(model.values), observations))
+    context = EffectContext(chain, extended(model.values), observations)
+    model = replace(model, effects=tuple(effect.elsewhere(context) for effect in model.effects))
+    additions = fitted_columns(model.effects, context)
     additions = additions.over(samples.average)
     moves = np.concatenate([free, np.zeros(len(additions), dtype=bool)])
     begun = np.concatenate([extended(model.values), coefficient_values(model.effects)])
@@ -74,10 +77,10 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
         )
         fit = refine(chain, left, fit.x, free=moves, excess_variance=0.0, additions=additions)
     if model.residual is not None:
-        placed = replace(model, placements=start.placements)
+        elsewhere = replace(model, placements=start.placements)
         reason = _why_left_out(
-            replace(placed, values=without.x[: len(chain)], residual=None, covariance=without.covariance),
-            replace(placed, values=fit.x[: len(chain)], covariance=fit.covariance),
+            replace(elsewhere, values=without.x[: len(chain)], residual=None, covariance=without.covariance),
+            replace(elsewhere, values=fit.x[: len(chain)], covariance=fit.covariance),
             observations,
         )
         if reason:
@@ -88,7 +91,7 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
     nominal = refine(chain, samples, extended(model.nominal_values), free=free)
     known = np.ones(len(model.covariance), dtype=bool)
     known[body : len(model.values)] = False
-    return replace(
+    placed = replace(
         model,
         placements=start.placements,
         values=fit.x[: len(chain)],
@@ -98,6 +101,7 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
         nominal_values=nominal.x,
         intervals=model.intervals.at_other_setups(),
     )
+    return replace(placed, intervals=SetupErrors.of(placed, observations).intervals(placed.intervals))
 
 
 def _why_left_out(without: CalibratedModel, whole: CalibratedModel, observations: Observations) -> str:

@@ -51,6 +51,11 @@ class Intervals:
         level = float(np.sqrt((self.axes[0] ** 2 + self.axes[1] ** 2) / 2.0))
         return Intervals((level, level, self.axes[2]), self.radius)
 
+    def or_wider(self, other: Intervals) -> Intervals:
+        """Intervals that are, along each axis and for the norm, the wider of two."""
+        x, y, z = np.maximum(self.axes, other.axes).tolist()
+        return Intervals((x, y, z), max(self.radius, other.radius))
+
     def half_mm(self, sigma_mm: Floats) -> Floats:
         """(n, 3) half widths of the intervals of x, y and z for standard deviations (n, 3)."""
         half_mm: Floats = sigma_mm * np.array(self.axes)

@@ -55,7 +55,7 @@ def _ended(jobs: list[dict[str, Any]]) -> bool:
     return any(j["kind"] == "report" for j in jobs) and all(j["state"] not in {"queued", "running"} for j in jobs)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_closed_sessions_become_a_model_and_a_report(finished: DaemonProcess) -> None:
     jobs = {job["kind"]: job for job in finished.say("jobs.list")}
     assert [jobs[kind]["state"] for kind in ("gap", "residual", "report")] == ["done"] * 3, jobs
@@ -67,7 +67,7 @@ def test_closed_sessions_become_a_model_and_a_report(finished: DaemonProcess) ->
     assert "cp1" in page
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_model_in_the_store_is_the_one_on_the_disk(finished: DaemonProcess) -> None:
     out = finished.directory / "evaluated.csv"
     model = next(j for j in finished.say("jobs.list") if j["kind"] == "residual")["result"]["model"]
@@ -80,7 +80,7 @@ def test_the_model_in_the_store_is_the_one_on_the_disk(finished: DaemonProcess) 
     assert json.loads(evaluated.stdout)["n"] > 12
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_exported_session_replays_to_the_same_observations(finished: DaemonProcess, tmp_path: Path) -> None:
     for suffix in ("log", "blf"):
         out = tmp_path / suffix
@@ -105,6 +105,7 @@ def test_an_exported_session_replays_to_the_same_observations(finished: DaemonPr
         again.close()
 
 
+@pytest.mark.long
 def test_status_says_what_every_channel_reads(finished: DaemonProcess) -> None:
     status = run_apart("status", "--socket", str(finished.socket), "--json")
     assert status.returncode == 0, status.stderr
@@ -121,6 +122,7 @@ def test_status_says_what_every_channel_reads(finished: DaemonProcess) -> None:
     assert "theta1" in run_apart("status", "--all", "--socket", str(finished.socket)).stdout
 
 
+@pytest.mark.long
 def test_every_list_is_shown_to_people_too(finished: DaemonProcess) -> None:
     for command in (("session", "list"), ("session", "show", "s001-r"), ("setup", "list"), ("jobs", "list")):
         shown = run_apart(*command, "--socket", str(finished.socket))
@@ -128,6 +130,7 @@ def test_every_list_is_shown_to_people_too(finished: DaemonProcess) -> None:
         assert shown.stdout.strip()
 
 
+@pytest.mark.long
 def test_commands_that_make_no_sense_are_refused_with_the_contracts_status(finished: DaemonProcess) -> None:
     for command in (
         ("session", "stop"),
@@ -143,6 +146,7 @@ def test_commands_that_make_no_sense_are_refused_with_the_contracts_status(finis
     assert "parked" in parked.stderr
 
 
+@pytest.mark.long
 def test_a_second_daemon_on_the_same_store_refuses_and_touches_nothing(finished: DaemonProcess) -> None:
     second = run_apart("run", "--config", str(finished.config), *SIM)
     assert second.returncode == 1
@@ -151,6 +155,7 @@ def test_a_second_daemon_on_the_same_store_refuses_and_touches_nothing(finished:
     finished.wait("fixes", lambda: finished.say("status")["acquisition"]["stations"][0]["fixes"] > fixes + 5)
 
 
+@pytest.mark.long
 def test_a_target_that_is_not_there_is_refused_at_once_and_the_rig_goes_on(finished: DaemonProcess) -> None:
     finished.say("session.start", prism="w", id="lost")
     refused = run_apart("session", "shoot", "nowhere", "--socket", str(finished.socket))
@@ -160,6 +165,7 @@ def test_a_target_that_is_not_there_is_refused_at_once_and_the_rig_goes_on(finis
     finished.say("session.abort")
 
 
+@pytest.mark.long
 def test_an_operator_confirms_the_prism_and_status_says_whether_it_is_suspected(finished: DaemonProcess) -> None:
     socket = ("--socket", str(finished.socket))
     refused = run_apart("session", "confirm-prism", *socket)
@@ -173,7 +179,7 @@ def test_an_operator_confirms_the_prism_and_status_says_whether_it_is_suspected(
     finished.say("session.abort")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_accepted_model_gives_the_live_tip_on_the_socket_and_on_the_bus(finished: DaemonProcess) -> None:
     socket = ("--socket", str(finished.socket))
     early, best = finished.say("model.list")
@@ -231,6 +237,7 @@ def _sent(directory: Path, identifier: int) -> list[CanCapture]:
     return [c for c in captures if c.arbitration_id == identifier]
 
 
+@pytest.mark.long
 def test_the_store_lost_nothing(finished: DaemonProcess) -> None:
     with sqlite3.connect(f"file:{finished.directory / 'rigcal.sqlite'}?mode=ro", uri=True) as store:
         assert store.execute("PRAGMA integrity_check").fetchone() == ("ok",)
@@ -241,7 +248,7 @@ def test_the_store_lost_nothing(finished: DaemonProcess) -> None:
     store.close()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_killed_daemon_loses_no_committed_row_and_goes_on(tmp_path: Path) -> None:
     daemon = DaemonProcess(tmp_path, *SIM, jobs=False)
     try:
@@ -286,7 +293,7 @@ def test_a_replay_runs_the_same_daemon_apart_from_the_rigs_own_store_and_ends_wi
     assert samples == sum('"table":"joint_samples"' in line for line in lines)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_malformed_log_is_refused_before_anything_runs(tmp_path: Path) -> None:
     golden = Path(__file__).parents[1] / "golden" / "simulated" / "moving"
     bad = tmp_path / "bad.log"
@@ -303,6 +310,7 @@ def test_a_malformed_log_is_refused_before_anything_runs(tmp_path: Path) -> None
     assert not (tmp_path / "new.sqlite").exists()
 
 
+@pytest.mark.long
 def test_a_log_is_played_back_in_place_of_a_bus(tmp_path: Path) -> None:
     golden = Path(__file__).parents[1] / "golden" / "simulated" / "standing"
     daemon = DaemonProcess(tmp_path, jobs=False, bus=f'interface = "playback"\nchannel = "{golden / "boom.log"}"')

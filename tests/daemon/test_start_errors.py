@@ -57,6 +57,7 @@ def test_a_full_disk_is_told_before_there_is_a_store(tmp_path: Path) -> None:
     assert "delete files" in sentence
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("free_kb", [16, 240])
 def test_a_disk_that_becomes_full_while_the_store_is_made_is_told(tmp_path: Path, free_kb: int) -> None:
     with small_disk(tmp_path / "disk", free_kb) as disk:

@@ -57,7 +57,7 @@ def test_every_page_with_commands_to_run_is_run_here() -> None:
     assert {page for page in pages() if runnable(page)} == run_here | set(LONG)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ALONE)
 def test_a_page_runs_from_nothing(name: str, tmp_path: Path) -> None:
     run(f"{HOW_TO}/{name}.md", tmp_path)
@@ -71,12 +71,12 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_page_that_calibrates_leaves_a_model_that_is_right(calibrated: Path) -> None:
     assert {"model", "predicted.csv", "commands.csv"} <= {path.name for path in calibrated.iterdir()}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", WITH_A_MODEL)
 def test_a_page_runs_with_that_model(name: str, calibrated: Path, tmp_path: Path) -> None:
     run(f"{HOW_TO}/{name}.md", Path(shutil.copytree(calibrated, tmp_path / "copy")))
@@ -94,12 +94,12 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DaemonProcess]:
         daemon.stop()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_page_of_sessions_leaves_a_closed_one(rig: DaemonProcess) -> None:
     assert [(one["id"], one["state"]) for one in rig.say("session.list")] == [("s001-r", "closed")]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", WITH_A_RIG)
 def test_a_page_runs_beside_a_daemon(name: str, rig: DaemonProcess) -> None:
     run(f"{HOW_TO}/{name}.md", rig.directory, RIGCAL_SOCKET=str(rig.socket))

@@ -18,6 +18,7 @@ SLOW_S = 5.0
 TARGETS = find_targets()
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", TARGETS)
 def test_whatever_comes_a_target_returns(name: str) -> None:

@@ -9,6 +9,7 @@ from tests.golden.regenerate import CASES, HERE, REAL, SIMULATED, can_logs, repl
 FOLDERS = sorted(path for kind in (SIMULATED, REAL) for path in kind.iterdir() if path.is_dir())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda path: f"{path.parent.name}/{path.name}")
 def test_a_captured_log_yields_its_golden_readings(folder: Path, tmp_path: Path) -> None:
     golden = folder / "readings.jsonl"

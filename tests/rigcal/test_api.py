@@ -17,6 +17,7 @@ from calibration.rig.description import Rig, shipped_rig
 ROOT = Path(__file__).parents[2]
 
 
+@pytest.mark.long
 def test_every_line_of_the_page_runs() -> None:
     """In a process of its own: doctest takes the trace function that measures coverage here."""
     page = ROOT / "docs" / "how-to" / "notebook.md"

@@ -214,6 +214,7 @@ def test_an_unplugged_port_comes_back(rig: Process) -> None:
     assert before.startswith("/dev/pts/")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

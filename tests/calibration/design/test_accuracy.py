@@ -53,6 +53,7 @@ def test_the_expected_error_over_the_work_volume_is_the_actual_one(hidden: str, 
     assert BAND[0] < ratio < BAND[1]
 
 
+@pytest.mark.long
 def test_on_measured_data_the_expected_error_is_the_held_out_one(ur10_random_poses: Observations) -> None:
     """Tracker noise is some 0.02 mm: what is left on held-out cells is the model's."""
     training, held_out = split_by_cells(ur10_random_poses, 0.15, 0)
@@ -85,6 +86,7 @@ def test_statistics_are_those_of_the_errors(session: Session) -> None:
     assert answer["rms_mm"] == pytest.approx(np.linalg.norm(parts))
 
 
+@pytest.mark.long
 def test_the_worst_part_of_a_range_is_named(session: Session) -> None:
     readings = np.random.default_rng(0).uniform(0.0, 1.0, (300, 9))
     for index, joint in enumerate(session.rig.joints):
@@ -98,6 +100,7 @@ def test_the_worst_part_of_a_range_is_named(session: Session) -> None:
     assert "where L2 is 1445 .. 2168 mm" in found.where
 
 
+@pytest.mark.long
 def test_after_a_session_the_next_poses_go_where_the_model_is_poor() -> None:
     rig = shipped_rig("swdt82")
     truth = RigTruth(rig, 3)
@@ -126,6 +129,7 @@ def test_repeats_of_a_standstill_are_no_further_evidence_of_what_the_model_lacks
     assert joint_error_scale(model, thrice) == 0.0
 
 
+@pytest.mark.long
 def test_scatter_with_structure_is_the_models_even_where_lever_arms_do_not_show_it(session: Session) -> None:
     noisier = replace(session.model, excess_sigma_mm=4.0)
     scale = joint_error_scale(noisier, session.training, structured=True)

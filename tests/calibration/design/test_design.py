@@ -98,6 +98,7 @@ def test_segment_distance_is_the_smallest_between_any_two_points() -> None:
     assert found == pytest.approx(sampled, abs=0.03)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("station", "seen"),
     [
@@ -257,6 +258,7 @@ def test_planned_poses_leave_less_error_than_random_ones() -> None:
     assert np.mean(planned) < 0.85 * np.mean(drawn)
 
 
+@pytest.mark.long
 def test_poses_that_separate_two_effects_show_them_better_than_others() -> None:
     knowledge, _, candidates = situation(shipped_rig("swdt82"), 1500)
     effects = ("joint_compliance@theta4", "angle_scale@theta4")
@@ -267,7 +269,7 @@ def test_poses_that_separate_two_effects_show_them_better_than_others() -> None:
         assert separating.stands_out[effect] > 1.2 * random.stands_out[effect]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_poses_that_may_move_separate_two_effects_better_than_those_among_which_they_are_chosen() -> None:
     knowledge, at, candidates = situation(shipped_rig("swdt82"), 1500)
     effects = ("joint_compliance@theta4", "angle_scale@theta4")

@@ -53,6 +53,7 @@ def test_chosen_poses_bring_more_than_as_many_at_random(poses: Floats) -> None:
     assert rms_mm(chosen.accuracy(), ("r",)) < rms_mm(at_random.accuracy(), ("r",))
 
 
+@pytest.mark.long
 def test_poses_are_inside_the_limits_and_the_same_for_the_same_seed(poses: Floats) -> None:
     low, high = np.array([joint.limits for joint in RIG.joints]).T
     assert poses.shape == (20, len(RIG.joints))

@@ -43,6 +43,7 @@ REPORTED = {
     "base_step": ("tilt_x_rad", "tilt_y_rad", "z_mm", "time_s"),
     "base_compliance": ("x_rad_per_Nm", "y_rad_per_Nm"),
     "base_shift": ("x_mm", "y_mm", "heading_rad", "time_s"),
+    "measured_tilt": tuple(f"about_{axis}_by_{reading}_rad_per_deg" for reading in "xy" for axis in "xy"),
     "zero_step": ("jump_rad", "time_s"),
     "prism_seat_step": ("x_mm", "y_mm", "z_mm", "time_s"),
     "lateral_compliance": ("compliance_rad_per_Nm",),
@@ -67,9 +68,11 @@ BESIDE_THE_MACHINE = {
     "base_step",
     "base_compliance",
     "base_shift",
+    "measured_tilt",
 }
 FAMILIES = sorted(library().items())
 ROWS = 40
+TILTS = ("tilt_x_deg", "tilt_y_deg")  # what an inclinometer reads, signals of a rig file
 UNKNOWN = 15  # of the rows of `lacking`, which lack all that is optional
 
 
@@ -81,14 +84,18 @@ def everything(rig: Rig, session: Observations) -> Observations:
     extra |= {f"{j.name}_bar": rng.uniform(20.0, 200.0, n) for j in rig.joints if j.kind == "prismatic"}
     extra["time_s"] = np.sort(rng.uniform(0.0, 4.0 * 3600.0, n))
     extra["temperature_degC"] = rng.uniform(-5.0, 25.0, n)
+    extra |= {column: rng.uniform(-0.5, 0.5, n) for column in TILTS}
     extra["payload_kg"] = np.where(rng.random(n) < 0.5, 0.0, 300.0)
     return replace(session, extra=extra)
 
 
 @pytest.fixture(scope="module")
 def situation(session: Session) -> EffectContext:
-    model = session.model
-    return EffectContext(model.chain, model.values, everything(session.rig, session.held_out.select(np.arange(ROWS))))
+    return EffectContext(
+        Chain(session.rig.with_signals(*TILTS), session.model.placements),
+        session.model.values,
+        everything(session.rig, session.held_out.select(np.arange(ROWS))),
+    )
 
 
 def forms(family: Family, situation: EffectContext) -> Iterator[tuple[str, Settings]]:
@@ -234,7 +241,7 @@ def test_settings_of_another_family_are_refused(family: Family) -> None:
 
 @pytest.mark.parametrize("rig_name", ["swdt82", "ys100", "ur10"])
 def test_every_family_copes_with_every_rig_and_with_a_single_row(rig_name: str) -> None:
-    rig = shipped_rig(rig_name)
+    rig = shipped_rig(rig_name).with_signals(*TILTS)
     table = simulate_observations(RigTruth(rig, 5), 12, 1, prisms_per_pose="one", noise_mm=0.1)
     full = everything(rig, parse_observations(table.csv_text().encode(), rig, "simulated.csv"))
     chain = Chain(rig, {"": Placement.identity()})

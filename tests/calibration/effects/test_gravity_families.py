@@ -149,6 +149,7 @@ def test_play_is_named_where_masses_and_the_carriers_lean_move_the_flip(poses: P
 # -- weights that no machine has ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_droop_that_the_library_lacks_is_no_compliance_with_impossible_weights() -> None:
     rig = shipped_rig("swdt82")
     drawn = draw(rig, Cell("left_out", ("boom_droop",), 3.0, "face", "fine", 10403))

@@ -230,6 +230,7 @@ def test_the_inverse_in_c_goes_round_the_gap_that_play_leaves(session: Session, 
     assert (missed, closure_mm <= EXACT_MM) == (0, True)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("effects", "variant"),
     [

@@ -88,6 +88,7 @@ def alarm(words: Grammar, seed: int = 0) -> float:
 # -- by chance ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_machine_without_hidden_effects_raises_no_alarm_whatever_its_noise() -> None:
     """Two alarms at p < 0.01 in 8 nulls are chance once in four hundred times."""
     rig = shipped_rig("swdt82")
@@ -161,6 +162,7 @@ def test_what_a_size_depends_on_is_asked_beside_the_error_itself() -> None:
 # -- what is there -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("effect", "where", "formula"),
     [

@@ -146,7 +146,7 @@ def short() -> Measured:
 # -- poses -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_proposed_poses_tell_apart_what_the_data_could_not(short: Measured) -> None:
     truth, alternative = "encoder_harmonic@theta4", "angle_scale@theta4"
     before = short.evidence(truth, alternative)
@@ -207,6 +207,7 @@ def test_what_a_set_is_told_from_has_the_forms_and_places_that_come_near(short: 
     assert near.choice.settings not in [w.choice.settings for w in near.same_family]
 
 
+@pytest.mark.long
 def test_every_effect_of_the_library_can_be_planned_for(rig: Rig) -> None:
     blank = Chain(rig, {"": Placement.identity()})
     at = site(blank, np.zeros(len(blank)))
@@ -239,7 +240,7 @@ def test_a_plan_varies_what_changes_one_effect_and_not_the_other(short: Measured
     assert "carry payload_kg" in proposed.text
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_plan_waits_only_where_time_tells(short: Measured) -> None:
     times = np.linspace(0.0, 28800.0, len(short.observations))
     timed = replace(short.observations, extra=dict(short.observations.extra) | {"time_s": times})
@@ -277,6 +278,7 @@ def test_several_fixes_of_a_pose_show_effects_better_and_none_is_repeated_on_the
     assert (rows.fixes == np.where(moves, 1, FIXES)).all()
 
 
+@pytest.mark.long
 def test_poses_near_the_best_show_effects_better(short: Measured) -> None:
     model, alternatives = short.model, short.found("encoder_harmonic@theta4", "angle_scale@theta4")
     knowledge = Knowledge.before(model, 0)
@@ -350,6 +352,7 @@ def of_plausible_size(case: Measured, effect: str) -> FittedEffect:
     return Choice(name, where, settings).fitted(situation, sigma, 0.1 * sigma)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("alternatives", "kind", "changed", "left"),
     [

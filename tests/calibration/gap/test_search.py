@@ -40,6 +40,7 @@ def hidden(drawn: Drawn) -> set[tuple[str, str]]:
     return {(effect["family"], effect["where"]) for effect in drawn.label["effects"]}
 
 
+@pytest.mark.long
 def test_two_effects_are_both_named_where_they_are_and_the_gap_closes() -> None:
     drawn, gap = answered(Cell("pair", ("angle_scale", "linkage_coupling"), 1.0, "wide", "fine", 43))
     assert gap.verdict == "named"
@@ -62,6 +63,7 @@ def test_scatter_far_beyond_the_instruments_is_no_effect_but_not_passed_over_in_
     assert not any("the fixes scatter by" in warning for warning in silent.warnings)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("width", [3e-3, -3e-3])
 def test_play_has_its_name_on_whichever_side_of_it_the_encoder_is(width: float) -> None:
     data = session_csv(60, hidden=f"backlash@theta4:width_rad={width}")
@@ -70,6 +72,7 @@ def test_play_has_its_name_on_whichever_side_of_it_the_encoder_is(width: float) 
     assert gap.effects[0].coefficients[0].value == pytest.approx(width, rel=0.2)
 
 
+@pytest.mark.long
 def test_a_disc_that_is_off_its_axis_and_oval_is_an_encoder_error_and_no_curve() -> None:
     robot = load_rig("ys100")
     once, twice = "cosk_rad=2e-4:sink_rad=1e-4:k=1", "cosk_rad=-1e-4:sink_rad=8e-5:k=2"
@@ -159,6 +162,7 @@ def test_an_effect_that_no_library_has_is_described_and_gets_no_name() -> None:
     assert gap.description.endswith("not in the library")
 
 
+@pytest.mark.long
 def test_an_effect_is_named_beside_one_that_no_library_has() -> None:
     drawn, gap = answered(Cell("beside", ("cross_law", "solar_bow"), 1.0, "wide", "fine", 52))
     strange, known = drawn.label["effects"]

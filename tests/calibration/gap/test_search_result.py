@@ -17,6 +17,7 @@ from tests.calibration.conftest import Session
 SOURCE = load_rig("swdt82")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("cell", "words"),
     [

@@ -220,6 +220,7 @@ def far_machine(name: str, seed: int) -> RigTruth:
     return truth
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "seed"), [("swdt82", 2), ("swdt82", 7), ("ys100", 1003)])
 def test_sweeps_start_the_search_where_angles_are_thirty_degrees_off(name: str, seed: int) -> None:
     truth = far_machine(name, seed)

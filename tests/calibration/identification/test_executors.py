@@ -74,7 +74,7 @@ def test_a_dask_cluster(search: str, reference: Evolved, cluster: Client) -> Non
     assert_same(SEARCHES[search](cluster.get_executor()), reference)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_whole_calibration_on_a_dask_cluster_is_that_of_threads_byte_by_byte(cluster: Client) -> None:
     rig = shipped_rig("ys100")
     harmonic = EncoderHarmonic("theta2", 4e-3, 3e-3, 2)  # beyond the kinematics: it is searched for, and then learnt

@@ -261,6 +261,7 @@ def test_additions_of_other_rows_are_refused(session: Session) -> None:
 # -- intervals -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "setting",
     [

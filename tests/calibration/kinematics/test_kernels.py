@@ -120,6 +120,7 @@ def test_candidates_may_consist_of_some_parameters_with_the_others_fixed(rig: Ri
     np.testing.assert_allclose(fixed(np.empty((1, 0))), expected, rtol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rig", RIGS, ids=lambda r: r.name)
 def test_float32_is_right_to_a_few_millionths(rig: Rig) -> None:
     chain, data, measured, weight, population = problem(rig)
@@ -210,7 +211,7 @@ def test_arrays_that_cannot_be_written_do_not_compile_anything_anew() -> None:
     assert (len(compiled_fitness.signatures), len(reduce_chain.signatures)) == compiled
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_kernel_compiles_where_numba_finds_no_place_for_its_cache() -> None:
     script = textwrap.dedent(
         """

@@ -100,11 +100,13 @@ def test_a_calibrated_model_covers_held_out_fixes(session: Session) -> None:
     assert covered["radius_coverage"] == pytest.approx(0.9, abs=0.04)
 
 
-def test_at_another_set_up_x_and_y_are_alike(session: Session) -> None:
-    intervals = evaluate(session.model, session.held_out, refit_base=True).model.intervals
-    assert intervals.axes[0] == intervals.axes[1]
-    assert min(session.model.intervals.axes[:2]) < intervals.axes[0] < max(session.model.intervals.axes[:2])
-    assert intervals.axes[2] == session.model.intervals.axes[2]
+def test_at_another_set_up_x_and_y_are_alike_and_nothing_is_surer_than_at_home(session: Session) -> None:
+    home = session.model.intervals.at_other_setups()
+    assert home.axes[0] == home.axes[1]
+    assert min(session.model.intervals.axes[:2]) < home.axes[0] < max(session.model.intervals.axes[:2])
+    assert home.axes[2] == session.model.intervals.axes[2]
+    there = evaluate(session.model, session.held_out, refit_base=True).model.intervals
+    assert there == there.or_wider(home)
 
 
 @pytest.mark.long

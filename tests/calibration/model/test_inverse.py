@@ -101,6 +101,7 @@ def assert_on_target(model: CalibratedModel, targets: Observations) -> None:
     assert ((joints >= low) & (joints <= high)).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("build", "prisms"),
     [(arm, ["tmac"]), (torso, ["left"]), (torso, ["chest", "left", "right"]), (boom_with_trees, ["r"])],

@@ -27,6 +27,7 @@ def processes() -> Iterator[Executor]:
         yield pool
 
 
+@pytest.mark.long
 def test_tasks_have_one_blas_thread_in_a_process_of_their_own(processes: Executor) -> None:
     assert list(SingleThreaded(processes).map(blas_threads, range(4))) == [{1}] * 4
 

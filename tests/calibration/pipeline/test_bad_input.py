@@ -66,6 +66,7 @@ def refused(training: Observations, name: str, change: Change, prior: str = "rec
     return str(raised.value)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -98,6 +99,7 @@ def test_a_sign_that_parameters_could_stand_for_is_named_all_the_same(session: S
     assert "the corrections are" in message
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -172,6 +174,7 @@ def test_fewer_fixes_than_parameters_are_named(session: Session) -> None:
     assert any(w.startswith("30 different fixes are few for 56 parameters") for w in model.warnings)
 
 
+@pytest.mark.long
 def test_an_encoder_that_does_not_read_is_named(session: Session) -> None:
     frozen = replace(session.training, joints={**session.training.joints, "theta3": np.full(250, 80.0)})
     assert "theta3 never moved in these data" in refused(frozen, "swdt82", lambda o: o)

@@ -32,6 +32,7 @@ def moved(which: Callable[[Observations], np.ndarray], place: Callable[[np.ndarr
     return lambda o: replace(o, position_mm=np.where(which(o)[:, None], place(o.position_mm), o.position_mm))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "setups", "change", "words"),
     [
@@ -76,7 +77,7 @@ def test_a_mistake_is_refused_by_its_name(name: str, setups: tuple[str, ...], ch
         identify(rig, text, change(training))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_outliers_that_one_setup_has_are_said_to_be_of_it() -> None:
     rig, text, training = machine("torso", "west", "east")
     stood = 90  # of the rows of east, then the station moved

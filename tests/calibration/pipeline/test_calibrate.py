@@ -251,6 +251,7 @@ def test_what_is_not_there_is_refused_by_name(session: Session) -> None:
         calibrate(session.rig, TEXT, session.training.select(np.arange(5)), effects="witchcraft@theta1")
 
 
+@pytest.mark.long
 def test_a_residual_is_not_used_for_a_prism_it_never_saw(session: Session) -> None:
     rows = session.training.select(session.training.prism != "r")
     biased = replace(rows, position_mm=rows.position_mm + 30.0 * np.sin(rows.joints["L3"] / 300.0)[:, None])
@@ -277,6 +278,7 @@ def turned(observations: Observations, joint: str, degrees: float) -> Observatio
     return replace(observations, joints={**observations.joints, joint: observations.joints[joint] + degrees})
 
 
+@pytest.mark.long
 def test_an_encoder_mounted_the_other_way_round_is_found_as_built_and_refused_otherwise(session: Session) -> None:
     training, held_out = (turned(o, "theta7", 180.0) for o in (session.training, session.held_out))
     with pytest.raises(UnsafeError, match="--prior as-built"):
@@ -301,6 +303,7 @@ def test_a_zero_that_is_far_off_is_refused_with_the_way_out(session: Session) ->
     assert not any("fit badly" in w for w in session.model.warnings)
 
 
+@pytest.mark.long
 def test_a_fit_that_leaves_out_a_whole_prism_is_refused(session: Session) -> None:
     position = session.training.position_mm.copy()
     position[session.training.prism == "s"] += [0.0, 900.0, 1300.0]

@@ -42,6 +42,7 @@ def test_what_is_doubtful_of_the_training_and_of_the_held_out_rows_is_told() -> 
     assert left_out in warnings
 
 
+@pytest.mark.long
 def test_an_effect_of_the_library_that_is_too_weak_to_be_named_is_not_said_to_be_outside_of_it() -> None:
     observations = session(60, hidden="base_settlement@base:tilt_x_rad_per_h=6e-4")
     gap = find_gap(support.SOURCE.rig, support.SOURCE.text, observations)

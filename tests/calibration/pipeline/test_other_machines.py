@@ -30,6 +30,7 @@ def simulated(truth: RigTruth, poses: int, seed: int, setups: tuple[str, ...]) -
     return parse_observations(table.encode(), truth.rig, "simulated.csv"), float(np.sqrt(squares / fixes))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "poses", "setups"),
     [

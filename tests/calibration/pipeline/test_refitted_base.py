@@ -79,6 +79,21 @@ def test_a_prediction_at_a_refitted_set_up_is_as_sure_as_it_says(moved: Moved, r
     assert 0.8 < np.mean(chi_square) < 1.25
 
 
+def test_what_a_machine_does_at_another_site_alone_widens_its_intervals_there() -> None:
+    rig = shipped_rig("swdt82")
+    model = identify(rig, rig_text("swdt82"), simulated(RigTruth(rig, 23), 150, 23), effects="none")
+    soft = parse_effects("base_compliance@base:x_rad_per_Nm=6e-8:y_rad_per_Nm=4e-8")  # the ground there
+    there = simulated(RigTruth(rig, 23, effects=soft), 500, 24, setup="there")
+    few, others = there.select(np.arange(40)), there.select(np.arange(40, 500))
+    placed = with_refitted_base(model, few)
+    prediction = Predictor.of(placed).predict(others)
+    error = others.position_mm - prediction.position_mm
+    assert model.intervals.coverage(error, prediction.sigma_mm).radius < 0.75
+    assert placed.intervals.coverage(error, prediction.sigma_mm).radius == pytest.approx(0.9, abs=0.06)
+    # Counted on the half of the fixes that does not tell how wide they are.
+    assert evaluate(model, there, refit_base=True).coverage.radius == pytest.approx(0.9, abs=0.04)
+
+
 def test_the_stages_without_a_residual_have_a_base_of_their_own(moved: Moved) -> None:
     few = moved.few[0]
     plain = evaluate(replace(moved.model, residual=None), few, refit_base=True)
@@ -115,6 +130,7 @@ def test_a_model_with_a_refitted_base_is_stored_whole(moved: Moved, refitted: li
         model_from_files(model_to_files(replace(refitted[0], base_covariance=np.eye(5))))
 
 
+@pytest.mark.long
 def test_compared_residuals_have_each_its_own_base(moved: Moved) -> None:
     few = moved.few[0]
     effects, rbfn = _compared(moved, few, "effects", "rbfn")

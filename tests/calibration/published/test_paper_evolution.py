@@ -173,6 +173,7 @@ def objective(**changed: object) -> PaperObjective:
     return PaperObjective(chain, data, measured, label, **options)  # type: ignore[arg-type]  # passed through
 
 
+@pytest.mark.long
 def test_the_objective_is_equation_19_with_the_attitude() -> None:
     paper = objective()
     rng = np.random.default_rng(1)

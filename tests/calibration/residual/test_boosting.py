@@ -64,6 +64,7 @@ def test_out_of_fold_errors_are_those_of_rows_that_nothing_was_trained_on() -> N
     assert rms(target - trees.predict(rows)) < 0.9 * rms(target - estimate)  # which rows it was trained on flatter
 
 
+@pytest.mark.long
 def test_out_of_fold_errors_are_not_flattered_by_the_choice_of_rounds() -> None:
     """Whatever trees say of pure noise, rows that had no part in them show a larger error than saying nothing."""
     shares = []
@@ -74,6 +75,7 @@ def test_out_of_fold_errors_are_not_flattered_by_the_choice_of_rounds() -> None:
     assert np.mean(shares) > 1.003  # 0.997 where a fold's own rows choose
 
 
+@pytest.mark.long
 def test_neither_the_number_of_workers_nor_a_second_run_changes_a_tree() -> None:
     rows = seen(200, 3)
     one, two = (validated(rows, truth(rows), workers) for workers in (1, 3))

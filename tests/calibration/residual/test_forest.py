@@ -164,6 +164,7 @@ def test_a_text_that_ends_anywhere_before_its_end_is_refused() -> None:
             read_trees(whole[:length], COLUMNS)
 
 
+@pytest.mark.long
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
 def test_a_hostile_text_is_refused_or_gives_finite_sums(data: st.DataObject) -> None:

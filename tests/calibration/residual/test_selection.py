@@ -79,6 +79,7 @@ def test_a_learner_that_helps_is_kept_and_predicts_rows_it_never_saw(kind: Kind)
     assert 0.5 * trial.after_mm**2 <= decision.variance_mm2.sum() <= 1.05 * trial.after_mm**2
 
 
+@pytest.mark.long
 def test_the_default_is_the_best_of_all_on_held_out_groups() -> None:
     decision = choose("default", noise=0.1, signal=1.0)
     assert decision.residual is not None
@@ -87,6 +88,7 @@ def test_the_default_is_the_best_of_all_on_held_out_groups() -> None:
     assert {t.kind for t in decision.trials} >= {"gp", "rbfn", "lightgbm"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 def test_nothing_is_learned_from_noise(seed: int) -> None:
     decision = choose("default", noise=1.0, signal=0.0, n=250, seed=seed)
@@ -109,6 +111,7 @@ def test_too_few_groups_are_a_reason_to_learn_nothing() -> None:
     assert decision.reason == "60 fixes in 1 groups are too few to learn a residual from"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["rbfn", "lightgbm", "chain", "gp"])
 def test_a_learner_survives_being_written_and_read(kind: Kind) -> None:
     residual = choose(kind, noise=0.1, signal=1.0, n=200).residual

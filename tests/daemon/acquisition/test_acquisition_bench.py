@@ -7,9 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[3]
 
 
+@pytest.mark.long
 def test_a_short_benchmark_counts_every_frame_and_loses_none() -> None:
     """Over slcan, where a slow listener slows the bus down: the test must pass on a busy machine."""
     command = [sys.executable, "-m", "tests.bench.acquisition", "--seconds", "0.5", "--transport", "slcan", "--json"]

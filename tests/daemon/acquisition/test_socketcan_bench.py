@@ -15,7 +15,7 @@ from tests.bench.traffic import multicast_works
 ROOT = Path(__file__).parents[3]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_short_benchmark_drops_nothing_and_no_stamp_goes_back() -> None:
     if not multicast_works(20_000 + os.getpid() % 20_000):
         pytest.skip("this host has no multicast")

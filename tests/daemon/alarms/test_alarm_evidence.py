@@ -92,6 +92,7 @@ def test_the_newest_set_up_is_told_and_whether_it_has_moved(rig: ModelRig, gathe
     assert gather().setup == SetupRow("S3", "ok")
 
 
+@pytest.mark.long
 def test_the_live_model_is_told_with_jumps_defects_and_drift(rig: ModelRig, gather: Gatherer) -> None:
     assert gather().model is None
     number = rig.accepted()

@@ -91,7 +91,7 @@ def test_a_clock_that_was_set_back_while_rigcal_did_not_run_is_an_event_and_alar
     assert steps == [pytest.approx(-7_200_000, abs=100), pytest.approx(7_200_000, abs=100)]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_rig_that_falls_silent_raises_few_alarms_and_clears_them_when_it_speaks_again(tmp_path: Path) -> None:
     daemon = DaemonProcess(tmp_path, "--sim", "--rate", "2", "--seed", "3", jobs=False)
     try:

@@ -274,7 +274,7 @@ def draw(directory: Path) -> tuple[Case, ...]:
     return draw_cases("swdt82", ["--short", "--cells", "triple,decoy", "--first", "7", "--workers", "1"], directory)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_labels_are_in_a_file_of_their_own_and_a_seed_makes_all_again(tmp_path: Path) -> None:
     cases = draw(tmp_path / "first")
     labels = read_labels(tmp_path / "first")["labels"]
@@ -296,6 +296,7 @@ def test_labels_are_in_a_file_of_their_own_and_a_seed_makes_all_again(tmp_path: 
             assert not np.allclose(own.position_mm, twin.position_mm, atol=1.0)
 
 
+@pytest.mark.long
 def test_further_poses_are_measured_of_the_same_machine(tmp_path: Path) -> None:
     rig = load_rig("swdt82").rig
     pose = {joint.column: sum(joint.limits) / 2 for joint in rig.joints}

@@ -46,7 +46,7 @@ def pictures(page: str) -> int:
     return len(re.findall(r'<img alt="[^"]+" src="data:image/svg\+xml;base64,', page))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_answer_has_a_row_for_every_method_and_a_page(ys100: list[object]) -> None:
     found = answer("compare", *ys100, "--time-limit", 0.2)
     assert list(found) == ["rig", "n", "n_holdout", "noise_mm", "methods", "warnings", "page"]

@@ -45,7 +45,7 @@ def found(directory: Path) -> dict[str, Any]:
     return answer
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_hidden_backlash_is_named_with_its_size_and_closes_the_gap(found: dict[str, Any]) -> None:
     assert set(CONTRACT) | {"rig", "n", "ignored_columns"} <= set(found)
     assert (found["verdict"], found["rig"], found["n"]) == ("named", "swdt82", 2 * support.POSES)
@@ -60,6 +60,7 @@ def test_a_hidden_backlash_is_named_with_its_size_and_closes_the_gap(found: dict
     assert found["rounds"][0]["candidates"][1]["reason"]
 
 
+@pytest.mark.long
 def test_the_files_hold_the_answer_the_report_and_a_model_that_can_be_used(
     found: dict[str, Any], directory: Path
 ) -> None:
@@ -74,6 +75,7 @@ def test_the_files_hold_the_answer_the_report_and_a_model_that_can_be_used(
     assert stages["geometric"] == pytest.approx(found["holdout"]["rms_before_mm"], rel=1e-6)
 
 
+@pytest.mark.long
 def test_held_out_rows_that_are_training_rows_are_named(found: dict[str, Any]) -> None:
     assert found["warnings"][0].startswith("1 of the 41 rows of held_out.csv are rows of session.csv as well")
     assert found["tolerance"]["verdict"] == "not judged"
@@ -109,6 +111,7 @@ def test_a_directory_with_other_things_is_left_alone(directory: Path, tmp_path: 
         check_gap_target(tmp_path / "notes.txt")
 
 
+@pytest.mark.long
 def test_the_poses_asked_for_are_a_plan_that_goes_when_none_are_asked_for(tmp_path: Path) -> None:
     named = support.named()
     pending = replace(support.pending(), model=named.model)

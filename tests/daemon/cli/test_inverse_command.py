@@ -49,6 +49,7 @@ def targets(tmp_path: Path) -> Path:
     return written(tmp_path / "targets.csv", rows)
 
 
+@pytest.mark.long
 def test_the_commands_bring_the_prisms_to_the_targets(model: Path, targets: Path, tmp_path: Path) -> None:
     done = run("inverse", "--model", model, "--data", targets)
     assert done.exit_code == 0, done.stderr
@@ -63,6 +64,7 @@ def test_the_commands_bring_the_prisms_to_the_targets(model: Path, targets: Path
     assert np.linalg.norm(there - numbers(before, PLACE), axis=1).max() <= 0.01
 
 
+@pytest.mark.long
 def test_a_target_out_of_reach_is_delivered_with_status_3(model: Path, targets: Path, tmp_path: Path) -> None:
     rows = parsed(targets.read_text())
     rows[4]["z_mm"] = "9000.0"
@@ -81,6 +83,7 @@ def test_a_target_out_of_reach_is_delivered_with_status_3(model: Path, targets: 
     assert "Warning: 1 of 12 targets are out of reach" in plain.stderr
 
 
+@pytest.mark.long
 def test_commands_can_be_targets_again(model: Path, targets: Path, tmp_path: Path) -> None:
     once = run("inverse", "--model", model, "--data", targets, "--json")
     first = json.loads(once.stdout)["csv"]
@@ -89,6 +92,7 @@ def test_commands_can_be_targets_again(model: Path, targets: Path, tmp_path: Pat
     np.testing.assert_allclose(numbers(parsed(again.stdout), JOINTS), numbers(parsed(first), JOINTS), atol=1e-6)
 
 
+@pytest.mark.long
 def test_wrong_use_is_refused_in_a_sentence(model: Path, targets: Path, tmp_path: Path) -> None:
     rows = parsed(targets.read_text())
     nowhere = written(tmp_path / "nowhere.csv", [{k: v for k, v in row.items() if k != "y_mm"} for row in rows])

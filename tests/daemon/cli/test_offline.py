@@ -58,7 +58,7 @@ def assert_contract(answer: dict[str, Any], n: int) -> None:
     assert list(answer["identifiability"])[:3] == ["parameters", "rank", "unidentifiable"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_calibrate_then_evaluate_as_programs(work: Path, tmp_path: Path) -> None:
     program = "from daemon.cli.main import main; main()"
 
@@ -92,6 +92,7 @@ def test_calibrate_then_evaluate_as_programs(work: Path, tmp_path: Path) -> None
     assert_contract(json.loads(done.stdout), 60)
 
 
+@pytest.mark.long
 def test_a_residual_that_was_asked_for_and_is_left_out_says_why(work: Path, tmp_path: Path) -> None:
     few = tmp_path / "few.csv"
     few.write_text("".join((work / "train.csv").read_text().splitlines(keepends=True)[:41]))
@@ -346,6 +347,7 @@ def test_every_method_of_the_command_is_one_of_the_mathematics() -> None:
     assert tuple(methods.METHODS) == METHODS
 
 
+@pytest.mark.long
 def test_a_killed_search_goes_on_where_it_was(work: Path, tmp_path: Path) -> None:
     out, checkpoint = tmp_path / "model", tmp_path / "model.checkpoint"
     data = tmp_path / "few.csv"

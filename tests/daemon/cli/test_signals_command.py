@@ -53,7 +53,7 @@ def calibrated(work: Path, name: str, *more: object, rig: object = "ur10") -> di
     return answer
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_model_uses_and_remembers_the_signal_that_it_was_trained_with(work: Path) -> None:
     answer = calibrated(work, "model", "--signal", "tilt_x_deg")
     assert (answer["residual"], answer["ignored_columns"]) == ("gp", ["operator"])
@@ -112,7 +112,7 @@ def test_a_signal_that_cannot_be_is_refused_in_a_sentence(work: Path, command: s
     assert not (out / "manifest.json").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_outliers_are_named_by_their_lines_in_the_file(work: Path) -> None:
     header, *rows = train_csv().decode().splitlines()
     place = header.split(",").index("z_mm")

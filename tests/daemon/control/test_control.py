@@ -165,6 +165,7 @@ HOSTILE_JSON = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("line", HOSTILE_JSON.values(), ids=HOSTILE_JSON.keys())
 def test_json_that_no_command_can_use_is_one_refusal(path: Path, line: bytes) -> None:
     answer = talk(path, line)

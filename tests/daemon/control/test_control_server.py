@@ -284,6 +284,7 @@ def break_listener(path: Path) -> None:
     raise AssertionError(f"nothing listens at {path}")
 
 
+@pytest.mark.long
 def test_the_watchdog_hears_nothing_of_a_daemon_that_takes_no_commands(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))

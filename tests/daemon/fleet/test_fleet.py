@@ -53,6 +53,7 @@ def client() -> Iterator[Client]:
         yield client
 
 
+@pytest.mark.long
 def test_what_rigs_have_in_common_and_who_differs(answers: list[dict[str, Any]]) -> None:
     (group,) = compare(answers).groups
     (shared,) = (quantity for quantity in group.common if quantity.name == COMMON)
@@ -63,6 +64,7 @@ def test_what_rigs_have_in_common_and_who_differs(answers: list[dict[str, Any]])
     assert gains(group, 0)[0].action == "calibrate"
 
 
+@pytest.mark.long
 def test_rigs_that_stayed_as_they_were_have_not_drifted(answers: list[dict[str, Any]]) -> None:
     drifts = [answer["drift"] for answer in answers]
     assert {drift["session"] for drift in drifts} == {"s2"}
@@ -76,7 +78,7 @@ def test_a_rig_that_has_changed_is_told(tmp_path: Path) -> None:
     assert found["drift"]["alarm"] == "worse"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_workers_that_die_lose_nothing(
     directory: Path, answers: list[dict[str, Any]], client: Client, tmp_path: Path
 ) -> None:
@@ -94,6 +96,7 @@ def test_workers_that_die_lose_nothing(
     assert len(list((tmp_path / RESULTS).iterdir())) == RIGS
 
 
+@pytest.mark.long
 def test_a_run_goes_on_with_what_is_not_done(directory: Path, answers: list[dict[str, Any]], tmp_path: Path) -> None:
     sources = find_rigs(sorted(directory.iterdir()), None, None)[:3]
 
@@ -139,6 +142,7 @@ def store_of(path: Path, csv: bytes, rig_text: str) -> None:
         table.change("s001", state="closed", **store.instant(at(1000.0), "ended_"))
 
 
+@pytest.mark.long
 def test_the_command_writes_a_page_and_a_table(directory: Path, tmp_path: Path) -> None:
     rig = simulated_rig(20, 100, odd_every=ODD_EVERY)
     (tmp_path / "rig20").mkdir()

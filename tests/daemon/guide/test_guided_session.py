@@ -18,6 +18,8 @@ from daemon.commands import REFUSED, CommandError
 from tests.daemon.daemon_process import DaemonProcess
 from tests.simulated.guided_operator import GuidedOperator
 
+pytestmark = pytest.mark.long
+
 SIM = ("--sim", "--by-hand", "--rate", "10", "--seed", "3")
 
 
@@ -42,7 +44,6 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-@pytest.mark.slow
 def test_a_whole_guide_survives_a_kill_and_ends_with_sessions_that_are_used(tmp_path: Path) -> None:
     daemon = ready(tmp_path)
     try:
@@ -109,7 +110,6 @@ def guide(daemon: DaemonProcess) -> Iterator[dict[str, Any]]:
         daemon.say("guide.stop", reason="the test is over")
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("guide")
 def test_commands_that_a_guide_gives_itself_are_refused_with_the_next_step(daemon: DaemonProcess) -> None:
     daemon.wait("the session", lambda: state(daemon)["session"])
@@ -133,7 +133,6 @@ def test_commands_that_a_guide_gives_itself_are_refused_with_the_next_step(daemo
     assert daemon.say("session.list")[-1]["state"] == "open"
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("guide")
 def test_skipped_control_points_are_kept_and_the_session_is_not_used(daemon: DaemonProcess) -> None:
     daemon.wait("the session", lambda: not state(daemon)["step"]["is_busy"])
@@ -152,12 +151,10 @@ def test_skipped_control_points_are_kept_and_the_session_is_not_used(daemon: Dae
     daemon.say("session.abort")
 
 
-@pytest.mark.slow
 def test_a_guide_warns_of_no_joint_while_all_are_read(guide: dict[str, Any]) -> None:
     assert guide["messages"] == []
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("guide")
 def test_hands_of_a_simulated_rig_aim_and_go_where_the_guide_says(daemon: DaemonProcess) -> None:
     def hand(*arguments: str) -> str:
@@ -179,7 +176,6 @@ def test_hands_of_a_simulated_rig_aim_and_go_where_the_guide_says(daemon: Daemon
     assert "theta1 is given twice" in hand("move", "theta1=1", "theta1=2")
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("guide")
 def test_a_station_that_was_left_on_the_control_point_is_told_at_the_pose(daemon: DaemonProcess) -> None:
     operator = GuidedOperator(daemon.say)
@@ -191,7 +187,6 @@ def test_a_station_that_was_left_on_the_control_point_is_told_at_the_pose(daemon
     daemon.wait("a pose", lambda: state(daemon)["poses"]["done"])
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("guide")
 def test_enough_goes_on_when_told_and_takes_more_poses_when_asked(daemon: DaemonProcess) -> None:
     operator = GuidedOperator(daemon.say)
@@ -206,7 +201,6 @@ def test_enough_goes_on_when_told_and_takes_more_poses_when_asked(daemon: Daemon
     }  # fmt: skip
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("guide")
 def test_the_terminal_leads_and_scripts_may_answer(daemon: DaemonProcess) -> None:
     daemon.wait("the session", lambda: not state(daemon)["step"]["is_busy"])
@@ -243,7 +237,6 @@ def test_the_terminal_leads_and_scripts_may_answer(daemon: DaemonProcess) -> Non
     assert state(daemon)["steps"][2]["poses"]["skipped"] == [{"pose": 1, "reason": "a wall"}]
 
 
-@pytest.mark.slow
 def test_a_shot_of_something_else_is_refused_and_a_station_that_moved_ends_the_guide(daemon: DaemonProcess) -> None:
     def opened(setup: str, cp1: list[float]) -> None:
         new_setup = {"id": setup, "control_points": {"cp1": cp1}}

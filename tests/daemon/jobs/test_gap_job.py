@@ -165,7 +165,7 @@ def measured(rig: JobRig, name: str, poses: int, seed: int, kind: str = "static_
     rig.observed(name, simulate_observations(truth, poses, seed, setup="S1", prisms=["r", "s"]))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_job_names_what_is_missing_and_proposes_a_model_that_has_it(rig: JobRig) -> None:
     """Also where a check lies at a set-up with too few fixes to place a base."""
     measured(rig, "a", 40, 20)

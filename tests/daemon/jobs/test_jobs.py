@@ -45,7 +45,7 @@ def insert(db: Database, name: str, *rows: dict[str, Any]) -> None:
 # ---- with the real work ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_chain_runs_in_order_and_leaves_its_models_and_report(rig: JobRig) -> None:
     rig.measured("a", 20, prisms=["r", "s"])
     rig.measured("c", 4, kind="check", prisms=["r", "s"])
@@ -74,6 +74,7 @@ def test_a_chain_runs_in_order_and_leaves_its_models_and_report(rig: JobRig) -> 
     assert (compared["live"], compared["sessions"], compared["is_better"]) == (None, ["c"], True)
 
 
+@pytest.mark.long
 def test_a_job_goes_on_from_the_checkpoint_of_its_number_and_leaves_none(rig: JobRig) -> None:
     rig.measured("a", 20, prisms=["r", "s"])
     for row in rig.store.rows("SELECT id, z_mm FROM observations"):  # misfit enough for a global search
@@ -160,6 +161,7 @@ def test_a_process_that_breaks_the_protocol_is_a_failed_job(rig: JobRig, what: s
     assert rig.job(1)["pid"] is None
 
 
+@pytest.mark.long
 def test_a_process_that_closes_its_output_and_lives_on_is_ended(rig: JobRig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("daemon.jobs.child.END_TIMEOUT_S", 0.3)
     rig.session("a")

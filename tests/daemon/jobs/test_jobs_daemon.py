@@ -6,8 +6,12 @@ import time
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from tests.daemon.daemon_process import DaemonProcess
 from tests.daemon.job_support import JobRig, is_gone
+
+pytestmark = pytest.mark.long
 
 SIM = ("--sim", "--rate", "25", "--seed", "3")
 POSES = 1500  # identification takes far longer than an orphan is given to end

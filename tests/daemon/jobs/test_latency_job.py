@@ -33,7 +33,7 @@ def rig(tmp_path: Path) -> Iterator[JobRig]:
     rig.close()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_report_tells_the_latency_of_each_session(rig: JobRig, tmp_path: Path) -> None:
     rig.measured("a", 40, prisms=["r", "s"])
     rig.measured("c", 4, kind="check", prisms=["r", "s"])

@@ -47,6 +47,7 @@ def comparisons(rig: ModelRig, model: int) -> list[str]:
     return [job["state"] for job in rig.jobs.jobs() if (job["kind"], job["model_id"]) == ("comparison", model)]
 
 
+@pytest.mark.long
 def test_a_model_that_was_compared_with_another_live_model_is_not_recommended(rig: ModelRig) -> None:
     live, waiting = stale(rig)
     told = advice(rig)

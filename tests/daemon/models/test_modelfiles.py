@@ -106,6 +106,7 @@ def test_a_model_that_predicts_positions_off_the_earth_is_refused_by_the_child(m
         read_model(model_directory)
 
 
+@pytest.mark.long
 def test_a_model_of_compressed_zeros_is_refused_and_not_unpacked(model_directory: Path) -> None:
     zeros = io.BytesIO()
     np.savez_compressed(zeros, covariance=np.zeros((9000, 9000)))

@@ -172,6 +172,7 @@ def test_a_port_that_is_taken_is_told_and_served_once_it_is_free(monkeypatch: py
         server.stop()
 
 
+@pytest.mark.long
 def test_callers_who_ask_nothing_are_hung_up_on_and_take_no_more_than_their_places(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -82,7 +82,7 @@ def events(rig: Rig, kind: EventKind) -> list[str]:
     return [row["text"] for row in table(rig.store.path, "device_events") if row["kind"] == kind]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_another_prism_s_fixes_never_become_observations_however_long_it_is_followed(rig: Rig) -> None:
     start(rig)
     rig.live(2)

@@ -186,6 +186,7 @@ def alike(live: dict[str, Any], again: dict[str, Any]) -> bool:
     return all(live[key] == again[key] for key in exact) and others == pytest.approx(numbers, rel=1e-4, abs=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("station_first", [True, False])
 @pytest.mark.parametrize(
     "happens",

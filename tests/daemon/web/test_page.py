@@ -265,6 +265,7 @@ def test_the_state_comes_five_times_a_second_and_says_what_is_next(page: WebProc
     events.close()  # type: ignore[attr-defined]
 
 
+@pytest.mark.long
 def test_a_client_that_takes_nothing_holds_up_no_other(page: WebProcess) -> None:
     stalled = socket.create_connection((page.host, page.port))
     stalled.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -296,6 +297,7 @@ def test_a_client_that_takes_nothing_holds_up_no_other(page: WebProcess) -> None
     assert min(counts) >= 25
 
 
+@pytest.mark.long
 def test_a_daemon_that_is_gone_is_told_and_comes_back_by_itself(tmp_path: Path) -> None:
     config = written(tmp_path)
     with idle_daemon(tmp_path):

@@ -116,6 +116,7 @@ def test_an_effect_far_below_the_noise_cannot_be_told_apart(scene: Scene) -> Non
     assert not nearest_alternative(scene, visibility(scene), effect).is_separable
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("turned_round", [False, True])
 @pytest.mark.parametrize("families", ALIASES)
 def test_an_alias_is_data_in_which_one_effect_is_as_the_other(

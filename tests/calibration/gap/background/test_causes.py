@@ -28,6 +28,7 @@ def answer(effects: str, without: str = "") -> GapResult:
     return find_gap(SOURCE.rig, SOURCE.text, rows, families=[name for name in library() if name != without])
 
 
+@pytest.mark.long
 def test_what_happens_at_one_instant_is_not_told_as_steps_of_something_else() -> None:
     gap = answer("prism_seat_step@r:x_mm=12:y_mm=-14:z_mm=30:time_s=8000", without="prism_seat_step")
     assert gap.effects == ()
@@ -39,6 +40,7 @@ def test_a_step_is_named_where_nothing_else_happened() -> None:
     assert [(e.family, e.where) for e in gap.effects] == [("zero_step", "theta5")]
 
 
+@pytest.mark.long
 def test_a_link_that_gives_way_otherwise_than_the_library_knows_is_not_told_as_another_one() -> None:
     gap = answer("lateral_compliance@theta7:compliance_rad_per_Nm=8e-7", without="lateral_compliance")
     assert gap.effects == ()

@@ -77,6 +77,7 @@ def test_effects_are_named_beside_structure_that_no_library_has() -> None:
         assert effect.reported[0].value == pytest.approx(true, rel=0.5)
 
 
+@pytest.mark.long
 def test_held_out_rows_gain_by_what_is_named_beside_structure() -> None:
     before, after = soft_machine().held_out or (0.0, np.inf)
     assert after < 0.8 * before
@@ -88,6 +89,7 @@ def test_every_name_has_a_certificate_from_rows_that_did_not_choose_it() -> None
         assert effect["places"][effect["where"]] > 0.5
 
 
+@pytest.mark.long
 def test_structure_alone_is_given_no_name() -> None:
     rows = simulated("", 21)
     gap = answer(replace(rows, position_mm=rows.position_mm + displacements_mm(rows)))

@@ -170,6 +170,7 @@ def test_report_without_held_out_fixes_says_it_is_about_the_fitted_ones() -> Non
     assert "Station set-ups" not in outline.headings
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fixes", [1, 2, 9])
 def test_report_is_made_of_very_few_fixes(fixes: int) -> None:
     report = report_input(n=fixes, held_out=False, parameters=[], outliers=[], warnings=[], unidentifiable=[], rank=56)
@@ -190,6 +191,7 @@ def test_report_is_made_where_a_model_fits_exactly_and_a_joint_stood_still() -> 
     assert "from 0&nbsp;mm to 0&nbsp;mm" in document
 
 
+@pytest.mark.long
 def test_report_is_the_same_bytes_for_the_same_input(document: str) -> None:
     assert calibration_report(report_input(joints=None)) == document
 

@@ -108,6 +108,7 @@ def test_another_prism_that_is_found_on_the_way_back_from_a_control_point_is_exc
     assert rig.used(session) > 80
 
 
+@pytest.mark.long
 def test_another_prism_that_is_told_while_the_disk_fails_is_excluded_once_it_works_again(rig: TrueRig) -> None:
     session = rig.say("start", prism="r")["id"]
     rig.stand(0, "r", 0.0)

@@ -1,0 +1,109 @@
+"""A machine that leans as an inclinometer on it says: its carrier on soft ground, or the mast that its boom bends."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.effects.base import Coefficient, Settings, SizedFamily, check_sizes, sizes
+from calibration.effects.context import EffectContext
+from calibration.observations import Floats
+from calibration.rig.description import Rig
+
+_TILT = "tilt"
+_AXES = ("_x", "_y")
+_RAD_PER_DEG = math.pi / 180.0
+_LEAST_DEG = 1e-3  # of spread; less is the last digit of an inclinometer
+_PIVOT = "pivot"
+_PIVOTS = (0.0, 1.0 / 3.0, 0.5, 1.0)  # of the lift's height: its foot, bent by a force or by a moment, its top
+_MEANS = ("mean_x_deg", "mean_y_deg")
+
+
+class MeasuredTilt(SizedFamily):
+    """The machine turns about its level axes by what the two axes of an inclinometer read beside their mean.
+
+    An inclinometer is a pair of signals of the rig file in degrees, such as `tilt_mast_x` and `tilt_mast_y`, with
+    `tilt` in their name; what stands before `_x` is the place. It must be on a part that no joint turns: the carrier,
+    or a mast that is lifted. How it is mounted need not be known: each reading may turn the machine about both axes.
+    Where the first joint is a lift, the turning point may be above the foot of the mast, which bends.
+    """
+
+    name = "measured_tilt"
+    equation = "turns about the base's level x and y axes = 2 x 2 matrix * (readings - their mean in the training)"
+    source = "rigid rotation by small angles; cantilever mast under an end force or an end moment (Euler-Bernoulli)"
+    confused_with = ("base_compliance", "base_settlement", "base_step")
+    revealed_by = "the boom far out to all sides, and the carrier set down anew on other ground"
+    fixed = tuple(
+        Coefficient(
+            f"about_{axis}_by_{reading}_rad_per_deg", "rad/deg", _RAD_PER_DEG, -2 * _RAD_PER_DEG, 2 * _RAD_PER_DEG
+        )
+        for reading in "xy"
+        for axis in "xy"
+    )
+    moves_machine = False
+
+    def places(self, rig: Rig) -> tuple[str, ...]:
+        tilts = {
+            signal.name for signal in (*rig.channels, *rig.signals) if signal.unit == "deg" and _TILT in signal.name
+        }
+        stems = dict.fromkeys(name.removesuffix(_AXES[0]) for name in sorted(tilts) if name.endswith(_AXES[0]))
+        return tuple(stem for stem in stems if stem + _AXES[1] in tilts and stem not in rig.joint_names)
+
+    def needs(self, where: str) -> str:
+        return "the columns " + " and ".join(_columns(where))
+
+    def known(self, context: EffectContext, where: str) -> NDArray[np.bool_]:
+        return np.asarray(np.isfinite(_readings(context, where)).all(axis=1), dtype=np.bool_)
+
+    def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
+        known = self.known(context, where)
+        readings = _readings(context, where)[known]
+        if not len(readings) or np.ptp(readings, axis=0).max() < _LEAST_DEG:
+            return ()
+        means = _means(readings)
+        pivots = _PIVOTS if context.rig.joints[0].kind == "prismatic" else _PIVOTS[:1]
+        forms = ({**means, _PIVOT: pivot} for pivot in pivots)
+        return tuple({**form, **sizes(_shift_mm(context, where, form)[known])} for form in forms)
+
+    def elsewhere(self, context: EffectContext, where: str, settings: Settings) -> Settings:
+        """Turn about the mean there: the new base has it, and is right for a carrier that leans by degrees."""
+        known = self.known(context, where)
+        return {**settings, **_means(_readings(context, where)[known])} if known.any() else settings
+
+    def form(self, settings: Settings) -> str:
+        return f"about a point at {settings[_PIVOT]:.2f} of the lift's height" if settings[_PIVOT] else ""
+
+    def check_settings(self, settings: Settings) -> None:
+        check_sizes(settings, (*_MEANS, _PIVOT), len(self.fixed))
+        if not all(math.isfinite(settings[name]) for name in (*_MEANS, _PIVOT)):
+            raise ValueError(f"the settings {', '.join((*_MEANS, _PIVOT))} are numbers")
+
+    def shift_mm(self, context: EffectContext, where: str, settings: Settings) -> Floats:
+        return _shift_mm(context, where, settings)
+
+
+def _columns(where: str) -> tuple[str, ...]:
+    return tuple(f"{where}{axis}_deg" for axis in _AXES)
+
+
+def _readings(context: EffectContext, where: str) -> Floats:
+    """Return what the inclinometer reads (n, 2), deg."""
+    return np.column_stack([context.extra(column) for column in _columns(where)])
+
+
+def _means(readings: Floats) -> dict[str, float]:
+    """Return the settings that have the mean of readings (n, 2)."""
+    return dict(zip(_MEANS, readings.mean(axis=0).tolist(), strict=True))
+
+
+def _shift_mm(context: EffectContext, where: str, settings: Settings) -> Floats:
+    """Return the displacement (n, 3, 4), mm per rad/deg."""
+    beside_mean = np.nan_to_num(_readings(context, where) - [settings[name] for name in _MEANS])
+    turned_mm = context.mast_tilt_mm(settings[_PIVOT])
+    shift: Floats = np.concatenate([turned_mm * beside_mean[:, axis, None, None] for axis in range(2)], axis=2)
+    return shift
+
+
+FAMILY = MeasuredTilt()
