@@ -177,17 +177,13 @@ class SessionKeeper:
             "values_json": joined.values,
             "excluded": excluded,
         }
-        self._unstored.append(partial(self._add_observation, session, row, joined, place_mm))
+        self._unstored.append(partial(self._add_observation, session, row, joined))
         return session
 
-    def _add_observation(
-        self, session: OpenSession, row: Mapping[str, object], joined: JoinedFix, place_mm: Place
-    ) -> None:
-        """Add it, unless a shot has told meanwhile that a control point is there.
-
-        The shot excludes what is stored by then. Both are transactions, so that one sees what the other did.
-        """
-        if row["excluded"] is None and session.is_control_point(place_mm):
+    def _add_observation(self, session: OpenSession, row: Mapping[str, object], joined: JoinedFix) -> None:
+        """Add it; a shot may have told since that a control point is there, and excluded what was stored by then."""
+        place_mm = position_mm(joined.fix)
+        if row["excluded"] is None and place_mm is not None and session.is_control_point(place_mm):
             row = {**row, "excluded": OF_CONTROL_POINT}
         self._observations.add(self._store.fix_id(joined.fix), joined.stamp, **row)
 
@@ -200,11 +196,9 @@ class SessionKeeper:
         if doubt is not None or joined.standstill is None:
             return changed, doubt
         at_ns = joined.stamp.monotonic_ns
-        confirmations = session.confirmations_by(joined.fix.stamp)
-        standstill = (session.id, joined.standstill)
-        here = self._places.add(standstill, at_ns, place_mm, joined.values, confirmations)
-        excluded = here.pop(at_ns)
-        return changed | here, excluded
+        standstill, confirmed = (session.id, joined.standstill), session.confirmations_by(joined.fix.stamp)
+        here = self._places.add(standstill, at_ns, place_mm, joined.values, confirmed)
+        return changed | {at: why for at, why in here.items() if at != at_ns}, here[at_ns]
 
     def _store_observations(self) -> None:
         """Store what was observed; while the store refuses it for now it waits, with what comes after it."""

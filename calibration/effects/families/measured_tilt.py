@@ -16,6 +16,7 @@ _TILT = "tilt"
 _AXES = ("_x", "_y")
 _RAD_PER_DEG = math.pi / 180.0
 _LEAST_DEG = 1e-3  # of spread; less is the last digit of an inclinometer
+_MOST_DEG = 5.0  # standard deviation; more has a part that a joint turns, and no carrier on its ground
 _PIVOT = "pivot"
 _PIVOTS = (0.0, 1.0 / 3.0, 0.5, 1.0)  # of the lift's height: its foot, bent by a force or by a moment, its top
 _MEANS = ("mean_x_deg", "mean_y_deg")
@@ -45,11 +46,10 @@ class MeasuredTilt(SizedFamily):
     moves_machine = False
 
     def places(self, rig: Rig) -> tuple[str, ...]:
-        tilts = {
-            signal.name for signal in (*rig.channels, *rig.signals) if signal.unit == "deg" and _TILT in signal.name
-        }
-        stems = dict.fromkeys(name.removesuffix(_AXES[0]) for name in sorted(tilts) if name.endswith(_AXES[0]))
-        return tuple(stem for stem in stems if stem + _AXES[1] in tilts and stem not in rig.joint_names)
+        in_degrees = {signal.name for signal in (*rig.channels, *rig.signals) if signal.unit == "deg"}
+        tilts = {name for name in in_degrees.difference(rig.joint_names) if _TILT in name}
+        stems = sorted(name.removesuffix(_AXES[0]) for name in tilts if name.endswith(_AXES[0]))
+        return tuple(stem for stem in stems if stem + _AXES[1] in tilts)
 
     def needs(self, where: str) -> str:
         return "the columns " + " and ".join(_columns(where))
@@ -60,7 +60,7 @@ class MeasuredTilt(SizedFamily):
     def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
         known = self.known(context, where)
         readings = _readings(context, where)[known]
-        if not len(readings) or np.ptp(readings, axis=0).max() < _LEAST_DEG:
+        if not len(readings) or np.ptp(readings, axis=0).max() < _LEAST_DEG or readings.std(axis=0).max() > _MOST_DEG:
             return ()
         means = _means(readings)
         pivots = _PIVOTS if context.rig.joints[0].kind == "prismatic" else _PIVOTS[:1]

@@ -129,8 +129,9 @@ def test_an_inclinometer_is_a_pair_of_signals_in_degrees_called_tilt() -> None:
         assert FAMILY.places(plain.with_signals(*columns) if columns else plain) == places
 
 
-def test_an_inclinometer_that_always_reads_the_same_shows_nothing() -> None:
-    rows = replace(training(), extra=training().extra | dict.fromkeys(TILTS, np.full(200, 0.3)))
+@pytest.mark.parametrize("reading_deg", [np.full(200, 0.3), np.linspace(-30.0, 60.0, 200)], ids=["still", "of a boom"])
+def test_an_inclinometer_that_never_moves_or_that_a_joint_turns_shows_nothing(reading_deg: Floats) -> None:
+    rows = replace(training(), extra=training().extra | dict.fromkeys(TILTS, reading_deg))
     chain = Chain(RIG, {"": Placement.identity()})
     assert FAMILY.variants(EffectContext(chain, np.zeros(len(chain)), rows), "tilt") == ()
 
