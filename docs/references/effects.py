@@ -36,7 +36,7 @@ def _acts_at(family: Family) -> str:
     if isinstance(family, JointFamily):
         return f"a {family.kind} joint"
     places = family.places(shipped_rig("swdt82"))
-    return f"`{places[0]}`" if len(places) == 1 else ", ".join(f"`{place}`" for place in places)
+    return ", ".join(f"`{place}`" for place in places) or "no place of the boom"
 
 
 def _section(family: Family) -> Iterator[str]:

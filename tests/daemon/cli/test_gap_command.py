@@ -163,6 +163,9 @@ def test_every_family_says_all_of_itself() -> None:
     assert [family["family"] for family in listed] == list(library())
     for family in listed:
         assert all(family[key] for key in ("equation", "source", "revealed_by"))
+        if family["family"] == "measured_tilt":  # the boom has no inclinometer
+            assert family["places"] == []
+            continue
         (first, *_) = family["places"]
         for coefficient in first["coefficients"]:
             if coefficient["lower"] is not None:
