@@ -129,17 +129,18 @@ def _row(made: Image, scratch: Path, checks: Sequence[Check], table: Table) -> N
     with Machine(made, scratch) as machine, table.running(machine):
         say(f"booted in {machine.booted_s:.0f} s")
         service = Service(machine)
+        shown: list[bool] = []
         try:
             service.install()
-        except MachineError:
+            for check in checks:
+                shown.append(table.show(check.__name__, partial(check, service)))
+                if not shown[-1]:
+                    service.mend()
+        except (MachineError, OSError):  # its power was cut between two checks
             if not table.is_over:
                 raise
-        shown = []
-        for check in checks:
-            shown.append(table.show(check.__name__, partial(check, service)))
-            if not shown[-1]:
-                service.mend()
-        if not all(shown):
+            table.leave_out(len(checks) - len(shown))
+        if not all(shown) and not table.is_over:
             print(machine.tried("journalctl -b -u rigcal -n 60 --no-pager -o short-monotonic").output, flush=True)
 
 
