@@ -27,7 +27,7 @@ class Check:
     Attributes:
         scores: of its standstills, in the order of the rows: as `cusum.score`.
         fixes: number of fixes.
-        ratio: RMS of the errors over their predicted standard deviation.
+        ratio: RMS of the errors over their formal standard deviation.
         refitted: set-ups that the model does not know, whose base was fitted on these very fixes.
         left_out: unknown set-ups whose fixes cannot place a base.
     """
@@ -90,7 +90,7 @@ def check(model: CalibratedModel, observations: Observations) -> Check:
 
 
 def _mean_squares(model: CalibratedModel, observations: Observations) -> Floats:
-    """(n,) squared errors over their predicted variance, mean of the three coordinates."""
+    """(n,) squared errors over their formal variance, mean of the three coordinates."""
     predicted = Predictor.of(model).predict(observations)
-    squares: Floats = (((observations.position_mm - predicted.position_mm) / predicted.sigma_mm) ** 2).mean(axis=1)
+    squares: Floats = (((observations.position_mm - predicted.position_mm) / predicted.formal_mm) ** 2).mean(axis=1)
     return squares

@@ -41,7 +41,7 @@ class Evaluation:
         model: the model, with the base refitted where that was asked for.
         observations: the rows.
         errors_mm: stage -> (n, 3) measured minus modelled, in the station's frame.
-        sigma_mm: (n, 3) standard deviation that the model expects of the hybrid stage's errors.
+        sigma_mm: (n, 3) standard deviation that the model predicts for the hybrid stage's errors.
         coverage: share of the hybrid stage's errors inside their intervals; where the base was refitted on these rows,
             intervals that were counted on the other half of them.
         outliers: rows farther off than noise explains.
@@ -110,10 +110,12 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
         UnsafeError: a set-up that the model does not know, or whose base cannot be placed with these rows.
     """
     require_positions(observations)
-    effects, learned, home = model, model.residual is not None, model.intervals.at_other_setups()
+    effects, learned, elsewhere = model, model.residual is not None, None
     if refit_base:
         effects = with_refitted_base(replace(model, residual=None), observations)
-        model = effects if model.residual is None else with_refitted_base(model, observations)
+        placed = with_refitted_base(model, observations) if learned else effects
+        elsewhere = SetupErrors.of(placed, observations)
+        model, home = elsewhere.widened(placed), placed.intervals
     prediction = Predictor.of(model).predict(observations)
     fitted = _fitted(model, observations)
     is_training = fitted == len(observations)
@@ -136,7 +138,7 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
     warnings += [
         w for w in (*row_warnings(model.rig, observations), *([rounded] if rounded else [])) if w not in warnings
     ]
-    strange = list(_strange(errors["hybrid"], prediction.sigma_mm, model.noise_mm, refit_base=refit_base))
+    strange = list(_strange(errors["hybrid"], prediction.formal_mm, model.noise_mm, refit_base=refit_base))
     outliers = Predictor.of(effects).find_outliers(observations)
     warnings += strange
     if outliers and not (strange or rounded or is_training):
@@ -144,9 +146,7 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
             f"{len(outliers)} of {len(observations)} fixes are farther off than noise explains, "
             f"{farthest(observations, outliers)}: the errors count them"
         )
-    coverage = model.intervals.coverage(errors["hybrid"], prediction.sigma_mm)
-    if refit_base:
-        coverage = SetupErrors.of(model, observations).coverage(home)
+    coverage = prediction.coverage(errors["hybrid"]) if elsewhere is None else elsewhere.coverage(home)
     axes = _axes(effects, observations)
     warnings += [w for w in disagreements(axes) if w not in warnings]
     return Evaluation(
@@ -171,14 +171,14 @@ def _fitted(model: CalibratedModel, observations: Observations) -> int:
     return len(observations) if is_same else 0
 
 
-def _strange(error_mm: Floats, sigma_mm: Floats, noise_mm: float, *, refit_base: bool) -> Iterator[str]:
+def _strange(error_mm: Floats, formal_mm: Floats, noise_mm: float, *, refit_base: bool) -> Iterator[str]:
     """Warn of errors far beyond the expected: the model is not of this machine, or no longer.
 
     A base that was fitted to these very rows counts their scatter in its own uncertainty, which then explains errors
     of any size: they are held against the scatter of the training as well.
     """
     size_mm = sizes_mm(error_mm)
-    times, most = float(np.median(size_mm / sizes_mm(sigma_mm))), _STRANGE
+    times, most = float(np.median(size_mm / sizes_mm(formal_mm))), _STRANGE
     where, moved, scale = "", "a moved base or prism", "the expected"
     if times <= most and refit_base:
         times, most = float(np.median(size_mm)) / noise_mm, _STRANGE_BODY

@@ -11,7 +11,7 @@ from calibration.identification.samples import Samples, averaged, left_out_error
 from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor
 from calibration.observations import Floats, Observations
-from calibration.residual.conformal import Coverage, Intervals, conformal_intervals
+from calibration.residual.conformal import Coverage, Intervals, conformal_intervals, coverage
 from calibration.residual.folds import neighbour_labels
 
 _LARGEST_GROUP = 40  # samples: the work of a group grows with the cube of their number
@@ -35,8 +35,8 @@ def with_intervals(
     error = observations.position_mm - prediction.position_mm
     if learned is not None and left_mm is not None:
         error[learned] = left_mm
-    samples = _leave_out(model, observations, error, slice(None), model.covariance)
-    return replace(model, intervals=conformal_intervals(error, prediction.sigma_mm, samples))
+    apart, samples = _left_out(model, observations, error, _groups(observations), slice(None), model.covariance)
+    return replace(model, intervals=conformal_intervals(apart, prediction.formal_mm, samples))
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,14 @@ class SetupErrors:
 
     Attributes:
         error_mm: (n, 3) measured minus predicted, in the station's frame.
-        sigma_mm: (n, 3) standard deviations that the model predicts.
+        formal_mm: (n, 3) their formal standard deviations.
         half: (n,) 0 or 1; groups, which are stretches of a path or cells, are wholly in one of them.
         samples: how many of the rows are independent of each other.
         has_one_setup: whether x and y point the same way in all rows.
     """
 
     error_mm: Floats
-    sigma_mm: Floats
+    formal_mm: Floats
     half: NDArray[np.intp]
     samples: int
     has_one_setup: bool
@@ -61,63 +61,67 @@ class SetupErrors:
     def of(cls, model: CalibratedModel, observations: Observations) -> SetupErrors:
         """The errors of a model with a refitted base on the n rows that this was fitted to."""
         assert model.base_covariance is not None
+        assert model.base_covariance is not None
         prediction = Predictor.of(model).predict(observations)
         error = observations.position_mm - prediction.position_mm
-        base = slice(model.chain.base_start, len(model.chain))
-        samples = _leave_out(model, observations, error, base, model.base_covariance)
-        group = np.unique(neighbour_labels(observations), return_inverse=True)[1].reshape(-1)
-        half = np.asarray(group % 2, dtype=np.intp)
-        return cls(error, prediction.sigma_mm, half, samples, len(np.unique(observations.setup)) == 1)
+        base, group = slice(model.chain.base_start, len(model.chain)), _groups(observations)
+        apart, samples = _left_out(model, observations, error, group, base, model.base_covariance)
+        has_one_setup = len(np.unique(observations.setup)) == 1
+        return cls(apart, prediction.formal_mm, group % 2, samples, has_one_setup)
 
-    def intervals(self, home: Intervals) -> Intervals:
-        """Intervals that hold at these set-ups what those of the training do at home, and are not narrower than they.
+    def widened(self, model: CalibratedModel) -> CalibratedModel:
+        """The model with intervals that hold at these set-ups too, and are nowhere narrower than its own.
 
         What a machine does elsewhere that it did not do in its training is in these errors and nowhere else.
         """
-        return home.or_wider(self._counted(np.ones(len(self.half), dtype=np.bool_)))
+        here = self._counted(np.ones(len(self.half), dtype=np.bool_))
+        return replace(model, intervals=model.intervals.or_wider(here))
 
     def coverage(self, home: Intervals) -> Coverage:
         """Share of the errors inside intervals that were counted on the other half of them."""
-        held, total = np.zeros(4), 0
+        half_mm, radius_mm = np.empty_like(self.formal_mm), np.empty(len(self.half))
         for half in range(2):
             here, there = self.half == half, self.half != half
-            if here.any():
-                intervals = home.or_wider(self._counted(there)) if there.any() else home
-                share = intervals.coverage(self.error_mm[here], self.sigma_mm[here])
-                held += int(here.sum()) * np.array([*share.axes, share.radius])
-                total += int(here.sum())
-        x, y, z, radius = (held / total).tolist()
-        return Coverage((x, y, z), radius)
+            intervals = home.or_wider(self._counted(there)) if there.any() else home
+            half_mm[here] = intervals.half_mm(self.formal_mm[here])
+            radius_mm[here] = intervals.radius_mm(self.formal_mm[here])
+        return coverage(self.error_mm, half_mm, radius_mm)
 
     def _counted(self, rows: NDArray[np.bool_]) -> Intervals:
         """Intervals that hold the errors of some of the rows."""
         independent = max(1, round(self.samples * float(rows.mean())))
-        counted = conformal_intervals(self.error_mm[rows], self.sigma_mm[rows], independent)
+        counted = conformal_intervals(self.error_mm[rows], self.formal_mm[rows], independent)
         return counted if self.has_one_setup else counted.at_other_setups()
 
 
-def _leave_out(
-    model: CalibratedModel, observations: Observations, error_mm: Floats, fitted: slice, covariance: Floats
-) -> int:
-    """Make errors (n, 3) those that rows would have, had the fit not seen their group; outliers it did not follow.
+def _left_out(
+    model: CalibratedModel,
+    observations: Observations,
+    error_mm: Floats,
+    group: NDArray[np.intp],
+    fitted: slice,
+    covariance: Floats,
+) -> tuple[Floats, int]:
+    """Return the errors that rows would have, had the fit not seen their group; outliers it did not follow.
 
     Args:
         model: the model.
         observations: n rows.
-        error_mm: of the rows; changed in place.
+        error_mm: (n, 3) of the rows.
+        group: (n,) number of each row's group.
         fitted: which parameters and coefficients were.
         covariance: (f, f) of these.
 
     Returns:
-        how many of the rows are independent of each other.
+        (n, 3) errors, mm; how many of the rows are independent of each other.
     """
-    outlier = np.zeros(len(observations), dtype=bool)
-    outlier[[o.row for o in Predictor.of(model).find_outliers(observations)]] = True
+    followed = np.ones(len(observations), dtype=bool)
     # The fit has not followed outliers: they are no nearer for it, nor is anything farther without them.
-    followed = observations.select(~outlier)
-    lin = Predictor.of(model).linearise(followed)
-    samples = averaged(model.chain, Predictor.of(model).corrected(followed))
-    mean = samples.average(error_mm[~outlier])
+    followed[[o.row for o in Predictor.of(model).find_outliers(observations)]] = False
+    rows = observations.select(followed)
+    lin = Predictor.of(model).linearise(rows)
+    samples = averaged(model.chain, Predictor.of(model).corrected(rows))
+    mean = samples.average(error_mm[followed])
     apart = left_out_errors(
         model.rig,
         samples,
@@ -126,15 +130,20 @@ def _leave_out(
         samples.average(lin.joint_jacobian),
         covariance,
         model.excess_sigma_mm**2,
-        _groups(followed, samples),
+        _blocks(group[followed], samples),
     )
-    error_mm[~outlier] += (apart - mean)[samples.of_row]
-    return len(samples)
+    error_mm = error_mm.copy()
+    error_mm[followed] += (apart - mean)[samples.of_row]
+    return error_mm, len(samples)
 
 
-def _groups(observations: Observations, samples: Samples) -> NDArray[np.intp]:
-    """(m,) number of each sample's stretch of a path or cell; in pieces where too many for one block are in it."""
-    group = np.unique(neighbour_labels(observations), return_inverse=True)[1].reshape(-1)
+def _groups(observations: Observations) -> NDArray[np.intp]:
+    """(n,) number of each row's stretch of a path or cell."""
+    return np.asarray(np.unique(neighbour_labels(observations), return_inverse=True)[1].reshape(-1), dtype=np.intp)
+
+
+def _blocks(group: NDArray[np.intp], samples: Samples) -> NDArray[np.intp]:
+    """(m,) number of each sample's group, given that of its rows; in pieces where too many for one block are in it."""
     out = np.zeros(len(samples), dtype=np.intp)
     out[samples.of_row] = group
     order = np.argsort(out, kind="stable")

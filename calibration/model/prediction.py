@@ -20,6 +20,7 @@ from calibration.kinematics.compiled_chain import CompiledChain, Located
 from calibration.kinematics.torques import GravityModel
 from calibration.model.model import CalibratedModel, Outlier
 from calibration.observations import Floats, Observations
+from calibration.residual.conformal import NORMAL, Coverage, Intervals, coverage
 from calibration.residual.features import Extractor, Features
 
 OUTLIER_SIGMA = 5.0
@@ -33,12 +34,25 @@ class Prediction:
 
     Attributes:
         position_mm: (n, 3) in the station's frame, as its fixes would be, systematic errors of fixes included.
-        sigma_mm: (n, 3) standard deviation of a fix about it: by parameters, readings, timing, station, effects left
-            out for want of a column, and the error that the model leaves.
+        formal_mm: (n, 3) standard deviation of a fix about it, propagated: from parameters, readings, timing, station,
+            effects left out for want of a column, and the error that the model leaves.
+        sigma_mm: (n, 3) the same, scaled by what was counted on rows left out of the fit: 1.645 of it hold 90 %.
+        radius_mm: (n,) a fix is that near with 90 % probability, its 3-D distance.
     """
 
     position_mm: Floats
+    formal_mm: Floats
     sigma_mm: Floats
+    radius_mm: Floats
+
+    @property
+    def half_mm(self) -> Floats:
+        """(n, 3) half widths of 90 % intervals: a fix is that near along each axis."""
+        return NORMAL * self.sigma_mm
+
+    def coverage(self, error_mm: Floats) -> Coverage:
+        """Share of errors (n, 3) that are inside their 90 % intervals."""
+        return coverage(error_mm, self.half_mm, self.radius_mm)
 
 
 @dataclass(frozen=True)
@@ -123,7 +137,10 @@ class Predictor:
         pieces = [observations.select(rows[first : first + _PIECE]) for first in range(0, len(rows), _PIECE)]
         found = list((executor.map if executor is not None else map)(self._predict, pieces))
         return Prediction(
-            np.concatenate([piece.position_mm for piece in found]), np.concatenate([piece.sigma_mm for piece in found])
+            np.concatenate([piece.position_mm for piece in found]),
+            np.concatenate([piece.formal_mm for piece in found]),
+            np.concatenate([piece.sigma_mm for piece in found]),
+            np.concatenate([piece.radius_mm for piece in found]),
         )
 
     def nominal_mm(self, observations: Observations) -> Floats:
@@ -281,7 +298,7 @@ class Predictor:
         rows = self._rows(observations)
         located, of_fix, of_parameters = self._spread(rows, jacobian=self._model.residual is not None)
         estimate, weight = self._learned(rows, located)
-        position_mm, sigma_mm = np.empty((len(rows.data), 3)), np.empty((len(rows.data), 3))
+        position_mm, formal_mm = np.empty((len(rows.data), 3)), np.empty((len(rows.data), 3))
         is_finite = fix_loops.add_learned(
             rows.data.setup,
             self._machine.bases,
@@ -294,11 +311,29 @@ class Predictor:
             self._made_good,
             self._excess_mm2,
             position_mm,
-            sigma_mm,
+            formal_mm,
         )
         if not is_finite:
-            _refuse_infinite(observations, position_mm, sigma_mm)
-        return Prediction(position_mm, sigma_mm)
+            _refuse_infinite(observations, position_mm, formal_mm)
+        axes, radius = self._interval_scales(weight)
+        return Prediction(
+            position_mm, formal_mm, formal_mm * (axes / NORMAL), radius * np.linalg.norm(formal_mm, axis=1)
+        )
+
+    def _interval_scales(self, weight: Floats) -> tuple[Floats, Floats]:
+        """Formal standard deviations that hold an error: (3,) or (n, 3) along the axes, and (n,) of balls.
+
+        What was counted in the region of the residual learner must not make an interval narrower where it is not used.
+
+        Args:
+            weight: (n,) of the learner in each row.
+        """
+        home = self._model.intervals
+        if self._model.residual is None:
+            return np.array(home.axes), np.full(len(weight), home.radius)
+        away = home.or_wider(Intervals())
+        axes = np.outer(weight, home.axes) + np.outer(1.0 - weight, away.axes)
+        return axes, weight * home.radius + (1.0 - weight) * away.radius
 
     def _covariances(self, observations: Observations) -> tuple[Floats, Floats, Floats]:
         """(n, 3) positions of stage effects; (n, 3, 3) covariance of a fix, and that by parameters and coefficients."""

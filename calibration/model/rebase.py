@@ -15,7 +15,6 @@ from calibration.identification.refinement import Fit, refine
 from calibration.identification.samples import Samples, averaged
 from calibration.identification.start import rough_start
 from calibration.kinematics.chain import Chain, Placement
-from calibration.model.intervals import SetupErrors
 from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor
 from calibration.observations import Floats, Observations
@@ -38,7 +37,7 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
 
     Returns:
         The model with these set-ups in place of its own; without its residual, and with the reason, where that is left
-        out.
+        out. Its intervals are those of its training (`SetupErrors` tells whether they hold here).
 
     Raises:
         DataError: a prism that the rig lacks.
@@ -91,7 +90,7 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
     nominal = refine(chain, samples, extended(model.nominal_values), free=free)
     known = np.ones(len(model.covariance), dtype=bool)
     known[body : len(model.values)] = False
-    placed = replace(
+    return replace(
         model,
         placements=start.placements,
         values=fit.x[: len(chain)],
@@ -101,7 +100,6 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
         nominal_values=nominal.x,
         intervals=model.intervals.at_other_setups(),
     )
-    return replace(placed, intervals=SetupErrors.of(placed, observations).intervals(placed.intervals))
 
 
 def _why_left_out(without: CalibratedModel, whole: CalibratedModel, observations: Observations) -> str:

@@ -1,8 +1,8 @@
 """Intervals that hold 90 % of what is measured, whatever the shape of the errors (split conformal prediction).
 
-A predicted standard deviation says how errors compare between predictions; how many of them an error may be is counted
-on rows that the model was fitted without (Papadopoulos et al. 2002; Lei et al. 2018), along each axis by itself: what
-gravity does to a boom is in one of them.
+A formal standard deviation, propagated from noise and covariances, says how errors compare between predictions. How
+many of them an error may be is counted on rows that the model was fitted without (Papadopoulos et al. 2002; Lei et al.
+2018), along each axis by itself: what gravity does to a boom is in one of them.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ from scipy.special import chdtri, ndtri
 from calibration.observations import Floats
 
 LEVEL = 0.9
+NORMAL = float(ndtri((1.0 + LEVEL) / 2.0))  # standard deviations that hold a normal error
+_NORMAL_RADIUS = float(np.sqrt(chdtri(3, 1.0 - LEVEL) / 3.0))
 
 
 @dataclass(frozen=True)
@@ -36,15 +38,15 @@ class Coverage:
 
 @dataclass(frozen=True)
 class Intervals:
-    """Number of predicted standard deviations that hold an error with probability `LEVEL`.
+    """Number of formal standard deviations that hold an error with probability `LEVEL`.
 
     Attributes:
         axes: of the error along x, y, z of the station's frame.
         radius: of its 3-D norm, in units of the root of the three variances' sum.
     """
 
-    axes: tuple[float, float, float] = (float(ndtri((1.0 + LEVEL) / 2.0)),) * 3
-    radius: float = float(np.sqrt(chdtri(3, 1.0 - LEVEL) / 3.0))
+    axes: tuple[float, float, float] = (NORMAL,) * 3
+    radius: float = _NORMAL_RADIUS
 
     def at_other_setups(self) -> Intervals:
         """Intervals where nobody knows which way x and y point, seen from the machine; z is up at all set-ups."""
@@ -56,33 +58,34 @@ class Intervals:
         x, y, z = np.maximum(self.axes, other.axes).tolist()
         return Intervals((x, y, z), max(self.radius, other.radius))
 
-    def half_mm(self, sigma_mm: Floats) -> Floats:
-        """(n, 3) half widths of the intervals of x, y and z for standard deviations (n, 3)."""
-        half_mm: Floats = sigma_mm * np.array(self.axes)
+    def half_mm(self, formal_mm: Floats) -> Floats:
+        """(n, 3) half widths of the intervals of x, y and z for formal standard deviations (n, 3)."""
+        half_mm: Floats = formal_mm * np.array(self.axes)
         return half_mm
 
-    def radius_mm(self, sigma_mm: Floats) -> Floats:
-        """(n,) radii of the balls for standard deviations (n, 3)."""
-        return np.asarray(self.radius * np.linalg.norm(sigma_mm, axis=1), dtype=np.float64)
-
-    def coverage(self, error_mm: Floats, sigma_mm: Floats) -> Coverage:
-        """Share of the errors (n, 3) that are inside, for standard deviations (n, 3)."""
-        axes = (np.abs(error_mm) <= self.half_mm(sigma_mm)).mean(axis=0)
-        radius = (np.linalg.norm(error_mm, axis=1) <= self.radius_mm(sigma_mm)).mean()
-        return Coverage(tuple(axes.tolist()), float(radius))
+    def radius_mm(self, formal_mm: Floats) -> Floats:
+        """(n,) radii of the balls for formal standard deviations (n, 3)."""
+        return np.asarray(self.radius * np.linalg.norm(formal_mm, axis=1), dtype=np.float64)
 
 
-def conformal_intervals(error_mm: Floats, sigma_mm: Floats, independent: int) -> Intervals:
-    """Count the standard deviations that hold held-out errors.
+def coverage(error_mm: Floats, half_mm: Floats, radius_mm: Floats) -> Coverage:
+    """Share of errors (n, 3) inside intervals of these half widths (n, 3) and inside balls of these radii (n,)."""
+    axes = (np.abs(error_mm) <= half_mm).mean(axis=0)
+    radius = (np.linalg.norm(error_mm, axis=1) <= radius_mm).mean()
+    return Coverage(tuple(axes.tolist()), float(radius))
+
+
+def conformal_intervals(error_mm: Floats, formal_mm: Floats, independent: int) -> Intervals:
+    """Count the formal standard deviations that hold held-out errors.
 
     Args:
         error_mm: (n, 3) errors of rows that the model was fitted without, in the station's frame.
-        sigma_mm: (n, 3) predicted standard deviations.
+        formal_mm: (n, 3) their formal standard deviations.
         independent: how many of the rows are independent of each other; a new one exceeds the largest of m with
             probability 1 / (m + 1), so few of them make the intervals wider.
     """
-    scaled = np.abs(error_mm) / sigma_mm
-    norm = np.linalg.norm(error_mm, axis=1) / np.linalg.norm(sigma_mm, axis=1)
+    scaled = np.abs(error_mm) / formal_mm
+    norm = np.linalg.norm(error_mm, axis=1) / np.linalg.norm(formal_mm, axis=1)
     share = min(1.0, LEVEL * (1.0 + 1.0 / independent))
     x, y, z = np.quantile(scaled, share, axis=0).tolist()
     return Intervals((x, y, z), float(np.quantile(norm, share)))

@@ -18,7 +18,6 @@ from typing import Any
 from calibration.rig.description import Rig
 from daemon.acquisition.joiner import JoinedFix, ObservationJoiner
 from daemon.commands import (
-    CHECK,
     SESSION_KINDS,
     CommandError,
     caller_columns,
@@ -30,15 +29,14 @@ from daemon.host.time_service import ClockState
 from daemon.sessions.advice import SessionAdvice, after_a_move
 from daemon.sessions.control_shot import Shot
 from daemon.sessions.lifecycle import SessionLifecycle
+from daemon.sessions.observing import ObservationMaker, PendingWrites
 from daemon.sessions.open_session import CONTROL_POINT_RADIUS_MM, OpenSession
 from daemon.sessions.prism_watch import PrismWatch, as_dict
 from daemon.sessions.prisms.guard import MotionLimit, Suspicion
-from daemon.sessions.prisms.standstill_places import Exclusions, StandstillPlaces
-from daemon.sessions.station_setups import AXES, Place, SetupBook
+from daemon.sessions.station_setups import AXES, SetupBook
 from daemon.sessions.without_job import why_no_job
-from daemon.store.errors import is_unwritable
 from daemon.store.queries.jobs import JobTable
-from daemon.store.queries.observations import OF_CONTROL_POINT, ObservationTable
+from daemon.store.queries.observations import ObservationTable
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, Clock, Stamp, lies_within
 from drivers.readings import DeviceEvent, EventKind, Fix, Record
@@ -46,7 +44,6 @@ from drivers.stations.survey import position_mm
 
 log = logging.getLogger(__name__)
 
-STANDING_KINDS = ("static_poses", CHECK)
 LOAD_S = 3.0  # how long a session's start waits for what tells prisms apart; it is heeded later as well
 LATE_NS = 60 * NS_PER_S  # once a fix was joined that was measured so long after a session's end, it has all of its own
 
@@ -87,19 +84,17 @@ class SessionKeeper:
     ) -> None:
         self._rig, self._rig_text = rig, rig_text
         self._store, self._joiner, self._settings, self._clock = store, joiner, settings, clock
-        self._setups, self._run_id, self._are_jobs_enabled = setups, run_id, are_jobs_enabled
+        self._setups, self._are_jobs_enabled = setups, are_jobs_enabled
         self._lifecycle = SessionLifecycle(store, rig.name, clock, settings.control_tolerance_mm, clock_state)
         self._table, self._observations = self._lifecycle.table, ObservationTable(store)
         self._jobs = JobTable(store, rig.name)
         self._aim = aim
         self._commands = threading.Lock()
         self._shot: Shot | None = None
-        self._places = StandstillPlaces(rig)
-        self._prisms = PrismWatch(store, rig, clock, limits or {}, self._tell_of_prism)
+        self._pending = PendingWrites(store)
+        self._prisms = PrismWatch(store, rig, clock, limits or {}, self._pending.add_event)
+        self._observing = ObservationMaker(rig, store, self._pending, self._prisms, run_id)
         self._advice = SessionAdvice(rig, setups, self._table, self._prisms)
-        self._unstored: list[Callable[[], object]] = []  # observations that the store has yet to take, in their order
-        self._is_waiting = False
-        self._newest: tuple[str, Stamp, str | None] | None = None  # session and instant of a fix; why it does not count
         self._late: set[str] = set()  # sessions that got fixes after their end, and must be judged again
         # Fixes measured in those that have ended may still come, or wait for their joints
         self._open: OpenSession | None = None
@@ -123,10 +118,10 @@ class SessionKeeper:
         late = [session.id for session in observing if session is not None and session.until is not None]
         self._late.update(late)
         if not late:  # no more of them at present
-            self._unstored += [partial(self._lifecycle.judge_again, session_id) for session_id in self._late]
+            for session_id in self._late:
+                self._pending.add(partial(self._lifecycle.judge_again, session_id))
             self._late.clear()
-        if self._unstored:
-            self._store_observations()
+        self._pending.store()
 
     def is_of_session(self, stamp: Stamp) -> bool:
         """Return True if an instant lies in the open session, or in one that ended and may still get fixes."""
@@ -136,9 +131,6 @@ class SessionKeeper:
         for session in self._taking():
             if session.lasted(fix.stamp):
                 self._prisms.see(session, fix)
-
-    def _tell_of_prism(self, event: DeviceEvent) -> None:
-        self._unstored.append(partial(self._store.insert_records, [event]))
 
     def _taking(self) -> list[OpenSession]:
         """The sessions that may have measured what comes now, oldest first."""
@@ -156,76 +148,8 @@ class SessionKeeper:
         place_mm = position_mm(joined.fix)
         if session is None or place_mm is None:
             return None
-        standing = joined.standstill is not None
-        excluded = self._exclusion(session, joined, place_mm)
-        if excluded is None:
-            self._prisms.follow(session, joined, place_mm)
-            excluded = "moving" if session.kind in STANDING_KINDS and not standing else None
-        if excluded is None:
-            changed, excluded = self._which_prism(session, joined, place_mm)
-            if changed:
-                self._unstored.append(partial(self._observations.exclude, session.id, changed, joined.stamp))
-        self._newest = session.id, joined.stamp, excluded
-        row = {
-            "session_id": session.id,
-            "setup_id": session.setup_id,
-            "prism": session.prism,
-            "pose": f"{self._run_id}.{joined.standstill}" if standing else None,
-            **dict(zip(AXES, place_mm, strict=True)),
-            "dwell_s": joined.dwell_s,
-            "moving": not standing,
-            "values_json": joined.values,
-            "excluded": excluded,
-        }
-        self._unstored.append(partial(self._add_observation, session, row, joined))
+        self._observing.observe(session, joined, place_mm)
         return session
-
-    def _add_observation(self, session: OpenSession, row: Mapping[str, object], joined: JoinedFix) -> None:
-        """Add it; a shot may have told since that a control point is there, and excluded what was stored by then."""
-        place_mm = position_mm(joined.fix)
-        if row["excluded"] is None and place_mm is not None and session.is_control_point(place_mm):
-            row = {**row, "excluded": OF_CONTROL_POINT}
-        self._observations.add(self._store.fix_id(joined.fix), joined.stamp, **row)
-
-    def _which_prism(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> tuple[Exclusions, str | None]:
-        """Why a fix must not be used since it may be of another prism, and earlier ones for which that has changed."""
-        changed = self._prisms.ask_joints(session, joined, place_mm)
-        if changed:
-            changed |= self._places.withdraw([at_ns for at_ns, why in changed.items() if why is not None])
-        doubt = self._prisms.doubt(session, joined.fix)
-        if doubt is not None or joined.standstill is None:
-            return changed, doubt
-        at_ns = joined.stamp.monotonic_ns
-        standstill, confirmed = (session.id, joined.standstill), session.confirmations_by(joined.fix.stamp)
-        here = self._places.add(standstill, at_ns, place_mm, joined.values, confirmed)
-        return changed | {at: why for at, why in here.items() if at != at_ns}, here[at_ns]
-
-    def _store_observations(self) -> None:
-        """Store what was observed; while the store refuses it for now it waits, with what comes after it."""
-        try:
-            with self._store.transaction():
-                for store in self._unstored:
-                    store()
-        except Exception as error:
-            if is_unwritable(error):
-                if not self._is_waiting:
-                    log.error("observations cannot be stored (%s); they wait and are tried again", error)
-                self._is_waiting = True
-                return
-            self._unstored.clear()  # one that can never be stored must not keep out all that follow
-            raise
-        self._unstored.clear()
-        self._is_waiting = False
-
-    def _exclusion(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> str | None:
-        if joined.refused:
-            return joined.refused
-        for joint in self._rig.joint_names:
-            if joint in session.jumped and lies_within(session.order, joined.stamp, session.jumped[joint], None):
-                return f"{joint} jumped: its readings from then on do not fit those before"
-        if session.is_control_point(place_mm):
-            return OF_CONTROL_POINT
-        return None
 
     # ---- sessions ----------------------------------------------------------------------------------------------------
 
@@ -413,7 +337,7 @@ class SessionKeeper:
         Args:
             fresh_s: how old it may be, real seconds; of an older one nothing is said.
         """
-        opened, newest = self._open, self._newest
+        opened, newest = self._open, self._observing.newest
         if opened is None or newest is None or newest[0] != opened.id:
             return None
         age_s = self._clock.now().since(newest[1]) / NS_PER_S

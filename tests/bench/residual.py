@@ -155,8 +155,7 @@ def outcome(seed: int, magnitude: float, effects: str, setting: Setting) -> Outc
         seconds = time.perf_counter() - began
         evaluation = evaluate(trained, held_out)
         errors_mm[method] = evaluation.errors_mm["hybrid"]
-        coverage = trained.intervals.coverage(errors_mm[method], evaluation.sigma_mm)
-        covered = float(np.mean(coverage.axes)), coverage.radius
+        covered = float(np.mean(evaluation.coverage.axes)), evaluation.coverage.radius
         chosen[method] = trained.residual.learner.kind if trained.residual else "none"
     if setting.search:
         errors_mm["tuned lightgbm"] = plain_mm - tuned_estimate_mm(model, training, held_out, seed, setting.search)

@@ -6,7 +6,7 @@ Simulated: each seed is a machine of its own with one of three sets of hidden ef
 coordinate, calibrated without named effects so that the residual has something to learn; 600 held-out fixes in poses of
 their own. `one` has one prism a pose, `all` four, whose readings err together. Measured: the UR10 data, 70/30 by 100 mm
 cells. Printed are the mean shares over the seeds and their standard error: of x, y, z, of the balls, and of what the
-predicted sigma of normal errors would cover (x, y, z together).
+formal standard deviation of normal errors would cover (x, y, z together).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor
 from calibration.observations import Floats, Observations, parse_observations
 from calibration.pipeline.calibrate import identify, train_residual
-from calibration.residual.conformal import Intervals
+from calibration.residual.conformal import Intervals, coverage
 from calibration.rig.description import shipped_rig
 from calibration.run_settings import Run
 from simulators.effects.library import parse_effects
@@ -85,8 +85,8 @@ def shares(model: CalibratedModel, held_out: Observations) -> Floats:
     """(5,) covered shares of x, y, z, of the balls, and of the axes if errors were normal."""
     prediction = Predictor.of(model).predict(held_out)
     error = held_out.position_mm - prediction.position_mm
-    found = model.intervals.coverage(error, prediction.sigma_mm)
-    normal = Intervals().coverage(error, prediction.sigma_mm)
+    found = prediction.coverage(error)
+    normal = coverage(error, Intervals().half_mm(prediction.formal_mm), prediction.radius_mm)
     return np.array([*found.axes, found.radius, np.mean(normal.axes)])
 
 

@@ -16,7 +16,6 @@ from daemon.warm_up import prepare
 if TYPE_CHECKING:
     from calibration.model.prediction import Prediction
     from calibration.observations import Floats
-    from calibration.residual.conformal import Intervals
 
 PREDICTED_COLUMNS = names(PREDICTED)
 INTERVAL_COLUMNS = names(INTERVALS)
@@ -51,7 +50,7 @@ def predict(directory: Path, data: Path, out: Path | None, *, intervals: bool, a
     observations, raw = offline.read_observations(data, model.rig, positions_required=False)
     with one_blas_thread(), ThreadPoolExecutor() as pool:
         prediction = Predictor.of(model).predict(observations, pool)
-    columns = _predicted_columns(prediction, model.intervals if intervals else None)
+    columns = _predicted_columns(prediction, intervals=intervals)
     table = offline.with_columns(raw, columns, {*PREDICTED_COLUMNS, *INTERVAL_COLUMNS} - set(columns))
     warnings = model_warnings(model, observations)
     result: dict[str, object] = {
@@ -65,12 +64,11 @@ def predict(directory: Path, data: Path, out: Path | None, *, intervals: bool, a
     return result
 
 
-def _predicted_columns(prediction: Prediction, intervals: Intervals | None) -> dict[str, Floats]:
+def _predicted_columns(prediction: Prediction, *, intervals: bool) -> dict[str, Floats]:
     """Return the columns that predictions add to an observations CSV, with their intervals if they are wanted."""
     columns = {name: prediction.position_mm[:, i] for i, name in enumerate(PREDICTED_COLUMNS[:3])}
     columns |= {name: prediction.sigma_mm[:, i] for i, name in enumerate(PREDICTED_COLUMNS[3:])}
-    if intervals is not None:
-        half_mm = intervals.half_mm(prediction.sigma_mm)
-        columns |= {name: half_mm[:, i] for i, name in enumerate(INTERVAL_COLUMNS[:3])}
-        columns[INTERVAL_COLUMNS[3]] = intervals.radius_mm(prediction.sigma_mm)
+    if intervals:
+        columns |= {name: prediction.half_mm[:, i] for i, name in enumerate(INTERVAL_COLUMNS[:3])}
+        columns[INTERVAL_COLUMNS[3]] = prediction.radius_mm
     return columns

@@ -15,7 +15,7 @@ from calibration.model.files import model_from_files, model_to_files
 from calibration.model.intervals import with_intervals
 from calibration.observations import Floats, parse_observations
 from calibration.pipeline.calibrate import identify
-from calibration.residual.conformal import Intervals, conformal_intervals
+from calibration.residual.conformal import Coverage, Intervals, conformal_intervals, coverage
 from calibration.rig.description import shipped_rig
 from simulators.rig.truth import RigTruth
 from tests.calibration.conftest import Session, rig_text, simulated
@@ -29,9 +29,13 @@ def draw(seed: int, n: int, freedom: float) -> tuple[Floats, Floats]:
     return sigma * rng.standard_t(freedom, (n, 3)) * [1.0, 1.0, 2.0], sigma
 
 
+def covered_by(intervals: Intervals, error: Floats, formal: Floats) -> Coverage:
+    return coverage(error, intervals.half_mm(formal), intervals.radius_mm(formal))
+
+
 def test_without_data_intervals_are_those_of_normal_errors() -> None:
     rng = np.random.default_rng(0)
-    covered = Intervals().coverage(rng.normal(0.0, 2.0, (100_000, 3)), np.full((100_000, 3), 2.0))
+    covered = covered_by(Intervals(), rng.normal(0.0, 2.0, (100_000, 3)), np.full((100_000, 3), 2.0))
     assert covered.axes == pytest.approx((0.9, 0.9, 0.9), abs=0.005)
     assert covered.radius == pytest.approx(0.9, abs=0.005)
 
@@ -42,10 +46,10 @@ def test_errors_of_any_shape_and_size_are_covered(freedom: float) -> None:
     for seed in range(20):
         error, sigma = draw(seed, 200, freedom)
         intervals = conformal_intervals(error, sigma, 200)
-        covered = intervals.coverage(*draw(seed + 100, 2000, freedom))
+        covered = covered_by(intervals, *draw(seed + 100, 2000, freedom))
         shares.append([*covered.axes, covered.radius])
     assert np.mean(shares, axis=0) == pytest.approx(0.9, abs=0.01)
-    normal = Intervals().coverage(*draw(0, 20_000, freedom))
+    normal = covered_by(Intervals(), *draw(0, 20_000, freedom))
     assert normal.axes[2] < 0.65
 
 
@@ -123,8 +127,7 @@ def test_outliers_are_covered_like_other_fixes() -> None:
         found.append(replace(rows, position_mm=position))
     model = identify(rig, rig_text("swdt82"), found[0])
     evaluation = evaluate(model, found[1])
-    covered = model.intervals.coverage(evaluation.errors_mm["hybrid"], evaluation.sigma_mm)
-    assert covered.radius == pytest.approx(0.9, abs=0.04)
+    assert evaluation.coverage.radius == pytest.approx(0.9, abs=0.04)
     assert model.intervals.radius > 3.0  # an eighth of all fixes is anywhere
 
 

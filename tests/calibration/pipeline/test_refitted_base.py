@@ -11,6 +11,7 @@ from calibration.errors import ModelError
 from calibration.evaluation.evaluation import evaluate
 from calibration.experiments.residual_comparison import MethodResult, compare_residuals
 from calibration.model.files import model_from_files, model_to_files
+from calibration.model.intervals import SetupErrors
 from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor
 from calibration.model.rebase import with_refitted_base
@@ -73,8 +74,8 @@ def test_a_prediction_at_a_refitted_set_up_is_as_sure_as_it_says(moved: Moved, r
     for model in refitted:
         prediction = Predictor.of(model).predict(moved.held_out)
         error = moved.held_out.position_mm - prediction.position_mm
-        covered.append(model.intervals.coverage(error, prediction.sigma_mm).radius)
-        chi_square.append(((error / prediction.sigma_mm) ** 2).mean())
+        covered.append(prediction.coverage(error).radius)
+        chi_square.append(((error / prediction.formal_mm) ** 2).mean())
     assert np.mean(covered) == pytest.approx(0.9, abs=0.04)
     assert 0.8 < np.mean(chi_square) < 1.25
 
@@ -86,10 +87,12 @@ def test_what_a_machine_does_at_another_site_alone_widens_its_intervals_there() 
     there = simulated(RigTruth(rig, 23, effects=soft), 500, 24, setup="there")
     few, others = there.select(np.arange(40)), there.select(np.arange(40, 500))
     placed = with_refitted_base(model, few)
-    prediction = Predictor.of(placed).predict(others)
-    error = others.position_mm - prediction.position_mm
-    assert model.intervals.coverage(error, prediction.sigma_mm).radius < 0.75
-    assert placed.intervals.coverage(error, prediction.sigma_mm).radius == pytest.approx(0.9, abs=0.06)
+    as_at_home = Predictor.of(placed).predict(others)
+    counted_there = Predictor.of(SetupErrors.of(placed, few).widened(placed)).predict(others)
+    error = others.position_mm - as_at_home.position_mm
+    assert as_at_home.coverage(error).radius < 0.75
+    assert counted_there.coverage(error).radius == pytest.approx(0.9, abs=0.06)
+    assert np.mean(np.abs(error) <= 1.645 * counted_there.sigma_mm) == pytest.approx(0.9, abs=0.06)
     # Counted on the half of the fixes that does not tell how wide they are.
     assert evaluate(model, there, refit_base=True).coverage.radius == pytest.approx(0.9, abs=0.04)
 
