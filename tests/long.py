@@ -66,7 +66,7 @@ GROUPS = (
         ("tests", f"--ignore={MATHEMATICS}"),
         Passed(
             "long_programs.passed",
-            (*TESTED_BY_ALL, "daemon", "drivers", "rigcal", "docs/tutorial.md", "docs/how-to"),
+            (*TESTED_BY_ALL, "daemon", "drivers", "rigcal", "deploy", "docs/tutorial.md", "docs/how-to"),
             lambda path: is_long(path) and not is_mathematics(path),
         ),
     ),

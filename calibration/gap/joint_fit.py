@@ -161,6 +161,10 @@ class Problem:
         """Fit kinematics and effects, from a start as `joint_fit` takes it."""
         return joint_fit(self.solution, self.observations, choices, self.prior, start)
 
+    def fit_part(self, joint: JointFit, kept: Sequence[Choice]) -> JointFit:
+        """Fit kinematics with some of the effects that a fit has, and which it gives the start."""
+        return self.fit(kept, joint.start(kept))
+
     def kinematics_only(self) -> JointFit:
         """Return the fit without effects."""
         chain, fit = self.solution.chain, self.solution.fit

@@ -114,7 +114,7 @@ class SearchResult:
             like = next((own for own in steps if sorted(own.fit.choices, key=str) == before), step)
             fit, projection = like.fit, like.projection
             if len(before) < len(fit.choices):
-                fit = self.problem.fit(before, fit.start(before))
+                fit = self.problem.fit_part(fit, before)
                 projection = self.problem.project(fit)
             steps.append(replace(step, fit=fit, projection=projection))
             there |= {str(c) for c in step.adopted}
@@ -201,7 +201,7 @@ def _without_partial_effects(
     if not against:
         return joint, {}
     kept = [c for c in joint.choices if str(c) not in against]
-    return problem.fit(kept, joint.start(kept)), against
+    return problem.fit_part(joint, kept), against
 
 
 def _final_steps(

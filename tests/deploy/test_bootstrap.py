@@ -119,6 +119,7 @@ def test_a_tool_that_is_only_wanted_stops_nothing(tree: Tree) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_an_index_that_does_not_answer_is_a_sentence_after_pips_own_words(tree: Tree) -> None:
     result = tree.bootstrap(
         PIP_CONFIG_FILE=os.devnull, PIP_INDEX_URL="http://127.0.0.1:9/simple", PIP_RETRIES="0", PIP_FIND_LINKS=""
@@ -129,6 +130,7 @@ def test_an_index_that_does_not_answer_is_a_sentence_after_pips_own_words(tree: 
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_package_that_is_not_the_locked_one_is_refused(tree: Tree) -> None:
     wheel = tree.path / "wheels/numpy-2.4.6-py3-none-any.whl"
     wheel.parent.mkdir()

@@ -56,6 +56,7 @@ def test_the_wheel_has_the_version_and_the_licences_of_all_that_is_inside(source
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_an_sdist_is_the_same_bytes_twice_and_gives_the_same_wheel(wheel: Path, tmp_path: Path) -> None:
     sdists = [build_sdist(copied(tmp_path / name), tmp_path / f"{name}-out") for name in ("first", "second")]
     assert sdists[0].read_bytes() == sdists[1].read_bytes()

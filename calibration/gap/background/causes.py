@@ -188,7 +188,7 @@ def _without_parts(problem: Problem, names: Names) -> Names:
         return names
     kept = [choice for choice in names.joint.choices if choice not in parts]
     evidence = {str(choice): names.evidence[str(choice)] for choice in kept}
-    return replace(names, joint=problem.fit(kept, names.joint.start(kept)), evidence=evidence)
+    return replace(names, joint=problem.fit_part(names.joint, kept), evidence=evidence)
 
 
 def _coincide(steps: Sequence[Choice]) -> bool:

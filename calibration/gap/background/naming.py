@@ -25,7 +25,6 @@ from calibration.gap.projection import Integers, Projection, rows_of
 from calibration.gap.result import Evidence
 from calibration.gap.screening import ScoredEffect, Screen
 from calibration.numerics.matrices import gram
-from calibration.observations import Floats
 from calibration.residual.folds import folds
 
 _FOLDS = 10
@@ -174,62 +173,62 @@ def _with_map(problem: Problem, joint: JointFit, where: str) -> JointFit:
 def without_harmful(problem: Problem, joint: JointFit) -> tuple[JointFit, tuple[str, ...]]:
     """Return a fit without the effects that raise the errors of held-out groups, and the names of these."""
     harmful: list[str] = []
-    while (lesser := _without_raising(problem, joint) or _without_contradicted(problem, joint)) is not None:
-        kept = set(map(str, lesser.choices))
-        harmful += [str(c) for c in joint.choices if str(c) not in kept]
-        joint = lesser
+    while joint.choices:
+        projection = problem.project(joint)
+        fold = folds(projection.groups, _FOLDS, problem.seed)
+        worst = _raising(projection, joint, fold)
+        if worst is None:
+            worst = _contradicted(problem, joint, projection, fold)
+        if worst is None:
+            break
+        harmful.append(str(joint.choices[worst]))
+        joint = _without(problem, joint, worst)
     return joint, tuple(harmful)
 
 
-def _without_raising(problem: Problem, joint: JointFit) -> JointFit | None:
-    """Return a fit without the effect that most raises the errors of fixes that count; None where none does."""
-    if not joint.choices:
-        return None
-    projection = problem.project(joint)
-    fold = folds(projection.groups, _FOLDS, problem.seed)
+def _raising(projection: Projection, joint: JointFit, fold: Integers) -> int | None:
+    """Return the number of the effect that most raises the errors of fixes that count; None where none does."""
     whole = _held_out(projection, np.empty(0, dtype=np.intp), fold)
     without = [_held_out(projection, np.r_[joint.slice_of(n)], fold) for n in range(len(joint.choices))]
     worst = int(np.argmin(without))
-    return None if without[worst] > whole * (1.0 - _HARM) else _without(problem, joint, worst)
+    return None if without[worst] > whole * (1.0 - _HARM) else worst
 
 
-def _without_contradicted(problem: Problem, joint: JointFit) -> JointFit | None:
-    """Return a fit without the effect that most raises the errors of all fixes, outliers to it alone among them.
+def _contradicted(problem: Problem, joint: JointFit, projection: Projection, fold: Integers) -> int | None:
+    """Return the number of the effect that most raises the errors of all fixes, outliers to it alone among them.
 
     Fixes that contradict an effect are outliers beside it and do not count, which says nothing for it: a step that most
     rows gain by, and to which some are ten times the noise off.
 
+    Args:
+        problem: the data.
+        joint: the fit with all effects.
+        projection: about that fit.
+        fold: (m,) in which of the folds each sample is left out.
+
     Returns:
         None where no effect makes outliers, or errors are greater without it.
     """
-    is_outlier, most, least = joint.fit.weight < OUTLIER, 1.0 + _HARM, None
+    is_outlier, most, worst = joint.fit.weight < OUTLIER, 1.0 + _HARM, None
     if not is_outlier.any():
         return None
-    own = _held_out_squares(problem, joint)
+    squares = (projection.held_out_mm(fold) ** 2).sum(axis=1)
     for number in range(len(joint.choices)):
         without = _without(problem, joint, number)
         was_outlier = without.fit.weight < OUTLIER
         if not (is_outlier & ~was_outlier).any():
             continue
         counts = ~(is_outlier & was_outlier)
-        raised = float(own[counts].sum() / _held_out_squares(problem, without)[counts].sum())
+        squares_without = (problem.project(without).held_out_mm(fold) ** 2).sum(axis=1)
+        raised = float(squares[counts].sum() / squares_without[counts].sum())
         if raised > most:
-            most, least = raised, without
-    return least
-
-
-def _held_out_squares(problem: Problem, joint: JointFit) -> Floats:
-    """Return (m,) squared held-out errors of all samples, mm^2."""
-    projection = problem.project(joint)
-    error_mm = projection.held_out_mm(folds(projection.groups, _FOLDS, problem.seed))
-    squares: Floats = (error_mm**2).sum(axis=1)
-    return squares
+            most, worst = raised, number
+    return worst
 
 
 def _without(problem: Problem, joint: JointFit, number: int) -> JointFit:
     """Return a fit without one of the effects."""
-    kept = [c for n, c in enumerate(joint.choices) if n != number]
-    return problem.fit(kept, joint.start(kept))
+    return problem.fit_part(joint, [c for n, c in enumerate(joint.choices) if n != number])
 
 
 def _held_out(projection: Projection, without: Integers, fold: Integers) -> float:

@@ -254,7 +254,7 @@ class StepwiseSearch:
         if name not in map(str, joint.choices):
             return joint, None, ()
         others = [c for c in joint.choices if str(c) != name]
-        without = self.problem.fit(others, joint.start(others))
+        without = self.problem.fit_part(joint, others)
         # What all together explain is no outlier to a part of it.
         counted = replace(without, fit=replace(without.fit, weight=joint.fit.weight))
         projection = self.problem.project_with_mild_outliers(counted)

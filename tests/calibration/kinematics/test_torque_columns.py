@@ -141,6 +141,7 @@ def test_an_effect_that_a_load_could_make_is_doubted_where_no_load_is_known() ->
     assert not doubted(rig, weighed(measured, None))
 
 
+@pytest.mark.long
 def test_coefficients_of_effects_count_among_what_the_data_must_determine() -> None:
     rig = shipped_rig("ys100")
     truth = RigTruth(rig, 5, perturbation=0.6, effects=parse_effects(EFFECTS))

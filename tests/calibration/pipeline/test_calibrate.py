@@ -297,6 +297,7 @@ def test_two_encoders_mounted_turned_are_found_as_built(session: Session) -> Non
     assert rms(evaluate(model, held_out).errors_mm["geometric"]) < 6.0
 
 
+@pytest.mark.long
 def test_a_zero_that_is_far_off_is_refused_with_the_way_out(session: Session) -> None:
     with pytest.raises(UnsafeError, match="--prior as-built"):
         identify(session.rig, TEXT, turned(session.training, "theta7", 20.0))

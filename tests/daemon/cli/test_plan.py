@@ -88,6 +88,7 @@ def test_two_effects_are_told_apart_and_the_approach_is_part_of_the_plan(tmp_pat
     assert {row["theta3_dir"] for row in rows} == {"-1", "1"}
 
 
+@pytest.mark.long
 def test_after_a_session_it_says_what_else_to_measure(tmp_path: Path) -> None:
     write_model(tmp_path / "model", small_calibration()[0])
     found = answer("plan", "--rig", "ur10", "--model", tmp_path / "model", "--poses", 12)

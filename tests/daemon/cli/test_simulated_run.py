@@ -16,6 +16,7 @@ DEADLINE_S = 120.0
 
 
 @pytest.mark.parametrize("rig", ["swdt82", "ur10"])
+@pytest.mark.long
 def test_a_simulated_rig_leaves_a_configuration_for_commands_on_its_store(rig: str, tmp_path: Path) -> None:
     """Joints that ur10's file reads from nowhere have simulated channels, which the configuration knows too."""
     config = tmp_path / "rigcal-sim" / "rigcal.toml"

@@ -89,6 +89,7 @@ def test_a_candidate_that_is_not_better_than_the_live_model_is_refused(rig: Mode
     assert (status["candidate"]["id"], status["candidate"]["comparison"]["is_better"]) == (again, False)
 
 
+@pytest.mark.long
 def test_one_that_is_better_takes_the_live_models_place(rig: ModelRig) -> None:
     first = rig.accepted(poses=30)
     second = rig.accepted(poses=40)

@@ -35,6 +35,7 @@ def test_what_happens_at_one_instant_is_not_told_as_steps_of_something_else() ->
     assert "time_s = 8" in str(gap.description)
 
 
+@pytest.mark.long
 def test_a_step_is_named_where_nothing_else_happened() -> None:
     gap = answer("zero_step@theta5:jump_rad=6e-3:time_s=8000", without="prism_seat_step")
     assert [(e.family, e.where) for e in gap.effects] == [("zero_step", "theta5")]

@@ -83,6 +83,7 @@ def test_held_out_rows_gain_by_what_is_named_beside_structure() -> None:
     assert after < 0.8 * before
 
 
+@pytest.mark.long
 def test_every_name_has_a_certificate_from_rows_that_did_not_choose_it() -> None:
     for effect in soft_machine().as_dict()["effects"]:  # type: ignore[attr-defined]
         assert 0.0 <= effect["certificate_p"] < 0.05
@@ -98,6 +99,7 @@ def test_structure_alone_is_given_no_name() -> None:
     assert gap.description
 
 
+@pytest.mark.long
 def test_a_torso_whose_arms_share_no_joint_s_errors_has_an_answer() -> None:
     # The two prisms of a standstill have no joint of an arm in common, so nothing tells its random errors.
     path = Path(__file__).parents[3] / "rigs" / "torso.toml"
