@@ -93,6 +93,12 @@ def inverse_by(factor: Floats) -> Floats:
     return inverse
 
 
+def inverse_root_by(factor: Floats) -> Floats:
+    """Return the lower triangular (q, q) root, inverse = root' root, for the matrix of a lower Cholesky factor."""
+    root: Floats = lapack.dtrtri(factor, lower=1)[0] if len(factor) else factor
+    return root
+
+
 def root_of(covariance: Floats) -> Floats:
     """Return a root (q, q) of a covariance that may be singular: root @ root' is the covariance."""
     scale = np.sqrt(np.diag(covariance))

@@ -69,11 +69,10 @@ def smooth_blocks(context: EffectContext, average: Callable[[Floats], Floats]) -
         average: makes values (m, ...) of samples from values (n, ...) of rows.
     """
     moving = _moving(context)
-    found = [_curve(context, name) for name in moving]
-    for pair in itertools.pairwise(moving):
-        found += [_surface(context, pair, at) for at in pair]
-    found.append(_place(context))
-    return (*(replace(b, columns=b.columns.over(average)) for b in found), *time_blocks(context, average))
+    curves = [_curve(context, name) for name in moving]
+    surfaces = [block for pair in itertools.pairwise(moving) for block in _surfaces(context, average, pair, pair)]
+    every = [*(_over(average, curve) for curve in curves), *surfaces, _over(average, _place(context))]
+    return (*every, *time_blocks(context, average))
 
 
 def possible_blocks(context: EffectContext, average: Callable[[Floats], Floats]) -> Iterator[Block]:
@@ -84,8 +83,9 @@ def possible_blocks(context: EffectContext, average: Callable[[Floats], Floats])
     yield from time_blocks(context, average, fine=True)
     moving = _moving(context)
     for pair in itertools.combinations(moving, 2):
-        for block in (*(_surface(context, pair, at) for at in moving), _pair(context, pair)):
-            yield replace(block, columns=block.columns.over(average))
+        yield from _surfaces(context, average, pair, moving)
+    for pair in itertools.combinations(moving, 2):
+        yield _over(average, _pair(context, pair))
 
 
 def displacement_blocks(context: EffectContext, average: Callable[[Floats], Floats]) -> tuple[Block, ...]:
@@ -93,8 +93,7 @@ def displacement_blocks(context: EffectContext, average: Callable[[Floats], Floa
 
     Arguments are those of `smooth_blocks`.
     """
-    found = [_pair(context, pair) for pair in itertools.pairwise(_moving(context))]
-    return tuple(replace(b, columns=b.columns.over(average)) for b in found)
+    return tuple(_over(average, _pair(context, pair)) for pair in itertools.pairwise(_moving(context)))
 
 
 def time_blocks(
@@ -117,7 +116,7 @@ def time_blocks(
     block = Block(
         name, "time", "station", "time", _shifts(name, waves, 1.0 / np.sqrt(number) if fine else 1.0 / number)
     )
-    return (replace(block, columns=block.columns.over(average)),)
+    return (_over(average, block),)
 
 
 def event_blocks(
@@ -189,6 +188,10 @@ def elastic_blocks(context: EffectContext, average: Callable[[Floats], Floats]) 
     return tuple(found)
 
 
+def _over(average: Callable[[Floats], Floats], block: Block) -> Block:
+    return replace(block, columns=block.columns.over(average))
+
+
 def _moving(context: EffectContext) -> list[str]:
     return [name for name in context.rig.joint_names if _moves(context, name)]
 
@@ -205,13 +208,17 @@ def _curve(context: EffectContext, joint: str) -> Block:
     return Block(name, "curve", joint, joint, _at_joint(context, joint, name, values, 1.0 / number))
 
 
-def _surface(context: EffectContext, pair: Sequence[str], joint: str) -> Block:
+def _surfaces(
+    context: EffectContext, average: Callable[[Floats], Floats], pair: Sequence[str], joints: Sequence[str]
+) -> Iterator[Block]:
+    """Yield errors of some joints that depend on two, of the samples."""
     (a, of_a), (b, of_b) = (_waves(context, name, _SURFACE_WAVES) for name in pair)
-    values = (a[:, :, None] * b[:, None, :]).reshape(len(context), -1)
+    values = average((a[:, :, None] * b[:, None, :]).reshape(len(context), -1))
     sizes = 1.0 / np.hypot(of_a[:, None], of_b).ravel()
     text = " and ".join(pair)
-    name = f"surface({text})@{joint}"
-    return Block(name, "surface", joint, text, _at_joint(context, joint, name, values, sizes))
+    for joint in joints:
+        name = f"surface({text})@{joint}"
+        yield Block(name, "surface", joint, text, _at_joint(context, joint, name, values, sizes))
 
 
 def _pair(context: EffectContext, pair: Sequence[str]) -> Block:

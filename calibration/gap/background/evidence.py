@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
+from scipy.linalg import blas, lapack
 from scipy.optimize import minimize
 
-from calibration.numerics.matrices import inverse_by
+from calibration.numerics.matrices import inverse_by, inverse_root_by
 from calibration.observations import Floats
 
 Integers = NDArray[np.intp]
@@ -119,12 +119,17 @@ def greatest(
 
     # SciPy's tolerance is relative to a value of many thousands; differences of a few are what counts.
     begin = np.zeros(len(theta))
+    at_begin = negative(begin)
+
+    def from_begin(z: Floats) -> tuple[float, Floats]:
+        return negative(z) if z.any() else at_begin
+
     found = minimize(
-        negative,
+        from_begin,
         begin,
         jac=True,
         method="L-BFGS-B",
-        options={"maxiter": _ITERATIONS, "ftol": enough / max(abs(negative(begin)[0]), 1.0)},
+        options={"maxiter": _ITERATIONS, "ftol": enough / max(abs(at_begin[0]), 1.0)},
     )
     best = (theta + turned @ found.x).clip(low, high)
     scale = dict(zip(names, best[:-1].tolist(), strict=True))
@@ -182,19 +187,19 @@ class FixedAndScaled:
         products, size = self._products, self._size
         left, across, factor = self._beside_fixed(sigma, noise)
         fixed = self._along_fixed * np.sqrt(left / noise)
-        outer = sigma * sigma[:, None] / noise
         score = sigma * (self._along - across.T @ fixed) / noise
-        inverse = inverse_by(factor)
-        mean = inverse @ score
-        explained = float(fixed @ fixed) / noise + float(score @ mean)
+        root = inverse_root_by(factor)
+        half = root @ score
+        mean = root.T @ half
+        explained = float(fixed @ fixed) / noise + float(half @ half)
         value = 0.5 * (explained - products.squares / noise - products.rows * np.log(noise))
         value -= float(np.log(np.diag(factor)).sum()) - 0.5 * float(np.log(left).sum())
-        variance = np.diag(inverse)
+        variance = np.einsum("ij,ij->j", root, root)
         slope: Floats = mean**2 + variance - 1.0
         # Of what stays: posterior means in prior sigmas, and variances with what the others leave open.
         mean_fixed = np.sqrt(left / noise) * (fixed - across @ (sigma * mean))
-        faded = across * np.sqrt(left)[:, None]
-        of_fixed = float(left.sum()) + float(np.vdot(inverse, (faded.T @ faded) * outer))
+        open_to_others = (blas.dtrmm(1.0, root, (across * sigma).T, lower=1) ** 2).sum(axis=0) / noise
+        of_fixed = float(left.sum()) + float(open_to_others @ left)
         # The squares that the posterior mean leaves, over the noise.
         squares = products.squares / noise - explained - float(mean @ mean) - float(mean_fixed @ mean_fixed)
         count = len(size) + len(sigma)

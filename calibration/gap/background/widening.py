@@ -7,12 +7,13 @@ one after another.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
+from calibration.effects.columns import joined
 from calibration.gap.background.blocks import Block
 from calibration.gap.background.system import Model, System
 from calibration.gap.projection import rows_of
@@ -21,6 +22,8 @@ from calibration.observations import Floats
 PossibleBlocks = Callable[[], Iterator[Block]]
 
 _SAMPLES = 700  # to choose by
+_AT_ONCE = 1000  # columns
+_COMPARED = 200  # blocks, those of the greatest gain by themselves
 _MOST = 8  # blocks at once
 _LEAST_GAIN = 15.0  # log evidence
 _SQUARED_SCALES = np.exp(np.linspace(-8.0, 6.0, 15))[:, None]
@@ -34,79 +37,116 @@ def further_blocks(system: System, model: Model, possible: PossibleBlocks) -> tu
         model: with its effects and background.
         possible: yields the blocks to choose from; those that the system has are passed over.
     """
-    found = _Additions(system, model, possible)
-    chosen = [name for _ in range(_MOST) for name in found.take()]
-    by_name = {block.name: block for block in possible() if block.name in chosen}
-    return tuple(by_name[name] for name in chosen)
+    beside = _BesideModel(system, model)
+    best: list[_Addition] = []
+    for some in _batches(block for block in possible() if block.name not in system.blocks):
+        best += beside.additions(some)
+        best = sorted(best, key=lambda own: -own.gain[0])[:_COMPARED]
+    return tuple(_chosen(best))
 
 
-@dataclass
 class _Addition:
-    """Columns of a block in the whole, with their (k, k) and (k,) products beside the model."""
+    """A block as an addition to a model.
 
-    columns: slice
-    gram: Floats
-    along: Floats
+    Args:
+        block: its columns (k).
+        own: (r, k) rows of these in prior sigmas, in units of the noise.
+        removed: (q, k) the part of these along the model: products of columns less those of what is removed from them
+            are products of what the model leaves of them.
+        gram: (k, k) products of what the model leaves of the columns.
+        along: (k,) of that with what it leaves of the target.
 
-    def gain(self) -> tuple[float, float]:
-        """Return the gain of log evidence at the best scale, and the square of that."""
-        size, axes = np.linalg.eigh(self.gram)
-        share = _SQUARED_SCALES * np.maximum(size, 0.0)
-        squares = (axes.T @ self.along) ** 2 * _SQUARED_SCALES
-        gains = 0.5 * (squares / (1.0 + share) - np.log1p(share)).sum(axis=1)
-        best = int(np.argmax(gains))
-        return float(gains[best]), float(_SQUARED_SCALES[best, 0])
+    Attributes:
+        gain: of log evidence at the best scale, and the square of that.
+    """
+
+    def __init__(self, block: Block, own: Floats, removed: Floats, gram: Floats, along: Floats) -> None:
+        self.block, self.own, self.removed, self.gram, self.along = block, own, removed, gram, along
+        self.gain = _gain(gram, along)
+
+    def beside(self, taken: _Addition, factor: Floats, left: Floats) -> _Addition:
+        """Return the same block beside another that is taken into the model.
+
+        Args:
+            taken: the other, of k columns.
+            factor: (k, k) Cholesky factor of its products with the prior of its amounts.
+            left: (k,) its products with the target, by that factor.
+        """
+        across = taken.own.T @ self.own - taken.removed.T @ self.removed
+        gone = solve_triangular(factor, across, lower=True)
+        removed = np.vstack([self.removed, gone])
+        return _Addition(self.block, self.own, removed, self.gram - gone.T @ gone, self.along - gone.T @ left)
 
 
-class _Additions:
-    """Blocks as additions to a model, by the products of their columns with everything in the model projected out."""
+class _BesideModel:
+    """What a model leaves of further columns, in some of its rows."""
 
-    def __init__(self, system: System, model: Model, possible: PossibleBlocks) -> None:
-        projection, index = system.projection, model.scales.index
-        rows = rows_of(_evenly(len(projection.target) // 3))
-        here, noise = system.of_rows(rows).products, model.scales.noise
-        sigma, in_model = model.scales.sigma, system.columns[np.ix_(rows, index)]
+    def __init__(self, system: System, model: Model) -> None:
+        self._projection, index = system.projection, model.scales.index
+        self._rows = rows_of(_evenly(len(self._projection.target) // 3))
+        here, noise = system.of_rows(self._rows).products, model.scales.noise
+        self._root = np.sqrt(noise)
+        sigma = model.scales.sigma
         matrix = here.gram[np.ix_(index, index)] * (sigma * sigma[:, None] / noise)
         matrix[np.diag_indices_from(matrix)] += 1.0
-        factor = cholesky(matrix, lower=True)
-        left = solve_triangular(factor, sigma * here.along[index] / noise, lower=True)
-        self._parts: dict[str, _Addition] = {}
-        columns, removed, count = list[Floats](), list[Floats](), 0
-        for block in possible():
-            if block.name in system.blocks:
-                continue
-            own = projection.whitened(projection.moved_mm(block.columns))[rows] * block.columns.prior_sigma
-            own /= np.sqrt(noise)
-            gone = solve_triangular(factor, sigma[:, None] * (in_model.T @ own) / np.sqrt(noise), lower=True)
-            along = own.T @ projection.target[rows] / np.sqrt(noise) - gone.T @ left
-            place = slice(count, count := count + own.shape[1])
-            self._parts[block.name] = _Addition(place, own.T @ own - gone.T @ gone, along)
-            columns.append(own)
-            removed.append(gone)
-        self._columns = np.hstack(columns) if columns else np.empty((len(rows), 0))
-        self._removed = np.hstack([np.empty((len(index), 0)), *removed])
-        self._taken = np.empty((0, count))
+        self._factor = cholesky(matrix, lower=True)
+        self._model = system.columns[np.ix_(self._rows, index)] * (sigma / self._root)
+        self._target = self._projection.target[self._rows] / self._root
+        self._left = solve_triangular(self._factor, sigma * here.along[index] / noise, lower=True)
 
-    def take(self) -> list[str]:
-        """Return the name of the block that gains most, and project it out of all others; nothing where none gains."""
-        gains = {name: part.gain() for name, part in self._parts.items()}
-        name = max(gains, key=lambda n: gains[n][0], default="")
-        if not name or gains[name][0] < _LEAST_GAIN:
-            return []
-        taken = self._parts.pop(name)
-        own = taken.columns
-        across = self._columns[:, own].T @ self._columns - self._removed[:, own].T @ self._removed
-        across -= self._taken[:, own].T @ self._taken
-        inner = across[:, own] + np.eye(across.shape[0]) / gains[name][1]
-        factor = cholesky(inner, lower=True)
-        gone = solve_triangular(factor, across, lower=True)
+    def additions(self, blocks: Sequence[Block]) -> Iterator[_Addition]:
+        """Yield blocks as additions to the model."""
+        columns = joined([block.columns for block in blocks], blocks[0].columns.rows)
+        moved_mm = self._projection.moved_mm(columns)
+        every = self._projection.whitened(moved_mm)[self._rows] * (columns.prior_sigma / self._root)
+        removed = solve_triangular(self._factor, self._model.T @ every, lower=True)
+        along = every.T @ self._target - removed.T @ self._left
+        first = 0
+        for block in blocks:
+            part = slice(first, first := first + len(block.columns))
+            own, gone = every[:, part].copy(), removed[:, part].copy()
+            yield _Addition(block, own, gone, own.T @ own - gone.T @ gone, along[part])
+
+
+def _batches(blocks: Iterator[Block]) -> Iterator[list[Block]]:
+    """Yield blocks many at a time, displacements apart from errors of joints: both together are mostly zeros."""
+    for _, same in groupby(blocks, lambda block: block.columns.shift_mm is None):
+        some, count = list[Block](), 0
+        for block in same:
+            some.append(block)
+            count += len(block.columns)
+            if count >= _AT_ONCE:
+                yield some
+                some, count = [], 0
+        if some:
+            yield some
+
+
+def _chosen(possible: list[_Addition]) -> Iterator[Block]:
+    """Yield the block that gains most, and so on beside those; none that gains little."""
+    for _ in range(_MOST):
+        taken = max(possible, key=lambda own: own.gain[0], default=None)
+        if taken is None or taken.gain[0] < _LEAST_GAIN:
+            return
+        yield taken.block
+        factor = cholesky(taken.gram + np.eye(len(taken.gram)) / taken.gain[1], lower=True)
         left = solve_triangular(factor, taken.along, lower=True)
-        self._taken = np.vstack([self._taken, gone])
-        for part in self._parts.values():
-            theirs = gone[:, part.columns]
-            part.gram = part.gram - theirs.T @ theirs
-            part.along = part.along - theirs.T @ left
-        return [name]
+        possible = [own.beside(taken, factor, left) for own in possible if own is not taken]
+
+
+def _gain(gram: Floats, along: Floats) -> tuple[float, float]:
+    """Return the gain of log evidence by columns at their best scale, and the square of that.
+
+    Args:
+        gram: (k, k) products of what a model leaves of them.
+        along: (k,) of that with what it leaves of the target.
+    """
+    size, axes = np.linalg.eigh(gram)
+    share = _SQUARED_SCALES * np.maximum(size, 0.0)
+    squares = (axes.T @ along) ** 2 * _SQUARED_SCALES
+    gains = 0.5 * (squares / (1.0 + share) - np.log1p(share)).sum(axis=1)
+    best = int(np.argmax(gains))
+    return float(gains[best]), float(_SQUARED_SCALES[best, 0])
 
 
 def _evenly(count: int) -> np.ndarray:
