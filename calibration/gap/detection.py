@@ -28,7 +28,7 @@ from calibration.gap.result import Disagreement
 from calibration.numerics.statistics import chance_beyond
 from calibration.observations import Floats
 
-FAR = 1e-12  # p-value of what is left, beyond which neither few names more nor one explain it
+FAR = 1e-12  # p-value of the remaining errors, below which neither one effect nor a few more will explain them
 _DRAWS = 999
 _ENOUGH = 10  # draws beyond a score, of which a share is a probability; with fewer a tail goes on from there
 _QUIET = 0.45  # of the noise that the fixes are said to have

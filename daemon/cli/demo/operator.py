@@ -14,7 +14,7 @@ from daemon.commands import CommandError
 from daemon.control.protocol import request
 
 RIG = "swdt82"
-_REST = """poll_interval_s = 0.25
+_OTHER_SETTINGS = """poll_interval_s = 0.25
 
 [sessions]
 settle_s = 2.0  # simulated time runs fast: the computer's own delays are this much longer in it
@@ -53,7 +53,7 @@ class Operator:
         self._rate = rate
         config = directory / "rigcal.toml"
         written = SIMULATED_CONFIG.format(written_by="rigcal demo", rig=f'"{RIG}"')
-        config.write_text(written + _REST + settings, encoding="utf-8")
+        config.write_text(written + _OTHER_SETTINGS + settings, encoding="utf-8")
         command = [sys.executable, "-m", "daemon.cli.main", "run", "--sim", "--config", str(config)]
         command += ["--rate", str(rate), "--seed", str(seed), "--dwell", str(DWELL_S), *options]
         self._log = (directory / "daemon.log").open("w", encoding="utf-8")
