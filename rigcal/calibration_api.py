@@ -107,7 +107,8 @@ class Model:
             observations: n rows; positions are not needed (`Observations.from_csv(..., positions_required=False)`).
 
         Returns:
-            `position_mm` (n, 3) in the station's frame and `sigma_mm` (n, 3), its standard deviation.
+            `position_mm` (n, 3) in the station's frame; `sigma_mm` (n, 3), the standard deviation of a fix about it;
+            `half_mm` (n, 3) and `radius_mm` (n,): a fix is that near with 90 % probability, along each axis and in 3-D.
 
         Raises:
             UnsafeError: a set-up that the model does not know.

@@ -79,7 +79,7 @@ class _Addition:
 
 
 class _BesideModel:
-    """What a model leaves of further columns, in some of its rows."""
+    """Products of further columns beside a model, in some of its rows."""
 
     def __init__(self, system: System, model: Model) -> None:
         self._projection, index = system.projection, model.scales.index
