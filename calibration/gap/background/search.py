@@ -179,7 +179,9 @@ def gains(
     """
     every = system.screen(model).score()
     possible = [w for w in promising(system, model, every, any_size=any_size) if w.candidate.family not in later]
-    found = [gain(system, model, w, model.scales) for w in possible[:_TRIED]]
+    # What is small beside the model stays so beside a further effect, and half of all columns may be of that.
+    small = system.negligible_blocks(model)
+    found = [gain(system, model, w, model.scales, small) for w in possible[:_TRIED]]
     return sorted(found, key=lambda g: -g.log_odds)
 
 

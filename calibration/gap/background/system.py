@@ -29,6 +29,7 @@ _ENOUGH, _NEARLY = 0.01, 0.1  # of a log evidence; differences of several are wh
 _START, _AGAIN = -1.0, -3.0  # log scale of a block at the beginning, and of one that had vanished
 _AT_ONCE = 3000  # rows
 _GONE = -5.0  # log scale of a block that has vanished
+_NEGLIGIBLE = 0.05  # nats at most that the data tell of a block
 _SEEN = 1e-10  # least eigenvalue of products of columns, of their largest
 
 
@@ -153,6 +154,15 @@ class System:
         noise = 1.0 if start is None else start.noise
         scales = greatest(self.products, fixed, sigma, blocks, log_scale, noise, _NEARLY if quick else _ENOUGH)
         return Model(tuple(effects), scales)
+
+    def negligible_blocks(self, model: Model) -> frozenset[str]:
+        """Return the blocks of a model that are so small in it that the data tell next to nothing of them."""
+        factor, diagonal = 0.5 / model.scales.noise, np.diag(self.products.gram)
+        return frozenset(
+            name
+            for name, log_scale in model.scales.log_scale.items()
+            if factor * math.exp(2.0 * log_scale) * float(diagonal[self._of_block[name]].sum()) < _NEGLIGIBLE
+        )
 
     def background_log_bayes_factor(self, model: Model) -> float:
         """Return the log Bayes factor of a model's background against noise alone.
