@@ -46,6 +46,7 @@ class SetupErrors:
     Attributes:
         error_mm: (n, 3) measured minus predicted, in the station's frame.
         formal_mm: (n, 3) their formal standard deviations.
+        weight: (n,) of the residual learner; None for a model that has none.
         half: (n,) 0 or 1; groups, which are stretches of a path or cells, are wholly in one of them.
         samples: how many of the rows are independent of each other.
         has_one_setup: whether x and y point the same way in all rows.
@@ -53,6 +54,7 @@ class SetupErrors:
 
     error_mm: Floats
     formal_mm: Floats
+    weight: Floats | None
     half: NDArray[np.intp]
     samples: int
     has_one_setup: bool
@@ -61,13 +63,13 @@ class SetupErrors:
     def of(cls, model: CalibratedModel, observations: Observations) -> SetupErrors:
         """The errors of a model with a refitted base on the n rows that this was fitted to."""
         assert model.base_covariance is not None
-        assert model.base_covariance is not None
         prediction = Predictor.of(model).predict(observations)
         error = observations.position_mm - prediction.position_mm
         base, group = slice(model.chain.base_start, len(model.chain)), _groups(observations)
         apart, samples = _left_out(model, observations, error, group, base, model.base_covariance)
         has_one_setup = len(np.unique(observations.setup)) == 1
-        return cls(apart, prediction.formal_mm, group % 2, samples, has_one_setup)
+        weight = Predictor.of(model).residual_weights(observations) if model.residual else None
+        return cls(apart, prediction.formal_mm, weight, group % 2, samples, has_one_setup)
 
     def widened(self, model: CalibratedModel) -> CalibratedModel:
         """The model with intervals that hold at these set-ups too, and are nowhere narrower than its own.
@@ -83,8 +85,9 @@ class SetupErrors:
         for half in range(2):
             here, there = self.half == half, self.half != half
             intervals = home.or_wider(self._counted(there)) if there.any() else home
-            half_mm[here] = intervals.half_mm(self.formal_mm[here])
-            radius_mm[here] = intervals.radius_mm(self.formal_mm[here])
+            weight = None if self.weight is None else self.weight[here]
+            half_mm[here] = intervals.half_mm(self.formal_mm[here], weight)
+            radius_mm[here] = intervals.radius_mm(self.formal_mm[here], weight)
         return coverage(self.error_mm, half_mm, radius_mm)
 
     def _counted(self, rows: NDArray[np.bool_]) -> Intervals:

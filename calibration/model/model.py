@@ -137,7 +137,7 @@ class CalibratedModel:
         residual: the learner that was kept, if any.
         trials: learners that were compared.
         residual_reason: why there is a learner or none.
-        intervals: how many standard deviations hold 90 % of errors.
+        intervals: how many formal standard deviations hold 90 % of errors.
         warnings: about the training data and the fit.
         fitted_rows: digests of the rows that were fitted (`observations.row_digests`); none of a model from before.
         provenance: data hash, versions, seed, search; text or numbers.

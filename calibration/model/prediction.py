@@ -20,7 +20,7 @@ from calibration.kinematics.compiled_chain import CompiledChain, Located
 from calibration.kinematics.torques import GravityModel
 from calibration.model.model import CalibratedModel, Outlier
 from calibration.observations import Floats, Observations
-from calibration.residual.conformal import NORMAL, Coverage, Intervals, coverage
+from calibration.residual.conformal import NORMAL, Coverage, coverage
 from calibration.residual.features import Extractor, Features
 
 OUTLIER_SIGMA = 5.0
@@ -36,7 +36,8 @@ class Prediction:
         position_mm: (n, 3) in the station's frame, as its fixes would be, systematic errors of fixes included.
         formal_mm: (n, 3) standard deviation of a fix about it, propagated: from parameters, readings, timing, station,
             effects left out for want of a column, and the error that the model leaves.
-        sigma_mm: (n, 3) the same, scaled by what was counted on rows left out of the fit: 1.645 of it hold 90 %.
+        sigma_mm: (n, 3) the same, scaled by what was counted on rows left out of the fit: 90 % of fixes lie within
+            1.645 times it.
         radius_mm: (n,) a fix is that near with 90 % probability, its 3-D distance.
     """
 
@@ -315,25 +316,13 @@ class Predictor:
         )
         if not is_finite:
             _refuse_infinite(observations, position_mm, formal_mm)
-        axes, radius = self._interval_scales(weight)
+        intervals, used = self._model.intervals, None if self._model.residual is None else weight
         return Prediction(
-            position_mm, formal_mm, formal_mm * (axes / NORMAL), radius * np.linalg.norm(formal_mm, axis=1)
+            position_mm,
+            formal_mm,
+            intervals.half_mm(formal_mm, used) / NORMAL,
+            intervals.radius_mm(formal_mm, used),
         )
-
-    def _interval_scales(self, weight: Floats) -> tuple[Floats, Floats]:
-        """Formal standard deviations that hold an error: (3,) or (n, 3) along the axes, and (n,) of balls.
-
-        What was counted in the region of the residual learner must not make an interval narrower where it is not used.
-
-        Args:
-            weight: (n,) of the learner in each row.
-        """
-        home = self._model.intervals
-        if self._model.residual is None:
-            return np.array(home.axes), np.full(len(weight), home.radius)
-        away = home.or_wider(Intervals())
-        axes = np.outer(weight, home.axes) + np.outer(1.0 - weight, away.axes)
-        return axes, weight * home.radius + (1.0 - weight) * away.radius
 
     def _covariances(self, observations: Observations) -> tuple[Floats, Floats, Floats]:
         """(n, 3) positions of stage effects; (n, 3, 3) covariance of a fix, and that by parameters and coefficients."""

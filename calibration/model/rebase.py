@@ -18,6 +18,7 @@ from calibration.kinematics.chain import Chain, Placement
 from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor
 from calibration.observations import Floats, Observations
+from calibration.residual.conformal import Intervals
 
 _REACHED = 0.5  # weight of the residual in a row, beyond which the row lies in its region
 _ROUNDS = 2  # the residual turns with the base: after the first by a few mrad, then by nothing that is seen
@@ -37,7 +38,7 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
 
     Returns:
         The model with these set-ups in place of its own; without its residual, and with the reason, where that is left
-        out. Its intervals are those of its training (`SetupErrors` tells whether they hold here).
+        out. Its intervals are those of its training, x and y alike: `SetupErrors` widens them by what is seen here.
 
     Raises:
         DataError: a prism that the rig lacks.
@@ -83,7 +84,9 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
             observations,
         )
         if reason:
-            return replace(with_refitted_base(replace(model, residual=None), observations), residual_reason=reason)
+            # Beyond the residual's region, intervals that were counted in it are not narrower than without.
+            bare = replace(model, residual=None, intervals=model.intervals.or_wider(Intervals()))
+            return replace(with_refitted_base(bare, observations), residual_reason=reason)
     geometric = effects_values
     if model.effects:
         geometric = refine(chain, samples, extended(model.geometric_values), free=free).x

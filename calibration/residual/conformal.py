@@ -58,14 +58,28 @@ class Intervals:
         x, y, z = np.maximum(self.axes, other.axes).tolist()
         return Intervals((x, y, z), max(self.radius, other.radius))
 
-    def half_mm(self, formal_mm: Floats) -> Floats:
-        """(n, 3) half widths of the intervals of x, y and z for formal standard deviations (n, 3)."""
-        half_mm: Floats = formal_mm * np.array(self.axes)
-        return half_mm
+    def half_mm(self, formal_mm: Floats, weight: Floats | None = None) -> Floats:
+        """Half widths (n, 3) of the intervals of x, y and z.
 
-    def radius_mm(self, formal_mm: Floats) -> Floats:
-        """(n,) radii of the balls for formal standard deviations (n, 3)."""
-        return np.asarray(self.radius * np.linalg.norm(formal_mm, axis=1), dtype=np.float64)
+        What was counted where a residual learner is used must not make an interval narrower where it is not.
+
+        Args:
+            formal_mm: (n, 3) formal standard deviations.
+            weight: (n,) of the learner in each row, 0 to 1; None for a model that has none.
+        """
+        half_mm: Floats = formal_mm * np.array(self.axes)
+        if weight is None:
+            return half_mm
+        away_mm = formal_mm * np.maximum(self.axes, NORMAL)
+        return weight[:, None] * half_mm + (1.0 - weight)[:, None] * away_mm
+
+    def radius_mm(self, formal_mm: Floats, weight: Floats | None = None) -> Floats:
+        """Radii (n,) of the balls; arguments are those of `half_mm`."""
+        size_mm = np.linalg.norm(formal_mm, axis=1)
+        if weight is None:
+            return np.asarray(self.radius * size_mm, dtype=np.float64)
+        away = max(self.radius, _NORMAL_RADIUS)
+        return np.asarray((weight * self.radius + (1.0 - weight) * away) * size_mm, dtype=np.float64)
 
 
 def coverage(error_mm: Floats, half_mm: Floats, radius_mm: Floats) -> Coverage:

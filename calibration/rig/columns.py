@@ -69,7 +69,9 @@ PREDICTED = (
     *(Column(f"{axis}_pred_mm", "mm", f"predicted `{axis}_mm`") for axis in "xyz"),
     *(
         Column(
-            f"sigma_{axis}_pred_mm", "mm", f"standard deviation of a fix about `{axis}_pred_mm`: 1.645 of it hold 90 %"
+            f"sigma_{axis}_pred_mm",
+            "mm",
+            f"standard deviation of a fix about `{axis}_pred_mm`; 1.645 times it holds 90 %",
         )
         for axis in "xyz"
     ),

@@ -198,7 +198,7 @@ def _predicted(live: Loaded, rig: Rig, state: MachineState, known: Tip, setup: s
     at = setup if setup is not None and is_known else list(model.placements)[-1]
     row = _observation(live, rig, state, known, at)
     prediction = predictor.predict(row)
-    position, sigma = prediction.position_mm[0], prediction.sigma_mm[0]
+    position, sigma = prediction.position_mm[0], prediction.formal_mm[0]
     warnings = (*model_warnings(model, row), *_travelled(model))
     return replace(
         known,

@@ -22,7 +22,7 @@ from calibration.observations import Floats
 PossibleBlocks = Callable[[], Iterator[Block]]
 
 _SAMPLES = 700  # to choose by
-_AT_ONCE = 1000  # columns
+_AT_ONCE = 500_000  # values of columns
 _COMPARED = 200  # blocks, those of the greatest gain by themselves
 _MOST = 8  # blocks at once
 _LEAST_GAIN = 15.0  # log evidence
@@ -31,6 +31,8 @@ _SQUARED_SCALES = np.exp(np.linspace(-8.0, 6.0, 15))[:, None]
 
 def further_blocks(system: System, model: Model, possible: PossibleBlocks) -> tuple[Block, ...]:
     """Return blocks that a model lacks and that what it leaves asks for, the one of the greatest gain first.
+
+    They are chosen from the `_COMPARED` that gain most by themselves.
 
     Args:
         system: a linear model.
@@ -42,15 +44,17 @@ def further_blocks(system: System, model: Model, possible: PossibleBlocks) -> tu
     for some in _batches(block for block in possible() if block.name not in system.blocks):
         best += beside.additions(some)
         best = sorted(best, key=lambda own: -own.gain[0])[:_COMPARED]
-    return tuple(_chosen(best))
+    chosen = list(_chosen(best))
+    by_name = {block.name: block for block in possible() if block.name in chosen} if chosen else {}
+    return tuple(by_name[name] for name in chosen)
 
 
 class _Addition:
     """A block as an addition to a model.
 
     Args:
-        block: its columns (k).
-        own: (r, k) rows of these in prior sigmas, in units of the noise.
+        name: of the block.
+        own: (r, k) rows of its columns in prior sigmas, in units of the noise.
         removed: (q, k) the part of these along the model: products of columns less those of what is removed from them
             are products of what the model leaves of them.
         gram: (k, k) products of what the model leaves of the columns.
@@ -60,8 +64,8 @@ class _Addition:
         gain: of log evidence at the best scale, and the square of that.
     """
 
-    def __init__(self, block: Block, own: Floats, removed: Floats, gram: Floats, along: Floats) -> None:
-        self.block, self.own, self.removed, self.gram, self.along = block, own, removed, gram, along
+    def __init__(self, name: str, own: Floats, removed: Floats, gram: Floats, along: Floats) -> None:
+        self.name, self.own, self.removed, self.gram, self.along = name, own, removed, gram, along
         self.gain = _gain(gram, along)
 
     def beside(self, taken: _Addition, factor: Floats, left: Floats) -> _Addition:
@@ -75,7 +79,7 @@ class _Addition:
         across = taken.own.T @ self.own - taken.removed.T @ self.removed
         gone = solve_triangular(factor, across, lower=True)
         removed = np.vstack([self.removed, gone])
-        return _Addition(self.block, self.own, removed, self.gram - gone.T @ gone, self.along - gone.T @ left)
+        return _Addition(self.name, self.own, removed, self.gram - gone.T @ gone, self.along - gone.T @ left)
 
 
 class _BesideModel:
@@ -105,7 +109,7 @@ class _BesideModel:
         for block in blocks:
             part = slice(first, first := first + len(block.columns))
             own, gone = every[:, part].copy(), removed[:, part].copy()
-            yield _Addition(block, own, gone, own.T @ own - gone.T @ gone, along[part])
+            yield _Addition(block.name, own, gone, own.T @ own - gone.T @ gone, along[part])
 
 
 def _batches(blocks: Iterator[Block]) -> Iterator[list[Block]]:
@@ -114,7 +118,7 @@ def _batches(blocks: Iterator[Block]) -> Iterator[list[Block]]:
         some, count = list[Block](), 0
         for block in same:
             some.append(block)
-            count += len(block.columns)
+            count += block.columns.column.size
             if count >= _AT_ONCE:
                 yield some
                 some, count = [], 0
@@ -122,13 +126,13 @@ def _batches(blocks: Iterator[Block]) -> Iterator[list[Block]]:
             yield some
 
 
-def _chosen(possible: list[_Addition]) -> Iterator[Block]:
-    """Yield the block that gains most, and so on beside those; none that gains little."""
+def _chosen(possible: list[_Addition]) -> Iterator[str]:
+    """Yield the name of the block that gains most, and so on beside those; of none that gains little."""
     for _ in range(_MOST):
         taken = max(possible, key=lambda own: own.gain[0], default=None)
         if taken is None or taken.gain[0] < _LEAST_GAIN:
             return
-        yield taken.block
+        yield taken.name
         factor = cholesky(taken.gram + np.eye(len(taken.gram)) / taken.gain[1], lower=True)
         left = solve_triangular(factor, taken.along, lower=True)
         possible = [own.beside(taken, factor, left) for own in possible if own is not taken]

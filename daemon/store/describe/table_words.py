@@ -327,7 +327,7 @@ TABLES: dict[str, Words] = {
             "session_id": "the check session",
             "fixes": "number of its fixes",
             "standstills": "number of its standstills",
-            "ratio": "RMS of the errors over their predicted standard deviation; NULL where the session was of no use",
+            "ratio": "RMS of the errors over their formal standard deviation; NULL where the session was of no use",
             "reason": "why it was of no use",
             "upper": "cumulative sum against errors that grow",
             "lower": "cumulative sum against errors that shrink",
