@@ -29,7 +29,7 @@ _ENOUGH, _NEARLY = 0.01, 0.1  # of a log evidence; differences of several are wh
 _START, _AGAIN = -1.0, -3.0  # log scale of a block at the beginning, and of one that had vanished
 _AT_ONCE = 3000  # rows
 _GONE = -5.0  # log scale of a block that has vanished
-_NEGLIGIBLE = 0.05  # nats, at most, of information that the data have about a block
+_NEGLIGIBLE = 0.01  # nats, at most, of information that the data have about a block
 _SEEN = 1e-10  # least eigenvalue of products of columns, of their largest
 
 
