@@ -11,12 +11,25 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from daemon.acquisition.acquisition import Acquisition
-from daemon.store import Store
+from daemon.store import Reader, Store
 from drivers.clock import Stamp, SystemClock
 from drivers.readings import CanCapture, Capture, Gap, GapReason, LinkItem, Reading, Record, SerialCapture, Status
-from tests.daemon.store_support import fix
+from tests.daemon.store_support import fix, table
 
 DEADLINE_S = 20.0
+
+Make = Callable[..., Acquisition]
+
+
+def raw(path: Path) -> list[Capture]:
+    """The captures that are stored, in order."""
+    with Reader(path) as reader:
+        return [*reader.captures()]
+
+
+def values(path: Path) -> list[float]:
+    """The samples of joints that are stored, in order."""
+    return [row["value"] for row in table(path, "joint_samples")]
 
 
 def wait_until(condition: Callable[[], bool]) -> None:

@@ -25,7 +25,7 @@ from daemon.service import Daemon
 from daemon.store import Reader, Store
 from drivers.clock import SystemClock
 from drivers.readings import Capture, LinkItem, Record
-from tests.daemon.acquisition_support import DEADLINE_S, ListLink, NumberDecoder, wait_until
+from tests.daemon.acquisition_support import DEADLINE_S, ListLink, NumberDecoder, values, wait_until
 from tests.daemon.damage import fill_up, tear
 from tests.daemon.job_support import SOURCE
 from tests.daemon.store_support import frame, reading, serial_bytes, table
@@ -56,10 +56,6 @@ def stored(path: Path) -> list[int]:
     """Numbers of the raw frames."""
     with Reader(path) as reader:
         return [int.from_bytes(capture.data, "little") for capture in reader.captures("boom")]
-
-
-def values(path: Path) -> list[float]:
-    return [row["value"] for row in table(path, "joint_samples")]
 
 
 class TellsWhenItStops(ListLink):
