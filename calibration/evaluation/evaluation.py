@@ -110,17 +110,18 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
         UnsafeError: a set-up that the model does not know, or whose base cannot be placed with these rows.
     """
     require_positions(observations)
-    effects, learned, elsewhere = model, model.residual is not None, None
+    effects, learned, left_out = model, model.residual is not None, None
     if refit_base:
-        effects = with_refitted_base(replace(model, residual=None), observations)
-        placed = with_refitted_base(model, observations) if learned else effects
-        elsewhere = SetupErrors.of(placed, observations)
-        model, home = elsewhere.widened(placed), placed.intervals
+        effects = placed = with_refitted_base(model, observations)
+        if placed.residual is not None:
+            effects = with_refitted_base(replace(model, residual=None), observations)
+        left_out = SetupErrors.of(placed, observations)
+        model = replace(placed, intervals=left_out.intervals)
     prediction = Predictor.of(model).predict(observations)
     fitted = _fitted(model, observations)
     is_training = fitted == len(observations)
     warnings = [w if is_training else f"in training: {w}" for w in model.warnings]
-    if refit_base:
+    if left_out is not None:
         names = ", ".join(repr(s) for s in model.placements)
         fixes = len(np.unique(originals(observations)))
         warnings.append(f"the base transform of set-up {names} was fitted on these {fixes} fixes")
@@ -146,7 +147,7 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
             f"{len(outliers)} of {len(observations)} fixes are farther off than noise explains, "
             f"{farthest(observations, outliers)}: the errors count them"
         )
-    coverage = prediction.coverage(errors["hybrid"]) if elsewhere is None else elsewhere.coverage(home)
+    coverage = prediction.coverage(errors["hybrid"]) if left_out is None else left_out.coverage()
     axes = _axes(effects, observations)
     warnings += [w for w in disagreements(axes) if w not in warnings]
     return Evaluation(

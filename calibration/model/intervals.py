@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from calibration.identification.samples import Samples, averaged, left_out_errors
 from calibration.model.model import CalibratedModel
-from calibration.model.prediction import Predictor
+from calibration.model.prediction import Prediction, Predictor
 from calibration.observations import Floats, Observations
 from calibration.residual.conformal import Coverage, Intervals, conformal_intervals, coverage
 from calibration.residual.folds import neighbour_labels
@@ -45,16 +45,16 @@ class SetupErrors:
 
     Attributes:
         error_mm: (n, 3) measured minus predicted, in the station's frame.
-        formal_mm: (n, 3) their formal standard deviations.
-        weight: (n,) of the residual learner; None for a model that has none.
+        prediction: of the rows.
+        home: intervals of the model's training.
         half: (n,) 0 or 1; groups, which are stretches of a path or cells, are wholly in one of them.
         samples: how many of the rows are independent of each other.
         has_one_setup: whether x and y point the same way in all rows.
     """
 
     error_mm: Floats
-    formal_mm: Floats
-    weight: Floats | None
+    prediction: Prediction
+    home: Intervals
     half: NDArray[np.intp]
     samples: int
     has_one_setup: bool
@@ -68,33 +68,34 @@ class SetupErrors:
         base, group = slice(model.chain.base_start, len(model.chain)), _groups(observations)
         apart, samples = _left_out(model, observations, error, group, base, model.base_covariance)
         has_one_setup = len(np.unique(observations.setup)) == 1
-        weight = Predictor.of(model).residual_weights(observations) if model.residual else None
-        return cls(apart, prediction.formal_mm, weight, group % 2, samples, has_one_setup)
+        return cls(apart, prediction, model.intervals, group % 2, samples, has_one_setup)
 
-    def widened(self, model: CalibratedModel) -> CalibratedModel:
-        """The model with intervals that hold at these set-ups too, and are nowhere narrower than its own.
+    @property
+    def intervals(self) -> Intervals:
+        """Intervals that hold at these set-ups too, and are nowhere narrower than those of the training.
 
         What a machine does elsewhere that it did not do in its training is in these errors and nowhere else.
         """
-        here = self._counted(np.ones(len(self.half), dtype=np.bool_))
-        return replace(model, intervals=model.intervals.or_wider(here))
+        return self._counted(np.ones(len(self.half), dtype=np.bool_))
 
-    def coverage(self, home: Intervals) -> Coverage:
+    def coverage(self) -> Coverage:
         """Share of the errors inside intervals that were counted on the other half of them."""
-        half_mm, radius_mm = np.empty_like(self.formal_mm), np.empty(len(self.half))
+        formal_mm, weight = self.prediction.formal_mm, self.prediction.weight
+        half_mm, radius_mm = np.empty_like(formal_mm), np.empty(len(formal_mm))
         for half in range(2):
-            here, there = self.half == half, self.half != half
-            intervals = home.or_wider(self._counted(there)) if there.any() else home
-            weight = None if self.weight is None else self.weight[here]
-            half_mm[here] = intervals.half_mm(self.formal_mm[here], weight)
-            radius_mm[here] = intervals.radius_mm(self.formal_mm[here], weight)
+            here, intervals = self.half == half, self._counted(self.half != half)
+            own = None if weight is None else weight[here]
+            half_mm[here] = intervals.half_mm(formal_mm[here], own)
+            radius_mm[here] = intervals.radius_mm(formal_mm[here], own)
         return coverage(self.error_mm, half_mm, radius_mm)
 
     def _counted(self, rows: NDArray[np.bool_]) -> Intervals:
-        """Intervals that hold the errors of some of the rows."""
+        """Intervals of the training, widened so that they hold the errors of some of the rows."""
+        if not rows.any():
+            return self.home
         independent = max(1, round(self.samples * float(rows.mean())))
-        counted = conformal_intervals(self.error_mm[rows], self.formal_mm[rows], independent)
-        return counted if self.has_one_setup else counted.at_other_setups()
+        counted = conformal_intervals(self.error_mm[rows], self.prediction.formal_mm[rows], independent)
+        return self.home.or_wider(counted if self.has_one_setup else counted.at_other_setups())
 
 
 def _left_out(

@@ -39,12 +39,14 @@ class Prediction:
         sigma_mm: (n, 3) the same, scaled by what was counted on rows left out of the fit: 90 % of fixes lie within
             1.645 times it.
         radius_mm: (n,) a fix is that near with 90 % probability, its 3-D distance.
+        weight: (n,) of the residual learner in each row, 0 to 1; None for a model that has none.
     """
 
     position_mm: Floats
     formal_mm: Floats
     sigma_mm: Floats
     radius_mm: Floats
+    weight: Floats | None
 
     @property
     def half_mm(self) -> Floats:
@@ -142,6 +144,7 @@ class Predictor:
             np.concatenate([piece.formal_mm for piece in found]),
             np.concatenate([piece.sigma_mm for piece in found]),
             np.concatenate([piece.radius_mm for piece in found]),
+            None if self._model.residual is None else np.concatenate([piece.weight for piece in found]),
         )
 
     def nominal_mm(self, observations: Observations) -> Floats:
@@ -210,10 +213,6 @@ class Predictor:
         without, learned = self._excess_mm2
         excess = (1.0 - weight)[:, None] * without + weight[:, None] * learned
         return _turned(rotation, estimate), (rotation * excess[:, None, :]) @ rotation.transpose(0, 2, 1)
-
-    def residual_weights(self, observations: Observations) -> Floats:
-        """(n,) weight of the residual learner in each row, 0 to 1; where it is 0 the model is its stage before."""
-        return self._located(self._rows(observations))[2]
 
     def features(self, observations: Observations, signals: Sequence[str]) -> Features:
         """Features of a residual learner with these signal columns, effects taken into account."""
@@ -322,6 +321,7 @@ class Predictor:
             formal_mm,
             intervals.half_mm(formal_mm, used) / NORMAL,
             intervals.radius_mm(formal_mm, used),
+            used,
         )
 
     def _covariances(self, observations: Observations) -> tuple[Floats, Floats, Floats]:

@@ -84,9 +84,10 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
             observations,
         )
         if reason:
-            # Beyond the residual's region, intervals that were counted in it are not narrower than without.
-            bare = replace(model, residual=None, intervals=model.intervals.or_wider(Intervals()))
-            return replace(with_refitted_base(bare, observations), residual_reason=reason)
+            # Intervals that the residual made narrower than normal ones do not hold without it.
+            wide = model.intervals.or_wider(Intervals())
+            model = replace(model, residual=None, residual_reason=reason, intervals=wide)
+            left, fit = samples, without
     geometric = effects_values
     if model.effects:
         geometric = refine(chain, samples, extended(model.geometric_values), free=free).x
@@ -107,18 +108,16 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
 
 def _why_left_out(without: CalibratedModel, whole: CalibratedModel, observations: Observations) -> str:
     """Return why the residual is left out at these set-ups; empty where it is of use."""
-    assert whole.residual is not None
-    reached = Predictor.of(whole).residual_weights(observations) > _REACHED
+    prediction = Predictor.of(whole).predict(observations)
+    assert prediction.weight is not None
+    reached = prediction.weight > _REACHED
     if 2 * int(reached.sum()) <= len(reached):
         return (
             f"{int((~reached).sum())} of {len(reached)} fixes lie outside the region that the residual was trained on"
         )
     before, after = (
         float(np.median(np.linalg.norm(observations.position_mm - position_mm, axis=1)))
-        for position_mm in (
-            Predictor.of(without).effects_mm(observations),
-            Predictor.of(whole).parts(observations).position_mm,
-        )
+        for position_mm in (Predictor.of(without).effects_mm(observations), prediction.position_mm)
     )
     if after > before:
         return f"the fixes are {after:.3g} mm off with the residual and {before:.3g} mm without, in the median"

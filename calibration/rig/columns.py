@@ -71,7 +71,7 @@ PREDICTED = (
         Column(
             f"sigma_{axis}_pred_mm",
             "mm",
-            f"standard deviation of a fix about `{axis}_pred_mm`; 1.645 times it holds 90 %",
+            f"standard deviation of a fix about `{axis}_pred_mm`; 1.645 times it is `half90_{axis}_pred_mm`",
         )
         for axis in "xyz"
     ),

@@ -367,7 +367,7 @@ FAMILIES: tuple[Family, ...] = (
     Family(
         "rigcal_check_error_ratio",
         "gauge",
-        "RMS error of the live model in the newest check session, over their formal sigma; about 1 when all is well.",
+        "RMS error of the live model in the newest check session, over its formal sigma; about 1 when all is well.",
         (),
         _one(lambda s: _drift(s).get("ratio")),
     ),

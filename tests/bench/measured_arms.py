@@ -265,7 +265,7 @@ def _measured(case: Case) -> tuple[list[str], float]:
     for name, rows in case.elsewhere.items():
         is_base = np.arange(len(rows)) < _OF_BASE
         placed = with_refitted_base(model, rows.select(is_base))
-        placed = SetupErrors.of(placed, rows.select(is_base)).widened(placed)
+        placed = replace(placed, intervals=SetupErrors.of(placed, rows.select(is_base)).intervals)
         numbers, _ = _errors(placed, rows.select(~is_base))
         lines.append(f"  {name + f', base by {_OF_BASE} fixes':30}  {numbers}")
     return lines, h_mm

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import blas, lapack
+from scipy.linalg import blas, cholesky, lapack
 from scipy.optimize import minimize
 
 from calibration.numerics.matrices import inverse_by, inverse_root_by
@@ -75,6 +75,17 @@ class Scales:
         """(q,) factors on the prior sigmas of these columns."""
         own = [np.full(len(v), np.exp(self.log_scale[k])) for k, v in self.blocks.items()]
         return np.concatenate([self.fixed_sigma, *own])
+
+    @property
+    def weight(self) -> Floats:
+        """(q,) factors that give these columns in units of the noise."""
+        weight: Floats = self.sigma / np.sqrt(self.noise)
+        return weight
+
+
+def posterior_factor(gram: Floats) -> Floats:
+    """Return the lower Cholesky factor of columns' products (q, q) in units of the noise, with the prior of each."""
+    return np.asarray(cholesky(gram + np.eye(len(gram)), lower=True), dtype=np.float64)
 
 
 def greatest(

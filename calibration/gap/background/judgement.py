@@ -72,8 +72,12 @@ def judged(system: System, model: Model) -> tuple[Model, list[Judged]]:
 
     Where an effect had to go, the search goes on beside those that are left.
     """
+    seen = set[frozenset[tuple[int, int]]]()
     for _ in range(_ROUNDS):
-        before = model
+        before, effects = model, frozenset(effect[:2] for effect in model.effects)
+        if effects in seen:  # no set holds: each is judged worse than another of them
+            break
+        seen.add(effects)
         found: list[Judged] = []
         for effect in before.effects:
             if effect not in model.effects:

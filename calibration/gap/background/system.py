@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
+from scipy.linalg import cho_solve, solve_triangular
 
 from calibration.effects.columns import EffectColumns
 from calibration.gap.background.blocks import Block
-from calibration.gap.background.evidence import Products, Scales, greatest
+from calibration.gap.background.evidence import Products, Scales, greatest, posterior_factor
 from calibration.gap.candidates import CandidateEffect
 from calibration.gap.projection import Projection
 from calibration.gap.screening import ScoredEffect, Screen
@@ -188,12 +188,10 @@ class System:
 
     def amounts(self, model: Model) -> Floats:
         """Return (t,) the posterior means of all columns' amounts, in prior sigmas; 0 of what a model lacks."""
-        index, sigma, noise = model.scales.index, model.scales.sigma, model.scales.noise
-        matrix = self.products.gram[np.ix_(index, index)] * (sigma * sigma[:, None] / noise)
-        matrix[np.diag_indices_from(matrix)] += 1.0
-        mean = cho_solve(cho_factor(matrix, lower=True), self.products.along[index] * sigma / noise)
+        index, weight = model.scales.index, model.scales.weight
+        factor = posterior_factor(self.products.gram[np.ix_(index, index)] * (weight * weight[:, None]))
         out = np.zeros(len(self.products.along))
-        out[index] = mean * sigma
+        out[index] = weight * cho_solve((factor, True), weight * self.products.along[index])
         return out
 
     def residual(self, model: Model) -> Floats:
@@ -238,18 +236,15 @@ class _BesideModel:
     """Products of the columns of variants with everything in a model projected out, as `Screen` takes them."""
 
     def __init__(self, system: System, model: Model, variants: Sequence[tuple[int, int]]) -> None:
-        index, root = model.scales.index, math.sqrt(model.scales.noise)
-        sigma = model.scales.sigma / root
+        index, weight, root = model.scales.index, model.scales.weight, math.sqrt(model.scales.noise)
         gram, along = system.products.gram, system.products.along
-        matrix = gram[np.ix_(index, index)] * (sigma * sigma[:, None])
-        matrix[np.diag_indices_from(matrix)] += 1.0
-        factor = cholesky(matrix, lower=True)
+        factor = posterior_factor(gram[np.ix_(index, index)] * (weight * weight[:, None]))
         of_variant = [system.of_effect((number, option, 1.0)) for number, option in variants]
         columns = np.concatenate([np.empty(0, dtype=np.intp), *of_variant])
         prior = [system.candidates[number].additions[option].prior_sigma for number, option in variants]
         unit = np.concatenate([np.empty(0), *prior]) * root
-        removed = solve_triangular(factor, sigma[:, None] * gram[np.ix_(index, columns)], lower=True) / unit
-        left = solve_triangular(factor, sigma * along[index], lower=True)
+        removed = solve_triangular(factor, weight[:, None] * gram[np.ix_(index, columns)], lower=True) / unit
+        left = solve_triangular(factor, weight * along[index], lower=True)
         self._gram = gram[np.ix_(columns, columns)] / (unit * unit[:, None]) - removed.T @ removed
         self._along = along[columns] / (unit * root) - removed.T @ left / root
         self.squares = (system.products.squares - float(left @ left)) / model.scales.noise

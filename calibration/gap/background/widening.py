@@ -15,6 +15,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 from calibration.effects.columns import joined
 from calibration.gap.background.blocks import Block
+from calibration.gap.background.evidence import posterior_factor
 from calibration.gap.background.system import Model, System
 from calibration.gap.projection import rows_of
 from calibration.observations import Floats
@@ -39,7 +40,7 @@ def further_blocks(system: System, model: Model, possible: PossibleBlocks) -> tu
         model: with its effects and background.
         possible: yields the blocks to choose from; those that the system has are passed over.
     """
-    beside = _BesideModel(system, model)
+    beside = _InSomeRows(system, model)
     best: list[_Addition] = []
     for some in _batches(block for block in possible() if block.name not in system.blocks):
         best += beside.additions(some)
@@ -82,21 +83,16 @@ class _Addition:
         return _Addition(self.name, self.own, removed, self.gram - gone.T @ gone, self.along - gone.T @ left)
 
 
-class _BesideModel:
+class _InSomeRows:
     """Products of further columns beside a model, in some of its rows."""
 
     def __init__(self, system: System, model: Model) -> None:
-        self._projection, index = system.projection, model.scales.index
+        self._projection, self._root = system.projection, np.sqrt(model.scales.noise)
         self._rows = rows_of(_evenly(len(self._projection.target) // 3))
-        here, noise = system.of_rows(self._rows).products, model.scales.noise
-        self._root = np.sqrt(noise)
-        sigma = model.scales.sigma
-        matrix = here.gram[np.ix_(index, index)] * (sigma * sigma[:, None] / noise)
-        matrix[np.diag_indices_from(matrix)] += 1.0
-        self._factor = cholesky(matrix, lower=True)
-        self._model = system.columns[np.ix_(self._rows, index)] * (sigma / self._root)
+        self._model = system.columns[np.ix_(self._rows, model.scales.index)] * model.scales.weight
         self._target = self._projection.target[self._rows] / self._root
-        self._left = solve_triangular(self._factor, sigma * here.along[index] / noise, lower=True)
+        self._factor = posterior_factor(self._model.T @ self._model)
+        self._left = solve_triangular(self._factor, self._model.T @ self._target, lower=True)
 
     def additions(self, blocks: Sequence[Block]) -> Iterator[_Addition]:
         """Yield blocks as additions to the model."""

@@ -69,6 +69,6 @@ def _predicted_columns(prediction: Prediction, *, intervals: bool) -> dict[str, 
     columns = {name: prediction.position_mm[:, i] for i, name in enumerate(PREDICTED_COLUMNS[:3])}
     columns |= {name: prediction.sigma_mm[:, i] for i, name in enumerate(PREDICTED_COLUMNS[3:])}
     if intervals:
-        columns |= {name: prediction.half_mm[:, i] for i, name in enumerate(INTERVAL_COLUMNS[:3])}
+        columns |= dict(zip(INTERVAL_COLUMNS, prediction.half_mm.T, strict=False))
         columns[INTERVAL_COLUMNS[3]] = prediction.radius_mm
     return columns

@@ -88,7 +88,7 @@ def test_what_a_machine_does_at_another_site_alone_widens_its_intervals_there() 
     few, others = there.select(np.arange(40)), there.select(np.arange(40, 500))
     placed = with_refitted_base(model, few)
     as_at_home = Predictor.of(placed).predict(others)
-    counted_there = Predictor.of(SetupErrors.of(placed, few).widened(placed)).predict(others)
+    counted_there = Predictor.of(replace(placed, intervals=SetupErrors.of(placed, few).intervals)).predict(others)
     error = others.position_mm - as_at_home.position_mm
     assert as_at_home.coverage(error).radius < 0.75
     assert counted_there.coverage(error).radius == pytest.approx(0.9, abs=0.06)
