@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import logging
 import signal
 import socket
 from collections.abc import Callable
 
+import h11
 import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from daemon.commands import FAILED, CommandError
 from daemon.host.systemd import Notifier
@@ -20,7 +23,25 @@ log = logging.getLogger(__name__)
 
 CONNECTIONS = 200
 KEEP_ALIVE_S = 15
+REQUEST_S = 10.0  # for a whole request; at most twice that
 STOP_S = 2
+
+
+class _Timed(H11Protocol):
+    """A connection that is closed where no whole request comes in time, so that silent ones keep nobody out."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override] # as in uvicorn
+        super().connection_made(transport)
+        self._seen = self.cycle
+        self.loop.call_later(REQUEST_S, self._look)
+
+    def _look(self) -> None:
+        """Close the connection if the caller has owed the rest of one request since the last look."""
+        if self.conn.their_state in (h11.IDLE, h11.SEND_BODY) and self.cycle is self._seen:
+            self.transport.close()
+        if not self.transport.is_closing():
+            self._seen = self.cycle
+            self.loop.call_later(REQUEST_S, self._look)
 
 
 def serve(settings: WebSettings, say: Callable[[str], None], notifier: Notifier) -> None:
@@ -38,6 +59,7 @@ def serve(settings: WebSettings, say: Callable[[str], None], notifier: Notifier)
     listener = _listener(settings)
     config = uvicorn.Config(
         make_app(settings),
+        http=_Timed,
         log_config=None,
         access_log=False,
         server_header=False,

@@ -34,6 +34,7 @@ from drivers.errors import LinkError
 
 Interface = Literal["socketcan", "virtual", "udp_multicast", "slcan"]
 
+ADAPTER_READY_S = 1.2  # after its port was opened: some slcan adapters start anew then; with the rest under 2 s
 BATCH_MAX = 512  # frames per read, so that a flooded bus cannot keep the loop from its other duties
 
 # Linux, include/uapi/asm-generic/socket.h; Python's socket module does not name them
@@ -85,7 +86,8 @@ class CanLinkConfig:
         sync_period_ms: send SYNC at this period; None: do not.
         receive_buffer_bytes: of the socket; 4 MiB, doubled by the kernel for its overhead, hold over a second of a
             saturated 1 Mbit/s bus.
-        options: further arguments of python-can's bus (`port` and `hop_limit` of udp_multicast, ...).
+        options: further arguments of python-can's bus (`port` and `hop_limit` of udp_multicast, `sleep_after_open` of
+            slcan, ...).
     """
 
     name: str
@@ -110,6 +112,7 @@ def open_port(config: CanLinkConfig) -> CanPort:
     """
     arguments = dict(config.options)
     if config.interface == "slcan":
+        arguments = {"sleep_after_open": ADAPTER_READY_S} | arguments
         arguments |= {"bitrate": config.bitrate, "listen_only": not config.allow_transmit}
     with contextlib.ExitStack() as on_failure:
         try:

@@ -291,6 +291,17 @@ def test_an_slcan_adapter_is_opened_listen_only_by_default(adapter: Adapter) -> 
     assert adapter.commands(b"C\r").replace(b"L\r", b"") == b"C\r", "closed, and nothing sent"
 
 
+def test_an_slcan_adapter_that_comes_back_is_open_within_two_seconds_without_any_option(adapter: Adapter) -> None:
+    with running(slcan_link(adapter, options={})) as heard:
+        heard.wait_for(EventKind.LINK_UP)
+        adapter.unplug()
+        heard.wait_for(EventKind.LINK_LOST)
+        adapter.plug_in()
+        back = time.monotonic_ns()
+        heard.wait_for(EventKind.LINK_UP, 2)
+        assert time.monotonic_ns() - back < 2e9
+
+
 def test_an_slcan_adapter_sends_what_it_may(adapter: Adapter) -> None:
     with running(slcan_link(adapter, allow_transmit=True, sync_period_ms=1000.0)) as heard:
         heard.wait(lambda: heard.sent, "a SYNC")

@@ -14,6 +14,7 @@ import pytest
 
 from daemon.config import Config
 from daemon.store.reader import Reader
+from daemon.web.server import REQUEST_S
 from tests.daemon.idle_daemon import idle_daemon
 from tests.daemon.web.web_support import WebProcess, wait_for
 
@@ -298,6 +299,17 @@ def test_a_client_that_takes_nothing_holds_up_no_other(page: WebProcess) -> None
 
 
 @pytest.mark.long
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "sent", ["", "GET / HTTP/1.1\r\nHost:", "POST /api/command HTTP/1.1\r\nHost: {}\r\nContent-Length: 9\r\n\r\n{{"]
+)
+def test_a_connection_on_which_no_whole_request_comes_is_closed(page: WebProcess, sent: str) -> None:
+    with socket.create_connection((page.host, page.port), timeout=2 * REQUEST_S + 10.0) as silent:
+        silent.sendall(sent.format(f"localhost:{page.port}").encode())
+        while silent.recv(4096):
+            pass
+
+
 def test_a_daemon_that_is_gone_is_told_and_comes_back_by_itself(tmp_path: Path) -> None:
     config = written(tmp_path)
     with idle_daemon(tmp_path):
