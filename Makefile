@@ -10,6 +10,8 @@ PANGO := libpangoft2-1.0.so.0=libpangoft2-1.0-0
 COMPILED := $(sort $(shell grep -rl --include=*.py 'numerics.jit\|numerics import jit\|import numba' calibration))
 KERNELS := .cache/numba/$(firstword $(shell cat $(COMPILED) | cksum))
 export NUMBA_CACHE_DIR := $(CURDIR)/$(KERNELS)
+# Where a rigcal that is not started by make has them (daemon/warm_up.py).
+USERS := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/rigcal/numba
 export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 
 # The tests start a hundred processes: each would compile every module anew.
@@ -30,6 +32,7 @@ $(KERNELS)/warm: | environment
 	@echo "Compiling kernels ahead (half a minute, once)"
 	@$(BIN)/python -m daemon.warm_up
 	@touch $@ 2>/dev/null || true
+	@mkdir -p "$(USERS)" 2>/dev/null && cp -R $(KERNELS)/. "$(USERS)" 2>/dev/null || true
 
 demo: setup ## a simulated rig, from bus traffic to a calibrated model and a report
 	@$(BIN)/rigcal demo

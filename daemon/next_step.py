@@ -162,7 +162,9 @@ def _between_sessions(status: Mapping[str, Any]) -> NextStep:
 def _pressing(status: Mapping[str, Any], candidate: Mapping[str, Any] | None) -> Iterator[tuple[str, str]]:
     """Yield what keeps the next model from being made or judged, the most important first."""
     setup, gap = status.get("setup"), status["gap"] or {}
-    if setup is None or setup["state"] != "ok":
+    if setup is None:
+        yield "describe where the station stands, and be led", "`rigcal session guide --new-setup NAME`"
+    elif setup["state"] != "ok":
         yield "describe where the station stands", "`rigcal setup new NAME --instrument TYPE`"
     if gap.get("failed") is not None:
         how = "`rigcal jobs list`, `rigcal session start`"

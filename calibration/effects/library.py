@@ -41,8 +41,9 @@ def parse_effects(text: str, rig: Rig) -> tuple[tuple[str, str], ...]:
             raise ValueError(f"effect {name!r} is unknown; there are {', '.join(library())}, as FAMILY@WHERE")
         places = library()[name].places(rig)
         if where not in places:
-            there = f"has {', '.join(places)} for it" if places else "has no place for it"
-            raise ValueError(f"{name}@{where}: rig {rig.name!r} {there}")
+            there = f"may be at {', '.join(places)}" if places else "has no place"
+            what = f"{name}@{where}" if where else name
+            raise ValueError(f"{what}: {name} {there} in rig {rig.name!r}")
         if (name, where) in found:
             raise ValueError(f"{name}@{where} is named twice")
         found.append((name, where))

@@ -7,6 +7,7 @@ import csv
 import select
 import shutil
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -77,7 +78,8 @@ def _lead_in_lines(say: Say) -> Mapping[str, Any]:
     while True:
         guide = _guide(say("guide.state"))
         step = guide["step"]
-        lines = [f"{step['title']}: {step['instruction']}"]
+        how = f" (`rigcal session guide --done`: {step['button']})" if step["button"] else ""
+        lines = [f"{step['title']}: {step['instruction']}{how}"]
         lines += [f"  {message['severity']}: {message['text']}" for message in guide["messages"]]
         for line in lines:
             if line not in told:
@@ -96,8 +98,10 @@ def _lead_watched(say: Say) -> Mapping[str, Any]:
         with _keys() as key:
             while True:
                 guide = _guide(say("guide.state"))
-                lines = [*screen(guide, shutil.get_terminal_size().columns), *([note] if note else [])]
-                draw_screen([(line, {}) for line in lines])
+                columns, rows = shutil.get_terminal_size()
+                lines = [*screen(guide, columns), *([note] if note else [])]
+                hidden = max(0, len(lines) - rows + 1)  # in the middle: the step is at the top, the keys below
+                draw_screen([(line, {}) for line in (*lines[: len(lines) - hidden - 2], *lines[-2:])])
                 if guide["state"] != "open":
                     break
                 pressed = key(LOOK_S)
@@ -142,7 +146,7 @@ def _with_reason(say: Say, step: Mapping[str, Any], *, rest: bool) -> str:
 
 
 def screen(guide: Mapping[str, Any], width: int) -> list[str]:
-    """Return the lines of a guide's present step, none longer than the terminal is wide."""
+    """Return the lines of a guide's present step, wrapped to the terminal's width."""
     step = guide["step"]
     lines = [f"Guide {guide['id']}, step {step['number']} of {step['of']}: {step['title']}", step["instruction"]]
     lines.append(step["why"])
@@ -151,7 +155,8 @@ def screen(guide: Mapping[str, Any], width: int) -> list[str]:
     lines += _gain_lines(guide)
     lines += [f"{message['severity']}: {message['text']}" for message in guide["messages"]]
     lines.append(_keys_line(step))
-    return [shown(line)[: max(20, width - 1)] for line in lines if line]
+    room = max(20, width - 1)
+    return [part for line in lines for part in textwrap.wrap(shown(line), room, subsequent_indent="  ")]
 
 
 def _joint_line(joint: Mapping[str, Any]) -> str:

@@ -104,14 +104,7 @@ class JobRunner:
 
     def list_command(self, _arguments: Mapping[str, Any]) -> list[dict[str, Any]]:
         """All jobs with their results and how long they took in real time, newest last."""
-        rows = self._queue.table.all()
-        now = self._clock.now()
-        for row in rows:
-            if row["state"] == "running":
-                row["duration_s"] = max(0.0, (now.utc_ns - row["started_utc_ns"]) / NS_PER_S)
-            if row["duration_s"] is not None:
-                row["duration_s"] = round(self._clock.real_seconds(row["duration_s"]), 1)
-        return rows
+        return self._queue.table.all(self._clock)
 
     def cancel_command(self, arguments: Mapping[str, Any]) -> str:
         """Cancel a job that has not ended, and with it those that wait for it."""

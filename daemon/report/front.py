@@ -90,7 +90,8 @@ class Verdict:
         """The verdict with its figures."""
         held = f"{number(self.rms_mm)} mm root mean square {self.rows}, tolerance {number(self.tolerance_mm)} mm"
         if self.outcome == "not judged":
-            return f"Not judged: {held}. Only fixes that the model has not seen can pass: hold a check session."
+            other = "hold a check session, or evaluate the model on other data"
+            return f"Not judged: {held}. Only fixes that the model has not seen can pass: {other}."
         return f"{self.outcome.capitalize()}: {held}."
 
     def as_dict(self) -> dict[str, float | str]:

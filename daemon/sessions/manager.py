@@ -277,7 +277,10 @@ class SessionKeeper:
         """One session: what it holds, what was excluded and why, how its set-up kept its place, and its jobs."""
         session_id = str(arguments.get("id", ""))
         session = self._table.summary(session_id)
-        about = {"jobs": self._jobs.of_session(session_id), "latency": self._jobs.latencies().get(session_id)}
+        about = {
+            "jobs": self._jobs.of_session(session_id, self._clock),
+            "latency": self._jobs.latencies().get(session_id),
+        }
         return session | about | self._without_job(session)
 
     def _without_job(self, session: Mapping[str, Any]) -> dict[str, str | None]:

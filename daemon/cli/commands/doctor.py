@@ -47,9 +47,6 @@ def _examine(socket: Path | None, path: Path | None) -> Iterator[Finding]:
     if path is not None:
         config, finding = diagnosis.read_configuration(path)
         yield finding
-    else:
-        remedy = "`rigcal init` writes one; --config FILE names another"
-        yield Finding("configuration", "unknown", f"there is no {INSTALLED_CONFIG}", remedy)
     yield from diagnosis.computer(config)
     at = socket_of(socket, None) if config is None or socket is not None else config.socket_path
     try:
@@ -57,6 +54,9 @@ def _examine(socket: Path | None, path: Path | None) -> Iterator[Finding]:
     except CommandError as error:
         if config is not None:
             yield from diagnosis.devices(config)
+        elif path is None:
+            remedy = "`rigcal init` writes one; --config FILE names another"
+            yield Finding("configuration", "unknown", f"there is no {INSTALLED_CONFIG}", remedy)
         yield diagnosis.socket_finding(str(error))
         return
     if config is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -13,7 +13,7 @@ from daemon.store.connection import Connection
 from daemon.store.errors import NotInStoreError
 from daemon.store.queries.models import ModelRow
 from daemon.store.rows import marks
-from drivers.clock import Stamp
+from drivers.clock import NS_PER_S, Clock, Stamp
 
 # Scheduling runs twice a second beside acquisition, for months: CROSS JOIN and NOT INDEXED keep SQLite's planner from
 # starting with all of a rig's sessions.
@@ -235,10 +235,14 @@ class JobTable:
 
     # ---- lists -------------------------------------------------------------------------------------------------------
 
-    def all(self) -> list[dict[str, Any]]:
-        """All jobs with their results, newest last. Read beside the writing connection, which must not wait."""
+    def all(self, clock: Clock) -> list[dict[str, Any]]:
+        """All jobs with their results, newest last, and how long each took or runs already, in real time.
+
+        Read beside the writing connection, which must not wait.
+        """
         with self._store.reader() as reader:
-            return _with_results(reader.rows(f"SELECT {_SHOWN}, result_json FROM jobs ORDER BY id"))
+            rows = reader.rows(f"SELECT {_SHOWN}, result_json FROM jobs ORDER BY id")
+        return [_shown(row, clock) for row in rows]
 
     def unfinished(self) -> list[dict[str, Any]]:
         """Jobs that run, wait, or will be offered again, without results, newest last."""
@@ -253,10 +257,10 @@ class JobTable:
         """Id and host_boot of the jobs that are marked as running."""
         return self._store.rows("SELECT id, host_boot FROM jobs WHERE state = 'running'")
 
-    def of_session(self, session_id: str) -> list[dict[str, Any]]:
-        """The jobs that a session has triggered, with their results."""
+    def of_session(self, session_id: str, clock: Clock) -> list[dict[str, Any]]:
+        """The jobs that a session has triggered, as `all` has them."""
         sql = f"SELECT {_SHOWN}, result_json FROM jobs WHERE session_id = ? ORDER BY id"
-        return _with_results(self._store.rows(sql, (session_id,)))
+        return [_shown(row, clock) for row in self._store.rows(sql, (session_id,))]
 
     def has_of_session(self, session_id: str) -> bool:
         """True if a session has triggered a job."""
@@ -294,8 +298,13 @@ class JobTable:
         return bool(self._store.update("jobs", {"id": job_id, "state": "interrupted"}, {"state": "queued"}))
 
 
-def _with_results(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [row | {"result": json.loads(row.pop("result_json") or "null")} for row in rows]
+def _shown(row: dict[str, Any], clock: Clock) -> dict[str, Any]:
+    took_s = row["duration_s"]
+    if row["state"] == "running":
+        took_s = max(0.0, (clock.now().utc_ns - row["started_utc_ns"]) / NS_PER_S)
+    if took_s is not None:
+        took_s = round(clock.real_seconds(took_s), 1)
+    return row | {"duration_s": took_s, "result": json.loads(row.pop("result_json") or "null")}
 
 
 def _result(row: Mapping[str, Any]) -> dict[str, Any]:

@@ -62,4 +62,6 @@ def test_the_screen_fits_a_narrow_terminal_and_says_what_is_old() -> None:
     assert "+22.5 to go  (old)" in joint
     assert "theta3" in "".join(lines)
     assert any("30 s ago" in line for line in lines)
-    assert "Enter: Measure here" in lines[-1]
+    whole = " ".join(line.strip() for line in lines)
+    assert "Move every joint to its target; the pose is measured by itself once the boom stands." in whole
+    assert "Enter: Measure here" in whole
