@@ -32,7 +32,7 @@ from calibration.numerics.stored_arrays import (
     float_array,
     read_npz,
 )
-from calibration.residual.conformal import Intervals
+from calibration.residual.conformal import Intervals, StageIntervals
 from calibration.residual.features import no_features
 from calibration.residual.learners import LOADERS
 from calibration.residual.region import Region
@@ -167,6 +167,7 @@ class _Document(_Part):
     trials: tuple[_Trial, ...]
     residual_reason: str
     intervals: _Intervals
+    effects_intervals: _Intervals | None = None  # models from before have none
     warnings: tuple[str, ...]
     fitted_rows: tuple[str, ...] = ()  # models from before have none
     provenance: dict[str, str | int | Finite]
@@ -175,7 +176,7 @@ class _Document(_Part):
 # Fields of the document that the model, or its coverage, has by the same name.
 _COVERAGE = tuple(field.name for field in fields(Coverage))
 _SAME = _Document.model_fields.keys() & {field.name for field in fields(CalibratedModel)}
-_SAME -= {"rig", "placements", "residual"}
+_SAME -= {"rig", "placements", "residual", "intervals"}
 
 
 def model_to_files(model: CalibratedModel) -> dict[str, bytes]:
@@ -188,6 +189,8 @@ def model_to_files(model: CalibratedModel) -> dict[str, bytes]:
         | {name: getattr(model.coverage, name) for name in _COVERAGE}
         | {
             "rig": model.rig.name,
+            "intervals": model.intervals.hybrid,
+            "effects_intervals": model.intervals.effects,
             "placements": {
                 setup: {"rotation": p.rotation.tolist(), "translation_mm": p.translation_mm.tolist()}
                 for setup, p in model.placements.items()
@@ -296,7 +299,7 @@ def model_from_files(files: Mapping[str, bytes]) -> CalibratedModel:
         | {
             "effects": tuple(_read_effect(part, chain) for part in document.effects),
             "identifiability": Identifiability(**dict(document.identifiability)),
-            "intervals": Intervals(**dict(document.intervals)),
+            "intervals": _stage_intervals(document),
             "outliers": tuple(Outlier(**dict(outlier)) for outlier in document.outliers),
             "trials": tuple(Trial(**dict(trial)) for trial in document.trials),
         },
@@ -327,6 +330,14 @@ def _check_residual(residual: LearnedResidual, chain: Chain) -> None:
         raise ModelError("the residual's region does not fit the model's rig; calibrate again")
     if residual.region.signals != residual.signals:
         raise ModelError("the residual's region was fitted with other signals than model.json has; calibrate again")
+
+
+def _stage_intervals(document: _Document) -> StageIntervals:
+    """Intervals of both stages; a model from before has none of its stage effects, and those at least normal ones."""
+    hybrid = Intervals(**dict(document.intervals))
+    if document.effects_intervals is not None:
+        return StageIntervals(hybrid, Intervals(**dict(document.effects_intervals)))
+    return StageIntervals(hybrid, hybrid if document.residual is None else hybrid.or_wider(Intervals()))
 
 
 def _check_parts(document: _Document, chain: Chain, covariance: np.ndarray, base_covariance: np.ndarray | None) -> None:

@@ -11,7 +11,7 @@ from calibration.identification.samples import Samples, averaged, left_out_error
 from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Prediction, Predictor
 from calibration.observations import Floats, Observations
-from calibration.residual.conformal import Coverage, Intervals, conformal_intervals, coverage
+from calibration.residual.conformal import Coverage, StageIntervals, conformal_intervals, coverage
 from calibration.residual.folds import neighbour_labels
 
 _LARGEST_GROUP = 40  # samples: the work of a group grows with the cube of their number
@@ -26,7 +26,7 @@ def with_intervals(
     """Give a model intervals that hold the errors of new fixes of the same kind, outliers among them.
 
     Args:
-        model: fitted to these rows.
+        model: fitted to these rows; one with a residual learner has the intervals of its stage before already.
         observations: n rows, none of them copies.
         learned: (n,) rows that the residual learner was trained on, for a model that has one.
         left_mm: (k, 3) errors on these rows of learners trained without them, in the station's frame.
@@ -36,7 +36,9 @@ def with_intervals(
     if learned is not None and left_mm is not None:
         error[learned] = left_mm
     apart, samples = _left_out(model, observations, error, _groups(observations), slice(None), model.covariance)
-    return replace(model, intervals=conformal_intervals(apart, prediction.formal_mm, samples))
+    counted = conformal_intervals(apart, prediction.formal_mm, samples)
+    before = counted if model.residual is None else model.intervals.effects
+    return replace(model, intervals=StageIntervals(counted, before))
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class SetupErrors:
 
     error_mm: Floats
     prediction: Prediction
-    home: Intervals
+    home: StageIntervals
     half: NDArray[np.intp]
     samples: int
     has_one_setup: bool
@@ -71,7 +73,7 @@ class SetupErrors:
         return cls(apart, prediction, model.intervals, group % 2, samples, has_one_setup)
 
     @property
-    def intervals(self) -> Intervals:
+    def intervals(self) -> StageIntervals:
         """Intervals that hold at these set-ups too, and are nowhere narrower than those of the training.
 
         What a machine does elsewhere that it did not do in its training is in these errors and nowhere else.
@@ -89,7 +91,7 @@ class SetupErrors:
             radius_mm[here] = intervals.radius_mm(formal_mm[here], own)
         return coverage(self.error_mm, half_mm, radius_mm)
 
-    def _counted(self, rows: NDArray[np.bool_]) -> Intervals:
+    def _counted(self, rows: NDArray[np.bool_]) -> StageIntervals:
         """Intervals of the training, widened so that they hold the errors of some of the rows."""
         if not rows.any():
             return self.home

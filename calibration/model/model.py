@@ -16,7 +16,7 @@ from calibration.identification.identifiability import Identifiability
 from calibration.identification.refinement import Prior
 from calibration.kinematics.chain import Chain, Placement
 from calibration.observations import Floats
-from calibration.residual.conformal import Intervals
+from calibration.residual.conformal import StageIntervals
 from calibration.residual.features import Features
 from calibration.residual.learners import Residual
 from calibration.residual.region import Region
@@ -165,7 +165,7 @@ class CalibratedModel:
     residual: LearnedResidual | None = None
     trials: tuple[Trial, ...] = ()
     residual_reason: str = "not trained"
-    intervals: Intervals = field(default_factory=Intervals)
+    intervals: StageIntervals = field(default_factory=StageIntervals)
     base_covariance: Floats | None = None
     warnings: tuple[str, ...] = ()
     fitted_rows: tuple[str, ...] = ()

@@ -18,7 +18,6 @@ from calibration.kinematics.chain import Chain, Placement
 from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor
 from calibration.observations import Floats, Observations
-from calibration.residual.conformal import Intervals
 
 _REACHED = 0.5  # weight of the residual in a row, beyond which the row lies in its region
 _ROUNDS = 2  # the residual turns with the base: after the first by a few mrad, then by nothing that is seen
@@ -84,9 +83,7 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
             observations,
         )
         if reason:
-            # Intervals that the residual made narrower than normal ones do not hold without it.
-            wide = model.intervals.or_wider(Intervals())
-            model = replace(model, residual=None, residual_reason=reason, intervals=wide)
+            model = replace(model, residual=None, residual_reason=reason)
             left, fit = samples, without
     geometric = effects_values
     if model.effects:

@@ -58,28 +58,57 @@ class Intervals:
         x, y, z = np.maximum(self.axes, other.axes).tolist()
         return Intervals((x, y, z), max(self.radius, other.radius))
 
-    def half_mm(self, formal_mm: Floats, weight: Floats | None = None) -> Floats:
-        """Half widths (n, 3) of the intervals of x, y and z.
+    def half_mm(self, formal_mm: Floats) -> Floats:
+        """Half widths (n, 3) of the intervals of x, y and z, given formal standard deviations (n, 3)."""
+        half_mm: Floats = formal_mm * np.array(self.axes)
+        return half_mm
 
-        What was counted where a residual learner is used must not make an interval narrower where it is not.
+    def radius_mm(self, formal_mm: Floats) -> Floats:
+        """Radii (n,) of the balls, given formal standard deviations (n, 3)."""
+        radius_mm: Floats = self.radius * np.linalg.norm(formal_mm, axis=1)
+        return radius_mm
+
+
+@dataclass(frozen=True)
+class StageIntervals:
+    """Intervals of a model with a residual learner, and of its stage before, which hold where the learner is not used.
+
+    What was counted where a learner is used says nothing of where it is not.
+
+    Attributes:
+        hybrid: of the model with its learner; the same as below where it has none.
+        effects: of kinematics and effects alone.
+    """
+
+    hybrid: Intervals = Intervals()
+    effects: Intervals = Intervals()
+
+    def at_other_setups(self) -> StageIntervals:
+        """Intervals where nobody knows which way x and y point, seen from the machine."""
+        return StageIntervals(self.hybrid.at_other_setups(), self.effects.at_other_setups())
+
+    def or_wider(self, other: Intervals) -> StageIntervals:
+        """Intervals that are, at each stage, the wider of these and another."""
+        return StageIntervals(self.hybrid.or_wider(other), self.effects.or_wider(other))
+
+    def half_mm(self, formal_mm: Floats, weight: Floats | None) -> Floats:
+        """Half widths (n, 3) of the intervals of x, y and z.
 
         Args:
             formal_mm: (n, 3) formal standard deviations.
             weight: (n,) of the learner in each row, 0 to 1; None for a model that has none.
         """
-        half_mm: Floats = formal_mm * np.array(self.axes)
         if weight is None:
-            return half_mm
-        away_mm = formal_mm * np.maximum(self.axes, NORMAL)
-        return weight[:, None] * half_mm + (1.0 - weight)[:, None] * away_mm
+            return self.effects.half_mm(formal_mm)
+        used, unused = self.hybrid.half_mm(formal_mm), self.effects.half_mm(formal_mm)
+        return weight[:, None] * used + (1.0 - weight)[:, None] * unused
 
-    def radius_mm(self, formal_mm: Floats, weight: Floats | None = None) -> Floats:
+    def radius_mm(self, formal_mm: Floats, weight: Floats | None) -> Floats:
         """Radii (n,) of the balls; arguments are those of `half_mm`."""
-        size_mm = np.linalg.norm(formal_mm, axis=1)
         if weight is None:
-            return np.asarray(self.radius * size_mm, dtype=np.float64)
-        away = max(self.radius, _NORMAL_RADIUS)
-        return np.asarray((weight * self.radius + (1.0 - weight) * away) * size_mm, dtype=np.float64)
+            return self.effects.radius_mm(formal_mm)
+        used, unused = self.hybrid.radius_mm(formal_mm), self.effects.radius_mm(formal_mm)
+        return weight * used + (1.0 - weight) * unused
 
 
 def coverage(error_mm: Floats, half_mm: Floats, radius_mm: Floats) -> Coverage:

@@ -15,7 +15,7 @@ from calibration.model.files import model_from_files, model_to_files
 from calibration.model.intervals import with_intervals
 from calibration.observations import Floats, parse_observations
 from calibration.pipeline.calibrate import identify
-from calibration.residual.conformal import Coverage, Intervals, conformal_intervals, coverage
+from calibration.residual.conformal import Coverage, Intervals, StageIntervals, conformal_intervals, coverage
 from calibration.rig.description import shipped_rig
 from simulators.rig.truth import RigTruth
 from tests.calibration.conftest import Session, rig_text, simulated
@@ -105,10 +105,11 @@ def test_a_calibrated_model_covers_held_out_fixes(session: Session) -> None:
 
 
 def test_at_another_set_up_x_and_y_are_alike_and_nothing_is_surer_than_at_home(session: Session) -> None:
-    home = session.model.intervals.at_other_setups()
+    trained = session.model.intervals.hybrid
+    home = trained.at_other_setups()
     assert home.axes[0] == home.axes[1]
-    assert min(session.model.intervals.axes[:2]) < home.axes[0] < max(session.model.intervals.axes[:2])
-    assert home.axes[2] == session.model.intervals.axes[2]
+    assert min(trained.axes[:2]) < home.axes[0] < max(trained.axes[:2])
+    assert home.axes[2] == trained.axes[2]
     there = evaluate(session.model, session.held_out, refit_base=True).model.intervals
     assert there == there.or_wider(home)
 
@@ -128,7 +129,7 @@ def test_outliers_are_covered_like_other_fixes() -> None:
     model = identify(rig, rig_text("swdt82"), found[0])
     evaluation = evaluate(model, found[1])
     assert evaluation.coverage.radius == pytest.approx(0.9, abs=0.04)
-    assert model.intervals.radius > 3.0  # an eighth of all fixes is anywhere
+    assert model.intervals.hybrid.radius > 3.0  # an eighth of all fixes is anywhere
 
 
 def test_an_outlier_makes_no_wider_what_stands_beside_it(session: Session) -> None:
@@ -137,12 +138,12 @@ def test_an_outlier_makes_no_wider_what_stands_beside_it(session: Session) -> No
     rows = parse_observations(data.csv_text().encode(), session.rig, "simulated.csv")
     position = rows.position_mm.copy()
     position[::16] += np.random.default_rng(0).normal(0.0, 10_000.0, position[::16].shape)
-    wide = with_intervals(session.model, replace(rows, position_mm=position)).intervals
-    assert wide.radius == pytest.approx(with_intervals(session.model, rows).intervals.radius, rel=0.4)
+    wide = with_intervals(session.model, replace(rows, position_mm=position)).intervals.hybrid
+    assert wide.radius == pytest.approx(with_intervals(session.model, rows).intervals.hybrid.radius, rel=0.4)
 
 
 def test_intervals_travel_with_the_model(session: Session) -> None:
     model = session.model
-    assert model.intervals != Intervals()
+    assert model.intervals != StageIntervals()
     assert with_intervals(model, session.training).intervals == model.intervals
     assert model_from_files(model_to_files(model)).intervals == model.intervals
