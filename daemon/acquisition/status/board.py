@@ -45,7 +45,8 @@ from drivers.readings import (
     Status,
 )
 
-RATE_WINDOW_BATCHES = 40
+RATE_WINDOW_S = 2.0  # real time, as batches are
+RATE_WINDOW_BATCHES = 40  # the window's, at the usual 20 batches a second
 LAG_WINDOW_BATCHES = 1200  # a minute at the usual 20 batches a second
 
 
@@ -74,6 +75,8 @@ class StatusBoard:
         self._clock = clock
         self._lock = threading.Lock()
         self._started = clock.now()
+        real_s = clock.real_seconds(1.0) or 1.0  # none passes on a clock that only moves when told to
+        self._rate_window_ns = round(RATE_WINDOW_S / real_s * NS_PER_S)
         self._channels = {channel.name: channel for channel in expected.channels}
         self._stations = {station.name: station for station in expected.stations}
         self._links: dict[str, _Link] = {}
@@ -242,13 +245,19 @@ class StatusBoard:
             sentence=station_sentence(status, age_s, last_lock, last or "", reason),
         )
 
+    def _per_s(self, link: str, now: Stamp) -> float:
+        """Return a link's captures per second of late, up to now: no batch comes where every link is silent."""
+        if not self._history:
+            return 0.0
+        since_ns = now.monotonic_ns - self._rate_window_ns
+        before_ns, before = next((one for one in reversed(self._history) if one[0] <= since_ns), self._history[0])
+        passed_ns = now.monotonic_ns - max(before_ns, since_ns)
+        return (self._totals[link] - before[link]) * NS_PER_S / max(passed_ns, 1)
+
     def _link(
         self, intake: LinkIntake, heard: CanSummary | None, decoder_failed: Stamp | None, now: Stamp
     ) -> LinkStatus:
-        name, per_s = intake.name, 0.0
-        if len(self._history) > 1:
-            (before_ns, before), (after_ns, after) = self._history[0], self._history[-1]
-            per_s = (after[name] - before[name]) * NS_PER_S / max(after_ns - before_ns, 1)
+        name = intake.name
         link = self._links.setdefault(name, _Link(self._started))
         if link.up is None and self._totals[name]:
             link.up = True  # a log that is played back says nothing of a port
@@ -260,7 +269,7 @@ class StatusBoard:
             name=name,
             up=link.up,
             captures=self._totals[name],
-            captures_per_s=per_s,
+            captures_per_s=self._per_s(name, now),
             dropped=intake.dropped,
             queued=intake.queued,
             restarts=intake.restarts,

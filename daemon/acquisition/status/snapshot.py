@@ -18,7 +18,7 @@ class LinkStatus:
         since_s: for how long it has been so.
         reason: why it is not open; "" while it is, and before the first word.
         captures: stored since the start.
-        captures_per_s: lately.
+        captures_per_s: of the last two seconds.
         dropped: captures that found the queue full since the start.
         dropped_age_s: since the last of them were noticed; None without any.
         queued: waiting to be stored.

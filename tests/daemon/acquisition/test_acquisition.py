@@ -171,6 +171,27 @@ def test_the_rate_of_a_link_is_what_it_was_lately(acquire: Make) -> None:
     assert 0 < acquisition.status().links[0].captures_per_s <= 20.0
 
 
+def test_a_link_has_no_rate_when_every_link_has_fallen_silent(acquire: Make) -> None:
+    clock = ManualClock(at(0))
+    first, second = threading.Event(), threading.Event()
+    links = [
+        ListLink("boom", [frame(n) for n in range(10)], first),
+        ListLink("boom", [frame(n) for n in range(800)], second),
+    ]
+    acquisition = acquire(links, clock=clock)
+    acquisition.start()
+    first.set()
+    wait_until(lambda: acquisition.status().links[0].captures == 10)
+    clock.advance(1.0)
+    second.set()
+    wait_until(lambda: acquisition.status().links[0].captures == 810)
+    assert acquisition.status().links[0].captures_per_s == 800.0
+    clock.advance(0.6)
+    assert acquisition.status().links[0].captures_per_s == 500.0, "no batch says so, but time has passed"
+    clock.advance(600.0)
+    assert acquisition.status().links[0].captures_per_s == 0.0
+
+
 def test_what_was_left_behind_is_decoded_apart_from_what_comes_live(path: Path, store: Store, acquire: Make) -> None:
     store.append_captures([frame(1)])
     decoders: list[NumberDecoder] = []
