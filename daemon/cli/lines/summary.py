@@ -1,9 +1,13 @@
-"""The daemon's state on one screen: what it does, what is wrong, and what to do next."""
+"""The daemon's state on one screen: what it does, what is wrong, and what to do next.
+
+Alarms get the room first, then open gaps; lists that may be long are bounded. What is left out is counted, with the
+command that shows it.
+"""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from daemon.cli.lines.jobs import job_line
@@ -17,6 +21,9 @@ NARROWEST = 60
 _LABEL = 10  # characters
 _NAMES_SHOWN = 6
 _REASONS_SHOWN = 2
+_DEVICES_SHOWN = 2  # of those with failed decodes
+_JOBS_SHOWN = 3
+_GAPS_KEPT = 3  # they have room whatever the alarms take
 _CELL = 22  # characters of a joint with its value
 _HELD_UP_S = 30.0
 
@@ -48,7 +55,7 @@ def state_sentence(status: Mapping[str, Any]) -> str:
 
 
 def summary(status: Mapping[str, Any], width: int, lines: int = LINES, *, with_joints: bool = False) -> list[Line]:
-    """Return the state on at most so many lines: what does not fit is counted, with the command that shows it.
+    """Return the state on at most so many lines.
 
     Args:
         status: the daemon's state.
@@ -62,14 +69,14 @@ def summary(status: Mapping[str, Any], width: int, lines: int = LINES, *, with_j
     head += _labelled("state", [state_sentence(status)], width, bold=True)
     if with_joints:
         head += _joints(status["acquisition"]["channels"], width)
-    body = [line for label, texts in _body(status) for line in _labelled(label, texts, width)]
     end = _labelled("next", [next_line(status)], width, bold=True)
-    room = max(lines - len(head) - len(end) - len(body), 3)
-    alarms = _alarms(status["alarms"]["active"], width, room)
-    left = max(lines - len(head) - len(end) - len(alarms), 1)
-    if len(body) > left:
-        body = [*body[: left - 1], Line(" " * _LABEL + "... `rigcal status --all` has the rest")]
-    return [*head, *alarms, *body, *end]
+    gaps = _entries("gaps", _gaps(status["acquisition"]), width)
+    body = [entry for label, texts in _body(status) for entry in _entries(label, texts, width)]
+    room = lines - len(head) - len(end)
+    kept = sum(map(len, gaps[:_GAPS_KEPT])) + 1  # and a line that counts what does not fit
+    alarms = _alarms(status["alarms"]["active"], width, room - kept)
+    told = _fitted([*gaps, *body], room - len(alarms), "... {} more lines: `rigcal status --all` has them", width)
+    return [*head, *alarms, *told, *end]
 
 
 def reading(channel: Mapping[str, Any]) -> str:
@@ -88,36 +95,35 @@ def _joints(channels: Sequence[Mapping[str, Any]], width: int) -> list[Line]:
 
 
 def _alarms(active: Sequence[Mapping[str, Any]], width: int, room: int) -> list[Line]:
-    """Return alarms with their remedies on as many lines as there is room, those that count most first."""
+    """Return alarms with their remedies where there is room, those that count most first, and one in any case."""
     if not active:
         return _labelled("alarms", ["none"], width)
-    told: list[Line] = []
-    for place, alarm in enumerate(active):
+    entries: list[list[Line]] = []
+    for alarm in active:
         is_critical = alarm["severity"] == "critical"
-        lines = _labelled(
-            "" if told else "alarms",
-            [alarm_line(alarm)],
-            width,
-            fg="red" if is_critical else "yellow",
-            bold=is_critical,
-        ) + _labelled("", [f"  {alarm['remedy']}"], width)
-        rest = len(active) - place
-        if told and len(told) + len(lines) > room - (rest > 1):
-            return [*told, *_labelled("", [f"and {rest} more: `rigcal alarms` has all"], width)]
-        told += lines
-    return told
+        style = {"fg": "red" if is_critical else "yellow", "bold": is_critical}
+        label = "" if entries else "alarms"
+        remedy = _labelled("", [f"  {alarm['remedy']}"], width)
+        entries.append(_labelled(label, [alarm_line(alarm)], width, **style) + remedy)
+    return _fitted(entries, max(room, len(entries[0]) + 1), "and {} more: `rigcal alarms` has all", width)
+
+
+def _gaps(acquisition: Mapping[str, Any]) -> list[str]:
+    return [line.removeprefix("gap: ") for line in gap_state_lines(acquisition)]
 
 
 def _body(status: Mapping[str, Any]) -> Iterator[tuple[str, list[str]]]:
     acquisition, models, gap = status["acquisition"], status["models"], status["gap"]
+    failing = sorted(acquisition["decoding"], key=lambda device: -device["lately"])
+    jobs = sorted(status["jobs"], key=lambda job: job["state"] != "running")
     yield "links", [_links(acquisition["links"])]
     yield "channels", [_channels(acquisition["channels"])]
     yield "station", [f"{s['name']}: {s['sentence']}; {s['fixes']} fixes" for s in acquisition["stations"]]
-    yield "", [*store_lines(status), *notice_lines(status["notices"]), *decoding_lines(acquisition["decoding"])]
-    yield "gaps", [line.removeprefix("gap: ") for line in gap_state_lines(acquisition)]
+    yield "", [*store_lines(status), *notice_lines(status["notices"])]
+    yield "decoding", _first([*decoding_lines(failing)], _DEVICES_SHOWN, "`rigcal status --all` has all")
     if status["session"]:
         yield "session", list(_session(status["session"]))
-    yield "jobs", [job_line(job) for job in status["jobs"]]
+    yield "jobs", _first([job_line(job) for job in jobs], _JOBS_SHOWN, "`rigcal jobs list` has all")
     yield "models", model_lines(models) if models else []
     if gap and gap["verdict"] is not None:
         yield "verdict", [f"{gap['verdict']['sentence']} (session {gap['verdict']['session']})"]
@@ -149,6 +155,12 @@ def _channels(channels: Sequence[Mapping[str, Any]]) -> str:
     return "; ".join([", ".join(told), *faults])
 
 
+def _first(lines: Sequence[str], most: int, where: str) -> list[str]:
+    """Return the first of some lines and how many more there are."""
+    more = [f"and {len(lines) - most} more: {where}"] if len(lines) > most else []
+    return [*lines[:most], *more]
+
+
 def _some(names: Sequence[str]) -> str:
     more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
     return ", ".join(names[:_NAMES_SHOWN]) + more
@@ -169,6 +181,22 @@ def _session(session: Mapping[str, Any]) -> Iterator[str]:
         yield f"excluded: {', '.join(reasons[:_REASONS_SHOWN])}{more}"
     for suspicion in session.get("prism_suspicions", ()):
         yield f"fixes do not count: {suspicion['text']}"
+
+
+def _fitted(entries: Sequence[list[Line]], room: int, more: str, width: int) -> list[Line]:
+    """Return as many whole entries as so many lines hold; the last line counts those that are left out."""
+    told: list[Line] = []
+    for place, entry in enumerate(entries):
+        left = len(entries) - place
+        if len(told) + len(entry) + (left > 1) > room:
+            return [*told, *_labelled("", [more.format(left)], width)]
+        told += entry
+    return told
+
+
+def _entries(label: str, texts: Iterable[str], width: int) -> list[list[Line]]:
+    """Return the lines of each text, with a label before the first."""
+    return [_labelled("" if place else label, [text], width) for place, text in enumerate(texts)]
 
 
 def _labelled(label: str, texts: Sequence[str], width: int, **style: Any) -> list[Line]:

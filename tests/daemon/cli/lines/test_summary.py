@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pty
+import re
 import select
 import subprocess
 import sys
@@ -109,10 +110,67 @@ def test_the_state_fits_a_terminal_of_24_lines(told: dict[str, Any]) -> None:
     assert any(line.text.startswith("next      ") for line in lines)
 
 
+def screen(told: dict[str, Any]) -> str:
+    lines = summary(told, TERMINAL[0])
+    assert len(lines) <= LINES
+    return "\n".join(line.text for line in lines)
+
+
+def acquired(**changes: Any) -> dict[str, Any]:
+    return {**status()["acquisition"], **changes}
+
+
+def gap(reason: str, number: int = 0) -> dict[str, Any]:
+    return {"channel": f"theta{number}", "reason": reason, "start_utc_ns": 0, "age_s": 41.0}
+
+
+def failing(number: int, lately: int = 0) -> dict[str, Any]:
+    reason = "the frame has 3 bytes, and the value that is looked for in it needs 4 of them"
+    return {"device": f"theta{number}", "count": 70, "reason": reason, "reason_count": 70, "lately": lately}
+
+
 def test_what_does_not_fit_is_counted_with_the_command_that_shows_it() -> None:
-    text = "\n".join(line.text for line in summary(WORST, TERMINAL[0]))
-    assert "more: `rigcal alarms` has all" in text
-    assert "CRITICAL joint_silent theta0" in text
+    text = screen(WORST)
+    told = text.count("CRITICAL joint_silent")
+    assert told >= 5
+    assert f"and {9 - told} more: `rigcal alarms` has all" in text
+    assert "... 10 more lines: `rigcal status --all` has them" in text
+
+
+def test_open_gaps_follow_the_alarms_however_many_these_are() -> None:
+    text = screen(WORST | {"acquisition": acquired(gaps=[gap("silent", 3), gap("link_down", 4)])})
+    assert text.count("CRITICAL joint_silent") >= 4
+    _, after = text.split("more: `rigcal alarms` has all\n")
+    first, second, *_ = after.splitlines()
+    assert first == "gaps      silent for 41 s: theta3"
+    assert second == "          link down for 41 s: theta4"
+
+
+def test_alarms_are_told_however_many_gaps_are_open() -> None:
+    text = screen(WORST | {"acquisition": acquired(gaps=[gap(f"reason_{n}") for n in range(30)])})
+    assert text.count("CRITICAL joint_silent") >= 4
+    assert text.count(" for 41 s: theta0") >= 3
+    left = 30 - text.count(" for 41 s: theta0")
+    number = int(re.findall(r"\.\.\. (\d+) more lines", text)[0])
+    assert number > left, "links, channels and the rest are left out as well"
+
+
+def test_failed_decodes_and_jobs_push_nothing_out() -> None:
+    decoding = [failing(n, lately=n) for n in range(9)]
+    told = status(acquisition=acquired(decoding=decoding, gaps=[gap("silent")]), session=session(), jobs=WORST["jobs"])
+    text = screen(told)
+    for label in ("gaps", "links", "channels", "station", "session", "jobs", "models"):
+        assert f"\n{label:10}" in text
+    assert "theta8 could not be decoded (8 in the last minute)" in text, "what fails now comes first"
+    assert "and 7 more: `rigcal status --all` has all" in text
+    assert "and 5 more: `rigcal jobs list` has all" in text
+    assert "more lines" not in text
+
+
+def test_a_job_that_runs_is_told_before_those_that_wait() -> None:
+    waiting = WORST["jobs"]
+    text = screen(status(jobs=[*waiting, waiting[0] | {"id": 99, "state": "running"}]))
+    assert "jobs      job 99 gap of s: running" in text
 
 
 CANDIDATE = {
