@@ -66,7 +66,7 @@ class Overview:
         unreadable: dict[str, str] = {}
         clock = self.parts.clock
 
-        setups = SetupTable(self.store)
+        setups = SetupTable(self.store, self.parts.rig.name)
 
         def stored(part: str, read: Callable[[], T]) -> T | None:
             try:
@@ -87,8 +87,8 @@ class Overview:
             "clock": self.clock(),
             "session": stored("session", self.sessions.open_session),
             "guide": self.guide.now(),
-            "setup": stored("setup", lambda: _setup(setups.newest())),
-            "control_shots": stored("control_shots", setups.newest_shots) or [],
+            "setup": stored("setup", lambda: _setup(setups.current())),
+            "control_shots": stored("control_shots", setups.current_shots) or [],
             "jobs": stored("jobs", self.jobs.unfinished) or [],
             "jobs_awaited": stored("jobs_awaited", self.runner.awaited_session),
             "job_counts": stored("job_counts", self.jobs.counts) or [],

@@ -206,7 +206,7 @@ class Daemon:
             "acquisition": self._acquisition.status,
             "session": sessions.open_session,
             "suspicions": self._sessions.prism_suspicions,
-            "setup": SetupTable(self._store).newest,
+            "setup": SetupTable(self._store, self._parts.rig.name).current,
             "failed_jobs": self._job_table.failed,
             "model": self._live_model.health,
             "store": lambda: self._watch.health,

@@ -28,7 +28,7 @@ class Evidence:
         acquisition: links, channels, stations, gaps and the last events.
         session: the open one.
         suspicions: stations that may be on another prism than the session's own.
-        setup: the newest one.
+        setup: the one that the station stands in.
         failed_jobs: those that somebody should look at.
         model: the live one.
         store: its file and its disk; None while not known.

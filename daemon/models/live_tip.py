@@ -53,7 +53,7 @@ class Tip:
         base_mm: x, y, z in the base frame.
         sigma_mm: RMS of the 3-D error to be expected: parameters, readings, timing, what the model lacks. The base
             frame is the one that the calibration has placed before its stations.
-        setup: the newest set-up, where it has not moved and the model knows it.
+        setup: the set-up that the station stands in, where it has not moved and the model knows it.
         station_mm, station_sigma_mm: x, y, z in that station's frame as it would measure them, with what its fixes err
             by and how the base has moved, and their standard deviations.
         warnings: what the model was not trained on.
@@ -89,7 +89,7 @@ class LiveTip:
         rig: the machine.
         joiner: what is known of the joints; fed in the thread that calls `on_records`.
         model: the live model.
-        setup: the newest set-up, None without one and where it has moved.
+        setup: the set-up that the station stands in, None without one and where it has moved.
         clock: for the readings' age.
         prism: of `rigcal tip` where no other is named; None where none is configured.
         fresh_s: readings older than this, on that clock, give no position.

@@ -339,7 +339,7 @@ FAMILIES: tuple[Family, ...] = (
     Family(
         "rigcal_control_point_misclosure_meters",
         "gauge",
-        "Distance of a control point's newest shot from its known place, newest set-up.",
+        "Distance of a control point's newest shot from its known place, current set-up.",
         ("setup", "point"),
         _misclosures,
     ),

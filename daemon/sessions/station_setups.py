@@ -34,7 +34,7 @@ class SetupBook:
 
     def __init__(self, rig: Rig, store: Store, clock: Clock, tolerance_mm: float) -> None:
         self._rig, self._store, self._clock, self._tolerance_mm = rig, store, clock, tolerance_mm
-        self._table = SetupTable(store)
+        self._table = SetupTable(store, rig.name)
 
     def new_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """A station set-up: instrument, tilt, ppm. It replaces none: sessions name theirs."""
@@ -65,26 +65,28 @@ class SetupBook:
         return {"id": setup_id}
 
     def list_command(self, _arguments: Mapping[str, Any]) -> list[dict[str, Any]]:
-        """All set-ups with their control points, oldest first."""
-        return self._table.all()
+        """All set-ups with their control points, oldest first, and which is the current one."""
+        current = self._table.current()
+        name = None if current is None else current.id
+        return [setup | {"is_current": setup["id"] == name} for setup in self._table.all()]
 
     def usable(self, wanted: object) -> str:
-        """The set-up that is asked for, or the newest: where the station stood before that one it stands no more.
+        """The set-up that is asked for, or the current one: where the station stood before that one it stands no more.
 
         Raises:
             CommandError: there is none, or it has moved.
         """
         if wanted is None:
-            newest = self._table.newest()
-            if newest is None:
+            current = self._table.current()
+            if current is None:
                 raise CommandError("there is no station set-up; describe one with `rigcal setup new`")
-            if newest.state != "ok":
+            if current.state != "ok":
                 raise CommandError(
-                    f"set-up {newest.id!r}, the newest, has {newest.state}; describe a new one (`rigcal setup "
-                    "new`), or name one with --setup if the station stands there again",
+                    f"set-up {current.id!r}, where the station stood last, has {current.state}; describe a new one "
+                    "(`rigcal setup new`), or name one with --setup if the station stands there again",
                     REFUSED,
                 )
-            return newest.id
+            return current.id
         states = self._table.states()
         if not isinstance(wanted, str) or wanted not in states:
             raise CommandError(f"there is no set-up {wanted!r:.80}; known: {', '.join(states) or 'none'}")
@@ -101,9 +103,9 @@ class SetupBook:
         return self._table.states()[setup_id] != "ok"
 
     def current(self) -> str | None:
-        """The newest set-up; None where there is none, and where it has moved."""
-        newest = self._table.newest()
-        return newest.id if newest is not None and newest.state == "ok" else None
+        """The set-up that the station stands in; None where there is none, and where it has moved."""
+        current = self._table.current()
+        return current.id if current is not None and current.state == "ok" else None
 
     def store_shot(
         self,

@@ -27,7 +27,7 @@ def fill(directory: Path) -> None:
         run = rig.models.live_run()
         assert live is not None
         assert run is not None
-        setups = SetupTable(rig.store)
+        setups = SetupTable(rig.store, "swdt82")
         setups.put_control_point("S1", "cp1", {"x_mm": 1.0, "y_mm": 2.0, "z_mm": 3.0})
         for number in range(6):
             rig.clock.advance(9 * DAY_S)

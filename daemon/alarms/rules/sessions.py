@@ -13,9 +13,10 @@ LONG_S = 86_400.0
 
 @rule("warning", "Describe where the station stands now with `rigcal setup new`, and hold a new session.")
 def setup_moved(evidence: Evidence) -> Iterator[Finding]:
-    """The newest station set-up has moved: a control point is not where it was.
+    """The set-up that the station stands in has moved: a control point is not where it was.
 
-    Critical while a session is open. Cleared when a new set-up is described.
+    It is that of the open session or guide, else the one that was described, or used for a session, last. Critical
+    while a session is open. Cleared when no session is open there and another set-up is described or used.
     """
     if evidence.setup is not None and evidence.setup.state == "moved":
         text = "the station has moved: its control points no longer fit"

@@ -28,7 +28,7 @@ def session() -> None:
 @session.command(cls=Command, name="start")
 @click.option("--prism", required=True, help="The prism that the station follows.")
 @click.option("--kind", type=click.Choice(SESSION_KINDS), default="static_poses", show_default=True)
-@click.option("--setup", help="Station set-up; the newest when not given.")
+@click.option("--setup", help="Station set-up; the one described or used last when not given.")
 @operator_option
 @click.option("--id", help="Name of the session.")
 @click.option("--note", default="")
@@ -163,7 +163,7 @@ def session_export(name: str, config: Path, out: Path, form: Any, *, as_json: bo
 
 
 @session.command(cls=Command, name="guide")
-@click.option("--setup", help="Station set-up that exists; the newest when not given.")
+@click.option("--setup", help="Station set-up that exists; the one described or used last when not given.")
 @click.option("--new-setup", metavar="NAME", help="Describe a new set-up of that name instead.")
 @click.option("--instrument", help="Of the new set-up.")
 @click.option("--tilt-arcsec", type=float, help="Of the new set-up.")

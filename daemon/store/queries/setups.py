@@ -15,10 +15,19 @@ _OF_SESSIONS = """SELECT id, instrument, state FROM station_setups
 _MISCLOSURES = """SELECT s.name, s.phase, s.x_mm - p.x_mm AS x, s.y_mm - p.y_mm AS y, s.z_mm - p.z_mm AS z
     FROM control_shots AS s JOIN control_points AS p ON p.setup_id = s.setup_id AND p.name = s.name
     WHERE s.setup_id = ? AND s.session_id IN ({}) ORDER BY s.id"""
-# The newest shot of each control point of the newest set-up: with max(), SQLite takes the other columns from its row.
+# What names a set-up: its description, a guide, a session. That which is open counts before what came after it.
+_CURRENT = """WITH named AS (
+        SELECT * FROM (SELECT id AS setup_id, 0 AS is_open, created_boot_id AS boot, created_monotonic_ns AS at
+            FROM station_setups ORDER BY rowid DESC LIMIT 1)
+        UNION ALL SELECT * FROM (SELECT setup_id, state = 'open', started_boot_id, started_monotonic_ns
+            FROM guides WHERE rig = ?1 ORDER BY id DESC LIMIT 1)
+        UNION ALL SELECT * FROM (SELECT setup_id, state = 'open', started_boot_id, started_monotonic_ns
+            FROM calibration_sessions WHERE rig = ?1 ORDER BY rowid DESC LIMIT 1))
+    SELECT id, state FROM named JOIN station_setups ON id = setup_id
+    ORDER BY is_open DESC, boot DESC, at DESC LIMIT 1"""
+# The newest shot of each control point of a set-up: with max(), SQLite takes the other columns from its row.
 _NEWEST_SHOTS = """SELECT max(id) AS id, setup_id AS setup, name AS point, session_id AS session, phase, utc_ns,
-        misclosure_mm FROM control_shots
-    WHERE setup_id = (SELECT id FROM station_setups ORDER BY rowid DESC LIMIT 1) GROUP BY name ORDER BY name"""
+        misclosure_mm FROM control_shots WHERE setup_id = ? GROUP BY name ORDER BY name"""
 _POINTS = "SELECT name, x_mm, y_mm, z_mm FROM control_points WHERE setup_id = ? ORDER BY rowid"
 
 
@@ -40,10 +49,11 @@ class SetupTable:
 
     Args:
         store: the database.
+        rig_name: whose sessions and guides tell where the station stands.
     """
 
-    def __init__(self, store: Connection) -> None:
-        self._store = store
+    def __init__(self, store: Connection, rig_name: str) -> None:
+        self._store, self._rig = store, rig_name
 
     def all(self) -> list[dict[str, Any]]:
         """All set-ups with their control points, oldest first."""
@@ -57,9 +67,12 @@ class SetupTable:
         rows = self._store.rows("SELECT id, state FROM station_setups ORDER BY rowid")
         return {row["id"]: row["state"] for row in rows}
 
-    def newest(self) -> SetupRow | None:
-        """The newest set-up; None before the first."""
-        found = self._store.rows("SELECT id, state FROM station_setups ORDER BY rowid DESC LIMIT 1")
+    def current(self) -> SetupRow | None:
+        """The set-up that the station stands in; None before the first.
+
+        That of the open session or guide, else the one that was described, or used for a session, last.
+        """
+        found = self._store.rows(_CURRENT, (self._rig,))
         return SetupRow(**found[0]) if found else None
 
     def point_shots(self, setup_id: str, name: str) -> list[dict[str, Any]]:
@@ -67,9 +80,10 @@ class SetupTable:
         sql = "SELECT session_id, phase, misclosure_mm FROM control_shots WHERE setup_id = ? AND name = ?"
         return self._store.rows(sql, (setup_id, name))
 
-    def newest_shots(self) -> list[dict[str, Any]]:
-        """The newest shot of each control point of the newest set-up: setup, point, session, phase, misclosure_mm."""
-        return self._store.rows(_NEWEST_SHOTS)
+    def current_shots(self) -> list[dict[str, Any]]:
+        """The newest shot of each control point of the current set-up: setup, point, session, phase, misclosure_mm."""
+        current = self.current()
+        return [] if current is None else self._store.rows(_NEWEST_SHOTS, (current.id,))
 
     def add(self, created: Stamp, **columns: object) -> None:
         """Add a set-up."""

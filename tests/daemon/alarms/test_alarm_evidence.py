@@ -32,7 +32,7 @@ def parts(rig: ModelRig) -> dict[str, Callable[[], object]]:
     sessions, jobs = SessionTable(rig.store, "swdt82"), JobTable(rig.store, "swdt82")
     return {
         "session": sessions.open_session,
-        "setup": SetupTable(rig.store).newest,
+        "setup": SetupTable(rig.store, "swdt82").current,
         "failed_jobs": jobs.failed,
         "model": rig.live.health,
         "untrained_sessions": sessions.untrained,
@@ -82,7 +82,7 @@ def test_an_open_session_is_told_with_its_age_and_the_joints_that_jumped_in_it(r
     assert gather().session is None
 
 
-def test_the_newest_set_up_is_told_and_whether_it_has_moved(rig: ModelRig, gather: Gatherer) -> None:
+def test_the_set_up_is_told_and_whether_it_has_moved(rig: ModelRig, gather: Gatherer) -> None:
     assert gather().setup is None
     created = rig.store.instant(rig.clock.now(), "created_")
     for name, state in (("S1", "ok"), ("S2", "moved")):

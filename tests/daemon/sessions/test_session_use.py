@@ -69,8 +69,8 @@ def test_a_station_that_moved_is_not_taken_for_where_it_stood_before(session_rig
         session_rig.say("start", prism="r")
     assert caught.value.status == 3
     assert str(caught.value) == (
-        "set-up 'S2', the newest, has moved; describe a new one (`rigcal setup new`), or name one with --setup if the "
-        "station stands there again"
+        "set-up 'S2', where the station stood last, has moved; describe a new one (`rigcal setup new`), or name one "
+        "with --setup if the station stands there again"
     )
     assert session_rig.setups.current() is None, "nor does the live tip"
     assert session_rig.say("start", prism="r", setup="S1")["setup"] == "S1"

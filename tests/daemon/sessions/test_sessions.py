@@ -288,7 +288,7 @@ def test_a_setup_that_moved_is_flagged_and_refused_from_then_on(rig: Rig) -> Non
     with pytest.raises(CommandError, match="set-up 'S1' has moved") as caught:
         rig.say("start", prism="r", setup="S1")
     assert caught.value.status == 3
-    with pytest.raises(CommandError, match="set-up 'S1', the newest, has moved; describe a new one"):
+    with pytest.raises(CommandError, match="set-up 'S1', where the station stood last, has moved; describe a new one"):
         rig.say("start", prism="r")
 
 

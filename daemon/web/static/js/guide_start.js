@@ -21,16 +21,16 @@ export function startForm(app, now) {
 }
 
 function form(app, setups, shape) {
-  const newest = setups.at(-1);
-  const stands = newest?.state === "ok";
+  const current = setups.find((setup) => setup.is_current);
+  const stands = current?.state === "ok";
   const taken = new Set(setups.map((setup) => setup.id));
   let free = setups.length + 1;
   while (taken.has(`S${free}`)) free++;
   const radio = (value, checked) => h("input", { type: "radio", name: "setup", value, checked });
   const field = (id, attributes) => h("input", { id, autocomplete: "off", ...attributes });
   const name = field("setup-name", { value: `S${free}`, maxlength: "64", pattern: "[A-Za-z0-9][A-Za-z0-9._\\-]*" });
-  const instrument = field("instrument", { value: newest?.instrument ?? "", maxlength: "200" });
-  const points = field("points", { value: newest?.control_points.map((point) => point.name).join(", ") || "cp1", required: true });
+  const instrument = field("instrument", { value: current?.instrument ?? "", maxlength: "200" });
+  const points = field("points", { value: current?.control_points.map((point) => point.name).join(", ") || "cp1", required: true });
   const target = field("target", { type: "number", min: "0.01", step: "any", inputmode: "decimal" });
   const prisms = Object.keys(shape.chains).map((prism) => h("label", { class: "choice" }, h("input", { type: "checkbox", name: "prism", value: prism, checked: true }), `Prism ${prism}`));
   const fault = h("p", { class: "fault", role: "alert" });
@@ -38,8 +38,8 @@ function form(app, setups, shape) {
   anew.hidden = stands;
   const choose = (event) => { anew.hidden = event.target.value !== "new"; };
   const where = h("fieldset", { onchange: choose }, h("legend", null, "Where does the station stand?"),
-    stands ? h("label", { class: "choice" }, radio("same", true), `As before: set-up ${newest.id}`) : null,
-    h("label", { class: "choice" }, radio("new", !stands), newest ? "It was moved or set up anew" : "It was set up just now"), anew);
+    stands ? h("label", { class: "choice" }, radio("same", true), `As before: set-up ${current.id}`) : null,
+    h("label", { class: "choice" }, radio("new", !stands), current ? "It was moved or set up anew" : "It was set up just now"), anew);
 
   async function start(event) {
     event.preventDefault();
@@ -48,7 +48,7 @@ function form(app, setups, shape) {
     if (!args.prisms.length) { fault.textContent = "Choose one prism or more."; return; }
     if (target.value) args.target_mm = Number(target.value);
     if (data.get("setup") === "new") args.new_setup = { id: name.value.trim(), instrument: instrument.value.trim() };
-    else args.setup = newest.id;
+    else args.setup = current.id;
     const button = event.submitter;
     button.disabled = true;
     try { await command("guide.start", args); } catch (error) { fault.textContent = error.message; }
