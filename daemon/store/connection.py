@@ -59,6 +59,7 @@ class Connection:
             raise StoreError(f"SQLite {sqlite3.sqlite_version} is too old; rigcal needs {wanted} or newer")
         self._turn = threading.RLock()
         self._transactions = threading.local()  # how many of this thread are open, one in the other
+        self._afterwards: list[Callable[[], object]] = []  # of the transaction that is open
         self._reading = threading.Lock()
         self._lock = WriterLock(path)
         try:
@@ -137,17 +138,35 @@ class Connection:
         Nested transactions are savepoints of the outermost one. Other threads wait for their turn.
         """
         with self._turn:
-            depth = self._depth
+            depth, due = self._depth, len(self._afterwards)
             self._transactions.depth = depth + 1
             try:
                 with self._db.atomic() as db:
                     yield db
             except BaseException as error:
+                del self._afterwards[due:]
                 self.note_damage(error)
                 self._forget_rows()
                 raise
             finally:
                 self._transactions.depth = depth
+            if not depth:
+                afterwards, self._afterwards = self._afterwards, []
+                for work in afterwards:
+                    work()
+
+    def once_committed(self, work: Callable[[], object]) -> None:
+        """Do `work` when all transactions that this thread is in are committed, and never if one is rolled back.
+
+        What is in memory thus changes after the store, and before another thread can store anything.
+
+        Args:
+            work: it must be quick, as other threads wait. Outside a transaction it is done at once.
+        """
+        if self._depth:
+            self._afterwards.append(work)
+        else:
+            work()
 
     @property
     def _depth(self) -> int:
