@@ -35,6 +35,7 @@ from daemon.sessions.prism_watch import PrismWatch, as_dict
 from daemon.sessions.prisms.guard import MotionLimit, Suspicion
 from daemon.sessions.station_setups import AXES, SetupBook
 from daemon.sessions.without_job import why_no_job
+from daemon.store.errors import is_unwritable
 from daemon.store.queries.jobs import JobTable
 from daemon.store.queries.observations import ObservationTable
 from daemon.store.store import Store
@@ -64,6 +65,9 @@ class SessionKeeper:
         limits: station -> what motion can do to its prism.
         are_jobs_enabled: closed sessions start jobs.
         clock_state: returns how the computer's clock is, to be noted with a session; None where it is another clock.
+
+    Attributes:
+        turn: held while a command is carried out; whoever gives several within a transaction takes it before that.
     """
 
     def __init__(
@@ -89,7 +93,7 @@ class SessionKeeper:
         self._table, self._observations = self._lifecycle.table, ObservationTable(store)
         self._jobs = JobTable(store, rig.name)
         self._aim = aim
-        self._commands = threading.Lock()
+        self.turn = threading.RLock()
         self._shot: Shot | None = None
         self._pending = PendingWrites(store)
         self._prisms = PrismWatch(store, rig, clock, limits or {}, self._pending.add_event)
@@ -155,7 +159,7 @@ class SessionKeeper:
 
     def start_command(self, arguments: Mapping[str, Any], *, is_aimed: bool = True) -> dict[str, Any]:
         """Open a session: from now on good fixes become its observations; from `look_back` on where not `is_aimed`."""
-        with self._commands:
+        with self.turn:
             if self._open is not None:
                 raise CommandError(f"session {self._open.id!r} is open; stop or abort it first")
             prism, kind = str(arguments.get("prism", "")), str(arguments.get("kind", "static_poses"))
@@ -186,12 +190,13 @@ class SessionKeeper:
             order = self._store.order
             session = OpenSession(session_id, setup_id, prism, kind, order, now, control_points=points)
             self._prisms.begin(session)
-            self._lifecycle.start(now, session_id, self._rig_text, **row)
             if not is_aimed:
                 session.shots.append(Shot(0, now))
+            with self._store.transaction():
+                self._lifecycle.start(now, session_id, self._rig_text, **row)
+                if self._aim is not None:
+                    self._prisms.turned(session, now)
             self._open = session
-            if self._aim is not None:
-                self._prisms.turned(session, now)
             return {
                 "id": session_id,
                 "setup": setup_id,
@@ -202,18 +207,18 @@ class SessionKeeper:
 
     def stop_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Close the open session; its jobs follow by themselves."""
-        with self._commands:
+        with self.turn:
             session = self._close("closed")
             return self._table.summary(session.id) | {"advice": self._advice.at_end(session)}
 
     def abort_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Close the open session as unusable: kept, never calibrated with."""
-        with self._commands:
+        with self.turn:
             return self._table.summary(self._close("aborted").id)
 
     def accept_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Let calibration use a closed session although nothing shows that the station stood still."""
-        with self._commands:
+        with self.turn:
             session_id, operator = str(arguments.get("id", "")), text_argument(arguments, "operator")
             despite = self._lifecycle.accept(session_id, operator)
             log.warning("session %s is used, by the word of %s: %s", session_id, operator or "an operator", despite)
@@ -224,7 +229,7 @@ class SessionKeeper:
 
         What lies further than `most_off_mm` from the known place is something else, and refused.
         """
-        with self._commands:
+        with self.turn:
             session = self._needs_open()
             name = identifier(arguments, "point", "a control point's name")
             if name in self._rig.prism_names:
@@ -237,34 +242,23 @@ class SessionKeeper:
                 shot.aimed = self._clock.now()
                 self._shot = shot
                 shot.wait(self._clock, self._settings.shot_timeout_s)
-                phase = self._table.phase(session.id, name)
-                result = self._setups.store_shot(
-                    session.setup_id, session.id, name, phase, shot.fixes, shot.places_mm, most_off_mm=most_off_mm
-                )
-                # Before the shot is over: fixes that come late are of the point, and known to be, and so are those
-                # that came before anything told where it is.
-                session.control_points = self._setups.control_points(session.setup_id)
-                if result["misclosure_mm"] is None:  # nothing told before
-                    self._observations.exclude_near(
-                        session.id, [result[axis] for axis in AXES], CONTROL_POINT_RADIUS_MM
-                    )
+                result = self._keep_shot(session, name, shot, most_off_mm)
             finally:
                 self._shot = None
                 if self._aim is not None:
                     self._aim(session.prism)
                 shot.until = self._clock.now()
-                if self._aim is not None:
-                    self._prisms.turned(session, shot.until)
+                self._note_turned(session, shot.until)
             return result | {"advice": after_a_move(session.id) if result["moved"] else []}
 
     def confirm_prism_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Take the operator's word that the station is on the session's prism: its fixes count from now on."""
-        with self._commands:
+        with self.turn:
             return self._prisms.confirm(self._needs_open(), text_argument(arguments, "operator"))
 
     def turned_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
         """In a replay: the station was turned to the session's prism at this instant."""
-        with self._commands:
+        with self.turn:
             session = self._needs_open()
             self._prisms.turned(session, self._clock.now())
             return {"session": session.id}
@@ -299,7 +293,7 @@ class SessionKeeper:
         session = self._open
         if self._aim is None or session is None or not self._prisms.suspicions(session):
             return
-        if self._commands.acquire(blocking=False):  # else a command is at work on the session: another time
+        if self.turn.acquire(blocking=False):  # else a command is at work on the session: another time
             try:
                 if session is self._open:
                     self._aim(session.prism)
@@ -307,7 +301,7 @@ class SessionKeeper:
             except (CommandError, sqlite3.Error) as error:  # another time: the station, or the disk, is not well
                 log.warning("station not aimed at prism %s again: %s", session.prism, error)
             finally:
-                self._commands.release()
+                self.turn.release()
 
     # ---- for a guide -------------------------------------------------------------------------------------------------
 
@@ -325,9 +319,9 @@ class SessionKeeper:
     def look_back(self, operator: str) -> None:
         """Count the fixes of the open session again, on an operator's word that the station is on its prism."""
         session = self._needs_open()
-        self._prisms.confirm(session, operator)
-        for shot in session.shots:
-            shot.until = shot.until or self._clock.now()
+        with self._store.transaction():
+            self._prisms.confirm(session, operator)
+            self._store.once_committed(partial(session.end_shots, self._clock.now()))
 
     def prism_suspicions(self) -> list[Suspicion]:
         """Stations that may be on another prism than that of the open session; from any thread."""
@@ -348,13 +342,45 @@ class SessionKeeper:
 
     # ---- parts -------------------------------------------------------------------------------------------------------
 
+    def _keep_shot(self, session: OpenSession, name: str, shot: Shot, most_off_mm: float) -> dict[str, Any]:
+        """Store a shot before it is over, and what it tells of fixes that came before anything told where its point is.
+
+        Fixes that come late are of the point, and known to be.
+        """
+        with self._store.transaction():
+            phase = self._table.phase(session.id, name)
+            result = self._setups.store_shot(
+                session.setup_id, session.id, name, phase, shot.fixes, shot.places_mm, most_off_mm=most_off_mm
+            )
+            if result["misclosure_mm"] is None:  # nothing told before
+                self._observations.exclude_near(session.id, [result[axis] for axis in AXES], CONTROL_POINT_RADIUS_MM)
+            points = self._setups.control_points(session.setup_id)
+            self._store.once_committed(partial(session.know, points))
+        return result
+
+    def _note_turned(self, session: OpenSession, at: Stamp) -> None:
+        """Note that the station was turned to the prism, where something can: it was, also if that cannot be stored."""
+        if self._aim is None:
+            return
+        try:
+            self._prisms.turned(session, at)
+        except sqlite3.Error as error:
+            if not is_unwritable(error):
+                raise
+            log.warning("it cannot be stored that the station was turned to prism %s: %s", session.prism, error)
+
     def _close(self, state: str) -> OpenSession:
         """End the open session, in the store and then here; what the store refuses leaves it open in both."""
         session = self._needs_open()
-        session.until = self._lifecycle.end(session.id, state)
+        with self._store.transaction():
+            until = self._lifecycle.end(session.id, state)
+            self._store.once_committed(partial(self._has_ended, session, until))
+        return session
+
+    def _has_ended(self, session: OpenSession, until: Stamp) -> None:
+        session.until = until
         self._ended.append(session)
         self._open = None
-        return session
 
     def _needs_open(self) -> OpenSession:
         if self._open is None:

@@ -58,6 +58,15 @@ class OpenSession:
         """Return the number of times that an operator had confirmed its prism by then."""
         return sum(not word.is_turning and self.order(word.at) <= self.order(stamp) for word in self.words)
 
+    def know(self, control_points: list[Place]) -> None:
+        """Take where the control points of its set-up are."""
+        self.control_points = control_points
+
+    def end_shots(self, at: Stamp) -> None:
+        """Take the station to be on its prism from then on."""
+        for shot in self.shots:
+            shot.until = shot.until or at
+
     def is_control_point(self, place_mm: Place) -> bool:
         """Return True if a control point of its set-up is there."""
         return any(math.dist(place_mm, point) < CONTROL_POINT_RADIUS_MM for point in self.control_points)

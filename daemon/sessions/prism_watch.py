@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from calibration.rig.description import Rig
@@ -172,7 +173,7 @@ class PrismWatch:
         with self._store.transaction():
             self._table.add_confirmation(session.id, at, operator=operator, turning=False, **caller_columns())
             self._store.insert_records(events)
-        session.words.append(Word(at))
+            self._store.once_committed(partial(session.words.append, Word(at)))
         log.info("session %s: %s", session.id, text)
         advice = [
             f"what {suspicion.station} measured before it jumped by {suspicion.distance_m:.2f} m counts too: if it was "
@@ -190,7 +191,7 @@ class PrismWatch:
     def turned(self, session: OpenSession, at: Stamp) -> None:
         """The station was turned to the session's prism by something that knows where that is."""
         self._table.add_confirmation(session.id, at, turning=True)
-        session.words.append(Word(at, is_turning=True))
+        self._store.once_committed(partial(session.words.append, Word(at, is_turning=True)))
 
     def restore(self, session: OpenSession) -> None:
         """Restore the knowledge of an earlier run of the daemon from the store; the next fix is a new lock.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from statistics import fmean
 from typing import Any
 
@@ -163,8 +164,8 @@ class SetupBook:
             )
             if moved:
                 self._table.mark_moved(setup_id)
-        if moved:
-            log.warning("set-up %s moved: control point %s is %.1f mm off", setup_id, name, distance_mm)
+                told = "set-up %s moved: control point %s is %.1f mm off", setup_id, name, distance_mm
+                self._store.once_committed(partial(log.warning, *told))
         return {
             "point": name,
             "phase": phase,

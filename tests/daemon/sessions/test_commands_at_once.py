@@ -1,0 +1,97 @@
+"""A session's command that stores several things stores all of them or none, whatever the disk refuses."""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+import threading
+from typing import Any
+
+import pytest
+
+from daemon.store.queries.observations import OF_CONTROL_POINT
+from tests.daemon.damage import fill_up, make_room
+from tests.daemon.session_support import STEP_S, Rig
+from tests.daemon.store_support import table
+
+POINT_MM = (9000.0, 500.0, 2000.0)
+
+
+def shoot_without_storing_fixes(rig: Rig) -> dict[str, Any] | sqlite3.Error:
+    """Shoot the control point while its fixes are told and not stored, as the disk may be full; what comes of it."""
+    answers: list[dict[str, Any] | sqlite3.Error] = []
+
+    def ask() -> None:
+        try:
+            answers.append(rig.say("shoot", point="cp1"))
+        except sqlite3.Error as error:
+            answers.append(error)
+
+    asking = threading.Thread(target=ask)
+    asking.start()
+    while asking.is_alive():
+        rig.clock.advance(STEP_S)
+        rig.keeper.on_records([rig.fix()])
+    asking.join()
+    return answers[0]
+
+
+def leave_no_room_for_a_word(rig: Rig, session_id: str) -> None:
+    """Fill the disk, and then the page in which the newest word stands that a station is on its session's prism."""
+    fill_up(rig.store)
+    word = {"session_id": session_id, "turning": True, **rig.store.instant(rig.clock.now())}
+    with contextlib.suppress(sqlite3.OperationalError):
+        while True:
+            rig.store.insert("prism_confirmations", word)
+
+
+def test_a_shot_is_not_kept_where_the_fixes_before_it_cannot_be_told_from_those_of_the_prism(session_rig: Rig) -> None:
+    session_rig.target_mm = POINT_MM
+    session_rig.say("start", prism="r")
+    session_rig.live(5)
+    fill_up(session_rig.store)
+    assert "database or disk is full" in str(shoot_without_storing_fixes(session_rig))
+    make_room(session_rig.store)
+    for name in ("control_points", "control_shots"):
+        assert table(session_rig.store.path, name) == [], name
+    session_rig.live(1)
+    reasons = {row["excluded"] for row in table(session_rig.store.path, "observations")}
+    assert OF_CONTROL_POINT not in reasons, "nothing has told yet that one is there"
+    assert session_rig.shoot("cp1", POINT_MM)["misclosure_mm"] is None, "it is the first shot"
+    assert all(row["excluded"] for row in table(session_rig.store.path, "observations"))
+    assert session_rig.say("show", id="s001-r")["excluded"][OF_CONTROL_POINT] > 80
+
+
+def test_a_session_is_not_open_where_it_cannot_be_stored_that_its_station_was_turned(session_rig: Rig) -> None:
+    session_rig.keeper = session_rig.new_keeper(session_rig.aimed.append)
+    name = session_rig.say("start", prism="r")["id"]
+    session_rig.say("abort")
+    leave_no_room_for_a_word(session_rig, name)
+    with pytest.raises(sqlite3.OperationalError, match="database or disk is full"):
+        session_rig.say("start", prism="b")
+    assert session_rig.keeper.open_session() is None
+    assert [row["id"] for row in table(session_rig.store.path, "calibration_sessions")] == [name]
+    make_room(session_rig.store)
+    assert session_rig.say("start", prism="b")["id"] == "s002-b"
+
+
+def test_a_shot_is_answered_where_it_cannot_be_stored_that_the_station_was_turned_back(
+    session_rig: Rig, caplog: pytest.LogCaptureFixture
+) -> None:
+    def aim(target: str) -> None:
+        session_rig.aimed.append(target)
+        if session_rig.aimed == ["r", "cp1", "r"]:
+            leave_no_room_for_a_word(session_rig, "s001-r")
+
+    session_rig.keeper = session_rig.new_keeper(aim)
+    session_rig.say("start", prism="r")
+    prism_mm, session_rig.target_mm = session_rig.target_mm, POINT_MM
+    answer = shoot_without_storing_fixes(session_rig)
+    assert isinstance(answer, dict)
+    assert answer["point"] == "cp1"
+    assert "cannot be stored that the station was turned to prism r" in caplog.text
+    assert len(table(session_rig.store.path, "control_shots")) == 1
+    make_room(session_rig.store)
+    session_rig.target_mm = prism_mm
+    session_rig.live(2)
+    assert session_rig.say("show", id="s001-r")["observations"] > 10, "its fixes are its observations again"
