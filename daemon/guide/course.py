@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -15,7 +16,7 @@ from calibration.rig.description import Rig
 from daemon.acquisition.joiner import ObservationJoiner
 from daemon.commands import CHECK, Caller, acting_for, current_caller
 from daemon.guide.advisor import Advisor
-from daemon.guide.job import Job, Pose, Request
+from daemon.guide.job import Job, Pose
 from daemon.guide.meter_link import Place
 from daemon.guide.position import PositionWatch
 from daemon.guide.record import GuideRecord, is_on_prism
@@ -67,9 +68,14 @@ class Course:
         self.is_choosing = False
         self._try_again = 0.0  # real monotonic seconds
 
-    def begin(self, request: Request, setup_id: str, operator: str) -> None:
-        """Open a guide."""
-        self.record.open(request, setup_id, operator)
+    @contextmanager
+    def at_once(self) -> Iterator[None]:
+        """All that the block changes of guide, sessions and set-ups is stored together, or nothing of it happens."""
+        with self.record.turn, self._sessions.turn, self._store.transaction():
+            yield
+
+    def begin(self) -> None:
+        """Begin to look: a guide was opened."""
         self.standstill, self._try_again = None, 0.0
         self.watch.begin()
         self.advisor.forget()
@@ -110,26 +116,27 @@ class Course:
     # ---- events ------------------------------------------------------------------------------------------------------
 
     def happen(self, kind: str, details: Mapping[str, Any], *, only_at: str = "") -> bool:
-        """Store an event and go on; False where another step than `only_at` is on by now."""
+        """Store an event and go on once it is committed; False where another step than `only_at` is on by now."""
         with self.record.turn:
             changed = self.record.happen(kind, details, only_at)
             if changed is not None:
-                self._followed(*changed)
+                self._store.once_committed(partial(self._followed, *changed))
             return changed is not None
 
     def abandon(self, reason: str) -> None:
         """Close the open session if it has poses, else abort it, and end the guide."""
-        opened = self._sessions.open_session()
-        if opened is not None and opened["poses"]:
-            self._sessions.stop_command({})
-        elif opened is not None:
-            self._sessions.abort_command({})
-        self.happen("stopped", {"reason": reason})
+        with self.at_once():
+            opened = self._sessions.open_session()
+            if opened is not None and opened["poses"]:
+                self._sessions.stop_command({})
+            elif opened is not None:
+                self._sessions.abort_command({})
+            self.happen("stopped", {"reason": reason})
 
     def aimed(self) -> None:
         """Count fixes from now on: the station is on the prism."""
-        with self.record.turn:
-            self.watch.forget_fixes()
+        with self.at_once():
+            self._store.once_committed(self.watch.forget_fixes)
             self._sessions.look_back(self.record.row.operator if self.record.row else "")
             self.happen("aimed", {})
 

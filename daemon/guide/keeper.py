@@ -120,14 +120,16 @@ class GuideKeeper:
             operator = text_argument(arguments, "operator")
             if described and arguments.get("setup") is not None:
                 raise CommandError("give a set-up that exists or describe a new one, not both")
-            if described:
-                request = request_of(arguments, self._rig, list(mapping_argument(described, "control_points")))
-                setup_id = str(self._setups.new_command(described)["id"])
-            else:
-                setup_id = self._setups.usable(arguments.get("setup"))
-                request = request_of(arguments, self._rig, self._setups.control_point_names(setup_id))
+            with self._course.at_once():
+                if described:
+                    request = request_of(arguments, self._rig, list(mapping_argument(described, "control_points")))
+                    setup_id = str(self._setups.new_command(described)["id"])
+                else:
+                    setup_id = self._setups.usable(arguments.get("setup"))
+                    request = request_of(arguments, self._rig, self._setups.control_point_names(setup_id))
+                self._record.open(request, setup_id, operator)
             self._worker.wanted = ""
-            self._course.begin(request, setup_id, operator)
+            self._course.begin()
             return self._state()
 
     def state_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -142,17 +144,18 @@ class GuideKeeper:
             assert step is not None
             if self._worker.busy == step_id or not run.session:
                 raise CommandError(f"the daemon is at work on it: {headline(job)}", REFUSED)
+            with self._course.at_once():
+                self._record.tapped()
+                if step.kind == "change_prism":
+                    self._course.aimed()
+                elif step.kind == "poses" and job.is_enough:
+                    self._course.happen("left", {})
+                elif step.kind == "poses" and run.next_pose is not None:
+                    self._measured_here()
+                elif step.kind != "shoot_control_point":
+                    raise CommandError(f"this step ends by itself: {headline(job)}", REFUSED)
             if step.kind == "shoot_control_point":
                 self._worker.wanted = step_id  # measured by the guide's own thread: the state shows how it goes
-            elif step.kind == "change_prism":
-                self._course.aimed()
-            elif step.kind == "poses" and job.is_enough:
-                self._course.happen("left", {})
-            elif step.kind == "poses" and run.next_pose is not None:
-                self._measured_here()
-            else:
-                raise CommandError(f"this step ends by itself: {headline(job)}", REFUSED)
-            self._record.tapped()
             return self._state()
 
     def skip_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -168,10 +171,11 @@ class GuideKeeper:
             assert step is not None
             if step.kind == "close" or (rest and step.kind != "poses"):
                 raise CommandError(f"this step cannot be skipped: {headline(job)}", REFUSED)
-            self._record.tapped()
-            if step.kind == "change_prism" and self._sessions.open_session() is not None:
-                self._sessions.abort_command({})
-            self._course.happen("skipped", {"reason": reason, "rest": rest})
+            with self._course.at_once():
+                self._record.tapped()
+                if step.kind == "change_prism" and self._sessions.open_session() is not None:
+                    self._sessions.abort_command({})
+                self._course.happen("skipped", {"reason": reason, "rest": rest})
             return self._state()
 
     def more_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -184,12 +188,13 @@ class GuideKeeper:
                 raise CommandError(f"more poses are for when there are enough; now: {headline(job)}", REFUSED)
             if self._course.is_choosing:
                 raise CommandError("more poses are being chosen already", REFUSED)
-            self._record.tapped()
             left = len(run.upcoming(count))
+            with self._course.at_once():
+                self._record.tapped()
+                if left >= count:
+                    self._course.happen("more", {"poses": []})
             if left < count:
                 self._course.choose(count - left, as_more=True)
-            else:
-                self._course.happen("more", {"poses": []})
             return self._state()
 
     def stop_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -199,8 +204,9 @@ class GuideKeeper:
         self._worker.give_up()
         with self._record.turn:
             self._record.needs_step({})
-            self._record.tapped()
-            self._course.abandon(reason)
+            with self._course.at_once():
+                self._record.tapped()
+                self._course.abandon(reason)
             return self._state()
 
     def _measured_here(self) -> None:

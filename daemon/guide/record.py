@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Any
 
 from daemon.commands import REFUSED, CommandError, caller_columns
@@ -62,17 +63,25 @@ class GuideRecord:
 
     def open(self, request: Request, setup_id: str, operator: str) -> None:
         """Begin a guide."""
-        self.table.open(self._clock.now(), setup_id, operator, request.as_dict(), **caller_columns())
-        self.row, self.job, self.taps = self.table.newest(), Job.of(request), 1
+        with self._store.transaction():
+            self.table.open(self._clock.now(), setup_id, operator, request.as_dict(), **caller_columns())
+            self._store.once_committed(partial(self._take, self.table.newest(), Job.of(request)))
+            self._store.once_committed(partial(self._count, 1))
 
     def tapped(self) -> None:
-        """Count a command that was given to the guide."""
-        self.taps += 1
-        if self.row is not None:
-            self.table.count_taps(self.row.id, self.taps)
+        """Count a command that is given to the guide."""
+        taps = self.taps + 1
+        with self._store.transaction():
+            if self.row is not None:
+                self.table.count_taps(self.row.id, taps)
+            self._store.once_committed(partial(self._count, taps))
 
     def happen(self, kind: str, details: Mapping[str, Any], only_at: str = "") -> tuple[Job, Job] | None:
-        """Store an event; returns the states before and after, None where another step than `only_at` is on by now."""
+        """Store an event, which counts once it is committed.
+
+        Returns:
+            The states before and after; None where another step than `only_at` is on by now.
+        """
         row, before = self.row, self.job
         if row is None or before is None or before.state != "open" or only_at not in ("", before.step_id):
             return None
@@ -81,11 +90,16 @@ class GuideRecord:
             self.table.add(row.id, kind, details, at, **caller_columns())
             if job.state != "open":
                 self.table.end(row.id, job.state, at)
-        self.job = job
-        if job.state != "open":
-            log.info("guide %d is %s", row.id, job.state)
-            self.row = self.table.newest()
+            self._store.once_committed(partial(self._take, self.table.newest(), job))
         return before, job
+
+    def _take(self, row: GuideRow | None, job: Job) -> None:
+        self.row, self.job = row, job
+        if row is not None and job.state != "open":
+            log.info("guide %d is %s", row.id, job.state)
+
+    def _count(self, taps: int) -> None:
+        self.taps = taps
 
     def restore(self) -> None:
         """Read the guide that an earlier run of the daemon left."""

@@ -1,0 +1,138 @@
+"""A command to a guide is carried out as a whole or not at all, whatever the disk refuses of it."""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_inputs
+from daemon.guide.keeper import GuideKeeper
+from daemon.guide.meter_link import Place
+from tests.daemon.damage import fill_up, make_room
+from tests.daemon.session_support import SOURCE, Rig, closed_afterwards, disk_fails
+from tests.daemon.store_support import table
+
+POSE = {joint.column: sum(joint.limits) / 2 for joint in SOURCE.rig.joints}
+
+
+class GuidedRig(Rig):
+    """A rig with a guide whose own thread does not run: what it would do, the tests do."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.guide = self.new_guide()
+
+    def new_guide(self) -> GuideKeeper:
+        return GuideKeeper(
+            self.machine,
+            self.store,
+            self.keeper,
+            self.setups,
+            ObservationJoiner(joint_inputs(self.machine), signal_inputs(self.machine), settle_s=0.5),
+            self.clock,
+            meter_place=_no_meter,
+            model=dict,
+            settle_s=0.5,
+            has_aim=False,
+        )
+
+    def guided(self, command: str, **arguments: Any) -> dict[str, Any]:
+        return dict(getattr(self.guide, f"{command}_command")(arguments)["guide"])
+
+    def after_the_point(self) -> None:
+        """A guide that waits for the station to be aimed at prism r, its session being open."""
+        self.guided("start", new_setup={"id": "S1"}, prisms=["r", "s"], poses=6, check_poses=0)
+        opened = self.keeper.start_command({"prism": "r", "setup": "S1"}, is_aimed=False)
+        self.guide._course.happen("opened", {"session": opened["id"], "last": 0})
+        self.guided("skip", reason="fog")
+
+    def known(self) -> dict[str, Any]:
+        """What the guide shows, without what goes by the clock."""
+        shown = self.guide.state_command({})["guide"]
+        return {key: shown[key] for key in ("state", "step", "steps", "session", "taps")}
+
+    def restarted(self) -> dict[str, Any]:
+        """What a daemon that starts now makes of what is stored."""
+        self.keeper = self.new_keeper()
+        self.guide = self.new_guide()
+        return self.known()
+
+
+def _no_meter() -> Place:
+    raise OSError("none is needed")
+
+
+rig = closed_afterwards(GuidedRig)
+
+
+def test_a_guide_that_finds_the_disk_full_leaves_no_set_up_behind_and_starts_when_it_is_asked_again(
+    rig: GuidedRig,
+) -> None:
+    asked = {"new_setup": {"id": "S1"}, "prisms": ["r"], "plan": [POSE] * 100, "check_poses": 0}
+    fill_up(rig.store)
+    with pytest.raises(sqlite3.OperationalError, match="database or disk is full"):
+        rig.guided("start", **asked)
+    assert rig.setups.list_command({}) == []
+    assert rig.guide.state_command({}) == {"guide": None}
+    make_room(rig.store)
+    assert rig.guided("start", **asked)["state"] == "open"
+    assert [setup["id"] for setup in rig.setups.list_command({})] == ["S1"]
+
+
+@pytest.mark.parametrize("command", ["skip", "stop"])
+def test_a_session_that_a_command_ends_stays_open_where_the_guide_cannot_store_why(
+    rig: GuidedRig, command: str
+) -> None:
+    rig.after_the_point()
+    before = rig.known()
+    leave_no_room_for_an_event(rig)
+    with pytest.raises(sqlite3.OperationalError, match="database or disk is full"):
+        rig.guided(command, reason="fog")
+    opened = rig.keeper.open_session()
+    assert opened is not None
+    assert opened["state"] == "open"
+    assert rig.known() == before
+    make_room(rig.store)
+    assert rig.restarted() == before, "what is stored is what was known"
+    after = rig.guided(command, reason="fog")
+    assert after["taps"] == before["taps"] + 1
+    assert [session["state"] for session in rig.keeper.list_command({})] == ["aborted"]
+
+
+def test_the_word_that_the_station_is_aimed_counts_for_session_and_guide_or_for_none(rig: GuidedRig) -> None:
+    rig.after_the_point()
+    before = rig.known()
+    rig.live(1)
+    leave_no_room_for_an_event(rig)
+    with pytest.raises(sqlite3.OperationalError, match="database or disk is full"):
+        rig.guided("done")
+    make_room(rig.store)
+    rig.live(1)
+    assert table(rig.store.path, "prism_confirmations") == []
+    assert rig.keeper.open_session()["observations"] == 0, "the station is on no prism yet"  # type: ignore[index]
+    assert rig.known()["taps"] == before["taps"]
+    assert rig.guided("done")["step"]["kind"] != "change_prism"
+    rig.live(1)
+    assert rig.keeper.open_session()["observations"] > 10  # type: ignore[index]
+
+
+def test_a_command_that_the_disk_refuses_is_not_counted(rig: GuidedRig) -> None:
+    rig.after_the_point()
+    before = rig.known()
+    for command in ("skip", "stop", "done"):
+        with disk_fails(), pytest.raises(sqlite3.OperationalError):
+            rig.guided(command, reason="rain")
+    assert rig.known() == before
+    assert rig.restarted() == before
+
+
+def leave_no_room_for_an_event(rig: GuidedRig) -> None:
+    """Fill the disk, and then the page in which the newest event of the guide stands."""
+    fill_up(rig.store)
+    with contextlib.suppress(sqlite3.OperationalError):
+        while True:
+            rig.guide._course.happen("failed", {"text": ""})
