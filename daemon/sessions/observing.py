@@ -7,7 +7,9 @@ change as more fixes come.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+import sqlite3
+from collections.abc import Callable, Sequence
+from functools import partial
 
 from calibration.rig.description import Rig
 from daemon.acquisition.joiner import JoinedFix
@@ -25,6 +27,7 @@ from drivers.readings import DeviceEvent
 log = logging.getLogger(__name__)
 
 STANDING_KINDS = ("static_poses", CHECK)
+_LEFT_OUT = "what a session observed cannot be stored, and is left out"
 
 
 class PendingWrites:
@@ -48,27 +51,44 @@ class PendingWrites:
         self.add(lambda: self._store.insert_records([event]))
 
     def store(self) -> None:
-        """Make all changes, or none while the store can take none.
+        """Make all changes, or none while the store can take none; one that can never be made is told and left out.
 
         Raises:
-            Exception: what a change raised that can never be made; those that waited with it are given up.
+            sqlite3.DatabaseError: the store is damaged and can commit none; they are given up.
         """
         if not self._writes:
             return
         try:
             with self._store.transaction():
-                for write in self._writes:
+                self._make(self._writes)
+        except sqlite3.DatabaseError as error:
+            if not is_unwritable(error):
+                self._writes.clear()  # what can never be stored must not keep out all that follows
+                raise
+            if not self._is_waiting:
+                log.error("observations cannot be stored (%s); they wait and are tried again", error)
+            self._is_waiting = True
+            return
+        self._writes.clear()
+        self._is_waiting = False
+
+    def _make(self, writes: Sequence[Callable[[], object]]) -> None:
+        """Make changes; one that can never be made must not keep out the others."""
+        try:
+            with self._store.transaction():
+                for write in writes:
                     write()
         except Exception as error:
             if is_unwritable(error):
-                if not self._is_waiting:
-                    log.error("observations cannot be stored (%s); they wait and are tried again", error)
-                self._is_waiting = True
+                raise
+            if len(writes) == 1:
+                # Once it is: where the disk then refuses the others, this one is tried again with them.
+                self._store.once_committed(partial(log.error, _LEFT_OUT, exc_info=error))
                 return
-            self._writes.clear()  # one that can never be stored must not keep out all that follow
-            raise
-        self._writes.clear()
-        self._is_waiting = False
+        else:
+            return
+        for write in writes:
+            self._make([write])
 
 
 class ObservationMaker:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import contextlib
 import sqlite3
 import threading
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from daemon.store.queries.observations import OF_CONTROL_POINT
 from tests.daemon.damage import fill_up, make_room
-from tests.daemon.session_support import STEP_S, Rig
+from tests.daemon.session_support import STEP_S, Rig, disk_fails
 from tests.daemon.store_support import table
 
 POINT_MM = (9000.0, 500.0, 2000.0)
@@ -95,3 +96,29 @@ def test_a_shot_is_answered_where_it_cannot_be_stored_that_the_station_was_turne
     session_rig.target_mm = prism_mm
     session_rig.live(2)
     assert session_rig.say("show", id="s001-r")["observations"] > 10, "its fixes are its observations again"
+
+
+def test_an_observation_that_can_never_be_stored_takes_none_of_those_that_wait_with_it(
+    session_rig: Rig, caplog: pytest.LogCaptureFixture
+) -> None:
+    session_rig.say("start", prism="r")
+    session_rig.live(1)
+    session_rig.observing = disk_fails
+    session_rig.live(0.5)
+    with disk_fails():
+        tell_a_fix_of_the_far_future(session_rig)
+    session_rig.live(0.5)
+    session_rig.observing = contextlib.nullcontext
+    session_rig.live(1)
+    observed = [row["monotonic_ns"] for row in table(session_rig.store.path, "observations")]
+    measured = [row["monotonic_ns"] for row in table(session_rig.store.path, "fixes")]
+    assert observed == measured[: len(observed)]
+    assert len(observed) > 45
+    assert caplog.text.count("cannot be stored, and is left out") == 1
+
+
+def tell_a_fix_of_the_far_future(rig: Rig) -> None:
+    """Tell of a fix whose UTC no column can hold: acquisition could not store it either."""
+    rig.clock.advance(STEP_S / 2)
+    fix = rig.fix()
+    rig.keeper.on_records([replace(fix, stamp=replace(fix.stamp, utc_ns=2**63))])
