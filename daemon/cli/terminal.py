@@ -126,6 +126,11 @@ def echo_table(
         click.echo("  ".join(styled).rstrip(), color=_color())
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun, which takes an s where there are several."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def percent(share: float) -> str:
     """Return the share that is done of work that goes on; never 100 %."""
     return f"{min(share, _MOST_SHOWN):.0%}".replace("%", " %")

@@ -14,7 +14,7 @@ import click
 
 from daemon.cli.client import client_options, socket_of
 from daemon.cli.command import Command, Delivered
-from daemon.cli.terminal import echo
+from daemon.cli.terminal import counted, echo
 from daemon.commands import CommandError
 from daemon.control.protocol import request
 from daemon.host.safe_output import duration
@@ -53,7 +53,7 @@ def health(socket: Path | None, config: Path | None, as_json: bool) -> Delivered
     """
     status, findings = _look(socket, config)
     if not as_json:
-        summary = "all is well" if not findings else f"{len(findings)} finding{'s' if len(findings) > 1 else ''}"
+        summary = "all is well" if not findings else counted(len(findings), "finding")
         echo(f"{_WORDS[status]}: {summary}")
         for finding in findings:
             since = "" if finding["age_s"] is None else f" (for {duration(finding['age_s'])})"

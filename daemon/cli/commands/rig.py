@@ -9,7 +9,7 @@ import click
 
 from daemon.cli.command import Command, json_option
 from daemon.cli.offline import FILE
-from daemon.cli.terminal import echo, echo_error, echo_list, echo_table
+from daemon.cli.terminal import counted, echo, echo_error, echo_list, echo_table
 from daemon.commands import CommandError
 from daemon.host.safe_output import write_file
 from daemon.report.words import number
@@ -169,7 +169,8 @@ def _show(found: RigCheck) -> None:
     from daemon.report.drawing import forward_axis
 
     rig, seen = found.rig, found.seen
-    echo(f"{rig.name}: good: {len(rig.rows)} rows, {len(rig.joints)} joints, {len(rig.prisms)} prisms", bold=True)
+    parts = [counted(len(own), noun) for own, noun in ((rig.rows, "row"), (rig.joints, "joint"), (rig.prisms, "prism"))]
+    echo(f"{rig.name}: good: {', '.join(parts)}", bold=True)
     places = [(f"frame {n}", place) for n, place in enumerate(found.zero.frames_mm[0]) if n]
     places += [(f"prism {name}", place) for name, place in zip(rig.prism_names, found.zero.prisms_mm[0], strict=True)]
     radii = {f"frame {link.row}": link for link in found.links}

@@ -13,7 +13,7 @@ import click
 
 from daemon.cli.client import config_option, utc
 from daemon.cli.command import DONE, FAILED, Command, Delivered, json_option
-from daemon.cli.terminal import echo, echo_error
+from daemon.cli.terminal import counted, echo, echo_error
 
 if TYPE_CHECKING:
     from daemon.config import Config
@@ -43,8 +43,9 @@ def store_stats(config: Path, *, tables: bool, as_json: bool) -> dict[str, Any]:
         echo(f"used again; {_size(found['disk_free_bytes'])} are free on its disk")
         if found["oldest_utc_ns"] is not None:
             echo(f"captures from {utc(found['oldest_utc_ns'])} to {utc(found['newest_utc_ns'])}")
-        echo(f"{found['chunks']} chunks of captures, {found['small_chunks']} of them wait to be packed")
-        echo(f"{found['undecoded_chunks']} wait to be decoded; {found['sessions']} sessions, {found['boots']} boots")
+        echo(f"{counted(found['chunks'], 'chunk')} of captures, {found['small_chunks']} of them wait to be packed")
+        held = f"{counted(found['sessions'], 'session')}, {counted(found['boots'], 'boot')}"
+        echo(f"{found['undecoded_chunks']} wait to be decoded; {held}")
         for name, size in (found.get("tables") or {}).items():
             echo(f"  {name:32} {size / _MIB:12.2f} MiB")
     return found
