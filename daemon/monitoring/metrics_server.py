@@ -80,29 +80,40 @@ class MetricsServer:
 
     def trouble(self) -> str | None:
         """Return why nobody can read the metrics, a clause; None where all is well."""
-        return self._trouble
+        if self._served is None:
+            return self._trouble
+        server, thread = self._served
+        return server.trouble if thread.is_alive() else "the thread that serves the metrics has ended"
 
     def look(self) -> None:
         """Begin to serve where that has not succeeded yet; to be called now and then."""
         now_ns = self._clock.monotonic_ns()
         if self._served is not None or now_ns < self._next_ns:
             return
-        from daemon.monitoring.scrape_server import ScrapeServer
-
         try:
-            server = ScrapeServer(HOST, self._wanted, self._registry)
-        except OSError as error:
+            self._served = self._begun()
+        except (OSError, RuntimeError) as error:  # the system has no thread to give
             self._next_ns = now_ns + round(RETRY_S * NS_PER_S)
             was_told = self._trouble is not None
-            self._trouble = f"metrics cannot be served at {HOST}:{self._wanted}: {error.strerror}{network_hint(error)}"
+            reason = error.strerror if isinstance(error, OSError) else error
+            self._trouble = f"metrics cannot be served at {HOST}:{self._wanted}: {reason}{network_hint(error)}"
             if not was_told:
                 log.error("%s", self._trouble)
         else:
-            thread = threading.Thread(target=server.serve_forever, name="metrics", daemon=True)
-            thread.start()
-            self._served = server, thread
             self._trouble = None
-            log.info("metrics are served at http://%s:%d/metrics", HOST, server.server_port)
+            log.info("metrics are served at http://%s:%d/metrics", HOST, self.port)
+
+    def _begun(self) -> tuple[ScrapeServer, threading.Thread]:
+        from daemon.monitoring.scrape_server import ScrapeServer
+
+        server = ScrapeServer(HOST, self._wanted, self._registry)
+        thread = threading.Thread(target=server.serve_forever, name="metrics", daemon=True)
+        try:
+            thread.start()
+        except RuntimeError:
+            server.server_close()
+            raise
+        return server, thread
 
     def stop(self) -> None:
         """Serve no more."""

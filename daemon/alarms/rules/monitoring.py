@@ -8,9 +8,18 @@ from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
 
 
-@rule("warning", "Give `[metrics]` a port that no other program listens on, and restart rigcal.", after_s=10.0)
+@rule(
+    "warning",
+    "Put right what the text says: give `[metrics]` a port that no other program listens on, or end what takes all "
+    "descriptors, threads or connections; restart rigcal if the alarm stays.",
+    after_s=10.0,
+)
 def metrics_unserved(evidence: Evidence) -> Iterator[Finding]:
-    """The port of the metrics cannot be opened for 10 s; it is tried again every 5 s."""
+    """Nobody has been able to read the metrics for 10 s.
+
+    Their port cannot be opened, which is tried again every 5 s, or whoever asked last could not be taken. Cleared when
+    they are read.
+    """
     if evidence.metrics_fault is not None:
         yield "metrics", evidence.metrics_fault
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import errno
 import socket
-import threading
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +19,9 @@ from daemon.composition import live
 from daemon.config import ConfigError, parse_config
 from daemon.control.protocol import request
 from daemon.host.systemd import network_hint
-from daemon.monitoring import metrics_server, scrape_server
+from daemon.monitoring import metrics_server
 from daemon.monitoring.metrics import FAMILIES
-from daemon.monitoring.metrics_server import MetricsServer, StatusCollector
+from daemon.monitoring.metrics_server import MetricsServer
 from daemon.rig_files import load_rig
 from daemon.service import Daemon
 from daemon.store import Store
@@ -170,30 +169,6 @@ def test_a_port_that_is_taken_is_told_and_served_once_it_is_free(monkeypatch: py
         assert (server.trouble(), server.port) == (None, port)
     finally:
         server.stop()
-
-
-@pytest.mark.long
-def test_callers_who_ask_nothing_are_hung_up_on_and_take_no_more_than_their_places(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(scrape_server, "WAIT_S", 0.0)
-    monkeypatch.setattr(scrape_server._Handler, "timeout", 0.5)
-    monkeypatch.setattr(StatusCollector, "collect", lambda _self: iter(()))
-    before = threading.active_count()
-    server = MetricsServer(0, dict)
-    try:
-        with ExitStack() as open_ones:
-            callers = [
-                open_ones.enter_context(socket.create_connection(("127.0.0.1", server.port or 0), timeout=10.0))
-                for _ in range(2 * scrape_server.MOST_AT_ONCE)
-            ]
-            assert threading.active_count() <= before + 1 + scrape_server.MOST_AT_ONCE
-            assert [caller.recv(1) for caller in callers] == [b""] * len(callers)
-            with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/metrics", timeout=10.0) as answer:
-                assert b"process_open_fds" in answer.read()
-    finally:
-        server.stop()
-    assert capfd.readouterr().err == ""
 
 
 def test_a_service_whose_unit_forbids_the_network_says_how_to_open_it() -> None:
