@@ -92,7 +92,8 @@ class StoreWatch:
 
     def __init__(self, store: Store, clock: Clock) -> None:
         self._store, self._clock = store, clock
-        self._findings = ""
+        self._findings: str | None = None  # of the check; None until it has come to its end
+        self._told = ""  # the fault of the check that the log has last
         self._stopping = threading.Event()
         self._connection: sqlite3.Connection | None = None
         self._check: threading.Thread | None = None
@@ -148,7 +149,7 @@ class StoreWatch:
                 f"{path}: the store is damaged ({damage}); acquisition goes on, jobs do not run, and nothing "
                 "that is read from it can be trusted: stop rigcal, keep the file, and restore the store from a backup"
             )
-        if self._check is not None and self._check.is_alive():
+        if self._check is not None and self._findings is None:
             return "checking", (
                 f"{path}: the last run did not end in order, so the store is being checked for damage; acquisition "
                 "goes on, and jobs wait"
@@ -182,12 +183,22 @@ class StoreWatch:
     def _search(self) -> None:
         lower_priority(UPKEEP_NICE)
         check = _CheckRow(self._store)
-        check.note(self._clock.now(), "started_")  # without a result, until there is one
-        while (findings := self._damage()) is None:
+        while not self._has_searched(check):
             if self._stopping.wait(RETRY_S):
                 return
-        self._findings = findings
-        check.note(self._clock.now(), "ended_", result=findings or SOUND)
+
+    def _has_searched(self, check: _CheckRow) -> bool:
+        """Make the check; False if it was stopped or cannot be made."""
+        try:
+            check.note(self._clock.now(), "started_")  # without a result, until there is one
+            self._findings = self._damage()
+            if self._findings is not None:
+                check.note(self._clock.now(), "ended_", result=self._findings or SOUND)
+        except Exception as error:  # a fault of rigcal: a store that nobody has checked is not known to be sound
+            if str(error) != self._told:
+                log.exception("%s: the check for damage has failed; it is made again", self._store.path)
+            self._told = str(error)
+        return self._findings is not None
 
     def _damage(self) -> str | None:
         """Search for damage: its description, "" if there is none; None if the check was stopped or cannot be made."""
@@ -202,7 +213,8 @@ class StoreWatch:
         except MemoryError:
             return None
         except sqlite3.DatabaseError as error:
-            if self._stopping.is_set() or (error.sqlite_errorcode & 0xFF) in _HINDRANCES:
+            code = getattr(error, "sqlite_errorcode", None)  # a text that is none has no code, and is damage
+            if self._stopping.is_set() or (code is not None and code & 0xFF in _HINDRANCES):
                 return None
             return str(error)
         finally:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import re
-import resource
 import shutil
 import sqlite3
 import subprocess
@@ -21,151 +20,18 @@ from daemon.composition import Parts, joiner
 from daemon.config import Config
 from daemon.control.protocol import request
 from daemon.service import Daemon
-from daemon.store import Reader, Store, StoreError, health
+from daemon.store import Reader, Store, StoreError
 from daemon.store.files import FileIdentity
-from daemon.store.health import StoreWatch
-from drivers.clock import ManualClock, SystemClock
+from drivers.clock import SystemClock
 from drivers.readings import Capture
 from tests.daemon.acquisition_support import ListLink, wait_until
 from tests.daemon.damage import fill, small_disk, tear
 from tests.daemon.idle_daemon import running as run_daemon
 from tests.daemon.job_support import SOURCE, JobRig
-from tests.daemon.session_support import disk_fails
-from tests.daemon.store_support import at, fix, frame, table
-
-
-@contextlib.contextmanager
-def watched(path: Path, *, ends_in_order: bool = True) -> Iterator[tuple[Store, StoreWatch]]:
-    """A run on a store; one that does not end in order is as if it had been killed."""
-    with contextlib.closing(Store(path)) as store:
-        store.begin_run(at(0))
-        watch = StoreWatch(store, ManualClock(at(0)))
-        watch.start()
-        yield store, watch
-        watch.stop()
-        if ends_in_order:
-            store.end_run(at(1))
-
-
-def settled(watch: StoreWatch) -> str:
-    """Its state once no check is under way."""
-
-    def is_settled() -> bool:
-        watch.look()
-        return watch.health.state != "checking"
-
-    wait_until(is_settled)
-    return watch.health.state
-
-
-def results(path: Path) -> list[str | None]:
-    return [row["result"] for row in table(path, "store_checks")]
-
+from tests.daemon.store_support import frame, table
+from tests.daemon.watch_support import results, settled, watched
 
 # ---- damage ----------------------------------------------------------------------------------------------------------
-
-
-def test_a_store_is_checked_after_an_unclean_end_and_not_after_an_orderly_one(path: Path) -> None:
-    with watched(path):
-        pass
-    with watched(path, ends_in_order=False):
-        assert results(path) == []
-    with watched(path) as (_, watch):
-        assert settled(watch) == "ok"
-        assert results(path) == ["ok"]
-    with watched(path):
-        assert results(path) == ["ok"]
-
-
-def damaged(path: Path) -> None:
-    """A store whose run was killed, and one of whose indexes is torn."""
-    with watched(path, ends_in_order=False) as (store, _):
-        store.declare_channels({"theta1": "deg"}, {})
-        store.insert_records([fix(n / 10) for n in range(100)])
-    shutil.copy(path, path.with_name("backup"))
-    tear(path, "fixes_by_instant")
-
-
-def test_damage_after_an_unclean_end_is_told_and_not_forgotten_by_the_next_start(path: Path) -> None:
-    damaged(path)
-    for _ in range(2):  # the first of them ends in order
-        with watched(path) as (_, watch):
-            assert settled(watch) == "damaged"
-            text = watch.health.text
-            assert str(path) in text
-            assert "restore the store from a backup" in text
-            assert watch.health.since == at(0)
-    assert "ok" not in results(path)
-    path.with_name("backup").replace(path)
-    with watched(path) as (_, watch):
-        assert settled(watch) == "ok"
-
-
-def test_a_check_that_a_stop_ends_is_made_again(path: Path) -> None:
-    with watched(path, ends_in_order=False):
-        pass
-    with contextlib.closing(Store(path)) as store:
-        store.begin_run(at(0))
-        watch = StoreWatch(store, ManualClock(at(0)))
-        watch.stop()  # as when the stop comes while it runs
-        watch.start()
-        wait_until(lambda: results(path) == [None])
-        store.end_run(at(1))
-    with watched(path) as (_, watch):
-        assert settled(watch) == "ok"
-        assert results(path) == [None, "ok"]
-
-
-def test_a_long_check_ends_at_a_stop(path: Path) -> None:
-    with watched(path, ends_in_order=False) as (store, _), store.transaction() as db:
-        db.execute("CREATE TABLE long (n INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE) STRICT")
-        db.execute(
-            "WITH RECURSIVE c(n) AS (VALUES (1) UNION ALL SELECT n + 1 FROM c WHERE n < 500000) "
-            "INSERT INTO long SELECT n, printf('%032d', (n * 7919) % 500009) FROM c"
-        )
-    with contextlib.closing(Store(path)) as store:
-        store.begin_run(at(0))
-        watch = StoreWatch(store, ManualClock(at(0)))
-        starting = threading.Thread(target=watch.start)
-        starting.start()
-        wait_until(lambda: watch._connection is not None)
-        watch.stop()
-        starting.join()
-        assert watch._check is not None
-        assert not watch._check.is_alive()
-    assert results(path) == [None]
-
-
-def test_a_check_that_lacks_a_descriptor_finds_no_damage_and_is_made_once_there_is_one(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(health, "RETRY_S", 0.05)
-    monkeypatch.setattr(health, "AT_START_S", 0.2)
-    with watched(path, ends_in_order=False):
-        pass
-    with contextlib.closing(Store(path)) as store:
-        store.begin_run(at(0))
-        watch = StoreWatch(store, ManualClock(at(0)))
-        before = resource.getrlimit(resource.RLIMIT_NOFILE)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))
-        try:
-            watch.start()
-        finally:
-            resource.setrlimit(resource.RLIMIT_NOFILE, before)
-        assert watch.health.state == "checking"
-        assert settled(watch) == "ok"
-    assert results(path) == ["ok"]
-
-
-def test_damage_is_found_although_the_disk_takes_no_row_about_the_check(path: Path) -> None:
-    damaged(path)
-    with contextlib.closing(Store(path)) as store:
-        store.begin_run(at(0))
-        watch = StoreWatch(store, ManualClock(at(0)))
-        with disk_fails():
-            watch.start()
-            assert settled(watch) == "damaged"
-        watch.stop()
 
 
 def test_a_start_that_fails_leaves_the_check_to_the_next(tmp_path: Path) -> None:
