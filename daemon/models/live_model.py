@@ -1,4 +1,8 @@
-"""The live model in memory: loaded beside everything else, again whenever another one goes live."""
+"""The live model in memory: loaded beside everything else, again whenever another one goes live.
+
+One that could not be loaded is looked at again now and then: what the computer lacked may be there, and its files may
+have been put right.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from calibration.errors import CalibrationError
+from calibration.errors import ModelError, UnsafeError
 from calibration.rig.description import Rig
 from daemon.store.queries.models import ModelRow, ModelTable
 
@@ -18,6 +22,7 @@ log = logging.getLogger(__name__)
 
 NO_MODEL = "no model is live; `rigcal model list` shows the candidates"
 LOADING = "the live model is being loaded"
+RETRY_S = 30.0  # after a load that failed
 STOP_TIMEOUT_S = 5.0
 
 
@@ -47,10 +52,12 @@ class Missing:
     Attributes:
         reason: a sentence.
         is_defect: a model is live and cannot be used.
+        is_hindered: that is for the computer's sake, and no fault of the model.
     """
 
     reason: str
     is_defect: bool = False
+    is_hindered: bool = False
 
 
 @dataclass(frozen=True)
@@ -60,13 +67,15 @@ class LiveModelHealth:
     Attributes:
         id: its number.
         jumped: joints whose encoder has jumped since it was trained, their zeros not being checked.
-        defect: why it cannot be used; "" if it can.
+        defect: why it cannot be used; "" if it can, or that is not known.
+        hindrance: what keeps the computer from loading it; "" for nothing.
         drifted_with: the check session with which it was found to have drifted; None before.
     """
 
     id: int
     jumped: tuple[str, ...] = ()
     defect: str = ""
+    hindrance: str = ""
     drifted_with: str | None = None
 
 
@@ -85,6 +94,7 @@ class LiveModel:
         self._changed = threading.Event()
         self._changed.set()
         self._stopping = False
+        self._told = ""  # why it could not be loaded, as the log has it last
         self._thread = threading.Thread(target=self._run, name="live-model", daemon=True)
 
     def start(self) -> None:
@@ -110,8 +120,10 @@ class LiveModel:
         live, drifted = self.now(), self._table.drifted(run)
         drifted_with = None if drifted is None else drifted[1]
         if isinstance(live, Loaded):
-            return LiveModelHealth(run.model_id, live.jumped, "", drifted_with)
-        return LiveModelHealth(run.model_id, (), live.reason if live.is_defect else "", drifted_with)
+            return LiveModelHealth(run.model_id, live.jumped, drifted_with=drifted_with)
+        reason = live.reason if live.is_defect else ""
+        defect, hindrance = ("", reason) if live.is_hindered else (reason, "")
+        return LiveModelHealth(run.model_id, (), defect, hindrance, drifted_with)
 
     def changed(self) -> None:
         """Another model has gone live, or what is known of the joints' zeros has changed."""
@@ -133,12 +145,14 @@ class LiveModel:
         return read_model_of_rig(row.path, row.manifest_sha256, self._rig)
 
     def _run(self) -> None:
+        wait_s: float | None = None
         while True:
-            self._changed.wait()
+            self._changed.wait(wait_s)
             self._changed.clear()
             if self._stopping:
                 return
             state = self._look()
+            wait_s = RETRY_S if isinstance(state, Missing) and state.is_defect else None
             with self._turn:
                 if not self._changed.is_set():
                     self._state = state
@@ -150,13 +164,22 @@ class LiveModel:
                 return Missing(NO_MODEL)
             jumped = tuple(name for name in self._table.jumped(row) if name in self._rig.joint_names)
             loaded = Loaded(row.id, self.load(row), jumped, *self._table.training_ns(row))
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001 - logged, and shown as what it is
             if self._stopping:
                 return Missing(LOADING)  # store and processes are going away under it: no defect of the model
-            if isinstance(error, CalibrationError):
-                log.error("the live model cannot be used: %s", error)
-                return Missing(f"the live model cannot be used: {error}", is_defect=True)
-            log.exception("the live model could not be loaded")
-            return Missing(f"the live model could not be loaded ({error}); the daemon's log tells", is_defect=True)
+            return self._failed(error)
+        self._told = ""
         log.info("model %d is live", row.id)
         return loaded
+
+    def _failed(self, error: Exception) -> Missing:
+        """Return why a model that is live could not be loaded, and tell the log once."""
+        is_hindered = not isinstance(error, ModelError | UnsafeError)
+        if is_hindered:
+            reason = f"the live model could not be loaded, which is tried again: {str(error) or type(error).__name__}"
+        else:
+            reason = f"the live model cannot be used: {error}"
+        if reason != self._told:
+            log.error("%s", reason, exc_info=error if is_hindered else None)
+        self._told = reason
+        return Missing(reason, is_defect=True, is_hindered=is_hindered)

@@ -27,6 +27,7 @@ from calibration.model.model import CalibratedModel
 from calibration.rig.description import Rig
 from daemon.host.safe_output import write_file
 from daemon.models.first_load import IS_NO_MODEL, encode
+from daemon.store.errors import LACKING
 from drivers.files import read_whole
 
 REPORT = "report.html"
@@ -135,7 +136,7 @@ def read_model(directory: Path, manifest_sha256: str | None = None) -> Calibrate
 
     Raises:
         ModelError: not a model, truncated, edited, of another version, or it brings down the process that loads it.
-        CalibrationError: this machine lacks what loading it needs.
+        CalibrationError: this machine lacks what loading it needs, or its disk fails.
     """
     if not directory.is_dir():
         raise ModelError(f"{directory} is not a directory; name the one that calibrate wrote")
@@ -197,7 +198,7 @@ def _listed(directory: Path) -> list[str]:
 
 
 def _read(directory: Path, name: str, most_bytes: int) -> bytes | None:
-    """The file's bytes; None if there is none; ModelError if it cannot be part of a model."""
+    """The file's bytes; None if there is none; as `read_model` where it is no part of a model, or cannot be read."""
     path = directory / name
     if path.exists() and not path.is_file():
         raise ModelError(f"{directory}: {name} is not a regular file; this is not a model")
@@ -210,7 +211,8 @@ def _read(directory: Path, name: str, most_bytes: int) -> bytes | None:
             raise ModelError(
                 f"{directory}: with {name} it is larger than a model can be ({_MODEL_MAX_BYTES:,} bytes)"
             ) from error
-        raise ModelError(f"{directory}: {name} cannot be read: {error.strerror}") from error
+        kind = CalibrationError if error.errno in LACKING or error.errno == errno.EIO else ModelError
+        raise kind(f"{directory}: {name} cannot be read: {error.strerror}") from error
 
 
 def _sha256(data: bytes) -> str:

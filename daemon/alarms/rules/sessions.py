@@ -76,9 +76,24 @@ def model_drifted(evidence: Evidence) -> Iterator[Finding]:
 
 @rule("critical", "Put another model live with `rigcal model rollback`, or calibrate again.", hold_s=10.0)
 def model_unusable(evidence: Evidence) -> Iterator[Finding]:
-    """The live model is damaged or is of another rig file: there is no tip."""
+    """The live model is damaged or is of another rig file: there is no tip.
+
+    Cleared when another model goes live, or its files are as they were: they are looked at every 30 s.
+    """
     if evidence.model is not None and evidence.model.defect:
         yield f"model {evidence.model.id}", evidence.model.defect
+
+
+@rule(
+    "critical", "Put right what the text says the computer lacks; rigcal loads the model by itself then.", hold_s=10.0
+)
+def model_not_loaded(evidence: Evidence) -> Iterator[Finding]:
+    """The computer cannot load the live model, for want of memory or descriptors or by a fault of its disk: no tip.
+
+    The model may be sound. It is tried again every 30 s.
+    """
+    if evidence.model is not None and evidence.model.hindrance:
+        yield f"model {evidence.model.id}", evidence.model.hindrance
 
 
 @rule("critical", "Check the joint's zero; then `rigcal model zeros-checked`, or calibrate again.", hold_s=10.0)

@@ -322,6 +322,9 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
     "model_unusable": [
         (known(model=LiveModelHealth(2, defect="damaged")), ["model 2"], known(model=LiveModelHealth(2)))
     ],
+    "model_not_loaded": [
+        (known(model=LiveModelHealth(2, hindrance="no memory")), ["model 2"], known(model=LiveModelHealth(2)))
+    ],
     "clock_stepped": [
         (known(event(E.CLOCK_STEP, "clock")), ["clock"], known(event(E.CLOCK_STEP, "clock", age_s=901))),
     ],
