@@ -206,6 +206,7 @@ class Daemon:
             "acquisition": self._acquisition.status,
             "session": sessions.open_session,
             "suspicions": self._sessions.prism_suspicions,
+            "prisms_fault": self._sessions.prisms_fault,
             "setup": SetupTable(self._store, self._parts.rig.name).current,
             "failed_jobs": self._job_table.failed,
             "model": self._live_model.health,

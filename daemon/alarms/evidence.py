@@ -28,6 +28,7 @@ class Evidence:
         acquisition: links, channels, stations, gaps and the last events.
         session: the open one.
         suspicions: stations that may be on another prism than the session's own.
+        prisms_fault: why the joints cannot be asked whether a station is on its prism; None where they can.
         setup: the one that the station stands in.
         failed_jobs: those that somebody should look at.
         model: the live one.
@@ -49,6 +50,7 @@ class Evidence:
     acquisition: AcquisitionStatus = field(default_factory=AcquisitionStatus)
     session: OpenSessionRow | None = None
     suspicions: Sequence[Suspicion] = ()
+    prisms_fault: str | None = None
     setup: SetupRow | None = None
     failed_jobs: Sequence[FailedJob] = ()
     model: LiveModelHealth | None = None
@@ -104,6 +106,7 @@ _PARTS = {
     "acquisition": "acquisition",
     "session": "the open session",
     "suspicions": "the prisms",
+    "prisms_fault": "what the joints say of prisms",
     "setup": "the set-ups",
     "failed_jobs": "the jobs",
     "model": "the live model",

@@ -328,6 +328,10 @@ class SessionKeeper:
         session = self._open
         return [] if session is None else self._prisms.suspicions(session)
 
+    def prisms_fault(self) -> str | None:
+        """Return why joints do not tell whether a station is on its prism, a clause; None where they do."""
+        return self._prisms.trouble()
+
     def not_counting(self, fresh_s: float) -> str | None:
         """Return why the newest fix of the open session does not count; from any thread.
 

@@ -55,6 +55,10 @@ class PrismWatch:
         """Be ready to ask the joints of a session's prism, and wait for that at most so long."""
         self._loader.start(wait_s)
 
+    def trouble(self) -> str | None:
+        """Return why the joints cannot be asked of prisms, a clause; None where they can, or nobody has wanted to."""
+        return self._loader.trouble
+
     def begin(self, session: OpenSession) -> None:
         """Take a session's set-up into account: what was measured there before."""
         jumps = [jump for jump in preset_jumps(self._store, None) if jump.device in self._rig.joint_names]

@@ -74,3 +74,17 @@ def prism_jump(evidence: Evidence) -> Iterator[Finding]:
     """
     for suspicion in evidence.suspicions:
         yield suspicion.station, f"{suspicion.reason}; its fixes do not count"
+
+
+@rule(
+    "warning",
+    "Put right what the text says the computer lacks; if the alarm stays, restart rigcal. Meanwhile see yourself "
+    "that each lock is on the session's prism.",
+)
+def prisms_not_compared(evidence: Evidence) -> Iterator[Finding]:
+    """The joints cannot be asked whether a station is on the session's prism: the mathematics cannot be loaded.
+
+    A wrong prism is noticed by its distance alone. It is tried again every 30 s.
+    """
+    if evidence.prisms_fault is not None:
+        yield "prisms", f"wrong prisms are noticed by their distance alone: {evidence.prisms_fault}"

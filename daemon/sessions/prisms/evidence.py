@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+RETRY_S = 30.0  # after the mathematics could not be loaded
 LATE_S = 0.25  # by so much the instants of fixes and of joints may differ while the boom moves
 MOST_SLACK_MM = 500.0  # a fix that may be further off for the motion tells nothing
 MOVED_MM = 100.0  # the boom, before another fix of a stretch is looked at
@@ -106,13 +108,17 @@ class Finding:
 
 
 class IdentityLoader:
-    """The mathematics, imported beside everything else when a session first needs it.
+    """The mathematics, imported beside everything else when a session first needs it; again where that fails.
 
     Args:
         rig: the machine.
+
+    Attributes:
+        trouble: why it could not be loaded the last time, a clause; None where nothing is wrong.
     """
 
     def __init__(self, rig: Rig) -> None:
+        self.trouble: str | None = None
         self._rig = rig
         self._thread: threading.Thread | None = None
         self._loaded: PrismIdentity | None = None
@@ -132,24 +138,43 @@ class IdentityLoader:
     def start(self, wait_s: float = 0.0) -> None:
         """Begin to load it, and wait for it at most so long."""
         if self._thread is None:
-            self._thread = threading.Thread(target=self._load, name="prism-identity", daemon=True)
-            self._thread.start()
+            thread = threading.Thread(target=self._run, name="prism-identity", daemon=True)
+            try:
+                thread.start()
+            except RuntimeError as error:  # the system has no thread to give; the next session asks again
+                self._fail(error)
+                return
+            self._thread = thread
         if wait_s:
             self._thread.join(wait_s)
 
-    def _load(self) -> None:
-        try:
-            prepare()
-            import daemon.sessions.prisms.motion  # noqa: F401  # so that nobody waits for it later
-            from calibration.identification.prism_identity import PrismIdentity
+    def _run(self) -> None:
+        while self._loaded is None:
+            try:
+                self._loaded = self._load()
+                self.trouble = None
+            except Exception as error:  # noqa: BLE001 - what the computer lacks may be there the next time
+                self._fail(error)
+                time.sleep(RETRY_S)
 
-            made = PrismIdentity(self._rig)
-            middle = tuple(sum(joint.limits) / 2 for joint in self._rig.joints)
-            made.own_misfits(targets(self._rig, [Sighting(self._rig.prism_names[0], middle, (0.0, 0.0, 0.0))]))
-        except Exception:
-            log.exception("what the joints say of prisms cannot be asked; new locks are judged by distance alone")
-        else:
-            self._loaded = made
+    def _load(self) -> PrismIdentity:
+        prepare()
+        import daemon.sessions.prisms.motion  # noqa: F401  # so that nobody waits for it later
+        from calibration.identification.prism_identity import PrismIdentity
+
+        made = PrismIdentity(self._rig)
+        middle = tuple(sum(joint.limits) / 2 for joint in self._rig.joints)
+        made.own_misfits(targets(self._rig, [Sighting(self._rig.prism_names[0], middle, (0.0, 0.0, 0.0))]))
+        return made
+
+    def _fail(self, error: Exception) -> None:
+        trouble = f"{type(error).__name__}: {error}"
+        if trouble != self.trouble:
+            log.error(
+                "what the joints say of prisms cannot be asked for now; new locks are judged by distance alone",
+                exc_info=error,
+            )
+        self.trouble = trouble
 
 
 class PrismEvidence:

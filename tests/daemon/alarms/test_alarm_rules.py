@@ -267,6 +267,7 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
             known(event(E.PRISM_JUMP, "station"), session=SESSION),
         )
     ],
+    "prisms_not_compared": [(known(prisms_fault="no memory"), ["prisms"], known())],
     "decoding_behind": [(known(is_behind=True), ["decoding"], known())],
     "not_storing": [(known(error="disk full"), ["store"], known())],
     "store_unsound": [(known(store=store_health("missing", "the file is gone")), ["store"], known())],

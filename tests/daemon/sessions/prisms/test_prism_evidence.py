@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from daemon.sessions.prisms.evidence import IdentityLoader, PrismEvidence, Sight
 from daemon.sessions.station_setups import Place
 from drivers.readings import EventKind
 from simulators.rig.truth import RigTruth
+from tests.daemon.acquisition_support import wait_until
 from tests.daemon.session_support import SOURCE, Rig, closed_afterwards, disk_fails
 from tests.daemon.store_support import table
 
@@ -191,6 +193,33 @@ def loaded() -> tuple[IdentityLoader, PrismIdentity]:
     identity = loader.now()
     assert identity is not None
     return loader, identity
+
+
+def test_what_cannot_be_loaded_is_told_and_loaded_once_it_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("daemon.sessions.prisms.evidence.RETRY_S", 0.05)
+    loader = IdentityLoader(RIG)
+    with monkeypatch.context() as without:
+        for variable in ("NUMBA_CACHE_DIR", "CACHE_DIRECTORY", "XDG_CACHE_HOME", "HOME"):
+            without.delenv(variable, raising=False)
+        without.setattr("tempfile.tempdir", "/dev/null")
+        loader.start()
+        wait_until(lambda: loader.trouble is not None)
+        assert loader.now() is None
+    wait_until(lambda: loader.now() is not None)
+    wait_until(lambda: loader.trouble is None)
+
+
+def test_a_session_for_which_there_is_no_thread_begins_and_the_next_one_has_the_joints_asked() -> None:
+    loader = IdentityLoader(RIG)
+    before = threading.stack_size(1 << 47)  # more than a process can have
+    try:
+        loader.start(60)
+    finally:
+        threading.stack_size(before)
+    assert "can't start new thread" in (loader.trouble or "")
+    loader.start(60)
+    assert loader.now() is not None
+    assert loader.trouble is None
 
 
 def test_fixes_of_another_prism_are_not_cleared_by_those_around_them_that_fit(rig: TrueRig) -> None:
