@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-import sqlite3
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from daemon.commands import CommandError, current_caller
@@ -13,7 +12,6 @@ from daemon.config import NotifySection
 from daemon.monitoring.delivery import Command, Target, Webhook
 from daemon.monitoring.notice import Notice
 from daemon.monitoring.outbox import USUAL, Outbox, Pace
-from daemon.store.errors import StoreError
 from daemon.store.queries.notices import NoticeTable
 from drivers.clock import Clock
 
@@ -57,6 +55,7 @@ class Notices:
         self._changed = threading.Condition()
         self._is_stopping = False
         self._is_told = False  # that the store cannot be written
+        self._fault = ""  # of the thread itself
         self._thread = threading.Thread(target=self._run, name="notices", daemon=True)
         self._status = [outbox.status() for outbox in self._outboxes]
 
@@ -97,29 +96,50 @@ class Notices:
         return self._status
 
     def faults(self) -> dict[str, str]:
-        """Targets whose last delivery failed -> why."""
-        return {one["target"]: one["error"] for one in self._status if one["error"] is not None}
+        """Targets whose last delivery failed, all of them where this part has failed itself -> why."""
+        errors = {one["target"]: self._fault or one["error"] for one in self._status}
+        return {target: error for target, error in errors.items() if error}
 
     # ---- the thread --------------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        while True:
+        while not self._is_stopping:
+            self._go_on(self._step)
+        self._go_on(self._take_in)
+
+    def _go_on(self, work: Callable[[], None]) -> None:
+        """Do something; a fault of rigcal must not keep the alarms of months from leaving the machine."""
+        try:
+            work()
+            self._fault = ""
+        except Exception as error:
+            fault = f"{type(error).__name__}: {error}"
+            if fault != self._fault:
+                log.exception("the thread that sends notices has failed; it goes on")
+            self._fault = fault
             with self._changed:
-                if not self._inbox and not self._is_stopping:
-                    self._changed.wait(self._patience_s())
-                taken, self._inbox = self._inbox, []
-                is_stopping = self._is_stopping
-            for outbox in self._outboxes:
-                for notice in taken:
-                    outbox.add(notice)
-            self._write()
-            if is_stopping:
-                return
-            for outbox in self._outboxes:
-                if outbox.due_in_s() == 0.0 and not self._is_stopping:
-                    outbox.send()
-            self._write()
-            self._status = [outbox.status() for outbox in self._outboxes]
+                self._changed.wait_for(lambda: self._is_stopping, REWRITE_S)
+
+    def _step(self) -> None:
+        with self._changed:
+            if not self._inbox and not self._is_stopping:
+                self._changed.wait(self._patience_s())
+        self._take_in()
+        for outbox in self._outboxes:
+            if outbox.due_in_s() == 0.0 and not self._is_stopping:
+                outbox.send()
+        self._write()
+        self._status = [outbox.status() for outbox in self._outboxes]
+
+    def _take_in(self) -> None:
+        with self._changed:
+            taken = list(self._inbox)
+        for outbox in self._outboxes:
+            for notice in taken:
+                outbox.add(notice)
+        with self._changed:
+            del self._inbox[: len(taken)]
+        self._write()
 
     def _patience_s(self) -> float | None:
         """Return how long the thread may sleep; None until it is woken."""
@@ -132,7 +152,7 @@ class Notices:
         try:
             for outbox in self._outboxes:
                 outbox.write()
-        except (sqlite3.Error, StoreError):
+        except Exception:
             if not self._is_told:
                 log.warning("notices cannot be written to the store; they are sent all the same", exc_info=True)
             self._is_told = True

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import email
 import email.policy
-import json
 import logging
 import os
 import resource
@@ -14,74 +13,23 @@ import stat
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from socketserver import BaseRequestHandler, ThreadingTCPServer
-from typing import Any, Literal
+from typing import Any
 
 import pytest
 
 from daemon.config import ConfigError, NotifySection, parse_config
 from daemon.control.protocol import request
-from daemon.monitoring import delivery
+from daemon.monitoring import delivery, outbox
 from daemon.monitoring.notice import LISTED, Notice, message_of
-from daemon.monitoring.notices import Notices
 from daemon.monitoring.outbox import Pace
-from daemon.store import Store
 from daemon.store.queries.alarms import AlarmTable
-from daemon.store.queries.notices import NoticeTable
-from drivers.clock import ManualClock
 from tests.daemon.acquisition_support import wait_until
 from tests.daemon.idle_daemon import idle_daemon
+from tests.daemon.notice_support import FAST, SECRET, Sender, WebServer
 from tests.daemon.session_support import disk_fails
 from tests.daemon.store_support import at, table
-
-FAST = Pace(gather_s=0.02, first_retry_s=0.02, longest_retry_s=0.1, per_hour=1000)
-SECRET = "T0ken"
-
-
-class WebServer(ThreadingHTTPServer):
-    """Takes what is posted; answers with the next of `answers`, and then with 200."""
-
-    def __init__(self, port: int = 0) -> None:
-        self.answers: list[int] = []
-        self.got: list[dict[str, Any]] = []
-        server = self
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_POST(self) -> None:
-                body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-                status = server.answers.pop(0) if server.answers else 200
-                if status == 200:
-                    server.got.append(body)
-                self.send_response(status)
-                if status == 302:
-                    self.send_header("Location", "/elsewhere")
-                self.end_headers()
-
-            def do_GET(self) -> None:
-                server.got.append({"text": "a redirection was followed"})
-                self.send_response(200)
-                self.end_headers()
-
-            def log_message(self, *arguments: object) -> None:
-                pass
-
-        super().__init__(("127.0.0.1", port), Handler)
-        self._thread = threading.Thread(target=self.serve_forever, kwargs={"poll_interval": 0.02})
-        self._thread.start()
-
-    @property
-    def url(self) -> str:
-        return f"http://127.0.0.1:{self.server_port}/hooks/{SECRET}"
-
-    def close(self) -> None:
-        self.shutdown()
-        self._thread.join()
-        self.server_close()
-
-    def events(self) -> list[tuple[str, str]]:
-        return [(notice["event"], notice["subject"]) for message in self.got for notice in message["notices"]]
 
 
 @pytest.fixture
@@ -91,43 +39,6 @@ def web() -> Iterator[WebServer]:
         yield server
     finally:
         server.close()
-
-
-class Sender:
-    """A store whose notices are sent; closed and opened again by tests."""
-
-    def __init__(self, path: Path, section: NotifySection, pace: Pace = FAST) -> None:
-        self.path, self.section, self.pace = path, section, pace
-        self.clock = ManualClock(at(0))
-        self.rows: dict[str, int] = {}
-        self.open()
-
-    def open(self) -> None:
-        self.store = Store(self.path)
-        active = AlarmTable(self.store).active()
-        self.notices = Notices(self.section, NoticeTable(self.store), active, "swdt82", self.clock, pace=self.pace)
-        self.notices.start()
-
-    def close(self) -> None:
-        self.notices.stop()
-        self.store.close()
-
-    def tell(self, event: Literal["raised", "cleared"], subject: str, severity: Any = "critical") -> None:
-        """As the board of alarms does, which writes the alarm to the store as well."""
-        now = self.clock.now()
-        if event == "raised":
-            about = {"severity": severity, "text": "no such port", "remedy": "Plug it in."}
-            self.rows[subject] = AlarmTable(self.store).add(now, "link_down", subject, **about)
-        else:
-            AlarmTable(self.store).clear(self.rows.pop(subject), now)
-        self.tell_only(event, subject, severity)
-
-    def tell_only(self, event: Literal["raised", "cleared"], subject: str, severity: Any = "critical") -> None:
-        now = self.clock.now()
-        self.notices.take(Notice(event, "link_down", subject, severity, "no such port", "Plug it in.", now, now))
-
-    def status(self) -> dict[str, Any]:
-        return self.notices.status()[0]
 
 
 @pytest.fixture
@@ -375,6 +286,30 @@ def test_a_store_that_cannot_be_written_keeps_no_notice_back(
     (row,) = table(sender.path, "notices")
     assert row["sent_utc_ns"] is not None
     assert web.events() == [("raised", "store")]
+
+
+def test_a_notice_that_no_store_can_hold_is_sent_all_the_same_and_so_are_those_after_it(
+    web: WebServer, opened: Callable[..., Sender]
+) -> None:
+    sender = opened(webhook_url=web.url)
+    beyond = replace(sender.clock.now(), monotonic_ns=2**70)
+    sender.notices.take(Notice("raised", "clock_behind", "clock", "critical", "a text", "Set it.", beyond, beyond))
+    wait_until(lambda: web.events() == [("raised", "clock")])
+    sender.tell("raised", "boom")
+    wait_until(lambda: web.events() == [("raised", "clock"), ("raised", "boom")])
+
+
+def test_a_fault_of_the_thread_that_sends_is_told_and_keeps_nothing_back_once_it_is_over(
+    web: WebServer, opened: Callable[..., Sender], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daemon.monitoring.notices.REWRITE_S", 0.05)
+    sender = opened(webhook_url=web.url)
+    with monkeypatch.context() as broken:
+        broken.setattr(outbox, "HOUR_S", None)
+        sender.tell("raised", "boom")
+        wait_until(lambda: "TypeError" in sender.notices.faults().get("webhook", ""))
+    wait_until(lambda: web.events() == [("raised", "boom")])
+    wait_until(lambda: sender.notices.faults() == {})
 
 
 def test_only_critical_alarms_are_told_where_that_is_asked_for_also_when_a_warning_becomes_critical(
