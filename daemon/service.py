@@ -25,6 +25,7 @@ from daemon.control.server import ControlServer
 from daemon.control_commands import Commands, control_servers
 from daemon.guide.keeper import GuideKeeper
 from daemon.guide.meter_link import Place
+from daemon.host.ended_threads import EndedThreads
 from daemon.host.systemd import Notifier
 from daemon.host.time_service import CLOCK_SOCKET, clock_state
 from daemon.jobs.job_processes import JOBS_SOCKET
@@ -84,6 +85,7 @@ class Daemon:
                 raise
 
     def _compose(self, config: Config, store: Store, parts: Parts) -> None:
+        self._ended_threads = EndedThreads()
         declare_channels(store, parts.rig)
         self._watch = StoreWatch(store, parts.clock)
         self._housekeeping = Housekeeping(store, parts.clock, keeping_of(config))
@@ -215,6 +217,7 @@ class Daemon:
             "is_store_new": lambda: is_store_new(self._job_table, self._config.models_directory),
             "untrained_sessions": sessions.untrained,
             "control_faults": self._control_faults,
+            "ended_threads": self._ended_threads.found,
             "clock_lost": lambda: None if self._time is None else self._time.lost(),
             "notice_faults": self._notices.faults,
             "metrics_fault": lambda: None if self._metrics is None else self._metrics.trouble(),
@@ -241,6 +244,10 @@ class Daemon:
             AcquisitionError: nothing is stored any more, and the process should end and be started again; or captures
                 could not be stored before the end.
         """
+        with self._ended_threads:
+            self._run(stop, notifier)
+
+    def _run(self, stop: threading.Event, notifier: Notifier) -> None:
         beat_s = min(BEAT_S, (notifier.watchdog_s or BEAT_S) / 2)
         try:
             self._live_model.start()

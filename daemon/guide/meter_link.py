@@ -126,7 +126,7 @@ class MeterLink:
                 answer = answers.readline()
                 if self._is_closing:
                     return
-                if not answer:
+                if not answer.endswith(b"\n"):
                     take({"error": "the process of the gain meter has ended; it is started again"})
                     return
                 take(json.loads(answer))

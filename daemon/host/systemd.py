@@ -20,6 +20,7 @@ import weakref
 from collections.abc import Iterator, Mapping
 from typing import TextIO
 
+from daemon.host.ended_threads import log_thread_end
 from daemon.host.safe_output import shown
 from drivers.clock import TimeBudget
 
@@ -70,13 +71,7 @@ def set_up_logging(*, level: int = logging.INFO, is_prefixed: bool | None = None
     handler.setFormatter(LineFormatter(is_prefixed=is_journal(sys.stderr) if is_prefixed is None else is_prefixed))
     logging.basicConfig(level=level, handlers=[handler])
     logging.captureWarnings(True)
-    threading.excepthook = _log_thread_end
-
-
-def _log_thread_end(end: threading.ExceptHookArgs) -> None:
-    if end.exc_value is not None and not isinstance(end.exc_value, SystemExit):
-        name = end.thread.name if end.thread is not None else "unknown"
-        log.critical("thread %s has ended", name, exc_info=end.exc_value)
+    threading.excepthook = log_thread_end
 
 
 def is_journal(stream: TextIO) -> bool:

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 
 from daemon.config import TipCanSection, TipSection
 from daemon.models.live_tip import LiveTip
 from drivers.can.tip_frames import encode_tip
 from drivers.can_link import CanLink
-from drivers.errors import DriverError
-
-log = logging.getLogger(__name__)
 
 STOP_TIMEOUT_S = 5.0
 
@@ -38,13 +34,9 @@ class TipSender(threading.Thread):
             self.join(timeout=STOP_TIMEOUT_S)
 
     def run(self) -> None:
-        """Send at the fixed rate until stopped."""
+        """Send at the fixed rate until stopped; where it may not be sent, the thread ends, which is an alarm."""
         counter = 0
         while not self._stopping.wait(1.0 / self._section.rate_hz):
             message = self._tip.tip(self._section.prism).message()
-            try:
-                self._link.publish(encode_tip(message, self._can.arbitration_id, counter))
-            except DriverError:
-                log.exception("the tip may not be sent; no more of it is")
-                return
+            self._link.publish(encode_tip(message, self._can.arbitration_id, counter))
             counter += 1

@@ -74,6 +74,17 @@ def control_dead(evidence: Evidence) -> Iterator[Finding]:
     yield from evidence.control_faults.items()
 
 
+@rule("critical", "Restart rigcal: `systemctl restart rigcal`, and report the fault with its log.")
+def thread_ended(evidence: Evidence) -> Iterator[Finding]:
+    """An error has ended a thread of the daemon: what it did is not done any more.
+
+    The threads that read links, keep the store, run jobs and send notices go on after an error, or have alarms of
+    their own. Cleared when rigcal is restarted.
+    """
+    for name, why in evidence.ended_threads.items():
+        yield name, f"the thread {name} has ended: {why}"
+
+
 @rule("warning", "Report the fault with rigcal's log; alarms of this sort stand as they were.", hold_s=5.0)
 def not_watched(evidence: Evidence) -> Iterator[Finding]:
     """A rule of an alarm, or what it looks at, has failed itself.

@@ -7,11 +7,12 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 
@@ -89,6 +90,24 @@ def test_a_clock_that_was_set_back_while_rigcal_did_not_run_is_an_event_and_alar
         wait_until(lambda: ("clock_behind", "clock") not in active(socket))
     steps = [e["code"] for e in table(tmp_path / "rigcal.sqlite", "device_events") if e["kind"] == "clock_step"]
     assert steps == [pytest.approx(-7_200_000, abs=100), pytest.approx(7_200_000, abs=100)]
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_thread_that_an_error_has_ended_is_an_alarm(tmp_path: Path) -> None:
+    def fail() -> NoReturn:
+        raise ArithmeticError("a fault")
+
+    before = threading.excepthook
+    with running(tmp_path, SetClock()) as socket:
+        wait_until(lambda: threading.excepthook != before)
+        for name, ends in (("tip", fail), ("another", sys.exit)):
+            thread = threading.Thread(target=ends, name=name)
+            thread.start()
+            thread.join()
+        wait_until(lambda: ("thread_ended", "tip") in active(socket))
+        assert active(socket)["thread_ended", "tip"]["text"] == "the thread tip has ended: ArithmeticError: a fault"
+        assert ("thread_ended", "another") not in active(socket)
+    assert threading.excepthook == before
 
 
 @pytest.mark.long

@@ -51,7 +51,7 @@ def test_lines_in_the_journal_carry_priorities_and_no_time(tmp_path: Path) -> No
     assert lines[3] == "<3>    Traceback (most recent call last):"
     assert all(re.match(r"<[23467]>", line) for line in lines), lines
     assert any(line.startswith("<4>py.warnings: ") and "a library warns" in line for line in lines)
-    assert "<2>daemon.host.systemd: thread worker has ended" in lines
+    assert "<2>daemon.host.ended_threads: thread worker has ended" in lines
 
 
 def test_lines_elsewhere_carry_the_time_and_no_priority(tmp_path: Path) -> None:

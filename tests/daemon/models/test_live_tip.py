@@ -11,6 +11,7 @@ from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor
 from daemon.commands import CommandError
 from daemon.config import TipCanSection, TipSection
+from daemon.host.ended_threads import EndedThreads
 from daemon.models.live_model import Loaded
 from daemon.models.tip_sender import TipSender
 from drivers.can.ports import CanLinkConfig
@@ -286,3 +287,14 @@ def test_the_sender_sends_the_tip_and_then_that_it_is_stale(rig: ModelRig) -> No
     assert [x_mm, z_mm] == pytest.approx([true[0], true[2]], abs=15.0)
     counters = [frame.data[6] for frame in heard.sent[:4]]
     assert counters[0] == counters[1] < counters[2] == counters[3], "two frames a tip; a late tip gives way to the next"
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_tip_that_may_not_be_sent_ends_the_sender_and_that_is_told(rig: ModelRig) -> None:
+    can = TipCanSection(link="boom", arbitration_id=0x680)
+    listening = CanLinkConfig(name="boom", interface="virtual", channel=unused_channel())
+    sender = TipSender(rig.tip, TipSection(prism="r", rate_hz=20.0, can=can), can, CanLink(listening, SystemClock()))
+    with EndedThreads() as ended:
+        sender.start()
+        sender.join()
+    assert "TransmitForbiddenError: boom" in ended.found()["tip"]
