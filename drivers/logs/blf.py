@@ -96,6 +96,8 @@ class BlfReader:
         _, _, version, _, kind = _OBJECT.unpack_from(data)
         if kind not in _BODIES:
             return None
+        if self._start_s is None:
+            raise ValueError("its header has no valid date: when its frames were is not known")
         stamped = _STAMPED.get(version)
         if stamped is None:
             raise ValueError(f"{where}: a frame with a header of version {version}, which is not known")
@@ -232,11 +234,11 @@ def _unpacked(body: bytes, where: str) -> bytes:
     return data
 
 
-def _seconds(time: list[int]) -> float:
-    """UTC of a SYSTEMTIME (year, month, day of the week, day, hour, minute, second, ms); 0 where it is none."""
+def _seconds(time: list[int]) -> float | None:
+    """UTC of a SYSTEMTIME (year, month, day of the week, day, hour, minute, second, ms); None where it is none."""
     year, month, _, day, hour, minute, second, millisecond = time
     try:
         stamp = datetime.datetime(year, month, day, hour, minute, second, millisecond * 1000, tzinfo=datetime.UTC)
     except ValueError:
-        return 0.0
+        return None
     return stamp.timestamp()

@@ -6,7 +6,8 @@ What the formats keep:
   python-can's turn an error frame into an empty one, or, for most error classes, into a data frame that never was.
 * `.blf`: everything but link names (channel numbers instead) and which error frames were sent. Own reader
   (`drivers.logs.blf`), because python-can's never ends on some damaged files.
-* `.asc`: no link names, error frames without class and data, and the local time of where it was written.
+* `.asc`: no link names, error frames without class and data, and the local time of where it was written. Own reader
+  (`drivers.logs.asc`), because python-can's passes over damaged lines; its writer.
 
 A remote frame's length is kept by none, because a capture has none. CAN FD frames are refused.
 """
@@ -14,7 +15,6 @@ A remote frame's length is kept by none, because a capture has none. CAN FD fram
 from __future__ import annotations
 
 import contextlib
-import io
 import math
 import re
 import zlib
@@ -27,6 +27,7 @@ from drivers.can.frame import DATA_MAX, EXTENDED_ID_MAX, STANDARD_ID_MAX
 from drivers.clock import Stamp
 from drivers.errors import DescriptionError
 from drivers.files import bounded_lines
+from drivers.logs.asc import AscReader
 from drivers.logs.blf import BlfReader
 from drivers.readings import CanCapture
 
@@ -39,9 +40,6 @@ _CANDUMP = re.compile(
     r"\((\d{1,10})\.(\d{1,9})\)\s+(\S+)\s+([0-9A-F]{3}|[0-9A-F]{8})#(?:(R)[0-8]?|((?:[0-9A-F]{2}){0,8}))(?:\s+([RT]))?",
     re.IGNORECASE,
 )
-# Lines that python-can's reader would pass over although they are meant to be frames
-_ASC_FRAME = re.compile(r"\d+\.\d+\s+\d+\s+\S+\s+\S+\s+[dr]\b", re.IGNORECASE)
-_ASC_READABLE = re.compile(r"\d+\.\d+\s+\d+\s+\w+\s+(Tx|Rx)\s+[dr]\b", re.IGNORECASE)
 
 
 def read_can_log(path: Path, link: str | None = None) -> Iterator[CanCapture]:
@@ -110,16 +108,22 @@ def _read_candump(path: Path, link: str | None) -> Iterator[CanCapture]:
         for number, line in enumerate(bounded_lines(file, _LINE_MAX), 1):
             text = line.strip()
             if text:
-                yield _candump_frame(text, link, f"{path}:{number}")
+                yield _candump_frame(text, link, f"{path}:{number}", is_ended=line.endswith("\n"))
 
 
-def _candump_frame(text: str, link: str | None, where: str) -> CanCapture:
+def _candump_frame(text: str, link: str | None, where: str, *, is_ended: bool) -> CanCapture:
     match = _CANDUMP.fullmatch(text)
     if match is None:
         example = "(1700000000.000000) can0 1A0#4E61BC00"
         fd = "CAN FD frames are not supported" if "##" in text else f"not a candump line such as {example}"
         raise DescriptionError(where, f"{fd}: {text[:80]!r}")
     seconds, fraction, channel, identifier, remote, data, direction = match.groups()
+    if not is_ended and not direction and data is not None and len(data) < 2 * DATA_MAX:
+        raise DescriptionError(
+            where,
+            f"the last line has no end, its frame may be cut short: {text[:80]!r}; "
+            "end the line if it is whole, or take it out",
+        )
     arbitration_id = int(identifier, 16)
     is_long = len(identifier) == 8
     is_error = is_long and bool(arbitration_id & _ERR_FLAG)
@@ -156,35 +160,14 @@ def _write_candump(path: Path, captures: Iterable[CanCapture]) -> int:
     return count
 
 
-class _CountedLines(io.TextIOWrapper):
-    """A text file for python-can's reader that knows which line it is at, and refuses those the reader would skip.
-
-    Attributes:
-        line: number of the last line that was read.
-    """
-
-    line = 0
-
-    def __next__(self) -> str:  # type: ignore[override]  # typeshed also gives it the bytes of _io._IOBase
-        text = self.readline(_LINE_MAX + 1)
-        if not text:
-            raise StopIteration
-        self.line += 1
-        if len(text) > _LINE_MAX:
-            raise ValueError(f"the line is longer than {_LINE_MAX} characters")
-        stripped = text.strip()
-        if _ASC_FRAME.match(stripped) and not _ASC_READABLE.match(stripped):
-            raise ValueError(repr(stripped[:80]))
-        return text
-
-
 def _read_asc(path: Path, link: str | None) -> Iterator[CanCapture]:
-    with _CountedLines(path.open("rb"), encoding="cp1252", errors="replace") as lines:
+    with path.open(encoding="cp1252", errors="replace") as file:
+        reader = AscReader(bounded_lines(file, _LINE_MAX))
         try:
-            for message in can.ASCReader(lines, relative_timestamp=False):
-                yield _capture(message, link, f"{path}:{lines.line}")
-        except (ValueError, IndexError, KeyError, OverflowError) as error:
-            raise DescriptionError(f"{path}:{lines.line}", f"not a frame: {error}") from error
+            for message in reader:
+                yield _capture(message, link, f"{path}:{reader.line}")
+        except ValueError as error:
+            raise DescriptionError(f"{path}:{reader.line}", str(error)) from error
 
 
 def _read_blf(path: Path, link: str | None) -> Iterator[CanCapture]:

@@ -108,6 +108,8 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
         with path.open("rb") as stream:
             for number, line in enumerate(bounded_lines(stream), 1):
                 text = line.rstrip(b"\r\n")
+                if text == line:
+                    raise DescriptionError(f"{path}, line {number}", "the line has no end: the file is cut short")
                 if text and not text.startswith(b"#"):
                     yield number, _text(path, number, text)
     except OSError as error:

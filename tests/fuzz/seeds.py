@@ -119,8 +119,9 @@ def _blf_with_fd_objects() -> bytes:
         objects += data + bytes(len(data) % 4)
     content = struct.pack("<H6xL4x", 0, len(objects)) + objects
     container = struct.pack("<4sHHLL", b"LOBJ", 16, 1, 16 + len(content), 10) + content
+    dates = (2023, 11, 2, 14, 22, 13, 20, 0) * 2
     head = struct.pack(
-        "<4sLBBBBBBBBQQLL8H8H", b"LOGG", 144, 5, 0, 0, 0, 2, 6, 8, 1, 144 + len(container), 0, 3, 3, *[0] * 16
+        "<4sLBBBBBBBBQQLL8H8H", b"LOGG", 144, 5, 0, 0, 0, 2, 6, 8, 1, 144 + len(container), 0, 3, 3, *dates
     )
     return head.ljust(144, b"\0") + container
 

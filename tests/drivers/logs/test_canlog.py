@@ -140,54 +140,16 @@ def test_a_malformed_candump_line_is_refused_with_its_number(tmp_path: Path, lin
     assert str(caught.value).startswith(f"{path}:2: ")
 
 
-ASC_HEADER = "date Tue Nov 14 10:13:20.000 pm 2023\nbase hex  timestamps absolute\nno internal events logged\n"
-
-
-def test_what_else_is_in_an_asc_file_is_passed_over(tmp_path: Path) -> None:
-    text = ASC_HEADER + (
-        "// a comment\n"
-        "Begin Triggerblock Tue Nov 14 10:13:20.000 pm 2023\n"
-        "   0.000000 Start of measurement\n"
-        "   0.010000 1  1A0             Rx   d 4 4E 61 BC 00  Length = 0 BitCount = 0\n"
-        "   0.015000 CAN 1 Status:chip status error active\n"
-        "   0.018000 1  Statistic: D 0 R 0 XD 0 XR 0 E 0 O 0 B 0.00%\n"
-        "   0.020000 2  CFE3021x        Tx   d 1 7D\n"
-        "End TriggerBlock\n"
-    )
-    frames = list(read_can_log(log(tmp_path, text, ".asc")))
-    assert [(c.link, c.arbitration_id, c.data, c.is_transmitted) for c in frames] == [
-        ("can0", 0x1A0, bytes.fromhex("4E61BC00"), False),
-        ("can1", 0x0CFE3021, b"\x7d", True),
-    ]
-
-
-@pytest.mark.parametrize(
-    ("line", "reason"),
-    [
-        ("0.010000 1  1G0             Rx   d 1 4E", "invalid literal"),
-        ("0.010000 1  1A0             Rx   d 8 4E 61", "says 8 bytes and has 2"),
-        ("0.010000 1  1A0             Rx   d 1 XX", "invalid literal"),
-        ("9" * 12 + ".0 1  1A0       Rx   d 1 00", "time lies before 1970 or after 2262"),
-        ("9" * 400 + ".0 1  1A0       Rx   d 1 00", "not a frame: cannot convert float infinity"),
-        ("0.010000 1  1A0             Qx   d 1 4E", "not a frame: '0.010000 1  1A0 "),
-        ("0.010000 1  8FF             Rx   d 1 4E", "identifier 8FFh is beyond"),
-        ("0.010000 1  2FFFFFFFx       Rx   d 1 4E", "identifier 2FFFFFFFh is beyond"),
-        ("0.010000 CANFD 1 Rx 1A0 1 0 d 32 " + "00 " * 32 + "0 0 3000 0 0 0 0 0", "CAN FD frames are not supported"),
-    ],
-)
-def test_a_malformed_asc_line_is_refused_with_its_number(tmp_path: Path, line: str, reason: str) -> None:
-    path = log(tmp_path, ASC_HEADER + f"0.005000 1  1A0             Rx   d 1 4E\n{line}\n", ".asc")
-    frames = read_can_log(path)
-    assert next(frames).data == b"\x4e"
-    with pytest.raises(DescriptionError, match=reason) as caught:
-        next(frames)
-    assert str(caught.value).startswith(f"{path}:5: ")
-
-
-def test_an_asc_header_with_an_impossible_date_is_refused(tmp_path: Path) -> None:
-    path = log(tmp_path, "date Tue Smarch 14 2023\nbase hex  timestamps absolute\n", ".asc")
-    with pytest.raises(DescriptionError, match=r"boom\.asc:1: .*Incompatible datetime"):
-        list(read_can_log(path))
+def test_a_candump_log_whose_last_frame_may_be_cut_is_refused(tmp_path: Path) -> None:
+    start = "(1700000000.0) can0 1A0#0011223344556677\n"
+    for last in ("1A0#", "1A0#4E61", "1A0#4E61BC00112233"):
+        path = log(tmp_path, f"{start}(1700000000.0) can0 {last}")
+        with pytest.raises(
+            DescriptionError, match=r"boom\.log:2: the last line has no end, its frame may be cut short"
+        ):
+            list(read_can_log(path))
+    for whole in ("1A0#4E61\n", "1A0#4E61\r\n", "1A0#4E61 R", "1A0#0011223344556677", "1A0#R"):
+        assert len(list(read_can_log(log(tmp_path, f"{start}(1700000000.0) can0 {whole}")))) == 2, whole
 
 
 def written_blf(tmp_path: Path) -> Path:

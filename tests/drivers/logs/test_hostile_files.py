@@ -27,6 +27,7 @@ CAPTURES = [
     capture("1A1", 1.5, is_remote=True),
 ]
 HEADER_BYTES = 144
+DATE = (2023, 11, 2, 14, 22, 13, 20, 0)
 
 
 def blf(tmp_path: Path, objects: bytes, is_packed: bool = True) -> Path:
@@ -36,9 +37,9 @@ def blf(tmp_path: Path, objects: bytes, is_packed: bool = True) -> Path:
     return blf_with(tmp_path, struct.pack("<4sHHLL", b"LOBJ", 16, 1, 16 + len(content), 10) + content)
 
 
-def blf_with(tmp_path: Path, rest: bytes) -> Path:
+def blf_with(tmp_path: Path, rest: bytes, date: tuple[int, ...] = DATE) -> Path:
     """A log whose header counts nothing, and what follows it."""
-    head = struct.pack("<4sLBBBBBBBBQQLL8H8H", b"LOGG", HEADER_BYTES, *[0] * 8, 0, 0, 0, 0, *[0] * 16)
+    head = struct.pack("<4sLBBBBBBBBQQLL8H8H", b"LOGG", HEADER_BYTES, *[0] * 8, 0, 0, 0, 0, *date * 2)
     path = tmp_path / "hostile.blf"
     path.write_bytes(head.ljust(HEADER_BYTES, b"\0") + rest)
     return path
@@ -128,6 +129,12 @@ def test_an_object_may_begin_in_one_container_and_end_in_the_next(tmp_path: Path
     path.write_bytes(head)
     found: list[CanCapture] = list(read_can_log(path))
     assert [c.data for c in found] == [c.data for c in CAPTURES]
+
+
+def test_a_blf_file_without_a_date_is_refused_as_its_frames_would_be_of_1970(tmp_path: Path) -> None:
+    path = tmp_path / "boom.blf"
+    write_can_log(path, CAPTURES)
+    refused(blf_with(tmp_path, path.read_bytes()[HEADER_BYTES:], (0,) * 8), "its header has no valid date")
 
 
 @pytest.mark.parametrize("suffix", [".log", ".asc"])

@@ -84,6 +84,14 @@ def test_a_malformed_line_is_refused_with_file_and_line(
         list(read_serial_log(path))
 
 
+def test_a_log_is_refused_wherever_its_last_capture_is_cut(tmp_path: Path) -> None:
+    path = tmp_path / "log"
+    for end in range(TEXT.rindex("17") + 1, len(TEXT)):
+        path.write_text(TEXT[:end], encoding="utf-8")
+        with pytest.raises(DescriptionError, match=r"log, line 9: the line has no end: the file is cut short"):
+            list(read_serial_log(path))
+
+
 def test_an_empty_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "log"
     path.write_text("", encoding="utf-8")

@@ -1,0 +1,193 @@
+"""Vector's text CAN log (`.asc`): a header, then frames among lines that tell what else went on.
+
+Own reader, because python-can's passes over every line that it does not know, also a damaged one or one cut short, and
+takes 1970 and hexadecimal numbers where the header is missing. Here a line is a frame, known to be none, or refused.
+
+    date Fri Nov 27 11:48:03.730 am 2026               local time of second 0
+    base hex  timestamps absolute                      of identifiers, lengths and data
+    Begin Triggerblock Fri Nov 27 11:51:33.000 2026    local time of second 0 from here on
+       0.057767 1  1BC             Rx   d 2 0B 05      second, channel, identifier (with x: 29 bits), direction, data
+       0.104574 2  730x            Tx   r
+       2.501000 1  ErrorFrame
+    End TriggerBlock
+"""
+
+from __future__ import annotations
+
+import datetime
+import re
+from collections.abc import Iterable, Iterator
+from itertools import takewhile
+
+import can
+
+from drivers.can.frame import DATA_MAX
+
+_EXAMPLE = "0.057767 1  1BC  Rx  d 2 0B 05"
+
+_DATE = re.compile(r"date\s+(?P<date>.+)", re.IGNORECASE)
+_BEGIN = re.compile(r"begin\s+triggerblock(?:\s+(?P<date>.+))?", re.IGNORECASE)
+_BASE = re.compile(r"base\s+(?P<base>hex|dec)(?:\s+timestamps\s+(?P<timestamps>absolute|relative))?", re.IGNORECASE)
+_INSTANT = re.compile(
+    r"(?:\w+\.?\s+)?(?P<month>[^\W\d]{3})\w*\.?\s+(?P<day>\d{1,2})\s+"
+    r"(?P<hour>\d{1,2}):(?P<minute>\d{1,2}):(?P<second>\d{1,2})(?:\.(?P<fraction>\d{1,6})\d*)?"
+    r"(?:\s+(?P<half>am|pm))?\s+(?P<year>\d{4})",
+    re.IGNORECASE,
+)
+_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+_GERMAN_MONTHS = {"mär": "mar", "mai": "may", "okt": "oct", "dez": "dec"}
+
+_UNTIMED = re.compile(r"//.*|;.*|(?:no\s+)?internal\s+events\s+logged|end\s+triggerblock", re.IGNORECASE)
+_TIMED = re.compile(r"(?P<seconds>\d{1,15}\.\d{1,15})\s+(?P<event>.+)", re.ASCII)
+_FRAME = re.compile(
+    r"(?P<channel>\d{1,3})\s+(?P<identifier>\w+?)(?P<extended>x?)\s+(?P<direction>Rx|Tx)\s+"
+    r"(?:(?P<remote>r)(?:\s.*)?|d\s+(?P<length>\w+)(?:\s+(?P<data>.*))?)",
+    re.ASCII | re.IGNORECASE,
+)
+_ERROR = re.compile(r"(?P<channel>\d{1,3})\s+ErrorFrame(?:\s.*)?", re.ASCII | re.IGNORECASE)
+_FD = re.compile(r"CANFD\s+\d{1,3}\s+(?:Rx|Tx)\s.*", re.ASCII | re.IGNORECASE)
+_EVENT = re.compile(
+    r"Start of measurement|//.*|Comment:.*|log (?:trigger|direct) .*"
+    r"|\d{1,3}\s+(?:Statistic:|J1939TP\s|OverloadFrame\b|\w+\s+TxRq\s).*"
+    r"|CAN(?:FD)?\s+\d{1,3}\s+(?:Status:|Statistic:|OverloadFrame\b).*"
+    r"|(?:Li|L\d+|LIN|Fr|ETH|AFDX|WLAN|MOST|M\d+)\s.*"  # other buses
+    r"|(?:CAN|LIN|FlexRay)\s+\d{1,3}\s+\S+\s=\s.*|\S+\s:=.*|SV:.*"  # signals and variables
+    r"|GPS\s.*|TFS:.*|.*\bGMGroup:.*",  # places, steps of tests, marks
+    re.ASCII | re.IGNORECASE,
+)
+_DIGITS = {16: re.compile(r"[0-9A-F]+", re.IGNORECASE), 10: re.compile(r"[0-9]+")}
+_BYTES = {16: re.compile(r"[0-9A-F]{2}", re.IGNORECASE), 10: re.compile(r"[01]?[0-9]?[0-9]|2[0-4][0-9]|25[0-5]")}
+_BASE_NAMES = {16: "hexadecimal", 10: "decimal"}
+_LONGEST_CODE = 15  # of a length; classic frames with codes above 8 have 8 bytes
+
+
+class AscReader:
+    """The frames of a log, as python-can's messages.
+
+    Args:
+        lines: of the file, with their ends.
+
+    Attributes:
+        line: number of the line that was read last.
+    """
+
+    def __init__(self, lines: Iterable[str]) -> None:
+        self.line = 0
+        self._lines = lines
+        self._base: int | None = None
+        self._start_s: float | None = None
+
+    def __iter__(self) -> Iterator[can.Message]:
+        """The frames in order; ValueError says what is wrong with the line `line`, frames before it have been given."""
+        for text in self._lines:
+            self.line += 1
+            line = text.strip()
+            if timed := _TIMED.fullmatch(line):
+                frame = self._frame(float(timed["seconds"]), timed["event"], line, is_ended=text.endswith("\n"))
+                if frame is not None:
+                    yield frame
+            elif line and not self._is_header(line) and not _UNTIMED.fullmatch(line):
+                raise _unknown(line)
+
+    def _is_header(self, line: str) -> bool:
+        """Take what a line says of all those after it."""
+        if date := _DATE.fullmatch(line) or _BEGIN.fullmatch(line):
+            if date["date"] is not None:
+                self._start_s = _local_time_s(date["date"])
+        elif base := _BASE.fullmatch(line):
+            if (base["timestamps"] or "").lower() == "relative":
+                raise ValueError("times that count from the line before are not read: save the log with absolute ones")
+            self._base = 16 if base["base"].lower() == "hex" else 10
+        else:
+            return False
+        return True
+
+    def _frame(self, seconds: float, event: str, line: str, *, is_ended: bool) -> can.Message | None:
+        if error := _ERROR.fullmatch(event):
+            return can.Message(self._utc_s(seconds), is_error_frame=True, channel=int(error["channel"]) - 1)
+        if _FD.fullmatch(event):
+            raise ValueError(f"CAN FD frames are not supported: {line[:80]!r}")
+        match = _FRAME.fullmatch(event)
+        if match is None:
+            if _EVENT.fullmatch(event):
+                return None
+            raise _unknown(line)
+        base = self._base
+        if base is None:
+            raise ValueError(
+                "a frame without a line 'base hex' or 'base dec' before it: whether its numbers are hexadecimal is not "
+                "known; the file's beginning is missing"
+            )
+        if base == 10 and not is_ended:
+            raise ValueError(f"the last line has no end, its last number may be cut short: {line[:80]!r}")
+        data, length = b"", 0
+        if match["remote"] is None:
+            data, length = _data(match["length"], match["data"] or "", base, line)
+        return can.Message(
+            timestamp=self._utc_s(seconds),
+            arbitration_id=_number(match["identifier"], "identifier", base, line),
+            is_extended_id=bool(match["extended"]),
+            is_remote_frame=match["remote"] is not None,
+            is_rx=match["direction"].lower() == "rx",
+            dlc=length,
+            data=data,
+            channel=int(match["channel"]) - 1,
+        )
+
+    def _utc_s(self, seconds: float) -> float:
+        if self._start_s is None:
+            raise ValueError(
+                "a frame without a line 'date ...' or 'Begin Triggerblock ...' before it: when it was is not known; "
+                "the file's beginning is missing"
+            )
+        return self._start_s + seconds
+
+
+def _data(code: str, text: str, base: int, line: str) -> tuple[bytes, int]:
+    """Bytes of a frame, and how many its length code says; other words may follow the bytes."""
+    length = _number(code, "length", base, line)
+    if length > _LONGEST_CODE:
+        raise ValueError(f"a frame has no length {code}: {line[:80]!r}")
+    length = min(length, DATA_MAX)
+    numbers = [int(word, base) for word in takewhile(_BYTES[base].fullmatch, text.split())]
+    if len(numbers) != length:
+        raise ValueError(f"the frame says {length} bytes and has {len(numbers)}: {line[:80]!r}")
+    return bytes(numbers), length
+
+
+def _number(word: str, what: str, base: int, line: str) -> int:
+    if _DIGITS[base].fullmatch(word) is None:
+        raise ValueError(f"{what} {word!r} is no {_BASE_NAMES[base]} number: {line[:80]!r}")
+    return int(word, base)
+
+
+def _unknown(line: str) -> ValueError:
+    return ValueError(
+        f"not a line of an ASC log such as {_EXAMPLE}: {line[:80]!r}; it is damaged, cut short, or of a kind that is "
+        "not known here: take it out to have the others read"
+    )
+
+
+def _local_time_s(text: str) -> float:
+    """UTC of a local time, whatever the language of the computer that reads it."""
+    match = _INSTANT.fullmatch(text.strip())
+    try:
+        if match is None:
+            raise ValueError
+        name = match["month"].lower()
+        hour = int(match["hour"])
+        if match["half"]:
+            if not 1 <= hour <= 12:
+                raise ValueError
+            hour = hour % 12 + (12 if match["half"].lower() == "pm" else 0)
+        return datetime.datetime(
+            int(match["year"]),
+            _MONTHS.index(_GERMAN_MONTHS.get(name, name)) + 1,
+            int(match["day"]),
+            hour,
+            int(match["minute"]),
+            int(match["second"]),
+            int((match["fraction"] or "").ljust(6, "0")),
+        ).timestamp()
+    except (ValueError, OverflowError, OSError):
+        raise ValueError(f"not a date such as Fri Nov 27 11:48:03.730 2026: {text[:80]!r}") from None
