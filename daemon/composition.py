@@ -344,12 +344,9 @@ def _parts(
 
 
 def _playback(section: CanSection, config: Config, clock: Clock) -> ReplayLink:
-    path = Path(section.channel)
-    first, now = first_captures([path], config)[path].stamp, clock.now()
-    captures = (
-        replace(capture, link=section.name, stamp=now.shifted(capture.stamp.since(first)))
-        for capture in captures_of(path, config)
-    )
+    path, alone = Path(section.channel), config.model_copy(update={"can": (section,)})
+    first, now = first_captures([path], alone)[path].stamp, clock.now()
+    captures = (replace(capture, stamp=now.shifted(capture.stamp.since(first))) for capture in captures_of(path, alone))
     return ReplayLink(section.name, captures, clock)
 
 

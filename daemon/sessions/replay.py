@@ -7,7 +7,9 @@ import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import NamedTuple
 
 from daemon.config import Config, ConfigError
 from daemon.sessions.export.session_file import DoubtfulCaptures
@@ -31,7 +33,7 @@ def captures_of(path: Path, config: Config, doubtful: Mapping[str, DoubtfulCaptu
     """Captures of one file, in order, with the link names of the configuration.
 
     A CAN log's channels are matched with the configured links' names, then with their channels (`can0`); a log of one
-    channel and a configuration of one link belong together in any case.
+    channel and a configuration of one link belong together in any case. Two channels never become one link.
 
     A log knows UTC alone, so all stamps are put on one monotonic axis: that of UTC. Recorded time that steps back
     stands still until it is past again.
@@ -42,8 +44,8 @@ def captures_of(path: Path, config: Config, doubtful: Mapping[str, DoubtfulCaptu
         doubtful: link -> its captures of doubtful time, as a session file tells them.
 
     Raises:
-        DescriptionError: the file is malformed (file and line), or is no captured log; or it is not the one that
-            `doubtful` speaks of.
+        DescriptionError: the file is malformed (file and line), is no captured log, or has several channels for a link;
+            or it is not the one that `doubtful` speaks of.
         ConfigError: a link of the file is not configured.
     """
     captures: Iterator[Capture]
@@ -61,10 +63,13 @@ def captures_of(path: Path, config: Config, doubtful: Mapping[str, DoubtfulCaptu
         raise DescriptionError(str(path), f"not a captured log by its name; allowed endings: {allowed}")
     latest_ns = 0
     counts: Counter[str] = Counter()
+    channels: dict[str, str] = {}
     for capture in captures:
         link = known.get(capture.link, only)
         if link is None:
             raise ConfigError(f"{path}: link {capture.link!r} is not configured as {what}; known: {', '.join(known)}")
+        if channels.setdefault(link, capture.link) != capture.link:
+            raise _several_channels(path, link, what, known)
         if not 0 <= capture.stamp.utc_ns < LATEST_UTC_NS:
             raise DescriptionError(str(path), f"a capture at {capture.stamp.utc_ns / NS_PER_S:.0f} s is beyond 2100")
         latest_ns = max(latest_ns, capture.stamp.utc_ns)
@@ -80,21 +85,65 @@ def captures_of(path: Path, config: Config, doubtful: Mapping[str, DoubtfulCaptu
             )
 
 
+def _several_channels(path: Path, link: str, what: str, known: Mapping[str, str]) -> DescriptionError:
+    found = ", ".join(sorted({capture.link for capture in read_can_log(path)}))
+    return DescriptionError(
+        str(path),
+        f"holds frames of several channels, {found}, of which more than one would become link {link!r}: configure each "
+        f"as a {what} (known: {', '.join(known)}), or give a log of the link's channel alone",
+    )
+
+
 def first_captures(
     paths: Sequence[Path], config: Config, doubtful: Mapping[str, DoubtfulCaptures] = NO_DOUBTS
 ) -> dict[Path, Capture]:
     """The first capture of each file; every file is read through, so that a bad one is refused before anything runs.
 
     Raises:
-        DescriptionError, ConfigError: as `captures_of`; or a file holds no captures.
+        DescriptionError, ConfigError: as `captures_of`; or a file holds no captures, is given twice, or has captures of
+            a link from a time from which another file has them.
     """
     firsts: dict[Path, Capture] = {}
+    spans: dict[str, list[_Span]] = {}
     for path in paths:
+        if path in firsts:
+            raise DescriptionError(str(path), "is given twice: its captures would be stored twice; give it once")
+        found: dict[str, _Span] = {}
         for capture in captures_of(path, config, doubtful):
             firsts.setdefault(path, capture)
+            at_ns = capture.stamp.monotonic_ns
+            span = found.get(capture.link)
+            found[capture.link] = _Span(path, at_ns, at_ns) if span is None else span._replace(last_ns=at_ns)
         if path not in firsts:
             raise DescriptionError(str(path), "holds no captures")
+        for link, span in found.items():
+            others = spans.setdefault(link, [])
+            for other in others:
+                span.check_apart(other, link)
+            others.append(span)
     return firsts
+
+
+class _Span(NamedTuple):
+    """From when to when a file has captures of a link."""
+
+    path: Path
+    first_ns: int
+    last_ns: int
+
+    def check_apart(self, other: _Span, link: str) -> None:
+        """Refuse a file that has captures of the link from the time of another; they may meet at one instant."""
+        first_ns, last_ns = max(self.first_ns, other.first_ns), min(self.last_ns, other.last_ns)
+        if first_ns < last_ns or (self.first_ns, self.last_ns) == (other.first_ns, other.last_ns):
+            raise DescriptionError(
+                str(self.path),
+                f"holds captures of link {link!r} from {_utc(first_ns)} to {_utc(last_ns)}, and so does {other.path}: "
+                "they would be stored twice; give one of the two",
+            )
+
+
+def _utc(utc_ns: int) -> str:
+    return f"{datetime.fromtimestamp(utc_ns / NS_PER_S, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
 def merged(
