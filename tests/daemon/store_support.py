@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -59,3 +61,10 @@ def table(path: Path, name: str, order: str = "rowid") -> list[dict[str, Any]]:
     """All rows of a table, through a reader of its own."""
     with Reader(path) as reader:
         return [*reader.rows(f"SELECT * FROM {name} ORDER BY {order}")]
+
+
+def rows(path: Path, sql: str, **parameters: Any) -> list[dict[str, Any]]:
+    """What a query answers on a store's file."""
+    with contextlib.closing(sqlite3.connect(path)) as db:
+        db.row_factory = sqlite3.Row
+        return [dict(row) for row in db.execute(sql, parameters)]

@@ -12,7 +12,7 @@ from calibration.identification.solve import place
 from calibration.identification.start import draw_rows
 from calibration.kinematics.chain import ChainData
 from tests.calibration.conftest import Session, simulated
-from tests.calibration.identification.test_circles import joined_observations
+from tests.calibration.identification.sweeps.test_circles import joined_observations
 
 
 def rows(setup: np.ndarray) -> ChainData:

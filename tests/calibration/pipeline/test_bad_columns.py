@@ -15,7 +15,7 @@ from calibration.observations import Floats, Observations, format_observations, 
 from calibration.pipeline.calibrate import identify
 from calibration.pipeline.find_gap import find_gap
 from tests.calibration.conftest import Session, rig_text, rms, simulated
-from tests.calibration.identification.test_circles import joined_observations
+from tests.calibration.identification.sweeps.test_circles import joined_observations
 from tests.simulated.observations import simulate_observations
 
 Change = Callable[[Observations], Observations]

@@ -20,7 +20,7 @@ from calibration.rig.description import parse_rig, shipped_rig
 from calibration.run_settings import Run
 from daemon.cli.main import main as rigcal
 from tests.calibration.conftest import Session, rig_text, rms
-from tests.calibration.identification.test_circles import joined_observations
+from tests.calibration.identification.sweeps.test_circles import joined_observations
 
 Change = Callable[[Observations], Observations]
 
