@@ -254,7 +254,7 @@ def trial(
     measured: Mapping[str, Any] | None,
     oracle: Mapping[str, Any] | None,
 ) -> Trial:
-    """A label, as the keeper's JSON has it, joined with the answers of its case and of its twin."""
+    """Return a label, as the file of labels has it, joined with the answers of its case and of its twin."""
     effects = tuple(
         TrueEffect(
             e["family"], e["where"], e["has_name"], tuple(e["places"]), e["coefficients"], e["scale"], e["separable"]

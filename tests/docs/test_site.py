@@ -20,6 +20,9 @@ LOADED = {
     **{"link": "href", "script": "src", "img": "src", "iframe": "src", "source": "src", "embed": "src"},
     **{"video": "src", "audio": "src", "object": "data", "use": "href", "image": "href"},
 }
+ROOMS = "tests|daemon|drivers|calibration|simulators|rigcal|deploy|docs"
+PATH = re.compile(rf"(?<![\w/.-])(?:{ROOMS})/[\w./*-]*")
+MODULE = re.compile(rf"(?<![\w/.-])(?:{ROOMS})(?:\.\w+){{2,}}(?![\w/])")
 OUTSIDE = re.compile(r"(?i)^\s*(https?:)?//")
 
 
@@ -32,6 +35,27 @@ def test_every_page_that_a_file_names_is_there() -> None:
     for path in sources():
         for name in re.findall(r"\bdocs/[\w/-]+\.(?:md|yaml)", path.read_text(encoding="utf-8")):
             assert (ROOT / name).exists(), f"{path.relative_to(ROOT)} names {name}"
+
+
+def test_every_file_and_module_that_a_page_names_is_there() -> None:
+    """Backticked paths and dotted names; `NAME` stands for what a reader adds, and a `*` for any text."""
+    listed = subprocess.run(["git", "ls-files", "*.md"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for page in listed.splitlines():
+        for code in re.findall(r"`([^`\n]+)`", (ROOT / page).read_text(encoding="utf-8")):
+            for name in PATH.findall(code):
+                if "NAME" not in name:
+                    assert any(ROOT.glob(name.rstrip("./"))), f"{page} names {name}"
+            for name in MODULE.findall(code):
+                assert is_there(name), f"{page} names {name}"
+
+
+def is_there(dotted: str) -> bool:
+    """Whether a module is there, or the one that a name is said to be of says that name."""
+    path, _, last = (ROOT / dotted.replace(".", "/")).as_posix().rpartition("/")
+    if any(Path(f"{path}/{last}{ending}").exists() for ending in ("", ".py")):
+        return True
+    files = [file for file in (Path(f"{path}.py"), Path(path, "__init__.py")) if file.exists()]
+    return any(re.search(rf"\b{last}\b", file.read_text(encoding="utf-8")) for file in files)
 
 
 def sources() -> Iterator[Path]:
