@@ -34,7 +34,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class MotionTree:
-    """All motions of a rig, parents first.
+    """Motions of a rig as a tree, parents first, and what hangs on them.
 
     Attributes:
         motions: see there.

@@ -12,9 +12,12 @@ from calibration.export.model_export import Export, Format
 
 def formats() -> Mapping[str, Format]:
     """Return the formats by their names, in alphabetical order."""
-    modules = sorted(module.name for module in pkgutil.iter_modules(__path__))
-    found = [importlib.import_module(f"{__name__}.{name}").FORMAT for name in modules]
-    return {made.name: made for made in sorted(found, key=lambda made: str(made.name))}
+    modules = [importlib.import_module(f"{__name__}.{info.name}") for info in pkgutil.iter_modules(__path__)]
+    found: dict[str, Format] = {}
+    for made in sorted((module.FORMAT for module in modules), key=lambda made: str(made.name)):
+        assert made.name not in found, f"two formats are called {made.name}"
+        found[made.name] = made
+    return found
 
 
 def chosen_formats(names: Sequence[str] = ()) -> tuple[Format, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,8 +21,26 @@ if TYPE_CHECKING:
 
 CONFIG, RIG = "rigcal.toml", "rig.toml"
 FIRST_NODE = 32
-PROFILES = ("topcon_gts8", "topcon_classic", "sokkia_set", "passive")
 INTERFACES = ("socketcan", "slcan", "udp_multicast")
+
+
+class _Profiles(click.Choice[str]):
+    """A station profile's name; the profiles are looked for when it is given or its help is shown."""
+
+    def __init__(self) -> None:
+        self.case_sensitive = True
+
+    @cached_property
+    def choices(self) -> tuple[str, ...]:  # type: ignore[override] # click sets it, and never again
+        """The names, that of the configuration's default first."""
+        from drivers.stations.config import StationConfig
+        from drivers.stations.profiles import station_profiles
+
+        usual = StationConfig.model_fields["profile"].default
+        return tuple(sorted(station_profiles(), key=lambda name: (name != usual, name)))
+
+
+PROFILE = _Profiles()
 
 
 @click.command(cls=Command)
@@ -45,7 +64,7 @@ INTERFACES = ("socketcan", "slcan", "udp_multicast")
 @click.option("--channel", metavar="NAME", help="CAN interface, port or group; can0 by default.")
 @click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), help="Of the bus, for an slcan adapter.")
 @click.option("--station", "port", metavar="PORT", help="Serial port of the total station; `none` without one.")
-@click.option("--profile", type=click.Choice(PROFILES), help="What the station speaks; topcon_gts8 by default.")
+@click.option("--profile", type=PROFILE, help="What the station speaks; the first of them by default.")
 @click.option("--baud", type=click.IntRange(50, 4_000_000), help="Of the station; 9600 by default.")
 @click.option(
     "--listen",
@@ -112,7 +131,7 @@ def _answers(given: dict[str, Any], *, is_asking: bool) -> dict[str, Any]:
     answer("channel", f"CAN interface ({answers['interface']})", "can0")
     answer("port", "Serial port of the total station (none without one)", _usual_port())
     if answers["port"] != "none" and not answers["listen_s"]:
-        answer("profile", f"What it speaks ({', '.join(PROFILES)})", PROFILES[0])
+        answer("profile", f"What it speaks ({', '.join(PROFILE.choices)})", PROFILE.choices[0])
         answer("baud", "Its baud", "9600")
     if is_asking and not answers["listen_s"] and click.confirm("Listen to bus and port for 5 s each?", err=True):
         answers["listen_s"] = 5.0
@@ -177,7 +196,7 @@ def _configuration(answers: dict[str, Any], rig: str, heard: HeardStation | None
     station = None
     if answers["port"] != "none":
         usual = SerialConfig(path=answers["port"], baud=int(answers["baud"] or 9600))
-        profile = answers["profile"] or (PROFILES[0] if heard is None else "passive")
+        profile = answers["profile"] or (PROFILE.choices[0] if heard is None else "passive")
         station = (profile, "topcon" if heard is None else heard.family, usual if heard is None else heard.serial)
     return configuration(rig, answers["interface"], answers["channel"], answers["bitrate"], station)
 

@@ -13,8 +13,11 @@ from drivers.stations.export_format import ExportFormat, refuse
 def export_formats() -> dict[str, ExportFormat]:
     """Return the formats by name, in the order in which they are tried."""
     modules = [importlib.import_module(f"{__name__}.{info.name}") for info in pkgutil.iter_modules(__path__)]
-    formats: list[ExportFormat] = sorted((module.FORMAT for module in modules), key=lambda known: known.rank)
-    return {known.name: known for known in formats}
+    found: dict[str, ExportFormat] = {}
+    for known in sorted((module.FORMAT for module in modules), key=lambda known: int(known.rank)):
+        assert known.name not in found, f"two formats are called {known.name}"
+        found[known.name] = known
+    return found
 
 
 def format_of(text: str, source: str) -> ExportFormat:

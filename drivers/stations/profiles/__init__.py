@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Iterable
 from functools import cache
 
 from drivers.stations.profile import Codec, StationProfile
@@ -13,19 +12,12 @@ from drivers.stations.profile import Codec, StationProfile
 @cache
 def station_profiles() -> dict[str, StationProfile]:
     """Return the profiles by name."""
-    return find_profiles(__path__, __name__)
-
-
-def find_profiles(folders: Iterable[str], package: str) -> dict[str, StationProfile]:
-    """Return the profiles that the files of a package define, by name.
-
-    Args:
-        folders: the package's folders.
-        package: its dotted name.
-    """
-    modules = (importlib.import_module(f"{package}.{info.name}") for info in pkgutil.iter_modules(folders))
-    profiles: list[StationProfile] = [module.PROFILE for module in modules]
-    return {profile.name: profile for profile in profiles}
+    found: dict[str, StationProfile] = {}
+    for info in pkgutil.iter_modules(__path__):
+        profile: StationProfile = importlib.import_module(f"{__name__}.{info.name}").PROFILE
+        assert profile.name not in found, f"two station profiles are called {profile.name}"
+        found[profile.name] = profile
+    return found
 
 
 def codecs_by_family() -> dict[str, Codec]:

@@ -14,8 +14,10 @@ from click.testing import CliRunner, Result
 
 from daemon.cli.listening import hear_bus, hear_station
 from daemon.cli.main import main
+from daemon.config import read_config
 from drivers.can.ports import CanLinkConfig
 from drivers.clock import SystemClock
+from drivers.stations.profiles import station_profiles
 from drivers.stations.topcon.codec import CODEC
 from tests.drivers.serial_support import framed
 
@@ -46,6 +48,13 @@ def test_a_shipped_rig_needs_no_rig_file(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["rigcal.toml"]
     assert init("--out", str(tmp_path / "b"), "--rig", "swdt28").exit_code == 2
     assert not (tmp_path / "b").exists()
+
+
+@pytest.mark.parametrize("profile", station_profiles())
+def test_every_profile_of_the_configuration_can_be_chosen(tmp_path: Path, profile: str) -> None:
+    made = init("--out", str(tmp_path), "--rig", "swdt82", "--station", "/dev/ttyUSB7", "--profile", profile)
+    assert made.exit_code == 0, made.output
+    assert read_config(tmp_path / "rigcal.toml").stations[0].profile == profile
 
 
 @pytest.mark.parametrize("joint", ["theta1", "theta1:round:0:1", "theta1:revolute:a:b", "t:revolute:0:1:2:3"])

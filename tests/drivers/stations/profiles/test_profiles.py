@@ -58,11 +58,12 @@ PROFILE = StationProfile(
 
 
 @pytest.fixture
-def new_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def new_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder with one further profile."""
     (tmp_path / "theodolite_one.py").write_text(NEW_INSTRUMENT, encoding="utf-8")
     monkeypatch.setattr(profiles, "__path__", [*profiles.__path__, str(tmp_path)])
     profiles.station_profiles.cache_clear()
-    yield
+    yield tmp_path
     profiles.station_profiles.cache_clear()
 
 
@@ -71,8 +72,14 @@ def config(**settings: object) -> StationConfig:
 
 
 def test_the_profiles_are_those_of_the_configuration() -> None:
-    assert sorted(profiles.station_profiles()) == ["passive", "sokkia_set", "topcon_classic", "topcon_gts8"]
-    assert sorted(profiles.codecs_by_family()) == ["sokkia", "topcon"]
+    assert {"passive", "sokkia_set", "topcon_classic", "topcon_gts8"} <= profiles.station_profiles().keys()
+    assert {"sokkia", "topcon"} <= profiles.codecs_by_family().keys()
+
+
+def test_two_profiles_of_one_name_are_refused(new_file: Path) -> None:
+    (new_file / "theodolite_two.py").write_text(NEW_INSTRUMENT, encoding="utf-8")
+    with pytest.raises(AssertionError, match="two station profiles are called theodolite_one"):
+        profiles.station_profiles()
 
 
 @pytest.mark.usefixtures("new_file")
@@ -90,8 +97,8 @@ def test_a_new_file_is_all_that_a_new_instrument_takes() -> None:
 
 
 def test_a_profile_or_family_that_no_file_defines_is_refused() -> None:
-    known = "passive, sokkia_set, topcon_classic, topcon_gts8"
+    known, families = (", ".join(sorted(names)) for names in (profiles.station_profiles(), profiles.codecs_by_family()))
     with pytest.raises(ValueError, match=f"'theodolite_one' is not known; known: {known}"):
         config(profile="theodolite_one")
-    with pytest.raises(ValueError, match="'theodolite_works' is not known; known: sokkia, topcon"):
+    with pytest.raises(ValueError, match=f"'theodolite_works' is not known; known: {families}"):
         config(profile="passive", listen_to="theodolite_works")
