@@ -109,7 +109,7 @@ class ExpectedAccuracy:
 
     @cached_property
     def spread(self) -> Spread:
-        """Of the errors of all poses and prisms together."""
+        """Spread of the errors of all poses and prisms together."""
         return _spread(self.rms_3d_mm, self._norms_mm)
 
     @cached_property
@@ -142,7 +142,7 @@ class ExpectedAccuracy:
         return f"largest at prism {prism} ({spread.rms_mm:.2g} mm RMS){text}"
 
     def as_dict(self) -> dict[str, object]:
-        """For JSON: the set-up, the spread over poses and prisms and of each prism, its parts, and the worst pose."""
+        """Return a JSON object: the spread over poses and prisms and of each prism, its parts, the worst pose."""
         pose, prism = self.worst
         return {
             **asdict(self.spread),
@@ -255,6 +255,6 @@ def _rms(values: Floats) -> float:
 
 
 def _spread(rms_3d_mm: Floats, norms_mm: Floats) -> Spread:
-    """Of poses with these RMS errors, which need no draws, and norms drawn."""
+    """Return the spread of errors whose RMS is known in each pose, the other figures from drawn norms."""
     median, p95, p99 = np.percentile(norms_mm, [50.0, 95.0, 99.0]).tolist()
     return Spread(_rms(rms_3d_mm), float(norms_mm.mean()), median, p95, p99)

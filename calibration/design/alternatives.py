@@ -88,7 +88,7 @@ class Alternative:
         return moved * (self.found if self.found.any() else 1.0)
 
     def columns(self, context: EffectContext) -> EffectColumns:
-        """Its k coefficients, of size 1, for the observations of a context."""
+        """Return the effect's columns for the observations of a context, one for each of its k coefficients."""
         column, shift = np.zeros((len(context), self.size)), np.zeros((0, self.size))
         first = 0
         for choice, weight in zip(self.choices, self.weights, strict=True):

@@ -61,7 +61,7 @@ class Knowledge:
         return cls(model.chain, model.values, setup, root_of(model.covariance), excess, model.effects)
 
     def at_new_setup(self, chain: Chain) -> Knowledge:
-        """The same machine before a station whose chain has one set-up, about whose base nothing is known."""
+        """Return the knowledge of this machine before a station at a new set-up, about whose base nothing is known."""
         body, p = self.chain.base_start, len(self.chain)
         kept = np.r_[:body, p : len(self.root)]
         covariance = np.diag(np.append(prior_precision(chain, 1.0) ** -1.0, np.zeros(len(kept) - body)))
@@ -76,7 +76,7 @@ class Knowledge:
         return len(self.chain) - _BASE * (len(self.chain.setups) - 1)
 
     def without(self, names: Collection[str]) -> Knowledge:
-        """The same, with nothing known of the effects called `names`, each `family@where`, nor of their being there."""
+        """Return this knowledge without the effects called `names`, each `family@where`."""
         kept_effects = tuple(e for e in self.effects if f"{e.family}@{e.where}" not in names)
         if kept_effects == self.effects:
             return self

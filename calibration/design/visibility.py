@@ -95,7 +95,7 @@ class Bodies:
 
     @classmethod
     def of(cls, chain: Chain, x: Floats, readings: Floats) -> Bodies:
-        """For readings (n, joints), deg or mm, and parameters `x` (p,)."""
+        """Return the bodies at readings (n, joints), deg or mm, of a chain with parameters `x` (p,)."""
         n, prisms = len(readings), len(chain.rig.prisms)
         here = Chain(chain.rig, {"": Placement.identity()})
         own = np.concatenate([x[: chain.base_start], np.zeros(6)])

@@ -246,7 +246,7 @@ class EffectContext:
 
     @cached_property
     def work_volume(self) -> EffectContext:
-        """The same machine in poses spread evenly between the limits of its joints, nothing else measured."""
+        """Context of this machine in poses spread evenly between the limits of its joints, nothing else measured."""
         unit = halton(len(self.rig.joints), _VOLUME_POSES)
         blank = np.full((_VOLUME_POSES, 3), np.nan)
         empty = np.full(_VOLUME_POSES, "")
@@ -257,7 +257,7 @@ class EffectContext:
 
     @cached_property
     def as_designed(self) -> EffectContext:
-        """The same observations of a machine that is as its rig file has it."""
+        """Context of these observations for a machine that is as its rig file has it."""
         x = np.zeros_like(self.x)
         return replace(self, x=x, prepared_loads=None, prepared_machine=None, levelled=False)
 

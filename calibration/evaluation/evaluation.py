@@ -165,7 +165,7 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
 
 
 def _fitted(model: CalibratedModel, observations: Observations) -> int:
-    """How many of the rows the model was fitted to; models from before know their rows by the whole table alone."""
+    """Return how many rows the model was fitted to; older models recognise only their whole training table."""
     if model.fitted_rows:
         return int(are_among(observations, model.fitted_rows).sum())
     is_same = model.provenance.get("data_sha256") == data_sha256(observations, model.rig)

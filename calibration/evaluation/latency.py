@@ -27,7 +27,7 @@ _ROUNDS = 3
 
 @dataclass(frozen=True)
 class Latency:
-    """By how much fixes are late against the joints' readings.
+    """Delay of fixes against the joints' readings, as estimated from fixes of a moving boom.
 
     Attributes:
         seconds: from the instant at which the boom was there to the fix's stamp, less that of the joints' readings; a

@@ -66,7 +66,7 @@ class HeldOutComparison:
         return f"{where}: no gain beyond chance{more}"
 
     def as_dict(self) -> dict[str, object]:
-        """For the store: all attributes and the sentence."""
+        """Return all attributes and the sentence as a JSON object, as the store keeps it."""
         return asdict(self) | {"sentence": self.sentence}
 
 

@@ -24,7 +24,7 @@ METHODS = ("km", "skcm", "rbf-tcm", "default", "pde-paper")  # in the order of t
 
 @dataclass(frozen=True)
 class Comparison:
-    """All methods side by side.
+    """Figures of all methods side by side, on the same rows.
 
     Attributes:
         rig: name.
@@ -51,7 +51,7 @@ class Comparison:
         return frozenset(method for method, value in known.items() if value == min(known.values()))
 
     def as_dict(self) -> dict[str, object]:
-        """For JSON."""
+        """Return a JSON object: the rig, numbers of rows, the noise, each method's figures and the warnings."""
         return {
             "rig": self.rig,
             "n": self.training,

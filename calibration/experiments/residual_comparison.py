@@ -60,7 +60,7 @@ class MethodResult:
     noise_mm: float | None = None
 
     def as_dict(self) -> dict[str, object]:
-        """For JSON: the figures in mm, None where the method does not apply."""
+        """Return a JSON object: the figures in mm, None where the method does not apply."""
         held, trained = self.error_mm, self.training_error_mm
         figures: dict[str, float | None] = dict.fromkeys(FIGURES)
         if held is not None and trained is not None:

@@ -58,7 +58,7 @@ class CandidateEffect:
 
 @dataclass(frozen=True)
 class CandidateEffects:
-    """All candidates of the library.
+    """Effects of the library that these data can show, and why the others are none.
 
     Attributes:
         candidates: effects that these data can show.

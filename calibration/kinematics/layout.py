@@ -139,7 +139,7 @@ class Planner:
 
     # Driven rotations are about z in every convention of the rig description, as the collapsed steps need it.
     def _segment(self, path: list[int], setup: int, run: list[Op], base: int) -> int:
-        """Return the number of the segment after the last one of `path`; its first `base` transforms are the base's."""
+        """Return the number of the segment of `run` that follows `path`; the first `base` transforms are the base's."""
         parent = path[-1] if path else -1
         key = parent, setup, tuple(run)
         if key in self._number:

@@ -157,5 +157,5 @@ def _likeliest(groups: list[_Groups], excess_sigma_mm: float) -> tuple[float, fl
 
 
 def _mean_variance(groups: list[_Groups], part: Literal["known", "by_joint"]) -> float:
-    """Of a coordinate, mm^2."""
+    """Return the mean variance of one coordinate of a fix, mm^2."""
     return sum(float(traces(getattr(g, part)).sum()) for g in groups) / sum(g.error.size for g in groups)

@@ -93,7 +93,7 @@ class Parts:
 
 
 class Predictor:
-    """Everything that a model computes for observations, its parts prepared once.
+    """Predictions of a model for observations, its parts prepared once.
 
     `Predictor.of(model)` prepares a model at the first call and keeps the result with it. Unless said otherwise,
     methods raise UnsafeError for observations of a set-up that the model does not know (as `check_setups`), and

@@ -46,7 +46,7 @@ class PaperSettings:
 
 @dataclass
 class _Population:
-    """Of one search; changed in place.
+    """Candidates of one search and their costs; changed in place.
 
     Attributes:
         generation: how many it has seen.

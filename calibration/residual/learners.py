@@ -39,7 +39,7 @@ class Residual(Protocol):
         """True if it was trained on the columns that these features have."""
 
     def to_files(self) -> dict[str, bytes]:
-        """Everything that is needed to predict again."""
+        """Return file name -> content of what is needed to predict again."""
 
 
 @dataclass(frozen=True)

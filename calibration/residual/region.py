@@ -245,7 +245,7 @@ def _signal_table(features: Features, predict: Callable[[Features], Floats], gai
 
 @part()
 def _falling(excess: float) -> float:
-    """From 1 at no excess to 0 at 1, smooth at both ends."""
+    """Return a weight that falls smoothly from 1, where the excess is 0 or less, to 0, where it is 1 or more."""
     if excess <= 0.0:
         return 1.0
     if excess >= 1.0:

@@ -25,7 +25,7 @@ CanopenChannel = Cia406Encoder | Cia406Linear | Cia404Analogue
 
 
 def decoder_factories(rig: Rig, directory: Path, link: str) -> list[Callable[[], ChannelDecoder]]:
-    """For each channel of a link, what makes a fresh decoder of it.
+    """Return for each channel of a link a function that makes a fresh decoder of it.
 
     Args:
         rig: whose channels.

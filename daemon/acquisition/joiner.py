@@ -56,7 +56,7 @@ class JoinedFix:
 
 @dataclass(frozen=True)
 class MachineState:
-    """All that is known of the machine at the newest instant at which every joint is known.
+    """State of the machine at the newest instant at which every joint is known.
 
     Attributes:
         monotonic_ns: that instant.

@@ -73,7 +73,7 @@ class RigTask:
 
     @property
     def sha256(self) -> str:
-        """Of all that decides the answer."""
+        """SHA-256 of all that decides the answer."""
         told = [str(FORM), self.rig_text, json.dumps(asdict(self.settings), sort_keys=True)]
         parts = [*(text.encode() for text in told), self.data, self.checks or b""]
         return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()

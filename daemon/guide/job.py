@@ -53,7 +53,7 @@ class Request:
     plan: tuple[tuple[Pose, tuple[str, ...]], ...] | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """For the store."""
+        """Return the request as a JSON object, as the store keeps it."""
         plan = None if self.plan is None else [{"joints": dict(p), "prisms": list(seen)} for p, seen in self.plan]
         return {
             "control_points": list(self.control_points),

@@ -40,7 +40,7 @@ class Target(Protocol):
 
     @property
     def name(self) -> str:
-        """Its name in the store, in `status` and in the metrics."""
+        """Name of the target in the store, in `status` and in the metrics."""
 
     def deliver(self, message: Message) -> None:
         """Deliver a message, or raise DeliveryError."""

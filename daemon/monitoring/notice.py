@@ -56,7 +56,7 @@ class Notice:
         return shown(f"{at:%Y-%m-%d %H:%M:%S} UTC {self.title}: {what}")
 
     def as_dict(self) -> dict[str, Any]:
-        """For programs."""
+        """Return the notice as a JSON object, as webhooks and commands get it."""
         return {
             "event": self.event,
             "kind": self.kind,

@@ -92,7 +92,7 @@ class Notices:
         return f"a test notice goes out by {names}; `rigcal status` shows if it does not arrive"
 
     def status(self) -> list[dict[str, Any]]:
-        """For each target: `target`, `waiting`, `sent`, `failures`, `error`."""
+        """Return for each target `target`, `waiting`, `sent`, `failures` and `error`."""
         return self._status
 
     def faults(self) -> dict[str, str]:

@@ -195,7 +195,7 @@ class Outbox:
         self._sent += 1
 
     def status(self) -> dict[str, Any]:
-        """For `status` and the metrics: messages sent and failed since the start, notices that wait, the last error."""
+        """Return messages sent and failed since the start, notices that wait, and the last error."""
         return {
             "target": self.target.name,
             "waiting": len(self._waiting) + self._unlisted,

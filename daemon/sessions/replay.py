@@ -155,7 +155,7 @@ def merged(
 
 
 def stored_readings(reader: Reader) -> Iterator[str]:
-    """Everything that decoding has stored, as JSON lines that depend on nothing but the captures.
+    """Yield what decoding has stored as JSON lines that depend on nothing but the captures.
 
     One line a joint sample, signal, fix, event, failure and gap, each kind in the order it was stored.
     """

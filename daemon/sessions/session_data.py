@@ -34,7 +34,7 @@ class SteadyTime:
         self._latest_ns = -(2**63)
 
     def of(self, stamp: Stamp) -> Stamp:
-        """The same instant, with steady UTC in place of that of the computer."""
+        """Return the stamp of an instant with steady UTC in place of the computer's."""
         if stamp.boot_id not in self._offsets_ns:
             self._offsets_ns[stamp.boot_id] = max(stamp.utc_ns, self._latest_ns) - stamp.monotonic_ns
         utc_ns = stamp.monotonic_ns + self._offsets_ns[stamp.boot_id]

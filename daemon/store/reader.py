@@ -133,7 +133,7 @@ class Reader:
         return int(next(self.rows(f'SELECT count(*) AS n FROM "{table}"'))["n"])
 
     def records(self) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Everything that decoding has stored, by nothing but what follows from the captures.
+        """Yield what decoding has stored, in columns that follow from the captures alone.
 
         Yields:
             table, and a row of it; each table's in the order they were stored.

@@ -34,7 +34,7 @@ class Channel:
 
     @property
     def column(self) -> str:
-        """Its column, as observations have it: `theta1_deg`, `boom_valve_mA`."""
+        """Name of the channel's column of observations: `theta1_deg`, `boom_valve_mA`."""
         return f"{self.name}_{self.unit.replace('/', '_per_')}" if self.unit else self.name
 
 

@@ -50,7 +50,7 @@ class Role(IntEnum):
 
     @property
     def word(self) -> str:
-        """Its name for people and files."""
+        """Name of the role for people and files."""
         return self.name.lower()
 
 

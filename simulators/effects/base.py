@@ -97,7 +97,7 @@ class Turning:
 
 @dataclass(frozen=True)
 class Bend:
-    """Everything at and beyond frame `frame` moves as one: it turns about `about_mm` and then shifts.
+    """Motion of all that is at and beyond a frame, as one: it turns about `about_mm` and then shifts.
 
     Attributes:
         frame: first frame that moves; 0 is the base.

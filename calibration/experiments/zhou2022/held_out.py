@@ -47,7 +47,7 @@ class LearningPoint:
     refused: int
 
     def as_dict(self) -> dict[str, object]:
-        """For JSON; None where every draw was refused."""
+        """Return a JSON object of the attributes; None where every draw was refused."""
 
         def summary(values: Sequence[float]) -> dict[str, float | None]:
             if not values:
@@ -138,7 +138,7 @@ class Trajectory:
     left_out: Mapping[str, str]
 
     def as_dict(self) -> dict[str, object]:
-        """For JSON."""
+        """Return a JSON object of the trajectory's errors."""
         return {
             "prism": self.prism,
             "points": len(self.rows),

@@ -56,7 +56,7 @@ class Before:
 
 @dataclass(frozen=True)
 class Protocol:
-    """Everything that section 4 shows.
+    """Results of the protocol: what section 4 of the paper shows.
 
     Attributes:
         rig: name.
@@ -82,7 +82,7 @@ class Protocol:
     warnings: tuple[str, ...]
 
     def as_dict(self) -> dict[str, object]:
-        """For JSON; the paper's own figures are beside them."""
+        """Return the results as a JSON object, beside the paper's own figures."""
         front = None
         if self.front is not None:
             points = [

@@ -69,7 +69,7 @@ class Identified:
     complete: bool
 
     def as_dict(self) -> dict[str, object]:
-        """For JSON."""
+        """Return a JSON object of what was identified."""
         return {
             "data": self.data,
             "search": self.way,

@@ -60,7 +60,7 @@ class WeightedSquares:
         )
 
     def with_base(self) -> WeightedSquares:
-        """The same with base and unknown prism offsets searched along, as far as 1 m or 1 rad."""
+        """Return the objective that also searches base and unknown prism offsets, as far as 1 m or 1 rad."""
         flat = np.isinf(self.chain.prior_sigma)
         width = np.array([FLAT_MM if p.unit == "mm" else FLAT_RAD for p in self.chain.parameters]) + np.abs(self.at)
         width[self.free] = self.width
@@ -144,7 +144,7 @@ class WeightPoint:
 
 @dataclass(frozen=True)
 class Front:
-    """All points, and the one that is taken.
+    """Errors of the prisms at every point of a grid of weights, and the point that is taken.
 
     Attributes:
         points: of the grid of weights.

@@ -35,7 +35,7 @@ _ANY_SIZE = 10.0  # factor on plausible sizes
 def names_beside_cause(
     problem: Problem, families: Collection[str], known: Sequence[Choice], *, is_open: bool
 ) -> Names | None:
-    """Return the names beside a cause that is in general what some effects imitate, where these leave only noise.
+    """Return what is named beside an event, a drift or yielding links in general, which effects of the library imitate.
 
     Args:
         problem: the data.

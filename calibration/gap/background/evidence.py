@@ -78,7 +78,7 @@ class Scales:
 
     @property
     def weight(self) -> Floats:
-        """(q,) factors that give these columns in units of the noise."""
+        """(q,) factors that scale these columns to coefficients of unit prior variance and residuals of unit noise."""
         weight: Floats = self.sigma / np.sqrt(self.noise)
         return weight
 

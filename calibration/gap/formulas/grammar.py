@@ -93,7 +93,7 @@ class _Path:
 
 
 class Grammar:
-    """All terms, in the projected space.
+    """Terms of which formulas are made, in the projected space, and how they fit.
 
     Args:
         projection: the fit.

@@ -58,7 +58,7 @@ class Term:
 
 
 def all_terms(variables: Variables) -> tuple[Term, ...]:
-    """All terms but those that are another one of the same source in these data.
+    """Return the terms of all sources; of those that are alike in these data, one.
 
     Single variables share most of the odds beforehand, what happens at other joints and products the rest.
     """

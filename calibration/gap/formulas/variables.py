@@ -91,7 +91,7 @@ class ErrorSource:
 
 
 class Variables:
-    """All sources of error and all variables that they may depend on, by sample.
+    """Sources of error and the variables that they may depend on, by sample.
 
     Args:
         projection: the fit.
@@ -381,7 +381,7 @@ def _squared(variable: Variable) -> Variable:
 
 
 def _from_mean(variable: Variable) -> Variable:
-    """The same from its mean: that of a product would stand for the other factor alone."""
+    """Return a variable less its mean: in a product the mean would stand for the other factor alone."""
     mean = round(float(variable.values.mean()), 2)
     return replace(variable, text=_less(variable.text, mean), values=variable.values - mean)
 

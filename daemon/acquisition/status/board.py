@@ -102,7 +102,7 @@ class StatusBoard:
             self._error = error
 
     def captured(self, captures: Sequence[Capture]) -> None:
-        """These captures are stored now."""
+        """Count captures that have just been stored, by link, and note how long the oldest has waited."""
         now_ns = self._clock.monotonic_ns()
         counts = Counter([capture.link for capture in captures])
         with self._lock:
@@ -112,7 +112,7 @@ class StatusBoard:
                 self._lags_ns.append(now_ns - min(capture.stamp.monotonic_ns for capture in captures))
 
     def recorded(self, records: Sequence[Record]) -> None:
-        """These records are stored now."""
+        """Take the newest readings, fixes and events from records that have just been stored."""
         with self._lock:
             self._failures.tell_time(self._clock.monotonic_ns())
             decoded: list[str] = []

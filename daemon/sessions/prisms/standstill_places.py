@@ -28,7 +28,7 @@ Exclusions = dict[int, str | None]
 
 @dataclass
 class _Place:
-    """One of the places.
+    """A place at which fixes of one standstill lie.
 
     Attributes:
         first_mm: where its first fix lies.

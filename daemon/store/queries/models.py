@@ -63,12 +63,12 @@ class ModelRow:
 
     @property
     def comparison(self) -> Mapping[str, Any] | None:
-        """Its figures on held-out sessions; None before they are known."""
+        """Figures of the model on held-out sessions; None before they are known."""
         found = self.metrics.get("comparison")
         return found if isinstance(found, dict) else None
 
     def as_dict(self) -> dict[str, Any]:
-        """For the control socket."""
+        """Return the row as a JSON object, as the control socket gives it."""
         return asdict(self) | {"path": str(self.path), "sessions": list(self.sessions)}
 
 

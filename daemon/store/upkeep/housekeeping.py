@@ -105,7 +105,7 @@ class Housekeeping:
 
     @property
     def state(self) -> KeepingState:
-        """How it goes; to be read from any thread."""
+        """State of the disk's room and of the newest backup; it may be read from any thread."""
         made = self._backups
         if made is None:
             return self._room
