@@ -11,7 +11,12 @@
 `simulators` may change without notice; these names follow Semantic Versioning.
 """
 
+from calibration.design.planning import PosePlan
 from calibration.errors import CalibrationError, DataError, ModelError, RigError, UnsafeError
+from calibration.evaluation.evaluation import Evaluation
+from calibration.gap.result import GapResult
+from calibration.model.inverse import Inverse
+from calibration.model.prediction import Prediction
 from calibration.observations import Observations
 from calibration.rig.description import Rig
 from daemon.store.errors import StoreError
@@ -24,9 +29,14 @@ __version__ = VERSION
 __all__ = [
     "CalibrationError",
     "DataError",
+    "Evaluation",
+    "GapResult",
+    "Inverse",
     "Model",
     "ModelError",
     "Observations",
+    "PosePlan",
+    "Prediction",
     "Rig",
     "RigError",
     "Store",

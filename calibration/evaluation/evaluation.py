@@ -35,7 +35,7 @@ STAGES = ("nominal", "geometric", "effects", "hybrid")
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A model on observations.
+    """Errors of every stage of a model on measured rows, and what they say of model and rows.
 
     Attributes:
         model: the model, with the base refitted where that was asked for.

@@ -191,10 +191,10 @@ class Round:
 
 @dataclass(frozen=True)
 class GapResult:
-    """The answer of the workflow.
+    """Answer of the gap workflow: a verdict, the effects it names, their evidence, and what to measure next.
 
     Attributes:
-        verdict: one of four.
+        verdict: `named`, `none`, `indistinguishable` or `unidentified`.
         effects: all that were adopted, with their coefficients from the joint refit.
         posterior: `family@where` of each adopted one -> probability of its family, when it was adopted.
         evidence: `family@where` of each adopted one -> its evidence given all others, and where else it may be.
@@ -207,7 +207,7 @@ class GapResult:
         held_out: RMS before and after on held-out rows, mm; None where none were given.
         disagreements: most significant first.
         experiments: what would tell more.
-        rounds: in their order.
+        rounds: steps of the search, in their order.
         forecasts: of every effect that this data has the columns for.
         model: kinematics and adopted effects, no residual.
         observations, error_before_mm, error_after_mm: the rows with (n, 3) errors, station's frame.

@@ -45,7 +45,7 @@ _TOGETHER = 500  # poses
 
 @dataclass(frozen=True)
 class Inverse:
-    """Commands for targets.
+    """Joint values that bring prisms to their targets.
 
     Attributes:
         observations: the rows given, with the joint values to command.

@@ -30,7 +30,7 @@ _PIECE = 1250  # rows that are worked on at a time
 
 @dataclass(frozen=True)
 class Prediction:
-    """Positions with their uncertainty.
+    """Predicted positions with their uncertainty.
 
     Attributes:
         position_mm: (n, 3) in the station's frame, as its fixes would be, systematic errors of fixes included.

@@ -13,6 +13,9 @@ import pytest
 
 import rigcal
 from calibration.rig.description import Rig, shipped_rig
+from simulators.effects.library import parse_effects
+from simulators.rig.truth import RigTruth
+from tests.simulated.observations import simulate_observations
 
 ROOT = Path(__file__).parents[2]
 
@@ -56,6 +59,25 @@ def test_a_rig_that_no_text_describes_is_refused() -> None:
     rows = rigcal.Observations.from_csv(str(ROOT / "tests" / "data" / "ur10_random_poses.csv"), rig)
     with pytest.raises(ValueError, match=r"Rig\.read"):
         rigcal.calibrate(made, rows)
+
+
+@pytest.mark.long
+def test_a_hidden_effect_is_found_and_the_model_with_it_is_nearer_to_held_out_fixes() -> None:
+    rig = rigcal.Rig.read("swdt82")
+    machine = RigTruth(rig, 1, effects=parse_effects("backlash@theta4:width_rad=3e-3"))
+    fixes, held_out = (
+        rigcal.Observations.from_csv(simulate_observations(machine, poses, seed, prisms=["r", "s"]).csv_text(), rig)
+        for poses, seed in ((60, 5), (30, 6))
+    )
+    found: rigcal.GapResult = rigcal.find_gap(rig, fixes, holdout=held_out, families=("angle_scale", "backlash"))
+    assert found.verdict == "named"
+    assert [(effect.family, effect.where) for effect in found.effects] == [("backlash", "theta4")]
+    assert found.held_out is not None
+    evaluation: rigcal.Evaluation = rigcal.Model(found.model).evaluate(held_out)
+    assert evaluation.errors_mm["effects"].shape == (len(held_out), 3)
+    rms_mm = {str(stage["stage"]): stage["rms_mm"] for stage in evaluation.stages()}
+    assert rms_mm["effects"] == pytest.approx(found.held_out[1])
+    assert rms_mm["effects"] < rms_mm["geometric"] < rms_mm["nominal"]
 
 
 @pytest.mark.parametrize("library", [pd, pl])
