@@ -20,6 +20,7 @@ def library() -> Mapping[str, Family]:
     found: dict[str, Family] = {}
     for name in names:
         family: Family = importlib.import_module(f"{families.__name__}.{name}").FAMILY
+        assert family.name not in found, f"two effects are called {family.name}"
         found[family.name] = family
     return MappingProxyType(found)
 
