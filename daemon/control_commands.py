@@ -12,6 +12,7 @@ from daemon.alarms.board import AlarmBoard
 from daemon.commands import FAILED, REFUSED, CommandError, Handler, go_on_for_caller, reading_socket, text_argument
 from daemon.composition import Parts
 from daemon.config import Config
+from daemon.control.command_table import check_arguments
 from daemon.control.protocol import reading_only
 from daemon.control.server import ControlServer
 from daemon.guide.keeper import GuideKeeper
@@ -98,9 +99,10 @@ class Commands:
             "simulation.aim": self._turn,
         }
         commands |= {name: self.guide.guarding(name, commands[name]) for name in GUARDED}
-        return {name: partial(self._carry_out, handler) for name, handler in commands.items()}
+        return {name: partial(self._carry_out, name, handler) for name, handler in commands.items()}
 
-    def _carry_out(self, handler: Handler, arguments: Mapping[str, Any]) -> Any:
+    def _carry_out(self, name: str, handler: Handler, arguments: Mapping[str, Any]) -> Any:
+        check_arguments(name, arguments)
         with unwritable_errors(self.store.path):
             return handler(arguments)
 

@@ -17,28 +17,14 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from daemon.commands import FAILED, REFUSED, CommandError, Handler, reading_socket
+from daemon.control.command_table import READING
+from daemon.host.safe_output import shown
 
 MAX_LINE_BYTES = 1 << 20
 MAX_ERROR_CHARACTERS = 2000
 MAX_DEPTH = 20  # of lists and objects in a request; those of our commands have four at most
 MAX_WHOLE = 2**63 - 1  # the store keeps whole numbers in 64 bits
-
-# Every command that is not named here changes something.
-READING = frozenset(
-    {
-        "status",
-        "setup.list",
-        "session.list",
-        "session.show",
-        "jobs.list",
-        "model.list",
-        "model.show",
-        "tip",
-        "alarms.list",
-        "rig.show",
-        "guide.state",
-    }
-)
+_FORM = '{"command": NAME, "arguments": {...}}'
 
 
 # ---- requests and answers --------------------------------------------------------------------------------------------
@@ -60,8 +46,10 @@ def parse_request(line: bytes) -> tuple[str, dict[str, Any]]:
     except RecursionError:
         raise _too_deep() from None
     if not isinstance(request, dict) or not isinstance(request.get("command"), str):
-        raise CommandError('a request is one JSON object a line: {"command": NAME, "arguments": {...}}')
+        raise CommandError(f"a request is one JSON object a line: {_FORM}")
     _check_values(request)
+    if unknown := sorted(request.keys() - {"command", "arguments"}):
+        raise CommandError(f"a request has no {shown(unknown[0], 80)}; it is {_FORM}")
     arguments = request.get("arguments", {})
     if not isinstance(arguments, dict):
         raise CommandError("arguments must be a JSON object")

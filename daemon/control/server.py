@@ -22,7 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from daemon.commands import FAILED, WRONG_USE, Caller, CommandError, Handler, acting_for
-from daemon.control.protocol import MAX_LINE_BYTES, READING, answer_line, parse_request, refusal_line
+from daemon.control.command_table import OPERATOR, READING
+from daemon.control.protocol import MAX_LINE_BYTES, answer_line, parse_request, refusal_line
 from daemon.host.safe_output import shown
 from daemon.store.errors import LACKING, NotInStoreError, StoreError
 from drivers.clock import NS_PER_S, SystemClock
@@ -319,7 +320,7 @@ class ControlServer:
 
 def _on_behalf(arguments: Mapping[str, Any]) -> str:
     """Return the operator whom a command names, as the end of a line of the log."""
-    operator = arguments.get("operator")
+    operator = arguments.get(OPERATOR)
     return f" for {shown(operator, 100)}" if isinstance(operator, str) and operator else ""
 
 

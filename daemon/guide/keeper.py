@@ -12,6 +12,7 @@ from typing import Any
 from calibration.rig.description import Rig
 from daemon.acquisition.joiner import ObservationJoiner
 from daemon.commands import REFUSED, CommandError, Handler, mapping_argument, text_argument
+from daemon.control.command_table import check_arguments
 from daemon.guide.advisor import accuracy_view
 from daemon.guide.course import Course
 from daemon.guide.job import Job
@@ -118,10 +119,12 @@ class GuideKeeper:
                 raise CommandError(f"session {opened['id']!r} is open; stop or abort it first", REFUSED)
             described = mapping_argument(arguments, "new_setup")
             operator = text_argument(arguments, "operator")
-            if described and arguments.get("setup") is not None:
+            is_new = "new_setup" in arguments
+            if is_new and arguments.get("setup") is not None:
                 raise CommandError("give a set-up that exists or describe a new one, not both")
             with self._course.at_once():
-                if described:
+                if is_new:
+                    check_arguments("setup.new", described)
                     request = request_of(arguments, self._rig, list(mapping_argument(described, "control_points")))
                     setup_id = str(self._setups.new_command(described)["id"])
                 else:

@@ -6,13 +6,24 @@ import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from docs.references import alarms, commands, configuration, effects, metrics, python, rig_keys, schema
+from docs.references import (
+    alarms,
+    commands,
+    configuration,
+    control_socket,
+    effects,
+    metrics,
+    python,
+    rig_keys,
+    schema,
+)
 
 REFERENCE = Path(__file__).parents[1] / "reference"
 PAGES: Mapping[str, Callable[[], str]] = {
     "alarms.md": alarms.page,
     "commands.md": commands.page,
     "configuration.md": configuration.page,
+    "control-socket.md": control_socket.page,
     "effects.md": effects.page,
     "metadata.yaml": schema.metadata,
     "metrics.md": metrics.page,

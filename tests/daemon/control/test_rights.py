@@ -19,7 +19,8 @@ from sqlite_utils import Database
 from daemon.cli.main import main
 from daemon.commands import Caller, CommandError, reading_socket
 from daemon.config import Config, ConfigError, parse_config
-from daemon.control.protocol import READING, request
+from daemon.control.command_table import READING
+from daemon.control.protocol import request
 from daemon.store.reader import Reader
 from tests.daemon.acquisition_support import wait_until
 from tests.daemon.idle_daemon import idle_daemon
@@ -108,11 +109,13 @@ def test_every_command_that_changes_something_is_logged_with_its_user(
     assert said == [f"setup.new, asked for by {Caller(OWN_USER, os.geteuid(), os.getpid())}"]
 
 
-def test_a_client_cannot_say_who_it_is(tmp_path: Path) -> None:
+@pytest.mark.parametrize("forged", ["caller_user", "caller_uid", "caller", "uid"])
+def test_a_client_cannot_say_who_it_is(tmp_path: Path, forged: str) -> None:
     with idle_daemon(tmp_path) as config:
         request(config.socket_path, "setup.new", {"id": "S1"})
-        forged = {"prism": "r", "caller_user": "root", "caller_uid": 0, "caller": {"uid": 0}, "uid": 0}
-        request(config.socket_path, "session.start", forged)
+        with pytest.raises(CommandError, match=f"unknown argument {forged};"):
+            request(config.socket_path, "session.start", {"prism": "r", forged: 0})
+        request(config.socket_path, "session.start", {"prism": "r"})
         (row,) = rows(config, "SELECT caller_uid, caller_pid FROM calibration_sessions")
         assert row == {"caller_uid": os.geteuid(), "caller_pid": os.getpid()}
 

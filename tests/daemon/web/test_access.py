@@ -118,7 +118,7 @@ def test_a_browser_that_keeps_a_removed_token_shuts_nobody_out() -> None:
 
 
 def test_what_writes_needs_more_than_reading_and_what_goes_live_needs_approval() -> None:
-    from daemon.control.protocol import READING
+    from daemon.control.command_table import READING
 
     assert {name for name, role in COMMANDS.items() if role is Role.READ} == READING
     assert COMMANDS["model.accept"] is COMMANDS["model.rollback"] is COMMANDS["model.reject"] is Role.APPROVE
