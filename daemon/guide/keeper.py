@@ -21,7 +21,7 @@ from daemon.guide.position import FRESH_S, is_there, joints_of
 from daemon.guide.request import request_of, whole_argument
 from daemon.guide.view import Around, headline, state_of
 from daemon.guide.worker import NEEDED_FIXES, Drive, GuideWorker
-from daemon.sessions.manager import SessionKeeper
+from daemon.sessions.manager import HOW_TO_END, SessionKeeper
 from daemon.sessions.station_setups import SetupBook
 from daemon.store.store import Store
 from drivers.clock import Clock
@@ -116,7 +116,7 @@ class GuideKeeper:
                 )
             opened = self._sessions.open_session()
             if opened is not None:
-                raise CommandError(f"session {opened['id']!r} is open; stop or abort it first", REFUSED)
+                raise CommandError(f"session {opened['id']!r} is open; {HOW_TO_END}", REFUSED)
             described = mapping_argument(arguments, "new_setup")
             operator = text_argument(arguments, "operator")
             is_new = "new_setup" in arguments

@@ -47,6 +47,7 @@ log = logging.getLogger(__name__)
 
 LOAD_S = 3.0  # how long a session's start waits for what tells prisms apart; it is heeded later as well
 LATE_NS = 60 * NS_PER_S  # once a fix was joined that was measured so long after a session's end, it has all of its own
+HOW_TO_END = "stop or abort it first: `rigcal session stop`, or `rigcal session abort` where it is of no use"
 
 
 class SessionKeeper:
@@ -161,7 +162,7 @@ class SessionKeeper:
         """Open a session: from now on good fixes become its observations; from `look_back` on where not `is_aimed`."""
         with self.turn:
             if self._open is not None:
-                raise CommandError(f"session {self._open.id!r} is open; stop or abort it first")
+                raise CommandError(f"session {self._open.id!r} is open; {HOW_TO_END}")
             prism, kind = str(arguments.get("prism", "")), str(arguments.get("kind", "static_poses"))
             if prism not in self._rig.prism_names:
                 raise CommandError(

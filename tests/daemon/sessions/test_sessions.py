@@ -218,8 +218,9 @@ def test_without_a_session_nothing_is_observed(rig: Rig) -> None:
 
 def test_a_second_session_is_refused_while_one_is_open(rig: Rig) -> None:
     start(rig)
-    with pytest.raises(CommandError, match="session 's001-r' is open; stop or abort it first"):
+    with pytest.raises(CommandError, match="session 's001-r' is open; stop or abort it first") as refused:
         rig.say("start", prism="b")
+    assert "`rigcal session stop`, or `rigcal session abort`" in str(refused.value)
 
 
 @pytest.mark.parametrize(
