@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import os
-import reprlib
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal
 from urllib.parse import urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic_core import ErrorDetails
 
 from calibration.rig.toml import LONGEST, parse_toml
+from calibration.rig.toml_errors import as_toml, place, reason, section_at
 from daemon.commands import INSTALLED_CONFIG, INSTALLED_SOCKET, CommandError, reading_socket
+from drivers.can.bus_options import check_options
 from drivers.can.tip_frames import FRAMES
 from drivers.canopen.transmit import is_free
 from drivers.files import read_text
@@ -71,6 +73,13 @@ class CanSection(_Section):
         if not self.allow_transmit and (self.transmit_nodes or self.sync_period_ms):
             raise ValueError("transmit_nodes and sync_period_ms need allow_transmit = true; CAN is listen-only without")
         return self
+
+    @field_validator("options", mode="before")
+    @classmethod
+    def _options_are_further_ones(cls, options: object) -> object:
+        if isinstance(options, dict):
+            check_options(options, frozenset(cls.model_fields))
+        return options
 
     @field_validator("transmit_nodes")
     @classmethod
@@ -413,29 +422,17 @@ def read_config(path: Path) -> Config:
         raise ConfigError(f"{path}: not UTF-8 at byte {error.start}; save it as UTF-8") from error
 
 
-def _sentence(error: Any) -> str:
+def _sentence(error: ErrorDetails) -> str:
     """Return one pydantic error as `key: fault (allowed: ...)`."""
-    key = ".".join(str(part + 1) if isinstance(part, int) else str(part)[:_QUOTED] for part in error["loc"]) or "file"
-    message = error["msg"].removeprefix("Value error, ")[: 4 * _QUOTED]
+    key = ".".join(str(part)[:_QUOTED] for part in place(error)) or "file"
     if error["type"] == "extra_forbidden":
-        section: type[BaseModel] = Config
-        for part in error["loc"][:-1]:
-            section = _section_of(section, part)
-        allowed = ", ".join(sorted(section.model_fields))
+        allowed = ", ".join(sorted(section_at(Config, error["loc"][:-1]).model_fields))
         return f"{key}: unknown key; allowed here: {allowed}"
     if error["type"] == "missing":
         return f"{key}: missing; it is required"
+    message = reason(error, Config)[: 4 * _QUOTED]
     if error["loc"][-1:] == ("webhook_url",):  # it may hold a secret
         return f"{key}: {message}"
     if isinstance(error["input"], dict):  # a whole table: the message names what is wrong in it
         return f"{key}: {message}"
-    return f"{key}: {message}, found {reprlib.repr(error['input'])}"
-
-
-def _section_of(section: type[BaseModel], part: int | str) -> type[BaseModel]:
-    """Return the section that `part` of an error's location leads to; an index stays in `section`."""
-    if isinstance(part, int) or part not in section.model_fields:
-        return section
-    annotation = section.model_fields[part].annotation
-    candidates = (annotation, *get_args(annotation))
-    return next((c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)), section)
+    return f"{key}: {message}, found {as_toml(error['input'])}"

@@ -33,6 +33,7 @@ from calibration.rig.parts import (
 )
 from calibration.rig.signals import Taken, signal_faults, signal_lines, signal_of
 from calibration.rig.toml import line_of, parse_toml
+from calibration.rig.toml_errors import place, reason
 
 __all__ = [
     "ANOTHER_VALUE",
@@ -323,14 +324,13 @@ def read_rig(text: str, source: str) -> tuple[Rig | None, tuple[RigError, ...]]:
 
 def _fault(text: str, source: str, error: ErrorDetails) -> RigError:
     """Return the fault that one of pydantic's errors is about."""
-    where = tuple(p + 1 if isinstance(p, int) else str(p) for p in error["loc"])
-    reason = _reason(error)
-    return RigError(source, ".".join(map(str, where)), reason, line_of(text, where or _named_in(reason)))
+    where, why = place(error), _reason(error)
+    return RigError(source, ".".join(map(str, where)), why, line_of(text, where or _named_in(why)))
 
 
-def _named_in(reason: str) -> tuple[str | int, ...]:
+def _named_in(why: str) -> tuple[str | int, ...]:
     """Return the key of the table that a sentence of the rig as a whole begins with: `row 3: ...` -> row, 3."""
-    section, _, rest = reason.partition(" ")
+    section, _, rest = why.partition(" ")
     number, _, _ = rest.partition(":")
     return (section, int(number)) if section in _SECTIONS and number.isdecimal() else ()
 
@@ -344,7 +344,7 @@ def _reason(error: ErrorDetails) -> str:
         section = _SECTIONS.get(".".join(inside))
         allowed = [field.alias or name for name, field in section.model_fields.items()] if section else []
         return "unknown key" + (f"; there are {', '.join(allowed)}" if allowed else "")
-    return error["msg"].removeprefix("Value error, ")
+    return reason(error, Rig)
 
 
 def shipped_rigs() -> tuple[str, ...]:

@@ -16,6 +16,7 @@ from pydantic import ValidationError
 from calibration.rig.columns import LABELS, POSITION, names
 from calibration.rig.description import Rig
 from calibration.rig.toml import parse_toml, quoted
+from calibration.rig.toml_errors import place, reason
 from drivers.errors import DescriptionError
 from drivers.files import read_whole
 from drivers.stations.delimited import cells_of, lines_of, number_of
@@ -58,7 +59,7 @@ def read_map(path: Path) -> ColumnMap:
         raise DescriptionError(str(path), f"cannot be read: {error.strerror}") from error
     except ValidationError as error:
         first = error.errors()[0]
-        raise DescriptionError(str(path), f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+        raise DescriptionError(str(path), f"{'.'.join(map(str, place(first)))}: {reason(first, ColumnMap)}") from error
     except ValueError as error:  # no TOML, no UTF-8
         raise DescriptionError(str(path), f"is not a TOML file: {error}") from error
     if found.format not in export_formats():

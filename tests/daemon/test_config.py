@@ -1,9 +1,27 @@
+import contextlib
+import re
 from pathlib import Path
 
 import pytest
+from pydantic import BaseModel
 
 from daemon.commands import INSTALLED_CONFIG
-from daemon.config import ConfigError, parse_config, read_config
+from daemon.config import (
+    CanSection,
+    Config,
+    ConfigError,
+    JobsSection,
+    NotifySection,
+    SessionsSection,
+    StoreSection,
+    TipCanSection,
+    TipSection,
+    WebSection,
+    parse_config,
+    read_config,
+)
+from drivers.stations.config import StationConfig
+from drivers.stations.serial_port import SerialConfig
 
 GOOD = """
 rig = "swdt82"
@@ -85,22 +103,92 @@ def test_every_wrong_key_is_told_at_once(tmp_path: Path) -> None:
 )
 def test_a_number_that_no_clock_disk_or_generator_takes_is_refused(tmp_path: Path, text: str) -> None:
     key = text.split()[1]
-    assert f".{key}: Input should be" in check(f'rig = "swdt82"\n{text}\n', tmp_path)
+    assert f".{key}: must be" in check(f'rig = "swdt82"\n{text}\n', tmp_path)
 
 
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("[store]\nfree_gb = true", "store.free_gb: cannot be true or false, found True"),
-        ("[sessions]\nfixes_per_shot = false", "sessions.fixes_per_shot: cannot be true or false, found False"),
+        ("[store]\nfree_gb = true", "store.free_gb: cannot be true or false, found true"),
+        ("[sessions]\nfixes_per_shot = false", "sessions.fixes_per_shot: cannot be true or false, found false"),
         ('[store]\nbackup_directory = ""', "store.backup_directory: is empty; give a path, or leave the key out"),
         ('state_directory = ""', "state_directory: is empty; give a path, or leave the key out"),
-        ('[[station]]\nserial.path = "/dev/x"\nmax_range_m = true', "max_range_m: cannot be true or false, found True"),
-        ('[[station]]\nserial = { path = "/dev/x", baud = true }', "serial.baud: cannot be true or false, found True"),
+        ('[[station]]\nserial.path = "/dev/x"\nmax_range_m = true', "max_range_m: cannot be true or false, found true"),
+        ('[[station]]\nserial = { path = "/dev/x", baud = true }', "serial.baud: cannot be true or false, found true"),
     ],
 )
 def test_neither_is_true_a_number_nor_an_empty_text_a_directory(tmp_path: Path, text: str, told: str) -> None:
     assert told in check(f'rig = "swdt82"\n{text}\n', tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ('can = "x"', "can: must be tables: [[can]] above the keys of each, found 'x'"),
+        ("can = [5]", "can.1: must be a table: its keys under a header in square brackets, or in braces, found 5"),
+        ("tip = 5", "tip: must be a table: its keys under a header in square brackets, or in braces, found 5"),
+        ("read_group = 5", "read_group: must be a text in quotes, found 5"),
+        ("read_group = 2026-01-02", "read_group: must be a text in quotes, found 2026-01-02"),
+        ("read_group = {}", "read_group: must be a text in quotes"),
+        ('read_group = ""', "read_group: must not be empty, found ''"),
+        ("socket = 5", "socket: must be a path, a text in quotes, found 5"),
+        ("jobs.seed = 1.5", "jobs.seed: must be a whole number, found 1.5"),
+        ('jobs.enabled = "perhaps"', "jobs.enabled: must be true or false, found 'perhaps'"),
+        ("tip.prism = [1]", "tip.prism: must be a text in quotes, found a list"),
+        ("store.free_gb = nan", "store.free_gb: must be a finite number, found nan"),
+        ("store.free_gb = 0", "store.free_gb: must be above 0, found 0"),
+        ("store.backups = 0", "store.backups: must be 1 or more, found 0"),
+        ("web.names = 5", "web.names: must be a list, in square brackets, found 5"),
+    ],
+)
+def test_what_a_value_must_be_is_said_in_words_of_toml(tmp_path: Path, text: str, told: str) -> None:
+    assert f"rigcal.toml: {told}" in check(f'rig = "swdt82"\n{text}\n', tmp_path).splitlines()[0]
+
+
+VALUES = ("5", "-5", "1.5", "1e300", "nan", "true", '"x"', '""', "[]", "[[1]]", "{a = 1}", "[{a = 1}]", "2026-01-02")
+WORDS_OF_PYTHON = re.compile(
+    r"\b(input|valid|tuple|dict\w*|instance|string|integer|parse|True|False|None|datetime|validation)\b"
+)
+
+
+@pytest.mark.parametrize(
+    ("section", "model"),
+    [
+        *(("", Config), ("[[can]]", CanSection), ("[[station]]", StationConfig), ("[station.serial]", SerialConfig)),
+        *(("[sessions]", SessionsSection), ("[jobs]", JobsSection), ("[store]", StoreSection)),
+        *(("[tip.can]", TipCanSection), ("[tip]", TipSection), ("[web]", WebSection), ("[notify]", NotifySection)),
+    ],
+)
+def test_no_message_speaks_of_python(tmp_path: Path, section: str, model: type[BaseModel]) -> None:
+    """Every key with values of every kind."""
+    told = []
+    for key in model.model_fields:
+        for value in VALUES:
+            with contextlib.suppress(ConfigError):
+                parse_config(f"{section}\n{key} = {value}\n", tmp_path / "rigcal.toml")
+                continue
+            told.append(check(f"{section}\n{key} = {value}\n", tmp_path))
+    assert len(told) > len(model.model_fields)
+    assert [message for message in told if WORDS_OF_PYTHON.search(message)] == []
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ('channel = "239.74.163.9"', "channel has a key of its own: give it beside `options`, not in them"),
+        ('interface = "slcan"', "interface has a key of its own"),
+        ("bitrate = 500000", "bitrate has a key of its own"),
+        ("allow_transmit = true", "allow_transmit has a key of its own"),
+        ("listen_only = false", "listen_only is no option: `allow_transmit` says it; remove it"),
+        ('bustype = "slcan"', "bustype is no option: `interface` says it; remove it"),
+        ("ignore_config = false", "ignore_config is no option: no configuration of python-can is read beside this one"),
+        ('config_context = "x"', "config_context is no option"),
+        ("port = [1]", "port must be a text in quotes, a number, true or false"),
+    ],
+)
+def test_an_option_does_not_repeat_what_has_a_key_of_its_own(tmp_path: Path, options: str, told: str) -> None:
+    message = check(GOOD.replace('channel = "can0"', f'channel = "can0"\noptions = {{ {options} }}'), tmp_path)
+    assert f"rigcal.toml: can.1.options: {told}" in message
 
 
 @pytest.mark.parametrize(

@@ -44,8 +44,8 @@ def test_the_column_of_a_signal_is_read_and_survives_the_round_trip(name: str, u
 @pytest.mark.parametrize(
     ("name", "unit", "reason"),
     [
-        ("tilt", "furlong", "signal.1.unit: Input should be 'deg'"),
-        ("tilt x", "deg", "signal.1.name: String should match pattern"),
+        ("tilt", "furlong", "signal.1.unit: must be 'deg'"),
+        ("tilt x", "deg", "signal.1.name: must be letters, digits and _"),
         ("temperature", "degC", "the column temperature_degC is known without it"),
         ("theta1_rate", "", "the column theta1_rate is known without it"),
         ("x_pred", "mm", "the column x_pred_mm is known without it"),

@@ -131,7 +131,7 @@ def test_joints_that_do_not_fit_are_refused(tmp_path: Path, change: tuple[str, s
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ('length_unit = "furlong"', "map.toml: length_unit: Input should be"),
+        ('length_unit = "furlong"', "map.toml: length_unit: must be"),
         (f"first_line = {'9' * 5000}", "map.toml: is not a TOML file: Exceeds the limit"),
         (f"header_line = 0x{'F' * 5000}", "map.toml: is not a TOML file: header_line: a whole number beyond 64 bits"),
     ],

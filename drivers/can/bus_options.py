@@ -1,0 +1,42 @@
+"""Further settings of a CAN link, handed to python-can as they are: those that the link's own settings do not make.
+
+Two of one name would be an argument given twice, or one that undoes the other: `listen_only` that of `allow_transmit`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+_LONGEST_NAME_TOLD = 100
+
+_NO_OTHER_FILE = "no configuration of python-can is read beside this one"
+# What `open_port` gives python-can's bus itself, under names that are no keys of a link.
+_MADE: Mapping[str, str] = MappingProxyType(
+    {
+        "listen_only": "`allow_transmit` says it",
+        "bustype": "`interface` says it",
+        "ignore_config": _NO_OTHER_FILE,
+        "config_context": _NO_OTHER_FILE,
+        "context": _NO_OTHER_FILE,
+    }
+)
+
+
+def check_options(options: Mapping[str, object], keys: frozenset[str]) -> None:
+    """Refuse options that repeat another setting, and values that no option has.
+
+    Args:
+        options: name -> value, as a configuration file has them.
+        keys: of the link itself.
+
+    Raises:
+        ValueError: says which.
+    """
+    for name, value in options.items():
+        if name in keys:
+            raise ValueError(f"{name} has a key of its own: give it beside `options`, not in them")
+        if name in _MADE:
+            raise ValueError(f"{name} is no option: {_MADE[name]}; remove it")
+        if not isinstance(value, str | int | float):
+            raise ValueError(f"{name:.{_LONGEST_NAME_TOLD}} must be a text in quotes, a number, true or false")
