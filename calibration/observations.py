@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import DataError
+from calibration.rig.columns import LEAST_SIGMA_MM
 from calibration.rig.description import Rig
 from calibration.rig.limits import on_one_turn
 from calibration.table import (
@@ -299,6 +300,8 @@ def _build(table: Table, rig: Rig, positions_required: bool) -> Observations:
             table.refuse(int(np.argmax(partly)), name, reason)
         own = sigma_mm[:, i]
         table.refuse_where(own <= 0, name, own, "is not a standard deviation; it must be positive")
+        reason = f"is smaller than any instrument's standard deviation ({LEAST_SIGMA_MM:g} mm); is it in another unit?"
+        table.refuse_where(own < LEAST_SIGMA_MM, name, own, reason)
     joints = {j.name: table.numbers(j.column, required=True) for j in rig.joints}
     for joint in rig.joints:
         limit = _MOST_DEG if joint.kind == "revolute" else _MOST_MM

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+LEAST_SIGMA_MM = 1e-6  # 1 nm: of no instrument's fix is the standard deviation smaller
 JOINT, SIGNAL = "<joint>", "<signal>"
 _ALWAYS = "required"
 _MEASURED = "required, but for `rigcal predict`"
@@ -46,7 +47,11 @@ LABELS = (
     Column("pose", "", "fixes of one standstill share it"),
 )
 SIGMA = tuple(
-    Column(f"sigma_{axis}_mm", "mm", f"standard deviation of `{axis}_mm`; a fix has all three or none")
+    Column(
+        f"sigma_{axis}_mm",
+        "mm",
+        f"standard deviation of `{axis}_mm`, {LEAST_SIGMA_MM:g} or more; a fix has all three or none",
+    )
     for axis in "xyz"
 )
 OF_JOINT = (

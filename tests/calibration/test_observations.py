@@ -71,6 +71,13 @@ def test_optional_columns_are_kept_and_strange_ones_are_listed() -> None:
             f"{HEADER},sigma_x_mm,sigma_y_mm,sigma_z_mm\n{ROW},0,1,1\n",
             "column sigma_x_mm: 0 is not a standard deviation",
         ),
+        *[
+            (
+                f"{HEADER},sigma_x_mm,sigma_y_mm,sigma_z_mm\n{ROW},1e-6,1,1\n{ROW},1,{sigma},1\n",
+                f"line 3, column sigma_y_mm: {sigma} is smaller than any instrument's standard deviation .1e-06 mm",
+            )
+            for sigma in ("9e-07", "1e-300")
+        ],
         (f"{HEADER},sigma_y_mm\n{ROW},1\n", "line 1, column sigma_y_mm: needs the other two of sigma_x_mm"),
         (
             f"{HEADER},sigma_x_mm,sigma_y_mm,sigma_z_mm\n{ROW},,,\n{ROW},1,,1\n",

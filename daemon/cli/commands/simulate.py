@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from calibration.rig.columns import LEAST_SIGMA_MM
 from daemon.cli.command import Command, json_option
 from daemon.cli.offline import FILE, FiniteRange, rig_option, seed_option
 from daemon.cli.terminal import echo
@@ -35,7 +36,7 @@ _MOST_POSES = 100_000
 @click.option(
     "--noise",
     "noise_mm",
-    type=FiniteRange(min=0.0, min_open=True),
+    type=FiniteRange(min=LEAST_SIGMA_MM),
     metavar="MM",
     help="Standard deviation of each coordinate of a fix, also stated in the data; the rig file's station by default.",
 )
