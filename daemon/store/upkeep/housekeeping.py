@@ -90,6 +90,7 @@ class Housekeeping:
         self._packing, self._retention = Packing(store), Retention(store)
         self._real = SystemClock()
         self._told = ""
+        self._told_of_room: set[str] = set()
         self._turn = threading.Lock()  # of steps: a command may delete as well
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
@@ -185,18 +186,25 @@ class Housekeeping:
         if not found.is_short:
             if self._room.is_short:
                 log.info("%s: there is room again", self._store.path)
+                self._told_of_room.clear()
                 self._room = replace(self._room, is_short=False, has_nothing_left=False)
             self._next_room_s = self._running_s() + ROOM_S
             return False
-        if not self._room.is_short:
-            log.warning("%s: little room is left; the oldest captures outside sessions are deleted", self._store.path)
         deleted = self._retention.delete_oldest()
         if deleted is None:
+            self._tell_once("little room is left, and nothing that may be deleted")
             self._room = replace(self._room, is_short=True, has_nothing_left=True)
             self._next_room_s = self._running_s() + ROOM_S
             return False
+        self._tell_once("little room is left; the oldest captures outside sessions are deleted")
         self._room = replace(self._room, is_short=True, has_nothing_left=False, deleted_until_utc_ns=deleted)
         return True
+
+    def _tell_once(self, what: str) -> None:
+        """Log what is done for want of room, once until there is room again."""
+        if what not in self._told_of_room:
+            self._told_of_room.add(what)
+            log.warning("%s: %s", self._store.path, what)
 
     def _forget_old(self) -> bool:
         if self._keeping.keep_days is None:

@@ -185,7 +185,27 @@ def run(housekeeping: Housekeeping) -> int:
     return sum(1 for _ in iter(housekeeping.step, False))
 
 
-def test_want_of_room_deletes_the_oldest_and_tells(tmp_path: Path) -> None:
+@pytest.mark.parametrize("minutes", [30, 90])
+def test_the_log_says_of_want_of_room_what_is_true(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, minutes: int
+) -> None:
+    with small_disk(tmp_path / "small", 16_000) as place:
+        path = place / "rigcal.sqlite"
+        with contextlib.closing(Store(path)) as store:
+            store.declare_channels({"theta1": "deg"}, {"valve": "mA"})
+            fill(store, minutes)
+            session(store, "s1", at(0.0), None, "open")
+            usage = shutil.disk_usage(place)
+            (place / "ballast").write_bytes(bytes(usage.free - round(0.08 * usage.total)))
+            housekeeping = Housekeeping(store, ManualClock(at(90 * MINUTE_S)), keeping(path, free_bytes=2**60))
+            run(housekeeping)
+            assert housekeeping.state.has_nothing_left
+            assert minutes_left(path) == list(range(minutes))
+            said = [record.getMessage() for record in caplog.records if "room" in record.getMessage()]
+            assert said == [f"{path}: little room is left, and nothing that may be deleted"]
+
+
+def test_want_of_room_deletes_the_oldest_and_tells(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with small_disk(tmp_path / "small", 16_000) as place:
         path = place / "rigcal.sqlite"
         with contextlib.closing(Store(path)) as store:
@@ -204,6 +224,8 @@ def test_want_of_room_deletes_the_oldest_and_tells(tmp_path: Path) -> None:
             assert not housekeeping.state.has_nothing_left
             run(housekeeping)
             assert housekeeping.state.deleted_until_utc_ns is not None
+            first = next(record.getMessage() for record in caplog.records if "room" in record.getMessage())
+            assert first == f"{path}: little room is left; the oldest captures outside sessions are deleted"
             assert minutes_left(path)[-1] == 399
             if housekeeping.state.is_short:
                 assert housekeeping.state.has_nothing_left
