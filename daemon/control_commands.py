@@ -15,14 +15,14 @@ from daemon.config import Config
 from daemon.control.command_table import check_arguments
 from daemon.control.protocol import reading_only
 from daemon.control.server import ControlServer
-from daemon.guide.keeper import GuideKeeper
+from daemon.guide.manager import GuideManager
 from daemon.jobs.runner import JobRunner
 from daemon.models.live_tip import LiveTip
 from daemon.models.registry import ModelRegistry
 from daemon.monitoring.notices import Notices
 from daemon.overview import Overview
-from daemon.sessions.manager import SessionKeeper
-from daemon.sessions.station_setups import SetupBook
+from daemon.sessions.manager import SessionManager
+from daemon.sessions.station_setups import StationSetups
 from daemon.store.errors import unwritable_errors
 from daemon.store.health import StoreHealth
 from daemon.store.store import Store
@@ -47,14 +47,14 @@ class Commands:
     store: Store
     store_health: Callable[[], StoreHealth]
     housekeeping: Housekeeping
-    setups: SetupBook
-    sessions: SessionKeeper
+    setups: StationSetups
+    sessions: SessionManager
     jobs: JobRunner
     models: ModelRegistry
     tip: LiveTip
     alarms: AlarmBoard
     notices: Notices
-    guide: GuideKeeper
+    guide: GuideManager
     overview: Overview
 
     def handlers(self) -> Mapping[str, Handler]:

@@ -10,12 +10,12 @@ from typing import Any, TypeVar
 from daemon.acquisition.status.snapshot import AcquisitionStatus
 from daemon.alarms.board import AlarmBoard
 from daemon.composition import Parts
-from daemon.guide.keeper import GuideKeeper
+from daemon.guide.manager import GuideManager
 from daemon.jobs.runner import JobRunner
 from daemon.models.drift import gap_status
 from daemon.models.registry import ModelRegistry
 from daemon.monitoring.notices import Notices
-from daemon.sessions.manager import SessionKeeper
+from daemon.sessions.manager import SessionManager
 from daemon.store.errors import StoreError
 from daemon.store.health import StoreHealth
 from daemon.store.queries.jobs import JobTable
@@ -54,8 +54,8 @@ class Overview:
     clock: Callable[[], dict[str, Any] | None]
     alarms: AlarmBoard
     notices: Notices
-    sessions: SessionKeeper
-    guide: GuideKeeper
+    sessions: SessionManager
+    guide: GuideManager
     runner: JobRunner
     jobs: JobTable
     models: ModelRegistry

@@ -23,7 +23,7 @@ from daemon.composition import Parts, motion_limits
 from daemon.config import Config
 from daemon.control.server import ControlServer
 from daemon.control_commands import Commands, control_servers
-from daemon.guide.keeper import GuideKeeper
+from daemon.guide.manager import GuideManager
 from daemon.guide.meter_link import Place
 from daemon.host.ended_threads import EndedThreads
 from daemon.host.systemd import Notifier
@@ -38,8 +38,8 @@ from daemon.monitoring.metrics_server import MetricsServer
 from daemon.monitoring.notices import Notices
 from daemon.monitoring.time_watch import TimeWatch
 from daemon.overview import Overview
-from daemon.sessions.manager import SessionKeeper
-from daemon.sessions.station_setups import SetupBook
+from daemon.sessions.manager import SessionManager
+from daemon.sessions.station_setups import StationSetups
 from daemon.store.errors import storage_errors, storage_sentence
 from daemon.store.health import StoreHealth, StoreWatch
 from daemon.store.queries.alarms import AlarmTable
@@ -92,8 +92,8 @@ class Daemon:
         # Simulated and replayed rigs have a clock of their own.
         read_clock = partial(clock_state, os.environ.get(CLOCK_SOCKET))
         self._time = TimeWatch(read_clock, parts.clock) if parts.mode == "live" else None
-        self._setups = SetupBook(parts.rig, store, parts.clock, config.sessions.control_tolerance_mm)
-        self._sessions = SessionKeeper(
+        self._setups = StationSetups(parts.rig, store, parts.clock, config.sessions.control_tolerance_mm)
+        self._sessions = SessionManager(
             parts.rig,
             parts.rig_text,
             store,
@@ -154,7 +154,7 @@ class Daemon:
             compare=self._jobs.compare,
             comparison_job=self._job_table.comparison_of,
         )
-        self._guide = GuideKeeper(
+        self._guide = GuideManager(
             parts.rig,
             store,
             self._sessions,

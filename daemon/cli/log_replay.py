@@ -15,9 +15,9 @@ from daemon.config import Config
 from daemon.rig_files import RigSource
 from daemon.service import declare_channels
 from daemon.sessions.export.session_file import SessionFile
-from daemon.sessions.manager import SessionKeeper
+from daemon.sessions.manager import SessionManager
 from daemon.sessions.replay import BOOT_ID, LATEST_UTC_NS, first_captures, merged
-from daemon.sessions.station_setups import SetupBook
+from daemon.sessions.station_setups import StationSetups
 from daemon.store.errors import storage_errors
 from daemon.store.store import Store
 from drivers.clock import ManualClock, Stamp
@@ -60,8 +60,8 @@ def replay_logs(
     made = decoders(settings, source)
     with storage_errors(path), contextlib.closing(Store(path)) as store:
         declare_channels(store, source.rig)
-        setups = SetupBook(source.rig, store, clock, settings.sessions.control_tolerance_mm)
-        keeper = SessionKeeper(
+        setups = StationSetups(source.rig, store, clock, settings.sessions.control_tolerance_mm)
+        sessions = SessionManager(
             source.rig,
             source.text,
             store,
@@ -77,25 +77,25 @@ def replay_logs(
         if told is not None:
             points = {name: list(place) for name, place in told.control_points.items()}
             setups.new_command({"id": REPLAYED, "instrument": REPLAYED, "control_points": points})
-            commands = _commands_of(told, keeper, clock.monotonic_ns())
-        acquisition = Acquisition((), made, store, clock, on_records=keeper.on_records)
+            commands = _commands_of(told, sessions, clock.monotonic_ns())
+        acquisition = Acquisition((), made, store, clock, on_records=sessions.on_records)
         acquisition.run_inline(_followed(merged(files, settings, doubtful), clock, commands))
         for _, command in commands:  # those after the last capture
             command()
-        return keeper.list_command({})[0] if told is not None else None
+        return sessions.list_command({})[0] if told is not None else None
 
 
-def _commands_of(told: SessionFile, keeper: SessionKeeper, begin_ns: int) -> Commands:
+def _commands_of(told: SessionFile, sessions: SessionManager, begin_ns: int) -> Commands:
     """Return the operator's commands of a session in the order of their instants."""
     start = {"id": REPLAYED, "prism": told.prism, "kind": told.kind, "operator": "replay"}
-    confirm = partial(keeper.confirm_prism_command, {"operator": "replay"})
+    confirm = partial(sessions.confirm_prism_command, {"operator": "replay"})
     between = [(at_ns, confirm) for at_ns in told.prism_confirmed_utc_ns]
-    between += [(at_ns, partial(keeper.turned_command, {})) for at_ns in told.prism_turned_utc_ns]
+    between += [(at_ns, partial(sessions.turned_command, {})) for at_ns in told.prism_turned_utc_ns]
     return Commands(
         [
-            (told.since_utc_ns or begin_ns, partial(keeper.start_command, start)),
+            (told.since_utc_ns or begin_ns, partial(sessions.start_command, start)),
             *sorted(between, key=lambda command: command[0]),
-            (told.until_utc_ns, partial(keeper.stop_command, {})),
+            (told.until_utc_ns, partial(sessions.stop_command, {})),
         ]
     )
 

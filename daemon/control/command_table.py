@@ -71,7 +71,7 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
             "opens a session",
             {"prism": "the prism that the station follows"},
             kind=f"{', '.join(f'`{kind}`' for kind in SESSION_KINDS)}; `static_poses` by default",
-            setup="name of the station's set-up; the newest by default",
+            setup="name of the station's set-up; the one described or used last by default",
             id="name of the session",
             note="text that is kept with it",
         ),
@@ -117,7 +117,7 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
         ),
         "guide.start": _changes(
             "opens a guide",
-            setup="name of a set-up that exists; the newest by default",
+            setup="name of a set-up that exists; the one described or used last by default",
             new_setup="object with the arguments of `setup.new`: described now, in place of `setup`",
             control_points='list of names; those of the set-up by default, else `["cp1"]`',
             prisms="list of prisms, in the order to measure; all of the rig by default",

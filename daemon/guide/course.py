@@ -1,6 +1,6 @@
 """The course of the open guide: every event is stored before it counts, and what follows from it by itself is done.
 
-The operator's commands (`keeper`) and the guide's own thread (`worker`) make the events, and the gain meter's answers.
+The operator's commands (`manager`) and the guide's own thread (`worker`) make the events, and the gain meter's answers.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from daemon.guide.job import Job, Pose
 from daemon.guide.meter_link import Place
 from daemon.guide.position import PositionWatch
 from daemon.guide.record import GuideRecord, is_on_prism
-from daemon.sessions.manager import SessionKeeper
+from daemon.sessions.manager import SessionManager
 from daemon.store.queries.guides import Standstill
 from daemon.store.queries.sessions import SessionTable
 from daemon.store.queries.setups import control_points
@@ -56,7 +56,7 @@ class Course:
         self,
         rig: Rig,
         store: Store,
-        sessions: SessionKeeper,
+        sessions: SessionManager,
         joiner: ObservationJoiner,
         clock: Clock,
         meter_place: Callable[[], Place],

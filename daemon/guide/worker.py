@@ -18,9 +18,9 @@ from daemon.guide.course import Course
 from daemon.guide.job import Job
 from daemon.guide.position import is_there, joints_of
 from daemon.guide.request import misfit
-from daemon.sessions.manager import SessionKeeper
+from daemon.sessions.manager import SessionManager
 from daemon.sessions.open_session import CONTROL_POINT_RADIUS_MM
-from daemon.sessions.station_setups import SetupBook
+from daemon.sessions.station_setups import StationSetups
 from drivers.clock import NS_PER_S, Clock
 
 log = logging.getLogger(__name__)
@@ -57,8 +57,8 @@ class GuideWorker:
         self,
         rig: Rig,
         course: Course,
-        sessions: SessionKeeper,
-        setups: SetupBook,
+        sessions: SessionManager,
+        setups: StationSetups,
         clock: Clock,
         *,
         has_aim: bool,

@@ -6,7 +6,7 @@ from calibration.rig.description import Rig
 from daemon.commands import CHECK
 from daemon.sessions.open_session import OpenSession
 from daemon.sessions.prism_watch import PrismWatch
-from daemon.sessions.station_setups import SetupBook
+from daemon.sessions.station_setups import StationSetups
 from daemon.store.queries.sessions import SessionTable
 
 CHECK_POSES = (3, 5)
@@ -22,7 +22,7 @@ class SessionAdvice:
         prisms: with the stations that may be on another prism.
     """
 
-    def __init__(self, rig: Rig, setups: SetupBook, table: SessionTable, prisms: PrismWatch) -> None:
+    def __init__(self, rig: Rig, setups: StationSetups, table: SessionTable, prisms: PrismWatch) -> None:
         self._rig, self._setups, self._table, self._prisms = rig, setups, table, prisms
 
     def at_start(self, session: OpenSession) -> list[str]:

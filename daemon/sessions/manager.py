@@ -33,7 +33,7 @@ from daemon.sessions.observing import ObservationMaker, PendingWrites
 from daemon.sessions.open_session import CONTROL_POINT_RADIUS_MM, OpenSession
 from daemon.sessions.prism_watch import PrismWatch, as_dict
 from daemon.sessions.prisms.guard import MotionLimit, Suspicion
-from daemon.sessions.station_setups import AXES, SetupBook
+from daemon.sessions.station_setups import AXES, StationSetups
 from daemon.sessions.without_job import why_no_job
 from daemon.store.errors import is_unwritable
 from daemon.store.queries.jobs import JobTable
@@ -50,7 +50,7 @@ LATE_NS = 60 * NS_PER_S  # once a fix was joined that was measured so long after
 HOW_TO_END = "stop or abort it first: `rigcal session stop`, or `rigcal session abort` where it is of no use"
 
 
-class SessionKeeper:
+class SessionManager:
     """Keeps the one open session and turns joined fixes into its observations.
 
     Args:
@@ -76,7 +76,7 @@ class SessionKeeper:
         rig: Rig,
         rig_text: str,
         store: Store,
-        setups: SetupBook,
+        setups: StationSetups,
         joiner: ObservationJoiner,
         settings: SessionsSection,
         clock: Clock,

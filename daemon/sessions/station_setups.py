@@ -23,7 +23,7 @@ MOST_CONSTANT_MM = 500.0
 AXES = ("x_mm", "y_mm", "z_mm")
 
 
-class SetupBook:
+class StationSetups:
     """The set-ups of a store.
 
     Args:

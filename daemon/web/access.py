@@ -85,7 +85,7 @@ class _File(BaseModel):
     tokens: tuple[_Entry, ...] = ()
 
 
-class TokenBook:
+class TokenFile:
     """The tokens of a page, in a JSON file that is read again whenever it has changed.
 
     Args:

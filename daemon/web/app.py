@@ -21,7 +21,7 @@ from daemon.commands import REFUSED, CommandError
 from daemon.store.errors import StoreError
 from daemon.store.queries.history import drift_history, misclosure_history, model_changes
 from daemon.store.reader import Reader
-from daemon.web.access import NAME_CHARACTERS, AttemptLimit, Person, Role, TokenBook, role_refusal
+from daemon.web.access import NAME_CHARACTERS, AttemptLimit, Person, Role, TokenFile, role_refusal
 from daemon.web.commands import COMMANDS, TIMEOUT_S, TIMEOUTS_S
 from daemon.web.daemon_client import DaemonClient
 from daemon.web.guard import REPORT_POLICY, Guard
@@ -65,7 +65,7 @@ class Page:
 
     def __init__(self, settings: WebSettings) -> None:
         self._settings = settings
-        self._tokens, self._wrong = TokenBook(settings.tokens), AttemptLimit()
+        self._tokens, self._wrong = TokenFile(settings.tokens), AttemptLimit()
         self._daemon, self._feed = DaemonClient(settings.socket), LiveFeed(settings.socket)
         self._fixes = SessionFixes()
         self._shape: dict[str, Any] | None = None

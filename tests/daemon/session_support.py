@@ -18,8 +18,8 @@ from daemon.commands import CommandError
 from daemon.config import SessionsSection
 from daemon.host.time_service import ClockState
 from daemon.rig_files import load_rig
-from daemon.sessions.manager import SessionKeeper
-from daemon.sessions.station_setups import SetupBook
+from daemon.sessions.manager import SessionManager
+from daemon.sessions.station_setups import StationSetups
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, ManualClock
 from drivers.readings import Fix, LockState, Reading, Record, Status
@@ -60,12 +60,12 @@ class Rig:
         self.target_mm = (3000.0, 8000.0, 1000.0)
         self.aimed: list[str] = []
         self.clock_state: ClockState | None = None  # of the computer
-        self.setups = SetupBook(SOURCE.rig, self.store, self.clock, SessionsSection().control_tolerance_mm)
+        self.setups = StationSetups(SOURCE.rig, self.store, self.clock, SessionsSection().control_tolerance_mm)
         self.keeper = self.new_keeper()
 
-    def new_keeper(self, aim: Callable[[str], None] | None = None) -> SessionKeeper:
+    def new_keeper(self, aim: Callable[[str], None] | None = None) -> SessionManager:
         joiner = ObservationJoiner(joint_inputs(self.machine), signal_inputs(self.machine), settle_s=0.5)
-        return SessionKeeper(
+        return SessionManager(
             self.machine,
             self.machine.text,
             self.store,

@@ -16,7 +16,7 @@ from daemon.alarms.library import library
 from daemon.config import Config
 from daemon.control.protocol import request
 from daemon.control.server import ControlServer
-from daemon.web.access import Role, TokenBook
+from daemon.web.access import Role, TokenFile
 from tests.daemon.idle_daemon import idle_daemon
 from tests.daemon.web.web_support import WebProcess
 from tests.web.browser import DEADLINE_MS, PHONE, TABLET, open_live, violations
@@ -259,7 +259,7 @@ def live(config: Config) -> int:
 
 
 def test_each_role_sees_its_own_buttons_and_is_refused_the_others(new_page: NewPage, months: Config) -> None:
-    tokens = TokenBook(months.tokens_path)
+    tokens = TokenFile(months.tokens_path)
     made = {role: tokens.add(f"someone who may {role.word}", role, 1) for role in Role}
     web = WebProcess(months.state_directory / "rigcal.toml", "--loopback-role", "read")
     try:

@@ -82,10 +82,10 @@ def judged(system: System, model: Model) -> tuple[Model, list[Judged]]:
         for effect in before.effects:
             if effect not in model.effects:
                 continue
-            rivals = _Rivals(system, model, model.effects.index(effect))
-            changed = rivals.changed()
+            alternatives = _Alternatives(system, model, model.effects.index(effect))
+            changed = alternatives.changed()
             model = model if changed is None else changed
-            found += [] if changed is not None else [rivals.judgement()]
+            found += [] if changed is not None else [alternatives.judgement()]
         model = grown(system, model)
         if len(found) == len(before.effects) == len(model.effects):
             return model, found
@@ -94,10 +94,10 @@ def judged(system: System, model: Model) -> tuple[Model, list[Judged]]:
 
 def judgements(system: System, model: Model) -> list[Judged]:
     """Return the judgement of every effect of a model that stays as it is."""
-    return [_Rivals(system, model, number).judgement() for number in range(len(model.effects))]
+    return [_Alternatives(system, model, number).judgement() for number in range(len(model.effects))]
 
 
-class _Rivals:
+class _Alternatives:
     """An effect of a model, and all that could be in its place."""
 
     def __init__(self, system: System, model: Model, number: int) -> None:

@@ -14,7 +14,7 @@ from daemon.cli.command import Command, json_option
 from daemon.cli.terminal import echo, echo_table
 
 if TYPE_CHECKING:
-    from daemon.web.access import TokenBook
+    from daemon.web.access import TokenFile
     from daemon.web.settings import WebSettings
 
 _ROLES = click.Choice(["read", "operate", "approve"])
@@ -76,7 +76,7 @@ def token_add(name: str, role: str, config: Path, *, as_json: bool) -> dict[str,
     from daemon.web.access import Role
     from drivers.clock import SystemClock
 
-    made = _book(config).add(name, Role.named(role), SystemClock().now().utc_ns)
+    made = _tokens(config).add(name, Role.named(role), SystemClock().now().utc_ns)
     if not as_json:
         echo(made)
     return {"name": name, "role": role, "token": made}
@@ -87,7 +87,7 @@ def token_add(name: str, role: str, config: Path, *, as_json: bool) -> dict[str,
 @_token_options
 def token_remove(name: str, config: Path, *, as_json: bool) -> dict[str, str]:
     """Remove the token of NAME: whoever uses it is refused from now on."""
-    _book(config).remove(name)
+    _tokens(config).remove(name)
     if not as_json:
         echo(f"the token of {name} counts no more")
     return {"removed": name}
@@ -97,7 +97,7 @@ def token_remove(name: str, config: Path, *, as_json: bool) -> dict[str, str]:
 @_token_options
 def token_list(config: Path, *, as_json: bool) -> dict[str, Any]:
     """List whose tokens there are, with their roles."""
-    entries = _book(config).entries()
+    entries = _tokens(config).entries()
     if not as_json:
         if entries:
             rows = [[entry.name, entry.role, utc(entry.created_utc_ns)] for entry in entries]
@@ -107,11 +107,11 @@ def token_list(config: Path, *, as_json: bool) -> dict[str, Any]:
     return {"tokens": [entry.model_dump(exclude={"sha256"}) for entry in entries]}
 
 
-def _book(config: Path) -> TokenBook:
+def _tokens(config: Path) -> TokenFile:
     from daemon.config import read_config
-    from daemon.web.access import TokenBook
+    from daemon.web.access import TokenFile
 
-    return TokenBook(read_config(config).tokens_path)
+    return TokenFile(read_config(config).tokens_path)
 
 
 def _settings(

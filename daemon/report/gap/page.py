@@ -362,7 +362,7 @@ def _not_shown(gap: GapResult) -> str:
             ]
             for pair, own in _by(alike, lambda f: (f.family, f.alternative.partition("@")[0])).items()
         ]
-        columns = ["effect", "where", "closest rival", "share that the rival cannot imitate"]
+        columns = ["effect", "where", "closest alternative", "share that the alternative cannot imitate"]
         content += ["<h3>Hard to tell from another</h3>", markup.table(columns, rows, text_columns=(0, 1, 2))]
     if gap.disabled:
         content += [
@@ -404,7 +404,14 @@ def _forecast_table(forecasts: Sequence[Forecast]) -> str:
                 f"{100 * f.separation:.0f} %" if f.alternative else "",
             ]
         )
-    columns = ["effect", "where", "named from this size on", "visible", "closest rival", "rival cannot imitate"]
+    columns = [
+        "effect",
+        "where",
+        "named from this size on",
+        "visible",
+        "closest alternative",
+        "alternative cannot imitate",
+    ]
     return markup.table(columns, rows, text_columns=(0, 1, 4))
 
 

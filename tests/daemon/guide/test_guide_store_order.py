@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_inputs
-from daemon.guide.keeper import GuideKeeper
+from daemon.guide.manager import GuideManager
 from daemon.guide.meter_link import Place
 from tests.daemon.damage import fill_up, make_room
 from tests.daemon.session_support import SOURCE, Rig, closed_afterwards, disk_fails
@@ -26,8 +26,8 @@ class GuidedRig(Rig):
         super().__init__(path)
         self.guide = self.new_guide()
 
-    def new_guide(self) -> GuideKeeper:
-        return GuideKeeper(
+    def new_guide(self) -> GuideManager:
+        return GuideManager(
             self.machine,
             self.store,
             self.keeper,

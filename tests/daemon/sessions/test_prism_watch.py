@@ -16,7 +16,7 @@ from daemon.commands import CommandError
 from daemon.config import SessionsSection, parse_config
 from daemon.sessions.export.captured_logs import export_session
 from daemon.sessions.export.session_file import SessionFile, read_session_file
-from daemon.sessions.manager import SessionKeeper
+from daemon.sessions.manager import SessionManager
 from daemon.sessions.prisms.guard import MotionLimit
 from daemon.store.reader import Reader
 from drivers.clock import ManualClock
@@ -51,8 +51,8 @@ CONTROL_MM = (9000.0, 500.0, 2000.0)
 class WatchedRig(Rig):
     """A rig whose configuration names its station."""
 
-    def new_keeper(self, aim: Callable[[str], None] | None = None) -> SessionKeeper:
-        return SessionKeeper(
+    def new_keeper(self, aim: Callable[[str], None] | None = None) -> SessionManager:
+        return SessionManager(
             SOURCE.rig,
             SOURCE.text,
             self.store,

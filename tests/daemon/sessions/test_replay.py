@@ -21,8 +21,8 @@ from daemon.config import read_config
 from daemon.rig_files import load_rig
 from daemon.service import declare_channels
 from daemon.sessions.export.session_file import read_session_file
-from daemon.sessions.manager import SessionKeeper
-from daemon.sessions.station_setups import SetupBook
+from daemon.sessions.manager import SessionManager
+from daemon.sessions.station_setups import StationSetups
 from daemon.store.reader import Reader
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, ManualClock, Stamp
@@ -130,9 +130,9 @@ def live(directory: Path, captures: Sequence[Capture], *, station_first: bool, *
     with closing(Store(config.store_path)) as store:
         store.begin_run(clock.now())
         declare_channels(store, source.rig)
-        setups = SetupBook(source.rig, store, clock, config.sessions.control_tolerance_mm)
+        setups = StationSetups(source.rig, store, clock, config.sessions.control_tolerance_mm)
         setups.new_command({"id": "S1", **setup})
-        keeper = SessionKeeper(
+        keeper = SessionManager(
             source.rig, source.text, store, setups, joiner(config, source.rig), config.sessions, clock, run_id=1
         )
         clock.set(captures[0].stamp.shifted(round(SESSION_S[0] * NS_PER_S)))

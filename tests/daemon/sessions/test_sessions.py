@@ -17,7 +17,7 @@ from daemon.config import Config, SessionsSection
 from daemon.control.server import ControlServer
 from daemon.host.time_service import ClockState
 from daemon.rig_files import load_rig
-from daemon.sessions.manager import SessionKeeper
+from daemon.sessions.manager import SessionManager
 from daemon.sessions.session_data import sessions_csv, setup_lines
 from daemon.store.errors import NotInStoreError
 from daemon.store.reader import Reader
@@ -321,7 +321,7 @@ def test_fixes_on_a_control_point_before_its_first_shot_are_no_observations(rig:
 class OvertakenJoiner(ObservationJoiner):
     """Joins as usual; when a shot has its fixes, what was joined is stored only after that of the command."""
 
-    keeper: SessionKeeper
+    keeper: SessionManager
 
     def feed(self, records: Iterable[Record]) -> Any:
         yield from super().feed(records)

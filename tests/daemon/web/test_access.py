@@ -8,29 +8,29 @@ from pathlib import Path
 import pytest
 
 from daemon.commands import CommandError
-from daemon.web.access import AttemptLimit, Person, Role, TokenBook, role_refusal
+from daemon.web.access import AttemptLimit, Person, Role, TokenFile, role_refusal
 from daemon.web.commands import COMMANDS
 from daemon.web.settings import WebSettings
 from drivers.clock import ManualClock
 
 
 def test_a_token_is_found_again_and_nowhere_written_down(tmp_path: Path) -> None:
-    book = TokenBook(tmp_path / "tokens.json")
-    token = book.add("Ada", Role.OPERATE, 1)
+    file = TokenFile(tmp_path / "tokens.json")
+    token = file.add("Ada", Role.OPERATE, 1)
     assert len(token) > 40
-    assert TokenBook(book.path).find(token) == Person("Ada", Role.OPERATE)
-    assert book.find(token + "x") is None
-    assert token not in book.path.read_text()
-    assert book.path.stat().st_mode & 0o777 == 0o640
+    assert TokenFile(file.path).find(token) == Person("Ada", Role.OPERATE)
+    assert file.find(token + "x") is None
+    assert token not in file.path.read_text()
+    assert file.path.stat().st_mode & 0o777 == 0o640
 
 
 def test_a_token_that_is_removed_counts_no_more_in_another_process_either(tmp_path: Path) -> None:
-    book, other = TokenBook(tmp_path / "tokens.json"), TokenBook(tmp_path / "tokens.json")
+    file, other = TokenFile(tmp_path / "tokens.json"), TokenFile(tmp_path / "tokens.json")
     ada, bo = other.add("Ada", Role.READ, 1), other.add("Bo", Role.APPROVE, 2)
-    assert book.find(ada) is not None
+    assert file.find(ada) is not None
     other.remove("Ada")
-    assert book.find(ada) is None
-    assert book.find(bo) == Person("Bo", Role.APPROVE)
+    assert file.find(ada) is None
+    assert file.find(bo) == Person("Bo", Role.APPROVE)
     with pytest.raises(CommandError, match="there are: Bo"):
         other.remove("Ada")
 
@@ -38,14 +38,14 @@ def test_a_token_that_is_removed_counts_no_more_in_another_process_either(tmp_pa
 @pytest.mark.parametrize("name", ["", " ", "a" * 61, "two\nlines"])
 def test_a_token_has_a_printable_name(tmp_path: Path, name: str) -> None:
     with pytest.raises(CommandError, match="a token's name is"):
-        TokenBook(tmp_path / "tokens.json").add(name, Role.READ, 1)
+        TokenFile(tmp_path / "tokens.json").add(name, Role.READ, 1)
 
 
 def test_two_tokens_never_have_one_name(tmp_path: Path) -> None:
-    book = TokenBook(tmp_path / "tokens.json")
-    book.add("Ada", Role.READ, 1)
+    file = TokenFile(tmp_path / "tokens.json")
+    file.add("Ada", Role.READ, 1)
     with pytest.raises(CommandError, match="has a token already"):
-        book.add("Ada", Role.APPROVE, 1)
+        file.add("Ada", Role.APPROVE, 1)
 
 
 # Says that it is ready; at a word it adds names of its own, and others that another process adds as well.
@@ -53,14 +53,14 @@ ADDING = """
 import sys
 from pathlib import Path
 from daemon.commands import CommandError
-from daemon.web.access import Role, TokenBook
-book, me = TokenBook(Path(sys.argv[1])), sys.argv[2]
+from daemon.web.access import Role, TokenFile
+file, me = TokenFile(Path(sys.argv[1])), sys.argv[2]
 print("ready", flush=True)
 input()
 for n in range(40):
-    book.add(f"{me}{n}", Role.READ, 1)
+    file.add(f"{me}{n}", Role.READ, 1)
     try:
-        book.add(f"both{n}", Role.READ, 1)
+        file.add(f"both{n}", Role.READ, 1)
         print(n)
     except CommandError as error:
         assert "has a token already" in str(error)
@@ -81,7 +81,7 @@ def test_processes_that_add_tokens_at_once_lose_none_and_share_no_name(tmp_path:
     told = [person.communicate(timeout=60)[0].split() for person in people]
     assert [person.returncode for person in people] == [0, 0]
     assert sorted(int(n) for numbers in told for n in numbers) == list(range(40)), "each name was given once"
-    names = {entry.name for entry in TokenBook(path).entries()}
+    names = {entry.name for entry in TokenFile(path).entries()}
     assert names == {f"{who}{n}" for who in ("a", "b", "both") for n in range(40)}
 
 
@@ -92,7 +92,7 @@ def test_a_damaged_file_lets_nobody_in(tmp_path: Path, text: str) -> None:
     path = tmp_path / "tokens.json"
     path.write_text(text)
     with pytest.raises(CommandError, match=r"tokens\.json"):
-        TokenBook(path).find("rigcal_x")
+        TokenFile(path).find("rigcal_x")
 
 
 def test_wrong_tokens_are_limited_for_each_address_and_in_all() -> None:

@@ -21,8 +21,8 @@ from daemon.guide.position import FRESH_S, is_there, joints_of
 from daemon.guide.request import request_of, whole_argument
 from daemon.guide.view import Around, headline, state_of
 from daemon.guide.worker import NEEDED_FIXES, Drive, GuideWorker
-from daemon.sessions.manager import HOW_TO_END, SessionKeeper
-from daemon.sessions.station_setups import SetupBook
+from daemon.sessions.manager import HOW_TO_END, SessionManager
+from daemon.sessions.station_setups import StationSetups
 from daemon.store.store import Store
 from drivers.clock import Clock
 from drivers.readings import Record
@@ -30,7 +30,7 @@ from drivers.readings import Record
 MORE_POSES = 5
 
 
-class GuideKeeper:
+class GuideManager:
     """Keeps the one open guide of a rig.
 
     Args:
@@ -52,8 +52,8 @@ class GuideKeeper:
         self,
         rig: Rig,
         store: Store,
-        sessions: SessionKeeper,
-        setups: SetupBook,
+        sessions: SessionManager,
+        setups: StationSetups,
         joiner: ObservationJoiner,
         clock: Clock,
         *,
