@@ -1,9 +1,6 @@
 """The daemon's parts hear of what was stored, whatever one of them does with it."""
 
-import sqlite3
 from pathlib import Path
-
-import pytest
 
 from daemon.composition import Parts, joiner
 from daemon.service import Daemon
@@ -56,8 +53,7 @@ def test_the_tip_hears_of_a_jump_that_comes_with_an_observation_that_cannot_be_s
         with store.transaction() as db:
             refuse = "BEGIN SELECT RAISE(FAIL, 'database or disk is full'); END"
             db.execute(f"CREATE TRIGGER full BEFORE INSERT ON observations {refuse}")
-        with pytest.raises(sqlite3.DatabaseError, match="disk is full"):
-            read(DeviceEvent("theta4", clock.now(), EventKind.PRESET_JUMP, "position jumped"))
+        read(DeviceEvent("theta4", clock.now(), EventKind.PRESET_JUMP, "position jumped"))
         assert status() is not TipStatus.OK
         wait(lambda: status() is not TipStatus.NO_MODEL)
         assert status() is TipStatus.ZERO_LOST

@@ -242,7 +242,7 @@ class JobTable:
         """
         with self._store.reader() as reader:
             rows = reader.rows(f"SELECT {_SHOWN}, result_json FROM jobs ORDER BY id")
-        return [_shown(row, clock) for row in rows]
+            return [_shown(row, clock) for row in rows]
 
     def unfinished(self) -> list[dict[str, Any]]:
         """Jobs that run, wait, or will be offered again, without results, newest last."""

@@ -54,7 +54,7 @@ def test_a_shipped_rig_needs_no_rig_file(tmp_path: Path) -> None:
 def test_every_profile_of_the_configuration_can_be_chosen(tmp_path: Path, profile: str) -> None:
     made = init("--out", str(tmp_path), "--rig", "swdt82", "--station", "/dev/ttyUSB7", "--profile", profile)
     assert made.exit_code == 0, made.output
-    assert read_config(tmp_path / "rigcal.toml").stations[0].profile == profile
+    assert read_config(tmp_path / "rigcal.toml").station[0].profile == profile
 
 
 @pytest.mark.parametrize("joint", ["theta1", "theta1:round:0:1", "theta1:revolute:a:b", "t:revolute:0:1:2:3"])

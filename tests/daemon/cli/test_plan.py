@@ -115,7 +115,7 @@ def test_after_a_session_it_says_what_else_to_measure(tmp_path: Path) -> None:
         (("--poses", "5", "--station", "1,2,nan"), "is no place"),
         (("--poses", "5", "--floor", "nan"), "'nan' is not a finite number"),
         (("--poses", "5", "--separate", "ghost@theta1,backlash@theta1"), "effect 'ghost' is unknown; there are"),
-        (("--poses", "5", "--separate", "backlash@L9,backlash@theta1"), "backlash@L9: rig 'ys100' has theta1"),
+        (("--poses", "5", "--separate", "backlash@L9,backlash@theta1"), "backlash@L9: backlash may be at theta1"),
         (("--poses", "5", "--separate", "backlash@theta1"), "'backlash@theta1' is not two or three effects"),
         (("--poses", "5", "--separate", "joint_compliance@theta1,backlash@theta1"), "does nothing at theta1"),
         (("--poses", "5", "--setup", "A"), "it is one of a model's: give --model"),

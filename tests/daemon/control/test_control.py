@@ -14,6 +14,7 @@ from daemon.control.protocol import request
 from daemon.control.server import ControlServer
 from daemon.store.queries.jobs import JobTable
 from daemon.store.store import Store
+from drivers.clock import SystemClock
 
 release = threading.Event()
 
@@ -143,7 +144,8 @@ def test_a_file_that_is_no_socket_is_left_alone(tmp_path: Path) -> None:
 def test_an_operator_who_asks_for_jobs_before_there_are_any_is_told_when_there_will_be(tmp_path: Path) -> None:
     store = Store(tmp_path / "rigcal.sqlite")
     table = JobTable(store, "swdt82")
-    server = ControlServer(tmp_path / "s", {"jobs.list": lambda _: table.all(), "session.list": lambda _: []})
+    answers = {"jobs.list": lambda _: table.all(SystemClock()), "session.list": lambda _: []}
+    server = ControlServer(tmp_path / "s", answers)
     done = CliRunner().invoke(rigcal, ["jobs", "list", "--socket", str(tmp_path / "s")])
     server.close()
     store.close()

@@ -200,7 +200,7 @@ GUIDE = {
     ("told", "step"),
     [
         (WORST, "theta0: Check the encoder's power"),
-        (status(setup=None), "`rigcal setup new"),
+        (status(setup=None), "`rigcal session guide --new-setup NAME`"),
         (status(), "`rigcal session start"),
         (status(session=session(control_shots=[])), "`rigcal session shoot NAME`"),
         (status(session=session()), "21 more poses"),
