@@ -30,10 +30,11 @@ COUNTED = (
 )
 assert all((Path(__file__).parents[1] / place).exists() for place in COUNTED)
 
-# A shell without job control starts what it sends to the background with SIGINT ignored, and so do its children; tests
-# that interrupt a process need it heard.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# A shell without job control starts what it sends to the background with SIGINT ignored, nohup starts all with SIGHUP
+# ignored, and so do their children; tests that interrupt a process need them heard.
+for heard, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(heard) is signal.SIG_IGN:
+        signal.signal(heard, handler)
 
 
 GATE_LINES = pytest.StashKey[list[str]]()
