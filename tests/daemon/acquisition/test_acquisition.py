@@ -154,37 +154,32 @@ def test_status_is_a_snapshot_that_json_can_carry(path: Path, acquire: Make) -> 
     assert json.loads(json.dumps(asdict(status)))["channels"][0]["status"] == "ok"
 
 
-def test_the_rate_of_a_link_is_what_it_was_lately(acquire: Make) -> None:
-    clock = ManualClock(at(0))
+def with_two_bursts(acquire: Make, clock: ManualClock, frames: tuple[int, int], apart_s: float) -> Acquisition:
+    """Acquisition that has stored so many frames of a link at one instant, and so many a while later."""
     first, second = threading.Event(), threading.Event()
     links = [
-        ListLink("boom", [frame(n) for n in range(10)], first),
-        ListLink("boom", [frame(n) for n in range(30)], second),
+        ListLink("boom", [frame(n) for n in range(count)], event)
+        for count, event in zip(frames, (first, second), strict=True)
     ]
     acquisition = acquire(links, clock=clock)
     acquisition.start()
     first.set()
-    wait_until(lambda: acquisition.status().links[0].captures == 10)
-    clock.advance(2.0)
+    wait_until(lambda: acquisition.status().links[0].captures == frames[0])
+    clock.advance(apart_s)
     second.set()
-    wait_until(lambda: acquisition.status().links[0].captures == 40)
+    wait_until(lambda: acquisition.status().links[0].captures == sum(frames))
+    return acquisition
+
+
+def test_the_rate_of_a_link_is_what_it_was_lately(acquire: Make) -> None:
+    clock = ManualClock(at(0))
+    acquisition = with_two_bursts(acquire, clock, (10, 30), apart_s=2.0)
     assert 0 < acquisition.status().links[0].captures_per_s <= 20.0
 
 
 def test_a_link_has_no_rate_when_every_link_has_fallen_silent(acquire: Make) -> None:
     clock = ManualClock(at(0))
-    first, second = threading.Event(), threading.Event()
-    links = [
-        ListLink("boom", [frame(n) for n in range(10)], first),
-        ListLink("boom", [frame(n) for n in range(800)], second),
-    ]
-    acquisition = acquire(links, clock=clock)
-    acquisition.start()
-    first.set()
-    wait_until(lambda: acquisition.status().links[0].captures == 10)
-    clock.advance(1.0)
-    second.set()
-    wait_until(lambda: acquisition.status().links[0].captures == 810)
+    acquisition = with_two_bursts(acquire, clock, (10, 800), apart_s=1.0)
     assert acquisition.status().links[0].captures_per_s == 800.0
     clock.advance(0.6)
     assert acquisition.status().links[0].captures_per_s == 500.0, "no batch says so, but time has passed"
