@@ -13,6 +13,7 @@ from typing import Any
 FAILED, WRONG_USE, REFUSED = 1, 2, 3
 CHECK = "check"
 SESSION_KINDS = ("single_joint", "multi_joint", "static_poses", CHECK)
+HOW_TO_END = "stop or abort it first: `rigcal session stop`, or `rigcal session abort` where it is of no use"
 MAX_TEXT_CHARACTERS = 500
 MAX_ENTRIES = 100
 

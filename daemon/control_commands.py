@@ -144,7 +144,7 @@ class Commands:
 
     def _redecode(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Make all readings and fixes of a session, or of some time, again from raw captures."""
-        return redecode_command(self.store, self.parts.decoders, arguments, go_on_for_caller)
+        return redecode_command(self.store, self.parts.rig, self.parts.decoders, arguments, go_on_for_caller)
 
     def _configure_devices(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Set up CANopen devices, if the operator says that the machine is parked."""

@@ -12,6 +12,8 @@ from calibration.rig.description import Rig, parse_rig, shipped_rigs
 from calibration.rig.toml import LONGEST
 from drivers.files import read_text
 
+HOW_TO_READ_AGAIN = "to read its captures with this one, `rigcal session export` it, and `rigcal replay` the files"
+
 
 @dataclass(frozen=True)
 class RigSource:
@@ -71,3 +73,22 @@ def read_rig_text(name_or_path: str) -> tuple[str, str, Path]:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise RigError(str(path), "", f"cannot be read: {reason}") from error
+
+
+def misreading(rig: Rig, recorded_text: str, prism: str) -> str:
+    """Return why readings that were made with another rig file are not those of `rig`, a clause; "" where they are.
+
+    Args:
+        rig: what they are to be used with.
+        recorded_text: the rig file that turned counts into the readings.
+        prism: on which they were measured.
+    """
+    if recorded_text == rig.text:
+        return ""
+    try:
+        recorded = parse_rig(recorded_text, "the rig file")
+    except RigError as error:
+        return f"this rigcal cannot read it ({error})"
+    if prism not in rig.prism_names:
+        return f"it has a prism {prism}, this one has none"
+    return rig.misreading(recorded)

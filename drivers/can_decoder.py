@@ -14,7 +14,7 @@ from drivers.canopen.pdo import PdoChannelDecoder
 from drivers.canopen.supervision import NodeSupervision
 from drivers.canopen.sync import SYNC_ID, SyncSampling
 from drivers.clock import NS_PER_S, Stamp
-from drivers.readings import CanCapture, Capture, Gap, GapReason, Record
+from drivers.readings import CanCapture, Capture, DeviceEvent, Gap, GapReason, Record
 
 IDS_MAX = 512
 """Identifiers that are counted one by one; noise on a 29-bit bus must fill neither memory nor an operator's screen."""
@@ -60,6 +60,12 @@ class CanDecoder:
             self._nodes.append(supervision)
             for arbitration_id, handler in supervision.handlers.items():
                 self._entry(arbitration_id, False).handler = handler
+
+    def recall(self, events: Iterable[DeviceEvent]) -> None:
+        """Take on what devices told before this decoder was made: the last event of each kind, oldest first."""
+        for event in events:
+            for node in self._nodes:
+                node.recall(event)
 
     def feed(self, capture: Capture) -> Sequence[Record]:
         if type(capture) is not CanCapture:

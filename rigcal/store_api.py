@@ -85,15 +85,16 @@ class Store:
             sessions: ids, of one rig; the newest one's description counts.
 
         Raises:
-            DataError: no such session, or no observation that may be used.
+            DataError: no such session, no observation that may be used, or sessions whose rig files differ in what
+                the readings mean.
         """
         found = [session(self._reader, name) for name in sessions]
         missing = [name for name, row in zip(sessions, found, strict=True) if row is None]
         if missing or not found:
             raise DataError(str(self._reader.path), f"there is no session {missing[0]!r}" if missing else "no session")
-        newest = found[-1]
-        assert newest is not None
-        rig = parse_rig(str(newest["rig_text"]), f"the rig of session {sessions[-1]}")
+        ages = [row["id"] for row in all_sessions(self._reader)]
+        newest = max((row for row in found if row is not None), key=lambda row: ages.index(row["id"]))
+        rig = parse_rig(str(newest["rig_text"]), f"the rig of session {newest['id']}")
         return rig, Observations.from_csv(sessions_csv(self._reader, rig, sessions).decode(), rig)
 
     def _frame(self, rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame | pl.DataFrame:

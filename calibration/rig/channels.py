@@ -48,6 +48,11 @@ class AnyChannel(_Quantity):
     link: str = "boom"
     timeout_s: float = Field(default=1.0, gt=0)
 
+    def conversion(self) -> dict[str, object]:
+        """Return the attributes that decide what a value of the device means, by name: not where it is heard."""
+        where = {*AnyChannel.model_fields, *CanopenChannel.model_fields, "range_mm"} - {"unit"}
+        return self.model_dump(exclude=where)
+
 
 class CanopenChannel(AnyChannel):
     """A CANopen slave.

@@ -223,6 +223,31 @@ class Rig(Part):
             if name != "signals" and getattr(self, name) != getattr(other, name)
         )
 
+    def misreading(self, recorded: Rig) -> str:
+        """Return why readings that were recorded with another rig file are not this one's; "" where they are.
+
+        Links, node numbers and times of a channel may differ, and so may all that is no reading: rows, limits, masses.
+
+        Args:
+            recorded: the rig file that turned counts into the readings.
+
+        Returns:
+            a clause: "its channel L2 has zero_counts = 0, this one -2000".
+        """
+        for joint in self.joints:
+            if joint.name not in recorded.joint_names:
+                return f"it has no joint {joint.name}"
+            if joint.unit != (unit := recorded.joint(joint.name).unit):
+                return f"its joint {joint.name} is in {unit}, this one in {joint.unit}"
+        channels = {channel.name: channel for channel in recorded.channels}
+        for channel in self.channels:
+            if channel.name in channels:
+                here, there = channel.conversion(), channels[channel.name].conversion()
+                for name in (*here, *there):
+                    if here.get(name) != there.get(name):
+                        return f"its channel {channel.name} has {name} = {there.get(name)}, this one {here.get(name)}"
+        return ""
+
     def couplings(self) -> Iterator[tuple[int, Driven, str, float]]:
         """Iterate over every (row number from 1, driven constant, joint name, coefficient)."""
         for number, row in enumerate(self.rows, 1):

@@ -28,6 +28,7 @@ from daemon.acquisition.status.snapshot import AcquisitionStatus
 from daemon.acquisition.thinning import Thinning
 from daemon.store import Store
 from daemon.store.errors import storage_sentence
+from daemon.store.queries.device_states import device_states
 from drivers.clock import NS_PER_S, Clock, Stamp, TimeBudget
 from drivers.readings import (
     CanCapture,
@@ -103,7 +104,7 @@ class Acquisition:
         self._batch_seconds = batch_seconds
         self._intakes = [LinkIntake(link, clock, queue_captures, store.begun or clock.now()) for link in links]
         self._factories = decoders
-        self._decoding = LinkDecoders(decoders)
+        self._decoding = self._new_decoding()
         self._backlog = Backlog(store, clock)
         self._is_left_over = False  # what is decoded now, a run before this one captured
         self._decoded: _Decoded | None = None
@@ -123,6 +124,7 @@ class Acquisition:
 
     def start(self) -> None:
         """Go live; what a run before this one left undecoded is decoded first, beside capturing."""
+        self._recall()
         self._last_cycle_ns = self._clock.monotonic_ns()
         for intake in self._intakes:
             intake.start(self._stop_links)
@@ -281,8 +283,17 @@ class Acquisition:
         if is_left_over:
             log.warning("captures that the last run left undecoded are being decoded")
         else:
-            self._decoding = LinkDecoders(self._factories)  # what was left over is decoded apart from what comes live
+            self._decoding = self._new_decoding()  # what was left over is decoded apart from what comes live
+            self._recall()
             log.info("what the last run left is decoded")
+
+    def _new_decoding(self) -> LinkDecoders:
+        """Return decoders that go on from what devices have told of their state."""
+        return LinkDecoders(self._factories, partial(device_states, self._store))
+
+    def _recall(self) -> None:
+        """Show what devices have told of their state before this run, as its decoders take it on."""
+        self._board.recall(device_states(self._store, self._clock.now()))
 
     # ---- replay ----------------------------------------------------------------------------------------------------
 

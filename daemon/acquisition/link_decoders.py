@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from drivers.can.summary import CanSummary
 from drivers.can_decoder import CanDecoder
 from drivers.clock import NS_PER_S, Stamp
-from drivers.readings import Capture, DecodeFailure, Decoder, Record
+from drivers.readings import Capture, DecodeFailure, Decoder, DeviceEvent, Record
 
 log = logging.getLogger(__name__)
 
@@ -20,10 +20,16 @@ class LinkDecoders:
 
     Args:
         factories: link -> what makes its decoder; captures of other links yield nothing.
+        recalled: returns what devices have told of their state before an instant, in its boot: a decoder that is made
+            then goes on from there.
     """
 
-    def __init__(self, factories: Mapping[str, Callable[[], Decoder]]) -> None:
-        self._factories = factories
+    def __init__(
+        self,
+        factories: Mapping[str, Callable[[], Decoder]],
+        recalled: Callable[[Stamp], Sequence[DeviceEvent]] = lambda _: (),
+    ) -> None:
+        self._factories, self._recalled = factories, recalled
         self._decoders: dict[str, Decoder] = {}
         self._boots: dict[str, str] = {}
         self._defects: dict[str, Stamp] = {}
@@ -37,7 +43,7 @@ class LinkDecoders:
         for capture in captures:
             if capture.link != link or capture.stamp.boot_id != boot:
                 link, boot = capture.link, capture.stamp.boot_id
-                decoder = self._decoder(link, boot) if link in self._factories else None
+                decoder = self._decoder(link, capture.stamp) if link in self._factories else None
             if decoder is None:
                 continue
             try:
@@ -66,7 +72,7 @@ class LinkDecoders:
             if self._boots.setdefault(link, now.boot_id) != now.boot_id:
                 continue
             try:
-                records.extend(self._decoder(link, now.boot_id).tick(now))
+                records.extend(self._decoder(link, now).tick(now))
             except Exception as error:  # noqa: BLE001 - see _failure
                 records.append(self._failure(link, now, error, b""))
         return records
@@ -87,7 +93,10 @@ class LinkDecoders:
         self._defects[link] = stamp
         return DecodeFailure(link, stamp, f"the decoder failed: {type(error).__name__}: {error}", raw)
 
-    def _decoder(self, link: str, boot: str) -> Decoder:
-        if link not in self._decoders or self._boots[link] != boot:
-            self._decoders[link], self._boots[link] = self._factories[link](), boot
+    def _decoder(self, link: str, at: Stamp) -> Decoder:
+        if link not in self._decoders or self._boots[link] != at.boot_id:
+            decoder = self._factories[link]()
+            if isinstance(decoder, CanDecoder):
+                decoder.recall(self._recalled(at))
+            self._decoders[link], self._boots[link] = decoder, at.boot_id
         return self._decoders[link]

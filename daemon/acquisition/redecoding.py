@@ -5,12 +5,16 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any
 
+from calibration.rig.description import Rig
 from daemon.acquisition.link_decoders import LinkDecoders
-from daemon.commands import CommandError
+from daemon.commands import REFUSED, CommandError
+from daemon.rig_files import HOW_TO_READ_AGAIN, misreading
 from daemon.store import Store
-from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS
+from daemon.store.queries.device_states import device_states
+from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS, sessions_between
 from daemon.store.reader import Reader
 from daemon.store.upkeep.full_samples import Stretch, put_again, stretches_between, stretches_of_session
 from drivers.clock import NS_PER_S, Stamp
@@ -40,12 +44,13 @@ def redecode(
         How many readings and fixes there are now that were not there before.
 
     Raises:
-        StoreError: a chunk of captures is damaged; all before it is stored.
+        StoreError: a chunk of captures is damaged, or readings that are stored are others than those that are made
+            again; all before it is stored.
     """
     added = 0
     with store.reader() as reader:
         for since, until in stretches:
-            decoding = LinkDecoders(decoders)
+            decoding = LinkDecoders(decoders, partial(device_states, store))
             for batch in _slices(_captures(reader, [*decoders], since.shifted(-BEFORE_NS), until.shifted(AFTER_NS))):
                 go_on()
                 records = [
@@ -80,6 +85,7 @@ def _slices(captures: Iterator[Capture]) -> Iterator[list[Capture]]:
 
 def redecode_command(
     store: Store,
+    rig: Rig,
     decoders: Mapping[str, Callable[[], Decoder]],
     arguments: Mapping[str, Any],
     go_on: Callable[[], None],
@@ -88,9 +94,14 @@ def redecode_command(
 
     Args:
         store: open for writing.
+        rig: the rig file that the decoders are of.
         decoders: link -> what makes its decoder.
         arguments: `session`, or `first_utc_ns` and `last_utc_ns`.
         go_on: called again and again; what it raises ends the work, and what was stored stays.
+
+    Raises:
+        CommandError: there is nothing to decode, or a session in it was recorded with a rig file that gives others.
+        StoreError: as `redecode`, or stored readings are others than those that are made again.
     """
     with store.reader() as reader:
         if session := arguments.get("session"):
@@ -102,8 +113,16 @@ def redecode_command(
                 raise CommandError("give a session, or a time whose end is later than its begin")
             stretches = stretches_between(reader, first_ns, last_ns)
             what = f"the time from {_text(first_ns)} to {_text(last_ns)}"
-    if not stretches:
-        raise CommandError(f"the store has no captures of {what}; `rigcal session list` shows the sessions")
+        if not stretches:
+            raise CommandError(f"the store has no captures of {what}; `rigcal session list` shows the sessions")
+        for since, until in stretches:
+            for row in sessions_between(reader, since, until, store.boot_row(since)):
+                if why := misreading(rig, row["rig_text"], row["prism"]):
+                    raise CommandError(
+                        f"session {row['id']} was recorded with another rig file than the one in use: {why}; "
+                        f"{HOW_TO_READ_AGAIN}",
+                        REFUSED,
+                    )
     added = redecode(store, decoders, stretches, go_on)
     return {
         "added": added,

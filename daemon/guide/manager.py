@@ -11,7 +11,7 @@ from typing import Any
 
 from calibration.rig.description import Rig
 from daemon.acquisition.joiner import ObservationJoiner
-from daemon.commands import REFUSED, CommandError, Handler, mapping_argument, text_argument
+from daemon.commands import HOW_TO_END, REFUSED, CommandError, Handler, mapping_argument, text_argument
 from daemon.control.command_table import check_arguments
 from daemon.guide.advisor import accuracy_view
 from daemon.guide.course import Course
@@ -21,7 +21,7 @@ from daemon.guide.position import FRESH_S, is_there, joints_of
 from daemon.guide.request import request_of, whole_argument
 from daemon.guide.view import Around, headline, state_of
 from daemon.guide.worker import NEEDED_FIXES, Drive, GuideWorker
-from daemon.sessions.manager import HOW_TO_END, SessionManager
+from daemon.sessions.manager import SessionManager
 from daemon.sessions.station_setups import StationSetups
 from daemon.store.store import Store
 from drivers.clock import Clock

@@ -290,7 +290,15 @@ def _store(order: Order) -> Reader:
 
 
 def _rig_text(order: Order) -> str:
-    """The rig file of the newest session: the sessions carry what they were recorded with."""
+    """The rig file of the newest session: the sessions carry what they were recorded with.
+
+    Raises:
+        DataError: no session may be used any more.
+    """
+    if not order.session_ids:
+        raise DataError(
+            "sessions", "none of those that the job was queued for may be used any more; `rigcal session list` says why"
+        )
     with _store(order) as reader:
         newest = session(reader, order.session_ids[-1])
         assert newest is not None  # no session is ever deleted

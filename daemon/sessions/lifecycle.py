@@ -1,7 +1,8 @@
 """Every way in which a calibration session changes its state, and whether calibration may use it.
 
 A session is open, then closed or aborted. When it is closed it is decided whether calibration may use it: where no
-control point shows that the station stood still from its start to its end, it may not, until an operator accepts it.
+control point shows that the station stood still from its start to its end, it may not, until an operator accepts it;
+where another rig file than today's turned counts into its readings, it may not as long as that file is not in use.
 Each change is one transaction.
 """
 
@@ -9,14 +10,17 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
-from daemon.commands import CommandError, caller_columns
+from calibration.rig.description import Rig
+from daemon.commands import REFUSED, CommandError, caller_columns
 from daemon.host.time_service import ClockState
+from daemon.rig_files import HOW_TO_READ_AGAIN, misreading
 from daemon.sessions.open_session import OpenSession
 from daemon.store.connection import rig_sha256
 from daemon.store.queries.jobs import JobTable
-from daemon.store.queries.sessions import SessionTable, preset_jumps
+from daemon.store.queries.sessions import OTHER_RIG_FILE, SessionTable, preset_jumps, session
 from daemon.store.store import Store
 from drivers.clock import Clock, Stamp
 
@@ -24,6 +28,10 @@ log = logging.getLogger(__name__)
 
 NOT_SHOT = "no control point was shot at its start and again at its end, so nothing shows that the station stood still"
 NOT_ENCLOSED = "most of its poses do not lie between a control point's shots at its start and at its end"
+NOT_THE_SAME = (
+    "the control point that was shot at its start was not shot at its end, and another one was, whose first shot came "
+    "after some poses: those may have been measured from another place"
+)
 LEAST_ENCLOSED = 0.25  # of its poses; some come before the operator gets to the first shot, or after the last
 
 
@@ -32,7 +40,7 @@ class SessionLifecycle:
 
     Args:
         store: the database.
-        rig_name: whose sessions are opened.
+        rig: whose sessions are opened.
         clock: time of the changes.
         tolerance_mm: a control point further off than this says that the station moved.
         clock_state: returns how the computer's clock is; None where it is not that of the session.
@@ -44,15 +52,15 @@ class SessionLifecycle:
     def __init__(
         self,
         store: Store,
-        rig_name: str,
+        rig: Rig,
         clock: Clock,
         tolerance_mm: float,
         clock_state: Callable[[], ClockState | None] = lambda: None,
     ) -> None:
-        self._store, self._rig, self._clock, self._tolerance_mm = store, rig_name, clock, tolerance_mm
+        self._store, self._rig, self._clock, self._tolerance_mm = store, rig, clock, tolerance_mm
         self._clock_state = clock_state
-        self.table = SessionTable(store, rig_name)
-        self._jobs = JobTable(store, rig_name)
+        self.table = SessionTable(store, rig.name)
+        self._jobs = JobTable(store, rig.name)
 
     def unfinished(self, rig_text: str) -> tuple[OpenSession | None, list[OpenSession]]:
         """The rig's open session, and those that have ended and whose last captures were not decoded yet.
@@ -63,7 +71,7 @@ class SessionLifecycle:
         ended: list[OpenSession] = []
         sha256 = rig_sha256(rig_text)
         for row in self.table.unfinished():
-            if row["rig"] != self._rig:
+            if row["rig"] != self._rig.name:
                 if row["state"] == "open":
                     log.warning(
                         "session %s of rig %s is open; it goes on when rigcal runs that rig", row["id"], row["rig"]
@@ -75,11 +83,11 @@ class SessionLifecycle:
                 continue
             since, until = self._store.stamp(row, "started_"), self._store.stamp_or_none(row, "ended_")
             order = self._store.order
-            session = OpenSession(row["id"], row["setup_id"], row["prism"], row["kind"], order, since, until)
+            found = OpenSession(row["id"], row["setup_id"], row["prism"], row["kind"], order, since, until)
             if until is None:
-                opened = session
+                opened = found
             else:
-                ended.append(session)
+                ended.append(found)
         return opened, ended
 
     def _close_of_another_file(self, row: Mapping[str, Any]) -> None:
@@ -134,6 +142,27 @@ class SessionLifecycle:
         with self._store.transaction():
             self.table.exclude_closed(session_id, self._why_not_used(session_id))
 
+    def judge_rig_files(self) -> None:
+        """Decide anew whether calibration may use the closed sessions, now that the rig file in use may be another."""
+        with self._store.transaction():
+            for row in self.table.closed():
+                why, excluded = self._why_misread(row["id"]), row["excluded"]
+                if why is None and (excluded or "").startswith(OTHER_RIG_FILE):
+                    why = self._why_not_used(row["id"]) if row["accepted_despite"] is None else None
+                elif why is None:
+                    continue
+                if why != excluded:
+                    self.table.change(row["id"], excluded=why)
+                    told = f"is not used: {why}" if why else "is used again"
+                    self._store.once_committed(partial(log.warning, "session %s %s", row["id"], told))
+
+    def _why_misread(self, session_id: str) -> str | None:
+        """Return why a session's readings are not those of the rig file in use, a clause; None where they are."""
+        row = session(self._store, session_id)
+        assert row is not None  # no session is ever deleted
+        why = misreading(self._rig, row["rig_text"], row["prism"])
+        return f"{OTHER_RIG_FILE}{why}" if why else None
+
     def accept(self, session_id: str, operator: str) -> str:
         """Let calibration use a closed session from now on, on an operator's word.
 
@@ -151,6 +180,8 @@ class SessionLifecycle:
                 raise CommandError(f"session {session_id!r} is {why}")
             if despite is None:
                 raise CommandError(f"session {session_id!r} is used by calibration; there is nothing to accept")
+            if despite.startswith(OTHER_RIG_FILE):
+                raise CommandError(f"session {session_id!r}: {despite}; {HOW_TO_READ_AGAIN}", REFUSED)
             self.table.change(
                 session_id,
                 excluded=None,
@@ -164,11 +195,15 @@ class SessionLifecycle:
 
     def _why_not_used(self, session_id: str) -> str | None:
         """Why calibration must not use a session, a clause; None where a control point shows that it may."""
+        if (misread := self._why_misread(session_id)) is not None:
+            return misread
         for shot in self.table.shots(session_id):
             if shot["misclosure_mm"] is not None and shot["misclosure_mm"] > self._tolerance_mm:
                 off = f"control point {shot['point']} was {shot['misclosure_mm']:.1f} mm off at its {shot['phase']}"
                 return f"{off}, so the station had moved"
         if not self.table.points_shot(session_id, "start") & self.table.points_shot(session_id, "end"):
             return NOT_SHOT
+        if self.table.has_poses_before_enclosed(session_id):
+            return NOT_THE_SAME
         poses, enclosed = self.table.count_poses(session_id)
         return NOT_ENCLOSED if enclosed < LEAST_ENCLOSED * poses else None

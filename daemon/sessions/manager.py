@@ -18,6 +18,7 @@ from typing import Any
 from calibration.rig.description import Rig
 from daemon.acquisition.joiner import JoinedFix, ObservationJoiner
 from daemon.commands import (
+    HOW_TO_END,
     SESSION_KINDS,
     CommandError,
     caller_columns,
@@ -47,7 +48,6 @@ log = logging.getLogger(__name__)
 
 LOAD_S = 3.0  # how long a session's start waits for what tells prisms apart; it is heeded later as well
 LATE_NS = 60 * NS_PER_S  # once a fix was joined that was measured so long after a session's end, it has all of its own
-HOW_TO_END = "stop or abort it first: `rigcal session stop`, or `rigcal session abort` where it is of no use"
 
 
 class SessionManager:
@@ -90,7 +90,7 @@ class SessionManager:
         self._rig, self._rig_text = rig, rig_text
         self._store, self._joiner, self._settings, self._clock = store, joiner, settings, clock
         self._setups, self._are_jobs_enabled = setups, are_jobs_enabled
-        self._lifecycle = SessionLifecycle(store, rig.name, clock, settings.control_tolerance_mm, clock_state)
+        self._lifecycle = SessionLifecycle(store, rig, clock, settings.control_tolerance_mm, clock_state)
         self._table, self._observations = self._lifecycle.table, ObservationTable(store)
         self._jobs = JobTable(store, rig.name)
         self._aim = aim
@@ -395,6 +395,7 @@ class SessionManager:
     def _go_on(self) -> None:
         """Ready the sessions that an earlier run left to take fixes: of those that ended, what it did not decode."""
         self._open, self._ended = self._lifecycle.unfinished(self._rig_text)
+        self._lifecycle.judge_rig_files()
         for session in self._taking():
             session.control_points = self._setups.control_points(session.setup_id)
             session.jumped = self._lifecycle.jumped(session)

@@ -11,11 +11,13 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from calibration.errors import DataError
 from calibration.rig.description import Rig
 from calibration.table import LABEL_COLUMNS, POSITION_COLUMNS, SIGMA_COLUMNS
 from daemon.report.calibration.inputs import ControlPoint, SetupLine
+from daemon.rig_files import HOW_TO_READ_AGAIN, misreading
 from daemon.store.queries.observations import first_observation_ns, moving_observations, observations
-from daemon.store.queries.sessions import session
+from daemon.store.queries.sessions import OTHER_RIG_FILE, session
 from daemon.store.queries.setups import misclosures, setups_of
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S, Stamp
@@ -48,7 +50,15 @@ def sessions_csv(reader: Reader, rig: Rig, session_ids: Sequence[str], *, moving
     `time_s` counts from the store's first observation that calibration may use, on UTC, steady within a session:
     sessions may lie boots apart. It is the same whichever sessions are asked for: what a model has learned from some of
     them depends on time (a jump, a base that settles), and is applied to others.
+
+    Raises:
+        DataError: another rig file turned counts into the readings of one of the sessions, so that they are not
+            readings of `rig`.
     """
+    for name in session_ids:
+        row = session(reader, name)
+        if row is not None and (why := misreading(rig, row["rig_text"], row["prism"])):
+            raise DataError(f"session {name}", f"{OTHER_RIG_FILE}{why}; {HOW_TO_READ_AGAIN}")
     rows = (moving_observations if moving else observations)(reader, session_ids)
     values = [json.loads(row["values_json"]) for row in rows]
     joints = [joint.column for joint in rig.joints]

@@ -10,7 +10,16 @@ from statistics import fmean
 from typing import Any
 
 from calibration.rig.description import Rig
-from daemon.commands import REFUSED, CommandError, identifier, mapping_argument, number_argument, text_argument
+from daemon.commands import (
+    HOW_TO_END,
+    REFUSED,
+    CommandError,
+    identifier,
+    mapping_argument,
+    number_argument,
+    text_argument,
+)
+from daemon.store.queries.sessions import SessionTable
 from daemon.store.queries.setups import SetupTable, control_points
 from daemon.store.store import Store
 from drivers.clock import Clock
@@ -35,10 +44,14 @@ class StationSetups:
 
     def __init__(self, rig: Rig, store: Store, clock: Clock, tolerance_mm: float) -> None:
         self._rig, self._store, self._clock, self._tolerance_mm = rig, store, clock, tolerance_mm
-        self._table = SetupTable(store, rig.name)
+        self._table, self._sessions = SetupTable(store, rig.name), SessionTable(store, rig.name)
 
     def new_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """A station set-up: instrument, tilt, ppm. It replaces none: sessions name theirs."""
+        """A station set-up: instrument, tilt, ppm. It replaces none: sessions name theirs.
+
+        Raises:
+            CommandError: a session is open, which goes on with the set-up that it was started in.
+        """
         setup_id = identifier(arguments, "id", "a set-up's id")
         if setup_id in self._table.states():
             raise CommandError(f"set-up {setup_id!r} exists already; a station that was moved is a new set-up")
@@ -60,6 +73,12 @@ class StationSetups:
             "note": text_argument(arguments, "note"),
         }
         with self._store.transaction():
+            if (opened := self._sessions.open_session()) is not None:
+                raise CommandError(
+                    f"session {opened.id!r} is open where the station stood at its start; {HOW_TO_END}, and then "
+                    "describe where the station stands now",
+                    REFUSED,
+                )
             self._table.add(self._clock.now(), id=setup_id, **row)
             for name, place in points.items():
                 self._table.put_control_point(setup_id, name, place)

@@ -348,8 +348,7 @@ def m015_large_chunks(db: Database) -> None:
         ),
         # A fix that is deleted is looked for among the observations: a foreign key.
         "CREATE INDEX observations_by_fix ON observations(fix_id) WHERE fix_id IS NOT NULL",
-        # No query uses these.
-        "DROP INDEX fixes_by_time",
+        "DROP INDEX fixes_by_time",  # no query uses these
         "DROP INDEX device_events_by_time",
         "DROP INDEX gaps_by_time",
     )
@@ -430,6 +429,12 @@ def m030_rig_files(db: Database) -> None:
                 JOIN calibration_sessions AS session ON session.id = of_job.value
                 WHERE jobs.id = models.job_id ORDER BY session.rowid DESC LIMIT 1)""",
     )
+
+
+@MIGRATIONS()
+def m031_states_of_devices(db: Database) -> None:
+    """The last event of a device is looked for by every start."""
+    db.execute("CREATE INDEX device_events_of_states ON device_events(device, kind, boot_id, monotonic_ns)")
 
 
 def unknown_migrations(db: Database) -> list[str]:

@@ -117,6 +117,11 @@ class _PositionDecoder(PdoChannelDecoder):
             self._take_flags(stamp, index, value, records)
         return records
 
+    def recall(self, event: DeviceEvent) -> None:
+        for index, (kind, _, _) in _FLAGS.items():
+            if event.kind is kind and event.code is not None:
+                self._flags[index] = event.code
+
     def node_restarted(self) -> None:
         super().node_restarted()
         self._flags = dict.fromkeys(_FLAGS, 0)

@@ -17,7 +17,7 @@ from drivers.canopen.cia301 import tpdo_id
 from drivers.clock import Stamp
 from drivers.errors import DescriptionError
 from drivers.files import read_whole
-from drivers.readings import Record
+from drivers.readings import DeviceEvent, Record
 
 _FILE_MAX_BYTES = 2 << 20
 
@@ -193,6 +193,9 @@ class PdoChannelDecoder:
     def object_read(self, stamp: Stamp, index: int, value: int) -> list[Record]:  # noqa: ARG002 - profiles use them
         """Return the records caused by an object of the node that was read over SDO."""
         return []
+
+    def recall(self, event: DeviceEvent) -> None:
+        """Take on what an event of the channel told, one that an earlier decoder made."""
 
     def node_restarted(self) -> None:
         """Forget the node's last known state, because it has booted."""

@@ -13,6 +13,9 @@ from drivers.readings import DecodeFailure, DeviceEvent, EventKind, Record
 
 HEARTBEAT_TOLERANCE = 2.5  # producer times without a heartbeat: two may be lost, and the node's clock be slow
 
+VOIDS = "its values are not used until it takes this back"
+"""How the text of an emergency ends while it, or one before it, voids the values of the node's channels."""
+
 _REGISTER_DEVICE_PROFILE = 1 << 5
 _CLASS_HARDWARE = 0x5000
 
@@ -25,8 +28,9 @@ class NodeSupervision:
 
     An emergency voids the values of the node's channels if it says that the measurement itself has failed: code 5xxxh
     (device hardware), or error register bit 5 (device profile). Any other, such as communication, voltage or
-    temperature, is reported and leaves the values, which 6503h voids where they are wrong. A code 00xxh without bit 5,
-    or a boot-up, makes them valid again.
+    temperature, is reported and leaves the values, which 6503h voids where they are wrong. A code 00xxh with an error
+    register of zero, or a boot-up, makes them valid again; with a bit of the register left, one error of several is
+    gone, and which one is not said (CiA 301, emergency state transitions).
 
     Args:
         node: node number.
@@ -50,6 +54,20 @@ class NodeSupervision:
             emcy_id(self.node): self._on_emergency,
             sdo_response_id(self.node): self._on_sdo_response,
         }
+
+    def recall(self, event: DeviceEvent) -> None:
+        """Take on what an event of the node told, one that an earlier decoder made: voided values, alarms, warnings."""
+        if event.device == self._name:
+            if event.kind is EventKind.BOOT_UP:
+                for channel in self._channels:
+                    channel.node_restarted()
+            elif event.kind is EventKind.EMERGENCY_CLEARED:
+                self._void(is_void=False)
+            elif event.kind is EventKind.EMERGENCY and event.text.endswith(VOIDS):
+                self._void(is_void=True)
+        for channel in self._channels:
+            if event.device == channel.name:
+                channel.recall(event)
 
     def tick(self, now: Stamp) -> list[Record]:
         """Report a heartbeat that is overdue."""
@@ -89,17 +107,21 @@ class NodeSupervision:
             emergency = decode_emergency(data)
         except ValueError as error:
             return [DecodeFailure(self._name, stamp, f"node {self.node}: {error}", data)]
+        if emergency.is_reset and not emergency.register:
+            self._void(is_void=False)
+            text = f"node {self.node}: errors are gone ({emergency.words})"
+            return [DeviceEvent(self._name, stamp, EventKind.EMERGENCY_CLEARED, text, emergency.code)]
         is_void = emergency.code & 0xF000 == _CLASS_HARDWARE or bool(emergency.register & _REGISTER_DEVICE_PROFILE)
+        # Another emergency does not make values valid that one before it has voided.
+        is_void |= any(channel.is_void for channel in self._channels)
+        self._void(is_void=is_void)
+        what = f"an error is gone, others are left: {emergency.words}" if emergency.is_reset else emergency.words
+        text = f"node {self.node}: {what}{f'; {VOIDS}' if is_void else ''}"
+        return [DeviceEvent(self._name, stamp, EventKind.EMERGENCY, text, emergency.code or None)]
+
+    def _void(self, *, is_void: bool) -> None:
         for channel in self._channels:
-            # A new emergency of another kind does not make values valid that one before it has voided
-            channel.is_void = is_void if emergency.is_reset else channel.is_void or is_void
-        if emergency.is_reset:
-            kind, text = EventKind.EMERGENCY_CLEARED, f"node {self.node}: errors are gone ({emergency.words})"
-        else:
-            kind, text = EventKind.EMERGENCY, f"node {self.node}: {emergency.words}"
-            if is_void:
-                text += "; its values are not used until it takes this back"
-        return [DeviceEvent(self._name, stamp, kind, text, emergency.code)]
+            channel.is_void = is_void
 
     def _on_sdo_response(self, stamp: Stamp, data: bytes) -> list[Record]:
         """Take the value of an object of the node that anybody on the bus has read."""

@@ -236,6 +236,39 @@ def test_one_error_less_is_not_none() -> None:
     assert the_reading(feed(boom, "1A0 00 40 00 00")).status is Status.DEVICE_ALARM
 
 
+@pytest.mark.parametrize("left", ["01", "20"])
+def test_errors_are_gone_only_with_the_last_bit_of_the_register(left: str) -> None:
+    boom = decoder()
+    feed(boom, "0A0 00 50 01 00 00 00 00 00")
+    feed(boom, "0A0 10 81 11 00 00 00 00 00")
+    (event,) = events(feed(boom, f"0A0 00 00 {left} 00 00 00 00 00"))
+    assert (event.kind, event.code) == (EventKind.EMERGENCY, None), "code 0 would take it back"
+    assert "an error is gone, others are left" in event.text
+    assert the_reading(feed(boom, "1A0 00 40 00 00")).status is Status.DEVICE_ALARM
+    assert kinds(feed(boom, "0A0 00 00 00 00 00 00 00 00")) == [EventKind.EMERGENCY_CLEARED]
+    assert the_reading(feed(boom, "1A0 00 40 00 00")).value == 90.0
+
+
+@pytest.mark.parametrize(
+    ("told", "status"),
+    [
+        ("0A0 00 50 81 00 00 00 00 00", Status.DEVICE_ALARM),
+        ("0A0 20 81 11 00 00 00 00 00", Status.OK),
+        ("0A0 00 50 81 00 00 00 00 00; 0A0 20 81 11 00 00 00 00 00", Status.DEVICE_ALARM),
+        ("0A0 00 50 81 00 00 00 00 00; 0A0 00 00 00 00 00 00 00 00", Status.OK),
+        ("0A0 00 50 81 00 00 00 00 00; 720 00", Status.OK),
+        ("5A0 4B 03 65 00 01 00 00 00", Status.DEVICE_ALARM),
+        ("5A0 4B 03 65 00 01 00 00 00; 5A0 4B 03 65 00 00 00 00 00", Status.OK),
+    ],
+    ids=["void", "other", "both", "taken back", "booted", "alarm", "alarm gone"],
+)
+def test_a_new_decoder_goes_on_from_what_devices_have_told_before(told: str, status: Status) -> None:
+    before, after = decoder(), decoder()
+    after.recall([event for frame in told.split("; ") for event in events(feed(before, frame))])
+    assert the_reading(feed(after, "1A0 00 40 00 00")).status is status
+    assert the_reading(feed(before, "1A0 00 40 00 00")).status is status
+
+
 def test_a_boot_up_ends_an_emergency() -> None:
     boom = decoder()
     feed(boom, "0A0 00 50 81 00 00 00 00 00")

@@ -101,6 +101,14 @@ class StatusBoard:
         with self._lock:
             self._error = error
 
+    def recall(self, events: Sequence[DeviceEvent]) -> None:
+        """Take on what expected channels told before this run; it is counted as nothing that happens now."""
+        with self._lock:
+            for event in events:
+                if event.device in self._channels:
+                    self._event_count += 1
+                    self._events[event.device, event.kind] = self._event_count, event
+
     def captured(self, captures: Sequence[Capture]) -> None:
         """Count captures that have just been stored, by link, and note how long the oldest has waited."""
         now_ns = self._clock.monotonic_ns()

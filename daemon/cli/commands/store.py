@@ -231,7 +231,7 @@ def store_redecode(
         from daemon.service import declare_channels
 
         declare_channels(store, source.rig)
-        return redecode_command(store, decoders(settings, source), arguments, _go_on)
+        return redecode_command(store, source.rig, decoders(settings, source), arguments, _go_on)
 
     result = _on_store(settings, work, "store.redecode", arguments)
     if not as_json:

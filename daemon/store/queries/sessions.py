@@ -41,6 +41,7 @@ _INSTANTS = """WITH instants AS (
         UNION ALL SELECT started_boot_id, started_monotonic_ns, started_utc_ns FROM calibration_sessions WHERE id = ?1
         UNION ALL SELECT ended_boot_id, ended_monotonic_ns, ended_utc_ns FROM calibration_sessions
             WHERE id = ?1 AND ended_utc_ns IS NOT NULL)"""
+OTHER_RIG_FILE = "it was recorded with another rig file: "  # so begins why a session is not used that was
 # Within a boot both clocks run alike, whatever NTP does to their rate: their difference changes only when the clock is
 # set. A later boot must not show an earlier time. The first query is cheap, and nearly always the answer.
 _MAY_HAVE_STEPPED = f"""{_INSTANTS} SELECT min(boot_id) < max(boot_id)
@@ -64,6 +65,14 @@ _ENCLOSED = """SELECT count(DISTINCT coalesce(o.pose, o.id)) AS poses,
                 AND (o.boot_id, o.monotonic_ns) < (b.boot_id, b.monotonic_ns))
             THEN coalesce(o.pose, o.id) END) AS enclosed
     FROM observations AS o WHERE o.session_id = ? AND o.excluded IS NULL"""
+# A pose after the first shot of all that no shot of a point which was shot again at the end came before.
+_BEFORE_ENCLOSED = """SELECT 1 FROM observations AS o WHERE o.session_id = ?1 AND o.excluded IS NULL
+        AND EXISTS (SELECT 1 FROM control_shots AS s WHERE s.session_id = ?1 AND s.phase = 'start'
+            AND (s.boot_id, s.monotonic_ns) < (o.boot_id, o.monotonic_ns))
+        AND NOT EXISTS (SELECT 1 FROM control_shots AS a JOIN control_shots AS b
+                ON b.session_id = ?1 AND b.name = a.name AND b.phase = 'end'
+            WHERE a.session_id = ?1 AND a.phase = 'start'
+                AND (a.boot_id, a.monotonic_ns) < (o.boot_id, o.monotonic_ns)) LIMIT 1"""
 _BETWEEN = """SELECT 1 FROM observations AS o JOIN control_shots AS c ON c.session_id = o.session_id AND c.name = ?
     WHERE o.session_id = ? AND o.excluded IS NULL
         AND (o.boot_id, o.monotonic_ns) > (c.boot_id, c.monotonic_ns) LIMIT 1"""
@@ -77,13 +86,17 @@ _STANDING = """SELECT max(o.id) AS id, o.session_id, o.prism, o.x_mm, o.y_mm, o.
         AND (o.boot_id, o.monotonic_ns) >= (?, ?)
     GROUP BY o.session_id, o.pose ORDER BY id DESC LIMIT 500"""
 # Those after the newest session that is used: later measurements make up for the earlier ones.
-_UNTRAINED = """SELECT id, excluded FROM calibration_sessions
-    WHERE rig = ?1 AND state = 'closed' AND excluded IS NOT NULL AND rowid >
+_UNTRAINED = f"""SELECT id, excluded FROM calibration_sessions
+    WHERE rig = ?1 AND state = 'closed' AND excluded IS NOT NULL AND excluded NOT LIKE '{OTHER_RIG_FILE}%' AND rowid >
         (SELECT coalesce(max(rowid), 0) FROM calibration_sessions
             WHERE rig = ?1 AND state = 'closed' AND excluded IS NULL)
     ORDER BY rowid"""
 _SESSION = """SELECT calibration_sessions.*, rig_files.text AS rig_text FROM calibration_sessions
     LEFT JOIN rig_files ON rig_files.sha256 = rig_sha256 WHERE id = ?"""
+_BETWEEN_INSTANTS = """SELECT calibration_sessions.*, rig_files.text AS rig_text FROM calibration_sessions
+    LEFT JOIN rig_files ON rig_files.sha256 = rig_sha256
+    WHERE (started_boot_id, started_monotonic_ns) <= (?, ?)
+        AND (ended_boot_id IS NULL OR (ended_boot_id, ended_monotonic_ns) >= (?, ?))"""
 # What was measured from a session's start to its end; the index of the table behind the view finds it.
 _FIXES_MEASURED = f"""SELECT row.* {in_session("links CROSS JOIN v_fixes")} AND row.station = links.name
     ORDER BY row.id"""
@@ -180,8 +193,17 @@ class SessionTable:
             (self._rig,),
         )
 
+    def closed(self) -> list[dict[str, Any]]:
+        """Id, excluded and accepted_despite of the rig's closed sessions, oldest first."""
+        sql = """SELECT id, excluded, accepted_despite FROM calibration_sessions
+            WHERE rig = ? AND state = 'closed' ORDER BY rowid"""
+        return self._store.rows(sql, (self._rig,))
+
     def untrained(self) -> dict[str, str]:
-        """Closed sessions of the rig that calibration does not use, newer than all that it uses -> why."""
+        """Closed sessions of the rig that calibration does not use, newer than all that it uses -> why.
+
+        Those that were recorded with another rig file are history, and left out.
+        """
         return {row["id"]: row["excluded"] for row in self._store.rows(_UNTRAINED, (self._rig,))}
 
     def newest_number(self) -> int:
@@ -250,6 +272,10 @@ class SessionTable:
         """Point, phase and misclosure_mm of a session's control shots, oldest first."""
         return self._store.rows(_SHOTS, (session_id,))
 
+    def has_poses_before_enclosed(self, session_id: str) -> bool:
+        """True if poses lie after a session's first shot and before any of a point that was shot again at the end."""
+        return bool(self._store.rows(_BEFORE_ENCLOSED, (session_id,)))
+
     def count_poses(self, session_id: str) -> tuple[int, int]:
         """Number of poses of a session, and of those that lie between two shots of a control point."""
         (found,) = self._store.rows(_ENCLOSED, (session_id,))
@@ -282,6 +308,19 @@ class SessionTable:
 def session(source: RowSource, session_id: str) -> dict[str, Any] | None:
     """Return a session's row with its `rig_text`; None where there is none."""
     return next(iter(source.rows(_SESSION, (session_id,))), None)
+
+
+def sessions_between(source: RowSource, since: Stamp, until: Stamp, boot: int) -> list[dict[str, Any]]:
+    """Return the rows of sessions, as `session` does, that were open between two instants of a boot.
+
+    Args:
+        source: the store.
+        since: the first instant.
+        until: the last one.
+        boot: number of the row of `boots`.
+    """
+    first, last = (boot, since.monotonic_ns), (boot, until.monotonic_ns)
+    return list(source.rows(_BETWEEN_INSTANTS, (*last, *first)))
 
 
 def all_sessions(source: RowSource) -> list[dict[str, Any]]:

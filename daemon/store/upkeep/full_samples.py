@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
+from daemon.store.errors import StoreError
 from daemon.store.reader import Reader
 from daemon.store.store import Store
 from drivers.clock import Stamp
 from drivers.readings import Fix, Reading
 
-_SAMPLES = """SELECT {0}.id, channels.name, unit, monotonic_ns FROM {0} JOIN channels ON channels.id = channel_id
+_SAMPLES = """SELECT {0}.id, channels.name, unit, monotonic_ns, value FROM {0} JOIN channels ON channels.id = channel_id
     WHERE boot_id = ? AND monotonic_ns BETWEEN ? AND ?"""
 _FIXES = "SELECT monotonic_ns FROM fixes WHERE station = ? AND boot_id = ? AND monotonic_ns BETWEEN ? AND ?"
 _SESSION = "SELECT * FROM calibration_sessions WHERE id = ?"
@@ -29,8 +32,8 @@ Stretch = tuple[Stamp, Stamp]
 def put_again(store: Store, records: Sequence[Reading | Fix]) -> int:
     """Store readings and fixes of one boot that were decoded again.
 
-    A reading takes the place of the stored one of its channel and instant. A stored fix stays as it is: observations
-    name it.
+    A reading takes the place of the stored one of its channel and instant, which has the same value if it has one. A
+    stored fix stays as it is: observations name it.
 
     Args:
         store: open for writing.
@@ -38,6 +41,9 @@ def put_again(store: Store, records: Sequence[Reading | Fix]) -> int:
 
     Returns:
         How many there are now that were not there before.
+
+    Raises:
+        StoreError: a stored value is another one: it was made with another rig file. None of the records is stored.
     """
     if not records:
         return 0
@@ -47,10 +53,15 @@ def put_again(store: Store, records: Sequence[Reading | Fix]) -> int:
         span = boot, min(instants), max(instants)
         added = 0
         readings = [record for record in records if isinstance(record, Reading)]
-        keys = {(r.channel, r.unit, r.stamp.monotonic_ns) for r in readings}
+        values = {(r.channel, r.unit, r.stamp.monotonic_ns): r.value for r in readings}
         for table in ("joint_samples", "signals"):
             stored = store.rows(_SAMPLES.format(table), span)
-            again = [(row["id"],) for row in stored if (row["name"], row["unit"], row["monotonic_ns"]) in keys]
+            again = []
+            for row in stored:
+                key = row["name"], row["unit"], row["monotonic_ns"]
+                if key in values:
+                    _require_the_same(store, row, values[key])
+                    again.append((row["id"],))
             db.conn.executemany(f"DELETE FROM {table} WHERE id = ?", again)
             added -= len(again)
         fixes: defaultdict[str, list[Fix]] = defaultdict(list)
@@ -63,6 +74,14 @@ def put_again(store: Store, records: Sequence[Reading | Fix]) -> int:
             new += [fix for fix in own if fix.stamp.monotonic_ns not in known]
         store.insert_records(new)
     return added + len(new)
+
+
+def _require_the_same(store: Store, row: Mapping[str, Any], value: float | None) -> None:
+    if None not in (value, row["value"]) and not math.isclose(row["value"], value or 0.0, rel_tol=1e-9, abs_tol=1e-9):
+        raise StoreError(
+            f"{store.path}: {row['name']} was {row['value']:.10g} {row['unit']} and would now be {value:.10g}: its "
+            "readings were made with another rig file; use that one"
+        )
 
 
 def stretches_of_session(reader: Reader, session_id: str) -> list[Stretch]:

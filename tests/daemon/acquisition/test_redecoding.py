@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from calibration.rig.description import parse_rig
 from daemon.acquisition.link_decoders import LinkDecoders
 from daemon.acquisition.redecoding import redecode, redecode_command
 from daemon.acquisition.thinning import Thinning
@@ -18,6 +20,8 @@ from daemon.config import parse_config
 from daemon.rig_files import load_rig
 from daemon.service import declare_channels
 from daemon.store import Store
+from daemon.store.errors import StoreError
+from daemon.store.queries.sessions import SessionTable
 from daemon.store.upkeep.full_samples import stretches_between
 from daemon.store.upkeep.packing import Packing
 from drivers.clock import NS_PER_S, Stamp
@@ -28,6 +32,10 @@ from tests.daemon.store_support import table
 SECONDS = 6.0
 SOURCE = load_rig("swdt82")
 DECODERS = decoders(parse_config(CONFIG, Path.cwd()), SOURCE)
+_L2 = 'name = "L2"\ndevice = "cia406_linear"\n'
+_OTHER_TEXT = SOURCE.text.replace(_L2, f"{_L2}zero_counts = -2000\n")
+OTHER = replace(SOURCE, rig=parse_rig(_OTHER_TEXT, "other"), text=_OTHER_TEXT)
+OTHER_DECODERS = decoders(parse_config(CONFIG, Path.cwd()), OTHER)
 TABLES = {
     "joint_samples": ("channel_id", "value", "status", "raw_counts"),
     "signals": ("channel_id", "value", "status"),
@@ -106,4 +114,23 @@ def test_a_time_of_the_wall_clock_is_found_and_one_without_captures_is_refused(t
         ({"first_utc_ns": 2, "last_utc_ns": 1}, "whose end is later"),
     ):
         with pytest.raises(CommandError, match=said):
-            redecode_command(thinned, DECODERS, arguments, lambda: None)
+            redecode_command(thinned, SOURCE.rig, DECODERS, arguments, lambda: None)
+
+
+def test_a_session_is_decoded_again_with_its_own_rig_file_alone(thinned: Store) -> None:
+    first = table(thinned.path, "joint_samples")[0]
+    SessionTable(thinned, SOURCE.rig.name).start(
+        thinned.stamp(first), SOURCE.text, id="s001-r", prism="r", operator="", kind="check", note=""
+    )
+    before = table(thinned.path, "joint_samples")
+    with pytest.raises(CommandError, match=r"s001-r was recorded with another rig file.*this one -2000"):
+        redecode_command(thinned, OTHER.rig, OTHER_DECODERS, {"session": "s001-r"}, lambda: None)
+    assert table(thinned.path, "joint_samples") == before
+
+
+def test_readings_outside_sessions_are_not_made_others_by_another_rig_file(thinned: Store) -> None:
+    stretch = Stamp(UTC_0_NS, 0, "bench"), Stamp(UTC_0_NS + 4 * NS_PER_S, 4 * NS_PER_S, "bench")
+    before = table(thinned.path, "joint_samples")
+    with pytest.raises(StoreError, match=r"L2 was \S+ mm and would now be \S+: .* another rig file"):
+        redecode(thinned, OTHER_DECODERS, [stretch])
+    assert table(thinned.path, "joint_samples") == before

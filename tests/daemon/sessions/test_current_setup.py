@@ -55,15 +55,6 @@ def test_a_set_up_that_is_used_again_is_watched_though_a_newer_one_is_there(rig:
     assert (rig.setups.current(), alarms(rig)) == ("S3", [])
 
 
-def test_a_move_is_told_although_another_set_up_was_described_meanwhile(rig: Rig) -> None:
-    rig.say("start", prism="r", setup="S1")
-    assert rig.shoot("cp1", MOVED)["moved"]
-    described(rig, "S3")
-    assert alarms(rig) == [("S1", "critical")], "the session goes on at S1"
-    rig.say("stop")
-    assert (rig.setups.current(), alarms(rig)) == ("S3", [])
-
-
 def test_a_newer_set_up_that_has_moved_is_no_fault_of_a_session_elsewhere(rig: Rig) -> None:
     rig.say("start", prism="r")
     rig.shoot("cp1", CP1)

@@ -152,6 +152,32 @@ def test_a_pose_before_the_first_shot_does_not_spoil_a_session(session_rig: Rig)
     assert session_rig.say("stop")["not_used"] is None
 
 
+def test_a_point_that_is_shot_later_does_not_vouch_for_the_poses_before_it(session_rig: Rig) -> None:
+    session_rig.say("start", prism="r")
+    session_rig.shoot("cp1", CP1)
+    session_rig.live(2)
+    session_rig.live(1, theta1=3.0)  # another pose, and meanwhile the station is carried elsewhere
+    session_rig.live(2)
+    session_rig.shoot("cp2", ELSEWHERE)
+    session_rig.live(1, theta1=3.0)
+    session_rig.live(4)
+    session_rig.shoot("cp2", ELSEWHERE)
+    name = session_rig.say("stop")["id"]
+    assert session_rig.say("show", id=name)["not_used"].startswith(
+        "the control point that was shot at its start was not"
+    )
+
+
+def test_no_set_up_is_described_while_a_session_goes_on_in_another(session_rig: Rig) -> None:
+    name = session_rig.say("start", prism="r")["id"]
+    with pytest.raises(CommandError, match=f"session '{name}' is open where the station stood at its start") as caught:
+        session_rig.say("setup_new", id="S2")
+    assert caught.value.status == 3
+    session_rig.say("abort")
+    session_rig.say("setup_new", id="S2")
+    assert session_rig.say("start", prism="r")["setup"] == "S2"
+
+
 def test_a_moving_session_is_controlled_like_any_other(session_rig: Rig) -> None:
     session_rig.say("start", prism="r", kind="multi_joint")
     session_rig.shoot("cp1", CP1)

@@ -1,0 +1,103 @@
+"""What devices said of their own state holds until they take it back, also over a restart of the daemon."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from daemon.acquisition.redecoding import redecode
+from daemon.acquisition.status.present import Expected, ExpectedChannel
+from daemon.store import Store
+from daemon.store.queries.device_states import device_states
+from drivers.can_decoder import CanDecoder
+from drivers.canopen.cia406 import EncoderChannel, EncoderDecoder
+from drivers.canopen.pdo import TransmitPdo
+from drivers.canopen.supervision import VOIDS
+from drivers.clock import SystemClock
+from drivers.readings import CanCapture, DeviceEvent, EventKind
+from tests.daemon.acquisition_support import ListLink, Make
+from tests.daemon.store_support import table
+from tests.drivers.can_support import EDS, at, capture
+
+PDO = "1A0 00 40 00 00"
+HARDWARE, OVERRUN, TAKEN_BACK = (
+    "0A0 00 50 81 00 00 00 00 00",
+    "0A0 10 81 11 00 00 00 00 00",
+    "0A0 00 00 00 00 00 00 00 00",
+)
+
+
+def boom() -> CanDecoder:
+    return CanDecoder(
+        "boom", [EncoderDecoder(EncoderChannel(name="theta1", node=32, pdo=TransmitPdo.from_eds(EDS, 32, 1)))]
+    )
+
+
+DECODERS = {"boom": boom}
+
+
+def statuses(store: Store) -> list[str]:
+    return [row["status"] for row in table(store.path, "joint_samples")]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "status"),
+    [
+        ([HARDWARE], [], "device_alarm"),
+        ([HARDWARE, OVERRUN], [], "device_alarm"),
+        ([OVERRUN], [], "ok"),
+        ([HARDWARE, TAKEN_BACK], [], "ok"),
+        ([HARDWARE], [TAKEN_BACK], "ok"),
+        ([HARDWARE], ["720 00"], "ok"),
+        (["5A0 4B 03 65 00 01 00 00 00"], [], "device_alarm"),
+    ],
+    ids=["hardware", "and another", "another", "taken back", "taken back later", "booted later", "alarm of an answer"],
+)
+def test_values_that_were_void_before_a_restart_are_void_after_it(
+    store: Store, acquire: Make, before: list[str], after: list[str], status: str
+) -> None:
+    acquire([], DECODERS).run_inline([capture(text, second) for second, text in enumerate(before)])
+    acquire([], DECODERS).run_inline([capture(text, 50 + second) for second, text in enumerate([*after, PDO])])
+    assert statuses(store) == [status]
+
+
+def test_a_boot_of_the_computer_begins_anew(store: Store, acquire: Make) -> None:
+    def of_next_boot(one: CanCapture) -> CanCapture:
+        return replace(one, stamp=replace(one.stamp, boot_id="another"))
+
+    acquire([], DECODERS).run_inline([capture(HARDWARE), of_next_boot(capture(PDO, 90))])
+    assert statuses(store) == ["ok"]
+
+
+def test_an_emergency_that_stands_is_shown_after_a_restart(store: Store, acquire: Make) -> None:
+    clock = SystemClock()
+    told = [
+        DeviceEvent("theta1", clock.now(), EventKind.EMERGENCY, f"node 32: broken; {VOIDS}", 0x5000),
+        DeviceEvent("roll9", clock.now(), EventKind.EMERGENCY, "of a joint that the rig has no more", 0x5000),
+    ]
+    store.insert_records(told)
+    expected = Expected((ExpectedChannel("theta1", "deg", "boom", "joint", 1.0),))
+    acquiring = acquire([ListLink("boom", [])], DECODERS, clock=clock, expected=expected)
+    acquiring.start()
+    status = acquiring.status()
+    assert [(event.device, event.text) for event in status.last_events] == [("theta1", told[0].text)]
+    assert status.event_counts == [], "it happened in the run before"
+
+
+def test_captures_that_are_decoded_again_are_as_void_as_they_were(store: Store, acquire: Make) -> None:
+    acquire([], DECODERS).run_inline([capture(HARDWARE), *(capture(PDO, 200 + n / 10) for n in range(10))])
+    assert set(statuses(store)) == {"device_alarm"}
+    assert redecode(store, DECODERS, [(at(200), at(201))]) == 0
+    assert set(statuses(store)) == {"device_alarm"}
+
+
+def test_of_a_storm_the_last_event_and_the_last_that_voids_are_told(store: Store) -> None:
+    void = DeviceEvent("theta1", at(1), EventKind.EMERGENCY, f"node 32: broken; {VOIDS}", 0x5000)
+    storm = [
+        DeviceEvent("theta1", at(2 + n / 1000), EventKind.EMERGENCY, "node 32: overrun", 0x8110) for n in range(500)
+    ]
+    later = DeviceEvent("theta1", at(60), EventKind.BOOT_UP, "node 32 has booted")
+    store.insert_records([void, *storm, later])
+    assert device_states(store, at(50)) == [void, storm[-1]]
+    assert device_states(store, at(61)) == [void, storm[-1], later]

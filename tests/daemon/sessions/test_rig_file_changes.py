@@ -1,0 +1,108 @@
+"""Sessions whose readings were made with another rig file than the one in use."""
+
+from __future__ import annotations
+
+import contextlib
+
+import pytest
+
+from calibration.errors import DataError
+from calibration.rig.description import Rig as Machine
+from calibration.rig.description import parse_rig
+from daemon.commands import CommandError
+from daemon.rig_files import misreading
+from daemon.sessions.session_data import sessions_csv
+from daemon.store.queries.sessions import SessionTable
+from rigcal.store_api import open_store
+from tests.daemon.session_support import SOURCE, Rig, controlled
+
+L2 = 'name = "L2"\ndevice = "cia406_linear"\nnode = 48\n'
+ANOTHER_ZERO = (L2, f"{L2}zero_counts = -2000\n")
+ANOTHER_PLACE = (L2, L2.replace("48", "58") + "heartbeat_ms = 500\nrange_mm = [-10, 3000]\n")
+ANOTHER_NAME = ("theta8", "roll8")
+WIDER = ("limits = [0, 2168]", "limits = [0, 2200]")
+
+
+def other(old: str, new: str) -> Machine:
+    assert old in SOURCE.text
+    return parse_rig(SOURCE.text.replace(old, new), "rig")
+
+
+def change_rig_file(rig: Rig, machine: Machine) -> None:
+    """Go on as a daemon that was started again with another rig file."""
+    rig.machine = machine
+    rig.keeper = rig.new_keeper()
+
+
+def used(rig: Rig) -> list[str]:
+    return [row["id"] for row in SessionTable(rig.store, SOURCE.rig.name).used()]
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (ANOTHER_ZERO, "its channel L2 has zero_counts = 0, this one -2000"),
+        (ANOTHER_NAME, "it has no joint roll8"),
+        (('name = "r"', 'name = "front"'), "it has a prism r, this one has none"),
+        (ANOTHER_PLACE, ""),
+        (WIDER, ""),
+    ],
+    ids=["zero", "name", "prism", "place", "limits"],
+)
+def test_only_what_decides_the_meaning_of_a_reading_makes_another_rig_file(change: tuple[str, str], why: str) -> None:
+    assert misreading(other(*change), SOURCE.text, "r") == why
+
+
+def test_sessions_of_another_rig_file_are_not_calibrated_together(session_rig: Rig) -> None:
+    before = controlled(session_rig)
+    change_rig_file(session_rig, other(*ANOTHER_ZERO))
+    assert used(session_rig) == []
+    after = controlled(session_rig)
+    assert used(session_rig) == [after]
+    told = session_rig.say("show", id=before)
+    assert told["not_used"] == (
+        "it was recorded with another rig file: its channel L2 has zero_counts = 0, this one -2000"
+    )
+    assert told["no_job"] is None or told["not_used"] in told["no_job"]
+    assert SessionTable(session_rig.store, SOURCE.rig.name).untrained() == {}, "history is no alarm"
+
+
+def test_sessions_count_again_as_soon_as_their_rig_file_is_back(session_rig: Rig) -> None:
+    held, unheld = controlled(session_rig), str(session_rig.say("start", prism="r")["id"])
+    session_rig.live(2)
+    session_rig.say("stop")
+    session_rig.say("accept", id=unheld)
+    change_rig_file(session_rig, other(*ANOTHER_NAME))
+    assert used(session_rig) == []
+    change_rig_file(session_rig, SOURCE.rig)
+    assert used(session_rig) == [held, unheld]
+
+
+def test_a_rig_file_that_reads_alike_keeps_its_sessions(session_rig: Rig) -> None:
+    name = controlled(session_rig)
+    change_rig_file(session_rig, other(*WIDER))
+    assert used(session_rig) == [name]
+
+
+def test_no_word_of_an_operator_makes_readings_of_another_rig_file_good(session_rig: Rig) -> None:
+    name = controlled(session_rig)
+    change_rig_file(session_rig, other(*ANOTHER_ZERO))
+    with pytest.raises(CommandError, match=r"another rig file.*`rigcal replay`") as caught:
+        session_rig.say("accept", id=name)
+    assert caught.value.status == 3
+
+
+def test_data_of_two_rig_files_are_refused_wherever_they_are_read(session_rig: Rig) -> None:
+    before = controlled(session_rig)
+    change_rig_file(session_rig, other(*ANOTHER_NAME))
+    after = controlled(session_rig)
+    why = f"session {before}: it was recorded with another rig file: it has no joint roll8"
+    with contextlib.closing(session_rig.store.reader()) as reader, pytest.raises(DataError, match=why):
+        sessions_csv(reader, session_rig.machine, [before, after])
+    with open_store(session_rig.store.path) as store:
+        for order in ([before, after], [after, before]):
+            with pytest.raises(DataError, match=why):
+                store.training_data(order)
+        rig, rows = store.training_data([before])
+        assert "theta8" in rig.joint_names
+        assert len(rows) > 0
