@@ -75,16 +75,18 @@ def read_rig_text(name_or_path: str) -> tuple[str, str, Path]:
         raise RigError(str(path), "", f"cannot be read: {reason}") from error
 
 
-def misreading(rig: Rig, recorded_text: str, prism: str) -> str:
+def misreading(rig: Rig, recorded_text: str | None, prism: str) -> str:
     """Return why readings that were made with another rig file are not those of `rig`, a clause; "" where they are.
 
     Args:
         rig: what they are to be used with.
-        recorded_text: the rig file that turned counts into the readings.
+        recorded_text: the rig file that turned counts into the readings; None where the store lacks it.
         prism: on which they were measured.
     """
     if recorded_text == rig.text:
         return ""
+    if recorded_text is None:
+        return "it is not in the store"
     try:
         recorded = parse_rig(recorded_text, "the rig file")
     except RigError as error:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Collection, Sequence
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
 from calibration.design.planning import PosePlan, plan_poses
 from calibration.effects.fitted import FittedEffect
+from calibration.effects.library import library
 from calibration.evaluation.evaluation import Evaluation, evaluate
 from calibration.export.formats import export_files
 from calibration.export.model_export import Export
@@ -198,8 +200,10 @@ def calibrate(
     Raises:
         DataError: rows without positions, prisms that the rig lacks, data that the method or an effect cannot use.
         UnsafeError: too few fixes, mirrored coordinates, another rig's data.
-        ValueError: an unknown method or effect, or a rig that was not read from a text.
+        ValueError: an unknown prior, method, effect or residual, or a rig that was not read from a text.
     """
+    _require_one_of("prior", prior, get_args(Prior))
+    _require_one_of("residual", residual, get_args(Kind))
     run = _run(seed, progress)
     data, _ = calibrate_rig(
         rig, _text(rig), observations, prior=prior, method=method, effects=effects, residual=residual, run=run
@@ -235,8 +239,11 @@ def find_gap(
     Raises:
         DataError: rows without positions, prisms that the rig lacks.
         UnsafeError: too few fixes, mirrored coordinates, another rig's data, a held-out set-up that is not trained on.
-        ValueError: a rig that was not read from a text.
+        ValueError: an unknown prior or family, or a rig that was not read from a text.
     """
+    _require_one_of("prior", prior, get_args(Prior))
+    for family in families or ():
+        _require_one_of("families", family, sorted(library()))
     run = _run(seed, progress)
     return find_gap_of_rig(rig, _text(rig), observations, holdout=holdout, prior=prior, families=families, run=run)
 
@@ -271,17 +278,30 @@ def plan(
     Raises:
         DataError: fewer reachable poses than asked for; an effect that poses do not show.
         UnsafeError: a model of another rig, or without that set-up; no reachable pose in view.
+        ValueError: no pose is asked for, an unknown effect, or a station's place that is not three finite numbers.
     """
+    if poses < 1:
+        raise ValueError(f"poses is {poses}; ask for one at least")
+    for effect in separate:
+        _require_one_of("separate", effect.partition("@")[0], sorted(library()))
+    station = None if station_mm is None else np.array(station_mm, dtype=np.float64)
+    if station is not None and (station.shape != (3,) or not np.isfinite(station).all()):
+        raise ValueError(f"station_mm is {station_mm!r}; give three finite numbers, x, y and z in mm")
     return plan_poses(
         rig,
         poses,
         model=None if model is None else model.data,
-        station_mm=None if station_mm is None else np.array(station_mm, dtype=np.float64),
+        station_mm=station,
         setup=setup,
         floor_mm=floor_mm,
         separate=separate,
         run=_run(seed, progress),
     )
+
+
+def _require_one_of(name: str, value: str, known: Collection[str]) -> None:
+    if value not in known:
+        raise ValueError(f"{name}: {value!r} is unknown; there are {', '.join(known)}")
 
 
 def _run(seed: int, progress: Progress | None) -> Run:

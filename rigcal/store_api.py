@@ -75,7 +75,11 @@ class Store:
             One row a fix: `session_id`, `setup_id`, `prism`, `pose`, `utc_ns`, `x_mm`, `y_mm`, `z_mm` in the station's
             frame, `sigma_x_mm` and so on, `dwell_s`, `excluded` (None where calibration may use it), and the joints and
             signals under their column names (`theta1_deg`, `L2_mm`, ...).
+
+        Raises:
+            DataError: no such session.
         """
+        self._require(sessions)
         return self._frame(all_observations(self._reader, sessions))
 
     def training_data(self, sessions: Sequence[str]) -> tuple[Rig, Observations]:
@@ -88,14 +92,25 @@ class Store:
             DataError: no such session, no observation that may be used, or sessions whose rig files differ in what
                 the readings mean.
         """
-        found = [session(self._reader, name) for name in sessions]
-        missing = [name for name, row in zip(sessions, found, strict=True) if row is None]
-        if missing or not found:
-            raise DataError(str(self._reader.path), f"there is no session {missing[0]!r}" if missing else "no session")
+        found = self._require(sessions)
+        if not found:
+            raise DataError(str(self._reader.path), "no session is named")
         ages = [row["id"] for row in all_sessions(self._reader)]
-        newest = max((row for row in found if row is not None), key=lambda row: ages.index(row["id"]))
+        newest = max(found, key=lambda row: ages.index(row["id"]))
         rig = parse_rig(str(newest["rig_text"]), f"the rig of session {newest['id']}")
         return rig, Observations.from_csv(sessions_csv(self._reader, rig, sessions).decode(), rig)
+
+    def _require(self, sessions: Sequence[str]) -> list[dict[str, Any]]:
+        """Return the rows of sessions; DataError where there is none of a name."""
+        if isinstance(sessions, str):
+            raise DataError(str(self._reader.path), f"give a list of sessions: [{sessions!r}]")
+        rows = []
+        for name in sessions:
+            row = session(self._reader, name)
+            if row is None:
+                raise DataError(str(self._reader.path), f"there is no session {name!r}")
+            rows.append(row)
+        return rows
 
     def _frame(self, rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame | pl.DataFrame:
         table = [dict(row) for row in rows]

@@ -12,6 +12,23 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 Unit = Literal["deg", "mm", "deg/s", "mm/s", "bar", "mA", "degC", "Nm", "kg", "V", "%", ""]
 
 
+_PLACE = frozenset(
+    (
+        "link",
+        "device",
+        "node",
+        "pdo",
+        "object",
+        "arbitration_id",
+        "is_extended",
+        "start_bit",
+        "dbc",
+        "message",
+        "signal",
+    )
+)
+
+
 class _Quantity(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -47,6 +64,10 @@ class AnyChannel(_Quantity):
 
     link: str = "boom"
     timeout_s: float = Field(default=1.0, gt=0)
+
+    def place(self) -> dict[str, object]:
+        """Return the attributes that decide where on the buses the value is found, by name."""
+        return self.model_dump(include=set(_PLACE))
 
     def conversion(self) -> dict[str, object]:
         """Return the attributes that decide what a value of the device means, by name: not where it is heard."""

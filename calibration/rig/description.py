@@ -141,6 +141,13 @@ class Rig(Part):
             joint = next((j for j in self.joints if j.name == channel.name), None)
             if joint is not None and channel.unit != joint.unit:
                 raise ValueError(f"channel {channel.name!r} is in {channel.unit}, its joint in {joint.unit}")
+        read = [channel for channel in self.channels if channel.name in known]
+        for number, channel in enumerate(read):
+            for other in read[:number]:
+                if channel.place() == other.place():
+                    raise ValueError(
+                        f"joints {other.name!r} and {channel.name!r} are read from the same place on the bus"
+                    )
         return self
 
     @model_validator(mode="after")

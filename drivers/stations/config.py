@@ -37,11 +37,11 @@ class StationConfig(ProfileOptions, PollTiming):
     profile: str = "topcon_gts8"
     serial: SerialConfig
     listen_to: str = "topcon"
-    link_delay_s: float = Field(default=0.0, ge=0)
+    link_delay_s: float = Field(default=0.0, ge=0, le=60)
     max_speed_m_s: float = Field(default=5.0, gt=0)
     jump_slack_m: float = Field(default=0.1, gt=0)
     relock_within_m: float = Field(default=2.0, gt=0)
-    max_range_m: float = Field(default=6000.0, gt=0)
+    max_range_m: float = Field(default=6000.0, ge=1)
     silence_timeout_s: float = Field(default=4.0, ge=0)
 
     @model_validator(mode="before")

@@ -327,3 +327,11 @@ def test_a_rig_file_that_contradicts_itself_is_refused(old: str, new: str, messa
     assert old in text
     with pytest.raises(RigError, match=message):
         parse_rig(text.replace(old, new, 1), "mine.toml")
+
+
+def test_two_joints_are_not_read_from_one_place() -> None:
+    text = rig_text("swdt82")
+    for old in ("node = 49", "node = 48"):
+        assert old in text
+    with pytest.raises(RigError, match="joints 'L2' and 'L3' are read from the same place on the bus"):
+        parse_rig(text.replace("node = 49", "node = 48"), "mine.toml")

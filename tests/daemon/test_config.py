@@ -243,3 +243,19 @@ def test_what_is_wrong_with_a_whole_table_is_told_without_the_table(tmp_path: Pa
         parse_config(text, tmp_path / "rigcal.toml")
     assert "station.1: new_target_after_s is gone, remove it" in str(raised.value)
     assert "found" not in str(raised.value)
+
+
+def test_a_second_station_is_refused() -> None:
+    text = 'rig = "swdt82"\n' + "".join(
+        f'[[station]]\nname = "{name}"\nserial.path = "/dev/{name}"\n' for name in ("one", "two")
+    )
+    with pytest.raises(ConfigError, match=r"sessions know one station, and here are 'one' and 'two'"):
+        parse_config(text, Path("rigcal.toml"))
+
+
+def test_a_port_belongs_to_one_link() -> None:
+    text = 'rig = "swdt82"\n' + "".join(
+        f'[[can]]\nname = "{name}"\ninterface = "socketcan"\nchannel = "can0"\n' for name in ("boom", "base")
+    )
+    with pytest.raises(ConfigError, match=r"links 'boom' and 'base' are both at 'can0'"):
+        parse_config(text, Path("rigcal.toml"))

@@ -2,8 +2,10 @@
 
 import doctest
 import importlib
+import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +64,25 @@ def test_a_rig_that_no_text_describes_is_refused() -> None:
 
 
 @pytest.mark.long
+@pytest.mark.parametrize(
+    ("call", "why"),
+    [
+        (lambda rig, rows: rigcal.calibrate(rig, rows, prior="zz"), "prior: 'zz' is unknown; there are recalibration"),
+        (lambda rig, rows: rigcal.calibrate(rig, rows, residual="zz"), "residual: 'zz' is unknown"),
+        (lambda rig, rows: rigcal.find_gap(rig, rows, families=["zz"]), "families: 'zz' is unknown; there are"),
+        (lambda rig, _: rigcal.plan(rig, 0), "ask for one at least"),
+        (lambda rig, _: rigcal.plan(rig, 3, station_mm=[1.0, 2.0]), "three finite numbers"),
+        (lambda rig, _: rigcal.plan(rig, 3, station_mm=[1.0, 2.0, float("nan")]), "three finite numbers"),
+        (lambda rig, _: rigcal.plan(rig, 3, separate=["zz@q1"]), "separate: 'zz' is unknown"),
+    ],
+    ids=["prior", "residual", "family", "no pose", "two numbers", "no number", "effect"],
+)
+def test_a_wrong_argument_is_said_in_a_sentence(call: Callable[..., object], why: str) -> None:
+    rig = rigcal.Rig.read("ur10")
+    with pytest.raises(ValueError, match=re.escape(why)):
+        call(rig, None)
+
+
 def test_a_hidden_effect_is_found_and_the_model_with_it_is_nearer_to_held_out_fixes() -> None:
     rig = rigcal.Rig.read("swdt82")
     machine = RigTruth(rig, 1, effects=parse_effects("backlash@theta4:width_rad=3e-3"))

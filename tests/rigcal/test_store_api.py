@@ -48,6 +48,14 @@ def test_a_session_is_training_data(written: tuple[Path, str]) -> None:
     assert len(observations) == int(used["excluded"].isna().sum())
 
 
+def test_a_session_that_is_not_there_is_no_empty_frame(written: tuple[Path, str]) -> None:
+    path, name = written
+    with rigcal.open_store(path) as store:
+        for sessions, why in ((["s9"], "no session 's9'"), (name, "give a list of sessions")):
+            with pytest.raises(rigcal.DataError, match=why):
+                store.observations(sessions)
+
+
 def test_what_is_no_store_or_no_library_is_said(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="pandas and polars"):
         rigcal.open_store(tmp_path / "rigcal.sqlite", "dask")  # type: ignore[arg-type]
