@@ -312,23 +312,16 @@ class Config(_Section):
         return self
 
     @model_validator(mode="after")
-    def _one_station(self) -> Config:
-        if len(self.station) > 1:
-            first, second = (station.name for station in self.station[:2])
-            raise ValueError(
-                f"sessions know one station, and here are {first!r} and {second!r}; keep one [[station]], and give the "
-                "other a rigcal of its own with another state_directory"
-            )
-        return self
-
-    @model_validator(mode="after")
     def _ports_differ(self) -> Config:
-        ports = [(link.name, link.channel) for link in self.can if link.interface in ("socketcan", "slcan")]
-        ports += [(station.name, station.serial.path) for station in self.station]
-        for number, (name, port) in enumerate(ports):
-            for other, path in ports[:number]:
-                if path == port:
-                    raise ValueError(f"links {other!r} and {name!r} are both at {port!r}; a port belongs to one link")
+        if len(self.station) > 1:
+            names = ", ".join(repr(station.name) for station in self.station)
+            raise ValueError(
+                f"sessions know one station, and here are {names}; give each other one a rigcal of its own"
+            )
+        ports = [link.channel for link in self.can if link.interface in ("socketcan", "slcan")]
+        ports += [station.serial.path for station in self.station]
+        if port := next((port for port in ports if ports.count(port) > 1), None):
+            raise ValueError(f"two links are at {port!r}; a port belongs to one link")
         return self
 
     @model_validator(mode="after")

@@ -55,8 +55,8 @@ def heartbeat_lost(evidence: Evidence) -> Iterator[Finding]:
 def emergency(evidence: Evidence) -> Iterator[Finding]:
     """A CANopen node has sent an emergency (EMCY) and has not taken it back.
 
-    It goes on over a restart of the daemon. Cleared when the node takes back its last error (code 0 with an error register
-    of zero), or boots.
+    It goes on over a restart of the daemon. Cleared when the node takes back its last error (code 0 with an error
+    register of zero), or boots.
     """
     for event in evidence.standing(EventKind.EMERGENCY, EventKind.EMERGENCY_CLEARED, EventKind.BOOT_UP):
         if not evidence.is_cut_off(event.device):

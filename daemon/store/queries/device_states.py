@@ -1,4 +1,4 @@
-"""What CANopen devices have said of their own state: emergencies, alarms and warnings that stand, and boot-ups."""
+"""The last words of CANopen devices on their own state: emergencies, alarms, warnings and boot-ups."""
 
 from __future__ import annotations
 
