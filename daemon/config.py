@@ -314,10 +314,7 @@ class Config(_Section):
     @model_validator(mode="after")
     def _ports_differ(self) -> Config:
         if len(self.station) > 1:
-            names = ", ".join(repr(station.name) for station in self.station)
-            raise ValueError(
-                f"sessions know one station, and here are {names}; give each other one a rigcal of its own"
-            )
+            raise ValueError("sessions know one station: keep one [[station]], and give another a rigcal of its own")
         ports = [link.channel for link in self.can if link.interface in ("socketcan", "slcan")]
         ports += [station.serial.path for station in self.station]
         if port := next((port for port in ports if ports.count(port) > 1), None):
