@@ -289,11 +289,14 @@ class Acquisition:
 
     def _new_decoding(self) -> LinkDecoders:
         """Return decoders that go on from what devices have told of their state."""
-        return LinkDecoders(self._factories, partial(device_states, self._store))
+        return LinkDecoders(self._factories, self._states)
 
     def _recall(self) -> None:
         """Show what devices have told of their state before this run, as its decoders take it on."""
-        self._board.recall(device_states(self._store, self._clock.now()))
+        self._board.recall(self._states(self._clock.now()))
+
+    def _states(self, before: Stamp) -> Sequence[DeviceEvent]:
+        return self._store.unless_damaged(partial(device_states, self._store, before), [])
 
     # ---- replay ----------------------------------------------------------------------------------------------------
 

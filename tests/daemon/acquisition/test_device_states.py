@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from daemon.acquisition.acquisition import Acquisition
 from daemon.acquisition.redecoding import redecode
 from daemon.acquisition.status.present import Expected, ExpectedChannel
 from daemon.store import Store
@@ -17,6 +20,7 @@ from drivers.canopen.supervision import VOIDS
 from drivers.clock import SystemClock
 from drivers.readings import CanCapture, DeviceEvent, EventKind
 from tests.daemon.acquisition_support import ListLink, Make
+from tests.daemon.damage import tear
 from tests.daemon.store_support import table
 from tests.drivers.can_support import EDS, at, capture
 
@@ -101,3 +105,14 @@ def test_of_a_storm_the_last_event_and_the_last_that_voids_are_told(store: Store
     store.insert_records([void, *storm, later])
     assert device_states(store, at(50)) == [void, storm[-1]]
     assert device_states(store, at(61)) == [void, storm[-1], later]
+
+
+def test_damage_to_what_devices_have_told_keeps_no_reading_from_being_decoded(path: Path) -> None:
+    with contextlib.closing(Store(path)) as store:
+        store.insert_records([DeviceEvent("theta1", at(-1), EventKind.BOOT_UP, "node 32 has booted")])
+    tear(path, "device_events", "device_events_of_states")
+    with contextlib.closing(Store(path)) as store:
+        store.declare_channels({"theta1": "deg"}, {})
+        Acquisition([], DECODERS, store, SystemClock(), on_records=lambda _: None).run_inline([capture(PDO)])
+        assert statuses(store) == ["ok"]
+        assert store.damage
