@@ -56,7 +56,7 @@ class NodeSupervision:
         }
 
     def recall(self, event: DeviceEvent) -> None:
-        """Take on what an event of the node told, one that an earlier decoder made: voided values, alarms, warnings."""
+        """Take on what an event told that an earlier decoder made: voided values, alarms, a heartbeat that is lost."""
         if event.device == self._name:
             if event.kind is EventKind.BOOT_UP:
                 for channel in self._channels:
@@ -65,6 +65,8 @@ class NodeSupervision:
                 self._void(is_void=False)
             elif event.kind is EventKind.EMERGENCY and event.text.endswith(VOIDS):
                 self._void(is_void=True)
+            elif event.kind in (EventKind.HEARTBEAT_LOST, EventKind.HEARTBEAT_RESTORED):
+                self._is_lost = event.kind is EventKind.HEARTBEAT_LOST
         for channel in self._channels:
             if event.device == channel.name:
                 channel.recall(event)

@@ -269,6 +269,15 @@ def test_a_new_decoder_goes_on_from_what_devices_have_told_before(told: str, sta
     assert the_reading(feed(before, "1A0 00 40 00 00")).status is status
 
 
+def test_a_heartbeat_that_was_lost_before_is_told_when_it_is_back() -> None:
+    before, after = decoder(), decoder()
+    told = [*events(feed(before, "720 7F", 0.0)), *events(before.tick(at(60)))]
+    assert EventKind.HEARTBEAT_LOST in kinds(told)
+    after.recall(told)
+    assert kinds(after.tick(at(61))) == [], "once is enough"
+    assert EventKind.HEARTBEAT_RESTORED in kinds(feed(after, "720 7F", 62.0))
+
+
 def test_a_boot_up_ends_an_emergency() -> None:
     boom = decoder()
     feed(boom, "0A0 00 50 81 00 00 00 00 00")

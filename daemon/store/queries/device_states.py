@@ -1,4 +1,4 @@
-"""The last words of CANopen devices on their own state: emergencies, alarms, warnings and boot-ups."""
+"""The last words of CANopen devices on their own state: emergencies, alarms, boot-ups, heartbeats."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ STATES = (
     EventKind.BOOT_UP,
     EventKind.EMERGENCY,
     EventKind.EMERGENCY_CLEARED,
+    EventKind.HEARTBEAT_LOST,
+    EventKind.HEARTBEAT_RESTORED,
     EventKind.WARNING,
 )
 # Steps from one device to the next by the index, however many events each has.
