@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -117,7 +118,18 @@ def test_a_real_job_that_stumbles_leaves_its_traceback_as_errors(
 ) -> None:
     Store(tmp_path / "none.sqlite").close()
     with caplog.at_level(logging.INFO):
-        assert follow(order(tmp_path)).state == "failed"  # no session: a fault inside, not of the data
+        unknown = replace(order(tmp_path), session_ids=("s001-r",))  # no session: a fault inside, not of the data
+        assert follow(unknown).state == "failed"
     lines = said(caplog)
     assert (logging.ERROR, "job 7: __main__: gap failed") in lines
     assert any(level == logging.ERROR and "Traceback" in text for level, text in lines)
+
+
+def test_a_job_whose_sessions_are_used_no_more_fails_with_a_sentence(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    Store(tmp_path / "none.sqlite").close()
+    outcome = follow(order(tmp_path))
+    assert outcome.state == "failed"
+    assert "none of those that the job was queued for may be used any more" in str(outcome.error)
+    assert not any("Traceback" in text for _, text in said(caplog))
