@@ -316,7 +316,7 @@ class Config(_Section):
         if len(self.station) > 1:
             raise ValueError("sessions know one station: keep one [[station]], and give another a rigcal of its own")
         ports = [link.channel for link in self.can if link.interface in ("socketcan", "slcan")]
-        ports += [station.serial.path for station in self.station]
+        ports = [os.path.realpath(port) for port in (*ports, *(s.serial.path for s in self.station))]
         if port := next((port for port in ports if ports.count(port) > 1), None):
             raise ValueError(f"two links are at {port!r}; a port belongs to one link")
         return self

@@ -61,11 +61,18 @@ class CanDecoder:
             for arbitration_id, handler in supervision.handlers.items():
                 self._entry(arbitration_id, False).handler = handler
 
-    def recall(self, events: Iterable[DeviceEvent]) -> None:
-        """Take on what devices told before this decoder was made: the last event of each kind, oldest first."""
-        for event in events:
-            for node in self._nodes:
-                node.recall(event)
+    def recall(self, events: Iterable[DeviceEvent]) -> list[DeviceEvent]:
+        """Take on what devices told before this decoder was made.
+
+        Args:
+            events: of any devices, the last of each kind, oldest first.
+
+        Returns:
+            Those of the link's nodes that tell something, each under the name that its node has now.
+        """
+        own = {channel.name for channel in self._channels}
+        mine = [event for event in events if event.device in own]
+        return [taken for event in mine for node in self._nodes for taken in node.recall(event)]
 
     def feed(self, capture: Capture) -> Sequence[Record]:
         if type(capture) is not CanCapture:

@@ -69,10 +69,9 @@ class AnyChannel(_Quantity):
         """Return the attributes that decide where on the buses the value is found, by name."""
         return self.model_dump(include=set(_PLACE))
 
-    def conversion(self) -> dict[str, object]:
-        """Return the attributes that decide what a value of the device means, by name: not where it is heard."""
-        where = {*AnyChannel.model_fields, *CanopenChannel.model_fields, "range_mm"} - {"unit"}
-        return self.model_dump(exclude=where)
+    def source(self) -> dict[str, object]:
+        """Return the attributes that decide which device's value it is and what that means, by name: all but times."""
+        return self.model_dump(exclude={"timeout_s", "mode", "period_ms", "heartbeat_ms"})
 
 
 class CanopenChannel(AnyChannel):

@@ -233,7 +233,7 @@ class Rig(Part):
     def misreading(self, recorded: Rig) -> str:
         """Return why readings that were recorded with another rig file are not this one's; "" where they are.
 
-        Links, node numbers and times of a channel may differ, and so may all that is no reading: rows, limits, masses.
+        Times of a channel may differ, and so may all that is no reading: rows, limits, masses.
 
         Args:
             recorded: the rig file that turned counts into the readings.
@@ -249,7 +249,7 @@ class Rig(Part):
         channels = {channel.name: channel for channel in recorded.channels}
         for channel in self.channels:
             if channel.name in channels:
-                here, there = channel.conversion(), channels[channel.name].conversion()
+                here, there = channel.source(), channels[channel.name].source()
                 for name in (*here, *there):
                     if here.get(name) != there.get(name):
                         return f"its channel {channel.name} has {name} = {there.get(name)}, this one {here.get(name)}"

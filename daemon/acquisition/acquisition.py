@@ -292,8 +292,8 @@ class Acquisition:
         return LinkDecoders(self._factories, self._states)
 
     def _recall(self) -> None:
-        """Show what devices have told of their state before this run, as its decoders take it on."""
-        self._board.recall(self._states(self._clock.now()))
+        """Have decoders go on from what devices have told of their state before this run, and show it."""
+        self._board.recall(self._decoding.begin(self._clock.now()))
 
     def _states(self, before: Stamp) -> Sequence[DeviceEvent]:
         return self._store.unless_damaged(partial(device_states, self._store, before), [])

@@ -93,10 +93,16 @@ class LinkDecoders:
         self._defects[link] = stamp
         return DecodeFailure(link, stamp, f"the decoder failed: {type(error).__name__}: {error}", raw)
 
+    def begin(self, at: Stamp) -> list[DeviceEvent]:
+        """Make the decoders of all links; return what they take on of what devices have told before that instant."""
+        return [event for link in self._factories for event in self._make(link, at)]
+
     def _decoder(self, link: str, at: Stamp) -> Decoder:
         if link not in self._decoders or self._boots[link] != at.boot_id:
-            decoder = self._factories[link]()
-            if isinstance(decoder, CanDecoder):
-                decoder.recall(self._recalled(at))
-            self._decoders[link], self._boots[link] = decoder, at.boot_id
+            self._make(link, at)
         return self._decoders[link]
+
+    def _make(self, link: str, at: Stamp) -> list[DeviceEvent]:
+        decoder = self._decoders[link] = self._factories[link]()
+        self._boots[link] = at.boot_id
+        return decoder.recall(self._recalled(at)) if isinstance(decoder, CanDecoder) else []

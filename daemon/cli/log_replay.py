@@ -14,14 +14,14 @@ from daemon.composition import decoders, joiner, motion_limits
 from daemon.config import Config
 from daemon.rig_files import RigSource
 from daemon.service import declare_channels
-from daemon.sessions.export.session_file import SessionFile
+from daemon.sessions.export.session_file import DeviceState, SessionFile
 from daemon.sessions.manager import SessionManager
 from daemon.sessions.replay import BOOT_ID, LATEST_UTC_NS, first_captures, merged
 from daemon.sessions.station_setups import StationSetups
 from daemon.store.errors import storage_errors
 from daemon.store.store import Store
 from drivers.clock import ManualClock, Stamp
-from drivers.readings import Capture
+from drivers.readings import Capture, DeviceEvent
 
 REPLAYED = "replayed"
 
@@ -78,11 +78,16 @@ def replay_logs(
             points = {name: list(place) for name, place in told.control_points.items()}
             setups.new_command({"id": REPLAYED, "instrument": REPLAYED, "control_points": points})
             commands = _commands_of(told, sessions, clock.monotonic_ns())
+            store.insert_records([_event_of(state) for state in told.device_states])
         acquisition = Acquisition((), made, store, clock, on_records=sessions.on_records)
         acquisition.run_inline(_followed(merged(files, settings, doubtful), clock, commands))
         for _, command in commands:  # those after the last capture
             command()
         return sessions.list_command({})[0] if told is not None else None
+
+
+def _event_of(state: DeviceState) -> DeviceEvent:
+    return DeviceEvent(state.device, Stamp(state.utc_ns, state.utc_ns, BOOT_ID), state.kind, state.text, state.code)
 
 
 def _commands_of(told: SessionFile, sessions: SessionManager, begin_ns: int) -> Commands:

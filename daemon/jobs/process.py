@@ -247,6 +247,8 @@ def _compare(order: Order, progress: Progress) -> dict[str, Any]:
         except ModelError as error:
             # What cannot be used any more must not keep a good model from its place; the operator sees why.
             note = f"the live model cannot be read ({error}); "
+    if live is not None and (why := candidate.rig.misreading(live.rig)):
+        live, note = None, f"the live model is of another rig file ({why}), so it says nothing of these readings; "
     compared = compare_held_out(candidate, live, _observations(order, candidate.rig, order.session_ids)).as_dict()
     return result | {"comparison": about | compared | {"sentence": f"{note}{compared['sentence']}"}}
 

@@ -114,13 +114,21 @@ class _PositionDecoder(PdoChannelDecoder):
     def object_read(self, stamp: Stamp, index: int, value: int) -> list[Record]:
         records: list[Record] = []
         if index in _FLAGS:
-            self._take_flags(stamp, index, value, records)
+            self._take_flags(stamp, index, value, self._answered(_FLAGS[index][1]), records)
         return records
 
-    def recall(self, event: DeviceEvent) -> None:
-        for index, (kind, _, _) in _FLAGS.items():
-            if event.kind is kind and event.code is not None:
-                self._flags[index] = event.code
+    def _answered(self, name: str) -> str:
+        """Return the name of flags that the node was asked for."""
+        return f"node {self.node}: {name} read over SDO"
+
+    def recall(self, event: DeviceEvent) -> bool:
+        carried = {field.index for field in self._flag_fields}  # which the next PDO tells
+        for index, (kind, name, _) in _FLAGS.items():
+            is_answer = event.text.startswith(self._answered(name)) and event.code is not None
+            if event.kind is kind and is_answer and index not in carried:
+                self._flags[index] = event.code or 0
+                return True
+        return False
 
     def node_restarted(self) -> None:
         super().node_restarted()
@@ -131,11 +139,11 @@ class _PositionDecoder(PdoChannelDecoder):
             self._jumps.bad(stamp)
         return super()._too_short(stamp, data, needed_bits)
 
-    def _take_flags(self, stamp: Stamp, index: int, flags: int, records: list[Record]) -> None:
+    def _take_flags(self, stamp: Stamp, index: int, flags: int, name: str, records: list[Record]) -> None:
         """Report alarms or warnings that have changed."""
         if flags != self._flags[index]:
             self._flags[index] = flags
-            kind, name, texts = _FLAGS[index]
+            kind, _, texts = _FLAGS[index]
             text = f"{name}: {_flag_texts(flags, texts)}" if flags else f"{name} are gone"
             records.append(DeviceEvent(self.name, stamp, kind, text, flags))
 
@@ -150,7 +158,7 @@ class _PositionDecoder(PdoChannelDecoder):
         records: list[Record] = []
         bits = int.from_bytes(data, "little")
         for field in self._flag_fields:
-            self._take_flags(stamp, field.index, field.extract(bits), records)
+            self._take_flags(stamp, field.index, field.extract(bits), _FLAGS[field.index][1], records)
         counts, status = self._counts(bits)
         if self._flags[ALARMS] or self.is_void:
             status = Status.DEVICE_ALARM

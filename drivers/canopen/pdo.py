@@ -194,8 +194,9 @@ class PdoChannelDecoder:
         """Return the records caused by an object of the node that was read over SDO."""
         return []
 
-    def recall(self, event: DeviceEvent) -> None:
-        """Take on what an event of the channel told, one that an earlier decoder made."""
+    def recall(self, event: DeviceEvent) -> bool:  # noqa: ARG002 - profiles use it
+        """Take on alarms or warnings that an earlier decoder of the channel told; True if that changes anything."""
+        return False
 
     def node_restarted(self) -> None:
         """Forget the node's last known state, because it has booted."""

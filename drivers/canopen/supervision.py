@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from drivers.canopen.cia301 import NmtState, decode_heartbeat, emcy_id, heartbeat_id, sdo_response_id
 from drivers.canopen.emcy import decode_emergency
@@ -55,21 +56,31 @@ class NodeSupervision:
             sdo_response_id(self.node): self._on_sdo_response,
         }
 
-    def recall(self, event: DeviceEvent) -> None:
-        """Take on what an event told that an earlier decoder made: voided values, alarms, a heartbeat that is lost."""
-        if event.device == self._name:
-            if event.kind is EventKind.BOOT_UP:
-                for channel in self._channels:
-                    channel.node_restarted()
-            elif event.kind is EventKind.EMERGENCY_CLEARED:
-                self._void(is_void=False)
-            elif event.kind is EventKind.EMERGENCY and event.text.endswith(VOIDS):
-                self._void(is_void=True)
-            elif event.kind in (EventKind.HEARTBEAT_LOST, EventKind.HEARTBEAT_RESTORED):
-                self._is_lost = event.kind is EventKind.HEARTBEAT_LOST
-        for channel in self._channels:
-            if event.device == channel.name:
-                channel.recall(event)
+    def recall(self, event: DeviceEvent) -> list[DeviceEvent]:
+        """Take on what an event told that an earlier decoder made of this node, as its text says.
+
+        Args:
+            event: of a channel of the link; with another rig file the node may have been another channel's.
+
+        Returns:
+            The event under the name that the node has now; nothing where it is another node's, or tells nothing.
+        """
+        if not event.text.startswith((f"node {self.node}:", f"node {self.node} ")):
+            return []
+        if event.kind in (EventKind.ALARM, EventKind.WARNING):
+            return [event for channel in self._channels if channel.name == event.device and channel.recall(event)]
+        if event.kind is EventKind.BOOT_UP:
+            for channel in self._channels:
+                channel.node_restarted()
+        elif event.kind is EventKind.EMERGENCY_CLEARED:
+            self._void(is_void=False)
+        elif event.kind is EventKind.EMERGENCY and event.text.endswith(VOIDS):
+            self._void(is_void=True)
+        elif event.kind in (EventKind.HEARTBEAT_LOST, EventKind.HEARTBEAT_RESTORED):
+            if not self._timeout_ns:
+                return []
+            self._is_lost = event.kind is EventKind.HEARTBEAT_LOST
+        return [replace(event, device=self._name)]
 
     def tick(self, now: Stamp) -> list[Record]:
         """Report a heartbeat that is overdue."""

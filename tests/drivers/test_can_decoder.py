@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -12,6 +13,7 @@ from drivers.can_decoder import CanDecoder
 from drivers.canopen.cia404 import AnalogueChannel, AnalogueDecoder
 from drivers.canopen.cia406 import EncoderChannel, EncoderDecoder
 from drivers.canopen.pdo import TransmitPdo
+from drivers.canopen.supervision import VOIDS
 from drivers.clock import Stamp
 from drivers.readings import (
     CanCapture,
@@ -269,6 +271,36 @@ def test_a_new_decoder_goes_on_from_what_devices_have_told_before(told: str, sta
     assert the_reading(feed(before, "1A0 00 40 00 00")).status is status
 
 
+VOID = DeviceEvent("theta1", at(0), EventKind.EMERGENCY, f"node 32: broken; {VOIDS}", 0x5000)
+
+
+def test_what_a_node_told_is_its_own_whatever_channel_it_was_then() -> None:
+    """The rig file was changed: node 33 was theta1, and theta3 node 32."""
+    boom = CanDecoder("boom", [encoder(), encoder("theta3", 33)])
+    (taken,) = boom.recall([replace(VOID, text=VOID.text.replace("32", "33"))])
+    assert taken.device == "theta3", "so that what takes it back has the same name"
+    assert the_reading(feed(boom, "1A0 00 40 00 00")).status is Status.OK
+    assert the_reading(feed(boom, "1A1 00 40 00 00")).status is Status.DEVICE_ALARM
+
+
+def test_what_a_node_of_another_link_told_says_nothing() -> None:
+    base = CanDecoder("base", [encoder("lift")])
+    assert base.recall([VOID]) == []
+    assert the_reading(feed(base, "1A0 00 40 00 00")).status is Status.OK
+
+
+def test_a_heartbeat_that_is_expected_no_more_is_not_missed() -> None:
+    lost = DeviceEvent("theta1", at(0), EventKind.HEARTBEAT_LOST, "node 32: no heartbeat for 2.5 s")
+    assert decoder(heartbeat_ms=0).recall([lost]) == []
+
+
+@pytest.mark.parametrize(
+    "text", ["alarms (6503h): position error", "node 33: alarms (6503h) read over SDO: position error"]
+)
+def test_alarms_of_pdos_are_told_by_the_next_one_and_those_of_other_nodes_are_theirs(text: str) -> None:
+    assert decoder().recall([DeviceEvent("theta1", at(0), EventKind.ALARM, text, 1)]) == []
+
+
 def test_a_heartbeat_that_was_lost_before_is_told_when_it_is_back() -> None:
     before, after = decoder(), decoder()
     told = [*events(feed(before, "720 7F", 0.0)), *events(before.tick(at(60)))]
@@ -301,7 +333,9 @@ def test_an_emergency_that_is_too_short_is_a_failure() -> None:
 
 def test_alarms_that_anyone_reads_over_sdo_are_heard() -> None:
     boom = decoder()
-    assert [e.text for e in events(feed(boom, "5A0 4B 03 65 00 01 00 00 00"))] == ["alarms (6503h): position error"]
+    assert [e.text for e in events(feed(boom, "5A0 4B 03 65 00 01 00 00 00"))] == [
+        "node 32: alarms (6503h) read over SDO: position error"
+    ]
     assert the_reading(feed(boom, "1A0 00 40 00 00")).status is Status.DEVICE_ALARM
     for other in (
         "5A0 60 00 18 05 00 00 00 00",

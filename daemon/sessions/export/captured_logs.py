@@ -11,8 +11,9 @@ from calibration.rig.description import parse_rig
 from daemon.commands import CommandError
 from daemon.config import Config, ConfigError
 from daemon.host.safe_output import write_file
-from daemon.sessions.export.session_file import DoubtfulCaptures, SessionFile
+from daemon.sessions.export.session_file import DeviceState, DoubtfulCaptures, SessionFile
 from daemon.sessions.session_data import SteadyTime, sessions_csv
+from daemon.store.queries.device_states import device_states
 from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS, prism_confirmations, session
 from daemon.store.queries.setups import control_points
 from daemon.store.reader import Reader
@@ -69,6 +70,10 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
             files.append(path)
             if doubts.runs:
                 doubtful[link["name"]] = DoubtfulCaptures(captures=doubts.captures, runs=tuple(doubts.runs))
+        states = [
+            DeviceState(device=e.device, kind=e.kind, text=e.text, code=e.code, utc_ns=steady.of(e.stamp).utc_ns)
+            for e in device_states(reader, since)
+        ]
         words = [
             (row["turning"], steady.of(reader.stamp(row)).utc_ns) for row in prism_confirmations(reader, session_id)
         ]
@@ -84,6 +89,7 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
                 for point in control_points(reader, found["setup_id"])
             },
             doubtful=doubtful,
+            device_states=tuple(states),
         )
         path = out / f"{session_id}.json"
         write_file(path, told.model_dump_json(indent=2, exclude_defaults=True).encode() + b"\n")

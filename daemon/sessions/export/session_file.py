@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from drivers.errors import DescriptionError
 from drivers.files import read_whole
+from drivers.readings import EventKind
 
 _FILE_MAX_BYTES = 8 << 20  # every run of doubtful captures takes some 20
 
@@ -32,6 +33,23 @@ class DoubtfulCaptures(BaseModel):
         return at >= 0 and number <= self.runs[at][1]
 
 
+class DeviceState(BaseModel):
+    """The last word of a device on its own state before the logs begin.
+
+    Attributes:
+        device, kind, text, code: as of its event.
+        utc_ns: when, on the time of the logs.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    device: str
+    kind: EventKind
+    text: str
+    code: int | None = None
+    utc_ns: int = Field(ge=0)
+
+
 class SessionFile(BaseModel):
     """An exported session, beside its captures.
 
@@ -42,6 +60,7 @@ class SessionFile(BaseModel):
         prism_turned_utc_ns: when something turned the station to the prism, on the same time.
         control_points: name -> place, mm, of those of its set-up: fixes there are not of the prism.
         doubtful: link -> its captures of doubtful time; links without any are not there.
+        device_states: what devices had told of their state before the logs begin, oldest first.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -54,6 +73,7 @@ class SessionFile(BaseModel):
     prism_confirmed_utc_ns: tuple[int, ...] = ()
     prism_turned_utc_ns: tuple[int, ...] = ()
     doubtful: dict[str, DoubtfulCaptures] = Field(default_factory=dict)
+    device_states: tuple[DeviceState, ...] = ()
 
 
 def read_session_file(path: Path) -> SessionFile:

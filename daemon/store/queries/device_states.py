@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from daemon.store.connection import Connection
+from daemon.store.reader import Reader
 from drivers.canopen.supervision import VOIDS
 from drivers.clock import Stamp
 from drivers.readings import DeviceEvent, EventKind
@@ -24,35 +25,35 @@ _DEVICES = """WITH RECURSIVE named(device) AS (
         UNION ALL SELECT (SELECT min(device) FROM device_events WHERE device > named.device)
             FROM named WHERE named.device IS NOT NULL)
     SELECT device FROM named WHERE device IS NOT NULL"""
-_LAST = """SELECT utc_ns, monotonic_ns, boot_id, device, kind, text, code FROM device_events
+_LAST = """SELECT id, utc_ns, monotonic_ns, boot_id, device, kind, text, code FROM device_events
     WHERE device = ? AND kind = ? AND boot_id = ? AND monotonic_ns < ? AND {}
     ORDER BY monotonic_ns DESC, id DESC LIMIT 1"""
 
 
-def device_states(store: Connection, before: Stamp) -> list[DeviceEvent]:
+def device_states(source: Connection | Reader, before: Stamp) -> list[DeviceEvent]:
     """Return the last event of each device and kind in the boot of an instant and before it, oldest first.
 
     Of emergencies it is the last one, and the last one that voids values beside it. Events that devices did not send
     themselves, as of a set-up that failed, have no code and are left out.
 
     Args:
-        store: the database.
+        source: the store.
         before: the instant.
     """
-    boot = store.number("SELECT id FROM boots WHERE kernel_boot_id = ?", [before.boot_id])
-    if boot is None:
+    boots = list(source.rows("SELECT id FROM boots WHERE kernel_boot_id = ?", [before.boot_id]))
+    if not boots:
         return []
-    found: dict[tuple[str, str, int], dict[str, Any]] = {}
-    for device in [row["device"] for row in store.rows(_DEVICES)]:
+    found: dict[int, dict[str, Any]] = {}
+    for device in [row["device"] for row in source.rows(_DEVICES)]:
         for kind in STATES:
-            about = (device, kind.value, boot, before.monotonic_ns)
+            about = (device, kind.value, boots[0]["id"], before.monotonic_ns)
             sent = "code IS NOT NULL" if kind in (EventKind.ALARM, EventKind.WARNING) else "TRUE"
-            rows = store.rows(_LAST.format(sent), about)
+            rows = list(source.rows(_LAST.format(sent), about))
             if kind is EventKind.EMERGENCY:
-                rows += store.rows(_LAST.format("text LIKE '%' || ?"), (*about, VOIDS))
-            for row in rows:
-                found[device, kind.value, row["monotonic_ns"]] = row
+                rows += source.rows(_LAST.format("text LIKE '%' || ?"), (*about, VOIDS))
+            found |= {row["id"]: row for row in rows}
     return [
-        DeviceEvent(row["device"], store.stamp(row), EventKind(row["kind"]), row["text"], row["code"])
-        for row in sorted(found.values(), key=lambda row: int(row["monotonic_ns"]))
+        DeviceEvent(row["device"], source.stamp(row), EventKind(row["kind"]), row["text"], row["code"])
+        # Frames that were read at once share a stamp.
+        for row in sorted(found.values(), key=lambda row: (row["monotonic_ns"], row["id"]))
     ]

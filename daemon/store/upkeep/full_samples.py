@@ -53,7 +53,9 @@ def put_again(store: Store, records: Sequence[Reading | Fix]) -> int:
         span = boot, min(instants), max(instants)
         added = 0
         readings = [record for record in records if isinstance(record, Reading)]
-        values = {(r.channel, r.unit, r.stamp.monotonic_ns): r.value for r in readings}
+        values: defaultdict[tuple[str, str, int], list[float | None]] = defaultdict(list)  # frames may share an instant
+        for r in readings:
+            values[r.channel, r.unit, r.stamp.monotonic_ns].append(r.value)
         for table in ("joint_samples", "signals"):
             stored = store.rows(_SAMPLES.format(table), span)
             again = []
@@ -76,11 +78,12 @@ def put_again(store: Store, records: Sequence[Reading | Fix]) -> int:
     return added + len(new)
 
 
-def _require_the_same(store: Store, row: Mapping[str, Any], value: float | None) -> None:
-    if None not in (value, row["value"]) and not math.isclose(row["value"], value or 0.0, rel_tol=1e-9, abs_tol=1e-9):
+def _require_the_same(store: Store, row: Mapping[str, Any], values: Sequence[float | None]) -> None:
+    was, now = row["value"], [value for value in values if value is not None]
+    if was is not None and now and not any(math.isclose(was, value, rel_tol=1e-9, abs_tol=1e-9) for value in now):
         raise StoreError(
-            f"{store.path}: {row['name']} was {row['value']:.10g} {row['unit']} and would now be {value:.10g}: its "
-            "readings were made with another rig file; use that one"
+            f"{store.path}: {row['name']} was {was:.10g} {row['unit']} and would now be {now[0]:.10g}: its readings "
+            "were made with another rig file; use that one"
         )
 
 

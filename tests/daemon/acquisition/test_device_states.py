@@ -66,6 +66,12 @@ def test_values_that_were_void_before_a_restart_are_void_after_it(
     assert statuses(store) == [status]
 
 
+def test_frames_that_were_read_at_once_are_recalled_in_their_order(store: Store, acquire: Make) -> None:
+    acquire([], DECODERS).run_inline([capture(text) for text in ("720 00", TAKEN_BACK, HARDWARE)])
+    acquire([], DECODERS).run_inline([capture(PDO, 50)])
+    assert statuses(store) == ["device_alarm"]
+
+
 def test_a_boot_of_the_computer_begins_anew(store: Store, acquire: Make) -> None:
     def of_next_boot(one: CanCapture) -> CanCapture:
         return replace(one, stamp=replace(one.stamp, boot_id="another"))
@@ -78,7 +84,7 @@ def test_an_emergency_that_stands_is_shown_after_a_restart(store: Store, acquire
     clock = SystemClock()
     told = [
         DeviceEvent("theta1", clock.now(), EventKind.EMERGENCY, f"node 32: broken; {VOIDS}", 0x5000),
-        DeviceEvent("roll9", clock.now(), EventKind.EMERGENCY, "of a joint that the rig has no more", 0x5000),
+        DeviceEvent("roll9", clock.now(), EventKind.EMERGENCY, "node 33: of a joint that the rig has no more", 0x5000),
     ]
     store.insert_records(told)
     expected = Expected((ExpectedChannel("theta1", "deg", "boom", "joint", 1.0),))

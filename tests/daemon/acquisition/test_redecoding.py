@@ -43,6 +43,11 @@ TABLES = {
 }
 
 
+def at_fifth(stamp: Stamp) -> Stamp:
+    """The fifth of a second that an instant lies in."""
+    return stamp.shifted(-(stamp.monotonic_ns % (NS_PER_S // 5)))
+
+
 @pytest.fixture(scope="module")
 def sent() -> list[list[Capture]]:
     return list(traffic(SECONDS, 1))
@@ -126,6 +131,20 @@ def test_a_session_is_decoded_again_with_its_own_rig_file_alone(thinned: Store) 
     with pytest.raises(CommandError, match=r"s001-r was recorded with another rig file.*this one -2000"):
         redecode_command(thinned, OTHER.rig, OTHER_DECODERS, {"session": "s001-r"}, lambda: None)
     assert table(thinned.path, "joint_samples") == before
+
+
+def test_two_frames_of_one_instant_are_decoded_again_as_two(tmp_path: Path, sent: list[list[Capture]]) -> None:
+    """An adapter hands over several at once, and logs have coarse stamps."""
+    coarse = [[replace(one, stamp=at_fifth(one.stamp)) for one in batch] for batch in sent]
+    with contextlib.closing(stored(tmp_path / "rigcal.sqlite", coarse, lambda _: True)) as store:
+        before = len(table(store.path, "joint_samples"))
+        assert (
+            redecode(
+                store, DECODERS, [(Stamp(UTC_0_NS, 0, "bench"), Stamp(UTC_0_NS + 9 * NS_PER_S, 9 * NS_PER_S, "bench"))]
+            )
+            == 0
+        )
+        assert len(table(store.path, "joint_samples")) == before
 
 
 def test_readings_outside_sessions_are_not_made_others_by_another_rig_file(thinned: Store) -> None:

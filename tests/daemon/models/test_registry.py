@@ -14,18 +14,22 @@ import pytest
 from sqlite_utils import Database
 
 from calibration.errors import ModelError
+from calibration.observations import parse_observations
+from calibration.pipeline.calibrate import identify
 from calibration.rig.description import parse_rig
 from daemon.commands import REFUSED, WRONG_USE, CommandError
 from daemon.jobs.process import perform
 from daemon.jobs.runner import JobRunner
 from daemon.models.live_model import LiveModel, Loaded, Missing
+from daemon.models.model_files import write_model
 from daemon.store.errors import NotInStoreError
 from daemon.store.migrations import MIGRATIONS
 from daemon.store.queries.models import ModelRow, ModelTable
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import DeviceEvent, EventKind
-from tests.daemon.job_support import SOURCE, JobRig
+from tests.daemon.job_support import SOURCE, TRUTH, JobRig
 from tests.daemon.model_support import PRISMS, ModelRig, wait
+from tests.simulated.observations import simulate_observations
 
 
 @pytest.fixture
@@ -126,6 +130,24 @@ def test_a_live_model_that_is_damaged_does_not_keep_a_good_one_from_its_place(ri
     assert (compared["live"], compared["against"], compared["is_better"]) == (live, "nominal", True)
     assert compared["sentence"].startswith("the live model cannot be read (")
     assert rig.registry.accept_command({"id": model})["retired"] == live
+
+
+def test_a_live_model_of_another_rig_file_says_nothing_of_the_readings_of_this_one(
+    rig: ModelRig, tmp_path: Path
+) -> None:
+    """Its channel L2 had another zero: what it would err on these readings is the zero's doing."""
+    channel = 'name = "L2"\ndevice = "cia406_linear"\n'
+    other = parse_rig(SOURCE.text.replace(channel, f"{channel}zero_counts = 9\n"), "other")
+    data = simulate_observations(TRUTH, 30, 20, setup="S1", prisms=PRISMS)
+    rows = parse_observations(data.csv_text().encode(), other, "simulated.csv")
+    write_model(tmp_path / "other", identify(other, other.text, rows))
+    live = rig.compared(rig.candidate(trained=tmp_path / "other"), live=None)
+    assert rig.models.go_live(rig.models.get(live), None, "accepted before the rig file was changed")
+    measured(rig, "c", 4, "check")
+    rig.registry.compare_command({"id": rig.candidate(poses=40)})
+    compared = rig.compare()
+    assert (compared["live"], compared["against"]) == (live, "nominal")
+    assert compared["sentence"].startswith("the live model is of another rig file (its channel L2 has zero_counts = 9")
 
 
 def test_in_place_of_a_damaged_live_model_nothing_goes_live_on_one_standstill(rig: ModelRig) -> None:

@@ -122,8 +122,11 @@ def clock_was_set(back_ns: int) -> Callable[[Sequence[Capture]], list[Capture]]:
     return happens
 
 
-def live(directory: Path, captures: Sequence[Capture], *, station_first: bool, **setup: object) -> list[dict[str, Any]]:
+def live(
+    directory: Path, captures: Sequence[Capture], *, station_first: bool, begin: Stamp | None = None, **setup: object
+) -> list[dict[str, Any]]:
     """A session's observations as the daemon makes them, the links read one after the other."""
+    begin = begin or captures[0].stamp
     (directory / "rigcal.toml").write_text(CONFIG.format(profile="passive", options=STATION), encoding="utf-8")
     config = read_config(directory / "rigcal.toml")
     source, clock = load_rig(config.rig), ManualClock(captures[0].stamp)
@@ -135,7 +138,7 @@ def live(directory: Path, captures: Sequence[Capture], *, station_first: bool, *
         keeper = SessionManager(
             source.rig, source.text, store, setups, joiner(config, source.rig), config.sessions, clock, run_id=1
         )
-        clock.set(captures[0].stamp.shifted(round(SESSION_S[0] * NS_PER_S)))
+        clock.set(begin.shifted(round(SESSION_S[0] * NS_PER_S)))
         keeper.start_command({"prism": "r", "id": "s1"})
         can = [c for c in captures if isinstance(c, CanCapture)]
         serial = [c for c in captures if isinstance(c, SerialCapture)]
@@ -146,7 +149,7 @@ def live(directory: Path, captures: Sequence[Capture], *, station_first: bool, *
         )
         acquisition.start()
         wait_until(first.done.is_set)
-        clock.set(captures[0].stamp.shifted(round(SESSION_S[1] * NS_PER_S)))
+        clock.set(begin.shifted(round(SESSION_S[1] * NS_PER_S)))
         keeper.stop_command({})
         wait_until(last.done.is_set)
         acquisition.stop()
@@ -239,6 +242,25 @@ def test_captures_of_doubtful_time_are_doubtful_again_in_a_replay(marked: Path) 
     told = read_session_file(marked / "out" / "s1.json")
     assert set(told.doubtful) == {"boom", "station"}
     assert len(told.doubtful["boom"].runs) == len(STOPS_S)
+
+
+def test_what_a_device_said_before_the_logs_begin_holds_in_a_replay(
+    tmp_path: Path, recorded: Sequence[Capture]
+) -> None:
+    emergency = CanCapture("boom", recorded[0].stamp, 0x080 + 32, bytes.fromhex("0050810000000000"))
+    boots = {(0x700 + 32, bytes(1))}  # they would end it
+    later = [
+        replace(capture, stamp=capture.stamp.shifted(100 * NS_PER_S))
+        for capture in recorded
+        if not (isinstance(capture, CanCapture) and (capture.arbitration_id, capture.data) in boots)
+    ]
+    made = live(tmp_path, [emergency, *later], station_first=False, begin=later[0].stamp)
+    again = replayed(tmp_path)
+    kept, repeated = (statuses(tmp_path / name) for name in ("rigcal.sqlite", "again.sqlite"))
+    assert kept == repeated
+    assert kept["joint_samples", "device_alarm"] > 100
+    assert [row["excluded"] for row in made] == [row["excluded"] for row in again]
+    assert not any(row["excluded"] is None for row in made), "a joint is missing"
 
 
 def test_a_log_that_is_not_the_session_s_is_refused_as_its_marks_would_be_misplaced(

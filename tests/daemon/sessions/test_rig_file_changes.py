@@ -18,7 +18,8 @@ from tests.daemon.session_support import SOURCE, Rig, controlled
 
 L2 = 'name = "L2"\ndevice = "cia406_linear"\nnode = 48\n'
 ANOTHER_ZERO = (L2, f"{L2}zero_counts = -2000\n")
-ANOTHER_PLACE = (L2, L2.replace("48", "58") + "heartbeat_ms = 500\nrange_mm = [-10, 3000]\n")
+ANOTHER_NODE = (L2, L2.replace("48", "58"))
+OTHER_TIMES = (L2, f"{L2}heartbeat_ms = 500\ntimeout_s = 3.0\n")
 ANOTHER_NAME = ("theta8", "roll8")
 WIDER = ("limits = [0, 2168]", "limits = [0, 2200]")
 
@@ -44,10 +45,11 @@ def used(rig: Rig) -> list[str]:
         (ANOTHER_ZERO, "its channel L2 has zero_counts = 0, this one -2000"),
         (ANOTHER_NAME, "it has no joint roll8"),
         (('name = "r"', 'name = "front"'), "it has a prism r, this one has none"),
-        (ANOTHER_PLACE, ""),
+        (ANOTHER_NODE, "its channel L2 has node = 48, this one 58"),
+        (OTHER_TIMES, ""),
         (WIDER, ""),
     ],
-    ids=["zero", "name", "prism", "place", "limits"],
+    ids=["zero", "name", "prism", "node", "times", "limits"],
 )
 def test_only_what_decides_the_meaning_of_a_reading_makes_another_rig_file(change: tuple[str, str], why: str) -> None:
     assert misreading(other(*change), SOURCE.text, "r") == why
