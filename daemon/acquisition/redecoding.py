@@ -29,6 +29,8 @@ def redecode(
     decoders: Mapping[str, Callable[[], Decoder]],
     stretches: Sequence[Stretch],
     go_on: Callable[[], None] = lambda: None,
+    *,
+    may_differ: bool = False,
 ) -> int:
     """Store every reading and fix that the captures of some stretches of time hold.
 
@@ -39,6 +41,8 @@ def redecode(
         decoders: link -> what makes its decoder.
         stretches: of time, each within one boot.
         go_on: called for each second of captures; what it raises ends the work, and what is stored stays.
+        may_differ: values may be others than those that are stored: the rig file is known to be theirs, and a decoder
+            was wrong.
 
     Returns:
         How many readings and fixes there are now that were not there before.
@@ -59,7 +63,7 @@ def redecode(
                     if isinstance(record, Reading | Fix)
                     and since.monotonic_ns <= record.stamp.monotonic_ns <= until.monotonic_ns
                 ]
-                added += put_again(store, records)
+                added += put_again(store, records, may_differ=may_differ)
     return added
 
 
@@ -123,7 +127,8 @@ def redecode_command(
                         f"{HOW_TO_READ_AGAIN}",
                         REFUSED,
                     )
-    added = redecode(store, decoders, stretches, go_on)
+    # Outside sessions nothing but the readings themselves tells which rig file made them.
+    added = redecode(store, decoders, stretches, go_on, may_differ=arguments.get("session") is not None)
     return {
         "added": added,
         "stretches": [{"first_utc_ns": first.utc_ns, "last_utc_ns": last.utc_ns} for first, last in stretches],

@@ -29,21 +29,23 @@ _BETWEEN = """SELECT first_boot_id AS boot_id, min(first_monotonic_ns) AS first_
 Stretch = tuple[Stamp, Stamp]
 
 
-def put_again(store: Store, records: Sequence[Reading | Fix]) -> int:
+def put_again(store: Store, records: Sequence[Reading | Fix], *, may_differ: bool = False) -> int:
     """Store readings and fixes of one boot that were decoded again.
 
-    A reading takes the place of the stored one of its channel and instant, which has the same value if it has one. A
-    stored fix stays as it is: observations name it.
+    A reading takes the place of the stored one of its channel and instant. A stored fix stays as it is: observations
+    name it.
 
     Args:
         store: open for writing.
         records: of a short stretch of time.
+        may_differ: a stored value may be another one.
 
     Returns:
         How many there are now that were not there before.
 
     Raises:
-        StoreError: a stored value is another one: it was made with another rig file. None of the records is stored.
+        StoreError: a stored value is another one and may not be: it was made with another rig file, and none of the
+            records is stored.
     """
     if not records:
         return 0
@@ -62,7 +64,8 @@ def put_again(store: Store, records: Sequence[Reading | Fix]) -> int:
             for row in stored:
                 key = row["name"], row["unit"], row["monotonic_ns"]
                 if key in values:
-                    _require_the_same(store, row, values[key])
+                    if not may_differ:
+                        _require_the_same(store, row, values[key])
                     again.append((row["id"],))
             db.conn.executemany(f"DELETE FROM {table} WHERE id = ?", again)
             added -= len(again)

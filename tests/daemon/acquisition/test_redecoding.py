@@ -153,3 +153,15 @@ def test_readings_outside_sessions_are_not_made_others_by_another_rig_file(thinn
     with pytest.raises(StoreError, match=r"L2 was \S+ mm and would now be \S+: .* another rig file"):
         redecode(thinned, OTHER_DECODERS, [stretch])
     assert table(thinned.path, "joint_samples") == before
+
+
+def test_in_a_session_of_the_rig_file_in_use_a_decoder_that_was_wrong_is_made_good(thinned: Store) -> None:
+    first = table(thinned.path, "joint_samples")[0]
+    SessionTable(thinned, SOURCE.rig.name).start(
+        thinned.stamp(first), SOURCE.text, id="s001-r", prism="r", operator="", kind="check", note=""
+    )
+    redecode_command(thinned, SOURCE.rig, OTHER_DECODERS, {"session": "s001-r"}, lambda: None)
+    redecode_command(thinned, SOURCE.rig, DECODERS, {"session": "s001-r"}, lambda: None)
+    key = first["channel_id"], first["monotonic_ns"]
+    again = [row for row in table(thinned.path, "joint_samples") if (row["channel_id"], row["monotonic_ns"]) == key]
+    assert [row["value"] for row in again] == [first["value"]]
