@@ -315,8 +315,9 @@ class Config(_Section):
     def _ports_differ(self) -> Config:
         if len(self.station) > 1:
             raise ValueError("sessions know one station: keep one [[station]], and give another a rigcal of its own")
-        ports = [link.channel for link in self.can if link.interface in ("socketcan", "slcan")]
-        ports = [os.path.realpath(port) for port in (*ports, *(s.serial.path for s in self.station))]
+        ports = [link.channel for link in self.can if link.interface == "socketcan"]
+        paths = [link.channel for link in self.can if link.interface == "slcan"]
+        ports += map(os.path.realpath, (*paths, *(station.serial.path for station in self.station)))
         if port := next((port for port in ports if ports.count(port) > 1), None):
             raise ValueError(f"two links are at {port!r}; a port belongs to one link")
         return self

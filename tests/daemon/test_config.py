@@ -259,3 +259,16 @@ def test_a_port_belongs_to_one_link() -> None:
     )
     with pytest.raises(ConfigError, match=r"two links are at 'can0'"):
         parse_config(text, Path("rigcal.toml"))
+
+
+def test_a_port_is_one_whatever_it_is_called(tmp_path: Path) -> None:
+    (tmp_path / "by-id").symlink_to(tmp_path / "ttyUSB0")
+    text = f'''rig = "swdt82"
+[[can]]
+interface = "slcan"
+channel = "{tmp_path}/ttyUSB0"
+[[station]]
+serial.path = "{tmp_path}/by-id"
+'''
+    with pytest.raises(ConfigError, match="two links are at '.*ttyUSB0'"):
+        parse_config(text, Path("rigcal.toml"))
