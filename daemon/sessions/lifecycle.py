@@ -59,6 +59,7 @@ class SessionLifecycle:
     ) -> None:
         self._store, self._rig, self._clock, self._tolerance_mm = store, rig, clock, tolerance_mm
         self._clock_state = clock_state
+        self._misread: dict[tuple[str, str], str] = {}  # rig file and prism -> why not
         self.table = SessionTable(store, rig.name)
         self._jobs = JobTable(store, rig.name)
 
@@ -160,7 +161,10 @@ class SessionLifecycle:
         """Return why a session's readings are not those of the rig file in use, a clause; None where they are."""
         row = session(self._store, session_id)
         assert row is not None  # no session is ever deleted
-        why = misreading(self._rig, row["rig_text"], row["prism"])
+        key = row["rig_sha256"], row["prism"]
+        if key not in self._misread:  # reading a rig file takes some 10 ms, and there may be hundreds of sessions
+            self._misread[key] = misreading(self._rig, row["rig_text"], row["prism"])
+        why = self._misread[key]
         return f"{OTHER_RIG_FILE}{why}" if why else None
 
     def accept(self, session_id: str, operator: str) -> str:

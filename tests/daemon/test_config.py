@@ -270,5 +270,5 @@ channel = "{tmp_path}/ttyUSB0"
 [[station]]
 serial.path = "{tmp_path}/by-id"
 '''
-    with pytest.raises(ConfigError, match="two links are at '.*ttyUSB0'"):
+    with pytest.raises(ConfigError, match=r"two links are at '.*ttyUSB0'"):
         parse_config(text, Path("rigcal.toml"))
