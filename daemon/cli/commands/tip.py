@@ -54,7 +54,9 @@ def _show(tip: dict[str, Any]) -> None:
         echo(_unknown(tip))
         return
     line = f"prism {tip['prism']}: base {_place(tip['base_mm'])} mm, sigma {tip['sigma_mm']:.1f} mm"
-    if tip["setup"] is not None:
+    if tip["setup"] is None:
+        line += "; in no station's frame: the model does not know where the station stands"
+    else:
         line += f"; station {tip['setup']} {_place(tip['station_mm'])} mm"
     echo(f"{line}; {tip['age_s']:.2f} s ago, model {tip['model']}, {tip['status']}")
     for warning in tip["warnings"]:

@@ -1,5 +1,6 @@
 """`rigcal model export` and `rigcal tip` as a user has them, and when a daemon sends anything at all."""
 
+import contextlib
 import csv
 import json
 import signal
@@ -153,6 +154,17 @@ def test_a_tip_without_a_position_says_why(socket: Path) -> None:
     shown = run_apart("tip", "--prism", "s", "--socket", str(socket))
     assert (shown.returncode, shown.stdout) == (1, "")
     assert shown.stderr == "Error: prism s: stale: L2: no reading yet\n"
+
+
+def test_a_tip_that_is_in_no_station_s_frame_says_so(tmp_path: Path) -> None:
+    known = {"status": "ok", "prism": "r", "base_mm": [1.0, 2.0, 3.0], "sigma_mm": 1.0, "age_s": 0.1, "model": 2}
+    with contextlib.closing(
+        ControlServer(tmp_path / "s", {"tip": lambda _: known | {"setup": None, "station_mm": None, "warnings": []}})
+    ):
+        shown = run_apart("tip", "--prism", "r", "--socket", str(tmp_path / "s"))
+    assert shown.returncode == 0
+    assert "base 1.0 2.0 3.0 mm" in shown.stdout
+    assert "in no station's frame: the model does not know where the station stands" in shown.stdout
 
 
 # ---- who may send ----------------------------------------------------------------------------------------------------
