@@ -192,7 +192,12 @@ class GuideWorker:
                 "note": f"guide {row.id}",
             }
             opened = self._sessions.start_command(arguments, is_aimed=False)
-        self._course.happen("opened", {"session": opened["id"], "last": last})
+        with self._course.at_once():
+            guide, now = self._course.record.opened(), self._sessions.open_session()
+            if guide is not None and guide[0].id == row.id:
+                self._course.happen("opened", {"session": opened["id"], "last": last})
+            elif now is not None and now["id"] == opened["id"]:  # the guide was abandoned while it was being opened
+                self._sessions.abort_command({})
 
     def _close_session(self) -> None:
         job = self._course.record.job

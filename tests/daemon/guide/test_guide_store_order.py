@@ -83,6 +83,29 @@ def test_a_guide_that_finds_the_disk_full_leaves_no_set_up_behind_and_starts_whe
     assert [setup["id"] for setup in rig.setups.list_command({})] == ["S1"]
 
 
+@pytest.mark.parametrize("is_first", [True, False])
+def test_a_guide_that_is_abandoned_while_its_session_is_being_opened_leaves_none_open(
+    rig: GuidedRig, monkeypatch: pytest.MonkeyPatch, is_first: bool
+) -> None:
+    start = rig.keeper.start_command
+
+    def with_a_stop(*arguments: Any, **more: Any) -> dict[str, Any]:
+        if is_first:
+            rig.guided("stop", reason="fog")
+        opened = start(*arguments, **more)
+        if not is_first:
+            rig.guided("stop", reason="fog")
+        return opened
+
+    rig.guided("start", new_setup={"id": "S1"}, prisms=["r"], poses=6, check_poses=0)
+    monkeypatch.setattr(rig.keeper, "start_command", with_a_stop)
+    rig.guide._worker._open_session()
+    assert rig.keeper.open_session() is None
+    assert [session["state"] for session in rig.keeper.list_command({})] == ["aborted"]
+    assert rig.known()["state"] == "abandoned"
+    assert rig.guided("start", new_setup={"id": "S2"}, prisms=["r"], poses=6, check_poses=0)["state"] == "open"
+
+
 @pytest.mark.parametrize("command", ["skip", "stop"])
 def test_a_session_that_a_command_ends_stays_open_where_the_guide_cannot_store_why(
     rig: GuidedRig, command: str
