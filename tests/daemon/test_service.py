@@ -191,7 +191,8 @@ def test_an_accepted_model_gives_the_live_tip_on_the_socket_and_on_the_bus(finis
     assert "was not compared with held-out data yet" in refused.stderr
     accepted = run_apart("model", "accept", str(best["id"]), "--operator", "Ada", *socket)
     assert accepted.returncode == 0, accepted.stderr
-    assert f"model {best['id']} (hybrid) is live" in run_apart("status", *socket).stdout
+    # The screen may be full of alarms, where the computer has too much to do to feed the simulated buses.
+    assert [model["state"] for model in finished.say("model.list")] == ["candidate", "live"]
     finished.wait("the model", lambda: finished.say("tip")["status"] != "no_model")
 
     name = finished.say("session.start", prism="r", kind="check")["id"]
