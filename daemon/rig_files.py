@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 
@@ -87,10 +88,18 @@ def misreading(rig: Rig, recorded_text: str | None, prism: str) -> str:
         return ""
     if recorded_text is None:
         return "it is not in the store"
-    try:
-        recorded = parse_rig(recorded_text, "the rig file")
-    except RigError as error:
-        return f"this rigcal cannot read it ({error})"
+    recorded = _recorded(recorded_text)
+    if isinstance(recorded, str):
+        return f"this rigcal cannot read it ({recorded})"
     if prism not in rig.prism_names:
         return f"it has a prism {prism}, this one has none"
     return rig.misreading(recorded)
+
+
+@lru_cache(maxsize=16)
+def _recorded(text: str) -> Rig | str:
+    """Return the rig of a file, or why it is none: it takes some 10 ms, and hundreds of sessions may have the same."""
+    try:
+        return parse_rig(text, "the rig file")
+    except RigError as error:
+        return str(error)

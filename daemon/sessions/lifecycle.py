@@ -59,7 +59,6 @@ class SessionLifecycle:
     ) -> None:
         self._store, self._rig, self._clock, self._tolerance_mm = store, rig, clock, tolerance_mm
         self._clock_state = clock_state
-        self._misread: dict[tuple[str, str], str] = {}  # rig file and prism -> why not
         self.table = SessionTable(store, rig.name)
         self._jobs = JobTable(store, rig.name)
 
@@ -148,10 +147,10 @@ class SessionLifecycle:
         with self._store.transaction():
             for row in self.table.closed():
                 why, excluded = self._why_misread(row["id"]), row["excluded"]
-                if why is None and (excluded or "").startswith(OTHER_RIG_FILE):
-                    why = self._why_not_used(row["id"]) if row["accepted_despite"] is None else None
-                elif why is None:
-                    continue
+                if why is None and not (excluded or "").startswith(OTHER_RIG_FILE):
+                    continue  # it has nothing to do with rig files
+                if why is None and row["accepted_despite"] is None:
+                    why = self._why_not_used(row["id"])
                 if why != excluded:
                     self.table.change(row["id"], excluded=why)
                     told = f"is not used: {why}" if why else "is used again"
@@ -161,10 +160,7 @@ class SessionLifecycle:
         """Return why a session's readings are not those of the rig file in use, a clause; None where they are."""
         row = session(self._store, session_id)
         assert row is not None  # no session is ever deleted
-        key = row["rig_sha256"], row["prism"]
-        if key not in self._misread:  # reading a rig file takes some 10 ms, and there may be hundreds of sessions
-            self._misread[key] = misreading(self._rig, row["rig_text"], row["prism"])
-        why = self._misread[key]
+        why = misreading(self._rig, row["rig_text"], row["prism"])
         return f"{OTHER_RIG_FILE}{why}" if why else None
 
     def accept(self, session_id: str, operator: str) -> str:

@@ -91,11 +91,10 @@ _UNTRAINED = f"""SELECT id, excluded FROM calibration_sessions
         (SELECT coalesce(max(rowid), 0) FROM calibration_sessions
             WHERE rig = ?1 AND state = 'closed' AND excluded IS NULL)
     ORDER BY rowid"""
-_SESSION = """SELECT calibration_sessions.*, rig_files.text AS rig_text FROM calibration_sessions
-    LEFT JOIN rig_files ON rig_files.sha256 = rig_sha256 WHERE id = ?"""
-_BETWEEN_INSTANTS = """SELECT calibration_sessions.*, rig_files.text AS rig_text FROM calibration_sessions
-    LEFT JOIN rig_files ON rig_files.sha256 = rig_sha256
-    WHERE (started_boot_id, started_monotonic_ns) <= (?, ?)
+_WITH_RIG = """SELECT calibration_sessions.*, rig_files.text AS rig_text FROM calibration_sessions
+    LEFT JOIN rig_files ON rig_files.sha256 = rig_sha256"""
+_SESSION = f"{_WITH_RIG} WHERE id = ?"
+_BETWEEN_INSTANTS = f"""{_WITH_RIG} WHERE (started_boot_id, started_monotonic_ns) <= (?, ?)
         AND (ended_boot_id IS NULL OR (ended_boot_id, ended_monotonic_ns) >= (?, ?))"""
 # What was measured from a session's start to its end; the index of the table behind the view finds it.
 _FIXES_MEASURED = f"""SELECT row.* {in_session("links CROSS JOIN v_fixes")} AND row.station = links.name

@@ -60,14 +60,11 @@ def put_again(store: Store, records: Sequence[Reading | Fix], *, may_differ: boo
             values[r.channel, r.unit, r.stamp.monotonic_ns].append(r.value)
         for table in ("joint_samples", "signals"):
             stored = store.rows(_SAMPLES.format(table), span)
-            again = []
-            for row in stored:
-                key = row["name"], row["unit"], row["monotonic_ns"]
-                if key in values:
-                    if not may_differ:
-                        _require_the_same(store, row, values[key])
-                    again.append((row["id"],))
-            db.conn.executemany(f"DELETE FROM {table} WHERE id = ?", again)
+            again = [row for row in stored if (row["name"], row["unit"], row["monotonic_ns"]) in values]
+            if not may_differ:
+                for row in again:
+                    _require_the_same(store, row, values[row["name"], row["unit"], row["monotonic_ns"]])
+            db.conn.executemany(f"DELETE FROM {table} WHERE id = ?", [(row["id"],) for row in again])
             added -= len(again)
         fixes: defaultdict[str, list[Fix]] = defaultdict(list)
         for record in records:
