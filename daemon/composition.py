@@ -21,7 +21,8 @@ from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_in
 from daemon.acquisition.simulated_channels import with_simulated_channels
 from daemon.acquisition.simulated_rig import SimulatedRig, SimulationError
 from daemon.commands import REFUSED, CommandError
-from daemon.config import CanSection, Config, ConfigError
+from daemon.config.config import Config, ConfigError
+from daemon.config.sections import CanSection
 from daemon.rig_files import RigSource
 from daemon.sessions.prisms.guard import MotionLimit
 from daemon.sessions.replay import captures_of, first_captures

@@ -11,7 +11,7 @@ from daemon.acquisition.redecoding import redecode_command
 from daemon.alarms.board import AlarmBoard
 from daemon.commands import FAILED, REFUSED, CommandError, Handler, go_on_for_caller, reading_socket, text_argument
 from daemon.composition import Parts
-from daemon.config import Config
+from daemon.config.config import Config
 from daemon.control.command_table import check_arguments
 from daemon.control.protocol import reading_only
 from daemon.control.server import ControlServer

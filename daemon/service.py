@@ -20,7 +20,7 @@ from daemon.acquisition.thinning import Thinning
 from daemon.alarms.board import AlarmBoard
 from daemon.alarms.evidence import Gatherer
 from daemon.composition import Parts, motion_limits
-from daemon.config import Config
+from daemon.config.config import Config
 from daemon.control.server import ControlServer
 from daemon.control_commands import Commands, control_servers
 from daemon.guide.manager import GuideManager

@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from daemon.config import ConfigError
+from daemon.config.config import ConfigError
 from drivers.clock import ScaledClock
 
 log = logging.getLogger(__name__)

@@ -24,7 +24,7 @@ def socket_of(path: Path | None, config: Path | None) -> Path:
     if path is not None:
         return path
     if config is not None:
-        from daemon.config import read_config
+        from daemon.config.config import read_config
 
         return read_config(config).socket_path
     return Path(os.environ.get("RIGCAL_SOCKET", INSTALLED_SOCKET))

@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
-    from daemon.config import CanSection, Config
+    from daemon.config.config import Config
+    from daemon.config.sections import CanSection
 
 State = Literal["good", "warning", "fault", "unknown"]
 
@@ -148,7 +149,7 @@ def read_configuration(path: Path) -> tuple[Config | None, Finding]:
     from calibration.errors import RigError
     from daemon.commands import CommandError
     from daemon.composition import decoders
-    from daemon.config import read_config
+    from daemon.config.config import read_config
     from daemon.rig_files import load_rig
     from drivers.errors import DescriptionError
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from daemon.acquisition.acquisition import Acquisition
 from daemon.composition import decoders, joiner, motion_limits
-from daemon.config import Config
+from daemon.config.config import Config
 from daemon.rig_files import RigSource
 from daemon.service import declare_channels
 from daemon.sessions.export.session_file import DeviceState, SessionFile

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from daemon.commands import CHECK, REFUSED, CommandError
-from daemon.config import Config
+from daemon.config.config import Config
 from daemon.jobs.order import Order, Outcome, Progress
 from daemon.jobs.scheduler import CHECKS, DueChain, State
 from daemon.models.drift import note_drift, unseen_checks

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from daemon.commands import REFUSED, CommandError
-from daemon.config import Config
+from daemon.config.config import Config
 from daemon.jobs.child import JOB_COMMAND, JobChild
 from daemon.jobs.job_queue import CANCELLED, STOPPED, JobQueue
 from daemon.jobs.order import Outcome, Started

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from daemon.config import TipCanSection, TipSection
+from daemon.config.sections import TipCanSection, TipSection
 from daemon.models.live_tip import LiveTip
 from drivers.can.tip_frames import encode_tip
 from drivers.can_link import CanLink

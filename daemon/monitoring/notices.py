@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from daemon.commands import CommandError, current_caller
-from daemon.config import NotifySection
+from daemon.config.sections import NotifySection
 from daemon.monitoring.delivery import Command, Target, Webhook
 from daemon.monitoring.notice import Notice
 from daemon.monitoring.outbox import USUAL, Outbox, Pace

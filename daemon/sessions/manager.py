@@ -25,7 +25,7 @@ from daemon.commands import (
     identifier,
     text_argument,
 )
-from daemon.config import SessionsSection
+from daemon.config.sections import SessionsSection
 from daemon.host.time_service import ClockState
 from daemon.sessions.advice import SessionAdvice, after_a_move
 from daemon.sessions.control_shot import Shot

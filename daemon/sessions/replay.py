@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
-from daemon.config import Config, ConfigError
+from daemon.config.config import Config, ConfigError
 from daemon.sessions.export.session_file import DoubtfulCaptures
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S, Stamp

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pydantic import BaseModel
 
-from daemon.config import (
+from daemon.config.config import Config
+from daemon.config.sections import (
     CanSection,
-    Config,
     JobsSection,
     MetricsSection,
     NotifySection,

@@ -21,7 +21,7 @@ import numpy as np
 from daemon.acquisition.link_decoders import LinkDecoders
 from daemon.acquisition.thinning import Thinning
 from daemon.composition import decoders
-from daemon.config import parse_config
+from daemon.config.config import parse_config
 from daemon.rig_files import load_rig
 from daemon.service import declare_channels
 from daemon.store import Reader, Store

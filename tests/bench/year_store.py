@@ -23,7 +23,7 @@ from pathlib import Path
 from daemon.acquisition.link_decoders import LinkDecoders
 from daemon.commands import CommandError
 from daemon.composition import decoders
-from daemon.config import parse_config
+from daemon.config.config import parse_config
 from daemon.control.protocol import request
 from daemon.rig_files import load_rig
 from daemon.service import declare_channels

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from daemon.composition import Parts, joiner
-from daemon.config import Config, JobsSection
+from daemon.config.config import Config
+from daemon.config.sections import JobsSection
 from daemon.host.systemd import Notifier
 from daemon.service import Daemon
 from daemon.store.store import Store

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from daemon.commands import CHECK
-from daemon.config import Config, JobsSection
+from daemon.config.config import Config
+from daemon.config.sections import JobsSection
 from daemon.jobs.child import JOB_COMMAND
 from daemon.jobs.runner import JobRunner
 from daemon.rig_files import load_rig

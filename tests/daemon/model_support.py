@@ -17,7 +17,7 @@ from calibration.observations import parse_observations
 from calibration.pipeline.calibrate import identify
 from calibration.rig.description import Rig
 from daemon.composition import joiner
-from daemon.config import Config
+from daemon.config.config import Config
 from daemon.jobs.job_queue import JobQueue
 from daemon.jobs.order import Outcome
 from daemon.jobs.process import perform

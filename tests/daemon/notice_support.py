@@ -8,7 +8,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, Literal
 
-from daemon.config import NotifySection
+from daemon.config.sections import NotifySection
 from daemon.monitoring.notice import Notice
 from daemon.monitoring.notices import Notices
 from daemon.monitoring.outbox import Pace

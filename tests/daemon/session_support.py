@@ -15,7 +15,7 @@ import pytest
 
 from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_inputs
 from daemon.commands import CommandError
-from daemon.config import SessionsSection
+from daemon.config.sections import SessionsSection
 from daemon.host.time_service import ClockState
 from daemon.rig_files import load_rig
 from daemon.sessions.manager import SessionManager

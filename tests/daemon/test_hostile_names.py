@@ -19,7 +19,7 @@ from click.testing import CliRunner
 from daemon.cli.main import main
 from daemon.cli.terminal import echo, echo_list, echo_table
 from daemon.commands import CommandError
-from daemon.config import Config
+from daemon.config.config import Config
 from daemon.control.protocol import request
 from daemon.host.safe_output import shown
 from daemon.host.systemd import Notifier

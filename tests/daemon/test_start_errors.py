@@ -14,7 +14,7 @@ import pytest
 
 from daemon.commands import REFUSED, CommandError
 from daemon.composition import Parts, joiner, require_apart
-from daemon.config import Config
+from daemon.config.config import Config
 from daemon.service import Daemon
 from daemon.store import Store, StoreError
 from drivers.clock import SystemClock

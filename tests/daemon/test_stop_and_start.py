@@ -18,7 +18,7 @@ from daemon.acquisition import backlog
 from daemon.acquisition.acquisition import Acquisition, AcquisitionError
 from daemon.commands import CommandError
 from daemon.composition import Parts, joiner
-from daemon.config import Config
+from daemon.config.config import Config
 from daemon.control.protocol import request
 from daemon.host.systemd import Notifier
 from daemon.service import Daemon

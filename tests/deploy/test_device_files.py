@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.config import read_config
+from daemon.config.config import read_config
 from drivers.can.ports import CanLinkConfig
 from tests.deploy.conftest import DEPLOY, private_namespaces, program, run
 

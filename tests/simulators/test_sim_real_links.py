@@ -20,7 +20,7 @@ import pytest
 
 from calibration.rig.description import shipped_rig
 from daemon.composition import live
-from daemon.config import parse_config
+from daemon.config.config import parse_config
 from daemon.control.protocol import request
 from daemon.rig_files import load_rig
 from daemon.service import Daemon

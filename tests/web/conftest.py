@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page
 
-from daemon.config import Config
+from daemon.config.config import Config
 from tests.daemon.web.web_support import WebProcess
 from tests.web.browser import TABLET, chromium, launched
 from tests.web.scene import served

@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from daemon.config import Config
+from daemon.config.config import Config
 from daemon.store.queries.setups import SetupTable
 from drivers.clock import NS_PER_S
 from tests.daemon.idle_daemon import idle_daemon

@@ -13,7 +13,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from daemon.alarms.library import library
-from daemon.config import Config
+from daemon.config.config import Config
 from daemon.control.protocol import request
 from daemon.control.server import ControlServer
 from daemon.web.access import Role, TokenFile

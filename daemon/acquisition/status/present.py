@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from calibration.rig.description import Rig
-from daemon.config import Config
+from daemon.config.config import Config
 from daemon.host.safe_output import duration
 
 STARTING = "starting"  # its link has not been opened yet, or the daemon has just begun to listen

@@ -26,7 +26,7 @@ def config_check(path: Path, *, as_json: bool) -> dict[str, Any]:
     PATH is /etc/rigcal/rigcal.toml where none is given.
     """
     from daemon.composition import decoders
-    from daemon.config import read_config
+    from daemon.config.config import read_config
     from daemon.rig_files import load_rig
 
     settings = read_config(path)

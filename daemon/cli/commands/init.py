@@ -242,7 +242,7 @@ def _check(path: Path) -> None:
     """
     from calibration.errors import RigError
     from daemon.composition import decoders
-    from daemon.config import read_config
+    from daemon.config.config import read_config
     from daemon.rig_files import load_rig
 
     try:

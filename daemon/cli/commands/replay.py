@@ -60,7 +60,7 @@ def replay(
     FILES are CAN logs (candump .log, Vector .asc or .blf) and serial captures (.serial).
     """
     from daemon.cli.log_replay import replay_logs, whole_session
-    from daemon.config import read_config
+    from daemon.config.config import read_config
     from daemon.rig_files import load_rig
     from daemon.sessions.export.session_file import read_session_file
     from daemon.sessions.replay import stored_readings

@@ -16,7 +16,7 @@ from daemon.cli.terminal import echo
 from daemon.host.systemd import Notifier, set_up_logging
 
 if TYPE_CHECKING:
-    from daemon.config import Config
+    from daemon.config.config import Config
     from daemon.store.store import Store
 
 SIMULATED_FILE = Path("rigcal-sim", "rigcal.toml")
@@ -80,7 +80,7 @@ def run(
     if not sim and (is_by_hand or rig is not None):
         raise click.UsageError("--rig and --by-hand are for a simulated rig: give --sim as well")
     from daemon.composition import live, replayed, simulated
-    from daemon.config import read_config
+    from daemon.config.config import read_config
     from daemon.rig_files import load_rig
     from daemon.service import Daemon, stop_on_signals
 
@@ -146,7 +146,7 @@ def _store(settings: Config, *, is_simulated: bool) -> Store:
 
 
 def _simulated_settings() -> Config:
-    from daemon.config import parse_config
+    from daemon.config.config import parse_config
 
     return parse_config(_simulated_config("swdt82"), SIMULATED_FILE.resolve())
 
@@ -162,7 +162,7 @@ def _write_config(settings: Config, rig: str) -> None:
 
 def _simulated_config(rig: str) -> str:
     from calibration.rig.toml import quoted
-    from daemon.config import SIMULATED_CONFIG
+    from daemon.config.config import SIMULATED_CONFIG
 
     by = "`rigcal run --sim` at each start, for commands that ask for --config"
     return SIMULATED_CONFIG.format(written_by=by, rig=quoted(rig))

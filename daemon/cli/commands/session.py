@@ -147,7 +147,7 @@ def session_export(name: str, config: Path, out: Path, form: Any, *, as_json: bo
     log, candump, asc, blf: CAN and serial captures as logs that `rigcal replay` reads, and the observations as CSV.
     csv, parquet, mat: the observations, all joint readings and all fixes as tables.
     """
-    from daemon.config import read_config
+    from daemon.config.config import read_config
     from daemon.sessions.export.captured_logs import export_session
     from daemon.sessions.export.tables import TABLE_FORMATS, export_tables
 

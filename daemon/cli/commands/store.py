@@ -16,7 +16,7 @@ from daemon.cli.command import DONE, FAILED, Command, Delivered, json_option
 from daemon.cli.terminal import counted, echo, echo_error
 
 if TYPE_CHECKING:
-    from daemon.config import Config
+    from daemon.config.config import Config
     from daemon.store import Store
 
 TIMEOUT_S = 86_400.0  # a command that deletes a year, or decodes a week again; Ctrl-C ends it
@@ -34,7 +34,7 @@ def store() -> None:
 @json_option
 def store_stats(config: Path, *, tables: bool, as_json: bool) -> dict[str, Any]:
     """Show how large the store is and what it holds."""
-    from daemon.config import read_config
+    from daemon.config.config import read_config
     from daemon.store.upkeep.statistics import statistics
 
     found = statistics(read_config(config).store_path, tables=tables)
@@ -57,7 +57,7 @@ def store_stats(config: Path, *, tables: bool, as_json: bool) -> dict[str, Any]:
 @json_option
 def store_describe(config: Path, out: Path | None, *, as_json: bool) -> dict[str, Any]:
     """Write the metadata.yaml with which Datasette shows the store: titles, meanings of columns, queries."""
-    from daemon.config import read_config
+    from daemon.config.config import read_config
     from daemon.host.safe_output import write_file
     from daemon.store.describe.description import describe_store
     from daemon.store.describe.metadata import datasette_metadata
@@ -80,7 +80,7 @@ def store_check(config: Path, backup: Path | None, *, as_json: bool) -> Delivere
 
     Exit status 1 where something is damaged.
     """
-    from daemon.config import read_config
+    from daemon.config.config import read_config
     from daemon.store.upkeep import backup as backup_module
     from daemon.store.upkeep.soundness import check_store
 
@@ -116,7 +116,7 @@ def store_check(config: Path, backup: Path | None, *, as_json: bool) -> Delivere
 @json_option
 def store_backup(config: Path, to: Path | None, keep: int | None, *, is_list: bool, as_json: bool) -> dict[str, Any]:
     """Copy store and models to a backup, verify it, and delete the oldest ones. The daemon may run."""
-    from daemon.config import read_config
+    from daemon.config.config import read_config
     from daemon.store.upkeep.backup import backups, make_backup
 
     settings = read_config(config)
@@ -154,7 +154,7 @@ def store_restore(backup: Path, config: Path, *, as_json: bool) -> dict[str, Any
 
     Stop the daemon first. What was there is moved to a directory beside the store and nothing of it is deleted.
     """
-    from daemon.config import read_config
+    from daemon.config.config import read_config
     from daemon.store.upkeep.backup import restore_backup
 
     settings = read_config(config)
@@ -176,7 +176,7 @@ def store_prune(config: Path, days: float | None, *, as_json: bool) -> dict[str,
     Sessions, what was captured in them and a minute before, and models always stay. The file does not become smaller:
     its free pages are used again.
     """
-    from daemon.config import read_config
+    from daemon.config.config import read_config
     from daemon.service import keeping_of
     from daemon.store.upkeep.housekeeping import Housekeeping
     from drivers.clock import SystemClock
@@ -214,7 +214,7 @@ def store_redecode(
     """
     from daemon.acquisition.redecoding import redecode_command
     from daemon.composition import decoders
-    from daemon.config import read_config
+    from daemon.config.config import read_config
     from daemon.rig_files import load_rig
 
     if (session is None) == (since is None or until is None):

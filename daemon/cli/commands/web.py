@@ -108,7 +108,7 @@ def token_list(config: Path, *, as_json: bool) -> dict[str, Any]:
 
 
 def _tokens(config: Path) -> TokenFile:
-    from daemon.config import read_config
+    from daemon.config.config import read_config
     from daemon.web.access import TokenFile
 
     return TokenFile(read_config(config).tokens_path)
@@ -123,7 +123,8 @@ def _settings(
     config: Path | None,
     loopback_role: str | None,
 ) -> WebSettings:
-    from daemon.config import WebSection, read_config
+    from daemon.config.config import read_config
+    from daemon.config.sections import WebSection
     from daemon.web.access import Role
     from daemon.web.settings import WebSettings
 

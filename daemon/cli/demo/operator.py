@@ -47,7 +47,7 @@ class Operator:
     def __init__(
         self, directory: Path, rate: float, seed: int, options: Sequence[str] = (), settings: str = ""
     ) -> None:
-        from daemon.config import SIMULATED_CONFIG
+        from daemon.config.config import SIMULATED_CONFIG
 
         self._socket = directory / "control.sock"
         self._rate = rate

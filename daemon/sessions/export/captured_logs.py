@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from calibration.rig.description import parse_rig
 from daemon.commands import CommandError
-from daemon.config import Config, ConfigError
+from daemon.config.config import Config, ConfigError
 from daemon.host.safe_output import write_file
 from daemon.sessions.export.session_file import DeviceState, DoubtfulCaptures, SessionFile
 from daemon.sessions.session_data import SteadyTime, sessions_csv

@@ -16,7 +16,7 @@ from daemon.acquisition.redecoding import redecode, redecode_command
 from daemon.acquisition.thinning import Thinning
 from daemon.commands import CommandError
 from daemon.composition import decoders
-from daemon.config import parse_config
+from daemon.config.config import parse_config
 from daemon.rig_files import load_rig
 from daemon.service import declare_channels
 from daemon.store import Store

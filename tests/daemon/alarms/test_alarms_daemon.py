@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 import pytest
 
 from daemon.composition import live
-from daemon.config import parse_config
+from daemon.config.config import parse_config
 from daemon.control.protocol import request
 from daemon.rig_files import load_rig
 from daemon.service import Daemon

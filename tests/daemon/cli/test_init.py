@@ -14,7 +14,7 @@ from click.testing import CliRunner, Result
 
 from daemon.cli.listening import hear_bus, hear_station
 from daemon.cli.main import main
-from daemon.config import read_config
+from daemon.config.config import read_config
 from drivers.can.ports import CanLinkConfig
 from drivers.clock import SystemClock
 from drivers.stations.profiles import station_profiles

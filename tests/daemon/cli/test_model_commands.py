@@ -20,7 +20,7 @@ from calibration.model.prediction import Predictor
 from calibration.rig.channels import RawSignal
 from daemon.cli.main import main
 from daemon.composition import decoders, live
-from daemon.config import Config, ConfigError, parse_config
+from daemon.config.config import Config, ConfigError, parse_config
 from daemon.control.server import ControlServer
 from daemon.models.model_files import read_model, write_model
 from daemon.rig_files import load_rig
@@ -28,8 +28,8 @@ from daemon.service import tip_sender
 from drivers.can.tip_frames import TipMessage, TipStatus, encode_tip
 from drivers.errors import TransmitForbiddenError
 from tests.commands import run_apart
+from tests.daemon.config.test_config import GOOD, check
 from tests.daemon.model_support import SOURCE, ModelRig, written
-from tests.daemon.test_config import GOOD, check
 
 TIP = """
 [tip]

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from daemon.commands import CommandError, reading_socket
-from daemon.config import Config
+from daemon.config.config import Config
 from daemon.control.command_table import COMMANDS, READING
 from daemon.control.protocol import request
 from tests.daemon.control.test_control import talk

@@ -18,7 +18,7 @@ from sqlite_utils import Database
 
 from daemon.cli.main import main
 from daemon.commands import Caller, CommandError, reading_socket
-from daemon.config import Config, ConfigError, parse_config
+from daemon.config.config import Config, ConfigError, parse_config
 from daemon.control.command_table import READING
 from daemon.control.protocol import request
 from daemon.store.reader import Reader

@@ -10,7 +10,7 @@ import pytest
 from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor
 from daemon.commands import CommandError
-from daemon.config import TipCanSection, TipSection
+from daemon.config.sections import TipCanSection, TipSection
 from daemon.host.ended_threads import EndedThreads
 from daemon.models.live_model import Loaded
 from daemon.models.tip_sender import TipSender

@@ -16,7 +16,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from daemon.acquisition.status.board import StatusBoard
 from daemon.composition import live
-from daemon.config import ConfigError, parse_config
+from daemon.config.config import ConfigError, parse_config
 from daemon.control.protocol import request
 from daemon.host.systemd import network_hint
 from daemon.monitoring import metrics_server

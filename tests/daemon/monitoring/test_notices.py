@@ -19,7 +19,8 @@ from typing import Any
 
 import pytest
 
-from daemon.config import ConfigError, NotifySection, parse_config
+from daemon.config.config import ConfigError, parse_config
+from daemon.config.sections import NotifySection
 from daemon.control.protocol import request
 from daemon.monitoring import delivery, outbox
 from daemon.monitoring.notice import LISTED, Notice, message_of

@@ -13,7 +13,8 @@ from calibration.rig.description import shipped_rig
 from daemon.acquisition.joiner import ObservationJoiner, joint_inputs
 from daemon.cli.main import main
 from daemon.commands import CommandError
-from daemon.config import SessionsSection, parse_config
+from daemon.config.config import parse_config
+from daemon.config.sections import SessionsSection
 from daemon.sessions.export.captured_logs import export_session
 from daemon.sessions.export.session_file import SessionFile, read_session_file
 from daemon.sessions.manager import SessionManager

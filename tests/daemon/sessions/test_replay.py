@@ -17,7 +17,7 @@ from calibration.rig.description import shipped_rig
 from daemon.acquisition.acquisition import Acquisition
 from daemon.cli.main import main
 from daemon.composition import decoders, joiner
-from daemon.config import read_config
+from daemon.config.config import read_config
 from daemon.rig_files import load_rig
 from daemon.service import declare_channels
 from daemon.sessions.export.session_file import read_session_file

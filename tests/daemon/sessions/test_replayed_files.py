@@ -12,7 +12,7 @@ from click.testing import CliRunner, Result
 
 from daemon.cli.main import main
 from daemon.composition import live
-from daemon.config import read_config
+from daemon.config.config import read_config
 from daemon.rig_files import load_rig
 from daemon.store.reader import Reader
 from drivers.errors import DescriptionError

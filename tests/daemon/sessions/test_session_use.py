@@ -9,7 +9,7 @@ from click.testing import CliRunner
 
 from daemon.cli.main import main
 from daemon.commands import CommandError
-from daemon.config import Config
+from daemon.config.config import Config
 from daemon.control.server import ControlServer
 from daemon.jobs.job_queue import JobQueue
 from daemon.jobs.order import Order, Outcome

@@ -13,7 +13,8 @@ from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_in
 from daemon.acquisition.status.present import expected_of
 from daemon.cli.lines.state import show_session
 from daemon.commands import CommandError
-from daemon.config import Config, SessionsSection
+from daemon.config.config import Config
+from daemon.config.sections import SessionsSection
 from daemon.control.server import ControlServer
 from daemon.host.time_service import ClockState
 from daemon.rig_files import load_rig

@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from daemon.cli.main import main
 from daemon.commands import CommandError
 from daemon.composition import Parts, joiner
-from daemon.config import Config
+from daemon.config.config import Config
 from daemon.control.protocol import request
 from daemon.service import Daemon
 from daemon.store import Reader, Store, StoreError

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from daemon.config import Config
+from daemon.config.config import Config
 from daemon.store.reader import Reader
 from daemon.web.server import REQUEST_S
 from tests.daemon.idle_daemon import idle_daemon

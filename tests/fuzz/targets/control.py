@@ -12,7 +12,7 @@ from pathlib import Path
 
 from calibration.rig.description import shipped_rig
 from daemon.composition import replayed
-from daemon.config import parse_config
+from daemon.config.config import parse_config
 from daemon.control.protocol import MAX_LINE_BYTES
 from daemon.host.systemd import Notifier
 from daemon.rig_files import load_rig

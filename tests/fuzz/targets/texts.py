@@ -11,7 +11,7 @@ from calibration.observations import parse_observations
 from calibration.rig.description import parse_rig
 from daemon.acquisition.channels import decoder_factories, node_setups
 from daemon.cli.offline import with_columns
-from daemon.config import ConfigError, parse_config
+from daemon.config.config import ConfigError, parse_config
 from daemon.rig_files import load_rig
 from daemon.sessions.export.session_file import read_session_file
 from drivers.can_decoder import CanDecoder

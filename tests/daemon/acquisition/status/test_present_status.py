@@ -14,7 +14,7 @@ from daemon.acquisition.status.decode_failures import KINDS_MAX, FailureCounter
 from daemon.acquisition.status.present import Expected, ExpectedChannel, ExpectedStation, expected_of
 from daemon.acquisition.status.snapshot import AcquisitionStatus
 from daemon.cli.lines.state import decoding_lines, gap_state_lines, station_line
-from daemon.config import Config
+from daemon.config.config import Config
 from daemon.host.safe_output import duration
 from daemon.rig_files import load_rig
 from daemon.store import Store

@@ -14,7 +14,7 @@ from calibration.rig.description import Rig, shipped_rig
 from daemon.acquisition.simulated_rig import SimulatedRig
 from daemon.cli.demo.hidden import HIDDEN as HIDDEN_FILE
 from daemon.cli.demo.hidden import Truth, concessions, outcome, rounds, show
-from daemon.config import ConfigError
+from daemon.config.config import ConfigError
 from drivers.clock import NS_PER_S, ScaledClock, Stamp, SystemClock
 from simulators.blind.hiding import draw_hidden_effect
 from simulators.effects.library import FAMILIES

@@ -6,10 +6,9 @@ import pytest
 from pydantic import BaseModel
 
 from daemon.commands import INSTALLED_CONFIG
-from daemon.config import (
+from daemon.config.config import Config, ConfigError, parse_config, read_config
+from daemon.config.sections import (
     CanSection,
-    Config,
-    ConfigError,
     JobsSection,
     NotifySection,
     SessionsSection,
@@ -17,8 +16,6 @@ from daemon.config import (
     TipCanSection,
     TipSection,
     WebSection,
-    parse_config,
-    read_config,
 )
 from drivers.stations.config import StationConfig
 from drivers.stations.serial_port import SerialConfig
