@@ -12,7 +12,7 @@ from daemon.alarms.board import AlarmBoard
 from daemon.commands import FAILED, REFUSED, CommandError, Handler, go_on_for_caller, reading_socket, text_argument
 from daemon.composition import Parts
 from daemon.config.config import Config
-from daemon.control.command_table import check_arguments
+from daemon.control.command_table import checked_arguments
 from daemon.control.protocol import reading_only
 from daemon.control.server import ControlServer
 from daemon.guide.manager import GuideManager
@@ -102,9 +102,9 @@ class Commands:
         return {name: partial(self._carry_out, name, handler) for name, handler in commands.items()}
 
     def _carry_out(self, name: str, handler: Handler, arguments: Mapping[str, Any]) -> Any:
-        check_arguments(name, arguments)
+        given = checked_arguments(name, arguments)
         with unwritable_errors(self.store.path):
-            return handler(arguments)
+            return handler(given)
 
     def _if_kept(self, what: str, handler: Handler) -> Handler:
         """Return a command that is refused where its store would be lost when the daemon stops."""

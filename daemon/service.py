@@ -153,6 +153,7 @@ class Daemon:
             self._live_model,
             compare=self._jobs.compare,
             comparison_job=self._job_table.comparison_of,
+            zeros_checked=self._sessions.zeros_checked,
         )
         self._guide = GuideManager(
             parts.rig,
@@ -216,6 +217,7 @@ class Daemon:
             "keeping": lambda: self._housekeeping.state,
             "is_store_new": lambda: is_store_new(self._job_table, self._config.models_directory),
             "untrained_sessions": sessions.untrained,
+            "zeros_lost": sessions.zeros_lost,
             "control_faults": self._control_faults,
             "ended_threads": self._ended_threads.found,
             "clock_lost": lambda: None if self._time is None else self._time.lost(),

@@ -41,6 +41,7 @@ class Evidence:
         notice_faults: ways out of the machine by which notices are not delivered at present -> why.
         untrained_sessions: closed sessions that nothing trains on -> why; those that newer ones make up for are not
             there.
+        zeros_lost: joints whose encoder has jumped since the newest closed session was started, unchecked.
         ended_threads: thread of the daemon that an error has ended -> the error.
         clock_lost: when the computer's clock was last synchronised, if it no longer is.
         unwatched: rule or part of the evidence that has failed itself -> why.
@@ -63,6 +64,7 @@ class Evidence:
     metrics_fault: str | None = None
     notice_faults: Mapping[str, str] = field(default_factory=dict)
     untrained_sessions: Mapping[str, str] = field(default_factory=dict)
+    zeros_lost: Sequence[str] = ()
     ended_threads: Mapping[str, str] = field(default_factory=dict)
     clock_lost: Stamp | None = None
     unwatched: Mapping[str, str] = field(default_factory=dict)
@@ -116,6 +118,7 @@ _PARTS = {
     "keeping": "the store's room and backups",
     "is_store_new": "the models",
     "untrained_sessions": "the sessions",
+    "zeros_lost": "the joints' zeros",
     "control_faults": "the control sockets",
     "metrics_fault": "the metrics",
     "notice_faults": "the notices",

@@ -152,8 +152,12 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
 READING = frozenset(name for name, command in COMMANDS.items() if not command.changes)
 
 
-def check_arguments(name: str, arguments: Mapping[str, Any]) -> None:
-    """Raise CommandError where a command of that name does not know an argument, or lacks one; null is none."""
+def checked_arguments(name: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments that are given, without those that are null: null is none.
+
+    Raises:
+        CommandError: the command of that name does not know an argument, or lacks one.
+    """
     command = COMMANDS[name]
     unknown = [shown(key, _NAME_CHARACTERS) for key in arguments if key not in command.known]
     if unknown:
@@ -162,3 +166,4 @@ def check_arguments(name: str, arguments: Mapping[str, Any]) -> None:
     for key, meaning in command.needed.items():
         if arguments.get(key) is None:
             raise CommandError(f"{name}: argument {key} is missing: {meaning}")
+    return {key: value for key, value in arguments.items() if value is not None}

@@ -12,7 +12,7 @@ from typing import Any
 from calibration.rig.description import Rig
 from daemon.acquisition.joiner import ObservationJoiner
 from daemon.commands import HOW_TO_END, REFUSED, CommandError, Handler, mapping_argument, text_argument
-from daemon.control.command_table import check_arguments
+from daemon.control.command_table import checked_arguments
 from daemon.guide.advisor import accuracy_view
 from daemon.guide.course import Course
 from daemon.guide.job import Job
@@ -88,19 +88,23 @@ class GuideManager:
         """Return a command that is refused while a guide is open, which holds its sessions itself."""
 
         def guarded(arguments: Mapping[str, Any]) -> Any:
-            with self._record.turn:
-                opened = self._record.opened()
-                if opened is not None:
-                    row, job = opened
-                    raise CommandError(
-                        f"{name} is not carried out: guide {row.id} is open and opens, shoots in and closes its "
-                        f"sessions itself; next: {headline(job)} (`rigcal session guide` leads, and "
-                        "`rigcal session guide --stop REASON` abandons it)",
-                        REFUSED,
-                    )
-            return handler(arguments)
+            self._require_none_open(name)  # at once: the guide may have the turn for long, for a shot
+            with self._sessions.turn:  # which a guide takes, too, to be opened
+                self._require_none_open(name)
+                return handler(arguments)
 
         return guarded
+
+    def _require_none_open(self, name: str) -> None:
+        opened = self._record.opened()
+        if opened is not None:
+            row, job = opened
+            raise CommandError(
+                f"{name} is not carried out: guide {row.id} is open and opens, shoots in and closes its sessions "
+                f"itself; next: {headline(job)} (`rigcal session guide` leads, and `rigcal session guide --stop "
+                "REASON` abandons it)",
+                REFUSED,
+            )
 
     # ---- commands ----------------------------------------------------------------------------------------------------
 
@@ -114,17 +118,16 @@ class GuideManager:
                     "`rigcal session guide --stop REASON` abandons it",
                     REFUSED,
                 )
-            opened = self._sessions.open_session()
-            if opened is not None:
-                raise CommandError(f"session {opened['id']!r} is open; {HOW_TO_END}", REFUSED)
             described = mapping_argument(arguments, "new_setup")
             operator = text_argument(arguments, "operator")
             is_new = "new_setup" in arguments
-            if is_new and arguments.get("setup") is not None:
+            if is_new and "setup" in arguments:
                 raise CommandError("give a set-up that exists or describe a new one, not both")
             with self._course.at_once():
+                if (session := self._sessions.open_session()) is not None:  # else one may be opened meanwhile
+                    raise CommandError(f"session {session['id']!r} is open; {HOW_TO_END}", REFUSED)
                 if is_new:
-                    check_arguments("setup.new", described)
+                    described = checked_arguments("setup.new", described)
                     request = request_of(arguments, self._rig, list(mapping_argument(described, "control_points")))
                     setup_id = str(self._setups.new_command(described)["id"])
                 else:

@@ -183,15 +183,10 @@ class GuideWorker:
             self._course.abandon(_MOVED)
             return
         last, opened = self._course.record.table.newest_observation(), self._sessions.open_session()
-        if opened is None or opened["prism"] != job.run.prism:  # else it was opened just before the daemon ended
-            arguments = {
-                "prism": job.run.prism,
-                "kind": job.run.kind,
-                "setup": row.setup_id,
-                "operator": row.operator,
-                "note": f"guide {row.id}",
-            }
-            opened = self._sessions.start_command(arguments, is_aimed=False)
+        wanted = {"prism": job.run.prism, "kind": job.run.kind, "setup": row.setup_id, "note": f"guide {row.id}"}
+        if opened is None or any(opened[key] != value for key, value in wanted.items()):
+            opened = self._sessions.start_command(wanted | {"operator": row.operator}, is_aimed=False)
+        # Else it was opened just before the daemon ended.
         with self._course.at_once():
             guide, now = self._course.record.opened(), self._sessions.open_session()
             if guide is not None and guide[0].id == row.id:

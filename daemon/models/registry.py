@@ -32,6 +32,7 @@ class ModelRegistry:
         live: the model in use.
         compare: queues the comparison of a model with the live one, and says so.
         comparison_job: tells the job that is yet to compare a model; None without one.
+        zeros_checked: takes that an operator has checked the joints' zeros, when that is stored.
     """
 
     def __init__(
@@ -42,9 +43,10 @@ class ModelRegistry:
         *,
         compare: Callable[[ModelRow], str],
         comparison_job: Callable[[ModelRow], int | None],
+        zeros_checked: Callable[[], None] = lambda: None,
     ) -> None:
         self._table, self._rig, self._live = table, rig_name, live
-        self._compare, self._comparison_job = compare, comparison_job
+        self._compare, self._comparison_job, self._zeros_checked = compare, comparison_job, zeros_checked
         # The candidate that was last loaded for `status`, its files as they lay there, and why it cannot go live.
         self._loaded: tuple[tuple[int, _Files], str | None] | None = None
 
@@ -122,6 +124,7 @@ class ModelRegistry:
         operator = text_argument(arguments, "operator")
         through = max(jumped.values(), default=0)
         self._table.note_zeros_checked(live, through, operator=operator, **caller_columns())
+        self._zeros_checked()
         self._live.changed()
         return f"model {live.id} is used again; jumps until now count no more: {', '.join(jumped) or 'there were none'}"
 

@@ -2,7 +2,8 @@
 
 A session is open, then closed or aborted. When it is closed it is decided whether calibration may use it: where no
 control point shows that the station stood still from its start to its end, it may not, until an operator accepts it;
-where another rig file than today's turned counts into its readings, it may not as long as that file is not in use.
+where another rig file than today's turned counts into its readings, it may not as long as that file is not in use; and
+where an encoder has jumped since, as long as nobody has checked the joint's zero.
 Each change is one transaction.
 """
 
@@ -20,7 +21,8 @@ from daemon.rig_files import HOW_TO_READ_AGAIN, misreading
 from daemon.sessions.open_session import OpenSession
 from daemon.store.connection import rig_sha256
 from daemon.store.queries.jobs import JobTable
-from daemon.store.queries.sessions import OTHER_RIG_FILE, SessionTable, preset_jumps, session
+from daemon.store.queries.sessions import OTHER_RIG_FILE, ZERO_LOST, SessionTable, session
+from daemon.store.queries.zeros import lost_zeros, preset_jumps
 from daemon.store.store import Store
 from drivers.clock import Clock, Stamp
 
@@ -142,26 +144,33 @@ class SessionLifecycle:
         with self._store.transaction():
             self.table.exclude_closed(session_id, self._why_not_used(session_id))
 
-    def judge_rig_files(self) -> None:
-        """Decide anew whether calibration may use the closed sessions, now that the rig file in use may be another."""
+    def judge_readings(self) -> None:
+        """Decide anew whether calibration may use the closed sessions: rig file or zeros may be others than theirs."""
         with self._store.transaction():
             for row in self.table.closed():
-                why, excluded = self._why_misread(row["id"]), row["excluded"]
-                if why is None and not (excluded or "").startswith(OTHER_RIG_FILE):
-                    continue  # it has nothing to do with rig files
-                if why is None and row["accepted_despite"] is None:
+                why, excluded = self._why_other_readings(row["id"]), row["excluded"]
+                if why is None and not (excluded or "").startswith((OTHER_RIG_FILE, ZERO_LOST)):
+                    continue  # it has nothing to do with either
+                if row["accepted_despite"] is None:
                     why = self._why_not_used(row["id"])
                 if why != excluded:
                     self.table.change(row["id"], excluded=why)
                     told = f"is not used: {why}" if why else "is used again"
                     self._store.once_committed(partial(log.warning, "session %s %s", row["id"], told))
 
-    def _why_misread(self, session_id: str) -> str | None:
-        """Return why a session's readings are not those of the rig file in use, a clause; None where they are."""
+    def _why_other_readings(self, session_id: str) -> str | None:
+        """Return why a session's readings are not those of the rig as it is now, a clause; None where they are.
+
+        An operator who accepts a session says that the zeros are those that it was measured with.
+        """
         row = session(self._store, session_id)
         assert row is not None  # no session is ever deleted
-        why = misreading(self._rig, row["rig_text"], row["prism"])
-        return f"{OTHER_RIG_FILE}{why}" if why else None
+        if why := misreading(self._rig, row["rig_text"], row["prism"]):
+            return f"{OTHER_RIG_FILE}{why}"
+        since = self._store.stamp_or_none(row, "accepted_") or self._store.stamp(row, "started_")
+        lost = lost_zeros(self._store, self._rig.name, since)
+        joints = [name for name in self._rig.joint_names if name in lost]
+        return f"{ZERO_LOST}{', '.join(joints)}" if joints else None
 
     def accept(self, session_id: str, operator: str) -> str:
         """Let calibration use a closed session from now on, on an operator's word.
@@ -195,12 +204,19 @@ class SessionLifecycle:
 
     def _why_not_used(self, session_id: str) -> str | None:
         """Why calibration must not use a session, a clause; None where a control point shows that it may."""
-        if (misread := self._why_misread(session_id)) is not None:
-            return misread
+        return "; ".join(filter(None, (self._why_other_readings(session_id), self._why_moved(session_id)))) or None
+
+    def _why_moved(self, session_id: str) -> str | None:
+        """Return why a session's station may have moved, a clause; None where a control point shows that it did not."""
         for shot in self.table.shots(session_id):
             if shot["misclosure_mm"] is not None and shot["misclosure_mm"] > self._tolerance_mm:
                 off = f"control point {shot['point']} was {shot['misclosure_mm']:.1f} mm off at its {shot['phase']}"
                 return f"{off}, so the station had moved"
+        again = self.table.moved_between(session_id)
+        if again is not None and again[1] > self._tolerance_mm:
+            return (
+                f"control point {again[0]} was {again[1]:.1f} mm off when it was shot again, so the station had moved"
+            )
         if not self.table.points_shot(session_id, "start") & self.table.points_shot(session_id, "end"):
             return NOT_SHOT
         if self.table.has_poses_before_enclosed(session_id):

@@ -22,6 +22,7 @@ from daemon.commands import (
     SESSION_KINDS,
     CommandError,
     caller_columns,
+    go_on_for_caller,
     identifier,
     text_argument,
 )
@@ -38,7 +39,7 @@ from daemon.sessions.station_setups import AXES, StationSetups
 from daemon.sessions.without_job import why_no_job
 from daemon.store.errors import is_unwritable
 from daemon.store.queries.jobs import JobTable
-from daemon.store.queries.observations import ObservationTable
+from daemon.store.queries.observations import ObservationTable, first_constants_mm
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, Clock, Stamp, lies_within
 from drivers.readings import DeviceEvent, EventKind, Fix, Record
@@ -119,6 +120,7 @@ class SessionManager:
                 for session in self._taking():
                     if session.lasted(record.stamp):
                         session.jumped.setdefault(record.device, record.stamp)
+                self._pending.add(self._lifecycle.judge_readings)
         observing = [self._observe(joined) for joined in self._joiner.feed(records)]
         late = [session.id for session in observing if session is not None and session.until is not None]
         self._late.update(late)
@@ -170,37 +172,16 @@ class SessionManager:
                 )
             if kind not in SESSION_KINDS:
                 raise CommandError(f"there is no kind {kind!r:.80}; kinds: {', '.join(SESSION_KINDS)}")
-            setup_id = self._setups.usable(arguments.get("setup"))
-            free = self._table.free_id(prism)
-            session_id = identifier(arguments, "id", "a session's id", default=free)
-            if session_id in self._table.ids():
-                raise CommandError(f"session {session_id!r} exists already; choose another --id")
-            points = self._setups.control_points(setup_id)
+            self._setups.usable(arguments.get("setup"))  # before anything is waited for
             self._prisms.prepare(LOAD_S)
             if self._aim is not None:
                 self._aim(prism)
-            now = self._clock.now()
-            row = {
-                "setup_id": setup_id,
-                "prism": prism,
-                "operator": text_argument(arguments, "operator"),
-                **caller_columns(),
-                "kind": kind,
-                "note": text_argument(arguments, "note"),
-            }
-            order = self._store.order
-            session = OpenSession(session_id, setup_id, prism, kind, order, now, control_points=points)
-            self._prisms.begin(session)
-            if not is_aimed:
-                session.shots.append(Shot(0, now))
+            go_on_for_caller()
             with self._store.transaction():
-                self._lifecycle.start(now, session_id, self._rig_text, **row)
-                if self._aim is not None:
-                    self._prisms.turned(session, now)
-            self._open = session
+                session = self._new_session(prism, kind, arguments, is_aimed=is_aimed)
             return {
-                "id": session_id,
-                "setup": setup_id,
+                "id": session.id,
+                "setup": session.setup_id,
                 "prism": prism,
                 "kind": kind,
                 "advice": self._advice.at_start(session),
@@ -251,6 +232,10 @@ class SessionManager:
                 shot.until = self._clock.now()
                 self._note_turned(session, shot.until)
             return result | {"advice": after_a_move(session.id) if result["moved"] else []}
+
+    def zeros_checked(self) -> None:
+        """Decide anew whether calibration may use closed sessions: an operator has checked the joints' zeros."""
+        self._lifecycle.judge_readings()
 
     def confirm_prism_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Take the operator's word that the station is on the session's prism: its fixes count from now on."""
@@ -347,6 +332,34 @@ class SessionManager:
 
     # ---- parts -------------------------------------------------------------------------------------------------------
 
+    def _new_session(self, prism: str, kind: str, arguments: Mapping[str, Any], *, is_aimed: bool) -> OpenSession:
+        """Store a session in the set-up that is the current one now, or that is named; it is open once committed."""
+        setup_id, now = self._setups.usable(arguments.get("setup")), self._clock.now()
+        session_id = identifier(arguments, "id", "a session's id", default=self._table.free_id(prism))
+        if session_id in self._table.ids():
+            raise CommandError(f"session {session_id!r} exists already; choose another --id")
+        points = self._setups.control_points(setup_id)
+        session = OpenSession(session_id, setup_id, prism, kind, self._store.order, now, control_points=points)
+        self._prisms.begin(session)
+        if not is_aimed:
+            session.shots.append(Shot(0, now))
+        row = {
+            "setup_id": setup_id,
+            "prism": prism,
+            "operator": text_argument(arguments, "operator"),
+            **caller_columns(),
+            "kind": kind,
+            "note": text_argument(arguments, "note"),
+        }
+        self._lifecycle.start(now, session_id, self._rig_text, **row)
+        if self._aim is not None:
+            self._prisms.turned(session, now)
+        self._store.once_committed(partial(self._has_begun, session))
+        return session
+
+    def _has_begun(self, session: OpenSession) -> None:
+        self._open = session
+
     def _keep_shot(self, session: OpenSession, name: str, shot: Shot, most_off_mm: float) -> dict[str, Any]:
         """Store a shot before it is over, and what it tells of fixes that came before anything told where its point is.
 
@@ -395,10 +408,11 @@ class SessionManager:
     def _go_on(self) -> None:
         """Ready the sessions that an earlier run left to take fixes: of those that ended, what it did not decode."""
         self._open, self._ended = self._lifecycle.unfinished(self._rig_text)
-        self._lifecycle.judge_rig_files()
+        self._lifecycle.judge_readings()
         for session in self._taking():
             session.control_points = self._setups.control_points(session.setup_id)
             session.jumped = self._lifecycle.jumped(session)
+            session.constants_mm = first_constants_mm(self._store, session.id)
             self._prisms.restore(session)
         opened = self._open
         if opened is None:

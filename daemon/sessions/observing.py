@@ -14,7 +14,7 @@ from functools import partial
 from calibration.rig.description import Rig
 from daemon.acquisition.joiner import JoinedFix
 from daemon.commands import CHECK
-from daemon.sessions.open_session import OpenSession
+from daemon.sessions.open_session import CONSTANT_TOLERANCE_MM, OpenSession
 from daemon.sessions.prism_watch import PrismWatch
 from daemon.sessions.prisms.standstill_places import Exclusions, StandstillPlaces
 from daemon.sessions.station_setups import AXES, Place
@@ -132,6 +132,11 @@ class ObservationMaker:
                 return f"{joint} jumped: its readings from then on do not fit those before"
         if session.is_control_point(place_mm):
             return OF_CONTROL_POINT
+        constant_mm = joined.fix.prism_constant_mm
+        if constant_mm is not None:
+            first_mm = session.constants_mm.setdefault(joined.fix.station, constant_mm)
+            if abs(constant_mm - first_mm) > CONSTANT_TOLERANCE_MM:
+                return f"the station applies a prism constant of {constant_mm:g} mm, and {first_mm:g} mm at first"
         self._prisms.follow(session, joined, place_mm)
         return "moving" if session.kind in STANDING_KINDS and joined.standstill is None else None
 

@@ -11,6 +11,7 @@ from daemon.sessions.prisms.guard import PrismGuard, Word
 from daemon.sessions.station_setups import Place
 from drivers.clock import Order, Stamp, lies_within
 
+CONSTANT_TOLERANCE_MM = 0.05  # of a prism's constant: stations have it in steps of 0.1 mm
 CONTROL_POINT_RADIUS_MM = 300.0  # a fix this close to a control point is of the control point, not of the boom
 
 
@@ -24,6 +25,7 @@ class OpenSession:
             None while it is open.
         shots: when the station was on control points instead.
         jumped: joints whose encoder jumped in it, since when.
+        constants_mm: prism constants that its stations applied to their first fixes of it, by the stations' names.
         control_points: where those of its set-up are, mm.
         words: who said when that its stations are on its prism.
         guards: station -> what watches that it stays there; for the writer's thread.
@@ -39,6 +41,7 @@ class OpenSession:
     until: Stamp | None = None
     shots: list[Shot] = field(default_factory=list)
     jumped: dict[str, Stamp] = field(default_factory=dict)
+    constants_mm: dict[str, float] = field(default_factory=dict)
     control_points: list[Place] = field(default_factory=list)
     words: list[Word] = field(default_factory=list)
     guards: dict[str, PrismGuard] = field(default_factory=dict)

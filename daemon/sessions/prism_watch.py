@@ -17,7 +17,8 @@ from daemon.sessions.prisms.guard import CONFIRM, MotionLimit, PrismGuard, Suspi
 from daemon.sessions.prisms.standstill_places import Exclusions
 from daemon.sessions.station_setups import Place
 from daemon.store.queries.observations import fixes_since_used
-from daemon.store.queries.sessions import SessionTable, preset_jumps, prism_confirmations
+from daemon.store.queries.sessions import SessionTable, prism_confirmations
+from daemon.store.queries.zeros import preset_jumps
 from daemon.store.store import Store
 from drivers.clock import Clock, Stamp
 from drivers.readings import DeviceEvent, EventKind, Fix, LockState, Status

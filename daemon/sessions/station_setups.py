@@ -63,7 +63,10 @@ class StationSetups:
             raise CommandError(
                 f"rig {self._rig.name!r} has no prism {unknown[0]!r:.80}; it has {', '.join(self._rig.prism_names)}"
             )
-        points = {str(n): _place(n, place) for n, place in mapping_argument(arguments, "control_points").items()}
+        given = mapping_argument(arguments, "control_points")
+        if named := next((name for name in given if name in self._rig.prism_names), None):
+            raise CommandError(f"{named!r} is a prism of the rig; a control point stands still beside it")
+        points = {str(n): _place(n, place) for n, place in given.items()}
         row: dict[str, object] = {
             "instrument": text_argument(arguments, "instrument"),
             "serial": text_argument(arguments, "serial"),
@@ -117,6 +120,10 @@ class StationSetups:
                 REFUSED,
             )
         return wanted
+
+    def constant_mm(self, setup_id: str, prism: str) -> float | None:
+        """The prism constant that a set-up's description says is set for a prism; None where it says none."""
+        return self._table.constants_mm(setup_id).get(prism)
 
     def has_moved(self, setup_id: str) -> bool:
         """Return True if a control point of the set-up was not where it had been."""

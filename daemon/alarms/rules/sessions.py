@@ -96,14 +96,20 @@ def model_not_loaded(evidence: Evidence) -> Iterator[Finding]:
         yield f"model {evidence.model.id}", evidence.model.hindrance
 
 
-@rule("critical", "Check the joint's zero; then `rigcal model zeros-checked`, or calibrate again.", hold_s=10.0)
+@rule(
+    "critical",
+    "Check the joint's zero; then `rigcal model zeros-checked` (`rigcal session accept` without a live model), or "
+    "calibrate again.",
+    hold_s=10.0,
+)
 def zero_lost(evidence: Evidence) -> Iterator[Finding]:
     """The encoder of a joint has jumped, and nobody has checked its zero.
 
-    It has jumped since the live model was trained, or in the open session: the model gives no tip, the session
-    takes no more fixes. Cleared 10 s after neither holds.
+    It has jumped since the live model was trained, since the newest session was begun, or in the open session: the
+    model gives no tip, no job uses the sessions from before it, the open session takes no more fixes. Cleared 10 s
+    after none of these holds.
     """
     model = () if evidence.model is None else evidence.model.jumped
     session = () if evidence.session is None else evidence.session.jumped
-    for joint in dict.fromkeys((*model, *session)):
+    for joint in dict.fromkeys((*model, *session, *evidence.zeros_lost)):
         yield joint, f"{joint} has jumped by more than it can move; its zero is not what it was"

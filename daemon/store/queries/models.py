@@ -16,7 +16,8 @@ from typing import Any
 from daemon.store.connection import Connection
 from daemon.store.errors import NotInStoreError
 from daemon.store.queries.observations import first_observation_ns, newest_observation_ns
-from daemon.store.queries.sessions import SessionTable, preset_jumps
+from daemon.store.queries.sessions import SessionTable
+from daemon.store.queries.zeros import lost_zeros
 from drivers.clock import Clock
 
 _MODELS = """SELECT model.id, model.rig, model.path, model.manifest_sha256, model.stage, model.state,
@@ -147,7 +148,7 @@ class ModelTable:
         )
 
     def jumped(self, model: ModelRow) -> dict[str, int]:
-        """Devices whose readings jumped since the model was trained, beyond what an operator has checked.
+        """Devices whose readings jumped since the model was trained, beyond the jumps that an operator has checked.
 
         What a session measured after a jump is in no model, so jumps count from the start of the newest session. What
         came later is decided by boots and the monotonic clock: a wall clock may be wrong for whole boots.
@@ -155,13 +156,7 @@ class ModelTable:
         Returns:
             device -> number of its newest jump among the store's device events.
         """
-        sql = "SELECT coalesce(max(zeros_checked_through), 0) FROM model_states WHERE model_id = ?"
-        checked_through = self._store.number(sql, (model.id,)) or 0
-        jumps = preset_jumps(self._store, self._sessions.newest_start(model.sessions), checked_through)
-        newest: dict[str, int] = {}
-        for jump in jumps:
-            newest[jump.device] = max(jump.number, newest.get(jump.device, 0))
-        return dict(sorted(newest.items()))
+        return lost_zeros(self._store, self._rig, self._sessions.newest_start(model.sessions))
 
     def training_ns(self, model: ModelRow) -> tuple[int, int]:
         """UTC, ns, that `time_s` of its training counts from, and of the newest observation it was trained on."""

@@ -31,6 +31,11 @@ _FIXES = f"""SELECT fixes.* FROM calibration_sessions AS session CROSS JOIN boot
             WHERE session_id = ?1 AND excluded IS NULL AND used.station = ?2), 0)
     ORDER BY fixes.id"""
 
+# The oldest fix of each station that made an observation and says its prism constant.
+_FIRST_CONSTANTS = """SELECT fixes.station, fixes.prism_constant_mm, min(observations.id) AS oldest
+    FROM observations JOIN fixes ON fixes.id = fix_id
+    WHERE session_id = ? AND prism_constant_mm IS NOT NULL AND excluded IS NOT ? GROUP BY station"""
+
 
 class ObservationTable:
     """The observations of a store.
@@ -99,6 +104,12 @@ def newest_observation_ns(source: RowSource, session_ids: Sequence[str]) -> int:
     """Return UTC, ns, of the newest observation of sessions that calibration may use; 0 without one."""
     sql = "SELECT coalesce(max(utc_ns), 0) AS utc_ns FROM observations WHERE excluded IS NULL AND session_id IN ({})"
     return next(int(row["utc_ns"]) for row in source.rows(sql.format(marks(session_ids)), session_ids))
+
+
+def first_constants_mm(source: RowSource, session_id: str) -> dict[str, float]:
+    """Return the prism constants that stations applied to their first fixes of a session, by the stations' names."""
+    rows = source.rows(_FIRST_CONSTANTS, (session_id, OF_CONTROL_POINT))
+    return {row["station"]: row["prism_constant_mm"] for row in rows}
 
 
 def fixes_since_used(source: RowSource, session_id: str, station: str) -> Iterator[dict[str, Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 from daemon.host.time_service import ClockState
 from daemon.store.connection import Connection
 from daemon.store.errors import NotInStoreError
+from daemon.store.queries.zeros import lost_zeros, preset_jumps
 from daemon.store.rows import RowSource, marks
 from daemon.store.views import in_session
 from drivers.clock import NS_PER_S, Stamp
@@ -41,7 +43,9 @@ _INSTANTS = """WITH instants AS (
         UNION ALL SELECT started_boot_id, started_monotonic_ns, started_utc_ns FROM calibration_sessions WHERE id = ?1
         UNION ALL SELECT ended_boot_id, ended_monotonic_ns, ended_utc_ns FROM calibration_sessions
             WHERE id = ?1 AND ended_utc_ns IS NOT NULL)"""
-OTHER_RIG_FILE = "it was recorded with another rig file: "  # so begins why a session is not used that was
+# So begins why a session is not used that was recorded with another rig file, or before a joint's zero was lost.
+OTHER_RIG_FILE = "it was recorded with another rig file: "
+ZERO_LOST = "an encoder has jumped since, and nobody has checked its zero: "
 # Within a boot both clocks run alike, whatever NTP does to their rate: their difference changes only when the clock is
 # set. A later boot must not show an earlier time. The first query is cheap, and nearly always the answer.
 _MAY_HAVE_STEPPED = f"""{_INSTANTS} SELECT min(boot_id) < max(boot_id)
@@ -73,21 +77,30 @@ _BEFORE_ENCLOSED = """SELECT 1 FROM observations AS o WHERE o.session_id = ?1 AN
                 ON b.session_id = ?1 AND b.name = a.name AND b.phase = 'end'
             WHERE a.session_id = ?1 AND a.phase = 'start'
                 AND (a.boot_id, a.monotonic_ns) < (o.boot_id, o.monotonic_ns)) LIMIT 1"""
+# A control point that was shot again after poses, and how far from its place before: shots one after the other.
+_MOVED_BETWEEN = """SELECT a.name AS point, max((a.x_mm - b.x_mm) * (a.x_mm - b.x_mm)
+            + (a.y_mm - b.y_mm) * (a.y_mm - b.y_mm) + (a.z_mm - b.z_mm) * (a.z_mm - b.z_mm)) AS square_mm2
+    FROM control_shots AS a JOIN control_shots AS b ON b.session_id = a.session_id AND b.name = a.name
+        AND b.id = (SELECT min(c.id) FROM control_shots AS c
+            WHERE c.session_id = a.session_id AND c.name = a.name AND c.id > a.id)
+    WHERE a.session_id = ? AND EXISTS (SELECT 1 FROM observations AS o
+        WHERE o.session_id = a.session_id AND o.excluded IS NULL
+            AND (a.boot_id, a.monotonic_ns) < (o.boot_id, o.monotonic_ns)
+            AND (o.boot_id, o.monotonic_ns) < (b.boot_id, b.monotonic_ns))"""
 _BETWEEN = """SELECT 1 FROM observations AS o JOIN control_shots AS c ON c.session_id = o.session_id AND c.name = ?
     WHERE o.session_id = ? AND o.excluded IS NULL
         AND (o.boot_id, o.monotonic_ns) > (c.boot_id, c.monotonic_ns) LIMIT 1"""
-# A boot's number rises from boot to boot, and monotonic_ns within one; utc_ns may step.
-_JUMPS = """SELECT id, device, utc_ns, monotonic_ns, boot_id FROM device_events
-    WHERE kind = 'preset_jump' AND (boot_id, monotonic_ns) >= (?, ?) AND id > ? ORDER BY boot_id, monotonic_ns, id"""
 # The newest fix of each standstill, by session, from an instant on.
 _STANDING = """SELECT max(o.id) AS id, o.session_id, o.prism, o.x_mm, o.y_mm, o.z_mm, o.values_json
     FROM calibration_sessions AS s JOIN observations AS o ON o.session_id = s.id
     WHERE s.setup_id = ? AND s.rig = ? AND s.state != 'aborted' AND o.excluded IS NULL AND o.pose IS NOT NULL
+        AND coalesce(s.excluded, '') NOT LIKE ?
         AND (o.boot_id, o.monotonic_ns) >= (?, ?)
     GROUP BY o.session_id, o.pose ORDER BY id DESC LIMIT 500"""
 # Those after the newest session that is used: later measurements make up for the earlier ones.
 _UNTRAINED = f"""SELECT id, excluded FROM calibration_sessions
-    WHERE rig = ?1 AND state = 'closed' AND excluded IS NOT NULL AND excluded NOT LIKE '{OTHER_RIG_FILE}%' AND rowid >
+    WHERE rig = ?1 AND state = 'closed' AND excluded IS NOT NULL AND excluded NOT LIKE '{OTHER_RIG_FILE}%'
+        AND excluded NOT LIKE '{ZERO_LOST}%' AND rowid >
         (SELECT coalesce(max(rowid), 0) FROM calibration_sessions
             WHERE rig = ?1 AND state = 'closed' AND excluded IS NULL)
     ORDER BY rowid"""
@@ -117,21 +130,6 @@ class OpenSessionRow:
     id: str
     started: Stamp
     jumped: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Jump:
-    """A joint's encoder that has jumped by more than the joint can move.
-
-    Attributes:
-        number: of the device event.
-        device: name of the joint.
-        at: when.
-    """
-
-    number: int
-    device: str
-    at: Stamp
 
 
 class SessionTable:
@@ -201,7 +199,7 @@ class SessionTable:
     def untrained(self) -> dict[str, str]:
         """Closed sessions of the rig that calibration does not use, newer than all that it uses -> why.
 
-        Those that were recorded with another rig file are history, and left out.
+        Those that were recorded with another rig file, or before a joint's zero was lost, are history, and left out.
         """
         return {row["id"]: row["excluded"] for row in self._store.rows(_UNTRAINED, (self._rig,))}
 
@@ -218,6 +216,13 @@ class SessionTable:
             (self._rig,),
         )
         return next((self._store.stamp(row, "started_") for row in rows if row["id"] in session_ids), None)
+
+    def zeros_lost(self) -> list[str]:
+        """Devices whose encoder has jumped since the newest closed session was started, their zeros not checked."""
+        sql = """SELECT started_utc_ns, started_monotonic_ns, started_boot_id FROM calibration_sessions
+            WHERE rig = ? AND state = 'closed' ORDER BY rowid DESC LIMIT 1"""
+        rows = self._store.rows(sql, (self._rig,))
+        return [*lost_zeros(self._store, self._rig, self._store.stamp(rows[0], "started_"))] if rows else []
 
     def rig_of(self, session_ids: Sequence[str]) -> str | None:
         """SHA-256 of the rig file of the newest of some sessions; None without any of them."""
@@ -271,6 +276,11 @@ class SessionTable:
         """Point, phase and misclosure_mm of a session's control shots, oldest first."""
         return self._store.rows(_SHOTS, (session_id,))
 
+    def moved_between(self, session_id: str) -> tuple[str, float] | None:
+        """The control point that moved most between two shots with poses in between, and by how many mm, if any."""
+        (found,) = self._store.rows(_MOVED_BETWEEN, (session_id,))
+        return None if found["point"] is None else (found["point"], math.sqrt(found["square_mm2"]))
+
     def has_poses_before_enclosed(self, session_id: str) -> bool:
         """True if poses lie after a session's first shot and before any of a point that was shot again at the end."""
         return bool(self._store.rows(_BEFORE_ENCLOSED, (session_id,)))
@@ -285,6 +295,8 @@ class SessionTable:
     def standing(self, setup_id: str, since: Stamp | None) -> list[dict[str, Any]]:
         """The newest observation of each standstill at a set-up that calibration may use, oldest first.
 
+        Those of sessions that were recorded with another rig file are left out.
+
         Args:
             setup_id: of the station.
             since: earlier ones do not count; all do when None.
@@ -293,7 +305,7 @@ class SessionTable:
             session_id, prism, x_mm, y_mm, z_mm and values_json, at most 500 of them.
         """
         first = (0, 0) if since is None else self._store.order(since)
-        return self._store.rows(_STANDING, (setup_id, self._rig, *first))[::-1]
+        return self._store.rows(_STANDING, (setup_id, self._rig, f"{OTHER_RIG_FILE}%", *first))[::-1]
 
     def add_confirmation(self, session_id: str, at: Stamp, **columns: object) -> None:
         """Add a word that the session's stations are on its prism: `operator` and caller, or `turning`."""
@@ -354,19 +366,6 @@ def joints_measured(source: RowSource, session_id: str) -> Iterator[dict[str, An
 def fixes_measured(source: RowSource, session_id: str) -> Iterator[dict[str, Any]]:
     """Return the rows of `v_fixes` from the start of a session that has ended to its end, oldest first."""
     return iter(source.rows(_FIXES_MEASURED, (session_id,)))
-
-
-def preset_jumps(store: Connection, since: Stamp | None, after_number: int = 0) -> list[Jump]:
-    """Return the encoder jumps from an instant on, in their order.
-
-    Args:
-        store: the database.
-        since: the instant; from the first jump on when None.
-        after_number: only those with a greater number.
-    """
-    first = (0, 0) if since is None else store.order(since)
-    rows = store.rows(_JUMPS, (*first, after_number))
-    return [Jump(row["id"], row["device"], store.stamp(row)) for row in rows]
 
 
 def _summary(source: RowSource, session_id: str) -> dict[str, Any]:

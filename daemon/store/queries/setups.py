@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -66,6 +67,11 @@ class SetupTable:
         """The state of each set-up, oldest first."""
         rows = self._store.rows("SELECT id, state FROM station_setups ORDER BY rowid")
         return {row["id"]: row["state"] for row in rows}
+
+    def constants_mm(self, setup_id: str) -> dict[str, float]:
+        """The prism constants that a set-up's description gives, by the prisms' names."""
+        rows = self._store.rows("SELECT prism_constants_json FROM station_setups WHERE id = ?", (setup_id,))
+        return {prism: mm for row in rows for prism, mm in json.loads(row["prism_constants_json"]).items()}
 
     def current(self) -> SetupRow | None:
         """The set-up that the station stands in; None before the first.

@@ -86,3 +86,16 @@ def test_a_request_has_no_other_members(daemon: Config) -> None:
 def test_a_name_that_cannot_be_printed_is_told_safely(daemon: Config) -> None:
     assert "unknown argument \\x1b[2J;" in refused(daemon.socket_path, "status", **{"\x1b[2J": 1})
     assert len(refused(daemon.socket_path, "status", **{"x" * 100_000: 1})) < 200
+
+
+def test_an_argument_that_is_null_is_as_if_it_were_not_given(daemon: Config) -> None:
+    asked = {"prism": "r", "kind": None, "setup": None, "id": None, "note": None, "operator": None}
+    opened = request(daemon.socket_path, "session.start", asked)
+    assert opened["kind"] == "static_poses"
+    request(daemon.socket_path, "session.abort", {"operator": None})
+    described = {"id": "S4", "control_points": None, "note": None}
+    guide = request(daemon.socket_path, "guide.start", {"prisms": ["r"], "new_setup": described, "setup": None})[
+        "guide"
+    ]
+    assert guide["setup"] == "S4"
+    request(daemon.socket_path, "guide.stop", {"reason": "seen"})

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import sqlite3
+import threading
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_inputs
+from daemon.commands import HOW_TO_END, CommandError
 from daemon.guide.manager import GuideManager
 from daemon.guide.meter_link import Place
 from tests.daemon.damage import fill_up, make_room
@@ -104,6 +106,50 @@ def test_a_guide_that_is_abandoned_while_its_session_is_being_opened_leaves_none
     assert [session["state"] for session in rig.keeper.list_command({})] == ["aborted"]
     assert rig.known()["state"] == "abandoned"
     assert rig.guided("start", new_setup={"id": "S2"}, prisms=["r"], poses=6, check_poses=0)["state"] == "open"
+
+
+def test_no_guide_is_opened_beside_a_session_that_is_being_started(rig: GuidedRig) -> None:
+    refused: list[CommandError] = []
+
+    def guide() -> None:
+        try:
+            rig.guided("start", setup="S1", prisms=["r"], poses=6, check_poses=0)
+        except CommandError as error:
+            refused.append(error)
+
+    asking = threading.Thread(target=guide)
+
+    def aim(_target: str) -> None:  # it takes a while, and another client asks for a guide
+        asking.start()
+        asking.join(timeout=1.0)
+
+    rig.keeper = rig.new_keeper(aim)
+    rig.guide = rig.new_guide()
+    rig.say("setup_new", id="S1")
+    opened = rig.say("start", prism="r", kind="check")
+    asking.join()
+    assert [str(error) for error in refused] == [f"session {opened['id']!r} is open; {HOW_TO_END}"]
+    assert rig.guide.state_command({}) == {"guide": None}
+
+
+def test_no_session_is_started_beside_a_guide_that_is_being_opened(rig: GuidedRig) -> None:
+    start = rig.guide.guarding("session.start", rig.keeper.start_command)
+    rig.guided("start", new_setup={"id": "S1"}, prisms=["r"], poses=6, check_poses=0)
+    with pytest.raises(CommandError, match=r"session\.start is not carried out: guide 1 is open"):
+        start({"prism": "r"})
+
+
+@pytest.mark.parametrize(
+    "other", [{"prism": "r", "kind": "check"}, {"prism": "r", "setup": "S0"}, {"prism": "r"}, {"prism": "s"}]
+)
+def test_a_guide_takes_no_other_session_for_its_own(rig: GuidedRig, other: dict[str, Any]) -> None:
+    rig.say("setup_new", id="S0")
+    rig.guided("start", new_setup={"id": "S1"}, prisms=["r"], poses=6, check_poses=0)
+    rig.say("start", **other)
+    rig.guide._worker._look()
+    shown = rig.guide.state_command({})["guide"]
+    assert shown["session"] in ("", None)
+    assert any("is open" in told["text"] for told in shown["messages"])
 
 
 @pytest.mark.parametrize("command", ["skip", "stop"])

@@ -6,7 +6,7 @@ import pytest
 
 from daemon.alarms.evidence import Evidence
 from daemon.alarms.rules.sessions import setup_moved
-from daemon.commands import CommandError
+from daemon.commands import CommandError, acting_for
 from daemon.store.queries.guides import GuideTable
 from daemon.store.queries.sessions import SessionTable
 from daemon.store.queries.setups import SetupTable
@@ -89,3 +89,24 @@ def test_an_open_guide_says_where_the_station_stands(rig: Rig) -> None:
     assert rig.setups.current() == "S1", "until its first session is open, too"
     GuideTable(rig.store, "ur10").open(rig.clock.now(), "S2", "", {})
     assert rig.setups.current() == "S1", "another rig's says nothing"
+
+
+def test_a_set_up_that_is_described_while_a_session_is_being_started_is_the_sessions_own(session_rig: Rig) -> None:
+    def aim(_target: str) -> None:  # it takes a while, as what tells prisms apart does at the first session
+        session_rig.say("setup_new", id="S2")
+
+    session_rig.keeper = session_rig.new_keeper(aim)
+    assert session_rig.say("start", prism="r")["setup"] == "S2"
+    assert session_rig.setups.current() == "S2"
+
+
+def test_a_session_is_not_opened_for_a_caller_who_has_left(session_rig: Rig) -> None:
+    with acting_for(None, lambda: True), pytest.raises(CommandError, match="given up, as nobody waits"):
+        session_rig.say("start", prism="r")
+    assert session_rig.keeper.open_session() is None
+
+
+def test_a_control_point_is_none_of_the_prisms(session_rig: Rig) -> None:
+    with pytest.raises(CommandError, match="'r' is a prism of the rig"):
+        session_rig.say("setup_new", id="S2", control_points={"r": [1.0, 2.0, 3.0]})
+    assert [setup["id"] for setup in session_rig.setups.list_command({})] == ["S1"]

@@ -297,3 +297,12 @@ def test_people_are_told_that_a_session_is_not_used_and_what_to_type(session_rig
         assert "does not use" not in told
     finally:
         server.close()
+
+
+def test_a_bad_shot_that_is_made_anew_before_any_pose_counts_for_nothing(session_rig: Rig) -> None:
+    session_rig.say("start", prism="r")
+    session_rig.shoot("cp1", (CP1[0] + 4000.0, *CP1[1:]))
+    session_rig.shoot("cp1", CP1)
+    session_rig.live(2)
+    session_rig.shoot("cp1", CP1)
+    assert session_rig.say("stop")["not_used"] is None

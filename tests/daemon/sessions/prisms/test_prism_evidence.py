@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from calibration.identification.prism_identity import PrismIdentity
+from calibration.rig.description import parse_rig
 from daemon.sessions.prisms.evidence import IdentityLoader, PrismEvidence, Sighting, Verdict, targets
 from daemon.sessions.station_setups import Place
 from drivers.readings import EventKind
@@ -248,3 +249,43 @@ def test_an_earlier_session_on_the_wrong_prism_does_not_make_the_right_one_wrong
     (finding,) = evidence._judge(identity, [stretch])
     assert finding.stretch.verdict is Verdict.NAMED
     assert len(targets(RIG, [])) == 0
+
+
+def test_a_station_that_was_knocked_while_its_fixes_were_suspected_has_moved(rig: TrueRig) -> None:
+    def stand(pose: int, knock_mm: float, seconds: float = 2.0) -> None:
+        rig.values = dict(zip(RIG.joint_names, map(float, POSES[pose]), strict=True))
+        east, north, up = place_mm("r", rig.values)
+        rig.target_mm = (east + knock_mm, north, up)
+        rig.live(seconds)
+
+    session = rig.say("start", prism="r")["id"]
+    rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    stand(0, 0.0, 0.3)
+    stand(1, 0.0)
+    assert (rig.used(session), len(rig.keeper.prism_suspicions())) == (0, 1)
+    again = rig.shoot("cp1", (9060.0, 500.0, 2000.0))
+    assert (again["phase"], again["misclosure_mm"]) == ("start", None), "as it seems, no pose came before it"
+    for pose in range(4, 9):
+        stand(pose, 60.0)
+    rig.shoot("cp1", (9060.0, 500.0, 2000.0))
+    ended = rig.say("stop")
+    assert ended["observations"] > 100, "the joints have told that all were of the prism, also those before the knock"
+    assert ended["not_used"] == "control point cp1 was 60.0 mm off when it was shot again, so the station had moved"
+
+
+def test_sessions_of_a_rig_file_that_was_wrong_do_not_speak_against_a_prism(rig: TrueRig) -> None:
+    rig.say("start", prism="r")
+    for pose in range(5):
+        rig.values = dict(zip(RIG.joint_names, map(float, POSES[pose]), strict=True))
+        rig.target_mm = place_mm("r", rig.values)
+        rig.values["theta4"] += 8.0
+        rig.live(2.0)
+    rig.say("stop")
+    l2 = 'name = "L2"\ndevice = "cia406_linear"\nnode = 48\n'
+    rig.machine = parse_rig(rig.machine.text.replace(l2, f"{l2}zero_counts = -2000\n"), "rig")
+    rig.keeper = rig.new_keeper()
+    session = rig.say("start", prism="r")["id"]
+    for pose in range(5, 10):
+        rig.stand(pose, "r")
+    assert rig.keeper.prism_suspicions() == []
+    assert rig.used(session) > 100

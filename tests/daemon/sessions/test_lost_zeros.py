@@ -1,0 +1,124 @@
+"""Sessions before and after the jump of a joint's encoder, whose zero is then another one."""
+
+from __future__ import annotations
+
+from daemon.store.queries.sessions import ZERO_LOST, SessionTable
+from daemon.store.queries.zeros import lost_zeros
+from drivers.readings import DeviceEvent, EventKind
+from tests.daemon.session_support import SOURCE, Rig, controlled
+
+LOST = f"{ZERO_LOST}theta1"
+
+
+def jump(rig: Rig, device: str = "theta1", degrees: float = 8.2) -> None:
+    """Have an encoder jump, as its decoder tells it."""
+    rig.clock.advance(1.0)
+    event = DeviceEvent(device, rig.clock.now(), EventKind.PRESET_JUMP, "position jumped")
+    if device in rig.values:
+        rig.values[device] += degrees
+    rig.store.insert_records([event])
+    rig.keeper.on_records([event])
+    rig.clock.advance(1.0)
+
+
+def used(rig: Rig) -> list[str]:
+    return [row["id"] for row in SessionTable(rig.store, SOURCE.rig.name).used()]
+
+
+def check_zeros(rig: Rig, trained_on: str) -> None:
+    """Give an operator's word that the zeros are those of a live model that was trained on a session."""
+    now = rig.store.instant(rig.clock.now(), "created_")
+    done = {"kind": "identification", "state": "done", "result_json": {"sessions": [trained_on]}}
+    made = {"rig": SOURCE.rig.name, "path": "", "manifest_sha256": "", "stage": "geometric", "state": "live"}
+    model = rig.store.insert("models", made | {"job_id": rig.store.insert("jobs", done | now)} | now)
+    through = rig.store.number("SELECT max(id) FROM device_events", ())
+    word = {"model_id": model, "state": "live", "reason": "zeros checked", "zeros_checked_through": through}
+    rig.store.insert("model_states", word | rig.store.instant(rig.clock.now()))
+    rig.keeper.zeros_checked()
+
+
+def test_sessions_before_and_after_a_jump_are_not_calibrated_together(session_rig: Rig) -> None:
+    before = controlled(session_rig)
+    jump(session_rig)
+    assert used(session_rig) == []
+    assert session_rig.say("show", id=before)["not_used"] == LOST
+    sessions = SessionTable(session_rig.store, SOURCE.rig.name)
+    assert sessions.zeros_lost() == ["theta1"], "somebody must look at it, also where no model is live"
+    assert sessions.untrained() == {}
+    after = controlled(session_rig)
+    assert used(session_rig) == [after]
+    assert sessions.zeros_lost() == []
+
+
+def test_a_session_in_which_an_encoder_jumps_is_not_calibrated_with_the_one_that_is_begun_anew(
+    session_rig: Rig,
+) -> None:
+    first = session_rig.say("start", prism="r")["id"]
+    session_rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    session_rig.live(2)
+    jump(session_rig)
+    session_rig.live(1)
+    session_rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    ended = session_rig.say("stop")
+    assert ended["not_used"] == LOST
+    assert any("start anew" in sentence for sentence in ended["advice"])
+    second = controlled(session_rig)
+    assert used(session_rig) == [second] != [first]
+    session_rig.keeper = session_rig.new_keeper()  # as a daemon that was started again
+    assert used(session_rig) == [second]
+
+
+def test_a_jump_of_something_that_is_no_joint_takes_no_session_away(session_rig: Rig) -> None:
+    name = controlled(session_rig)
+    jump(session_rig, "boom_valve")
+    assert used(session_rig) == [name]
+
+
+def test_an_operators_word_about_the_zeros_brings_back_the_sessions_of_the_live_model(session_rig: Rig) -> None:
+    before = controlled(session_rig)
+    jump(session_rig)
+    session_rig.values["theta1"] -= 8.2
+    after = controlled(session_rig)
+    check_zeros(session_rig, before)
+    assert used(session_rig) == [before, after]
+    jump(session_rig)
+    assert used(session_rig) == []
+
+
+def test_a_session_between_a_lost_zero_and_its_being_set_back_stays_out(session_rig: Rig) -> None:
+    before = controlled(session_rig)
+    jump(session_rig)
+    between = controlled(session_rig)
+    jump(session_rig, degrees=-8.2)  # the preset that sets it back is a jump as well
+    check_zeros(session_rig, before)
+    after = controlled(session_rig)
+    assert used(session_rig) == [before, after]
+    assert session_rig.say("show", id=between)["not_used"] == LOST
+
+
+def test_an_accepted_session_is_used_until_the_next_jump(session_rig: Rig) -> None:
+    name = controlled(session_rig)
+    jump(session_rig)
+    session_rig.say("accept", id=name, operator="Ada")
+    assert used(session_rig) == [name]
+    session_rig.keeper = session_rig.new_keeper()
+    assert used(session_rig) == [name]
+    jump(session_rig)
+    assert used(session_rig) == []
+
+
+def test_a_word_about_a_model_that_is_newer_than_all_jumps_changes_nothing(session_rig: Rig) -> None:
+    early = session_rig.clock.now()
+    jump(session_rig)
+    name = controlled(session_rig)
+    check_zeros(session_rig, name)
+    assert list(lost_zeros(session_rig.store, SOURCE.rig.name, early)) == ["theta1"]
+
+
+def test_a_session_says_all_that_speaks_against_it(session_rig: Rig) -> None:
+    session_rig.say("start", prism="r")
+    session_rig.live(2)
+    session_rig.say("stop")
+    jump(session_rig)
+    told = session_rig.say("list")[0]["not_used"]
+    assert told.startswith(f"{LOST}; no control point was shot")

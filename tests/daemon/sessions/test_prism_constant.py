@@ -1,0 +1,66 @@
+"""The prism constant that a station applies, as its records say it."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from drivers.readings import Fix
+from tests.daemon.session_support import Rig, closed_afterwards, controlled
+from tests.daemon.store_support import table
+
+
+class ConstantRig(Rig):
+    """A rig whose station says the prism constant that is set on it."""
+
+    constant_mm: float | None = -30.0
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.say("setup_new", id="S1", prism_constants_mm={"r": -30.0})
+
+    def fix(self) -> Fix:
+        found = super().fix()
+        applied_mm = -30.0 if self.constant_mm is None else self.constant_mm
+        assert found.slope_distance_m is not None
+        distance_m = found.slope_distance_m + (applied_mm + 30.0) / 1000
+        return dataclasses.replace(found, slope_distance_m=distance_m, prism_constant_mm=self.constant_mm)
+
+
+rig = closed_afterwards(ConstantRig)
+OTHER = "the station applies a prism constant of 0 mm, and -30 mm at first"
+
+
+def test_fixes_with_another_prism_constant_than_the_session_began_with_are_not_used(rig: ConstantRig) -> None:
+    name = rig.say("start", prism="r")["id"]
+    rig.live(2)
+    rig.constant_mm = 0.0
+    rig.live(2)
+    rig.keeper = rig.new_keeper()  # a restart of the daemon forgets nothing of it
+    rig.live(2)
+    rig.constant_mm = -30.0
+    rig.live(2)
+    assert rig.say("show", id=name)["excluded"][OTHER] > 40
+    constants = {row["id"]: row["prism_constant_mm"] for row in table(rig.store.path, "fixes")}
+    used = [row["fix_id"] for row in table(rig.store.path, "observations") if row["excluded"] is None]
+    assert {constants[fix] for fix in used} == {-30.0}
+    assert len(used) == 60, "40 before, and 20 after the boom stood long enough again"
+
+
+def test_a_station_that_does_not_say_its_prism_constant_is_taken_at_its_word(rig: ConstantRig) -> None:
+    rig.constant_mm = None
+    name = controlled(rig)
+    assert rig.say("show", id=name)["observations"] > 20
+
+
+def test_a_constant_that_is_not_the_one_of_the_set_up_is_told_at_the_sessions_end(rig: ConstantRig) -> None:
+    rig.constant_mm = 0.0
+    rig.say("start", prism="r")
+    rig.live(2)
+    (told,) = [line for line in rig.say("stop")["advice"] if "constant" in line]
+    assert told.startswith("station applies a prism constant of 0 mm, and set-up S1 says -30 mm for r")
+    rig.constant_mm = -30.0
+    rig.clock.advance(1.0)
+    rig.say("start", prism="r")
+    rig.live(2)
+    assert not [line for line in rig.say("stop")["advice"] if "constant" in line]
