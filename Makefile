@@ -26,6 +26,7 @@ environment:
 	@$(BOOTSTRAP) .venv requirements-dev.lock
 
 setup: environment $(KERNELS)/warm ## the virtual environment, and kernels compiled ahead
+	@$(if $(filter setup,$(MAKECMDGOALS)),echo "rigcal is set up in .venv; make demo shows a whole calibration on a simulated rig")
 
 # Once for each state of the sources. A directory that cannot be written is said, and stops nothing.
 $(KERNELS)/warm: | environment

@@ -111,8 +111,10 @@ if [ -z "$editable" ] || [ "$(cat "$stamp" 2>/dev/null)" != "$state" ]; then
         die "pip could not install the locked packages ($lock) for Python $version; its message is above. If it speaks of" \
             "connections or retries, the package index cannot be reached: check the network or pip's proxy and index settings"
     if [ -n "$editable" ]; then
-        # setuptools warns of every editable installation that it is one.
-        PYTHONWARNINGS=ignore "$venv/bin/python" -m pip install --quiet --no-deps --no-build-isolation --editable "$root"
+        # A path (compat) and not a finder, which is asked after the path: in the parent of a clone named rigcal the
+        # clone itself would be the package, and an empty one. setuptools warns of every editable installation.
+        PYTHONWARNINGS=ignore "$venv/bin/python" -m pip install --quiet --no-deps --no-build-isolation \
+            --config-settings editable_mode=compat --editable "$root"
     else
         # What an earlier build left behind would be packed again.
         rm -rf "$root/build"

@@ -6,13 +6,15 @@ pip's settings.
 
 import os
 import shutil
+import site
+import subprocess
 import sys
 from pathlib import Path
 from subprocess import CompletedProcess
 
 import pytest
 
-from tests.deploy.conftest import DEPLOY, run
+from tests.deploy.conftest import DEPLOY, REPOSITORY, run
 
 VERSION = f"{sys.version_info.major}.{sys.version_info.minor}"
 INTERPRETER = Path(sys.base_prefix) / "bin" / f"python{VERSION}"
@@ -170,3 +172,33 @@ def test_an_installation_that_failed_is_tried_again(tree: Tree) -> None:
     executable(tree.path / "venv/bin/python", f'echo "$@" >>"{log}"\n')
     assert tree.bootstrap("-e").returncode == 0
     assert log.read_text(encoding="utf-8").count("pip install") == 2
+
+
+def test_a_clone_that_is_named_as_its_package_is_no_package_to_its_parent(tmp_path: Path) -> None:
+    """git names a clone after its project; Python finds it there as an empty package, before any finder is asked."""
+    clone = tmp_path / "arm"
+    clone.mkdir()
+    tree = Tree(clone)
+    (clone / "lock").write_text("# nothing\n", encoding="utf-8")
+    project = '[project]\nname = "arm"\nversion = "1"\n[tool.setuptools]\npackages.find.include = ["arm*"]\n'
+    (clone / "pyproject.toml").write_text(project, encoding="utf-8")
+    (clone / "arm").mkdir()
+    (clone / "arm" / "__init__.py").write_text("IS_HERE = True\n", encoding="utf-8")
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", clone / "venv"], check=True)
+    tools = f"import sys; sys.path.append({site.getsitepackages()[0]!r})\n"  # pip and setuptools, as they are here
+    (next((clone / "venv").glob("lib/python*/site-packages")) / "tools.pth").write_text(tools, encoding="utf-8")
+    result = tree.bootstrap("-e")
+    assert result.returncode == 0, result.stdout
+    python = clone / "venv/bin/python"
+    found = subprocess.run(
+        [python, "-c", "import arm; print(arm.IS_HERE)"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert found.stdout == "True\n", found.stderr
+
+
+def test_setup_ends_with_what_comes_next_and_the_targets_that_need_it_do_not() -> None:
+    def planned(target: str) -> str:
+        return run("make", "--directory", str(REPOSITORY), "--dry-run", target).stdout
+
+    assert "make demo shows a whole calibration" in planned("setup")
+    assert "make demo shows a whole calibration" not in planned("demo")
