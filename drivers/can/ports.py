@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import abc
 import contextlib
+import errno
 import fcntl
 import itertools
 import os
@@ -121,7 +122,7 @@ def open_port(config: CanLinkConfig) -> CanPort:
             port = _port(bus, config)
         except (can.CanError, OSError, ValueError, TypeError) as error:
             what = f"{config.interface} {config.channel!r}"
-            raise LinkError(config.name, f"cannot open {what}: {_message_of(error)}; {_hint(config)}") from error
+            raise LinkError(config.name, f"cannot open {what}: {_message_of(error)}; {_hint(config, error)}") from error
         on_failure.pop_all()
         return port
 
@@ -140,10 +141,16 @@ def _port(bus: can.BusABC, config: CanLinkConfig) -> CanPort:
 
 
 def _message_of(error: BaseException) -> str:
+    """Return the system's reason in its words alone, where there is one; libraries quote it with the path, twice."""
+    cause = error.__cause__ or error
+    if isinstance(cause, OSError) and cause.errno is not None and cause.errno > 0:
+        return os.strerror(cause.errno)
     return str(error).strip().rstrip(".") or type(error).__name__
 
 
-def _hint(config: CanLinkConfig) -> str:
+def _hint(config: CanLinkConfig, error: BaseException) -> str:
+    if isinstance(error, OSError) and error.errno == errno.EAFNOSUPPORT:
+        return "the kernel has no CAN support here: load it with `modprobe can_raw`, for a container on its host"
     if config.interface == "socketcan":
         mode = f"bitrate {config.bitrate or 250_000} listen-only {'off' if config.allow_transmit else 'on'}"
         return f"try: ip link set {config.channel} up type can {mode} restart-ms 100"

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import socket
 import struct
@@ -8,6 +9,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NoReturn
 
 import can
 import pytest
@@ -254,7 +256,7 @@ def test_a_bus_that_cannot_be_opened_is_told_once_with_what_to_do(allow_transmit
     assert event.kind is EventKind.LINK_LOST
     assert event.text.startswith("boom: cannot open socketcan 'can-none': ")
     hint = f"try: ip link set can-none up type can bitrate 125000 listen-only {listen_only} restart-ms 100"
-    assert event.text.endswith(hint)
+    assert event.text.endswith(hint) or "the kernel has no CAN support here" in event.text
     (gap,) = heard.gaps
     assert (gap.channel, gap.reason, gap.end) == ("boom", GapReason.LINK_DOWN, None)
     assert 0 <= gap.start.since(start) <= event.stamp.since(start)
@@ -273,6 +275,31 @@ def test_settings_that_open_nothing_are_a_link_error(
 ) -> None:
     with pytest.raises(LinkError, match=rf"^boom: cannot open {interface} .*{text}"):
         open_port(settings(interface, channel, options))
+
+
+def test_what_the_system_said_of_a_missing_adapter_is_told_once() -> None:
+    with pytest.raises(LinkError) as refused:
+        open_port(settings("slcan", "/dev/no-such-adapter", {}))
+    assert str(refused.value) == (
+        "boom: cannot open slcan '/dev/no-such-adapter': No such file or directory; check that the adapter is plugged "
+        "in, that this user may use the port, and the bitrate"
+    )
+
+
+@pytest.mark.parametrize(
+    ("code", "hint"), [(errno.EAFNOSUPPORT, "`modprobe can_raw`"), (errno.ENODEV, "try: ip link set can0 up ")]
+)
+def test_an_interface_that_a_kernel_without_can_refuses_is_not_said_to_be_down(
+    monkeypatch: pytest.MonkeyPatch, code: int, hint: str
+) -> None:
+    def refusing(*_arguments: object, **_options: object) -> NoReturn:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(can, "Bus", refusing)  # which of the two a kernel says is not the test's to choose
+    with pytest.raises(LinkError) as refused:
+        open_port(settings("socketcan", "can0", {}))
+    assert f"cannot open socketcan 'can0': {os.strerror(code)}; " in str(refused.value)
+    assert hint in str(refused.value)
 
 
 def settings(interface: Interface, channel: str, options: dict[str, object]) -> CanLinkConfig:
