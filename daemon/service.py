@@ -153,6 +153,7 @@ class Daemon:
             self._live_model,
             compare=self._jobs.compare,
             comparison_job=self._job_table.comparison_of,
+            comparison_after=self._job_table.comparison_after,
             zeros_checked=self._sessions.zeros_checked,
         )
         self._guide = GuideManager(

@@ -32,6 +32,8 @@ class ModelRegistry:
         live: the model in use.
         compare: queues the comparison of a model with the live one, and says so.
         comparison_job: tells the job that is yet to compare a model; None without one.
+        comparison_after: tells the job that is yet to compare the model which a later stage makes of a model, and the
+            job that makes it; None without one.
         zeros_checked: takes that an operator has checked the joints' zeros, when that is stored.
     """
 
@@ -43,10 +45,12 @@ class ModelRegistry:
         *,
         compare: Callable[[ModelRow], str],
         comparison_job: Callable[[ModelRow], int | None],
+        comparison_after: Callable[[ModelRow], tuple[int, int] | None],
         zeros_checked: Callable[[], None] = lambda: None,
     ) -> None:
         self._table, self._rig, self._live = table, rig_name, live
-        self._compare, self._comparison_job, self._zeros_checked = compare, comparison_job, zeros_checked
+        self._compare, self._comparison_job, self._comparison_after = compare, comparison_job, comparison_after
+        self._zeros_checked = zeros_checked
         # The candidate that was last loaded for `status`, its files as they lay there, and why it cannot go live.
         self._loaded: tuple[tuple[int, _Files], str | None] | None = None
 
@@ -196,6 +200,9 @@ class ModelRegistry:
         again = f"; `rigcal model compare {model.id}` compares it anew"
         if (compared is None or is_stale) and (job := self._comparison_job(model)) is not None:
             again = f"; job {job} is yet to compare it: wait for that job"
+        elif compared is None and (later := self._comparison_after(model)) is not None:
+            job, maker = later
+            again = f"; job {job} compares the model that job {maker} makes of the same sessions: wait for that one"
         elif compared is None:
             again = f": hold a check session (`rigcal session start --kind check`){again}"
         if compared is None:

@@ -67,6 +67,7 @@ class ModelRig:
             self.live,
             compare=self.job_table.compare,
             comparison_job=self.job_table.table.comparison_of,
+            comparison_after=self.job_table.table.comparison_after,
         )
         self.joiner = joiner(Config(rig="swdt82"), rig)
         self.setup: str | None = None

@@ -194,6 +194,19 @@ class JobTable:
         found = self._store.rows(sql, (model.id, str(model.path)))
         return int(found[0]["id"]) if found else None
 
+    def comparison_after(self, model: ModelRow) -> tuple[int, int] | None:
+        """Return the job that is yet to compare the model of a later stage, and the job that makes that; or None.
+
+        The model of a later stage is made from this one and of the same sessions.
+        """
+        sql = """SELECT job.id, job.depends_on FROM jobs AS job JOIN jobs AS later ON later.id = job.depends_on
+            JOIN jobs AS made ON made.id = later.depends_on
+            WHERE job.kind = 'comparison' AND job.state IN ('queued', 'running', 'interrupted')
+                AND json_extract(made.result_json, '$.model') = ?
+            ORDER BY job.id LIMIT 1"""
+        found = self._store.rows(sql, (str(model.path),))
+        return (int(found[0]["id"]), int(found[0]["depends_on"])) if found else None
+
     # ---- one job -----------------------------------------------------------------------------------------------------
 
     def get(self, job_id: object) -> dict[str, Any]:

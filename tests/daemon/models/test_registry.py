@@ -18,17 +18,19 @@ from calibration.observations import parse_observations
 from calibration.pipeline.calibrate import identify
 from calibration.rig.description import parse_rig
 from daemon.commands import REFUSED, WRONG_USE, CommandError
+from daemon.jobs.order import Outcome
 from daemon.jobs.process import perform
 from daemon.jobs.runner import JobRunner
+from daemon.jobs.scheduler import CHAIN, DueChain
 from daemon.models.live_model import LiveModel, Loaded, Missing
-from daemon.models.model_files import write_model
+from daemon.models.model_files import model_sha256, write_model
 from daemon.store.errors import NotInStoreError
 from daemon.store.migrations import MIGRATIONS
 from daemon.store.queries.models import ModelRow, ModelTable
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import DeviceEvent, EventKind
 from tests.daemon.job_support import SOURCE, TRUTH, JobRig
-from tests.daemon.model_support import PRISMS, ModelRig, wait
+from tests.daemon.model_support import PRISMS, ModelRig, wait, written
 from tests.simulated.observations import simulate_observations
 
 
@@ -77,6 +79,22 @@ def test_a_candidate_is_compared_on_check_sessions_then_accepted_and_loaded(rig:
     shown = rig.registry.show_command({})
     assert [(h["state"], h["operator"]) for h in shown["history"]] == [("candidate", ""), ("live", "Ada")]
     assert shown["history"][-1]["reason"].startswith("accepted: on 8 held-out fixes of 4 standstills its error is")
+
+
+def test_the_model_of_an_early_stage_names_the_job_that_compares_the_last_one(rig: ModelRig) -> None:
+    rig.jobs.session("a")
+    rig.jobs.session("c", kind="check")
+    queue = rig.job_table
+    queue.queue(DueChain(CHAIN, "a", "c"))
+    gap, residual, _, comparison = (job.id for job in queue.state().jobs)
+    directory = Path(shutil.copytree(written(30), rig.config.models_directory / "00001-geometric"))
+    result = {"model": str(directory), "manifest_sha256": model_sha256(directory), "stage": "geometric"}
+    queue.end(gap, Outcome("done", result=result | {"sessions": ["a"], "metrics": {}}))
+    (model,) = rig.models.all()
+    assert refusal(rig.registry.accept_command, REFUSED, id=model.id) == (
+        f"model {model.id} was not compared with held-out data yet; job {comparison} compares the model that job "
+        f"{residual} makes of the same sessions: wait for that one"
+    )
 
 
 def test_a_candidate_that_is_not_better_than_the_live_model_is_refused(rig: ModelRig) -> None:
