@@ -69,6 +69,7 @@ class Parts:
         turn: turns the simulated station as an operator's hand would; None where it turns by itself, or is real.
         is_over: True when a replay has ended.
         rig_name: shipped name, or path of the file that describes the machine.
+        has_simulation_ended: True when the process of a simulated rig has ended.
     """
 
     mode: Mode
@@ -84,6 +85,7 @@ class Parts:
     can_links: Sequence[CanLink] = ()
     is_over: Callable[[], bool] = _never
     rig_name: str = ""
+    has_simulation_ended: Callable[[], bool] = _never
 
 
 def live(
@@ -185,7 +187,9 @@ def simulated(
         turn = partial(_aim, simulation)
         parts = _parts("simulated", rewired, source, clock, aim=None if is_by_hand else turn)
         visit = partial(_visit, simulation, source.rig, dwell_s)
-        parts = replace(parts, visit=visit, turn=turn if is_by_hand else None)
+        parts = replace(
+            parts, visit=visit, turn=turn if is_by_hand else None, has_simulation_ended=simulation.has_ended
+        )
         simulation.drive_around(dwell_s, is_by_hand=is_by_hand)
         yield parts
     finally:

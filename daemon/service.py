@@ -208,6 +208,7 @@ class Daemon:
         sessions = SessionTable(self._store, self._parts.rig.name)
         return {
             "acquisition": self._acquisition.status,
+            "has_simulation_ended": self._parts.has_simulation_ended,
             "session": sessions.open_session,
             "suspicions": self._sessions.prism_suspicions,
             "prisms_fault": self._sessions.prisms_fault,

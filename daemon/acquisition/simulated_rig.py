@@ -28,6 +28,7 @@ BOOM_SPEED = 0.45  # of the joints' greatest rates
 _REFUSES = 2  # exit status of a simulator that was asked for what there is not
 _ANSWER_S = 60.0
 _HAND_S = 0.02  # how often, in real time, it is looked whether the operator wants the boom elsewhere
+_ENDED = "the simulated rig has ended; stop the daemon, and `rigcal run --sim` starts both again"
 POSES_AHEAD = 30  # drawn at a time, and visited by the short way
 
 
@@ -98,6 +99,10 @@ class SimulatedRig:
             if self._process.returncode == _REFUSES:
                 raise ConfigError("the simulated rig refuses what it was asked for, as it says above") from error
             raise
+
+    def has_ended(self) -> bool:
+        """Return True if the process has ended."""
+        return self._process.poll() is not None
 
     def aim(self, target: str) -> None:
         """Turn the station to a prism or a control point."""
@@ -188,7 +193,7 @@ class SimulatedRig:
                 self._process.stdin.write(json.dumps({"do": what, **arguments}) + "\n")
                 self._process.stdin.flush()
             except (OSError, ValueError) as error:
-                raise SimulationError(f"the simulated rig has ended: {error}") from error
+                raise SimulationError(_ENDED) from error
             return self._expect(answer, "error")
 
     def _expect(self, *wanted: str) -> dict[str, Any]:
@@ -205,7 +210,7 @@ class SimulatedRig:
             if answer["event"] != "ended":
                 self._events.remove(answer)
         if answer["event"] != wanted[0]:
-            raise SimulationError(f"the simulated rig: {answer.get('text', 'the process has ended')}")
+            raise SimulationError(f"the simulated rig: {answer['text']}" if "text" in answer else _ENDED)
         return answer
 
     def _read(self) -> None:

@@ -65,8 +65,16 @@ class Rule:
         """Yield an alarm for everything that is wrong now."""
         for subject, text, *severity in self.find(evidence):
             how = severity[0] if severity else self.severity
-            plain = shown(text).removeprefix(f"{subject}: ")[:TEXT_MAX]  # the subject is shown before it
+            plain = _cut(shown(text).removeprefix(f"{subject}: "))  # the subject is shown before it
             yield Alarm(self.kind, subject, how, plain, self.remedy.replace("SUBJECT", subject))
+
+
+def _cut(text: str) -> str:
+    """Return a text of at most TEXT_MAX characters, cut between words where it can be."""
+    if len(text) <= TEXT_MAX:
+        return text
+    head, _, _ = text[:TEXT_MAX].rpartition(" ")
+    return f"{head or text[: TEXT_MAX - 1]}…"
 
 
 def rule(

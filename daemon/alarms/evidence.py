@@ -26,6 +26,7 @@ class Evidence:
         now: when it was taken.
         running_s: since the daemon began to watch.
         acquisition: links, channels, stations, gaps and the last events.
+        has_simulation_ended: the process of a simulated rig has ended.
         session: the open one.
         suspicions: stations that may be on another prism than the session's own.
         prisms_fault: why the joints cannot be asked whether a station is on its prism; None where they can.
@@ -50,6 +51,7 @@ class Evidence:
     now: Stamp
     running_s: float = 0.0
     acquisition: AcquisitionStatus = field(default_factory=AcquisitionStatus)
+    has_simulation_ended: bool = False
     session: OpenSessionRow | None = None
     suspicions: Sequence[Suspicion] = ()
     prisms_fault: str | None = None
@@ -108,6 +110,7 @@ class Evidence:
 # Part of the evidence -> its name in the alarm that it cannot be watched.
 _PARTS = {
     "acquisition": "acquisition",
+    "has_simulation_ended": "the simulated rig",
     "session": "the open session",
     "suspicions": "the prisms",
     "prisms_fault": "what the joints say of prisms",

@@ -18,8 +18,11 @@ def link_down(evidence: Evidence) -> Iterator[Finding]:
     """A link is closed: its port cannot be opened, or was lost.
 
     What its channels lack is explained by this alarm and raises none of its own. A station's link is a warning
-    while no session is open. Cleared 3 s after the link has been opened, so that a loose plug is one alarm.
+    while no session is open. Cleared 3 s after the link has been opened, so that a loose plug is one alarm. Not raised
+    where `simulated_rig_ended` is.
     """
+    if evidence.has_simulation_ended:
+        return
     stations = {station.name for station in evidence.acquisition.stations}
     for link in evidence.acquisition.links:
         if link.up is False:
@@ -30,6 +33,13 @@ def link_down(evidence: Evidence) -> Iterator[Finding]:
             continue
         is_idle = link.name in stations and evidence.session is None
         yield link.name, text, "warning" if is_idle else "critical"
+
+
+@rule("critical", "Stop the daemon; `rigcal run --sim` starts it again with a simulated rig.")
+def simulated_rig_ended(evidence: Evidence) -> Iterator[Finding]:
+    """The process of the simulated rig of `rigcal run --sim` has ended, which closes all links."""
+    if evidence.has_simulation_ended:
+        yield "simulation", "the simulated rig has ended, so nothing is measured"
 
 
 @rule("warning", "Report the fault with rigcal's log; what the link brought meanwhile is lost.")

@@ -105,6 +105,9 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
         (known(links=[link(False, reason="unplugged")]), ["boom"], known()),
         (known(links=[link(None)]), ["boom"], known(links=[link(None)], running_s=2.0)),
     ],
+    "simulated_rig_ended": [
+        (known(links=[link(False)], has_simulation_ended=True), ["simulation"], known()),
+    ],
     "link_restarted": [
         (known(links=[link(restarted_age_s=5)]), ["boom"], known(links=[link(restarted_age_s=301)])),
     ],
@@ -403,6 +406,17 @@ def test_what_an_instrument_says_comes_without_control_characters_and_bounded() 
     (alarm,) = raised("instrument_error", known(loud))
     assert alarm.text.startswith(r"\x1b[2J\ud800xxx")
     assert len(alarm.text) == 300
+    assert alarm.text.endswith("xxx…")
+    (wordy,) = raised("link_down", known(links=[link(False, reason="refused " * 100)]))
+    assert wordy.text.endswith("refused refused…")
+    assert len(wordy.text) <= 300
+
+
+def test_links_that_a_simulated_rig_has_left_behind_are_explained_by_its_end() -> None:
+    ended = known(links=[link(False), link(False, name="station")], has_simulation_ended=True)
+    (alarm,) = (alarm for rule in library() for alarm in rule(ended) if alarm.severity == "critical")
+    assert alarm.kind == "simulated_rig_ended"
+    assert "`rigcal run --sim` starts it again" in alarm.remedy
 
 
 def test_every_kind_is_in_the_documentation_with_what_to_do() -> None:
