@@ -73,18 +73,19 @@ def lead(say: Say) -> Mapping[str, Any]:
 
 
 def _lead_in_lines(say: Say) -> Mapping[str, Any]:
-    """Print a line for every step and every message, once."""
+    """Print a line for every step, its targets and every message, once; a message again after another one."""
     told: list[str] = []
+    warned: list[str] = []
     while True:
         guide = _guide(say("guide.state"))
         step = guide["step"]
         how = f" (`rigcal session guide --done`: {step['button']})" if step["button"] else ""
-        lines = [f"{step['title']}: {step['instruction']}{how}"]
-        lines += [f"  {message['severity']}: {message['text']}" for message in guide["messages"]]
-        for line in lines:
-            if line not in told:
-                echo(line)
-        told = lines
+        lines = [f"{step['title']}: {step['instruction']}{how}", *_target_lines(guide)]
+        messages = [f"  {message['severity']}: {message['text']}" for message in guide["messages"]]
+        new = [line for line in messages if line not in warned]
+        for line in (*(line for line in lines if line not in told), *new):
+            echo(line)
+        told, warned = lines, messages if new else warned
         if guide["state"] != "open":
             return guide
         time.sleep(LOOK_S)
@@ -157,6 +158,14 @@ def screen(guide: Mapping[str, Any], width: int) -> list[str]:
     lines.append(_keys_line(step))
     room = max(20, width - 1)
     return [part for line in lines for part in textwrap.wrap(shown(line), room, subsequent_indent="  ")]
+
+
+def _target_lines(guide: Mapping[str, Any]) -> list[str]:
+    """Return where the joints should be for the present pose, on one line; none at another step."""
+    if guide["hold"] is None:
+        return []
+    targets = (f"{joint['name']} {joint['target']:.1f} {joint['unit']}" for joint in guide["joints"])
+    return [f"  targets: {', '.join(targets)}"]
 
 
 def _joint_line(joint: Mapping[str, Any]) -> str:

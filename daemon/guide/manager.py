@@ -65,6 +65,7 @@ class GuideManager:
     ) -> None:
         self._rig, self._sessions, self._setups = rig, sessions, setups
         self._model, self._settle_s, self._has_aim = model, settle_s, has_aim
+        self._clock = clock
         self._course = Course(rig, store, sessions, joiner, clock, meter_place)
         self._record = self._course.record
         self._worker = GuideWorker(rig, self._course, sessions, setups, clock, has_aim=has_aim, drive=drive)
@@ -278,12 +279,19 @@ class GuideManager:
         return found
 
     def _unused_fixes(self, job: Job) -> list[str]:
-        """Why the fixes at a pose do not count, where the boom stands there."""
+        """Why fixes that were measured since the boom has settled do not count, while a pose is to be measured."""
         step, stands_s = job.step, self._course.watch.boom().stands_s
-        if step is None or step.kind != "poses" or stands_s is None or stands_s < self._settle_s:
+        if step is None or step.kind != "poses" or job.run.poses is None or job.is_enough:
             return []
-        reason = self._sessions.not_counting(FRESH_S)
-        return [] if reason is None else [f"the fixes do not count: {reason}; is the station on prism {job.run.prism}?"]
+        if stands_s is None or stands_s < self._settle_s:
+            return []
+        settled_s = self._clock.real_seconds(stands_s - self._settle_s)
+        reason = self._sessions.not_counting(min(FRESH_S, settled_s))
+        if reason is None:
+            return []
+        # Others are of the joints or the computer, where aiming helps nothing.
+        question = f"; is the station on prism {job.run.prism}?" if "prism" in reason else ""
+        return [f"the fixes do not count: {reason}{question}"]
 
 
 def _reason(arguments: Mapping[str, Any]) -> str:

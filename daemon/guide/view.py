@@ -212,7 +212,7 @@ def _after_all(model: Mapping[str, Any] | None) -> str:
         return "No model awaits; `rigcal jobs list` says what became of the jobs."
     if model["jobs"]:
         jobs = "1 job is" if model["jobs"] == 1 else f"{model['jobs']} jobs are"
-        return f"Wait: {jobs} still at work on the model."
+        return f"You may leave it: {jobs} still at work on the model; `rigcal jobs list` shows them."
     if model["is_acceptable"]:
         return f"Model {model['id']} awaits: `rigcal model accept {model['id']}` makes it live."
     return f"Model {model['id']} awaits and would be refused: {model['refused_because']}"

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import io
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from calibration.rig.description import shipped_rig
-from daemon.cli.guide_terminal import plan_rows, screen
+from daemon.cli import guide_terminal
+from daemon.cli.guide_terminal import lead, plan_rows, screen
 from daemon.commands import WRONG_USE, CommandError
 from daemon.guide.job import Job, Request
 from daemon.guide.position import BoomPosition
 from daemon.guide.request import request_of
-from daemon.guide.view import Around, state_of
+from daemon.guide.view import Around, _after_all, state_of
 from daemon.models.gap_files import poses_csv
 from daemon.store.queries.guides import GuideRow
 from drivers.clock import Stamp
@@ -43,7 +47,8 @@ def test_a_file_that_is_no_plan_is_refused_with_its_place(tmp_path: Path, text: 
     assert refused.value.status == WRONG_USE
 
 
-def test_the_screen_fits_a_narrow_terminal_and_says_what_is_old() -> None:
+def at_a_pose(*warnings: str) -> dict[str, Any]:
+    """State of a guide that waits for a pose."""
     job = Job.of(Request(("cp1",), ("r",), 1, 0, plan=((MIDDLE, ("r",)),)))
     for kind, details in (
         ("opened", {"session": "s001-r", "last": 0}),
@@ -53,8 +58,12 @@ def test_the_screen_fits_a_narrow_terminal_and_says_what_is_old() -> None:
         job = job.after(kind, details)
     row = GuideRow(1, "open", "S1", "Ada", {}, 3, Stamp(0, 0, "boot"))
     boom = BoomPosition(MIDDLE | {"theta1": 0.0}, 30.0, None, is_fresh=False, missing="the joints were read 30 s ago")
-    around = Around(boom, None, None, None, 3, False, False, False, 1.0, 5, [], None)
-    guide = state_of(RIG, row, job, around)
+    around = Around(boom, None, None, None, 3, False, False, False, 1.0, 5, [*warnings], None)
+    return state_of(RIG, row, job, around)
+
+
+def test_the_screen_fits_a_narrow_terminal_and_says_what_is_old() -> None:
+    guide = at_a_pose()
     assert guide["step"]["kind"] == "go_to_pose"
     lines = screen(guide, 60)
     assert max(map(len, lines)) < 60
@@ -65,3 +74,25 @@ def test_the_screen_fits_a_narrow_terminal_and_says_what_is_old() -> None:
     whole = " ".join(line.strip() for line in lines)
     assert "Move every joint to its target; the pose is measured by itself once the boom stands." in whole
     assert "Enter: Measure here" in whole
+
+
+def test_off_a_terminal_targets_are_printed_and_a_warning_once_until_it_changes(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    monkeypatch.setattr(guide_terminal, "LOOK_S", 0.0)
+    states = [at_a_pose("fog"), at_a_pose(), at_a_pose("fog"), at_a_pose("rain"), at_a_pose() | {"state": "finished"}]
+    coming = iter(states)
+    assert lead(lambda _command, **_arguments: {"guide": next(coming)})["state"] == "finished"
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if "fog" in line] == ["  warning: fog"]
+    assert "  warning: rain" in lines
+    (targets,) = (line for line in lines if line.startswith("  targets: "))
+    for joint in RIG.joints:
+        assert f"{joint.name} {MIDDLE[joint.name]:.1f} {joint.unit}" in targets
+
+
+def test_who_has_measured_all_is_told_that_the_jobs_need_nobody() -> None:
+    awaiting = {"id": None, "jobs": 4, "is_acceptable": None, "refused_because": None}
+    said = _after_all(awaiting)
+    assert said == "You may leave it: 4 jobs are still at work on the model; `rigcal jobs list` shows them."
