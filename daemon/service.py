@@ -90,7 +90,7 @@ class Daemon:
         self._watch = StoreWatch(store, parts.clock)
         self._housekeeping = Housekeeping(store, parts.clock, keeping_of(config))
         # Simulated and replayed rigs have a clock of their own.
-        read_clock = partial(clock_state, os.environ.get(CLOCK_SOCKET))
+        read_clock = partial(clock_state, os.environ.get(CLOCK_SOCKET) or None)
         self._time = TimeWatch(read_clock, parts.clock) if parts.mode == "live" else None
         self._setups = StationSetups(parts.rig, store, parts.clock, config.sessions.control_tolerance_mm)
         self._sessions = SessionManager(
@@ -136,7 +136,7 @@ class Daemon:
             config,
             parts.rig.name,
             parts.clock,
-            jobs_socket=os.environ.get(JOBS_SOCKET),
+            jobs_socket=os.environ.get(JOBS_SOCKET) or None,
             is_held=self._are_jobs_held,
         )
         self._job_table, self._model_table = JobTable(store, parts.rig.name), models

@@ -27,7 +27,7 @@ def socket_of(path: Path | None, config: Path | None) -> Path:
         from daemon.config.config import read_config
 
         return read_config(config).socket_path
-    return Path(os.environ.get("RIGCAL_SOCKET", INSTALLED_SOCKET))
+    return Path(os.environ.get("RIGCAL_SOCKET") or INSTALLED_SOCKET)
 
 
 def config_option(command: Callable[..., Any]) -> Callable[..., Any]:

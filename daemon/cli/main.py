@@ -7,6 +7,7 @@ underscore at its end there (`import_.py`).
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import keyword
 import pkgutil
@@ -30,6 +31,18 @@ class _Commands(click.Group):
         command = getattr(importlib.import_module(f"{commands.__name__}.{name}"), name)
         assert isinstance(command, click.Command)
         return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """As click does, which suggests commands of a group only where they are loaded already."""
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError as error:
+            near = difflib.get_close_matches(args[0], self.list_commands(ctx))
+            if not near:
+                raise
+            raise click.UsageError(f"{error.message} Did you mean {' or '.join(map(repr, near))}?", ctx) from None
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})

@@ -116,11 +116,13 @@ def _too_deep() -> CommandError:
 
 
 def how_to_be_let_in(control_path: Path) -> str:
-    """Say how a user gets access who may not use a daemon's control socket: a clause that names its group."""
+    """Say how a user gets access who may not use a daemon's control socket: a clause that names its group, if any."""
     try:
         gid = control_path.stat().st_gid
     except OSError:
         return "join the group that owns its control socket, or use sudo"
+    if gid == 0:
+        return "use sudo: its group is root, which nobody should join"
     try:
         group = grp.getgrgid(gid).gr_name
     except (KeyError, OSError):

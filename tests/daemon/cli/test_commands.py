@@ -13,7 +13,9 @@ import pytest
 from click.testing import CliRunner
 
 from daemon.cli import commands
+from daemon.cli.client import socket_of
 from daemon.cli.main import main
+from daemon.commands import INSTALLED_SOCKET
 from tests.daemon.idle_daemon import idle_daemon
 
 HEAVY = ("numpy", "scipy", "pydantic", "rich", "matplotlib", "numba", "lightgbm")
@@ -47,6 +49,27 @@ def test_a_new_file_in_the_folder_is_a_new_command(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(commands, "__path__", [*commands.__path__, str(tmp_path)])
     assert re.search(r"hello +Greet\.", CliRunner().invoke(main, ["--help"]).stdout)
     assert CliRunner().invoke(main, ["hello"]).stdout == "hello there\n"
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"), [(["statsu"], "Did you mean 'status'?"), (["session", "strat"], "Did you mean 'start'?")]
+)
+def test_a_mistyped_command_is_told_which_one_may_be_meant(typed: list[str], meant: str) -> None:
+    refused = CliRunner().invoke(main, typed)
+    assert refused.exit_code == 2
+    assert f"No such command {typed[-1]!r}. {meant}" in refused.stderr
+
+
+def test_a_word_that_resembles_no_command_suggests_none() -> None:
+    refused = CliRunner().invoke(main, ["xyzzy"])
+    assert "No such command 'xyzzy'.\n" in refused.stderr
+
+
+def test_an_empty_variable_is_as_if_it_were_not_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RIGCAL_SOCKET", "")
+    assert socket_of(None, None) == INSTALLED_SOCKET
+    monkeypatch.setenv("RIGCAL_SOCKET", "rigcal-sim/control.sock")
+    assert socket_of(None, None) == Path("rigcal-sim/control.sock")
 
 
 def test_no_command_uses_another_commands_module() -> None:

@@ -20,7 +20,7 @@ from daemon.cli.main import main
 from daemon.commands import Caller, CommandError, reading_socket
 from daemon.config.config import Config, ConfigError, parse_config
 from daemon.control.command_table import READING
-from daemon.control.protocol import request
+from daemon.control.protocol import how_to_be_let_in, request
 from daemon.store.reader import Reader
 from tests.daemon.acquisition_support import wait_until
 from tests.daemon.idle_daemon import idle_daemon
@@ -28,6 +28,7 @@ from tests.daemon.model_support import ModelRig
 
 OWN_GROUP = grp.getgrgid(os.getegid()).gr_name
 OWN_USER = pwd.getpwuid(os.geteuid()).pw_name
+HOW = "use sudo" if os.getegid() == 0 else f"join the group {OWN_GROUP} "
 STRANGER = 65534
 AS_STRANGER = """
 import os, sys
@@ -130,7 +131,7 @@ def test_every_command_either_reads_or_changes() -> None:
         commands = set(str(unknown.value).partition("known: ")[2].split(", "))
         assert commands > READING
         for command in sorted(commands - READING):
-            with pytest.raises(CommandError, match=f"{command} does: join the group {OWN_GROUP} ") as refused:
+            with pytest.raises(CommandError, match=f"{command} does: {HOW}") as refused:
                 request(reading_socket(config.socket_path), command)
             assert refused.value.status == 3
         for command in ("status", "setup.list", "session.list", "jobs.list", "model.list"):
@@ -159,6 +160,12 @@ def test_a_reading_socket_in_the_control_sockets_place_is_refused(tmp_path: Path
         parse_config(text, tmp_path / "rigcal.toml")
 
 
+def test_nobody_is_told_to_join_the_group_of_root() -> None:
+    of_root = Path("/")
+    assert of_root.stat().st_gid == 0
+    assert how_to_be_let_in(of_root) == "use sudo: its group is root, which nobody should join"
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
 def test_who_may_only_look_is_told_how_to_be_let_in(reachable: Path) -> None:
     group = next(g for g in grp.getgrall() if g.gr_gid not in {0, STRANGER})
@@ -177,10 +184,10 @@ def test_who_may_only_look_is_told_how_to_be_let_in(reachable: Path) -> None:
         assert json.loads(shown.stdout)["rig"] == "swdt82"
         refused = as_stranger("setup", "new", "S1", groups=str(group.gr_gid))
         assert refused.returncode == 3
-        assert f"join the group {OWN_GROUP} " in refused.stderr
+        assert HOW in refused.stderr
         nobody = as_stranger("status")
         assert nobody.returncode == 3
-        assert f"permission denied; join the group {OWN_GROUP} " in nobody.stderr
+        assert f"permission denied; {HOW}" in nobody.stderr
         assert rows(config, "SELECT * FROM station_setups") == []
 
 
