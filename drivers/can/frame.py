@@ -100,6 +100,7 @@ class SlcanLines:
     """
 
     _FRAME = re.compile(rb"(?:t([0-9A-F]{3})|T([0-9A-F]{8})|r([0-9A-F]{3})|R([0-9A-F]{8}))([0-8])([0-9A-F]*)", re.I)
+    _ANSWER = re.compile(rb"[zZ]|F[0-9A-Fa-f]{2}|[VN].*", re.DOTALL)  # sent, status flags, version or serial number
     _STATE = re.compile(rb"s([awpb])(\d{3})(\d{3})")
     _ERRORS = re.compile(rb"e(\d)([abBcfsoO]+)")
     _LINE_MAX = 64  # bytes: more without an end is noise
@@ -120,12 +121,12 @@ class SlcanLines:
             frame = self._frame(line)
             if frame is not None:
                 frames.append(frame)
-            elif line and line[:1] not in b"zZVNF":  # sent, version, serial number, status flags
+            elif line and not self._ANSWER.fullmatch(line):
                 self.malformed += 1
         return frames
 
     def _frame(self, line: bytes) -> Frame | None:
-        match = self._FRAME.match(line)
+        match = self._FRAME.fullmatch(line)
         if match is None:
             return self._error_frame(line)
         standard, extended, remote_standard, remote_extended, length, digits = match.groups()
@@ -133,12 +134,11 @@ class SlcanLines:
         is_extended = bool(extended or remote_extended)
         if identifier > (EXTENDED_ID_MAX if is_extended else STANDARD_ID_MAX):
             return None
-        if remote_standard or remote_extended:
-            return Frame(identifier, b"", is_extended, is_remote=True)
-        end = 2 * int(length)
+        is_remote = bool(remote_standard or remote_extended)
+        end = 0 if is_remote else 2 * int(length)
         if len(digits) not in (end, end + 4):  # with the adapter's time stamp switched on, four digits more
             return None
-        return Frame(identifier, bytes.fromhex(digits[:end].decode("ascii")), is_extended)
+        return Frame(identifier, bytes.fromhex(digits[:end].decode("ascii")), is_extended, is_remote)
 
     def _error_frame(self, line: bytes) -> Frame | None:
         """Return the error frame that an adapter's line about errors stands for; None if it is no such line."""

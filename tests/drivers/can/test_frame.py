@@ -80,6 +80,7 @@ def test_no_datagram_makes_a_parser_raise(datagram: bytes) -> None:
         ("r1A04", Frame(0x1A0, b"", is_remote=True)),
         ("R0CFE30210", Frame(0x0CFE3021, b"", is_extended=True, is_remote=True)),
         ("t1A02AABB1234", Frame(0x1A0, b"\xaa\xbb")),
+        ("r1A041234", Frame(0x1A0, b"", is_remote=True)),
     ],
 )
 def test_lines_of_an_adapter(line: str, frame: Frame) -> None:
@@ -123,6 +124,30 @@ def test_a_line_that_is_no_frame_is_counted(line: bytes) -> None:
     lines = SlcanLines()
     assert lines.feed(line + b"\r") == []
     assert lines.malformed == 1
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"t1A04AABBCCDDt1A04AABBCCDE",
+        b"t1A04AABBCCDD1234t1A04AABBCCDE",
+        b"r1A04t1A01AA",
+        b"r1A0412345678",
+        b"zt1A01AA",
+        b"F00t1A01AA",
+    ],
+)
+def test_two_lines_whose_end_was_lost_between_them_are_counted_and_give_no_frame(line: bytes) -> None:
+    lines = SlcanLines()
+    assert lines.feed(b"t1A00\r" + line + b"\rt1A10\r") == [Frame(0x1A0, b""), Frame(0x1A1, b"")]
+    assert lines.malformed == 1
+
+
+@pytest.mark.parametrize("line", [b"z", b"Z", b"F00", b"F8a", b"V1013", b"NA123"])
+def test_answers_of_an_adapter_are_no_lost_lines(line: bytes) -> None:
+    lines = SlcanLines()
+    assert lines.feed(line + b"\r") == []
+    assert lines.malformed == 0
 
 
 def test_noise_without_an_end_is_dropped() -> None:
