@@ -105,7 +105,7 @@ class Cia406Encoder(CanopenChannel):
     """
 
     device: Literal["cia406_encoder"]
-    unit: Unit = "deg"
+    unit: Literal["deg"] = "deg"
     units_per_revolution: int = Field(default=65536, ge=1)
     total_units: int = Field(default=65536, ge=1)
     sign: Literal[-1, 1] = 1
@@ -129,7 +129,7 @@ class Cia406Linear(CanopenChannel):
     """
 
     device: Literal["cia406_linear"]
-    unit: Unit = "mm"
+    unit: Literal["mm"] = "mm"
     object: Literal["6004", "6020"] = "6020"
     step_nm: int = Field(default=100_000, ge=1)
     sign: Literal[-1, 1] = 1

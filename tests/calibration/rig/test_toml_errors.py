@@ -32,6 +32,14 @@ def told(text: str) -> str:
         (f"{PRISM}offset_mm = [1, 2, 3, 4]", "offset_mm: must have at most 3"),
         (f"{PRISM}offset_mm = [1, 2, 3]\noffset_known = 3", "offset_known: must be true or false"),
         ('[[channel]]\nname = "x"', "lacks the key 'device', which says what it is"),
+        (
+            '[[channel]]\nname = "t"\ndevice = "cia406_linear"\nnode = 9\nunit = "bar"',
+            "channel.1.cia406_linear.unit: must be 'mm'",
+        ),
+        (
+            '[[channel]]\nname = "t"\ndevice = "cia406_encoder"\nnode = 9\nunit = "mm"',
+            "channel.1.cia406_encoder.unit: must be 'deg'",
+        ),
         ('[[channel]]\ndevice = "x"', "'device' must be one of 'cia406_encoder', 'cia406_linear', "),
     ],
 )
