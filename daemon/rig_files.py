@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib import resources
 from pathlib import Path
 
 from calibration.errors import RigError
-from calibration.rig.description import Rig, parse_rig, shipped_rigs
+from calibration.rig.description import Rig, parse_rig
+from calibration.rig.files import rig_path
 from calibration.rig.toml import LONGEST
 from drivers.files import read_text
 
@@ -60,17 +60,9 @@ def read_rig_text(name_or_path: str) -> tuple[str, str, Path]:
     Raises:
         RigError: no such rig or file, or it cannot be read.
     """
-    if name_or_path in shipped_rigs():
-        directory = Path(str(resources.files("calibration").joinpath("rigs")))
-        path = directory / f"{name_or_path}.toml"
-    else:
-        path = Path(name_or_path)
-        directory = path.parent
-        if not path.is_file():
-            shipped = ", ".join(shipped_rigs())
-            raise RigError(name_or_path, "", f"neither a shipped rig ({shipped}) nor a rig file")
+    path = rig_path(name_or_path)
     try:
-        return read_text(path, LONGEST), path.name, directory
+        return read_text(path, LONGEST), path.name, path.parent
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise RigError(str(path), "", f"cannot be read: {reason}") from error

@@ -6,8 +6,7 @@ after row i. Files keep degrees and mm, and so does this description.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from importlib import resources
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from pydantic import BaseModel, Field, PrivateAttr, ValidationError, ValidationInfo, field_validator, model_validator
@@ -15,6 +14,7 @@ from pydantic_core import ErrorDetails
 
 from calibration.errors import RigError
 from calibration.rig.channels import Channel, Signal
+from calibration.rig.files import rig_path, shipped_rigs
 from calibration.rig.parts import (
     Convention,
     Driven,
@@ -141,14 +141,16 @@ class Rig(Part):
             joint = next((j for j in self.joints if j.name == channel.name), None)
             if joint is not None and channel.unit != joint.unit:
                 raise ValueError(f"channel {channel.name!r} is in {channel.unit}, its joint in {joint.unit}")
-        read = [channel for channel in self.channels if channel.name in known]
-        for number, channel in enumerate(read):
-            for other in read[:number]:
-                if channel.place() == other.place():
-                    raise ValueError(
-                        f"joints {other.name!r} and {channel.name!r} are read from the same place on the bus"
-                    )
+        self._require_places_of_their_own([channel for channel in self.channels if channel.name in known])
         return self
+
+    @staticmethod
+    def _require_places_of_their_own(channels: Iterable[Channel]) -> None:
+        taken: dict[tuple[tuple[str, object], ...], str] = {}
+        for channel in channels:
+            other = taken.setdefault(tuple(channel.place().items()), channel.name)
+            if other != channel.name:
+                raise ValueError(f"joints {other!r} and {channel.name!r} are read from the same place on the bus")
 
     @model_validator(mode="after")
     def _rows_fit(self) -> Rig:
@@ -189,12 +191,7 @@ class Rig(Part):
         Raises:
             RigError: no such rig or file, or the file is malformed.
         """
-        if str(path_or_shipped_name) in shipped_rigs():
-            return shipped_rig(str(path_or_shipped_name))
-        path = Path(path_or_shipped_name)
-        if not path.is_file():
-            shipped = ", ".join(shipped_rigs())
-            raise RigError(str(path), "", f"neither a shipped rig ({shipped}) nor a rig file")
+        path = rig_path(str(path_or_shipped_name))
         try:
             text = path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
@@ -379,15 +376,9 @@ def _reason(error: ErrorDetails) -> str:
     return reason(error, Rig)
 
 
-def shipped_rigs() -> tuple[str, ...]:
-    """Return the names of the rigs that come with the program."""
-    files = resources.files("calibration").joinpath("rigs").iterdir()
-    return tuple(sorted(f.name.removesuffix(".toml") for f in files if f.name.endswith(".toml")))
-
-
 def shipped_rig(name: str) -> Rig:
     """Return a rig that comes with the program; RigError if there is none of that name."""
     if name not in shipped_rigs():
         raise RigError(name, "", f"no such rig; shipped: {', '.join(shipped_rigs())}, or give a path to a TOML file")
-    text = resources.files("calibration").joinpath("rigs", f"{name}.toml").read_text(encoding="utf-8")
-    return parse_rig(text, f"{name}.toml")
+    path = rig_path(name)
+    return parse_rig(path.read_text(encoding="utf-8"), path.name)

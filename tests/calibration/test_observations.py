@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from calibration.errors import DataError, RigError
 from calibration.observations import Observations, format_observations, parse_observations
+from calibration.rig.channels import AnyChannel
 from calibration.rig.description import Rig, parse_rig, shipped_rig, shipped_rigs
 from tests.calibration.conftest import Session, rig_text
 
@@ -261,6 +262,10 @@ def test_a_rig_is_read_by_its_name_or_from_its_file(tmp_path: Path) -> None:
     assert Rig.read("ys100") == Rig.read(path) == Rig.read(str(path)) == shipped_rig("ys100")
     with pytest.raises(RigError, match="neither a shipped rig \\(swdt82, ur10, ys100\\) nor a rig file"):
         Rig.read("r2d2")
+    with pytest.raises(
+        RigError, match=r"^r2d2\.toml: there is no such file; name one that there is, or a shipped rig \("
+    ):
+        Rig.read("r2d2.toml")
     path.write_bytes(b"name = '\xff'")
     with pytest.raises(RigError, match=r"own\.toml: cannot be read: not UTF-8 text"):
         Rig.read(path)
@@ -335,3 +340,16 @@ def test_two_joints_are_not_read_from_one_place() -> None:
         assert old in text
     with pytest.raises(RigError, match="joints 'L2' and 'L3' are read from the same place on the bus"):
         parse_rig(text.replace("node = 49", "node = 48"), "mine.toml")
+
+
+def test_each_channel_tells_its_place_on_the_bus_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    place = AnyChannel.place
+
+    def counted(channel: AnyChannel) -> dict[str, object]:
+        asked.append(channel.name)
+        return place(channel)
+
+    monkeypatch.setattr(AnyChannel, "place", counted)
+    rig = parse_rig(rig_text("swdt82"), "swdt82.toml")
+    assert sorted(asked) == sorted(rig.joint_names)
