@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 from calibration.rig.channels import Cia404Analogue, Cia406Encoder, Cia406Linear
 from calibration.rig.description import Rig, parse_rig
+from daemon.acquisition.channel_files import ChannelFiles, with_files
 from daemon.acquisition.channels import decoder_factories, node_setups
 from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_inputs
 from daemon.acquisition.simulated_channels import with_simulated_channels
@@ -30,6 +31,7 @@ from drivers.can.channel import ChannelDecoder
 from drivers.can.ports import CanLinkConfig, Interface
 from drivers.can_decoder import CanDecoder
 from drivers.can_link import CanLink
+from drivers.canopen.node_setup import NodeSetup
 from drivers.clock import Clock, ScaledClock, Stamp, SystemClock
 from drivers.readings import Decoder, LinkLoop
 from drivers.stations.decoder import StationDecoder
@@ -57,7 +59,8 @@ class Parts:
 
     Attributes:
         mode: for `status`.
-        rig, rig_text: the machine, and the file that describes it.
+        rig, rig_text: the machine, and the file that describes it, both with the decoding of channels that DBC and EDS
+            files describe.
         clock: of everything.
         links: loops that capture.
         decoders: link name -> a factory of decoders for its captures.
@@ -252,20 +255,22 @@ def replayed(config: Config, source: RigSource, files: Sequence[Path], speed: fl
     return _parts("replayed", config, source, clock, links=links, is_over=is_over)
 
 
-def decoders(config: Config, source: RigSource) -> dict[str, Callable[[], Decoder]]:
+def decoders(config: Config, source: RigSource, files: ChannelFiles | None = None) -> dict[str, Callable[[], Decoder]]:
     """Return link name -> a factory of decoders for its captures.
 
     Args:
         config: names the links.
         source: the rig.
+        files: its DBC and EDS files, where they were read already.
 
     Raises:
         ConfigError: a channel's link is not configured.
         DescriptionError: a DBC or EDS file is missing or malformed.
     """
+    files = files or ChannelFiles.read(source.rig, source.directory)
     made: dict[str, Callable[[], Decoder]] = {}
     for section in config.can:
-        factories = decoder_factories(source.rig, source.directory, section.name)
+        factories = decoder_factories(source.rig, files, section.name)
         made[section.name] = partial(_can_decoder, section.name, factories)
         _check_identifiers(section.name, config.own_identifiers(section.name), factories)
     for station in config.station:
@@ -322,6 +327,7 @@ def _parts(
     aim: Callable[[str], None] | None = None,
     is_over: Callable[[], bool] = _never,
 ) -> Parts:
+    source, files = with_files(source)
     can_links: list[CanLink] = []
     played: list[ReplayLink] = []
     for section in config.can:
@@ -329,8 +335,9 @@ def _parts(
             played.append(_playback(section, config, clock))
         else:
             own, is_simulated = config.own_identifiers(section.name), mode == "simulated"
+            setups = node_setups(source.rig, files, section.name)
             can_links.append(
-                _can_link(section, section.interface, source, clock, own_identifiers=own, is_simulated=is_simulated)
+                _can_link(section, section.interface, setups, clock, own_identifiers=own, is_simulated=is_simulated)
             )
     stations = [StationLink(station, clock) for station in config.station]
     return Parts(
@@ -339,7 +346,7 @@ def _parts(
         rig_text=source.text,
         clock=clock,
         links=[*can_links, *played, *stations] if links is None else links,
-        decoders=decoders(config, source),
+        decoders=decoders(config, source, files),
         joiner=joiner(config, source.rig),
         aim=aim,
         can_links=can_links if links is None else (),
@@ -358,7 +365,7 @@ def _playback(section: CanSection, config: Config, clock: Clock) -> ReplayLink:
 def _can_link(
     section: CanSection,
     interface: Interface,
-    source: RigSource,
+    setups: Sequence[NodeSetup],
     clock: Clock,
     *,
     own_identifiers: tuple[int, ...],
@@ -375,5 +382,4 @@ def _can_link(
         sync_period_ms=section.sync_period_ms,
         options=section.options,
     )
-    setups = node_setups(source.rig, source.directory, section.name)
     return CanLink(config, clock, setups, configure_at_start=is_simulated)

@@ -184,10 +184,10 @@ def plan_poses(
 
 
 def _require_same(rig: Rig, of_model: Rig) -> None:
-    """UnsafeError unless the rigs are one; which signals they carry on their buses plays no part in a plan."""
+    """UnsafeError unless the rigs are one; what they carry on their buses, and how, plays no part in a plan."""
     if of_model.name != rig.name:
         raise UnsafeError(f"the model is of rig {of_model.name!r}, not of {rig.name!r}; name its own rig")
-    differ = [key for key in rig.differences(of_model) if key != "channels"]
+    differ = [key for key in rig.differences(of_model) if key not in ("channels", "decoding")]
     if differ:
         raise UnsafeError(
             f"rig {rig.name!r} differs from the one that the model was calibrated with, in its {', '.join(differ)}; "

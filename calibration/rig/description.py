@@ -6,7 +6,7 @@ after row i. Files keep degrees and mm, and so does this description.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from pydantic import BaseModel, Field, PrivateAttr, ValidationError, ValidationInfo, field_validator, model_validator
@@ -14,6 +14,7 @@ from pydantic_core import ErrorDetails
 
 from calibration.errors import RigError
 from calibration.rig.channels import Channel, Signal
+from calibration.rig.decoding import decoded_otherwise, with_decoding
 from calibration.rig.files import rig_path, shipped_rigs
 from calibration.rig.parts import (
     Convention,
@@ -76,6 +77,8 @@ class Rig(Part):
         signals: further columns of observations files, `[[signal]]`.
         tolerances: build tolerances.
         station: random error of a fix.
+        decoding: channel -> how the DBC or EDS file that it names decodes its value. The daemon adds it to the rig that
+            it stores with sessions and models; a rig file needs none.
     """
 
     name: str
@@ -89,6 +92,7 @@ class Rig(Part):
     signals: tuple[Signal, ...] = Field(alias="signal", default=(), max_length=_MOST)
     tolerances: Tolerances
     station: Station = Station()
+    decoding: dict[str, str] = Field(default_factory=dict, max_length=_MOST)
 
     _text: str = PrivateAttr("")
 
@@ -209,9 +213,7 @@ class Rig(Part):
             RigError: a column that cannot be a signal's, or that the rig has already.
             ValueError: the rig was not read from a text.
         """
-        if not self.text:
-            raise ValueError("the rig was not read from a text, to which the signals could be added; use Rig.read")
-        lines = [self.text.rstrip("\n")]
+        lines = [self._text_to_add_to("the signals").rstrip("\n")]
         for column in columns:
             try:
                 lines += ["", *signal_lines(signal_of(column, self.taken.names))]
@@ -219,13 +221,32 @@ class Rig(Part):
                 raise RigError(f"rig {self.name!r}", "signal", str(error)) from error
         return parse_rig("\n".join((*lines, "")), f"rig {self.name!r}")
 
+    def with_decoding(self, decoding: Mapping[str, str]) -> Rig:
+        """Return the rig with another decoding of its channels, in its text as well.
+
+        Args:
+            decoding: channel -> how its value is decoded.
+
+        Raises:
+            ValueError: the rig was not read from a text.
+        """
+        if decoding == self.decoding:
+            return self
+        return parse_rig(with_decoding(self._text_to_add_to("a decoding"), decoding), f"rig {self.name!r}")
+
+    def _text_to_add_to(self, what: str) -> str:
+        if not self.text:
+            raise ValueError(f"the rig was not read from a text, to which {what} could be added; use Rig.read")
+        return self.text
+
     def differences(self, other: Rig) -> tuple[str, ...]:
-        """Return the attributes in which another rig is another machine: neither its text nor its signals."""
-        return tuple(
-            name
-            for name in type(self).model_fields
-            if name != "signals" and getattr(self, name) != getattr(other, name)
-        )
+        """Return the attributes in which another rig is another machine.
+
+        Neither its text nor its signals are such, and the decoding of a channel only where both rigs tell it.
+        """
+        named = (name for name in type(self).model_fields if name not in ("signals", "decoding"))
+        differ = [name for name in named if getattr(self, name) != getattr(other, name)]
+        return (*differ, "decoding") if decoded_otherwise(self.decoding, other.decoding) else tuple(differ)
 
     def misreading(self, recorded: Rig) -> str:
         """Return why readings that were recorded with another rig file are not this one's; "" where they are.
@@ -250,6 +271,8 @@ class Rig(Part):
                 for name in (*here, *there):
                     if here.get(name) != there.get(name):
                         return f"its channel {channel.name} has {name} = {there.get(name)}, this one {here.get(name)}"
+        for name in decoded_otherwise(self.decoding, recorded.decoding):
+            return f"its channel {name} is decoded as {recorded.decoding[name]}, this one as {self.decoding[name]}"
         return ""
 
     def couplings(self) -> Iterator[tuple[int, Driven, str, float]]:
@@ -371,7 +394,8 @@ def _reason(error: ErrorDetails) -> str:
     if error["type"] == "extra_forbidden":
         *inside, _ = (part for part in error["loc"] if isinstance(part, str))
         section = _SECTIONS.get(".".join(inside))
-        allowed = [field.alias or name for name, field in section.model_fields.items()] if section else []
+        fields = section.model_fields.items() if section else ()
+        allowed = [field.alias or name for name, field in fields if name != "decoding"]  # nobody writes it by hand
         return "unknown key" + (f"; there are {', '.join(allowed)}" if allowed else "")
     return reason(error, Rig)
 

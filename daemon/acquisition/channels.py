@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import TypedDict, assert_never
 
 from calibration.rig.channels import Channel, Cia404Analogue, Cia406Encoder, Cia406Linear, DbcSignal, RawSignal
 from calibration.rig.description import Rig
+from daemon.acquisition.channel_files import CanopenChannel, ChannelFiles
 from drivers.can.channel import ChannelDecoder
-from drivers.can.dbc import DbcFile
 from drivers.can.raw_signal import BitField, SignalChannel, SignalDecoder
 from drivers.canopen.cia404 import AnalogueChannel, AnalogueDecoder
 from drivers.canopen.cia406 import EncoderChannel, EncoderDecoder, LinearChannel, LinearDecoder
@@ -18,42 +17,29 @@ from drivers.canopen.node_setup import PROFILE_ANALOGUE, PROFILE_ENCODER, NodeSe
 from drivers.canopen.pdo import TransmitPdo
 from drivers.errors import DescriptionError
 
-# What the devices map to their TPDO1 by default (the rig file names an EDS for others): index, sub-index, bits.
-_USUAL_MAPPING = {"6004": 0x60040020, "6020": 0x60200120, "6130": 0x61300120, "7130": 0x71300110, "9130": 0x91300120}
 
-CanopenChannel = Cia406Encoder | Cia406Linear | Cia404Analogue
-
-
-def decoder_factories(rig: Rig, directory: Path, link: str) -> list[Callable[[], ChannelDecoder]]:
+def decoder_factories(rig: Rig, files: ChannelFiles, link: str) -> list[Callable[[], ChannelDecoder]]:
     """Return for each channel of a link a function that makes a fresh decoder of it.
 
     Args:
         rig: whose channels.
-        directory: where the rig's DBC and EDS files are.
+        files: the rig's DBC and EDS files.
         link: name of the CAN link.
 
     Raises:
-        DescriptionError: a DBC or EDS file is missing, malformed, or lacks what a channel names.
+        DescriptionError: a channel lies beyond its frame, or is not in its PDO.
     """
-    dbc_files: dict[str, DbcFile] = {}
-    factories = []
-    for channel in rig.channels:
-        if channel.link != link:
-            continue
-        if isinstance(channel, DbcSignal) and channel.dbc not in dbc_files:
-            dbc_files[channel.dbc] = DbcFile(directory / channel.dbc)
-        factories.append(_factory(channel, rig, directory, dbc_files))
-    return factories
+    return [_factory(channel, rig, files) for channel in rig.channels if channel.link == link]
 
 
-def node_setups(rig: Rig, directory: Path, link: str) -> list[NodeSetup]:
+def node_setups(rig: Rig, files: ChannelFiles, link: str) -> list[NodeSetup]:
     """Settings that active set-up expects of each CANopen node of a link, and writes to it."""
     return [
         NodeSetup(
             node=channel.node,
             name=channel.name,
             profile=PROFILE_ANALOGUE if isinstance(channel, Cia404Analogue) else PROFILE_ENCODER,
-            pdo=_pdo(channel, directory),
+            pdo=files.pdos[channel.name],
             pdo_number=channel.pdo,
             mode=channel.mode,
             period_ms=channel.period_ms,
@@ -68,13 +54,11 @@ def node_setups(rig: Rig, directory: Path, link: str) -> list[NodeSetup]:
     ]
 
 
-def _factory(
-    channel: Channel, rig: Rig, directory: Path, dbc_files: dict[str, DbcFile]
-) -> Callable[[], ChannelDecoder]:
+def _factory(channel: Channel, rig: Rig, files: ChannelFiles) -> Callable[[], ChannelDecoder]:
     match channel:
         case Cia406Encoder():
             encoder = EncoderChannel(
-                **_canopen(channel, directory),
+                **_canopen(channel, files),
                 sign=channel.sign,
                 zero_counts=channel.zero_counts,
                 max_rate_per_s=_max_rate(rig, channel.name),
@@ -84,7 +68,7 @@ def _factory(
             return lambda: EncoderDecoder(encoder)
         case Cia406Linear():
             linear = LinearChannel(
-                **_canopen(channel, directory),
+                **_canopen(channel, files),
                 sign=channel.sign,
                 zero_counts=channel.zero_counts,
                 max_rate_per_s=_max_rate(rig, channel.name),
@@ -95,7 +79,7 @@ def _factory(
             return lambda: LinearDecoder(linear)
         case Cia404Analogue():
             analogue = AnalogueChannel(
-                **_canopen(channel, directory),
+                **_canopen(channel, files),
                 process_value=int(channel.object, 16),
                 decimal_digits=channel.decimal_digits,
                 scale=channel.scale,
@@ -104,16 +88,7 @@ def _factory(
             )
             return lambda: AnalogueDecoder(analogue)
         case DbcSignal():
-            signal = dbc_files[channel.dbc].channel(
-                channel.name,
-                channel.unit,
-                channel.message,
-                channel.signal,
-                scale=channel.scale,
-                offset=channel.offset,
-                timeout_s=channel.timeout_s,
-            )
-            signal = replace(signal, max_rate_per_s=_max_rate(rig, channel.name))
+            signal = replace(files.signals[channel.name], max_rate_per_s=_max_rate(rig, channel.name))
             return lambda: SignalDecoder(signal)
         case RawSignal():
             raw = SignalChannel(
@@ -146,24 +121,17 @@ class _CanopenPart(TypedDict):
     timeout_s: float
 
 
-def _canopen(channel: CanopenChannel, directory: Path) -> _CanopenPart:
+def _canopen(channel: CanopenChannel, files: ChannelFiles) -> _CanopenPart:
     return {
         "name": channel.name,
         "unit": channel.unit,
         "node": channel.node,
-        "pdo": _pdo(channel, directory),
+        "pdo": files.pdos[channel.name],
         "pdo_number": channel.pdo,
         "is_synchronous": channel.mode == "sync",
         "heartbeat_ms": channel.heartbeat_ms,
         "timeout_s": channel.timeout_s,
     }
-
-
-def _pdo(channel: CanopenChannel, directory: Path) -> TransmitPdo:
-    if channel.eds is not None:
-        return TransmitPdo.from_eds(directory / channel.eds, channel.node, channel.pdo)
-    carried = "6004" if isinstance(channel, Cia406Encoder) else channel.object
-    return TransmitPdo.usual(channel.node, channel.pdo, [_USUAL_MAPPING[carried]])
 
 
 def _bit_field(channel: RawSignal) -> BitField:

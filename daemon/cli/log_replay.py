@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from daemon.acquisition.acquisition import Acquisition
+from daemon.acquisition.channel_files import with_files
 from daemon.composition import decoders, joiner, motion_limits
 from daemon.config.config import Config
 from daemon.rig_files import RigSource
@@ -57,7 +58,8 @@ def replay_logs(
     starts = first_captures(files, settings, doubtful)  # a bad log is refused before a store is made
     clock = ManualClock()
     clock.set(min((capture.stamp for capture in starts.values()), key=lambda stamp: stamp.monotonic_ns))
-    made = decoders(settings, source)
+    source, read = with_files(source)
+    made = decoders(settings, source, read)
     with storage_errors(path), contextlib.closing(Store(path)) as store:
         declare_channels(store, source.rig)
         setups = StationSetups(source.rig, store, clock, settings.sessions.control_tolerance_mm)

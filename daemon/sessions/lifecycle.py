@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+from calibration.rig.decoding import without_decoding
 from calibration.rig.description import Rig
 from daemon.commands import REFUSED, CommandError, caller_columns
 from daemon.host.time_service import ClockState
@@ -67,11 +68,12 @@ class SessionLifecycle:
     def unfinished(self, rig_text: str) -> tuple[OpenSession | None, list[OpenSession]]:
         """The rig's open session, and those that have ended and whose last captures were not decoded yet.
 
-        A session is of one rig file: one that was started with another is closed, and gets no more fixes.
+        A session is of one rig file: one that was started with another is closed, and gets no more fixes. One that has
+        the file alone, as the store kept it before it kept the decoding of channels, goes on.
         """
         opened: OpenSession | None = None
         ended: list[OpenSession] = []
-        sha256 = rig_sha256(rig_text)
+        own = {rig_sha256(rig_text), rig_sha256(without_decoding(rig_text))}
         for row in self.table.unfinished():
             if row["rig"] != self._rig.name:
                 if row["state"] == "open":
@@ -79,7 +81,7 @@ class SessionLifecycle:
                         "session %s of rig %s is open; it goes on when rigcal runs that rig", row["id"], row["rig"]
                     )
                 continue
-            if row["rig_sha256"] != sha256:
+            if row["rig_sha256"] not in own:
                 if row["state"] == "open":
                     self._close_of_another_file(row)
                 continue

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import math
 import re
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -21,6 +23,8 @@ _FILE_MAX_BYTES = 2 << 20  # cantools takes more than a second for a megabyte
 
 _COUNTER_NAME = re.compile(r"counter|alive", re.IGNORECASE)
 _NO_VALUE_TEXT = re.compile(r"^(sna|(signal )?not available|invalid)$", re.IGNORECASE)
+
+_UNIT_SHOWN, _NUMBERS_SHOWN = 20, 8  # characters; numbers
 
 _MESSAGE_MAX_BYTES = 1785  # of J1939's transport protocol
 # cantools takes a second or two for each of these
@@ -101,13 +105,40 @@ class DbcFile:
         Raises:
             DescriptionError: no such message or signal, or one that no classic CAN frame can carry.
         """
-        try:
-            declared = self._declared(message, signal)
-        except (ArithmeticError, LookupError, ValueError) as error:
-            raise DescriptionError(self._where, f"signal {signal!r} cannot be read: {error}") from error
+        declared = self._declared(message, signal)
         return dataclasses.replace(declared, name=name, unit=unit, scale=scale, offset=offset, timeout_s=timeout_s)
 
+    def decoding(self, message: str, signal: str) -> str:
+        """Return in a line how a signal's bits become its value.
+
+        It is the same in every file that reads the same values out of the same frames, whatever else is in the file.
+        Range and message counter are left out: they make gaps in the readings, and no others.
+
+        Args:
+            message: name in the file.
+            signal: name in the file.
+
+        Raises:
+            DescriptionError: as `channel`.
+        """
+        found = self._declared(message, signal)
+        frame = f"{found.arbitration_id:08X}h" if found.is_extended else f"{found.arbitration_id:03X}h"
+        value = f"{found.factor!r} * {'float' if found.is_float else 'integer'} + {found.summand!r}"
+        parts = [f"frame {frame}", _place(found.field), f"{value} {found.unit[:_UNIT_SHOWN]}".rstrip()]
+        if found.not_available:
+            parts.append(f"no value {_listed(found.not_available)}")
+        if found.multiplexing is not None:
+            parts.append(f"where {_place(found.multiplexing.selector)} are {_listed(found.multiplexing.values)}")
+        return ", ".join(parts)
+
     def _declared(self, message: str, signal: str) -> SignalChannel:
+        """Return the channel as the file declares it."""
+        try:
+            return self._read(message, signal)
+        except (ArithmeticError, LookupError, ValueError) as error:
+            raise DescriptionError(self._where, f"signal {signal!r} cannot be read: {error}") from error
+
+    def _read(self, message: str, signal: str) -> SignalChannel:
         """Return the channel as the file declares it; numbers may be too large to compute with."""
         found = self._message(message)
         signals: dict[str, Signal] = {item.name: item for item in found.signals}
@@ -122,7 +153,7 @@ class DbcFile:
             )
         return SignalChannel(
             name=signal,
-            unit="",
+            unit=wanted.unit or "",
             arbitration_id=found.frame_id,
             is_extended=is_extended,
             field=_field(wanted),
@@ -168,6 +199,19 @@ def _counter(signals: dict[str, Signal], signal: str) -> BitField | None:
         if _COUNTER_NAME.search(item.name) and item.name != signal and not item.multiplexer_ids
     ]
     return _field(counters[0]) if len(counters) == 1 else None
+
+
+def _place(field: BitField) -> str:
+    sign = "signed" if field.is_signed else "unsigned"
+    return f"{field.length_bits} {sign} bits from {field.byte_order} bit {field.start_bit}"
+
+
+def _listed(numbers: Collection[int]) -> str:
+    """Return numbers in a line; of many, how many they are and a digest, which tells them from others."""
+    text = " ".join(map(str, sorted(numbers)))
+    if len(numbers) <= _NUMBERS_SHOWN:
+        return text
+    return f"{len(numbers)} numbers (SHA-256 {hashlib.sha256(text.encode()).hexdigest()[:16]})"
 
 
 def _plain(text: object) -> str:

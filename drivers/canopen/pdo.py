@@ -139,6 +139,14 @@ class TransmitPdo:
         arbitration_id = cob_id & (EXTENDED_ID_MAX if is_extended else 0x7FF)
         return cls(arbitration_id, is_extended, PdoMapping.from_words(words, f"{where}: TPDO{number}"))
 
+    def decoding(self, index: int) -> str:
+        """Return in a line where an object is found on the bus, whatever else the PDO carries."""
+        frame = f"frame {self.arbitration_id:08X}h" if self.is_extended else f"frame {self.arbitration_id:03X}h"
+        field = self.mapping.find(index)
+        if field is None:
+            return f"{frame}, without object {index:04X}h"
+        return f"{frame}, {field.length_bits} bits from bit {field.first_bit}, object {index:04X}h.{field.subindex}"
+
 
 @dataclass(frozen=True, kw_only=True)
 class PdoChannel:

@@ -212,6 +212,7 @@ def store_redecode(
     Outside sessions the store has one reading a second and channel; raw captures have them all. A time is taken with
     the whole chunks of captures that it touches, so that more than it may be decoded.
     """
+    from daemon.acquisition.channel_files import with_files
     from daemon.acquisition.redecoding import redecode_command
     from daemon.composition import decoders
     from daemon.config.config import read_config
@@ -230,8 +231,9 @@ def store_redecode(
     def work(store: Store) -> dict[str, Any]:
         from daemon.service import declare_channels
 
-        declare_channels(store, source.rig)
-        return redecode_command(store, source.rig, decoders(settings, source), arguments, _go_on)
+        decoded, files = with_files(source)
+        declare_channels(store, decoded.rig)
+        return redecode_command(store, decoded.rig, decoders(settings, decoded, files), arguments, _go_on)
 
     result = _on_store(settings, work, "store.redecode", arguments)
     if not as_json:

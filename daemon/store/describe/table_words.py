@@ -204,7 +204,11 @@ TABLES: dict[str, Words] = {
     "rig_files": Words(
         "Rig files",
         "One row for each text of a rig file that a session was recorded with.",
-        {"sha256": "SHA-256 of the text", "rig": "name of the rig", "text": "the file"},
+        {
+            "sha256": "SHA-256 of the text",
+            "rig": "name of the rig",
+            "text": "the file, and how the DBC and EDS files that it names decode",
+        },
         label="rig",
     ),
     "calibration_sessions": Words(

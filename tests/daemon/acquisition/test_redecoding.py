@@ -27,6 +27,7 @@ from daemon.store.upkeep.packing import Packing
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import Capture
 from tests.bench.store_growth import CONFIG, UTC_0_NS, traffic
+from tests.daemon.rig_file_support import ANOTHER_FACTOR, decoded_rig
 from tests.daemon.store_support import table
 
 SECONDS = 6.0
@@ -131,6 +132,20 @@ def test_a_session_is_decoded_again_with_its_own_rig_file_alone(thinned: Store) 
     with pytest.raises(CommandError, match=r"s001-r was recorded with another rig file.*this one -2000"):
         redecode_command(thinned, OTHER.rig, OTHER_DECODERS, {"session": "s001-r"}, lambda: None)
     assert table(thinned.path, "joint_samples") == before
+
+
+def test_a_session_from_before_a_change_of_the_dbc_file_is_not_decoded_again(thinned: Store, tmp_path: Path) -> None:
+    first = table(thinned.path, "joint_samples")[0]
+    before, after = decoded_rig(tmp_path / "before"), decoded_rig(tmp_path / "after", ANOTHER_FACTOR)
+    SessionTable(thinned, before.rig.name).start(
+        thinned.stamp(first), before.text, id="s001-r", prism="r", operator="", kind="check", note=""
+    )
+    stored_signals = table(thinned.path, "signals")
+    with pytest.raises(CommandError, match=r"s001-r was recorded with another rig file.* channel pump is decoded as "):
+        redecode_command(
+            thinned, after.rig, decoders(parse_config(CONFIG, tmp_path), after), {"session": "s001-r"}, lambda: None
+        )
+    assert table(thinned.path, "signals") == stored_signals
 
 
 def test_two_frames_of_one_instant_are_decoded_again_as_two(tmp_path: Path, sent: list[list[Capture]]) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from calibration.rig.description import parse_rig
+from daemon.acquisition.channel_files import ChannelFiles
 from daemon.acquisition.channels import decoder_factories
 from daemon.acquisition.simulated_channels import with_simulated_channels
 from daemon.rig_files import load_rig
@@ -204,7 +205,7 @@ def test_joints_without_a_channel_are_read_from_simulated_devices(panda: Path) -
     rig = parse_rig(with_simulated_channels(source.rig, source.text), "panda")
     assert [channel.name for channel in rig.channels] == list(rig.joint_names)
     simulator = RigSimulator(RigTruth(rig, 1), 1)
-    decoders = [factory() for factory in decoder_factories(rig, source.directory, "boom")]
+    decoders = [factory() for factory in decoder_factories(rig, ChannelFiles.read(rig, source.directory), "boom")]
     found: dict[str, float] = {}
     for step in range(1, 40):
         for frame in simulator.poll(step * 0.05).frames:

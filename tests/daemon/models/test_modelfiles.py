@@ -8,16 +8,17 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from calibration.errors import CalibrationError, ModelError
+from calibration.errors import CalibrationError, ModelError, UnsafeError
 from calibration.model.prediction import Predictor
 from calibration.observations import parse_observations
 from daemon.models import model_files as modelfiles
-from daemon.models.model_files import check_target, model_sha256, read_model, write_model
+from daemon.models.model_files import check_target, model_sha256, read_model, read_model_of_rig, write_model
 from tests.daemon.offline_support import held_out_csv, small_calibration
 
 
@@ -58,6 +59,19 @@ def test_a_written_model_predicts_the_same_when_read(written: Path) -> None:
 def test_the_manifest_names_the_model(written: Path, tmp_path: Path) -> None:
     digest = write_model(tmp_path / "again", small_calibration()[0])
     assert digest == model_sha256(written) == model_sha256(tmp_path / "again")
+
+
+def test_a_model_of_channels_that_a_file_decoded_otherwise_is_refused(written: Path, tmp_path: Path) -> None:
+    model = read_model(written)
+    before, after = (model.rig.with_decoding({"q1": f"frame 201h, {factor} * integer"}) for factor in (0.1, 0.01))
+    path = tmp_path / "model"
+    provenance = {**model.provenance, "rig_sha256": hashlib.sha256(before.text.encode()).hexdigest()}
+    write_model(path, replace(model, rig=before, rig_text=before.text, provenance=provenance))
+    for rig in (before, model.rig):
+        assert read_model_of_rig(path, model_sha256(path), rig).rig.decoding == before.decoding
+    with pytest.raises(UnsafeError, match="was made for another rig file"):
+        read_model_of_rig(path, model_sha256(path), after)
+    assert read_model_of_rig(written, model_sha256(written), after).rig.decoding == {}, "an older model goes on"
 
 
 def test_nothing_is_left_beside_the_model(tmp_path: Path) -> None:

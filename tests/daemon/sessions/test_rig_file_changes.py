@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from pathlib import Path
 
 import pytest
 
@@ -14,6 +15,7 @@ from daemon.rig_files import misreading
 from daemon.sessions.session_data import sessions_csv
 from daemon.store.queries.sessions import SessionTable
 from rigcal.store_api import open_store
+from tests.daemon.rig_file_support import ANOTHER_FACTOR, ANOTHER_LENGTH, decoded_rig, own_rig
 from tests.daemon.session_support import SOURCE, Rig, controlled
 
 L2 = 'name = "L2"\ndevice = "cia406_linear"\nnode = 48\n'
@@ -67,6 +69,44 @@ def test_sessions_of_another_rig_file_are_not_calibrated_together(session_rig: R
     )
     assert told["no_job"] is None or told["not_used"] in told["no_job"]
     assert SessionTable(session_rig.store, SOURCE.rig.name).untrained() == {}, "history is no alarm"
+
+
+@pytest.mark.parametrize("changed", ["dbc", "eds"])
+def test_sessions_from_before_and_after_a_changed_dbc_or_eds_file_are_not_calibrated_together(
+    session_rig: Rig, tmp_path: Path, changed: str
+) -> None:
+    change_rig_file(session_rig, decoded_rig(tmp_path).rig)
+    before = controlled(session_rig)
+    if changed == "dbc":
+        channel, after_change = "pump", decoded_rig(tmp_path, dbc=ANOTHER_FACTOR).rig
+    else:
+        channel, after_change = "theta1", decoded_rig(tmp_path, eds=ANOTHER_LENGTH).rig
+    change_rig_file(session_rig, after_change)
+    assert used(session_rig) == []
+    after = controlled(session_rig)
+    assert used(session_rig) == [after]
+    why = f"another rig file: its channel {channel} is decoded as "
+    assert why in session_rig.say("show", id=before)["not_used"]
+    with contextlib.closing(session_rig.store.reader()) as reader, pytest.raises(DataError, match=why):
+        sessions_csv(reader, session_rig.machine, [before, after])
+
+
+def test_an_unrelated_change_of_a_dbc_file_keeps_its_sessions(session_rig: Rig, tmp_path: Path) -> None:
+    change_rig_file(session_rig, decoded_rig(tmp_path).rig)
+    name = controlled(session_rig)
+    change_rig_file(
+        session_rig, decoded_rig(tmp_path, dbc=("SG_ ErrFlags : 60|4@1+ (1,0)", "SG_ Flags : 61|3@1+ (2,0)")).rig
+    )
+    assert used(session_rig) == [name]
+
+
+def test_sessions_from_before_decodings_were_stored_are_used_on(session_rig: Rig, tmp_path: Path) -> None:
+    change_rig_file(session_rig, own_rig(tmp_path).rig)
+    name = controlled(session_rig)
+    open_one = session_rig.say("start", prism="r")["id"]
+    change_rig_file(session_rig, decoded_rig(tmp_path).rig)
+    assert used(session_rig) == [name]
+    assert [s["state"] for s in session_rig.say("list") if s["id"] == open_one] == ["open"], "it is the same file"
 
 
 def test_sessions_count_again_as_soon_as_their_rig_file_is_back(session_rig: Rig) -> None:

@@ -204,3 +204,74 @@ def test_a_factor_that_makes_no_value_is_refused(tmp_path: Path, numbers: str) -
     )
     with pytest.raises(DescriptionError, match=r"signal 'P_Pump_bar': factor .* make no value"):
         DbcFile(written(tmp_path, text)).channel("pump", "bar", "Pressure1", "P_Pump_bar")
+
+
+def decoding(
+    directory: Path, old: str = "", new: str = "", signal: tuple[str, str] = ("Pressure1", "P_Pump_bar")
+) -> str:
+    text = DBC.read_text(encoding="cp1252")
+    assert old in text
+    path = directory / "changed.dbc"
+    path.write_text(text.replace(old, new) if old else text, encoding="cp1252")
+    return DbcFile(path).decoding(*signal)
+
+
+PUMP = "SG_ P_Pump_bar : 0|16@1+ (0.1,0)"
+
+
+def test_how_a_signal_is_decoded_is_told_in_a_line(tmp_path: Path) -> None:
+    assert decoding(tmp_path) == "frame 201h, 16 unsigned bits from intel bit 0, 0.1 * integer + 0.0 bar"
+    flow = decoding(tmp_path, signal=("AuxValve0Cmd", "PortFlowCmd_pct"))
+    assert flow == "frame 0CFE3021h, 8 unsigned bits from intel bit 0, 0.4 * integer + 0.0 %"
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (PUMP, PUMP.replace("0.1", "0.01")),
+        (PUMP, PUMP.replace(",0)", ",-1)")),
+        (PUMP, PUMP.replace("0|16", "0|12")),
+        (PUMP, PUMP.replace("0|16", "1|15")),
+        (PUMP, PUMP.replace("@1+", "@1-")),
+        (PUMP, PUMP.replace("0|16@1", "7|16@0")),
+        ('[0|600] "bar" DAQ\n SG_ P_BoomA', '[0|600] "kPa" DAQ\n SG_ P_BoomA'),
+        ("BO_ 513 P", "BO_ 514 P"),
+        ("VAL_ ", 'VAL_ 513 P_Pump_bar 9 "SNA";\nVAL_ '),
+    ],
+    ids=["factor", "offset", "length", "start", "sign", "byte order", "unit", "identifier", "no value"],
+)
+def test_another_reading_of_the_same_frames_is_another_decoding(tmp_path: Path, old: str, new: str) -> None:
+    assert decoding(tmp_path, old, new) != decoding(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("@1- (1,0)", "@1- (2,0)"),
+        ("SG_ P_BoomA_bar : 16|16@1+ (0.1,0)", "SG_ P_BoomA_bar : 16|16@1+ (0.01,0)"),
+        ("[0|600]", "[0|700]"),
+        ("MsgCounter", "Alive"),
+        ("2365468705", "2365468706"),
+        ('VERSION ""', 'VERSION "2"'),
+        ("BU_: MachineECU DAQ", "BU_: MachineECU DAQ Other"),
+    ],
+    ids=["other message", "other signal", "range", "counter", "other identifier", "version", "nodes"],
+)
+def test_what_else_is_in_a_file_is_no_other_decoding(tmp_path: Path, old: str, new: str) -> None:
+    assert decoding(tmp_path, old, new) == decoding(tmp_path)
+
+
+def test_the_page_of_a_multiplexed_signal_is_part_of_its_decoding_however_many_it_has(tmp_path: Path) -> None:
+    def told(*pages: int) -> str:
+        ranges = ",".join(f"{page}-{page}" for page in pages)
+        path = tmp_path / "pages.dbc"
+        path.write_text(
+            f'BO_ 1 M: 8 X\n SG_ page M : 0|8@1+ (1,0) [0|0] "" X\n SG_ a m{pages[0]} : 8|8@1+ (1,0) [0|0] "" X\n'
+            f"SG_MUL_VAL_ 1 a page {ranges};\n"
+        )
+        return DbcFile(path).decoding("M", "a")
+
+    assert told(1, 2).endswith("where 8 unsigned bits from intel bit 0 are 1 2")
+    many = told(*range(200))
+    assert "are 200 numbers (SHA-256 " in many
+    assert many != told(*range(1, 201))

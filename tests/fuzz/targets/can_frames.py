@@ -6,6 +6,7 @@ import contextlib
 
 import msgpack
 
+from daemon.acquisition.channel_files import ChannelFiles
 from daemon.acquisition.channels import decoder_factories
 from daemon.rig_files import load_rig
 from drivers.can.error_frames import BusErrors
@@ -60,7 +61,7 @@ def _slcan() -> Run:
 
 def _decoder() -> Run:
     source = load_rig("swdt82")
-    factories = decoder_factories(source.rig, source.directory, "boom")
+    factories = decoder_factories(source.rig, ChannelFiles.read(source.rig, source.directory), "boom")
     raw = SignalChannel(
         name="raw", unit="x", arbitration_id=0x18FEEE00, is_extended=True, field=BitField(0, 8, "intel")
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import struct
 
+from daemon.acquisition.channel_files import ChannelFiles
 from daemon.acquisition.channels import decoder_factories, node_setups
 from daemon.rig_files import load_rig
 from drivers.can.frame import Frame
@@ -38,7 +39,8 @@ def _sdo() -> Run:
 
 def _setup() -> Run:
     source = load_rig("swdt82")
-    setups = [s for s in node_setups(source.rig, source.directory, "boom") if s.node in (32, 48, 60)]
+    files = ChannelFiles.read(source.rig, source.directory)
+    setups = [s for s in node_setups(source.rig, files, "boom") if s.node in (32, 48, 60)]
 
     def run(data: bytes) -> None:
         conversation = SetupRunner()
@@ -84,7 +86,7 @@ def _answer(data: bytes, at: int, asked: bytes) -> tuple[bytes, int]:  # noqa: P
 
 def _supervision() -> Run:
     source = load_rig("swdt82")
-    factories = decoder_factories(source.rig, source.directory, "boom")
+    factories = decoder_factories(source.rig, ChannelFiles.read(source.rig, source.directory), "boom")
 
     def run(data: bytes) -> None:
         made = (make() for make in factories)

@@ -9,6 +9,7 @@ from pathlib import Path
 from calibration.errors import DataError, RigError
 from calibration.observations import parse_observations
 from calibration.rig.description import parse_rig
+from daemon.acquisition.channel_files import ChannelFiles
 from daemon.acquisition.channels import decoder_factories, node_setups
 from daemon.cli.offline import with_columns
 from daemon.config.config import ConfigError, parse_config
@@ -78,9 +79,10 @@ def _rig() -> Run:
             text = data.decode()
             try:
                 rig = parse_rig(text, "rig.toml")
+                files = ChannelFiles.read(rig, directory)
                 for link in {channel.link for channel in rig.channels}:
-                    node_setups(rig, directory, link)
-                    decoder = CanDecoder(link, [make() for make in decoder_factories(rig, directory, link)])
+                    node_setups(rig, files, link)
+                    decoder = CanDecoder(link, [make() for make in decoder_factories(rig, files, link)])
                     for capture in some:
                         decoder.feed(capture)
                         decoder.tick(capture.stamp)
