@@ -54,8 +54,7 @@ def replay_logs(
         DescriptionError, ConfigError: a log is malformed, empty, or of a link that is not configured.
         StoreError: the store cannot be written.
     """
-    doubtful = {} if told is None else told.doubtful
-    starts = first_captures(files, settings, doubtful)  # a bad log is refused before a store is made
+    starts = first_captures(files, settings, told)  # a bad log is refused before a store is made
     clock = ManualClock()
     clock.set(min((capture.stamp for capture in starts.values()), key=lambda stamp: stamp.monotonic_ns))
     source, read = with_files(source)
@@ -82,7 +81,7 @@ def replay_logs(
             commands = _commands_of(told, sessions, clock.monotonic_ns())
             store.insert_records([_event_of(state) for state in told.device_states])
         acquisition = Acquisition((), made, store, clock, on_records=sessions.on_records)
-        acquisition.run_inline(_followed(merged(files, settings, doubtful), clock, commands))
+        acquisition.run_inline(_followed(merged(files, settings, told), clock, commands))
         for _, command in commands:  # those after the last capture
             command()
         return sessions.list_command({})[0] if told is not None else None

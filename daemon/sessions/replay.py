@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from daemon.config.config import Config, ConfigError
-from daemon.sessions.export.session_file import DoubtfulCaptures
+from daemon.sessions.export.session_file import SessionFile
+from daemon.sessions.vector_channels import SUFFIXES as VECTOR_SUFFIXES
+from daemon.sessions.vector_channels import links_of_channels
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S, Stamp
 from drivers.errors import DescriptionError
@@ -20,20 +22,18 @@ from drivers.logs.can_log import read_can_log
 from drivers.logs.serial_log import read_serial_log
 from drivers.readings import Capture
 
-CAN_SUFFIXES = (".log", ".asc", ".blf")
+CAN_SUFFIXES = (".log", *VECTOR_SUFFIXES)
 SERIAL_SUFFIX = ".serial"
 BOOT_ID = "replayed"
 LATEST_UTC_NS = 4_102_444_800 * NS_PER_S  # the year 2100
 
 
-NO_DOUBTS: Mapping[str, DoubtfulCaptures] = {}
-
-
-def captures_of(path: Path, config: Config, doubtful: Mapping[str, DoubtfulCaptures] = NO_DOUBTS) -> Iterator[Capture]:
+def captures_of(path: Path, config: Config, told: SessionFile | None = None) -> Iterator[Capture]:
     """Captures of one file, in order, with the link names of the configuration.
 
-    A CAN log's channels are matched with the configured links' names, then with their channels (`can0`); a log of one
-    channel and a configuration of one link belong together in any case. Two channels never become one link.
+    A CAN log's channels are matched with the configured links' names, then with their channels (`can0`); the numbers
+    of `.asc` and `.blf` by the session file, else as `vector_channels` has it. A log of one channel and a configuration
+    of one link belong together in any case, unless the session file says otherwise. Two channels never become one link.
 
     A log knows UTC alone, so all stamps are put on one monotonic axis: that of UTC. Recorded time that steps back
     stands still until it is past again.
@@ -41,19 +41,25 @@ def captures_of(path: Path, config: Config, doubtful: Mapping[str, DoubtfulCaptu
     Args:
         path: the file.
         config: names the links.
-        doubtful: link -> its captures of doubtful time, as a session file tells them.
+        told: the session file of the log; None without one.
 
     Raises:
-        DescriptionError: the file is malformed (file and line), is no captured log, or has several channels for a link;
-            or it is not the one that `doubtful` speaks of.
+        DescriptionError: the file is malformed (file and line), is no captured log, or has several channels for a link,
+            or one that may be several links'; or it is not the one that the session file speaks of.
         ConfigError: a link of the file is not configured.
     """
     captures: Iterator[Capture]
     suffix = path.suffix.lower()
+    doubtful = {} if told is None else told.doubtful
     if suffix in CAN_SUFFIXES:
-        known = {section.channel: section.name for section in config.can} | {s.name: s.name for s in config.can}
         what, captures = "[[can]]", read_can_log(path)
         only = config.can[0].name if len(config.can) == 1 else None
+        if suffix in VECTOR_SUFFIXES:
+            numbers = {} if told is None else told.can_channels
+            known = links_of_channels(path, config, numbers)
+            only = None if only in numbers else only
+        else:
+            known = {section.channel: section.name for section in config.can} | {s.name: s.name for s in config.can}
     elif suffix == SERIAL_SUFFIX:
         known = {station.name: station.name for station in config.station}
         what, captures = "[[station]]", read_serial_log(path)
@@ -73,8 +79,7 @@ def captures_of(path: Path, config: Config, doubtful: Mapping[str, DoubtfulCaptu
         if not 0 <= capture.stamp.utc_ns < LATEST_UTC_NS:
             raise DescriptionError(str(path), f"a capture at {capture.stamp.utc_ns / NS_PER_S:.0f} s is beyond 2100")
         latest_ns = max(latest_ns, capture.stamp.utc_ns)
-        told = doubtful.get(link)
-        is_doubtful = told is not None and told.is_among(counts[link])
+        is_doubtful = link in doubtful and doubtful[link].is_among(counts[link])
         counts[link] += 1
         yield replace(capture, link=link, stamp=Stamp(capture.stamp.utc_ns, latest_ns, BOOT_ID, is_doubtful))
     for link, count in counts.items():
@@ -94,9 +99,7 @@ def _several_channels(path: Path, link: str, what: str, known: Mapping[str, str]
     )
 
 
-def first_captures(
-    paths: Sequence[Path], config: Config, doubtful: Mapping[str, DoubtfulCaptures] = NO_DOUBTS
-) -> dict[Path, Capture]:
+def first_captures(paths: Sequence[Path], config: Config, told: SessionFile | None = None) -> dict[Path, Capture]:
     """The first capture of each file; every file is read through, so that a bad one is refused before anything runs.
 
     Raises:
@@ -109,7 +112,7 @@ def first_captures(
         if path in firsts:
             raise DescriptionError(str(path), "is given twice: its captures would be stored twice; give it once")
         found: dict[str, _Span] = {}
-        for capture in captures_of(path, config, doubtful):
+        for capture in captures_of(path, config, told):
             firsts.setdefault(path, capture)
             at_ns = capture.stamp.monotonic_ns
             span = found.get(capture.link)
@@ -146,11 +149,9 @@ def _utc(utc_ns: int) -> str:
     return f"{datetime.fromtimestamp(utc_ns / NS_PER_S, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
-def merged(
-    paths: Sequence[Path], config: Config, doubtful: Mapping[str, DoubtfulCaptures] = NO_DOUBTS
-) -> Iterator[Capture]:
+def merged(paths: Sequence[Path], config: Config, told: SessionFile | None = None) -> Iterator[Capture]:
     """Captures of several files in the order of their instants; at one instant in the order of the files."""
-    files = (captures_of(path, config, doubtful) for path in paths)
+    files = (captures_of(path, config, told) for path in paths)
     return heapq.merge(*files, key=lambda capture: capture.stamp.monotonic_ns)
 
 

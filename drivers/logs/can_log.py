@@ -18,7 +18,7 @@ import contextlib
 import math
 import re
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import can
@@ -67,12 +67,18 @@ def read_can_log(path: Path, link: str | None = None) -> Iterator[CanCapture]:
         raise DescriptionError(str(path), f"cannot be read: {error.strerror}") from error
 
 
-def write_can_log(path: Path, captures: Iterable[CanCapture]) -> int:
+def channel_name(number: int) -> str:
+    """Return the name that frames of a channel of an `.asc` or `.blf` get: `can0` for channel 1."""
+    return f"can{number - 1}"
+
+
+def write_can_log(path: Path, captures: Iterable[CanCapture], channels: Mapping[str, int] | None = None) -> int:
     """Write a log; return the number of frames.
 
     Args:
         path: the file; its suffix is one of FORMATS.
-        captures: in order. For `.asc` and `.blf` the links get channel numbers in order of appearance.
+        captures: in order.
+        channels: link -> its channel number, from 1, in `.asc` and `.blf`; None: in order of appearance.
 
     Raises:
         DescriptionError: not one of FORMATS, the file cannot be written, or a link's name has blanks (candump).
@@ -81,7 +87,7 @@ def write_can_log(path: Path, captures: Iterable[CanCapture]) -> int:
     try:
         if suffix == ".log":
             return _write_candump(path, captures)
-        return _write_vector(path, captures)
+        return _write_vector(path, captures, channels)
     except OSError as error:
         raise DescriptionError(str(path), f"cannot be written: {error.strerror}") from error
 
@@ -201,9 +207,9 @@ def _capture(message: can.Message, link: str | None, where: str) -> CanCapture:
         <= (EXTENDED_ID_MAX if is_extended or message.is_error_frame else STANDARD_ID_MAX)
     ):
         raise DescriptionError(where, f"identifier {message.arbitration_id:X}h is beyond what CAN has")
-    channel = message.channel if isinstance(message.channel, int) else 0
+    number = message.channel + 1 if isinstance(message.channel, int) else 1
     return CanCapture(
-        f"can{channel}" if link is None else link,
+        channel_name(number) if link is None else link,
         _stamp(round(message.timestamp * 1e6) * _NS_PER_US, where),
         message.arbitration_id,
         data,
@@ -214,14 +220,15 @@ def _capture(message: can.Message, link: str | None, where: str) -> CanCapture:
     )
 
 
-def _write_vector(path: Path, captures: Iterable[CanCapture]) -> int:
-    channels: dict[str, int] = {}
+def _write_vector(path: Path, captures: Iterable[CanCapture], given: Mapping[str, int] | None) -> int:
+    seen: dict[str, int] = {}
     count = 0
     writer = can.ASCWriter(path) if path.suffix.lower() == ".asc" else can.BLFWriter(path)
     with contextlib.ExitStack() as stack:
         stack.callback(writer.stop)
         for capture in captures:
             timestamp = _microseconds(capture) / 1e6
+            number = seen.setdefault(capture.link, len(seen) + 1) if given is None else given[capture.link]
             if count == 0 and isinstance(writer, can.ASCWriter):
                 # Frames are counted from the header's start, whose milliseconds python-can writes without zeros
                 writer.log_event("// start", math.floor(timestamp))
@@ -234,7 +241,7 @@ def _write_vector(path: Path, captures: Iterable[CanCapture]) -> int:
                     is_remote_frame=capture.is_remote,
                     is_error_frame=capture.is_error,
                     is_rx=not capture.is_transmitted,
-                    channel=channels.setdefault(capture.link, len(channels)),
+                    channel=number - 1,  # python-can counts from 0
                 )
             )
             count += 1

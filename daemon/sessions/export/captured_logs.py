@@ -13,6 +13,7 @@ from daemon.config.config import Config, ConfigError
 from daemon.host.safe_output import write_file
 from daemon.sessions.export.session_file import DeviceState, DoubtfulCaptures, SessionFile
 from daemon.sessions.session_data import SteadyTime, sessions_csv
+from daemon.sessions.vector_channels import channel_numbers
 from daemon.store.queries.device_states import device_states
 from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS, prism_confirmations, session
 from daemon.store.queries.setups import control_points
@@ -53,13 +54,15 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
         steady = SteadyTime()
         steady.of(since)
         doubtful: dict[str, DoubtfulCaptures] = {}
-        for link in reader.links():
+        links = reader.links()
+        numbers = channel_numbers(config, [link["name"] for link in links if link["kind"] == "can"])
+        for link in links:
             stored = reader.captures(link["name"], since, until)
             doubts = _Doubts()
             captures = doubts.noted(replace(capture, stamp=steady.of(capture.stamp)) for capture in stored)
             if link["kind"] == "can":
                 path = out / f"{session_id}-{link['name']}.{can_format}"
-                write_can_log(path, (c for c in captures if isinstance(c, CanCapture)))
+                write_can_log(path, (c for c in captures if isinstance(c, CanCapture)), numbers)
             else:
                 path = out / f"{session_id}-{link['name']}.serial"
                 with path.open("w", encoding="utf-8", newline="\n") as stream:
@@ -89,6 +92,7 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
                 for point in control_points(reader, found["setup_id"])
             },
             doubtful=doubtful,
+            can_channels=numbers,
             device_states=tuple(states),
         )
         path = out / f"{session_id}.json"

@@ -60,6 +60,8 @@ class SessionFile(BaseModel):
         prism_turned_utc_ns: when something turned the station to the prism, on the same time.
         control_points: name -> place, mm, of those of its set-up: fixes there are not of the prism.
         doubtful: link -> its captures of doubtful time; links without any are not there.
+        can_channels: CAN link -> its channel number, from 1, in logs that have no names; empty in files of earlier
+            versions.
         device_states: what devices had told of their state before the logs begin, oldest first.
     """
 
@@ -73,6 +75,7 @@ class SessionFile(BaseModel):
     prism_confirmed_utc_ns: tuple[int, ...] = ()
     prism_turned_utc_ns: tuple[int, ...] = ()
     doubtful: dict[str, DoubtfulCaptures] = Field(default_factory=dict)
+    can_channels: dict[str, int] = Field(default_factory=dict)
     device_states: tuple[DeviceState, ...] = ()
 
 

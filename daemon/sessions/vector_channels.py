@@ -1,0 +1,71 @@
+"""Channel numbers of Vector logs (`.asc`, `.blf`), which these have in place of names, and the CAN links they are."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from daemon.config.config import Config
+from drivers.errors import DescriptionError
+from drivers.logs.can_log import channel_name, read_can_log
+
+SUFFIXES = (".asc", ".blf")
+
+_NUMBERED = re.compile(r"can(\d{1,2})")
+
+
+def channel_numbers(config: Config, stored: Iterable[str] = ()) -> dict[str, int]:
+    """Return the number, from 1, of each CAN link in Vector logs.
+
+    `can0` is number 1, `can1` number 2, by a link's name or else its channel. Links that are called otherwise get the
+    numbers that are left, in the order of the configuration.
+
+    Args:
+        config: names the links.
+        stored: further CAN links, which are no longer configured.
+    """
+    names = [*dict.fromkeys([section.name for section in config.can] + list(stored))]
+    called = [(name, name) for name in names] + [(section.channel, section.name) for section in config.can]
+    numbers: dict[str, int] = {}
+    for word, name in called:
+        found = _NUMBERED.fullmatch(word)
+        if found and name not in numbers and int(found[1]) + 1 not in numbers.values():
+            numbers[name] = int(found[1]) + 1
+    taken = set(numbers.values())
+    free = (number for number in itertools.count(1) if number not in taken)
+    return numbers | {name: next(free) for name in names if name not in numbers}
+
+
+def links_of_channels(path: Path, config: Config, told: Mapping[str, int]) -> dict[str, str]:
+    """Return channel name, as `read_can_log` gives it -> link, for a Vector log.
+
+    Args:
+        path: the log.
+        config: names the links.
+        told: link -> its number, by the session file of the log; empty where that does not say it.
+
+    Raises:
+        DescriptionError: the log is malformed; or it has frames of channel 1 alone and several links may be meant.
+    """
+    numbers = {name: number for name, number in told.items() if name in {section.name for section in config.can}}
+    if not told:
+        numbers = channel_numbers(config)
+        first = channel_name(1)
+        if len(numbers) > 1 and all(capture.link == first for capture in read_can_log(path)):
+            return {first: _named_by(path, list(numbers))}
+    return {channel_name(number): name for name, number in numbers.items()}
+
+
+def _named_by(path: Path, names: Sequence[str]) -> str:
+    """Return the link by which an exported log is named: the files of all links once had channel 1."""
+    ending = [name for name in names if path.stem == name or path.stem.endswith(f"-{name}")]
+    if len(ending) != 1:
+        raise DescriptionError(
+            str(path),
+            f"has frames of channel 1 alone, which was every link's in exports of earlier versions, and its name ends "
+            f"in that of {'several links' if ending else 'no link'}: name the file ...-LINK{path.suffix}, with LINK "
+            f"one of {', '.join(names)}; or give the session file of an export with --session",
+        )
+    return ending[0]
