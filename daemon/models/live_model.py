@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from calibration.errors import ModelError, UnsafeError
 from calibration.rig.description import Rig
 from daemon.store.queries.models import ModelRow, ModelTable
+from daemon.store.queries.time_axis import TimeAxis
 
 if TYPE_CHECKING:
     from calibration.model.model import CalibratedModel
@@ -34,15 +35,13 @@ class Loaded:
         id: its number in the store.
         model: to predict with.
         jumped: joints whose readings jumped since it was trained: their zeros are not those that it knows.
-        zero_ns: UTC that `time_s` of its training counts from.
-        newest_ns: UTC of the newest observation that it was trained on; now is later, or the clock is wrong.
+        time_axis: that `time_s` of its training lies on, as it was when the model was loaded.
     """
 
     id: int
     model: CalibratedModel
     jumped: tuple[str, ...]
-    zero_ns: int
-    newest_ns: int
+    time_axis: TimeAxis
 
 
 @dataclass(frozen=True)
@@ -163,7 +162,7 @@ class LiveModel:
             if row is None:
                 return Missing(NO_MODEL)
             jumped = tuple(name for name in self._table.jumped(row) if name in self._rig.joint_names)
-            loaded = Loaded(row.id, self.load(row), jumped, *self._table.training_ns(row))
+            loaded = Loaded(row.id, self.load(row), jumped, self._table.time_axis())
         except Exception as error:  # noqa: BLE001 - logged, and shown as what it is
             if self._stopping:
                 return Missing(LOADING)  # store and processes are going away under it: no defect of the model

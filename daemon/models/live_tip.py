@@ -22,7 +22,7 @@ from daemon.acquisition.joiner import MachineState, ObservationJoiner
 from daemon.commands import CommandError
 from daemon.models.live_model import LiveModel, Loaded, Missing
 from drivers.can.tip_frames import TipMessage, TipStatus
-from drivers.clock import NS_PER_S, Clock
+from drivers.clock import NS_PER_S, Clock, Stamp
 from drivers.readings import DeviceEvent, EventKind, Record
 
 if TYPE_CHECKING:
@@ -237,8 +237,10 @@ def _observation(live: Loaded, rig: Rig, state: MachineState, known: Tip, setup:
     extra = {name: np.array([value]) for name, value in state.values.items() if name not in known.joints}
     if state.dwell_s is not None:
         extra["dwell_s"] = np.array([state.dwell_s])
-    if known.utc_ns is not None and known.utc_ns >= live.newest_ns:  # a clock that was set back tells no time
-        extra["time_s"] = np.array([(known.utc_ns - live.zero_ns) / NS_PER_S])
+    if known.utc_ns is not None:
+        at_s = live.time_axis.present(Stamp(known.utc_ns, state.monotonic_ns, state.boot_id))
+        if at_s is not None:
+            extra["time_s"] = np.array([at_s])
     return Observations(
         prism=np.array([known.prism]),
         joints=joints,

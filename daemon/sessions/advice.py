@@ -49,8 +49,8 @@ class SessionAdvice:
         if session.kind == CHECK and not CHECK_POSES[0] <= summary["poses"] <= CHECK_POSES[1]:
             advice.append(f"a check wants {CHECK_POSES[0]} to {CHECK_POSES[1]} poses; this one has {summary['poses']}")
         advice += [
-            f"the computer's clock was set back by {-step['step_s']:.1f} s during the session: its rows keep the times "
-            "that it showed, and calibration goes by the monotonic clock"
+            f"the computer's clock was set back by {-step['step_s']:.1f} s during the session or before it: "
+            "rows keep the times that it showed, and calibration goes by the monotonic clock"
             for step in summary["clock_steps"]
             if step["step_s"] < 0
         ]

@@ -9,47 +9,28 @@ import csv
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from calibration.errors import DataError
 from calibration.rig.description import Rig
 from calibration.table import LABEL_COLUMNS, POSITION_COLUMNS, SIGMA_COLUMNS
 from daemon.report.calibration.inputs import ControlPoint, SetupLine
 from daemon.rig_files import HOW_TO_READ_AGAIN, misreading
-from daemon.store.queries.observations import first_observation_ns, moving_observations, observations
+from daemon.store.queries.observations import moving_observations, observations
 from daemon.store.queries.sessions import OTHER_RIG_FILE, session
 from daemon.store.queries.setups import misclosures, setups_of
+from daemon.store.queries.time_axis import time_axis
 from daemon.store.reader import Reader
-from drivers.clock import NS_PER_S, Stamp
 
 Misclosure = tuple[float, float, float]
-
-
-class SteadyTime:
-    """Puts instants on one axis: UTC as it was at the first instant of each boot, and no boot before the one before.
-
-    So UTC has no steps of a computer's clock: within a boot, time passes as the monotonic clock says.
-    """
-
-    def __init__(self) -> None:
-        self._offsets_ns: dict[str, int] = {}
-        self._latest_ns = -(2**63)
-
-    def of(self, stamp: Stamp) -> Stamp:
-        """Return the stamp of an instant with steady UTC in place of the computer's."""
-        if stamp.boot_id not in self._offsets_ns:
-            self._offsets_ns[stamp.boot_id] = max(stamp.utc_ns, self._latest_ns) - stamp.monotonic_ns
-        utc_ns = stamp.monotonic_ns + self._offsets_ns[stamp.boot_id]
-        self._latest_ns = max(self._latest_ns, utc_ns)
-        return replace(stamp, utc_ns=utc_ns)
 
 
 def sessions_csv(reader: Reader, rig: Rig, session_ids: Sequence[str], *, moving: bool = False) -> bytes:
     """Observations of the given sessions that calibration may use, oldest first; with `moving` those of a moving boom.
 
-    `time_s` counts from the store's first observation that calibration may use, on UTC, steady within a session:
-    sessions may lie boots apart. It is the same whichever sessions are asked for: what a model has learned from some of
-    them depends on time (a jump, a base that settles), and is applied to others.
+    `time_s` counts from the store's first observation that calibration may use, on one axis for all sessions
+    (`daemon.store.queries.time_axis`). It is the same whichever sessions are asked for: what a model has learned from
+    some of them depends on time (a jump, a base that settles), and is applied to others.
 
     Raises:
         DataError: another rig file turned counts into the readings of one of the sessions, so that they are not
@@ -63,19 +44,15 @@ def sessions_csv(reader: Reader, rig: Rig, session_ids: Sequence[str], *, moving
     values = [json.loads(row["values_json"]) for row in rows]
     joints = [joint.column for joint in rig.joints]
     more = sorted({name for row in values for name in row} - set(joints))
-    steady = {session_id: SteadyTime() for session_id in session_ids}
-    utc_ns = [
-        steady[row["session_id"]].of(Stamp(row["utc_ns"], row["monotonic_ns"], str(row["boot_id"]))).utc_ns
-        for row in rows
-    ]
-    zero_ns = first_observation_ns(reader)
+    axis = time_axis(reader)
+    at_s = [axis.observed(reader.stamp(row)) for row in rows]
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(["prism", *joints, *POSITION_COLUMNS, *LABEL_COLUMNS, "time_s", *SIGMA_COLUMNS, "dwell_s", *more])
-    for row, measured, at_ns in zip(rows, values, utc_ns, strict=True):
+    for row, measured, seconds in zip(rows, values, at_s, strict=True):
         cells = [row["prism"], *(measured.get(name) for name in joints)]
         cells += [row[name] for name in POSITION_COLUMNS]
-        cells += [row["setup_id"], row["session_id"], row["pose"], round((at_ns - zero_ns) / NS_PER_S, 6)]
+        cells += [row["setup_id"], row["session_id"], row["pose"], round(seconds, 6)]
         cells += [row[name] for name in SIGMA_COLUMNS] + [row["dwell_s"], *(measured.get(name) for name in more)]
         writer.writerow("" if cell is None else repr(cell) if isinstance(cell, float) else cell for cell in cells)
     return out.getvalue().encode()

@@ -21,7 +21,7 @@ from daemon.cli.demo.operator import DEADLINE_S, PRISMS, RIG, Advance, DemoError
 from daemon.cli.terminal import echo, echo_error, echo_table
 from daemon.rig_files import load_rig
 from daemon.sessions.session_data import sessions_csv
-from daemon.store.queries.observations import first_observation_ns
+from daemon.store.queries.observations import first_observation
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S
 
@@ -121,7 +121,10 @@ def _timed_as(truth: Truth, store: Path) -> Truth:
     if "time_s" not in truth.coefficients:
         return truth
     with Reader(store) as reader:
-        later_s = (first_observation_ns(reader) - truth.begin_utc_ns) / NS_PER_S
+        first = first_observation(reader)
+    if first is None:
+        return truth
+    later_s = (first["utc_ns"] - truth.begin_utc_ns) / NS_PER_S
     time_s = truth.coefficients["time_s"] - later_s
     return replace(truth, coefficients={**truth.coefficients, "time_s": time_s})
 

@@ -12,12 +12,13 @@ from daemon.commands import CommandError
 from daemon.config.config import Config, ConfigError
 from daemon.host.safe_output import write_file
 from daemon.sessions.export.session_file import DeviceState, DoubtfulCaptures, SessionFile
-from daemon.sessions.session_data import SteadyTime, sessions_csv
+from daemon.sessions.session_data import sessions_csv
 from daemon.sessions.vector_channels import channel_numbers
 from daemon.store.queries.device_states import device_states
 from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS, prism_confirmations, session
 from daemon.store.queries.setups import control_points
 from daemon.store.reader import Reader
+from drivers.clock import Stamp
 from drivers.logs.can_log import write_can_log
 from drivers.logs.serial_log import SerialLogHeader, SerialLogWriter
 from drivers.readings import CanCapture, Capture, SerialCapture
@@ -51,7 +52,7 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
         since, until = started.shifted(-BEFORE_NS), ended.shifted(AFTER_NS)
         out.mkdir(parents=True, exist_ok=True)
         files = []
-        steady = SteadyTime()
+        steady = _SteadyTime()
         steady.of(since)
         doubtful: dict[str, DoubtfulCaptures] = {}
         links = reader.links()
@@ -115,6 +116,25 @@ def ended_session(reader: Reader, session_id: str) -> dict[str, Any]:
     if found["ended_utc_ns"] is None:
         raise CommandError(f"session {session_id!r} is still open; stop it first")
     return found
+
+
+class _SteadyTime:
+    """Puts instants on one axis: UTC as it was at the first instant of each boot, and no boot before the one before.
+
+    So UTC has no steps of a computer's clock: within a boot, time passes as the monotonic clock says.
+    """
+
+    def __init__(self) -> None:
+        self._offsets_ns: dict[str, int] = {}
+        self._latest_ns = -(2**63)
+
+    def of(self, stamp: Stamp) -> Stamp:
+        """Return the stamp of an instant with steady UTC in place of the computer's."""
+        if stamp.boot_id not in self._offsets_ns:
+            self._offsets_ns[stamp.boot_id] = max(stamp.utc_ns, self._latest_ns) - stamp.monotonic_ns
+        utc_ns = stamp.monotonic_ns + self._offsets_ns[stamp.boot_id]
+        self._latest_ns = max(self._latest_ns, utc_ns)
+        return replace(stamp, utc_ns=utc_ns)
 
 
 class _Doubts:

@@ -15,8 +15,8 @@ from typing import Any
 
 from daemon.store.connection import Connection
 from daemon.store.errors import NotInStoreError
-from daemon.store.queries.observations import first_observation_ns, newest_observation_ns
 from daemon.store.queries.sessions import SessionTable
+from daemon.store.queries.time_axis import TimeAxis, time_axis
 from daemon.store.queries.zeros import lost_zeros
 from drivers.clock import Clock
 
@@ -158,9 +158,9 @@ class ModelTable:
         """
         return lost_zeros(self._store, self._rig, self._sessions.newest_start(model.sessions))
 
-    def training_ns(self, model: ModelRow) -> tuple[int, int]:
-        """UTC, ns, that `time_s` of its training counts from, and of the newest observation it was trained on."""
-        return first_observation_ns(self._store), newest_observation_ns(self._store, model.sessions)
+    def time_axis(self) -> TimeAxis:
+        """The axis that `time_s` of the store's observations, and so of its models' training, lies on."""
+        return time_axis(self._store)
 
     def live_run(self) -> LiveRun | None:
         """The live model's run; None where none is live."""

@@ -23,6 +23,8 @@ _OBSERVATIONS = """SELECT session_id, setup_id, prism, pose, utc_ns, monotonic_n
     FROM observations WHERE excluded IS NULL AND session_id IN ({}) ORDER BY id"""
 # Fixes of a moving boom; those of poses leave them out, for that reason alone.
 _MOVING = _OBSERVATIONS.replace("excluded IS NULL", "moving AND coalesce(excluded, 'moving') = 'moving'")
+_FIRST = """SELECT utc_ns, monotonic_ns, kernel_boot_id FROM observations JOIN boots ON boots.id = boot_id
+    WHERE excluded IS NULL ORDER BY observations.id LIMIT 1"""
 # All that a station gave in a session from the last fix that calibration may use, or from the session's start.
 _FIXES = f"""SELECT fixes.* FROM calibration_sessions AS session CROSS JOIN boots CROSS JOIN fixes
     WHERE session.id = ?1 AND station = ?2
@@ -94,16 +96,9 @@ def all_observations(source: RowSource, session_ids: Sequence[str] = ()) -> list
     return [{**row, **json.loads(row.pop("values_json"))} for row in rows]
 
 
-def first_observation_ns(source: RowSource) -> int:
-    """Return UTC, ns, of the first observation that calibration may use; 0 without one."""
-    rows = source.rows("SELECT utc_ns FROM observations WHERE excluded IS NULL ORDER BY id LIMIT 1")
-    return next((int(row["utc_ns"]) for row in rows), 0)
-
-
-def newest_observation_ns(source: RowSource, session_ids: Sequence[str]) -> int:
-    """Return UTC, ns, of the newest observation of sessions that calibration may use; 0 without one."""
-    sql = "SELECT coalesce(max(utc_ns), 0) AS utc_ns FROM observations WHERE excluded IS NULL AND session_id IN ({})"
-    return next(int(row["utc_ns"]) for row in source.rows(sql.format(marks(session_ids)), session_ids))
+def first_observation(source: RowSource) -> dict[str, Any] | None:
+    """Return utc_ns, monotonic_ns and kernel_boot_id of the first observation that calibration may use, or None."""
+    return next(iter(source.rows(_FIRST)), None)
 
 
 def first_constants_mm(source: RowSource, session_id: str) -> dict[str, float]:

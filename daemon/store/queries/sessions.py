@@ -38,25 +38,32 @@ _EXCLUDED = """SELECT excluded AS reason, count(*) AS n FROM observations
     WHERE session_id = ? AND excluded IS NOT NULL GROUP BY excluded ORDER BY n DESC, reason"""
 _SHOTS = "SELECT name AS point, phase, misclosure_mm FROM control_shots WHERE session_id = ? ORDER BY id"
 _INSTANTS = """WITH instants AS (
-        SELECT boot_id, monotonic_ns, utc_ns FROM observations WHERE session_id = ?1
-        UNION ALL SELECT boot_id, monotonic_ns, utc_ns FROM control_shots WHERE session_id = ?1
-        UNION ALL SELECT started_boot_id, started_monotonic_ns, started_utc_ns FROM calibration_sessions WHERE id = ?1
-        UNION ALL SELECT ended_boot_id, ended_monotonic_ns, ended_utc_ns FROM calibration_sessions
-            WHERE id = ?1 AND ended_utc_ns IS NOT NULL)"""
+        SELECT boot_id, monotonic_ns, utc_ns, 0 AS is_before FROM observations WHERE session_id = ?1
+        UNION ALL SELECT boot_id, monotonic_ns, utc_ns, 0 FROM control_shots WHERE session_id = ?1
+        UNION ALL SELECT started_boot_id, started_monotonic_ns, started_utc_ns, 0 FROM calibration_sessions
+            WHERE id = ?1
+        UNION ALL SELECT ended_boot_id, ended_monotonic_ns, ended_utc_ns, 0 FROM calibration_sessions
+            WHERE id = ?1 AND ended_utc_ns IS NOT NULL
+        UNION ALL SELECT * FROM (SELECT ended_boot_id, ended_monotonic_ns, ended_utc_ns, 1 FROM calibration_sessions
+            WHERE ended_utc_ns IS NOT NULL AND rowid < (SELECT rowid FROM calibration_sessions WHERE id = ?1)
+            ORDER BY rowid DESC LIMIT 1))"""
 # So begins why a session is not used that was recorded with another rig file, or before a joint's zero was lost.
 OTHER_RIG_FILE = "it was recorded with another rig file: "
 ZERO_LOST = "an encoder has jumped since, and nobody has checked its zero: "
 # Within a boot both clocks run alike, whatever NTP does to their rate: their difference changes only when the clock is
-# set. A later boot must not show an earlier time. The first query is cheap, and nearly always the answer.
+# set. A later boot must not show an earlier time. Since the end of the session before only what was set back counts: a
+# computer that slept meanwhile is ahead. The first query is cheap, and nearly always the answer.
 _MAY_HAVE_STEPPED = f"""{_INSTANTS} SELECT min(boot_id) < max(boot_id)
         OR max(utc_ns - monotonic_ns) - min(utc_ns - monotonic_ns) >= {CLOCK_STEP_NS} AS maybe FROM instants"""
 _CLOCK_STEPS = f"""{_INSTANTS},
     pairs AS (SELECT utc_ns, utc_ns - lag(utc_ns) OVER earlier AS passed_ns,
             boot_id = lag(boot_id) OVER earlier AS is_same_boot,
-            monotonic_ns - lag(monotonic_ns) OVER earlier AS true_ns
-        FROM instants WINDOW earlier AS (ORDER BY boot_id, monotonic_ns)),
-    steps AS (SELECT utc_ns, CASE WHEN is_same_boot THEN passed_ns - true_ns ELSE min(passed_ns, 0) END AS step_ns
-        FROM pairs WHERE passed_ns IS NOT NULL)
+            lag(is_before) OVER earlier AS is_between, monotonic_ns - lag(monotonic_ns) OVER earlier AS true_ns
+        FROM instants WINDOW earlier AS (ORDER BY boot_id, monotonic_ns, is_before DESC)),
+    sizes AS (SELECT utc_ns, is_between OR NOT is_same_boot AS is_back_only,
+            CASE WHEN is_same_boot THEN passed_ns - true_ns ELSE passed_ns END AS step_ns
+        FROM pairs WHERE passed_ns IS NOT NULL),
+    steps AS (SELECT utc_ns, CASE WHEN is_back_only THEN min(step_ns, 0) ELSE step_ns END AS step_ns FROM sizes)
     SELECT utc_ns AS at_utc_ns, step_ns FROM steps WHERE abs(step_ns) >= {CLOCK_STEP_NS}"""
 _CLOCKS = """SELECT phase, synchronized AS is_synchronized, offset_s, max_error_s, source, error
     FROM session_clocks WHERE session_id = ?"""
@@ -399,7 +406,7 @@ def _clocks(source: RowSource, session_id: str) -> dict[str, dict[str, Any] | No
 
 
 def _clock_steps(source: RowSource, session_id: str) -> list[dict[str, Any]]:
-    """Return the instants at which the computer's clock was set during a session, and by how much."""
+    """Return when the computer's clock was set during a session or back before it, and by how much."""
     (found,) = source.rows(_MAY_HAVE_STEPPED, (session_id,))
     if not found["maybe"]:
         return []

@@ -104,9 +104,18 @@ def test_after_a_transducer_has_jumped_the_tip_is_where_its_true_length_has_it(t
     assert distance_mm(true_mm(joints), true_mm(joints, JUMP)) > 10.0
 
 
-def test_a_clock_that_is_behind_the_training_leaves_out_what_goes_by_time_and_says_so(trained: Trained) -> None:
-    rig, now = trained(JUMP), START.shifted(round(DAY_S * NS_PER_S))
+def test_a_clock_that_was_set_back_since_the_training_takes_nothing_from_the_tip(trained: Trained) -> None:
+    rig, now, joints = trained(JUMP), START.shifted(round(DAY_S * NS_PER_S)), pose(1)
     rig.clock.set(Stamp(START.utc_ns - NS_PER_S, now.monotonic_ns, now.boot_id))
+    rig.drive(joints, STILL_S)
+    tip = rig.tip.tip("r", "S1")
+    assert tip.status is TipStatus.OK, tip.warnings
+    assert distance_mm(tip.station_mm, true_mm(joints, JUMP)) < 4.0
+
+
+def test_a_boot_whose_clock_is_behind_the_training_leaves_out_what_goes_by_time_and_says_so(trained: Trained) -> None:
+    rig = trained(JUMP)
+    rig.clock.set(Stamp(START.utc_ns - NS_PER_S, NS_PER_S, "next boot"))
     rig.drive(pose(1), STILL_S)
     tip = rig.tip.tip("r")
     assert tip.status is TipStatus.DOUBTFUL

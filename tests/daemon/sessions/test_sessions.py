@@ -126,6 +126,33 @@ def test_a_session_that_goes_on_after_a_boot_with_an_earlier_clock_is_flagged(ri
     assert rig.say("stop")["clock_steps"] == []
 
 
+@pytest.mark.parametrize("boot", ["", "next boot"])
+def test_a_session_before_which_the_clock_was_set_back_is_flagged(rig: Rig, boot: str) -> None:
+    start(rig)
+    rig.live(2)
+    rig.say("stop")
+    ended = rig.clock.now()
+    rig.clock.set(Stamp(ended.utc_ns - 3600 * NS_PER_S, ended.monotonic_ns, boot or ended.boot_id))
+    rig.say("start", prism="r")
+    rig.live(2)
+    told = rig.say("stop")
+    assert told["clock_steps"] == [{"at_utc_ns": ended.utc_ns - 3600 * NS_PER_S, "step_s": -3600.0}]
+    assert told["utc_ran_backwards"]
+    assert any("was set back by 3600.0 s during the session or before it" in line for line in told["advice"])
+    assert not rig.say("show", id="s001-r")["utc_ran_backwards"]
+    rig.say("start", prism="r")
+    assert rig.say("abort")["clock_steps"] == []
+
+
+def test_a_clock_that_runs_ahead_between_sessions_is_none_that_was_set_back(rig: Rig) -> None:
+    start(rig)
+    rig.say("stop")
+    ended = rig.clock.now()
+    rig.clock.set(Stamp(ended.utc_ns + 3600 * NS_PER_S, ended.monotonic_ns, ended.boot_id))
+    rig.say("start", prism="r")
+    assert rig.say("stop")["clock_steps"] == []
+
+
 def test_a_session_knows_how_the_computers_clock_was_at_its_start_and_end(
     rig: Rig, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,0 +1,64 @@
+"""One axis of time for all that a store has observed, whatever the computer's clock was set to meanwhile.
+
+Within a boot, time passes as the monotonic clock says. From the last observation of a boot to the first one of the next
+it passes as the computer's clock says, and not at all where that shows an earlier time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from daemon.store.queries.observations import first_observation
+from daemon.store.rows import RowSource
+from drivers.clock import NS_PER_S, Stamp
+
+# SQLite takes the other columns from the row that has the least or the greatest one.
+_BOOTS = """WITH firsts AS (SELECT boot_id, min(monotonic_ns) AS first_ns, utc_ns AS first_utc_ns FROM observations
+            GROUP BY boot_id),
+        lasts AS (SELECT boot_id, max(monotonic_ns) AS last_ns, utc_ns AS last_utc_ns FROM observations
+            GROUP BY boot_id)
+    SELECT kernel_boot_id, first_ns, first_utc_ns, last_ns, last_utc_ns FROM firsts JOIN lasts USING (boot_id)
+        JOIN boots ON boots.id = boot_id ORDER BY boot_id"""
+
+
+@dataclass(frozen=True)
+class TimeAxis:
+    """The axis that `time_s` of observations lies on: seconds since the first one that calibration may use.
+
+    Attributes:
+        offsets_ns: boot -> what its monotonic clock lacks to the axis.
+        end_ns: of the newest observation, on the axis.
+        end_utc_ns: what the computer's clock showed then.
+    """
+
+    offsets_ns: dict[str, int]
+    end_ns: int = 0
+    end_utc_ns: int = 0
+
+    def observed(self, stamp: Stamp) -> float:
+        """Return the place, s, of an instant of a boot that has observations."""
+        return (stamp.monotonic_ns + self.offsets_ns[stamp.boot_id]) / NS_PER_S
+
+    def present(self, stamp: Stamp) -> float | None:
+        """Return the place, s, of an instant that is not before the newest observation.
+
+        In a boot without observations the computer's clock tells it; None where that shows an earlier time than it did
+        at the newest observation, so that it is wrong.
+        """
+        if stamp.boot_id in self.offsets_ns:
+            return self.observed(stamp)
+        passed_ns = stamp.utc_ns - self.end_utc_ns
+        return None if passed_ns < 0 else (self.end_ns + passed_ns) / NS_PER_S
+
+
+def time_axis(source: RowSource) -> TimeAxis:
+    """Return the axis of all observations of a store, used or not: it is the same whichever sessions are looked at."""
+    offsets_ns: dict[str, int] = {}
+    end_ns = end_utc_ns = 0
+    for boot in source.rows(_BOOTS):
+        begin_ns = end_ns + max(0, boot["first_utc_ns"] - end_utc_ns) if offsets_ns else 0
+        offsets_ns[boot["kernel_boot_id"]] = offset_ns = begin_ns - boot["first_ns"]
+        end_ns, end_utc_ns = boot["last_ns"] + offset_ns, boot["last_utc_ns"]
+    first = first_observation(source)
+    zero_ns = 0 if first is None else first["monotonic_ns"] + offsets_ns[first["kernel_boot_id"]]
+    return TimeAxis({boot: ns - zero_ns for boot, ns in offsets_ns.items()}, end_ns - zero_ns, end_utc_ns)
