@@ -15,6 +15,7 @@ from daemon.config.config import Config, ConfigError
 from daemon.sessions.export.session_file import SessionFile
 from daemon.sessions.vector_channels import SUFFIXES as VECTOR_SUFFIXES
 from daemon.sessions.vector_channels import links_of_channels
+from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S, Stamp
 from drivers.errors import DescriptionError
@@ -104,7 +105,7 @@ def first_captures(paths: Sequence[Path], config: Config, told: SessionFile | No
 
     Raises:
         DescriptionError, ConfigError: as `captures_of`; or a file holds no captures, is given twice, or has captures of
-            a link from a time from which another file has them.
+            a link from a time from which another file has them; or a link has none from the time of the session.
     """
     firsts: dict[Path, Capture] = {}
     spans: dict[str, list[_Span]] = {}
@@ -124,6 +125,9 @@ def first_captures(paths: Sequence[Path], config: Config, told: SessionFile | No
             for other in others:
                 span.check_apart(other, link)
             others.append(span)
+    if told is not None:
+        for link, found_in in spans.items():
+            _check_overlap(found_in, link, told)
     return firsts
 
 
@@ -143,6 +147,26 @@ class _Span(NamedTuple):
                 f"holds captures of link {link!r} from {_utc(first_ns)} to {_utc(last_ns)}, and so does {other.path}: "
                 "they would be stored twice; give one of the two",
             )
+
+
+def _check_overlap(spans: Sequence[_Span], link: str, told: SessionFile) -> None:
+    """Refuse a link whose files have nothing from the time of their session: the clock of one of them is another."""
+    since_ns, until_ns = told.since_utc_ns - BEFORE_NS, told.until_utc_ns + AFTER_NS
+    if any(span.first_ns <= until_ns and span.last_ns >= since_ns for span in spans):
+        return
+    path, first_ns, last_ns = spans[0]
+    if path.suffix.lower() == ".asc":
+        remedy = (
+            "an .asc holds local time without its zone: set the environment variable TZ to the zone where it was made, "
+            "as TZ=Europe/Berlin, or export the session with --format candump"
+        )
+    else:
+        remedy = "give the files that were exported with it"
+    raise DescriptionError(
+        str(path),
+        f"holds captures of link {link!r} from {_utc(first_ns)} to {_utc(last_ns)}, and the session was from "
+        f"{_utc(told.since_utc_ns)} to {_utc(told.until_utc_ns)}: {remedy}",
+    )
 
 
 def _utc(utc_ns: int) -> str:

@@ -83,4 +83,8 @@ def replay(
     if not as_json:
         for table, n in counts.items():
             echo(f"{n:9d} {table.replace('_', ' ')}")
+        if session is not None:
+            echo(f"{session['observations']:9d} of these observations can be used")
+            for reason, n in session["excluded"].items():
+                echo(f"{n:9d} cannot: {reason}")
     return counts | ({} if session is None else {"session": session})
