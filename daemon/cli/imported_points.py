@@ -211,10 +211,10 @@ def _plain(pose: str) -> str:
 
 def far_repetitions(fixes: Sequence[ExportedFix], source: str) -> tuple[str, ...]:
     """Return a note on points that are there twice in different places; most likely one of them is another pose."""
-    first: dict[tuple[str, str], ExportedFix] = {}
+    first: dict[tuple[str, str, str], ExportedFix] = {}
     found = []
     for fix in fixes:
-        other = first.setdefault((fix.target, _plain(fix.point)), fix)
+        other = first.setdefault((fix.station, fix.target, _plain(fix.point)), fix)
         apart_mm = math.dist(fix.position_mm, other.position_mm)
         if apart_mm > REPEATED_MM:
             found.append(f"{fix.point!r} in lines {other.line} and {fix.line}, {apart_mm:.0f} mm apart")
@@ -222,6 +222,29 @@ def far_repetitions(fixes: Sequence[ExportedFix], source: str) -> tuple[str, ...
         return ()
     more = f" and {len(found) - 3} more" if len(found) > 3 else ""
     return (f"{source} has points twice in different places: {'; '.join(found[:3])}{more}; both are taken",)
+
+
+def setup_names(fixes: Sequence[ExportedFix], setup: str) -> dict[str, str]:
+    """Return station of the file -> set-up of its rows; every station has one of its own where the file has several.
+
+    Args:
+        fixes: as the file has them.
+        setup: as it was named for all rows; "" where it was not.
+    """
+    stations = list(dict.fromkeys(fix.station for fix in fixes))
+    if len(stations) == 1:
+        return {stations[0]: setup}
+    return {station: "-".join(filter(None, (setup, station or "unnamed"))) for station in stations}
+
+
+def several_setups(setups: Mapping[str, str], source: str) -> tuple[str, ...]:
+    """Return a note on a file of several stations."""
+    if len(setups) < 2:
+        return ()
+    return (
+        f"{source} has {len(setups)} set-ups of the instrument, and so have the rows: {', '.join(setups.values())}; "
+        "each has a frame of its own",
+    )
 
 
 # ---- observations ----------------------------------------------------------------------------------------------------
@@ -234,7 +257,8 @@ def observations_csv(
     rig: Rig | None,
     joints: JointRows | None,
     prism: str | None,
-    labels: Mapping[str, str],
+    setups: Mapping[str, str],
+    session: str,
 ) -> str:
     """Return the observations CSV of an export's fixes.
 
@@ -245,7 +269,8 @@ def observations_csv(
         rig: whose prisms are measured; any name is taken when None.
         joints: their joint values; none when None.
         prism: of all fixes; by the file and the map when None.
-        labels: `setup` and `session` of all rows, where given.
+        setups: station of the file -> set-up.
+        session: of all rows; "" for none.
 
     Raises:
         DescriptionError: a fix's prism is not known, or it has no joint values; with its line.
@@ -253,12 +278,14 @@ def observations_csv(
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     has_time = any(fix.time_s is not None for fix in fixes)
-    given = [name for name in names(LABELS) if labels.get(name)]
+    has = {"setup": any(setups.values()), "session": session}
+    given = [name for name in names(LABELS) if has.get(name)]
     joint_columns = joints.columns if joints is not None else ()
     writer.writerow(["prism", *joint_columns, *names(POSITION), *given, POSE, *([TIME_S] if has_time else [])])
     for fix in fixes:
         values = [] if joints is None else joints.of(fix, source)
         cells = [prism or _prism(fix, columns, source, rig), *map(repr, map(float, values))]
+        labels = {"setup": setups[fix.station], "session": session}
         cells += [f"{value:.4f}" for value in fix.position_mm] + [labels[name] for name in given] + [fix.point]
         writer.writerow([*cells, *(["" if fix.time_s is None else repr(fix.time_s)] if has_time else [])])
     return out.getvalue()

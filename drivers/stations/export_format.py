@@ -66,6 +66,7 @@ class ExportedFix:
         position_mm: east, north, up from the instrument's centre, where the file tells where that is.
         time_s: when; seconds since 1970 where the file has a date, else since its own origin; None where it says
             nothing.
+        station: where the instrument stood, as the file names it; another name is another set-up.
     """
 
     line: int
@@ -73,6 +74,7 @@ class ExportedFix:
     target: str
     position_mm: tuple[float, float, float]
     time_s: float | None = None
+    station: str = ""
 
 
 @dataclass(frozen=True)

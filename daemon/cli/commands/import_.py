@@ -23,7 +23,7 @@ from daemon.cli.terminal import echo
     help="CSV with a column for each joint (theta1_deg, ...) and pose (the point's number), time_s or time.",
 )
 @click.option("--prism", help="The prism that all points are of; otherwise by their codes or markers.")
-@click.option("--setup", default="", help="Name of the station set-up, for all rows.")
+@click.option("--setup", default="", help="Name of the station set-up; of several in FILE, each has its own after it.")
 @click.option("--session", default="", help="Name of the session, for all rows.")
 @json_option
 def import_(
@@ -52,6 +52,8 @@ def import_(
         read_export,
         read_joints,
         read_map,
+        setup_names,
+        several_setups,
     )
     from daemon.host.safe_output import write_file
     from daemon.rig_files import load_rig
@@ -79,8 +81,9 @@ def import_(
     fixes = known.read(text, columns, file.name)
     notes += far_repetitions(fixes, file.name)
     rows = None if joints is None or described is None else read_joints(joints, described)
-    labels = {"setup": setup, "session": session}
-    table = observations_csv(fixes, columns, file.name, described, rows, prism, labels)
+    setups = setup_names(fixes, setup)
+    notes += several_setups(setups, file.name)
+    table = observations_csv(fixes, columns, file.name, described, rows, prism, setups, session)
     if described is not None and rows is not None:
         parse_observations(table.encode(), described, f"what {file.name} became")
     saved = None

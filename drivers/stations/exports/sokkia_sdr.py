@@ -58,7 +58,8 @@ def _guess(text: str, source: str) -> Guess:
 def _read(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
     mm, rad = MM_PER[columns.length_unit], RAD_PER[columns.angle_unit]
     fixes: list[ExportedFix] = []
-    origin = (0.0, 0.0, 0.0)
+    origin, station = (0.0, 0.0, 0.0), ""
+    stood = {station: origin}
     target_mm = 0.0
     for number, line in enumerate(text.lstrip("\ufeff").splitlines(), 1):
         record = line.strip("\x02\x03\x04\x1a\r\n ")
@@ -68,19 +69,22 @@ def _read(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
         match code[:2]:
             case "02":
                 north, east, up, height = (_number(cells, n, code, number, source) * mm for n in (1, 2, 3, 4))
-                if fixes and origin != (east, north, up + height):
-                    refuse(source, "a second place of the station; split the file, one set-up each", number)
-                origin = (east, north, up + height)
+                origin, station = (east, north, up + height), _name(cells, 0)
+                if stood.setdefault(station, origin) != origin and any(fix.station == station for fix in fixes):
+                    problem = f"a second place of the station {station!r}; name it otherwise, or split the file"
+                    refuse(source, f"{problem}, one set-up each", number)
+                stood[station] = origin
             case "03":
                 target_mm = _number([record[_CODE:]], 0, code, number, source) * mm
             case "08":
                 north, east, up = (_number(cells, n, code, number, source) * mm for n in (1, 2, 3))
                 place = (east - origin[0], north - origin[1], up + target_mm - origin[2])
-                fixes.append(ExportedFix(number, _name(cells, 0), _name(cells, 4), place))
+                fixes.append(ExportedFix(number, _name(cells, 0), _name(cells, 4), place, station=station))
             case "09" if code in ("09F1", "09F2"):
                 distance, zenith, hz = (_number(cells, n, code, number, source) for n in (2, 3, 4))
                 place = polar_position_mm(hz * rad, zenith * rad, distance * mm)
-                fixes.append(ExportedFix(number, _name(cells, 1), _name(cells, 5), place))
+                at = _name(cells, 0) or station
+                fixes.append(ExportedFix(number, _name(cells, 1), _name(cells, 5), place, station=at))
             case kind if kind not in _PASSED_OVER:
                 refuse(source, f"records {code!r} are not known", number)
     if not fixes:

@@ -10,6 +10,7 @@ A record is the `?` record that the instrument sends over its line, with its own
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 from drivers.clock import Stamp
 from drivers.stations.export_format import ColumnMap, ExportedFix, ExportFormat, Guess, refuse
@@ -42,7 +43,7 @@ def _read(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:  # n
         refuse(source, "the download ends within a field: blocks are missing", lines[-1] if lines else None)
     joined = joined[:-1]
     fixes: list[ExportedFix] = []
-    point, target = "", ""
+    point, target, stood = "", "", {"'": "", "(": "", ")": ""}
     end = 0
     for match in _FIELD.finditer(joined):
         line = lines[match.start() // 128]
@@ -51,15 +52,17 @@ def _read(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:  # n
         end = match.end()
         value = match["value"]
         match match["kind"]:
+            case "'" | "(" | ")" as kind:
+                stood[kind] = value.strip()
             case "+":
                 point, target = value.strip(), ""
             case " ":
-                fixes.append(_fix(value, point, line, source))
+                station = "/".join(filter(None, stood.values()))
+                fixes.append(replace(_fix(value, point, line, source), station=station))
             case "*":
                 target = value.strip()
                 if target and fixes and fixes[-1].point == point:
-                    last = fixes[-1]
-                    fixes[-1] = ExportedFix(last.line, last.point, target, last.position_mm)
+                    fixes[-1] = replace(fixes[-1], target=target)
     if joined[end:].strip():
         refuse(source, f"{joined[end:].strip()[:20]!r} belongs to no field", lines[-1])
     if not fixes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from click.testing import CliRunner, Result
 from calibration.observations import Observations
 from calibration.rig.description import shipped_rig
 from daemon.cli.main import main
-from tests.drivers.stations.exports.test_exports import VICON, gts_download
+from tests.drivers.stations.exports.test_exports import POINTS, VICON, gts_download
 
 RIG = shipped_rig("ur10")
 JOINTS = [joint.column for joint in RIG.joints]
@@ -70,6 +71,26 @@ def test_a_point_that_is_there_twice_in_different_places_is_said(tmp_path: Path)
     survey.write_text(SURVEY + "2;110;214;313;tmac\n2;110;210;510;tmac\n")
     *_, note = told(survey, "--out", out)["notes"]
     assert note == "survey.csv has points twice in different places: '2' in lines 3 and 5, 200 mm apart; both are taken"
+
+
+@pytest.mark.parametrize(("setup", "names"), [("S1", ["S1-J/A/1.5", "S1-J/B/1.6"]), ("", ["J/A/1.5", "J/B/1.6"])])
+def test_a_file_of_two_set_ups_gives_rows_of_two_set_ups_and_says_so(
+    tmp_path: Path, setup: str, names: list[str]
+) -> None:
+    download, out = tmp_path / "two.gts", tmp_path / "out.csv"
+    download.write_text(gts_download(POINTS[:2], ("_'J_(A_)1.5", "_'J_(B_)1.6")))
+    *_, note = told(download, "--setup", setup, "--out", out)["notes"]
+    said = f"two.gts has 2 set-ups of the instrument, and so have the rows: {', '.join(names)}; "
+    assert note == f"{said}each has a frame of its own"
+    rows = list(csv.DictReader(out.read_text(encoding="utf-8").splitlines()))
+    assert [row["setup"] for row in rows] == [names[0], names[0], names[1], names[1]]
+
+
+def test_a_file_of_one_named_set_up_has_the_given_name(tmp_path: Path) -> None:
+    download, out = tmp_path / "one.gts", tmp_path / "out.csv"
+    download.write_text(gts_download(POINTS[:2], ("_'J_(A_)1.5",)))
+    assert len(told(download, "--setup", "S1", "--out", out)["notes"]) == 1
+    assert [row["setup"] for row in csv.DictReader(out.read_text(encoding="utf-8").splitlines())] == ["S1", "S1"]
 
 
 def test_joints_are_matched_by_time(tmp_path: Path) -> None:

@@ -27,18 +27,21 @@ POINTS = [
 ]
 
 
+SETUP = "_'_(_)1.540"
+
+
 def gts_record(slope_mm: int, zenith_gon: float, hz_gon: float) -> str:
     level_mm = round(slope_mm * math.sin(math.radians(zenith_gon * 0.9)))
     data = f"?+{slope_mm:08d}m{round(zenith_gon * 1e4):07d}+{round(hz_gon * 1e4):07d}g+{level_mm:08d}t**+00+00"
     return data + block_check(data.encode()).decode()
 
 
-def gts_download(points: list[tuple[str, int, float, float, str]] = POINTS) -> str:
-    """A memory download as the instrument sends it."""
-    fields = "_'_(_)1.540" + "".join(
+def gts_download(points: list[tuple[str, int, float, float, str]] = POINTS, setups: tuple[str, ...] = (SETUP,)) -> str:
+    """A memory download as the instrument sends it: the points, at each set-up."""
+    measured = "".join(
         f"_+{name}_ {gts_record(slope, zenith, hz)}_*{code}_,1.500" for name, slope, zenith, hz, code in points
     )
-    fields += "_"
+    fields = "".join(setup + measured for setup in setups) + "_"
     lines = []
     for number, at in enumerate(range(0, len(fields), 128)):
         data = fields[at : at + 128].ljust(128) + str(number % 10)
@@ -72,6 +75,17 @@ def test_a_gts_download_is_read_record_by_record() -> None:
     level = 43_575 * math.sin(zenith)
     expected = (level * math.sin(hz), level * math.cos(hz), 43_575 * math.cos(zenith))
     np.testing.assert_allclose(first.position_mm, expected, atol=1e-6)
+
+
+def test_gts_points_are_of_the_job_the_instrument_and_the_height_before_them() -> None:
+    setups = ("_'JOB1_(ST-A_)1.500", "_(ST-B_)1.500", "_)1.620", "_'JOB2_(ST-A_)1.500")
+    found = fixes(gts_download(POINTS[:1], setups), "topcon_gts")
+    assert [fix.station for fix in found] == [
+        "JOB1/ST-A/1.500",
+        "JOB1/ST-B/1.500",
+        "JOB1/ST-B/1.620",
+        "JOB2/ST-A/1.500",
+    ]
 
 
 def test_a_gts_download_of_more_than_ten_blocks() -> None:
@@ -127,8 +141,18 @@ def test_bad_sdr_files_are_refused() -> None:
     assert "line 4: 'x.0' is not a number, in column 2" in refused(SDR_HEAD + good + sdr("08TP", "2", "x.0", 2.0, 3.0))
     assert "line 3: 'nan' is not a number, in column 3" in refused(SDR_HEAD + sdr("08TP", "1", 1.0, "nan", 3.0))
     assert "columns of another width" in refused(SDR_HEAD.replace("SDR33", "SDR20") + good)
-    moved = sdr("02TP", "3", 0.0, 0.0, 0.0, 1.5) + good + sdr("02TP", "4", 9.0, 0.0, 0.0, 1.5)
-    assert "line 5: a second place of the station" in refused(SDR_HEAD + moved)
+    moved = sdr("02TP", "3", 0.0, 0.0, 0.0, 1.5) + good + sdr("02TP", "3", 9.0, 0.0, 0.0, 1.5)
+    assert "line 5: a second place of the station '3'; name it otherwise, or split" in refused(SDR_HEAD + moved)
+
+
+def test_sdr_points_are_of_the_station_that_stood_there_though_its_coordinates_were_left_at_0() -> None:
+    stood = [sdr("02TP", name, 0.0, 0.0, 0.0, 0.0) for name in ("A", "B", "A")]
+    polar = [sdr("09F1", name, n, 10.0, 90.0, 0.0, "r") for n, name in enumerate(("A", "B", "A"))]
+    found = fixes(SDR_HEAD + "".join(a + b for a, b in zip(stood, polar, strict=True)), "sokkia_sdr")
+    assert [fix.station for fix in found] == ["A", "B", "A"]
+    places = [sdr("02TP", name, north, 0.0, 0.0, 0.0) for name, north in (("A", 0.0), ("B", 7.0))]
+    found = fixes(SDR_HEAD + "".join(place + sdr("08TP", "1", 9.0, 1.0, 2.0) for place in places), "sokkia_sdr")
+    assert [(fix.station, fix.position_mm[1]) for fix in found] == [("A", 9000.0), ("B", 2000.0)]
 
 
 # ---- tables ----------------------------------------------------------------------------------------------------------
