@@ -38,6 +38,8 @@ _CHUNKS = """SELECT id, first_boot_id, first_monotonic_ns, last_boot_id, last_mo
 _ANY_NS = -(2**63)
 _NEWEST = """SELECT last_boot_id, last_monotonic_ns FROM raw_chunks
     ORDER BY last_boot_id DESC, last_monotonic_ns DESC LIMIT 1"""
+_LAST_CLOCK = """SELECT last_utc_ns - last_monotonic_ns AS ahead_ns FROM raw_chunks WHERE last_boot_id = ?
+    ORDER BY last_monotonic_ns DESC LIMIT 1"""
 _ROWS = """DELETE FROM {0} WHERE id IN (SELECT id FROM {0}
     WHERE (boot_id, monotonic_ns) >= (?1, ?2) AND (boot_id, monotonic_ns) <= (?3, ?4) LIMIT ?5)"""
 _FIXES = """DELETE FROM fixes WHERE id IN (SELECT id FROM fixes
@@ -115,9 +117,10 @@ class Retention:
             if begin >= limit:
                 return None
             span = [*begin, *min(end, limit)]
-            found = self._store.rows(_CHUNKS, [*span, LOOKED_AT, _ANY_NS])
+            found = self._timed(self._store.rows(_CHUNKS, [*span, LOOKED_AT, _ANY_NS]))
             if older_than_ns is not None and all(row["last_utc_ns"] < TRUE_SINCE_NS for row in found):
-                found += self._store.rows(_CHUNKS, [*span, 1, TRUE_SINCE_NS])  # which tells how old they are
+                # the next one whose clock was set tells how old they are
+                found += self._timed(self._store.rows(_CHUNKS, [*span, 1, TRUE_SINCE_NS]))
             old = (found if older_than_ns is None else self._older(found, older_than_ns))[:STEP_CHUNKS]
             if old:
                 last = old[-1]
@@ -130,8 +133,10 @@ class Retention:
     def oldest_ns(self) -> int | None:
         """UTC in ns of the oldest capture that may go, by a clock that was set; None where there is none."""
         for begin, end in free_stretches(self._store):
-            for row in self._store.rows(_CHUNKS, [*begin, *end, 1, TRUE_SINCE_NS]):
-                return int(row["last_utc_ns"])
+            for shown_ns in (_ANY_NS, TRUE_SINCE_NS):
+                for row in self._timed(self._store.rows(_CHUNKS, [*begin, *end, 1, shown_ns])):
+                    if row["last_utc_ns"] >= TRUE_SINCE_NS:
+                        return int(row["last_utc_ns"])
         return None
 
     def aged_on(self) -> int:
@@ -142,6 +147,21 @@ class Retention:
         """Note that records go by age on a day, in the number that the file's header has for its program."""
         with self._store.transaction() as db:
             db.execute(f"PRAGMA user_version = {day:d}")
+
+    def _timed(self, chunks: list[dict[str, int]]) -> list[dict[str, int]]:
+        """Return chunks timed within each boot by the monotonic clock, from what the computer's clock showed last.
+
+        Where that clock was not set at the boot's end, the UTC of a chunk stays its own.
+        """
+        ahead_ns = {
+            boot: self._store.rows(_LAST_CLOCK, [boot])[0]["ahead_ns"]
+            for boot in {row["last_boot_id"] for row in chunks}
+        }
+        timed = []
+        for row in chunks:
+            utc_ns = row["last_monotonic_ns"] + ahead_ns[row["last_boot_id"]]
+            timed.append({**row, "last_utc_ns": utc_ns if utc_ns >= TRUE_SINCE_NS else row["last_utc_ns"]})
+        return timed
 
     @staticmethod
     def _older(chunks: list[dict[str, int]], than_ns: int) -> list[dict[str, int]]:

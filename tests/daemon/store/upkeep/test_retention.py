@@ -118,12 +118,27 @@ def test_captures_of_a_clock_that_was_not_set_are_as_old_as_those_after_them(pat
 
 
 def test_captures_of_a_clock_that_was_not_set_for_days_go_as_well(path: Path, store: Store) -> None:
-    fill(store, retention.LOOKED_AT + 50, utc_ns=0)
+    fill(store, retention.LOOKED_AT + 50, boot="boot of 1970", utc_ns=0)
     fill(store, 100, begin_s=10 * DAY_S)
     assert delete_all(store, NOW_NS + round(5 * DAY_S * NS_PER_S)) == 0, "no older than what follows"
     fill(store, 100, begin_s=20 * DAY_S)
     assert delete_all(store, NOW_NS + round(15 * DAY_S * NS_PER_S)) > 0
     assert minutes_left(path)[0] == round(20 * DAY_S / 60)
+    assert minutes_left(path, "boot of 1970") == []
+
+
+@pytest.mark.parametrize("wrong_by_days", [-150, -10_000, 150])
+def test_captures_of_a_boot_are_as_old_as_the_monotonic_clock_says_whatever_the_clock_was_set_to(
+    path: Path, store: Store, wrong_by_days: int
+) -> None:
+    fill(store, 240, utc_ns=NOW_NS + round(wrong_by_days * DAY_S * NS_PER_S))
+    fill(store, 60, begin_s=240 * MINUTE_S)  # the clock was set
+    now_ns = NOW_NS + 5 * 3600 * NS_PER_S
+    assert Retention(store).oldest_ns() == pytest.approx(NOW_NS, abs=60 * NS_PER_S)
+    assert delete_all(store, now_ns - round(30 * DAY_S * NS_PER_S)) == 0
+    assert minutes_left(path) == [*range(300)]
+    assert delete_all(store, now_ns - 3 * 3600 * NS_PER_S) > 0
+    assert minutes_left(path)[0] == 120
 
 
 def test_what_waits_to_be_decoded_stays(path: Path, store: Store) -> None:
