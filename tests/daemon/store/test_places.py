@@ -10,7 +10,7 @@ import pytest
 
 from daemon.store import Store, reader
 from daemon.store.places import LEAST_NS, MOST_NS, between, since
-from daemon.store.queries import observations, sessions
+from daemon.store.queries import observations, sessions, zeros
 from daemon.store.upkeep import full_samples, retention
 from drivers.clock import Stamp
 
@@ -65,7 +65,7 @@ _AT = "(boot_id,monotonic_ns)"
         (retention._FIXES, 6, f"fixes_by_instant (station=? AND {_AT}>(?,?) AND {_AT}<(?,?))"),
         (reader.CHUNKS, 5, f"raw_chunks_by_end ({_END}>(?,?))"),
         (full_samples._BETWEEN, 4, f"raw_chunks_by_end ({_END}>(?,?))"),
-        (sessions._JUMPS, 3, f"device_events_of_jumps ({_AT}>(?,?))"),
+        (zeros._JUMPS, 2, f"device_events_of_jumps ({_AT}>(?,?))"),
         (observations._FIXES, 2, "fixes_by_instant (station=? AND boot_id=? AND monotonic_ns>?)"),
         (sessions._FIXES_MEASURED, 1, "fixes_by_instant (station=? AND boot_id=? AND monotonic_ns>? AND"),
         (sessions._JOINTS_MEASURED, 1, "joint_samples_by_instant (boot_id=? AND monotonic_ns>? AND monotonic_ns<?)"),
