@@ -98,7 +98,10 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
         "model.rollback": _changes(
             "puts back a model that was live", id="number of the model; the one that the live one replaced by default"
         ),
-        "model.zeros-checked": _changes("uses the live model again after a joint's encoder has jumped"),
+        "model.zeros-checked": _changes(
+            "uses the live model, or the one that waits, and sessions with its zeros again after a joint's encoder has "
+            "jumped"
+        ),
         "model.compare": _changes("compares a model with the live one, by a job", _MODEL),
         "tip": _looks("tells where a prism is now", prism="which one; the configured one by default"),
         "alarms.list": _looks("tells the active alarms", all="true: also those that are over"),

@@ -120,17 +120,24 @@ class ModelRegistry:
         return self._changed(model, live)
 
     def zeros_checked_command(self, arguments: Mapping[str, Any]) -> str:
-        """Take the operator's word that the joints' zeros are those that the live model was trained with."""
-        live = self._table.live()
-        if live is None:
-            raise CommandError("no model is live, so there are no zeros to hold it to")
-        jumped = self._table.jumped(live)
+        """Take the operator's word that the joints' zeros are those that a model was trained with.
+
+        It is the live one, or, where none is, the newest that waits to be accepted.
+        """
+        model = self._table.live() or self._table.waiting()
+        if model is None:
+            raise CommandError(
+                "there is no model yet whose zeros they could be; `rigcal session accept ID` says of each session that "
+                "it was measured with the present ones"
+            )
+        jumped = self._table.jumped(model)
         operator = text_argument(arguments, "operator")
         through = max(jumped.values(), default=0)
-        self._table.note_zeros_checked(live, through, operator=operator, **caller_columns())
+        self._table.note_zeros_checked(model, through, operator=operator, **caller_columns())
         self._zeros_checked()
         self._live.changed()
-        return f"model {live.id} is used again; jumps until now count no more: {', '.join(jumped) or 'there were none'}"
+        told = f"jumps until now count no more: {', '.join(jumped) or 'there were none'}"
+        return f"model {model.id} is used again; {told}" if model.state == "live" else f"model {model.id}: {told}"
 
     def status(self) -> dict[str, Any]:
         """Return the live model, and the newest candidate that waits to be accepted, for `status`."""

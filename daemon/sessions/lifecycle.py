@@ -160,6 +160,13 @@ class SessionLifecycle:
                     told = f"is not used: {why}" if why else "is used again"
                     self._store.once_committed(partial(log.warning, "session %s %s", row["id"], told))
 
+    def judge_zeros(self) -> None:
+        """Decide anew whether calibration may use closed sessions: an encoder has jumped, maybe once again."""
+        known = (OTHER_RIG_FILE, ZERO_LOST)
+        rows = [row["id"] for row in self.table.closed() if not (row["excluded"] or "").startswith(known)]
+        if any(map(self._why_other_readings, rows)):
+            self.judge_readings()
+
     def _why_other_readings(self, session_id: str) -> str | None:
         """Return why a session's readings are not those of the rig as it is now, a clause; None where they are.
 

@@ -111,6 +111,7 @@ class SessionManager:
 
     def on_records(self, records: Sequence[Record]) -> None:
         """Take records that are stored now: complete a shot, or store observations of the open session."""
+        has_jumped = False
         for record in records:
             if isinstance(record, Fix):
                 if self._shot is not None:
@@ -120,7 +121,9 @@ class SessionManager:
                 for session in self._taking():
                     if session.lasted(record.stamp):
                         session.jumped.setdefault(record.device, record.stamp)
-                self._pending.add(self._lifecycle.judge_readings)
+                has_jumped = True
+        if has_jumped:
+            self._pending.add(self._lifecycle.judge_zeros)
         observing = [self._observe(joined) for joined in self._joiner.feed(records)]
         late = [session.id for session in observing if session is not None and session.until is not None]
         self._late.update(late)

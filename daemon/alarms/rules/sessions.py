@@ -98,7 +98,7 @@ def model_not_loaded(evidence: Evidence) -> Iterator[Finding]:
 
 @rule(
     "critical",
-    "Check the joint's zero; then `rigcal model zeros-checked` (`rigcal session accept` without a live model), or "
+    "Check the joint's zero; then `rigcal model zeros-checked` (`rigcal session accept` before the first model), or "
     "calibrate again.",
     hold_s=10.0,
 )

@@ -91,7 +91,10 @@ def model_rollback(number: int | None, operator: str, **where: Any) -> Any:
 @operator_option
 @client_options
 def model_zeros_checked(operator: str, **where: Any) -> Any:
-    """Use the live model again after a joint's encoder has jumped, its zero being checked or set back."""
+    """Use the model again after a joint's encoder has jumped, its zero being checked or set back.
+
+    The model is the live one, or the newest candidate where none is live; sessions with its zeros are used again, too.
+    """
     return ask(where, "model.zeros-checked", echo, operator=operator)
 
 

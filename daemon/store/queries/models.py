@@ -250,14 +250,14 @@ class ModelTable:
         return any(change["state"] == "live" for change in self.history(model))
 
     def note_zeros_checked(self, model: ModelRow, through: int, **by: object) -> None:
-        """Note that an operator has made sure that the joints' zeros are those that the live model was trained with.
+        """Note that an operator has made sure that the joints' zeros are those that a model was trained with.
 
         Args:
-            model: the live one.
+            model: the live one, or one that waits.
             through: number of the newest device event that was known then; jumps beyond it count.
             by: as of `go_live`.
         """
-        self._note_state(model.id, "live", "zeros checked", zeros_checked_through=through, **by)
+        self._note_state(model.id, model.state, "zeros checked", zeros_checked_through=through, **by)
 
     def _note_state(self, model_id: int, state: str, reason: str, **columns: object) -> None:
         row = {"model_id": model_id, "state": state, "reason": reason, **columns}

@@ -6,7 +6,7 @@ is the one with which that model was trained: what lies between may have had a t
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from daemon.store.connection import Connection
@@ -15,13 +15,22 @@ from drivers.clock import Stamp
 # A boot's number rises from boot to boot, and monotonic_ns within one; utc_ns may step.
 _JUMPS = """SELECT id, device, utc_ns, monotonic_ns, boot_id FROM device_events
     WHERE kind = 'preset_jump' AND (boot_id, monotonic_ns) >= (?, ?) ORDER BY boot_id, monotonic_ns, id"""
+_JUMPED_SINCE = """SELECT device, max(id) AS number FROM device_events
+    WHERE kind = 'preset_jump' AND (boot_id, monotonic_ns) >= (?, ?) GROUP BY device ORDER BY device"""
+_LAST = """SELECT boot_id, monotonic_ns, id FROM device_events
+    WHERE kind = 'preset_jump' AND device = ? AND (boot_id, monotonic_ns) < (?, ?) AND id <= ?
+    ORDER BY boot_id DESC, monotonic_ns DESC, id DESC LIMIT 1"""
 # Each word with the start of the newest session that the model was trained on: after a jump in it nothing is used.
 _WORDS = """SELECT state.zeros_checked_through AS through, max(session.rowid) AS newest,
         session.started_boot_id AS boot_id, session.started_monotonic_ns AS monotonic_ns
     FROM model_states AS state JOIN models AS model ON model.id = state.model_id
         JOIN jobs AS job ON job.id = model.job_id JOIN json_each(job.result_json, '$.sessions') AS trained
         JOIN calibration_sessions AS session ON session.id = trained.value
-    WHERE model.rig = ? AND state.zeros_checked_through IS NOT NULL GROUP BY state.id ORDER BY state.id"""
+    WHERE model.rig = ? AND state.zeros_checked_through IS NOT NULL GROUP BY state.id"""
+_END = 2**63 - 1  # after every instant, and every number
+
+_Stretch = tuple[int, int, int]
+"""The time from a jump to the next one, by the jump that it begins with."""
 
 
 @dataclass(frozen=True)
@@ -56,22 +65,27 @@ def lost_zeros(store: Connection, rig_name: str, since: Stamp | None) -> dict[st
     Returns:
         device -> number of its newest jump among the store's device events.
     """
-    if not preset_jumps(store, since):  # as nearly always
-        return {}
     first = (0, 0) if since is None else store.order(since)
-    words = [(row["through"], (row["boot_id"], row["monotonic_ns"])) for row in store.rows(_WORDS, (rig_name,))]
-    by_device: dict[str, list[Jump]] = {}
-    for jump in preset_jumps(store, None):
-        by_device.setdefault(jump.device, []).append(jump)
-    lost: dict[str, int] = {}
-    for device, jumps in sorted(by_device.items()):
-        instants = [store.order(jump.at) for jump in jumps]
-        zeros = list(range(len(jumps) + 1))  # of the stretches between jumps; equal numbers are the same zero
-        for through, trained_at in words:
-            trained = bisect_left(instants, trained_at)
-            checked = max((n for n, jump in enumerate(jumps, 1) if jump.number <= through), default=0)
-            if checked > trained:
-                zeros = [zeros[trained] if zero == zeros[checked] else zero for zero in zeros]
-        if zeros[bisect_left(instants, first)] != zeros[-1]:
-            lost[device] = max(jump.number for jump in jumps)
-    return lost
+    jumped = {row["device"]: row["number"] for row in store.rows(_JUMPED_SINCE, first)}
+    words = store.rows(_WORDS, (rig_name,)) if jumped else []
+    return {name: number for name, number in jumped.items() if not words or not _is_checked(store, name, first, words)}
+
+
+def _is_checked(store: Connection, device: str, first: tuple[int, int], words: Sequence[Mapping[str, int]]) -> bool:
+    """Return True if operators' words, one after the other, say that the zero of an instant is the present one."""
+    same: list[set[_Stretch]] = []
+    for word in words:
+        trained = _stretch(store, device, (word["boot_id"], word["monotonic_ns"]))
+        checked = _stretch(store, device, through=word["through"])
+        if checked > trained:  # else it had not jumped
+            same.append({trained, checked})
+    alike = {_stretch(store, device)}
+    while more := [pair for pair in same if pair & alike and not pair <= alike]:
+        alike = alike.union(*more)
+    return _stretch(store, device, first) in alike
+
+
+def _stretch(store: Connection, device: str, before: tuple[int, int] = (_END, _END), through: int = _END) -> _Stretch:
+    """Return the stretch of a device that lasts at an instant, or at the last jump that was known by a number."""
+    rows = store.rows(_LAST, (device, *before, through))
+    return (rows[0]["boot_id"], rows[0]["monotonic_ns"], rows[0]["id"]) if rows else (0, 0, 0)

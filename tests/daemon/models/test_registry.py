@@ -314,6 +314,17 @@ def test_a_jump_that_comes_after_the_operator_looked_counts(rig: ModelRig) -> No
     assert list(rig.models.jumped(model)) == ["theta3"]
 
 
+def test_where_no_model_is_live_a_word_about_the_zeros_is_about_the_one_that_waits(rig: ModelRig) -> None:
+    assert "there is no model yet" in refusal(rig.registry.zeros_checked_command, WRONG_USE)
+    model = rig.models.get(rig.candidate())
+    rig.clock.advance(10.0)
+    rig.store.insert_records([DeviceEvent("theta1", rig.clock.now(), EventKind.PRESET_JUMP, "position jumped")])
+    assert rig.registry.zeros_checked_command({}) == f"model {model.id}: jumps until now count no more: theta1"
+    assert rig.models.jumped(model) == {}
+    assert not rig.models.was_live(model)
+    assert states(rig) == {model.id: "candidate"}
+
+
 def test_what_makes_no_sense_is_refused_in_a_sentence(rig: ModelRig) -> None:
     assert "no model is live" in refusal(rig.registry.rollback_command, WRONG_USE)
     assert "no model is live" in refusal(rig.registry.show_command, WRONG_USE)
