@@ -119,14 +119,14 @@ class GuideManager:
                     "`rigcal session guide --stop REASON` abandons it",
                     REFUSED,
                 )
+            self._require_no_session()  # at once: a command about it may have the turn for long, for a shot
             described = mapping_argument(arguments, "new_setup")
             operator = text_argument(arguments, "operator")
             is_new = "new_setup" in arguments
             if is_new and "setup" in arguments:
                 raise CommandError("give a set-up that exists or describe a new one, not both")
             with self._course.at_once():
-                if (session := self._sessions.open_session()) is not None:  # else one may be opened meanwhile
-                    raise CommandError(f"session {session['id']!r} is open; {HOW_TO_END}", REFUSED)
+                self._require_no_session()
                 if is_new:
                     described = checked_arguments("setup.new", described)
                     request = request_of(arguments, self._rig, list(mapping_argument(described, "control_points")))
@@ -138,6 +138,11 @@ class GuideManager:
             self._worker.wanted = ""
             self._course.begin()
             return self._state()
+
+    def _require_no_session(self) -> None:
+        session = self._sessions.open_session()
+        if session is not None:
+            raise CommandError(f"session {session['id']!r} is open; {HOW_TO_END}", REFUSED)
 
     def state_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
         """The newest guide, open or not."""

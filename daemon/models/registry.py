@@ -34,7 +34,7 @@ class ModelRegistry:
         comparison_job: tells the job that is yet to compare a model; None without one.
         comparison_after: tells the job that is yet to compare the model which a later stage makes of a model, and the
             job that makes it; None without one.
-        zeros_checked: takes that an operator has checked the joints' zeros, when that is stored.
+        zeros_checked: stores what follows from an operator's word about the joints' zeros.
     """
 
     def __init__(
@@ -133,8 +133,9 @@ class ModelRegistry:
         jumped = self._table.jumped(model)
         operator = text_argument(arguments, "operator")
         through = max(jumped.values(), default=0)
-        self._table.note_zeros_checked(model, through, operator=operator, **caller_columns())
-        self._zeros_checked()
+        with self._table.at_once():
+            self._table.note_zeros_checked(model, through, operator=operator, **caller_columns())
+            self._zeros_checked()
         self._live.changed()
         told = f"jumps until now count no more: {', '.join(jumped) or 'there were none'}"
         return f"model {model.id} is used again; {told}" if model.state == "live" else f"model {model.id}: {told}"

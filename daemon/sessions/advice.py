@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from calibration.rig.description import Rig
 from daemon.commands import CHECK
-from daemon.sessions.open_session import CONSTANT_TOLERANCE_MM, OpenSession
+from daemon.sessions.open_session import OpenSession
 from daemon.sessions.prism_watch import PrismWatch
 from daemon.sessions.station_setups import StationSetups
 from daemon.store.queries.sessions import SessionTable
@@ -62,23 +62,13 @@ class SessionAdvice:
         return points, [name for name in points if name not in shot]
 
     def _doubts(self, session: OpenSession) -> list[str]:
-        """Return a sentence on every joint that has jumped, and on every station that may be on another prism.
-
-        And on one that applies another prism constant than its set-up says.
-        """
-        found = [
+        """Return a sentence on every joint that has jumped, and on every station that may be on another prism."""
+        jumps = [
             f"{joint} jumped during the session, and nothing after that is used: if its encoder was preset, start anew"
             for joint in self._rig.joint_names
             if joint in session.jumped
         ]
-        said_mm = self._setups.constant_mm(session.setup_id, session.prism)
-        found += [
-            f"{station} applies a prism constant of {mm:g} mm, and set-up {session.setup_id} says {said_mm:g} mm for "
-            f"{session.prism}: set the station right and hold the session anew, or describe the set-up anew"
-            for station, mm in session.constants_mm.items()
-            if said_mm is not None and abs(mm - said_mm) > CONSTANT_TOLERANCE_MM
-        ]
-        return found + [
+        return jumps + [
             f"{suspicion.reason}; its fixes since then do not count: {suspicion.remedy}"
             for suspicion in self._prisms.suspicions(session)
         ]

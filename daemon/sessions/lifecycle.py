@@ -19,10 +19,12 @@ from calibration.rig.description import Rig
 from daemon.commands import REFUSED, CommandError, caller_columns
 from daemon.host.time_service import ClockState
 from daemon.rig_files import HOW_TO_READ_AGAIN, misreading
-from daemon.sessions.open_session import OpenSession
+from daemon.sessions.open_session import CONSTANT_TOLERANCE_MM, OpenSession
 from daemon.store.connection import rig_sha256
 from daemon.store.queries.jobs import JobTable
+from daemon.store.queries.observations import first_constants_mm
 from daemon.store.queries.sessions import OTHER_RIG_FILE, ZERO_LOST, SessionTable, session
+from daemon.store.queries.setups import SetupTable
 from daemon.store.queries.zeros import lost_zeros, preset_jumps
 from daemon.store.store import Store
 from drivers.clock import Clock, Stamp
@@ -62,7 +64,7 @@ class SessionLifecycle:
     ) -> None:
         self._store, self._rig, self._clock, self._tolerance_mm = store, rig, clock, tolerance_mm
         self._clock_state = clock_state
-        self.table = SessionTable(store, rig.name)
+        self.table, self._setups = SessionTable(store, rig.name), SetupTable(store, rig.name)
         self._jobs = JobTable(store, rig.name)
 
     def unfinished(self, rig_text: str) -> tuple[OpenSession | None, list[OpenSession]]:
@@ -73,7 +75,8 @@ class SessionLifecycle:
         """
         opened: OpenSession | None = None
         ended: list[OpenSession] = []
-        own = {rig_sha256(rig_text), rig_sha256(without_decoding(rig_text))}
+        bare = without_decoding(rig_text)
+        own = {rig_sha256(text) for text in (rig_text, bare, bare.removesuffix("\n"))}
         for row in self.table.unfinished():
             if row["rig"] != self._rig.name:
                 if row["state"] == "open":
@@ -213,7 +216,31 @@ class SessionLifecycle:
 
     def _why_not_used(self, session_id: str) -> str | None:
         """Why calibration must not use a session, a clause; None where a control point shows that it may."""
-        return "; ".join(filter(None, (self._why_other_readings(session_id), self._why_moved(session_id)))) or None
+        reasons = (
+            self._why_other_readings(session_id),
+            self._why_other_constant(session_id),
+            self._why_moved(session_id),
+        )
+        return "; ".join(filter(None, reasons)) or None
+
+    def _why_other_constant(self, session_id: str) -> str | None:
+        """Return why a session's distances do not fit those of others, a clause: another prism constant was set.
+
+        It is held against what the set-up's description says, else against the newest session that is used there.
+        """
+        row = session(self._store, session_id)
+        assert row is not None  # no session is ever deleted
+        said_mm = self._setups.constants_mm(row["setup_id"]).get(row["prism"])
+        like = self.table.used_like(session_id)
+        for station, mm in first_constants_mm(self._store, session_id).items():
+            if said_mm is not None:
+                other_mm, where = said_mm, f"set-up {row['setup_id']} says"
+            else:
+                other_mm = mm if like is None else first_constants_mm(self._store, like).get(station, mm)
+                where = f"session {like} has"
+            if abs(mm - other_mm) > CONSTANT_TOLERANCE_MM:
+                return f"{station} applied a prism constant of {mm:g} mm to {row['prism']}, and {where} {other_mm:g} mm"
+        return None
 
     def _why_moved(self, session_id: str) -> str | None:
         """Return why a session's station may have moved, a clause; None where a control point shows that it did not."""

@@ -376,7 +376,8 @@ class SessionManager:
             if result["misclosure_mm"] is None:  # nothing told before
                 self._observations.exclude_near(session.id, [result[axis] for axis in AXES], CONTROL_POINT_RADIUS_MM)
             points = self._setups.control_points(session.setup_id)
-            self._store.once_committed(partial(session.know, points))
+            constants_mm = first_constants_mm(self._store, session.id)
+            self._store.once_committed(partial(session.know, points, constants_mm))
         return result
 
     def _note_turned(self, session: OpenSession, at: Stamp) -> None:
@@ -413,9 +414,8 @@ class SessionManager:
         self._open, self._ended = self._lifecycle.unfinished(self._rig_text)
         self._lifecycle.judge_readings()
         for session in self._taking():
-            session.control_points = self._setups.control_points(session.setup_id)
+            session.know(self._setups.control_points(session.setup_id), first_constants_mm(self._store, session.id))
             session.jumped = self._lifecycle.jumped(session)
-            session.constants_mm = first_constants_mm(self._store, session.id)
             self._prisms.restore(session)
         opened = self._open
         if opened is None:

@@ -22,7 +22,7 @@ from daemon.store.errors import is_unwritable
 from daemon.store.queries.observations import OF_CONTROL_POINT, ObservationTable
 from daemon.store.store import Store
 from drivers.clock import Stamp, lies_within
-from drivers.readings import DeviceEvent
+from drivers.readings import DeviceEvent, Fix
 
 log = logging.getLogger(__name__)
 
@@ -119,7 +119,11 @@ class ObservationMaker:
             joined: the fix with its joints.
             place_mm: where the fix lies.
         """
-        excluded = self._why_not_a_pose(session, joined, place_mm) or self._why_another_prism(session, joined, place_mm)
+        excluded = (
+            self._why_not_a_pose(session, joined, place_mm)
+            or self._why_another_prism(session, joined, place_mm)
+            or _why_another_constant(session, joined.fix)
+        )
         self.newest = session.id, joined.stamp, excluded
         self._pending.add(lambda: self._add(session, joined, place_mm, excluded))
 
@@ -132,11 +136,6 @@ class ObservationMaker:
                 return f"{joint} jumped: its readings from then on do not fit those before"
         if session.is_control_point(place_mm):
             return OF_CONTROL_POINT
-        constant_mm = joined.fix.prism_constant_mm
-        if constant_mm is not None:
-            first_mm = session.constants_mm.setdefault(joined.fix.station, constant_mm)
-            if abs(constant_mm - first_mm) > CONSTANT_TOLERANCE_MM:
-                return f"the station applies a prism constant of {constant_mm:g} mm, and {first_mm:g} mm at first"
         self._prisms.follow(session, joined, place_mm)
         return "moving" if session.kind in STANDING_KINDS and joined.standstill is None else None
 
@@ -177,3 +176,13 @@ class ObservationMaker:
             values_json=joined.values,
             excluded=excluded,
         )
+
+
+def _why_another_constant(session: OpenSession, fix: Fix) -> str | None:
+    """Why a fix that might be used must not be: its station applies another prism constant than to the first one."""
+    if fix.prism_constant_mm is None:
+        return None
+    first_mm = session.constants_mm.setdefault(fix.station, fix.prism_constant_mm)
+    if abs(fix.prism_constant_mm - first_mm) <= CONSTANT_TOLERANCE_MM:
+        return None
+    return f"the station applies a prism constant of {fix.prism_constant_mm:g} mm, and {first_mm:g} mm at first"

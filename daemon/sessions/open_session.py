@@ -25,7 +25,7 @@ class OpenSession:
             None while it is open.
         shots: when the station was on control points instead.
         jumped: joints whose encoder jumped in it, since when.
-        constants_mm: prism constants that its stations applied to their first fixes of it, by the stations' names.
+        constants_mm: station -> prism constant that it applied to its first fix that may be used.
         control_points: where those of its set-up are, mm.
         words: who said when that its stations are on its prism.
         guards: station -> what watches that it stays there; for the writer's thread.
@@ -61,9 +61,9 @@ class OpenSession:
         """Return the number of times that an operator had confirmed its prism by then."""
         return sum(not word.is_turning and self.order(word.at) <= self.order(stamp) for word in self.words)
 
-    def know(self, control_points: list[Place]) -> None:
-        """Take where the control points of its set-up are."""
-        self.control_points = control_points
+    def know(self, control_points: list[Place], constants_mm: dict[str, float]) -> None:
+        """Take where the control points of its set-up are, and the prism constants of other fixes."""
+        self.control_points, self.constants_mm = control_points, constants_mm
 
     def end_shots(self, at: Stamp) -> None:
         """Take the station to be on its prism from then on."""

@@ -121,10 +121,6 @@ class StationSetups:
             )
         return wanted
 
-    def constant_mm(self, setup_id: str, prism: str) -> float | None:
-        """The prism constant that a set-up's description says is set for a prism; None where it says none."""
-        return self._table.constants_mm(setup_id).get(prism)
-
     def has_moved(self, setup_id: str) -> bool:
         """Return True if a control point of the set-up was not where it had been."""
         return self._table.states()[setup_id] != "ok"

@@ -99,7 +99,10 @@ class SlcanLines:
         malformed: lines that were neither a frame nor an answer to a command.
     """
 
-    _FRAME = re.compile(rb"(?:t([0-9A-F]{3})|T([0-9A-F]{8})|r([0-9A-F]{3})|R([0-9A-F]{8}))([0-8])([0-9A-F]*)", re.I)
+    # Case tells extended frames (T, R) from standard ones: digits alone may be in either
+    _FRAME = re.compile(
+        rb"(?:t([0-9A-Fa-f]{3})|T([0-9A-Fa-f]{8})|r([0-9A-Fa-f]{3})|R([0-9A-Fa-f]{8}))([0-8])([0-9A-Fa-f]*)"
+    )
     _ANSWER = re.compile(rb"[zZ]|F[0-9A-Fa-f]{2}|[VN].*", re.DOTALL)  # sent, status flags, version or serial number
     _STATE = re.compile(rb"s([awpb])(\d{3})(\d{3})")
     _ERRORS = re.compile(rb"e(\d)([abBcfsoO]+)")
@@ -117,7 +120,7 @@ class SlcanLines:
             self._rest = b""
             self.malformed += 1
         frames = []
-        for line in lines:
+        for line in (line.strip(b"\n") for line in lines):  # of adapters that end a line with CR and LF
             frame = self._frame(line)
             if frame is not None:
                 frames.append(frame)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -248,6 +249,10 @@ class ModelTable:
     def was_live(self, model: ModelRow) -> bool:
         """True if a model was ever the live one."""
         return any(change["state"] == "live" for change in self.history(model))
+
+    def at_once(self) -> AbstractContextManager[object]:
+        """All that the block changes is stored together, or nothing of it."""
+        return self._store.transaction()
 
     def note_zeros_checked(self, model: ModelRow, through: int, **by: object) -> None:
         """Note that an operator has made sure that the joints' zeros are those that a model was trained with.

@@ -33,10 +33,10 @@ _FIXES = f"""SELECT fixes.* FROM calibration_sessions AS session CROSS JOIN boot
             WHERE session_id = ?1 AND excluded IS NULL AND used.station = ?2), 0)
     ORDER BY fixes.id"""
 
-# The oldest fix of each station that made an observation and says its prism constant.
+# The oldest fix of each station that is of the prism, as far as is known, and says its prism constant.
 _FIRST_CONSTANTS = """SELECT fixes.station, fixes.prism_constant_mm, min(observations.id) AS oldest
     FROM observations JOIN fixes ON fixes.id = fix_id
-    WHERE session_id = ? AND prism_constant_mm IS NOT NULL AND excluded IS NOT ? GROUP BY station"""
+    WHERE session_id = ? AND prism_constant_mm IS NOT NULL AND excluded IS NULL GROUP BY station"""
 
 
 class ObservationTable:
@@ -102,8 +102,12 @@ def first_observation(source: RowSource) -> dict[str, Any] | None:
 
 
 def first_constants_mm(source: RowSource, session_id: str) -> dict[str, float]:
-    """Return the prism constants that stations applied to their first fixes of a session, by the stations' names."""
-    rows = source.rows(_FIRST_CONSTANTS, (session_id, OF_CONTROL_POINT))
+    """Return the prism constants that stations applied to their first fixes of a session that are used.
+
+    Returns:
+        station -> constant, mm.
+    """
+    rows = source.rows(_FIRST_CONSTANTS, (session_id,))
     return {row["station"]: row["prism_constant_mm"] for row in rows}
 
 

@@ -84,16 +84,17 @@ _BEFORE_ENCLOSED = """SELECT 1 FROM observations AS o WHERE o.session_id = ?1 AN
                 ON b.session_id = ?1 AND b.name = a.name AND b.phase = 'end'
             WHERE a.session_id = ?1 AND a.phase = 'start'
                 AND (a.boot_id, a.monotonic_ns) < (o.boot_id, o.monotonic_ns)) LIMIT 1"""
-# A control point that was shot again after poses, and how far from its place before: shots one after the other.
-_MOVED_BETWEEN = """SELECT a.name AS point, max((a.x_mm - b.x_mm) * (a.x_mm - b.x_mm)
-            + (a.y_mm - b.y_mm) * (a.y_mm - b.y_mm) + (a.z_mm - b.z_mm) * (a.z_mm - b.z_mm)) AS square_mm2
-    FROM control_shots AS a JOIN control_shots AS b ON b.session_id = a.session_id AND b.name = a.name
-        AND b.id = (SELECT min(c.id) FROM control_shots AS c
-            WHERE c.session_id = a.session_id AND c.name = a.name AND c.id > a.id)
-    WHERE a.session_id = ? AND EXISTS (SELECT 1 FROM observations AS o
-        WHERE o.session_id = a.session_id AND o.excluded IS NULL
-            AND (a.boot_id, a.monotonic_ns) < (o.boot_id, o.monotonic_ns)
-            AND (o.boot_id, o.monotonic_ns) < (b.boot_id, b.monotonic_ns))"""
+# How far apart a control point's shots lie between which there are poses. Of shots without poses in between the last
+# one counts: it was made because the one before was no good.
+_MOVED_BETWEEN = """WITH counted AS (SELECT s.id, s.name, s.x_mm, s.y_mm, s.z_mm FROM control_shots AS s
+        WHERE s.session_id = ?1 AND NOT EXISTS (SELECT 1 FROM control_shots AS c
+            WHERE c.session_id = ?1 AND c.name = s.name AND c.id > s.id AND NOT EXISTS (SELECT 1 FROM observations AS o
+                WHERE o.session_id = ?1 AND o.excluded IS NULL
+                    AND (s.boot_id, s.monotonic_ns) < (o.boot_id, o.monotonic_ns)
+                    AND (o.boot_id, o.monotonic_ns) < (c.boot_id, c.monotonic_ns))))
+    SELECT a.name AS point, max((a.x_mm - b.x_mm) * (a.x_mm - b.x_mm) + (a.y_mm - b.y_mm) * (a.y_mm - b.y_mm)
+            + (a.z_mm - b.z_mm) * (a.z_mm - b.z_mm)) AS square_mm2
+    FROM counted AS a JOIN counted AS b ON b.name = a.name AND b.id > a.id"""
 _BETWEEN = """SELECT 1 FROM observations AS o JOIN control_shots AS c ON c.session_id = o.session_id AND c.name = ?
     WHERE o.session_id = ? AND o.excluded IS NULL
         AND (o.boot_id, o.monotonic_ns) > (c.boot_id, c.monotonic_ns) LIMIT 1"""
@@ -196,6 +197,13 @@ class SessionTable:
             "ORDER BY rowid",
             (self._rig,),
         )
+
+    def used_like(self, session_id: str) -> str | None:
+        """The newest other session that calibration may use, of the same prism in the same set-up."""
+        sql = """SELECT other.id FROM calibration_sessions AS own JOIN calibration_sessions AS other
+                ON other.setup_id = own.setup_id AND other.prism = own.prism AND other.id <> own.id
+            WHERE own.id = ? AND other.state = 'closed' AND other.excluded IS NULL ORDER BY other.rowid DESC LIMIT 1"""
+        return next((row["id"] for row in self._store.rows(sql, (session_id,))), None)
 
     def closed(self) -> list[dict[str, Any]]:
         """Id, excluded and accepted_despite of the rig's closed sessions, oldest first."""

@@ -132,6 +132,26 @@ def test_no_guide_is_opened_beside_a_session_that_is_being_started(rig: GuidedRi
     assert rig.guide.state_command({}) == {"guide": None}
 
 
+def test_a_guide_is_refused_at_once_while_a_shot_is_waited_for(rig: GuidedRig) -> None:
+    held, is_over = threading.Event(), threading.Event()
+
+    def shoot() -> None:  # as a command does that waits for fixes
+        with rig.keeper.turn:
+            held.set()
+            is_over.wait(20)
+
+    rig.say("setup_new", id="S1")
+    rig.say("start", prism="r")
+    shooting = threading.Thread(target=shoot)
+    shooting.start()
+    held.wait()
+    with pytest.raises(CommandError, match="is open; stop or abort it first"):
+        rig.guided("start", setup="S1", prisms=["r"], poses=6, check_poses=0)
+    assert shooting.is_alive()
+    is_over.set()
+    shooting.join()
+
+
 def test_no_session_is_started_beside_a_guide_that_is_being_opened(rig: GuidedRig) -> None:
     start = rig.guide.guarding("session.start", rig.keeper.start_command)
     rig.guided("start", new_setup={"id": "S1"}, prisms=["r"], poses=6, check_poses=0)

@@ -325,6 +325,21 @@ def test_where_no_model_is_live_a_word_about_the_zeros_is_about_the_one_that_wai
     assert states(rig) == {model.id: "candidate"}
 
 
+def test_a_word_about_the_zeros_is_kept_with_what_follows_from_it_or_not_at_all(
+    rig: ModelRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full() -> NoReturn:
+        raise sqlite3.OperationalError("database or disk is full")
+
+    model = rig.models.get(rig.accepted())
+    rig.clock.advance(10.0)
+    rig.store.insert_records([DeviceEvent("theta1", rig.clock.now(), EventKind.PRESET_JUMP, "position jumped")])
+    monkeypatch.setattr(rig.registry, "_zeros_checked", full)  # a disk that is full at its second write
+    with pytest.raises(sqlite3.OperationalError):
+        rig.registry.zeros_checked_command({})
+    assert list(rig.models.jumped(model)) == ["theta1"]
+
+
 def test_what_makes_no_sense_is_refused_in_a_sentence(rig: ModelRig) -> None:
     assert "no model is live" in refusal(rig.registry.rollback_command, WRONG_USE)
     assert "no model is live" in refusal(rig.registry.show_command, WRONG_USE)

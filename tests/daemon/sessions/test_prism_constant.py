@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 from drivers.readings import Fix
 from tests.daemon.session_support import Rig, closed_afterwards, controlled
@@ -28,6 +29,7 @@ class ConstantRig(Rig):
 
 
 rig = closed_afterwards(ConstantRig)
+CP1 = (9000.0, 500.0, 2000.0)
 OTHER = "the station applies a prism constant of 0 mm, and -30 mm at first"
 
 
@@ -53,14 +55,54 @@ def test_a_station_that_does_not_say_its_prism_constant_is_taken_at_its_word(rig
     assert rig.say("show", id=name)["observations"] > 20
 
 
-def test_a_constant_that_is_not_the_one_of_the_set_up_is_told_at_the_sessions_end(rig: ConstantRig) -> None:
+def test_fixes_of_a_control_point_before_its_first_shot_say_nothing_of_the_prism(rig: ConstantRig) -> None:
+    prism_mm, rig.target_mm, rig.constant_mm = rig.target_mm, CP1, 0.0
+    name = rig.say("start", prism="r")["id"]
+    rig.live(3)
+    rig.shoot("cp1", CP1)
+    rig.target_mm, rig.constant_mm = prism_mm, -30.0
+    rig.live(1)
+    rig.say("confirm_prism")
+    rig.live(3)
+    assert rig.say("show", id=name)["observations"] > 40
+
+
+def test_fixes_that_are_refused_for_another_reason_say_nothing_of_it_after_a_restart_either(rig: ConstantRig) -> None:
     rig.constant_mm = 0.0
-    rig.say("start", prism="r")
-    rig.live(2)
-    (told,) = [line for line in rig.say("stop")["advice"] if "constant" in line]
-    assert told.startswith("station applies a prism constant of 0 mm, and set-up S1 says -30 mm for r")
+    name = rig.say("start", prism="r")["id"]
+    rig.live(2, theta1=5.0)  # moving
     rig.constant_mm = -30.0
+    rig.live(3)
+    before = rig.say("show", id=name)["observations"]
+    rig.keeper = rig.new_keeper()
+    rig.live(3)
+    assert rig.say("show", id=name)["observations"] > before > 30
+
+
+def ended(rig: ConstantRig, constant_mm: float) -> dict[str, Any]:
+    """A session with a prism constant; the control point's own prism has the right one."""
     rig.clock.advance(1.0)
     rig.say("start", prism="r")
-    rig.live(2)
-    assert not [line for line in rig.say("stop")["advice"] if "constant" in line]
+    rig.constant_mm = -30.0
+    rig.shoot("cp1", CP1)
+    rig.constant_mm = constant_mm
+    rig.live(3)
+    rig.constant_mm = -30.0
+    rig.shoot("cp1", CP1)
+    return dict(rig.say("stop"))
+
+
+def test_a_session_whose_constant_is_not_the_one_of_its_set_up_is_not_used(rig: ConstantRig) -> None:
+    assert ended(rig, 0.0)["not_used"] == "station applied a prism constant of 0 mm to r, and set-up S1 says -30 mm"
+    assert ended(rig, -30.0)["not_used"] is None
+
+
+def test_sessions_with_different_constants_are_not_used_together(rig: ConstantRig) -> None:
+    rig.clock.advance(1.0)
+    rig.say("setup_new", id="S2")
+    assert ended(rig, -30.0)["not_used"] is None
+    assert ended(rig, 0.0)["not_used"] == "station applied a prism constant of 0 mm to r, and session s001-r has -30 mm"
+    assert ended(rig, -30.0)["not_used"] is None
+    rig.clock.advance(1.0)
+    rig.say("setup_new", id="S3")
+    assert ended(rig, 0.0)["not_used"] is None, "another instrument may count otherwise"

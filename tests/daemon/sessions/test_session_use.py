@@ -306,3 +306,15 @@ def test_a_bad_shot_that_is_made_anew_before_any_pose_counts_for_nothing(session
     session_rig.live(2)
     session_rig.shoot("cp1", CP1)
     assert session_rig.say("stop")["not_used"] is None
+
+
+def test_a_shot_in_the_middle_does_not_hide_how_far_a_point_was_off_in_all(session_rig: Rig) -> None:
+    east, north, up = CP1
+    session_rig.say("setup_new", id="S2", control_points={"cp1": list(CP1)})
+    session_rig.say("start", prism="r")
+    for off in (-4.5, 0.0, 4.5):
+        session_rig.shoot("cp1", (east + off, north, up))
+        if off < 4.5:
+            session_rig.live(2)
+    told = session_rig.say("stop")["not_used"]
+    assert told == "control point cp1 was 9.0 mm off when it was shot again, so the station had moved"

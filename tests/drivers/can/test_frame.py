@@ -150,6 +150,25 @@ def test_answers_of_an_adapter_are_no_lost_lines(line: bytes) -> None:
     assert lines.malformed == 0
 
 
+@given(
+    identifier=st.integers(0, 2**29 - 1),
+    data=st.binary(max_size=8),
+    stamp=st.sampled_from(["", "1A2F"]),
+    end=st.sampled_from(["\r", "\r\n"]),
+    is_lower=st.booleans(),
+)
+def test_a_frame_of_any_identifier_is_the_line_of_it(
+    identifier: int, data: bytes, stamp: str, end: str, is_lower: bool
+) -> None:
+    digits = f"{len(data)}{data.hex().upper()}{stamp}"
+    lines = [f"{identifier:08X}{digits}", f"{identifier % 2048:03X}{digits}"]
+    extended, standard = [line.lower() if is_lower else line for line in lines]
+    lines_of = SlcanLines()
+    expected = [Frame(identifier, data, is_extended=True), Frame(identifier % 2048, data)]
+    assert lines_of.feed(f"T{extended}{end}t{standard}{end}".encode()) == expected
+    assert lines_of.malformed == 0
+
+
 def test_noise_without_an_end_is_dropped() -> None:
     lines = SlcanLines()
     for _ in range(10):
