@@ -38,8 +38,9 @@ _CHUNKS = """SELECT id, first_boot_id, first_monotonic_ns, last_boot_id, last_mo
 _ANY_NS = -(2**63)
 _NEWEST = """SELECT last_boot_id, last_monotonic_ns FROM raw_chunks
     ORDER BY last_boot_id DESC, last_monotonic_ns DESC LIMIT 1"""
-_LAST_CLOCK = """SELECT last_utc_ns - last_monotonic_ns AS ahead_ns FROM raw_chunks WHERE last_boot_id = ?
-    ORDER BY last_monotonic_ns DESC LIMIT 1"""
+_CLOCK = """SELECT last_utc_ns - last_monotonic_ns AS ahead_ns FROM raw_chunks WHERE last_boot_id = ?
+    ORDER BY last_monotonic_ns {} LIMIT 1"""
+_CLOCKS = (_CLOCK.format("DESC"), _CLOCK.format("ASC"))  # as a boot's captures show it last, and first
 _ROWS = """DELETE FROM {0} WHERE id IN (SELECT id FROM {0}
     WHERE (boot_id, monotonic_ns) >= (?1, ?2) AND (boot_id, monotonic_ns) <= (?3, ?4) LIMIT ?5)"""
 _FIXES = """DELETE FROM fixes WHERE id IN (SELECT id FROM fixes
@@ -149,18 +150,24 @@ class Retention:
             db.execute(f"PRAGMA user_version = {day:d}")
 
     def _timed(self, chunks: list[dict[str, int]]) -> list[dict[str, int]]:
-        """Return chunks timed within each boot by the monotonic clock, from what the computer's clock showed last.
+        """Return chunks with the latest UTC of three: their own, and the ones by the monotonic clock from two others.
 
-        Where that clock was not set at the boot's end, the UTC of a chunk stays its own.
+        These are the last and the first of the boot's captures. Each of the three may be wrong, and what seems too old
+        is deleted. A UTC after that of the newest capture of all is wrong, and counts only where all are.
         """
+        if not chunks:
+            return []
+        newest_boot, at_ns = self._store.rows(_NEWEST)[0].values()
         ahead_ns = {
-            boot: self._store.rows(_LAST_CLOCK, [boot])[0]["ahead_ns"]
-            for boot in {row["last_boot_id"] for row in chunks}
+            boot: [self._store.rows(sql, [boot])[0]["ahead_ns"] for sql in _CLOCKS]
+            for boot in {newest_boot, *(row["last_boot_id"] for row in chunks)}
         }
+        newest_ns = at_ns + ahead_ns[newest_boot][0]
         timed = []
         for row in chunks:
-            utc_ns = row["last_monotonic_ns"] + ahead_ns[row["last_boot_id"]]
-            timed.append({**row, "last_utc_ns": utc_ns if utc_ns >= TRUE_SINCE_NS else row["last_utc_ns"]})
+            shown = [row["last_utc_ns"], *(row["last_monotonic_ns"] + ns for ns in ahead_ns[row["last_boot_id"]])]
+            possible = [utc_ns for utc_ns in shown if utc_ns <= newest_ns]
+            timed.append({**row, "last_utc_ns": max(possible or shown)})
         return timed
 
     @staticmethod

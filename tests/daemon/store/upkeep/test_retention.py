@@ -141,6 +141,41 @@ def test_captures_of_a_boot_are_as_old_as_the_monotonic_clock_says_whatever_the_
     assert minutes_left(path)[0] == 120
 
 
+@pytest.mark.parametrize("wrong_by_days", [-150, -300, -10_000, 3650])
+def test_a_clock_that_is_set_wrong_at_the_end_of_a_boot_makes_its_captures_neither_older_nor_younger(
+    path: Path, store: Store, wrong_by_days: int
+) -> None:
+    fill(store, 240)
+    fill(store, 2, begin_s=240 * MINUTE_S, utc_ns=NOW_NS + round(wrong_by_days * DAY_S * NS_PER_S))
+    fill(store, 120, begin_s=300 * MINUTE_S, boot="boot-b")
+    now_ns = NOW_NS + 8 * 3600 * NS_PER_S
+    assert Retention(store).oldest_ns() == pytest.approx(NOW_NS, abs=60 * NS_PER_S)
+    assert delete_all(store, now_ns - round(30 * DAY_S * NS_PER_S)) == 0
+    assert minutes_left(path) == [*range(242)]
+    assert delete_all(store, now_ns - 5 * 3600 * NS_PER_S) > 0
+    assert minutes_left(path)[0] == 180
+
+
+def test_captures_of_a_wrong_clock_are_no_older_where_those_before_them_lie_in_a_session(
+    path: Path, store: Store
+) -> None:
+    fill(store, 240)
+    fill(store, 9, begin_s=240 * MINUTE_S, utc_ns=NOW_NS - round(150 * DAY_S * NS_PER_S))
+    fill(store, 120, begin_s=300 * MINUTE_S, boot="boot-b")
+    session(store, "s1", at(60.0), at(240 * MINUTE_S))
+    assert delete_all(store, NOW_NS - round(30 * DAY_S * NS_PER_S)) == 0
+    assert minutes_left(path) == [*range(249)]
+
+
+@pytest.mark.parametrize("wrong_by_days", [-150, 150])
+def test_captures_are_kept_while_the_newest_clock_is_wrong(path: Path, store: Store, wrong_by_days: int) -> None:
+    wrong_ns = NOW_NS + round(wrong_by_days * DAY_S * NS_PER_S)
+    fill(store, 120)
+    fill(store, 120, boot="boot-b", begin_s=120 * MINUTE_S, utc_ns=wrong_ns)
+    assert delete_all(store, min(wrong_ns, NOW_NS) - round(30 * DAY_S * NS_PER_S)) == 0
+    assert (minutes_left(path), minutes_left(path, "boot-b")) == ([*range(120)], [*range(120, 240)])
+
+
 def test_what_waits_to_be_decoded_stays(path: Path, store: Store) -> None:
     waiting = store.append_captures([frame(0, 0.0)])
     fill(store, 120, begin_s=10.0)
