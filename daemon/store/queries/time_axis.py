@@ -2,15 +2,22 @@
 
 Within a boot, time passes as the monotonic clock says. From the last observation of a boot to the first one of the next
 it passes as the computer's clock says, and not at all where that shows an earlier time.
+
+Any clock may be wrong. A boot is timed by what the clock showed at its first observation and by what it showed at its
+last one; the end of a boot also by the latest time of the boots before. The least time between two boots by any of
+these counts: so a clock that is wrong in a part of a boot moves no later boot far.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from daemon.store.queries.observations import first_observation
 from daemon.store.rows import RowSource
 from drivers.clock import NS_PER_S, Stamp
+
+SET_SINCE_NS = 1_577_836_800 * NS_PER_S  # 2020: a clock that shows an earlier time is not set
 
 # SQLite takes the other columns from the row that has the least or the greatest one.
 _BOOTS = """WITH firsts AS (SELECT boot_id, min(monotonic_ns) AS first_ns, utc_ns AS first_utc_ns FROM observations
@@ -28,12 +35,12 @@ class TimeAxis:
     Attributes:
         offsets_ns: boot -> what its monotonic clock lacks to the axis.
         end_ns: of the newest observation, on the axis.
-        end_utc_ns: what the computer's clock showed then.
+        ends_utc_ns: UTC then, by each clock that may be right.
     """
 
     offsets_ns: dict[str, int]
     end_ns: int = 0
-    end_utc_ns: int = 0
+    ends_utc_ns: tuple[int, ...] = ()
 
     def observed(self, stamp: Stamp) -> float:
         """Return the place, s, of an instant of a boot that has observations."""
@@ -42,23 +49,36 @@ class TimeAxis:
     def present(self, stamp: Stamp) -> float | None:
         """Return the place, s, of an instant that is not before the newest observation.
 
-        In a boot without observations the computer's clock tells it; None where that shows an earlier time than it did
-        at the newest observation, so that it is wrong.
+        In a boot without observations the computer's clock tells it; None where that shows an earlier time than any
+        clock did at the newest observation, so that it is wrong.
         """
         if stamp.boot_id in self.offsets_ns:
             return self.observed(stamp)
-        passed_ns = stamp.utc_ns - self.end_utc_ns
-        return None if passed_ns < 0 else (self.end_ns + passed_ns) / NS_PER_S
+        passed_ns = _least_ns([stamp.utc_ns], self.ends_utc_ns)
+        return None if passed_ns is None else (self.end_ns + passed_ns) / NS_PER_S
 
 
 def time_axis(source: RowSource) -> TimeAxis:
     """Return the axis of all observations of a store, used or not: it is the same whichever sessions are looked at."""
     offsets_ns: dict[str, int] = {}
-    end_ns = end_utc_ns = 0
+    end_ns = 0
+    ends_utc_ns: tuple[int, ...] = ()
     for boot in source.rows(_BOOTS):
-        begin_ns = end_ns + max(0, boot["first_utc_ns"] - end_utc_ns) if offsets_ns else 0
+        span_ns = boot["last_ns"] - boot["first_ns"]
+        shown_ns = boot["first_utc_ns"], boot["last_utc_ns"] - span_ns
+        begins_utc_ns = [utc_ns for utc_ns in shown_ns if utc_ns >= SET_SINCE_NS]
+        passed_ns = _least_ns(begins_utc_ns, ends_utc_ns) or 0
+        begin_ns = end_ns + passed_ns
         offsets_ns[boot["kernel_boot_id"]] = offset_ns = begin_ns - boot["first_ns"]
-        end_ns, end_utc_ns = boot["last_ns"] + offset_ns, boot["last_utc_ns"]
+        end_ns = boot["last_ns"] + offset_ns
+        # The latest of before may be right where this boot's clock is behind.
+        begins_utc_ns += [ns + passed_ns for ns in ends_utc_ns[-1:]]
+        ends_utc_ns = tuple(sorted({ns + span_ns for ns in begins_utc_ns}))
     first = first_observation(source)
     zero_ns = 0 if first is None else first["monotonic_ns"] + offsets_ns[first["kernel_boot_id"]]
-    return TimeAxis({boot: ns - zero_ns for boot, ns in offsets_ns.items()}, end_ns - zero_ns, end_utc_ns)
+    return TimeAxis({boot: ns - zero_ns for boot, ns in offsets_ns.items()}, end_ns - zero_ns, ends_utc_ns)
+
+
+def _least_ns(begins_utc_ns: Iterable[int], ends_utc_ns: Sequence[int]) -> int | None:
+    """Return the least time from an end to a begin that is not before it; None where every begin is before all ends."""
+    return min((begin - end for begin in begins_utc_ns for end in ends_utc_ns if begin >= end), default=None)
