@@ -14,7 +14,7 @@ from typing import NamedTuple
 from daemon.config.config import Config, ConfigError
 from daemon.sessions.export.session_file import SessionFile
 from daemon.sessions.vector_channels import SUFFIXES as VECTOR_SUFFIXES
-from daemon.sessions.vector_channels import links_of_channels
+from daemon.sessions.vector_channels import links_named_by, links_of_channels
 from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S, Stamp
@@ -103,6 +103,8 @@ def _several_channels(path: Path, link: str, what: str, known: Mapping[str, str]
 def first_captures(paths: Sequence[Path], config: Config, told: SessionFile | None = None) -> dict[Path, Capture]:
     """The first capture of each file; every file is read through, so that a bad one is refused before anything runs.
 
+    A file without captures has none, and is taken where it is named by a link that had none by the session file.
+
     Raises:
         DescriptionError, ConfigError: as `captures_of`; or a file holds no captures, is given twice, or has captures of
             a link from a time from which another file has them; or a link has none from the time of the session.
@@ -118,17 +120,28 @@ def first_captures(paths: Sequence[Path], config: Config, told: SessionFile | No
             at_ns = capture.stamp.monotonic_ns
             span = found.get(capture.link)
             found[capture.link] = _Span(path, at_ns, at_ns) if span is None else span._replace(last_ns=at_ns)
-        if path not in firsts:
-            raise DescriptionError(str(path), "holds no captures")
+        if path not in firsts and not _is_of_silent_link(path, config, told):
+            raise DescriptionError(str(path), "holds no captures: leave it out")
         for link, span in found.items():
             others = spans.setdefault(link, [])
             for other in others:
                 span.check_apart(other, link)
             others.append(span)
+    if not firsts:
+        raise DescriptionError(", ".join(map(str, paths)), "no file holds captures: nothing can be replayed")
     if told is not None:
         for link, found_in in spans.items():
             _check_overlap(found_in, link, told)
     return firsts
+
+
+def _is_of_silent_link(path: Path, config: Config, told: SessionFile | None) -> bool:
+    """Return True for the log of a link that a session file knows, and of which it knows no capture."""
+    if told is None:
+        return False
+    stations = (section.name for section in config.station)
+    named = links_named_by(path, stations if path.suffix.lower() == SERIAL_SUFFIX else told.can_channels)
+    return bool(named) and named[0] not in told.doubtful
 
 
 class _Span(NamedTuple):

@@ -47,25 +47,52 @@ def links_of_channels(path: Path, config: Config, told: Mapping[str, int]) -> di
         told: link -> its number, by the session file of the log; empty where that does not say it.
 
     Raises:
-        DescriptionError: the log is malformed; or it has frames of channel 1 alone and several links may be meant.
+        DescriptionError: the log is malformed; or it has frames of one channel alone, several links are configured, and
+            its name is not that of the channel's link.
     """
     numbers = {name: number for name, number in told.items() if name in {section.name for section in config.can}}
-    if not told:
-        numbers = channel_numbers(config)
-        first = channel_name(1)
-        if len(numbers) > 1 and all(capture.link == first for capture in read_can_log(path)):
-            return {first: _named_by(path, list(numbers))}
-    return {channel_name(number): name for name, number in numbers.items()}
+    if told:
+        return {channel_name(number): name for name, number in numbers.items()}
+    known = {channel_name(number): name for name, number in channel_numbers(config).items()}
+    only = _only_channel(path) if len(known) > 1 else None
+    if only is not None:
+        ending = links_named_by(path, known.values())
+        if only == channel_name(1):
+            return {only: _named_first(path, ending, list(known.values()))}
+        if only in known and ending and known[only] not in ending:
+            raise DescriptionError(
+                str(path),
+                f"has frames of link {known[only]!r} by the channel number of this configuration, and of "
+                f"{ending[0]!r} by the file's name: links may have had other numbers where it was made; give the "
+                f"session file of the export with --session, or rename the file if it is of {known[only]!r}",
+            )
+    return known
 
 
-def _named_by(path: Path, names: Sequence[str]) -> str:
-    """Return the link by which an exported log is named: the files of all links once had channel 1."""
+def links_named_by(path: Path, names: Iterable[str]) -> list[str]:
+    """Return the links by which an exported log may be named, the one of the longest name first."""
     ending = [name for name in names if path.stem == name or path.stem.endswith(f"-{name}")]
-    if len(ending) != 1:
+    return sorted(ending, key=len, reverse=True)
+
+
+def _only_channel(path: Path) -> str | None:
+    """Return the channel of all frames of a log; None where these have several, or where there are none."""
+    first = None
+    for capture in read_can_log(path):
+        if first is None:
+            first = capture.link
+        elif capture.link != first:
+            return None
+    return first
+
+
+def _named_first(path: Path, ending: Sequence[str], names: Sequence[str]) -> str:
+    """Return the link by which a log of channel 1 is named: the exported files of all links once had that channel."""
+    if not ending:
         raise DescriptionError(
             str(path),
             f"has frames of channel 1 alone, which was every link's in exports of earlier versions, and its name ends "
-            f"in that of {'several links' if ending else 'no link'}: name the file ...-LINK{path.suffix}, with LINK "
-            f"one of {', '.join(names)}; or give the session file of an export with --session",
+            f"in that of no link: name the file ...-LINK{path.suffix}, with LINK one of {', '.join(names)}; or give "
+            "the session file of an export with --session",
         )
     return ending[0]

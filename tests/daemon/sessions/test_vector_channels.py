@@ -10,7 +10,7 @@ import pytest
 
 from daemon.config.config import Config, ConfigError, read_config
 from daemon.sessions.export.captured_logs import export_session
-from daemon.sessions.export.session_file import SessionFile, read_session_file
+from daemon.sessions.export.session_file import DoubtfulCaptures, SessionFile, read_session_file
 from daemon.sessions.replay import captures_of, first_captures
 from daemon.sessions.vector_channels import SUFFIXES, channel_numbers
 from drivers.clock import Stamp
@@ -93,13 +93,74 @@ def test_an_export_of_an_earlier_version_is_the_link_s_whose_name_it_has(tmp_pat
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-@pytest.mark.parametrize(("stem", "why"), [("recorded", "no link"), ("s1-left-arm", "several links")])
-def test_a_log_of_channel_1_that_may_be_any_link_s_is_refused(tmp_path: Path, suffix: str, stem: str, why: str) -> None:
-    path = tmp_path / f"{stem}{suffix}"
+def test_a_log_of_channel_1_that_may_be_any_link_s_is_refused(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"recorded{suffix}"
     write_can_log(path, frames("boom"))
     config = configured(tmp_path, **{"arm": "can0", "left-arm": "can1"})
-    with pytest.raises(DescriptionError, match=rf"channel 1 alone.*in that of {why}: name the file \.\.\.-LINK"):
+    with pytest.raises(DescriptionError, match=r"channel 1 alone.*in that of no link: name the file \.\.\.-LINK"):
         links_of(path, config, TOLD)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_of_links_whose_names_end_alike_the_longest_is_a_log_s(tmp_path: Path, suffix: str) -> None:
+    config = configured(tmp_path, **{"arm": "can0", "left-arm": "can1"})
+    for link in ("arm", "left-arm"):
+        path = tmp_path / f"s001-r-{link}{suffix}"
+        write_can_log(path, frames(link))
+        assert links_of(path, config) == {link}
+    new = tmp_path / f"left-arm{suffix}"
+    write_can_log(new, frames("left-arm"), channel_numbers(config))
+    assert links_of(new, config) == {"left-arm"}
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("now", [["crane", "boom", "arm"], ["arm", "boom"]])
+def test_frames_do_not_come_under_a_link_that_has_the_number_of_another_by_now(
+    tmp_path: Path, suffix: str, now: list[str]
+) -> None:
+    ports = {"boom": "/dev/a", "arm": "/dev/b", "crane": "/dev/c"}
+    then = channel_numbers(configured(tmp_path, boom="/dev/a", arm="/dev/b"))
+    logs = {link: tmp_path / f"s001-r-{link}{suffix}" for link in then}
+    for link, path in logs.items():
+        write_can_log(path, frames(link), then)
+    config = configured(tmp_path, **{link: ports[link] for link in now})
+    assert links_of(logs["boom"], config) == {"boom"}, "which has channel 1, and goes by its name"
+    said = "has frames of link 'boom' by the channel number.*of 'arm' by the file's name: .* with --session"
+    with pytest.raises(DescriptionError, match=said):
+        links_of(logs["arm"], config)
+    told = TOLD.model_copy(update={"can_channels": then})
+    assert links_of(logs["arm"], config, told) == {"arm"}
+
+
+@pytest.mark.parametrize("can_format", ["log", "asc", "blf"])
+def test_the_exported_log_of_a_link_without_captures_is_taken_with_its_session_file(
+    tmp_path: Path, can_format: str
+) -> None:
+    config = configured(tmp_path, boom="can0", arm="can1")
+    rest = exported(tmp_path, config, can_format, ["boom"])
+    silent = tmp_path / "out" / f"s001-r-arm.{can_format}"
+    write_can_log(silent, [], {"boom": 1, "arm": 2})
+    told = read_session_file(tmp_path / "out" / "s001-r.json")
+    assert list(first_captures([silent, rest["boom"]], config, told)) == [rest["boom"]]
+    other = tmp_path / f"other.{can_format}"
+    other.write_bytes(silent.read_bytes())
+    for files, known, said in (
+        ([silent], told, "no file holds captures"),
+        ([silent, rest["boom"]], None, "holds no captures: leave it out"),
+        ([other, rest["boom"]], told, "holds no captures: leave it out"),
+    ):
+        with pytest.raises(DescriptionError, match=said):
+            first_captures(files, config, known)
+
+
+def test_a_log_that_has_lost_its_captures_is_no_silent_link_s(tmp_path: Path) -> None:
+    config = configured(tmp_path, boom="can0", arm="can1")
+    doubtful = {"arm": DoubtfulCaptures(captures=3, runs=((0, 1),))}
+    told = TOLD.model_copy(update={"can_channels": {"boom": 1, "arm": 2}, "doubtful": doubtful})
+    path = tmp_path / "s001-r-arm.log"
+    write_can_log(path, [])
+    with pytest.raises(DescriptionError, match="holds no captures"):
+        first_captures([path], config, told)
 
 
 def test_the_log_of_one_link_does_not_become_another_s_that_alone_is_configured(tmp_path: Path) -> None:
