@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
@@ -234,7 +235,9 @@ def setup_names(fixes: Sequence[ExportedFix], setup: str) -> dict[str, str]:
     stations = list(dict.fromkeys(fix.station for fix in fixes))
     if len(stations) == 1:
         return {stations[0]: setup}
-    return {station: "-".join(filter(None, (setup, station or "unnamed"))) for station in stations}
+    blanks = ("-".join(["unnamed", *["0"] * zeros]) for zeros in itertools.count())
+    blank = next(name for name in blanks if name not in stations)
+    return {station: "-".join(filter(None, (setup, station or blank))) for station in stations}
 
 
 def several_setups(setups: Mapping[str, str], source: str) -> tuple[str, ...]:
@@ -244,6 +247,23 @@ def several_setups(setups: Mapping[str, str], source: str) -> tuple[str, ...]:
     return (
         f"{source} has {len(setups)} set-ups of the instrument, and so have the rows: {', '.join(setups.values())}; "
         "each has a frame of its own",
+    )
+
+
+def repeated_setups(fixes: Sequence[ExportedFix], source: str) -> tuple[str, ...]:
+    """Return a note on an instrument that is set up again under the name of a set-up before."""
+    first: dict[str, int] = {}
+    lines: dict[int, tuple[int, str]] = {}
+    for fix in fixes:
+        if first.setdefault(fix.station, fix.times_set_up) != fix.times_set_up:
+            lines.setdefault(fix.times_set_up, (fix.line, fix.station))
+    if not lines:
+        return ()
+    again = [f"before line {line} as {station or 'unnamed'!r}" for line, station in lines.values()]
+    more = f" and {len(again) - 3} times more" if len(again) > 3 else ""
+    return (
+        f"{source} sets the instrument up again under a name it had before: {'; '.join(again[:3])}{more}; its points "
+        "are taken as of one set-up: give the file in parts if it stood elsewhere or was turned",
     )
 
 

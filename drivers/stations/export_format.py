@@ -67,6 +67,7 @@ class ExportedFix:
         time_s: when; seconds since 1970 where the file has a date, else since its own origin; None where it says
             nothing.
         station: where the instrument stood, as the file names it; another name is another set-up.
+        times_set_up: how often the file had set the instrument up by then, under any name; 0 where it does not say.
     """
 
     line: int
@@ -75,6 +76,7 @@ class ExportedFix:
     position_mm: tuple[float, float, float]
     time_s: float | None = None
     station: str = ""
+    times_set_up: int = 0
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,7 @@ def import_(
         read_export,
         read_joints,
         read_map,
+        repeated_setups,
         setup_names,
         several_setups,
     )
@@ -82,7 +83,7 @@ def import_(
     notes += far_repetitions(fixes, file.name)
     rows = None if joints is None or described is None else read_joints(joints, described)
     setups = setup_names(fixes, setup)
-    notes += several_setups(setups, file.name)
+    notes += several_setups(setups, file.name) + repeated_setups(fixes, file.name)
     table = observations_csv(fixes, columns, file.name, described, rows, prism, setups, session)
     if described is not None and rows is not None:
         parse_observations(table.encode(), described, f"what {file.name} became")

@@ -44,6 +44,7 @@ def _read(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:  # n
     joined = joined[:-1]
     fixes: list[ExportedFix] = []
     point, target, stood = "", "", {"'": "", "(": "", ")": ""}
+    times_set_up, has_measured = 0, True  # since it was set up
     end = 0
     for match in _FIELD.finditer(joined):
         line = lines[match.start() // 128]
@@ -54,11 +55,14 @@ def _read(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:  # n
         match match["kind"]:
             case "'" | "(" | ")" as kind:
                 stood[kind] = value.strip()
+                if has_measured:
+                    times_set_up, has_measured = times_set_up + 1, False
             case "+":
                 point, target = value.strip(), ""
             case " ":
                 station = "/".join(filter(None, stood.values()))
-                fixes.append(replace(_fix(value, point, line, source), station=station))
+                fixes.append(replace(_fix(value, point, line, source), station=station, times_set_up=times_set_up))
+                has_measured = True
             case "*":
                 target = value.strip()
                 if target and fixes and fixes[-1].point == point:

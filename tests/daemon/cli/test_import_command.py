@@ -12,8 +12,10 @@ from click.testing import CliRunner, Result
 
 from calibration.observations import Observations
 from calibration.rig.description import shipped_rig
+from daemon.cli.imported_points import setup_names
 from daemon.cli.main import main
-from tests.drivers.stations.exports.test_exports import POINTS, VICON, gts_download
+from drivers.stations.export_format import ExportedFix
+from tests.drivers.stations.exports.test_exports import POINTS, SDR_HEAD, SETUP, VICON, gts_download, sdr
 
 RIG = shipped_rig("ur10")
 JOINTS = [joint.column for joint in RIG.joints]
@@ -91,6 +93,44 @@ def test_a_file_of_one_named_set_up_has_the_given_name(tmp_path: Path) -> None:
     download.write_text(gts_download(POINTS[:2], ("_'J_(A_)1.5",)))
     assert len(told(download, "--setup", "S1", "--out", out)["notes"]) == 1
     assert [row["setup"] for row in csv.DictReader(out.read_text(encoding="utf-8").splitlines())] == ["S1", "S1"]
+
+
+STOOD = sdr("02TP", "1", 0.0, 0.0, 0.0, 1.5)
+SHOT = sdr("09F1", "1", "1", 10.0, 90.0, 0.0, "r")
+BACK = sdr("07TP", "1", "2", 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "again"),
+    [
+        (gts_download(POINTS[:1], ("_'J_(A_)1.5",) * 2), "before line 1 as 'J/A/1.5'"),
+        (gts_download(POINTS, (SETUP,) * 2), "before line 2 as '1.540'"),
+        (SDR_HEAD + STOOD + BACK + SHOT + STOOD + BACK + SHOT, "before line 8 as 'JOB1/1'"),
+        (SDR_HEAD + STOOD + SHOT + BACK + SHOT, "before line 6 as 'JOB1/1'"),
+        (SDR_HEAD + STOOD + SHOT + "10NMJOB1\n" + SHOT * 2, "before line 6 as 'JOB1/1'"),
+    ],
+)
+def test_an_instrument_that_is_set_up_again_under_the_same_name_is_said(tmp_path: Path, text: str, again: str) -> None:
+    survey, out = tmp_path / "survey.txt", tmp_path / "out.csv"
+    survey.write_text(text)
+    found = told(survey, "--out", out)
+    for notes in (found["notes"], told(survey, "--map", found["map_file"], "--out", tmp_path / "2.csv")["notes"]):
+        assert notes[-1].startswith(f"survey.txt sets the instrument up again under a name it had before: {again}; ")
+        assert notes[-1].endswith("give the file in parts if it stood elsewhere or was turned")
+
+
+@pytest.mark.parametrize("text", [gts_download(), SDR_HEAD + STOOD + BACK + SHOT * 3, SURVEY])
+def test_an_instrument_that_is_set_up_once_is_not_said_to_be_set_up_again(tmp_path: Path, text: str) -> None:
+    survey = tmp_path / "survey.txt"
+    survey.write_text(text)
+    assert not any("again" in note for note in told(survey, "--out", tmp_path / "out.csv")["notes"])
+
+
+@pytest.mark.parametrize("setup", ["", "S1"])
+def test_a_station_without_a_name_shares_no_set_up_with_one_that_is_called_unnamed(setup: str) -> None:
+    stations = ["unnamed", "", "unnamed-0"]
+    found = [ExportedFix(n, "1", "", (0.0, 0.0, 0.0), station=station) for n, station in enumerate(stations)]
+    assert len(set(setup_names(found, setup).values())) == 3
 
 
 def test_joints_are_matched_by_time(tmp_path: Path) -> None:

@@ -142,17 +142,25 @@ def test_bad_sdr_files_are_refused() -> None:
     assert "line 3: 'nan' is not a number, in column 3" in refused(SDR_HEAD + sdr("08TP", "1", 1.0, "nan", 3.0))
     assert "columns of another width" in refused(SDR_HEAD.replace("SDR33", "SDR20") + good)
     moved = sdr("02TP", "3", 0.0, 0.0, 0.0, 1.5) + good + sdr("02TP", "3", 9.0, 0.0, 0.0, 1.5)
-    assert "line 5: a second place of the station '3'; name it otherwise, or split" in refused(SDR_HEAD + moved)
+    assert "line 5: a second place of the station 'JOB1/3'; name it otherwise, or split" in refused(SDR_HEAD + moved)
 
 
 def test_sdr_points_are_of_the_station_that_stood_there_though_its_coordinates_were_left_at_0() -> None:
     stood = [sdr("02TP", name, 0.0, 0.0, 0.0, 0.0) for name in ("A", "B", "A")]
     polar = [sdr("09F1", name, n, 10.0, 90.0, 0.0, "r") for n, name in enumerate(("A", "B", "A"))]
     found = fixes(SDR_HEAD + "".join(a + b for a, b in zip(stood, polar, strict=True)), "sokkia_sdr")
-    assert [fix.station for fix in found] == ["A", "B", "A"]
+    assert [fix.station for fix in found] == ["JOB1/A", "JOB1/B", "JOB1/A"]
     places = [sdr("02TP", name, north, 0.0, 0.0, 0.0) for name, north in (("A", 0.0), ("B", 7.0))]
     found = fixes(SDR_HEAD + "".join(place + sdr("08TP", "1", 9.0, 1.0, 2.0) for place in places), "sokkia_sdr")
-    assert [(fix.station, fix.position_mm[1]) for fix in found] == [("A", 9000.0), ("B", 2000.0)]
+    assert [(fix.station, fix.position_mm[1]) for fix in found] == [("JOB1/A", 9000.0), ("JOB1/B", 2000.0)]
+
+
+def test_sdr_stations_of_two_jobs_are_two_set_ups_though_their_names_are_the_same() -> None:
+    polar, place = sdr("09F1", "1", "1", 10.0, 90.0, 0.0, "r"), sdr("08TP", "2", 9.0, 1.0, 2.0)
+    first, second = (sdr("02TP", "1", north, 0.0, 0.0, 1.5) + polar + place for north in (0.0, 7.0))
+    found = fixes(SDR_HEAD + first + sdr("10NM", "JOB2") + second, "sokkia_sdr")
+    assert [fix.station for fix in found] == ["JOB1/1", "JOB1/1", "JOB2/1", "JOB2/1"]
+    assert [fix.times_set_up for fix in found] == [1, 1, 2, 2]
 
 
 # ---- tables ----------------------------------------------------------------------------------------------------------
