@@ -7,7 +7,7 @@ import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import NamedTuple
 
@@ -161,14 +161,36 @@ class _Span(NamedTuple):
                 "they would be stored twice; give one of the two",
             )
 
+    def is_of(self, told: SessionFile) -> bool:
+        """Return True if some of it may be from the time of a session."""
+        return self.first_ns <= told.until_utc_ns + AFTER_NS and self.last_ns >= told.since_utc_ns - BEFORE_NS
+
+    def zone_of_second_hour(self, told: SessionFile) -> str | None:
+        """Return a TZ of fixed offset in which a log of a local time that comes twice is the session's; else None."""
+        second = datetime.fromtimestamp(self.first_ns / NS_PER_S, UTC).astimezone().replace(tzinfo=None, fold=1)
+        later_ns = round(second.timestamp() * NS_PER_S) - self.first_ns
+        moved = self._replace(first_ns=self.first_ns + later_ns, last_ns=self.last_ns + later_ns)
+        offset = second.astimezone().utcoffset()
+        if offset is None or abs(later_ns) < NS_PER_S or not moved.is_of(told):
+            return None
+        hours, minutes = divmod(abs(round(offset.total_seconds() / 60)), 60)
+        sign = "-" if offset > timedelta(0) else "+"  # POSIX counts to the west
+        return f"UTC{sign}{hours}" + (f":{minutes:02d}" if minutes else "")
+
 
 def _check_overlap(spans: Sequence[_Span], link: str, told: SessionFile) -> None:
     """Refuse a link whose files have nothing from the time of their session: the clock of one of them is another."""
-    since_ns, until_ns = told.since_utc_ns - BEFORE_NS, told.until_utc_ns + AFTER_NS
-    if any(span.first_ns <= until_ns and span.last_ns >= since_ns for span in spans):
+    if any(span.is_of(told) for span in spans):
         return
     path, first_ns, last_ns = spans[0]
-    if path.suffix.lower() == ".asc":
+    zone = spans[0].zone_of_second_hour(told) if path.suffix.lower() == ".asc" else None
+    if zone is not None:
+        remedy = (
+            "the local time of an .asc may come twice at the end of summer time, and the first one was read: set the "
+            f"environment variable TZ to {zone}, in which the log is of the session's time, or export the session with "
+            "--format candump"
+        )
+    elif path.suffix.lower() == ".asc":
         remedy = (
             "an .asc holds local time without its zone: set the environment variable TZ to the zone where it was made, "
             "as TZ=Europe/Berlin, or export the session with --format candump"

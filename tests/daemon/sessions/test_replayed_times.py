@@ -6,6 +6,8 @@ import re
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -73,6 +75,36 @@ def test_an_asc_of_another_time_zone_is_refused_with_both_times_and_what_to_do(t
         said,
     )
     assert not (tmp_path / "new.sqlite").exists()
+
+
+@pytest.mark.parametrize(
+    ("zone", "utc", "fixed"),
+    [
+        ("Europe/Berlin", "2026-10-25T01:10:00Z", "UTC-1"),
+        ("America/St_Johns", "2026-11-01T05:10:00Z", "UTC+3:30"),
+        ("Australia/Lord_Howe", "2026-04-04T15:10:00Z", "UTC-10:30"),
+    ],
+)
+def test_an_asc_of_the_second_hour_of_two_is_refused_with_a_zone_in_which_it_is_taken(
+    tmp_path: Path, local: Zone, zone: str, utc: str, fixed: str
+) -> None:
+    local(zone)
+    later_ns = round(datetime.fromisoformat(utc).timestamp()) * NS_PER_S - FIRST_NS
+    path = tmp_path / "s001-r-boom.asc"
+    write_can_log(path, [replace(frame, stamp=frame.stamp.shifted(later_ns)) for frame in FRAMES])
+    text = (STANDING / "station.serial").read_text(encoding="utf-8")
+    path.with_name("station.serial").write_text(
+        re.sub(r"^(\d{10})(?=\.)", lambda found: str(int(found[1]) + later_ns // NS_PER_S), text, flags=re.MULTILINE),
+        encoding="utf-8",
+    )
+    changes = {"since_ns": FIRST_NS + NS_PER_S + later_ns, "until_ns": LAST_NS + later_ns}
+    result = replayed(tmp_path, path, **changes)
+    assert result.exit_code == 2
+    said = " ".join(result.output.split())
+    assert f"set the environment variable TZ to {fixed}, in which" in said
+    assert said.endswith("or export the session with --format candump")
+    local(fixed)
+    assert replayed(tmp_path, path, **changes).exit_code == 0
 
 
 def test_logs_of_another_session_are_refused(tmp_path: Path) -> None:
