@@ -153,30 +153,37 @@ class SessionLifecycle:
         """Decide anew whether calibration may use the closed sessions: rig file or zeros may be others than theirs."""
         with self._store.transaction():
             for row in self.table.closed():
-                why, excluded = self._why_other_readings(row["id"]), row["excluded"]
-                if why is None and not (excluded or "").startswith((OTHER_RIG_FILE, ZERO_LOST)):
-                    continue  # it has nothing to do with either
-                if row["accepted_despite"] is None:
-                    why = self._why_not_used(row["id"])
-                if why != excluded:
-                    self.table.change(row["id"], excluded=why)
-                    told = f"is not used: {why}" if why else "is used again"
-                    self._store.once_committed(partial(log.warning, "session %s %s", row["id"], told))
+                self._judge_readings(row)
 
     def judge_zeros(self) -> None:
         """Decide anew whether calibration may use closed sessions: an encoder has jumped, maybe once again."""
-        known = (OTHER_RIG_FILE, ZERO_LOST)
-        rows = [row["id"] for row in self.table.closed() if not (row["excluded"] or "").startswith(known)]
-        if any(map(self._why_other_readings, rows)):
-            self.judge_readings()
+        with self._store.transaction():
+            for row in self.table.closed():
+                if not _has_other_readings(row):
+                    self._judge_readings(row)
 
-    def _why_other_readings(self, session_id: str) -> str | None:
+    def _judge_readings(self, closed: Mapping[str, Any]) -> None:
+        session_id, excluded = closed["id"], closed["excluded"]
+        why = self._why_other_readings(self._row(session_id))
+        if why is None and not _has_other_readings(closed):
+            return
+        if closed["accepted_despite"] is None:
+            why = self._why_not_used(session_id)
+        if why != excluded:
+            self.table.change(session_id, excluded=why)
+            told = f"is not used: {why}" if why else "is used again"
+            self._store.once_committed(partial(log.warning, "session %s %s", session_id, told))
+
+    def _row(self, session_id: str) -> dict[str, Any]:
+        row = session(self._store, session_id)
+        assert row is not None  # no session is ever deleted
+        return row
+
+    def _why_other_readings(self, row: Mapping[str, Any]) -> str | None:
         """Return why a session's readings are not those of the rig as it is now, a clause; None where they are.
 
         An operator who accepts a session says that the zeros are those that it was measured with.
         """
-        row = session(self._store, session_id)
-        assert row is not None  # no session is ever deleted
         if why := misreading(self._rig, row["rig_text"], row["prism"]):
             return f"{OTHER_RIG_FILE}{why}"
         since = self._store.stamp_or_none(row, "accepted_") or self._store.stamp(row, "started_")
@@ -216,23 +223,18 @@ class SessionLifecycle:
 
     def _why_not_used(self, session_id: str) -> str | None:
         """Why calibration must not use a session, a clause; None where a control point shows that it may."""
-        reasons = (
-            self._why_other_readings(session_id),
-            self._why_other_constant(session_id),
-            self._why_moved(session_id),
-        )
+        row = self._row(session_id)
+        reasons = self._why_other_readings(row), self._why_other_constant(row), self._why_moved(session_id)
         return "; ".join(filter(None, reasons)) or None
 
-    def _why_other_constant(self, session_id: str) -> str | None:
+    def _why_other_constant(self, row: Mapping[str, Any]) -> str | None:
         """Return why a session's distances do not fit those of others, a clause: another prism constant was set.
 
         It is held against what the set-up's description says, else against the newest session that is used there.
         """
-        row = session(self._store, session_id)
-        assert row is not None  # no session is ever deleted
         said_mm = self._setups.constants_mm(row["setup_id"]).get(row["prism"])
-        like = self.table.used_like(session_id)
-        for station, mm in first_constants_mm(self._store, session_id).items():
+        like = self.table.used_like(row["id"])
+        for station, mm in first_constants_mm(self._store, row["id"]).items():
             if said_mm is not None:
                 other_mm, where = said_mm, f"set-up {row['setup_id']} says"
             else:
@@ -259,3 +261,8 @@ class SessionLifecycle:
             return NOT_THE_SAME
         poses, enclosed = self.table.count_poses(session_id)
         return NOT_ENCLOSED if enclosed < LEAST_ENCLOSED * poses else None
+
+
+def _has_other_readings(closed: Mapping[str, Any]) -> bool:
+    """Return True if a session is not used since its readings are not those of the rig as it is now."""
+    return (closed["excluded"] or "").startswith((OTHER_RIG_FILE, ZERO_LOST))

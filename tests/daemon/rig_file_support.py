@@ -10,6 +10,8 @@ from daemon.rig_files import RigSource, load_rig
 Change = tuple[str, str]
 UNCHANGED = ("", "")
 ENCODER = 'name = "theta1"\ndevice = "cia406_encoder"\n'
+L2 = 'name = "L2"\ndevice = "cia406_linear"\nnode = 48\n'
+ANOTHER_ZERO = (L2, f"{L2}zero_counts = -2000\n")
 ANOTHER_FACTOR = ("SG_ P_Pump_bar : 0|16@1+ (0.1,0)", "SG_ P_Pump_bar : 0|16@1+ (0.01,0)")
 _ENTRY = "[1A00sub1]\nParameterName=Map 1\nObjectType=0x7\nDataType=0x0007\nAccessType=rw\nDefaultValue="
 ANOTHER_LENGTH = (f"{_ENTRY}0x60040020", f"{_ENTRY}0x60040010")

@@ -7,7 +7,7 @@ import math
 import resource
 import sqlite3
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +92,11 @@ class Rig:
                 records.append(self.fix())
             self.store.insert_records(records)
             with self.observing():
-                self.keeper.on_records(records)
+                self.tell(records)
+
+    def tell(self, records: Sequence[Record]) -> None:
+        """Tell records that are stored to whoever takes them."""
+        self.keeper.on_records(records)
 
     def fix(self) -> Fix:
         east, north, up = (v / 1000 for v in self.target_mm)

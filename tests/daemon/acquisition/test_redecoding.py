@@ -27,14 +27,13 @@ from daemon.store.upkeep.packing import Packing
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import Capture
 from tests.bench.store_growth import CONFIG, UTC_0_NS, traffic
-from tests.daemon.rig_file_support import ANOTHER_FACTOR, decoded_rig
+from tests.daemon.rig_file_support import ANOTHER_FACTOR, ANOTHER_ZERO, decoded_rig
 from tests.daemon.store_support import table
 
 SECONDS = 6.0
 SOURCE = load_rig("swdt82")
 DECODERS = decoders(parse_config(CONFIG, Path.cwd()), SOURCE)
-_L2 = 'name = "L2"\ndevice = "cia406_linear"\n'
-_OTHER_TEXT = SOURCE.text.replace(_L2, f"{_L2}zero_counts = -2000\n")
+_OTHER_TEXT = SOURCE.text.replace(*ANOTHER_ZERO)
 OTHER = replace(SOURCE, rig=parse_rig(_OTHER_TEXT, "other"), text=_OTHER_TEXT)
 OTHER_DECODERS = decoders(parse_config(CONFIG, Path.cwd()), OTHER)
 TABLES = {

@@ -20,15 +20,12 @@ class WatchedRig(GuidedRig):
         guide = super().new_guide()
         watch = guide._course.watch
         watch._joiner = ObservationJoiner(joint_inputs(self.machine), signal_inputs(self.machine), settle_s=0.5)
-        keep = self.keeper.on_records
-
-        def on_records(records: Sequence[Record]) -> None:
-            keep(records)
-            watch._joiner.feed(records)
-            guide.on_records(records)
-
-        self.keeper.on_records = on_records  # type: ignore[method-assign]
         return guide
+
+    def tell(self, records: Sequence[Record]) -> None:
+        super().tell(records)
+        self.guide._course.watch._joiner.feed(records)
+        self.guide.on_records(records)
 
     def at_a_pose(self, **request: Any) -> None:
         """A guide that waits for a pose of prism r, the station having been aimed."""
@@ -41,7 +38,7 @@ class WatchedRig(GuidedRig):
     def jump(self) -> None:
         """Say that a joint has jumped: its readings, and so all fixes from now on, do not count."""
         now = self.clock.now()
-        self.keeper.on_records([DeviceEvent("theta1", now, EventKind.PRESET_JUMP, "theta1: jumped by 3 deg")])
+        self.tell([DeviceEvent("theta1", now, EventKind.PRESET_JUMP, "theta1: jumped by 3 deg")])
 
     def warnings(self) -> list[str]:
         """What the guide says of fixes."""

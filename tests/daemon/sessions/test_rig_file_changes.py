@@ -15,11 +15,9 @@ from daemon.rig_files import misreading
 from daemon.sessions.session_data import sessions_csv
 from daemon.store.queries.sessions import SessionTable
 from rigcal.store_api import open_store
-from tests.daemon.rig_file_support import ANOTHER_FACTOR, ANOTHER_LENGTH, decoded_rig, own_rig
+from tests.daemon.rig_file_support import ANOTHER_FACTOR, ANOTHER_LENGTH, ANOTHER_ZERO, L2, decoded_rig, own_rig
 from tests.daemon.session_support import SOURCE, Rig, controlled
 
-L2 = 'name = "L2"\ndevice = "cia406_linear"\nnode = 48\n'
-ANOTHER_ZERO = (L2, f"{L2}zero_counts = -2000\n")
 ANOTHER_NODE = (L2, L2.replace("48", "58"))
 OTHER_TIMES = (L2, f"{L2}heartbeat_ms = 500\ntimeout_s = 3.0\n")
 ANOTHER_NAME = ("theta8", "roll8")

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from daemon.config.config import Config, ConfigError, read_config
-from daemon.sessions.export.captured_logs import export_session
+from daemon.sessions.export.captured_logs import CanFormat, export_session
 from daemon.sessions.export.session_file import DoubtfulCaptures, SessionFile, read_session_file
 from daemon.sessions.replay import captures_of, first_captures
 from daemon.sessions.vector_channels import SUFFIXES, channel_numbers
@@ -38,7 +38,7 @@ def links_of(path: Path, config: Config, told: SessionFile | None = None) -> set
     return {capture.link for capture in captures_of(path, config, told)}
 
 
-def exported(directory: Path, config: Config, can_format: str, links: Sequence[str]) -> dict[str, Path]:
+def exported(directory: Path, config: Config, can_format: CanFormat, links: Sequence[str]) -> dict[str, Path]:
     """Link -> its log of a session in which all links had frames."""
     rig = Rig(config.store_path)
     rig.clock.set(BEGIN)
@@ -50,7 +50,7 @@ def exported(directory: Path, config: Config, can_format: str, links: Sequence[s
     rig.clock.advance(2.0)
     rig.say("stop")
     rig.store.close()
-    export_session(config, "s001-r", directory / "out", can_format)  # type: ignore[arg-type]
+    export_session(config, "s001-r", directory / "out", can_format)
     return {link: directory / "out" / f"s001-r-{link}.{can_format}" for link in links}
 
 
@@ -65,7 +65,7 @@ def exported(directory: Path, config: Config, can_format: str, links: Sequence[s
     ],
 )
 def test_each_link_of_an_exported_session_comes_back_as_itself_alone_and_with_the_others(
-    tmp_path: Path, can_format: str, channels: dict[str, str]
+    tmp_path: Path, can_format: CanFormat, channels: dict[str, str]
 ) -> None:
     config = configured(tmp_path, **channels)
     logs = exported(tmp_path, config, can_format, list(channels))
@@ -134,7 +134,7 @@ def test_frames_do_not_come_under_a_link_that_has_the_number_of_another_by_now(
 
 @pytest.mark.parametrize("can_format", ["log", "asc", "blf"])
 def test_the_exported_log_of_a_link_without_captures_is_taken_with_its_session_file(
-    tmp_path: Path, can_format: str
+    tmp_path: Path, can_format: CanFormat
 ) -> None:
     config = configured(tmp_path, boom="can0", arm="can1")
     rest = exported(tmp_path, config, can_format, ["boom"])

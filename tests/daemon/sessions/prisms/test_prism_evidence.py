@@ -17,6 +17,7 @@ from daemon.sessions.station_setups import Place
 from drivers.readings import EventKind
 from simulators.rig.truth import RigTruth
 from tests.daemon.acquisition_support import wait_until
+from tests.daemon.rig_file_support import ANOTHER_ZERO
 from tests.daemon.session_support import SOURCE, Rig, closed_afterwards, disk_fails
 from tests.daemon.store_support import table
 
@@ -281,8 +282,7 @@ def test_sessions_of_a_rig_file_that_was_wrong_do_not_speak_against_a_prism(rig:
         rig.values["theta4"] += 8.0
         rig.live(2.0)
     rig.say("stop")
-    l2 = 'name = "L2"\ndevice = "cia406_linear"\nnode = 48\n'
-    rig.machine = parse_rig(rig.machine.text.replace(l2, f"{l2}zero_counts = -2000\n"), "rig")
+    rig.machine = parse_rig(rig.machine.text.replace(*ANOTHER_ZERO), "rig")
     rig.keeper = rig.new_keeper()
     session = rig.say("start", prism="r")["id"]
     for pose in range(5, 10):
