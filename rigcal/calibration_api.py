@@ -44,6 +44,11 @@ class Model:
     def __init__(self, data: CalibratedModel) -> None:
         self.data = data
 
+    def __repr__(self) -> str:
+        named = ", ".join(f"{effect.family}@{effect.where}" for effect in self.effects) or "no effects"
+        learned = " and a learned residual" if self.data.residual is not None else ""
+        return f"<rigcal.Model of rig {self.rig.name}: {named}{learned}, noise {self.noise_mm:.3g} mm RMS>"
+
     @classmethod
     def load(cls, directory: str | Path) -> Model:
         """Read a model directory.

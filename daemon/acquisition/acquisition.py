@@ -177,7 +177,7 @@ class Acquisition:
         return self._backlog.is_behind
 
     def check(self) -> None:
-        """Return True if the writer lives; a disk that is full or slow is no reason to raise, it is waited for.
+        """Raise if the writer has ended; a disk that is full or slow is no reason to, it is waited for.
 
         Raises:
             AcquisitionError: the writer has ended, and nothing is stored any more.

@@ -170,8 +170,11 @@ def devices(config: Config) -> Iterator[Finding]:
     for section in config.can:
         if section.interface == "socketcan":
             yield can_interface(section, _link_details(section.channel), NETWORK_DEVICES / section.channel)
+        elif section.interface == "slcan":
+            # python-can's slcan takes PORT@BAUD
+            yield _serial_port(section.name, Path(section.channel.partition("@")[0]), "[[can]] channel")
     for station in config.station:
-        yield _station_port(station.name, Path(station.serial.path))
+        yield _serial_port(station.name, Path(station.serial.path), "[station.serial] path")
 
 
 def _link_details(channel: str) -> Mapping[str, Any] | None:
@@ -227,7 +230,7 @@ def _controller(section: CanSection, data: Mapping[str, Any]) -> Finding:
     return Finding(section.channel, found, text, remedy)
 
 
-def _station_port(name: str, path: Path) -> Finding:
+def _serial_port(name: str, path: Path, key: str) -> Finding:
     if not path.exists():
         plugged = ", ".join(
             sorted(str(p) for p in Path("/dev").glob("ttyUSB*")) + sorted(str(p) for p in Path("/dev").glob("ttyACM*"))
@@ -241,7 +244,7 @@ def _station_port(name: str, path: Path) -> Finding:
         remedy = f"join its group: `sudo adduser {_user()} dialout`, then log in anew (the service has it already)"
         return Finding(name, "fault", f"{path} may not be opened by {_user()}", remedy)
     if path.resolve().name.startswith(("ttyUSB", "ttyACM")) and not path.is_symlink():
-        remedy = f"name the adapter in {_RULES_FILE}, and use that name in [station.serial] path"
+        remedy = f"name the adapter in {_RULES_FILE}, and use that name in {key}"
         return Finding(
             name, "warning", f"{path} names a socket, not an adapter: it may be another one after a restart", remedy
         )

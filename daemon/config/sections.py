@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
-from drivers.can.bus_options import check_options
+from drivers.can.bus_options import check_channel, check_options
 from drivers.can.tip_frames import FRAMES
 from drivers.canopen.transmit import is_free
 from drivers.settings import Settings
@@ -43,6 +43,11 @@ class CanSection(Section):
     transmit_nodes: tuple[int, ...] = ()
     sync_period_ms: int | None = Field(default=None, ge=1, le=10_000)
     options: dict[str, str | int | float | bool] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _channel_is_of_the_interface(self) -> CanSection:
+        check_channel(self.interface, self.channel)
+        return self
 
     @model_validator(mode="after")
     def _sending_is_said(self) -> CanSection:

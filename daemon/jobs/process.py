@@ -322,7 +322,11 @@ def _made(
         "model": str(directory),
         "manifest_sha256": sha256,
         "stage": stage,
-        "metrics": {"training": evaluation.stages(), "noise_mm": model.noise_mm},
+        "metrics": {
+            "training": evaluation.stages(),
+            "noise_mm": model.noise_mm,
+            "effects": [effect.as_dict() for effect in model.effects],
+        },
     }
 
 

@@ -105,9 +105,9 @@ class ModelRegistry:
                 raise CommandError("no model is live, so none can be rolled back; `rigcal model list` shows all")
             wanted = self._table.predecessor(live)
             if wanted is None:
-                raise CommandError(
-                    f"model {live.id} is the first that went live; name another with `rigcal model rollback ID`"
-                )
+                others = [m.id for m in self._table.all() if m.state == "retired" and self._table.was_live(m)]
+                another = f"; name another, as `rigcal model rollback {others[-1]}`" if others else ""
+                raise CommandError(f"model {live.id} is the first that went live, and replaced none{another}")
         model = self._own(self._table.get(wanted))
         if model.state != "retired" or not self._table.was_live(model):
             why = {

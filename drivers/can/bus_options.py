@@ -1,14 +1,17 @@
-"""Further settings of a CAN link, handed to python-can as they are: those that the link's own settings do not make.
+"""Settings of a CAN link that python-can would take and fail of later: its channel, and further options.
 
-Two of one name would be an argument given twice, or one that undoes the other: `listen_only` that of `allow_transmit`.
+Options are handed to python-can as they are: those that the link's own settings do not make. Two of one name would be
+an argument given twice, or one that undoes the other: `listen_only` that of `allow_transmit`.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from types import MappingProxyType
 
 _LONGEST_NAME_TOLD = 100
+_INTERFACE_NAME = re.compile(r"(?!\.{1,2}\Z)[^/:\s]{1,15}")  # Linux, net/core/dev.c, dev_valid_name
 
 _NO_OTHER_FILE = "no configuration of python-can is read beside this one"
 # What `open_port` gives python-can's bus itself, under names that are no keys of a link.
@@ -21,6 +24,23 @@ _MADE: Mapping[str, str] = MappingProxyType(
         "context": _NO_OTHER_FILE,
     }
 )
+
+
+def check_channel(interface: str, channel: str) -> None:
+    """Refuse a channel that names no network interface where one is meant.
+
+    Args:
+        interface: kind of adapter, as python-can names it.
+        channel: of the link.
+
+    Raises:
+        ValueError: a sentence on what to write instead.
+    """
+    if interface == "socketcan" and not _INTERFACE_NAME.fullmatch(channel):
+        raise ValueError(
+            f"{channel[:_LONGEST_NAME_TOLD]!r} is no name of a network interface, as can0 is one; an adapter at a "
+            "serial port has the interface slcan"
+        )
 
 
 def check_options(options: Mapping[str, object], keys: frozenset[str]) -> None:

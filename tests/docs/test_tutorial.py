@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -87,7 +88,7 @@ def test_the_tutorial_ends_with_an_accepted_model(tmp_path: Path) -> None:
         kinds = ("gap", "residual", "report", "comparison")
         reader.wait(lambda: sum(job["state"] not in ("queued", "running") for job in reader.jobs()) >= len(kinds))
         assert [(job["kind"], job["state"]) for job in reader.jobs()] == [(kind, "done") for kind in kinds]
-        reader.type(accepting(accept, reader))
+        assert "effect backlash@theta4: " in reader.type(accepting(accept, reader))
         reader.type(use.text)
         assert (reader.directory / "exported" / "rigcal_model.h").is_file()
     finally:
@@ -98,8 +99,8 @@ def test_the_tutorial_ends_with_an_accepted_model(tmp_path: Path) -> None:
 def accepting(block: Block, reader: Reader) -> str:
     """Return the block with the number of the newest candidate, as the page asks for."""
     newest = max(model["id"] for model in reader.ask("rigcal model list") if model["state"] == "candidate")
-    assert "model accept 2 " in block.text
-    return block.text.replace("model accept 2 ", f"model accept {newest} ")
+    assert "model show 2\nrigcal model accept 2 " in block.text
+    return re.sub(r"(model \w+) 2\b", rf"\1 {newest}", block.text)
 
 
 def test_the_page_of_missing_physics_names_the_soft_joint(tmp_path: Path) -> None:

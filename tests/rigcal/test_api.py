@@ -94,7 +94,9 @@ def test_a_hidden_effect_is_found_and_the_model_with_it_is_nearer_to_held_out_fi
     assert found.verdict == "named"
     assert [(effect.family, effect.where) for effect in found.effects] == [("backlash", "theta4")]
     assert found.held_out is not None
-    evaluation: rigcal.Evaluation = rigcal.Model(found.model).evaluate(held_out)
+    model = rigcal.Model(found.model)
+    assert "rig swdt82: backlash@theta4" in repr(model)
+    evaluation: rigcal.Evaluation = model.evaluate(held_out)
     assert evaluation.errors_mm["effects"].shape == (len(held_out), 3)
     rms_mm = {str(stage["stage"]): stage["rms_mm"] for stage in evaluation.stages()}
     assert rms_mm["effects"] == pytest.approx(found.held_out[1])

@@ -94,6 +94,7 @@ def init(out: Path, rig: str | None, *, no_questions: bool, as_json: bool, **giv
             raise CommandError(f"no rig {rig!r} ships with rigcal; there are {', '.join(shipped_rigs())}")
     is_asking = not no_questions and not as_json and sys.stdin.isatty()
     answers = _answers(given, is_asking=is_asking)
+    _check_channel(answers)
     bus = _listen_to_bus(answers)
     station = _listen_to_station(answers)
     files = {CONFIG: _configuration(answers, rig or RIG, station)}
@@ -136,6 +137,15 @@ def _answers(given: dict[str, Any], *, is_asking: bool) -> dict[str, Any]:
     if is_asking and not answers["listen_s"] and click.confirm("Listen to bus and port for 5 s each?", err=True):
         answers["listen_s"] = 5.0
     return answers
+
+
+def _check_channel(answers: dict[str, Any]) -> None:
+    from drivers.can.bus_options import check_channel
+
+    try:
+        check_channel(answers["interface"], answers["channel"])
+    except ValueError as error:
+        raise click.BadParameter(str(error), param_hint="--channel") from error
 
 
 def _usual_port() -> str:

@@ -14,6 +14,7 @@ from daemon.cli.command import Command
 from daemon.cli.terminal import echo, echo_error, echo_table
 from daemon.control.protocol import request
 from daemon.host.safe_output import write_file
+from daemon.report.words import INTERVAL_SIGMAS, PLUS_MINUS
 from daemon.warm_up import prepare
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ def model_list(**where: Any) -> Any:
 @click.argument("number", type=int, required=False)
 @client_options
 def model_show(number: int | None, **where: Any) -> Any:
-    """Show model NUMBER (the live one by default): its directory, its comparison, who put it live and when."""
+    """Show model NUMBER (the live one by default): its directory, effects and comparison, who put it live and when."""
     return ask(where, "model.show", _show, id=number)
 
 
@@ -211,6 +212,13 @@ def _show_list(models: Sequence[Mapping[str, Any]]) -> None:
 def _show(model: Mapping[str, Any]) -> None:
     echo(f"model {model['id']} of rig {model['rig']} ({model['stage']}) is {model['state']}: {model['path']}")
     echo(f"  trained on {', '.join(model['sessions'])}; manifest SHA-256 {model['manifest_sha256']}")
+    for effect in model["metrics"].get("effects", ()):
+        sizes = (
+            f"{name} {c['value']:.4g} {PLUS_MINUS} {INTERVAL_SIGMAS * c['standard_error']:.2g} {c['unit']}"
+            for name, c in effect["coefficients"].items()
+        )
+        form = f" ({effect['form']})" if effect["form"] else ""
+        echo(f"  effect {effect['family']}@{effect['where']}{form}: {', '.join(sizes)}")
     compared = model["metrics"].get("comparison")
     if compared is not None:
         other = "no live model" if compared["live"] is None else f"model {compared['live']}, live then"

@@ -65,7 +65,8 @@ def _show(tip: dict[str, Any]) -> None:
 
 def _unknown(tip: dict[str, Any]) -> str:
     remedy = "; `rigcal status` says what leads to a live model" if tip["status"] == "no_model" else ""
-    return f"prism {tip['prism']}: {tip['status'].replace('_', ' ')}: {tip['reason']}{remedy}"
+    status = "" if tip["status"] == "no_model" else f"{tip['status'].replace('_', ' ')}: "
+    return f"prism {tip['prism']}: {status}{tip['reason']}{remedy}"
 
 
 def _place(place: list[float]) -> str:

@@ -301,7 +301,7 @@ TABLES: dict[str, Words] = {
             "stage": "geometric, effects or hybrid",
             "state": "candidate, live or retired",
             "job_id": "the job that made it",
-            "metrics_json": "its errors on its training rows, and its comparison on check sessions",
+            "metrics_json": "its errors on its training rows, its named effects, and its comparison on check sessions",
             "rig_sha256": "SHA-256 of the rig file of the newest session that it was trained on",
         },
         {"created_": "making"},

@@ -49,8 +49,9 @@ class ModelRow:
         manifest_sha256: of its manifest when it was written.
         sessions: those that it was trained on.
         created_utc_ns: when it was made.
-        metrics: errors on its training rows (`training`, `noise_mm`), and `comparison`, where there was one: its
-            figures on held-out sessions beside those of the model `live` then, as `evaluation.promotion` has them.
+        metrics: errors on its training rows (`training`, `noise_mm`), its named `effects`, and `comparison`, where
+            there was one: its figures on held-out sessions beside those of the model `live` then, as
+            `evaluation.promotion` has them.
     """
 
     id: int

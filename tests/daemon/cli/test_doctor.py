@@ -74,6 +74,18 @@ def test_without_a_daemon_each_fault_says_what_to_type(tmp_path: Path) -> None:
     assert shown.stdout.count("-> ") == sum(bool(finding["remedy"]) for finding in findings.values())
 
 
+def test_the_port_of_an_slcan_adapter_is_looked_at_as_that_of_a_station(tmp_path: Path) -> None:
+    config = tmp_path / "rigcal.toml"
+    port = tmp_path / "adapter"
+    config.write_text(f'rig = "swdt82"\n[[can]]\ninterface = "slcan"\nchannel = "{port}@115200"\n', encoding="utf-8")
+    _, findings = examine("--config", str(config))
+    assert findings["boom"]["state"] == "fault"
+    assert f"{port} does not exist" in findings["boom"]["text"]
+    port.touch()
+    _, findings = examine("--config", str(config))
+    assert findings["boom"]["state"] == "good"
+
+
 def test_backups_go_where_the_daemon_may_write(tmp_path: Path) -> None:
     config, place = tmp_path / "rigcal.toml", tmp_path / "backups"
     config.write_text(CONFIG.format("none"), encoding="utf-8")

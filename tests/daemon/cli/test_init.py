@@ -57,6 +57,13 @@ def test_every_profile_of_the_configuration_can_be_chosen(tmp_path: Path, profil
     assert read_config(tmp_path / "rigcal.toml").station[0].profile == profile
 
 
+def test_a_port_is_no_channel_of_socketcan(tmp_path: Path) -> None:
+    refused = init("--out", str(tmp_path), "--rig", "swdt82", "--station", "none", "--channel", "/dev/ttyACM0")
+    assert refused.exit_code == 2
+    assert "interface slcan" in refused.stderr
+    assert not any(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("joint", ["theta1", "theta1:round:0:1", "theta1:revolute:a:b", "t:revolute:0:1:2:3"])
 def test_a_joint_that_cannot_be_read_is_refused_with_an_example(tmp_path: Path, joint: str) -> None:
     refused = init("--out", str(tmp_path), "--joint", joint)

@@ -86,6 +86,13 @@ def test_every_wrong_key_is_told_at_once(tmp_path: Path) -> None:
     assert "'socketcan', 'virtual', 'udp_multicast', 'slcan' or 'playback', found 'serial'" in message
 
 
+@pytest.mark.parametrize("channel", ["/dev/ttyACM0", "", "..", "can 0", "a-name-longer-than-15"])
+def test_a_socketcan_channel_that_no_interface_can_have_is_refused(tmp_path: Path, channel: str) -> None:
+    message = check(f'rig = "swdt82"\n[[can]]\nchannel = "{channel}"\n', tmp_path)
+    assert "is no name of a network interface" in message
+    assert "slcan" in message
+
+
 @pytest.mark.parametrize(
     "text",
     [

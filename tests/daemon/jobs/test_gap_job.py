@@ -186,6 +186,7 @@ def test_the_job_names_what_is_missing_and_proposes_a_model_that_has_it(rig: Job
     model = read_model(Path(result["model"]), result["manifest_sha256"])
     assert [(e.family, e.where) for e in model.effects] == [("backlash", "theta4")]
     assert json.loads((directory / "gap.json").read_text("utf-8"))["seconds"] > 0.0
+    assert result["metrics"]["effects"] == [effect.as_dict() for effect in model.effects]
     assert (list(model.placements), result["sessions"]) == (["S1"], ["a", "lost"])
     keep(rig, "gap", result)
     shown = lines(rig)

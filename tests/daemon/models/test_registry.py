@@ -254,12 +254,20 @@ def test_a_comparison_with_a_model_that_is_live_no_more_does_not_count(rig: Mode
 # ---- back ------------------------------------------------------------------------------------------------------------
 
 
+def test_nothing_is_named_where_no_other_model_was_ever_live(rig: ModelRig) -> None:
+    live = rig.accepted(30)
+    rig.candidate()
+    told = refusal(rig.registry.rollback_command, WRONG_USE)
+    assert told == f"model {live} is the first that went live, and replaced none"
+
+
 def test_rollback_puts_back_what_the_live_model_replaced_step_by_step(rig: ModelRig) -> None:
     one, two, three = rig.accepted(30), rig.accepted(40), rig.accepted(30)
     assert rig.registry.rollback_command({"operator": "Bo"})["live"] == two
     assert rig.registry.rollback_command({})["live"] == one
     assert states(rig) == {one: "live", two: "retired", three: "retired"}
-    assert "the first that went live" in refusal(rig.registry.rollback_command, WRONG_USE)
+    told = refusal(rig.registry.rollback_command, WRONG_USE)
+    assert f"the first that went live, and replaced none; name another, as `rigcal model rollback {three}`" in told
     assert rig.registry.rollback_command({"id": three})["retired"] == one
     assert rig.registry.rollback_command({})["live"] == two, "what the third had replaced when it was accepted"
     loaded = rig.settled()
