@@ -88,6 +88,17 @@ def misreading(rig: Rig, recorded_text: str | None, prism: str) -> str:
     return rig.misreading(recorded)
 
 
+def tells_decoding(rig: Rig, recorded_text: str) -> bool:
+    """Return True if a recorded rig file says how each channel of `rig` that a DBC or EDS file describes was read.
+
+    Args:
+        rig: what its readings are to be used with.
+        recorded_text: a rig file of which `misreading` says nothing.
+    """
+    recorded = _recorded(recorded_text)
+    return isinstance(recorded, Rig) and rig.decoding.keys() <= recorded.decoding.keys()
+
+
 @lru_cache(maxsize=16)
 def _recorded(text: str) -> Rig | str:
     """Return the rig of a file, or why it is none: it takes some 10 ms, and hundreds of sessions may have the same."""

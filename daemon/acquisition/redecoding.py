@@ -11,7 +11,7 @@ from typing import Any
 from calibration.rig.description import Rig
 from daemon.acquisition.link_decoders import LinkDecoders
 from daemon.commands import REFUSED, CommandError
-from daemon.rig_files import HOW_TO_READ_AGAIN, misreading
+from daemon.rig_files import HOW_TO_READ_AGAIN, misreading, tells_decoding
 from daemon.store import Store
 from daemon.store.queries.device_states import device_states
 from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS, sessions_between
@@ -119,6 +119,7 @@ def redecode_command(
             what = f"the time from {_text(first_ns)} to {_text(last_ns)}"
         if not stretches:
             raise CommandError(f"the store has no captures of {what}; `rigcal session list` shows the sessions")
+        may_differ = session is not None
         for since, until in stretches:
             for row in sessions_between(reader, since, until, store.boot_row(since)):
                 if why := misreading(rig, row["rig_text"], row["prism"]):
@@ -127,8 +128,10 @@ def redecode_command(
                         f"{HOW_TO_READ_AGAIN}",
                         REFUSED,
                     )
-    # Outside sessions nothing but the readings themselves tells which rig file made them.
-    added = redecode(store, decoders, stretches, go_on, may_differ=arguments.get("session") is not None)
+                may_differ &= tells_decoding(rig, row["rig_text"])
+    # Outside sessions, and in those of versions that kept no decoding of channels, nothing but the readings themselves
+    # tells which files made them.
+    added = redecode(store, decoders, stretches, go_on, may_differ=may_differ)
     return {
         "added": added,
         "stretches": [{"first_utc_ns": first.utc_ns, "last_utc_ns": last.utc_ns} for first, last in stretches],

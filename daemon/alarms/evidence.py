@@ -42,7 +42,7 @@ class Evidence:
         notice_faults: ways out of the machine by which notices are not delivered at present -> why.
         untrained_sessions: closed sessions that nothing trains on -> why; those that newer ones make up for are not
             there.
-        zeros_lost: joints whose encoder has jumped since the newest closed session was started, unchecked.
+        zeros_lost: joints whose encoder has jumped since the newest closed session was started or accepted, unchecked.
         ended_threads: thread of the daemon that an error has ended -> the error.
         clock_lost: when the computer's clock was last synchronised, if it no longer is.
         unwatched: rule or part of the evidence that has failed itself -> why.

@@ -186,8 +186,7 @@ class SessionLifecycle:
         """
         if why := misreading(self._rig, row["rig_text"], row["prism"]):
             return f"{OTHER_RIG_FILE}{why}"
-        since = self._store.stamp_or_none(row, "accepted_") or self._store.stamp(row, "started_")
-        lost = lost_zeros(self._store, self._rig.name, since)
+        lost = lost_zeros(self._store, self._rig.name, self.table.zeros_known(row))
         joints = [name for name in self._rig.joint_names if name in lost]
         return f"{ZERO_LOST}{', '.join(joints)}" if joints else None
 

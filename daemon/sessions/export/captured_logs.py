@@ -18,6 +18,7 @@ from daemon.store.queries.device_states import device_states
 from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS, prism_confirmations, session
 from daemon.store.queries.setups import control_points
 from daemon.store.reader import Reader
+from daemon.store.upkeep.full_samples import stretches_of_session
 from drivers.clock import Stamp
 from drivers.logs.can_log import write_can_log
 from drivers.logs.serial_log import SerialLogHeader, SerialLogWriter
@@ -53,7 +54,8 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
         out.mkdir(parents=True, exist_ok=True)
         files = []
         steady = _SteadyTime()
-        steady.of(since)
+        for instant in (since, *(each for stretch in stretches_of_session(reader, session_id) for each in stretch)):
+            steady.of(instant)
         doubtful: dict[str, DoubtfulCaptures] = {}
         links = reader.links()
         numbers = channel_numbers(config, [link["name"] for link in links if link["kind"] == "can"])
@@ -121,7 +123,8 @@ def ended_session(reader: Reader, session_id: str) -> dict[str, Any]:
 class _SteadyTime:
     """Puts instants on one axis: UTC as it was at the first instant of each boot, and no boot before the one before.
 
-    So UTC has no steps of a computer's clock: within a boot, time passes as the monotonic clock says.
+    So UTC has no steps of a computer's clock: within a boot, time passes as the monotonic clock says. The first and the
+    last instant of each boot come first, whichever link they are of: a link may have fallen silent before the others.
     """
 
     def __init__(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -233,11 +233,16 @@ class SessionTable:
         return next((self._store.stamp(row, "started_") for row in rows if row["id"] in session_ids), None)
 
     def zeros_lost(self) -> list[str]:
-        """Devices whose encoder has jumped since the newest closed session was started, their zeros not checked."""
-        sql = """SELECT started_utc_ns, started_monotonic_ns, started_boot_id FROM calibration_sessions
-            WHERE rig = ? AND state = 'closed' ORDER BY rowid DESC LIMIT 1"""
+        """Devices whose encoder has jumped since the zeros of the newest closed session were known, and not checked."""
+        sql = """SELECT started_utc_ns, started_monotonic_ns, started_boot_id,
+                accepted_utc_ns, accepted_monotonic_ns, accepted_boot_id
+            FROM calibration_sessions WHERE rig = ? AND state = 'closed' ORDER BY rowid DESC LIMIT 1"""
         rows = self._store.rows(sql, (self._rig,))
-        return [*lost_zeros(self._store, self._rig, self._store.stamp(rows[0], "started_"))] if rows else []
+        return [*lost_zeros(self._store, self._rig, self.zeros_known(rows[0]))] if rows else []
+
+    def zeros_known(self, session: Mapping[str, Any]) -> Stamp:
+        """When the zeros of a session were the present ones: at its start, or when an operator accepted it later."""
+        return self._store.stamp_or_none(session, "accepted_") or self._store.stamp(session, "started_")
 
     def rig_of(self, session_ids: Sequence[str]) -> str | None:
         """SHA-256 of the rig file of the newest of some sessions; None without any of them."""

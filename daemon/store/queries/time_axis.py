@@ -80,5 +80,11 @@ def time_axis(source: RowSource) -> TimeAxis:
 
 
 def _least_ns(begins_utc_ns: Iterable[int], ends_utc_ns: Sequence[int]) -> int | None:
-    """Return the least time from an end to a begin that is not before it; None where every begin is before all ends."""
-    return min((begin - end for begin in begins_utc_ns for end in ends_utc_ns if begin >= end), default=None)
+    """Return the least time from an end to a begin that is not before it.
+
+    None where every begin is before all ends, and where the nearest two show an earlier time: a clock is behind there.
+    """
+    passed_ns = [begin - end for begin in begins_utc_ns for end in ends_utc_ns]
+    if not passed_ns or min(passed_ns, key=abs) < 0:
+        return None
+    return min(ns for ns in passed_ns if ns >= 0)

@@ -17,14 +17,18 @@ _SAMPLES = """SELECT {0}.id, channels.name, unit, monotonic_ns, value FROM {0} J
     WHERE boot_id = ? AND monotonic_ns BETWEEN ? AND ?"""
 _FIXES = "SELECT monotonic_ns FROM fixes WHERE station = ? AND boot_id = ? AND monotonic_ns BETWEEN ? AND ?"
 _SESSION = "SELECT * FROM calibration_sessions WHERE id = ?"
+# SQLite takes the other columns from the row that has the least or the greatest one.
+_OF_CHUNKS = """WITH chunks AS (SELECT first_boot_id AS boot_id, first_monotonic_ns, first_utc_ns, last_monotonic_ns,
+        last_utc_ns FROM raw_chunks WHERE {}),
+    firsts AS (SELECT boot_id, min(first_monotonic_ns) AS first_ns, first_utc_ns FROM chunks GROUP BY boot_id),
+    lasts AS (SELECT boot_id, max(last_monotonic_ns) AS last_ns, last_utc_ns FROM chunks GROUP BY boot_id)
+    SELECT boot_id, first_ns, first_utc_ns, last_ns, last_utc_ns FROM firsts JOIN lasts USING (boot_id)
+    ORDER BY boot_id"""
 # By the wall clock there is no index: a rare question, for which every chunk's row is read, without its captures.
-_STRETCHES = """SELECT first_boot_id AS boot_id, min(first_monotonic_ns) AS first_ns, max(last_monotonic_ns) AS last_ns,
-        min(first_utc_ns) AS first_utc_ns, max(last_utc_ns) AS last_utc_ns
-    FROM raw_chunks WHERE last_utc_ns >= ? AND first_utc_ns <= ? GROUP BY first_boot_id ORDER BY first_boot_id"""
-_BETWEEN = """SELECT first_boot_id AS boot_id, min(first_monotonic_ns) AS first_ns, max(last_monotonic_ns) AS last_ns,
-        min(first_utc_ns) AS first_utc_ns, max(last_utc_ns) AS last_utc_ns
-    FROM raw_chunks WHERE (last_boot_id, last_monotonic_ns) >= (?, ?) AND (first_boot_id, first_monotonic_ns) <= (?, ?)
-    GROUP BY first_boot_id ORDER BY first_boot_id"""
+_STRETCHES = _OF_CHUNKS.format("last_utc_ns >= ? AND first_utc_ns <= ?")
+_BETWEEN = _OF_CHUNKS.format(
+    "(last_boot_id, last_monotonic_ns) >= (?, ?) AND (first_boot_id, first_monotonic_ns) <= (?, ?)"
+)
 
 Stretch = tuple[Stamp, Stamp]
 

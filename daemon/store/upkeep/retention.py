@@ -153,7 +153,8 @@ class Retention:
         """Return chunks with the latest UTC of three: their own, and the ones by the monotonic clock from two others.
 
         These are the last and the first of the boot's captures. Each of the three may be wrong, and what seems too old
-        is deleted. A UTC after that of the newest capture of all is wrong, and counts only where all are.
+        is deleted. A UTC after that of the newest capture of all is wrong, unless it is the nearest to that one: then
+        the newest capture's clock may be behind.
         """
         if not chunks:
             return []
@@ -166,8 +167,9 @@ class Retention:
         timed = []
         for row in chunks:
             shown = [row["last_utc_ns"], *(row["last_monotonic_ns"] + ns for ns in ahead_ns[row["last_boot_id"]])]
-            possible = [utc_ns for utc_ns in shown if utc_ns <= newest_ns]
-            timed.append({**row, "last_utc_ns": max(possible or shown)})
+            nearest_ns = min(shown, key=lambda utc_ns: abs(utc_ns - newest_ns))
+            possible = [utc_ns for utc_ns in shown if utc_ns <= max(newest_ns, nearest_ns)]
+            timed.append({**row, "last_utc_ns": max(possible)})
         return timed
 
     @staticmethod

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from calibration.rig.decoding import without_decoding
 from calibration.rig.description import parse_rig
 from daemon.acquisition.link_decoders import LinkDecoders
 from daemon.acquisition.redecoding import redecode, redecode_command
@@ -141,6 +142,23 @@ def test_a_session_from_before_a_change_of_the_dbc_file_is_not_decoded_again(thi
     )
     stored_signals = table(thinned.path, "signals")
     with pytest.raises(CommandError, match=r"s001-r was recorded with another rig file.* channel pump is decoded as "):
+        redecode_command(
+            thinned, after.rig, decoders(parse_config(CONFIG, tmp_path), after), {"session": "s001-r"}, lambda: None
+        )
+    assert table(thinned.path, "signals") == stored_signals
+
+
+def test_a_session_that_does_not_tell_how_a_dbc_decoded_it_keeps_its_readings(thinned: Store, tmp_path: Path) -> None:
+    """One that an earlier version has recorded."""
+    before, after = decoded_rig(tmp_path / "before"), decoded_rig(tmp_path / "after", ANOTHER_FACTOR)
+    early = without_decoding(before.text)
+    stretch = Stamp(UTC_0_NS, 0, "bench"), Stamp(UTC_0_NS + 4 * NS_PER_S, 4 * NS_PER_S, "bench")
+    SessionTable(thinned, before.rig.name).start(
+        stretch[0], early, id="s001-r", prism="r", operator="", kind="check", note=""
+    )
+    redecode(thinned, decoders(parse_config(CONFIG, tmp_path), before), [stretch])
+    stored_signals = table(thinned.path, "signals")
+    with pytest.raises(StoreError, match=r"pump was \S+ \S+ and would now be .* another rig file"):
         redecode_command(
             thinned, after.rig, decoders(parse_config(CONFIG, tmp_path), after), {"session": "s001-r"}, lambda: None
         )

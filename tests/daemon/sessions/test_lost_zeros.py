@@ -101,6 +101,7 @@ def test_an_accepted_session_is_used_until_the_next_jump(session_rig: Rig) -> No
     jump(session_rig)
     session_rig.say("accept", id=name, operator="Ada")
     assert used(session_rig) == [name]
+    assert SessionTable(session_rig.store, SOURCE.rig.name).zeros_lost() == [], "so that the alarm ends"
     session_rig.keeper = session_rig.new_keeper()
     assert used(session_rig) == [name]
     jump(session_rig)

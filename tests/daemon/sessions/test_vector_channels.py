@@ -25,7 +25,11 @@ TOLD = SessionFile(prism="r", kind="check", since_utc_ns=0, until_utc_ns=1, cont
 
 def configured(directory: Path, **channels: str) -> Config:
     """A configuration of these CAN links, name=channel."""
-    links = "".join(f'\n[[can]]\nname = "{name}"\nchannel = "{channel}"\n' for name, channel in channels.items())
+    links = "".join(
+        f'\n[[can]]\nname = "{name}"\ninterface = "{"slcan" if "/" in channel else "socketcan"}"\n'
+        f'channel = "{channel}"\n'
+        for name, channel in channels.items()
+    )
     (directory / "rigcal.toml").write_text(f'rig = "swdt82"\nstate_directory = "."\n{links}', encoding="utf-8")
     return read_config(directory / "rigcal.toml")
 

@@ -124,6 +124,22 @@ def test_boots_whose_clock_is_behind_lie_as_far_apart_as_it_says_and_move_no_boo
     assert found[fourth][0] == pytest.approx(26 * HOUR_S, abs=180.0), "the hour that was lost is there again"
 
 
+def test_a_boot_whose_clock_is_behind_is_not_timed_by_a_clock_that_was_wrong_before_it_was_set(rig: Rig) -> None:
+    wrong_s = 200 * 24 * HOUR_S
+    step(rig, -wrong_s, "boot-1")
+    rig.say("setup_new", id="S1")
+    first = controlled(rig)
+    step(rig, wrong_s)
+    second = controlled(rig)
+    step(rig, -HOUR_S / 10, "boot-2")
+    third = controlled(rig)
+    step(rig, 24 * HOUR_S + HOUR_S / 10, "boot-3")
+    fourth = controlled(rig)
+    found = times(rig, first, second, third, fourth)
+    assert found[third][0] - found[second][-1] < 60.0
+    assert found[fourth][0] - found[third][-1] == pytest.approx(24 * HOUR_S, abs=HOUR_S / 5)
+
+
 def test_boots_after_one_whose_clock_was_years_ahead_lie_as_far_apart_as_theirs_says(rig: Rig, first: str) -> None:
     step(rig, 2 * YEARS_S, "boot-2")
     second = controlled(rig)

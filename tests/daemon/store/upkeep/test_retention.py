@@ -167,6 +167,19 @@ def test_captures_of_a_wrong_clock_are_no_older_where_those_before_them_lie_in_a
     assert minutes_left(path) == [*range(249)]
 
 
+@pytest.mark.parametrize("behind_s", [45 * MINUTE_S, 3 * DAY_S])
+def test_a_newest_clock_that_is_behind_makes_no_capture_as_old_as_a_wrong_clock_said(
+    path: Path, store: Store, behind_s: float
+) -> None:
+    fill(store, 5, utc_ns=NOW_NS - round(200 * DAY_S * NS_PER_S))
+    fill(store, 55, begin_s=5 * MINUTE_S)  # the clock was set
+    fill(store, 1, begin_s=60 * MINUTE_S, boot="boot-b", utc_ns=NOW_NS - round(behind_s * NS_PER_S))
+    session(store, "s1", at(6 * MINUTE_S), at(20 * MINUTE_S))
+    newest_ns = NOW_NS + round((60 * MINUTE_S - behind_s) * NS_PER_S)
+    assert delete_all(store, newest_ns - round(30 * DAY_S * NS_PER_S)) == 0
+    assert minutes_left(path) == [*range(60)]
+
+
 @pytest.mark.parametrize("wrong_by_days", [-150, 150])
 def test_captures_are_kept_while_the_newest_clock_is_wrong(path: Path, store: Store, wrong_by_days: int) -> None:
     wrong_ns = NOW_NS + round(wrong_by_days * DAY_S * NS_PER_S)

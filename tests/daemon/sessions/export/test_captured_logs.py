@@ -1,0 +1,78 @@
+"""A session's logs have one axis of time, on which captures of all links lie as they came."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from daemon.config.config import parse_config
+from daemon.sessions.export.captured_logs import CanFormat, export_session
+from daemon.sessions.export.session_file import read_session_file
+from daemon.sessions.replay import merged
+from drivers.clock import NS_PER_S, Stamp
+from drivers.readings import CanCapture, SerialCapture
+from tests.daemon.session_support import Rig
+
+CONFIG = """
+rig = "swdt82"
+state_directory = "."
+[[can]]
+name = "boom"
+channel = "can0"
+[[station]]
+name = "ts"
+serial.path = "/dev/ttyS9"
+profile = "passive"
+"""
+BEGIN = Stamp(1_795_800_000 * NS_PER_S, 5 * NS_PER_S, "boot-a")
+REBOOT_S, END_S = 130, 250
+
+
+def at_second(second: int, behind_s: int) -> Stamp:
+    """The instant of a second of the session; after the reboot the computer's clock is behind."""
+    if second < REBOOT_S:
+        return BEGIN.shifted(second * NS_PER_S)
+    since_ns = (second - REBOOT_S) * NS_PER_S
+    return Stamp(BEGIN.utc_ns + (second - behind_s) * NS_PER_S, 20 * NS_PER_S + since_ns, "boot-b")
+
+
+def heard(*, is_silent: bool) -> list[int]:
+    """Seconds in which a link had a capture; one that is silent had none in the two minutes before the reboot."""
+    until = 20 if is_silent else REBOOT_S - 10
+    return [*range(1, until), *range(REBOOT_S + 1, END_S)]
+
+
+@pytest.mark.parametrize("can_format", ["log", "asc", "blf"])
+@pytest.mark.parametrize("behind_s", [0, 3600])
+@pytest.mark.parametrize("silent", ["boom", "ts"])
+def test_a_link_that_fell_silent_before_a_reboot_comes_beside_the_others_of_the_same_second(
+    tmp_path: Path, can_format: CanFormat, behind_s: int, silent: str
+) -> None:
+    boom, ts = (heard(is_silent=silent == link) for link in ("boom", "ts"))
+    config = parse_config(CONFIG, tmp_path / "rigcal.toml")
+    rig = Rig(config.store_path)
+    rig.clock.set(BEGIN)
+    rig.store.begin_run(BEGIN)
+    rig.say("setup_new", id="S1")
+    rig.say("start", prism="r", id="s1")
+    for seconds in (range(1, REBOOT_S - 9), range(REBOOT_S + 1, END_S)):
+        stamps = {second: at_second(second, behind_s) for second in seconds}
+        rig.clock.set(stamps[seconds[0]])
+        rig.store.begin_run(rig.clock.now())
+        rig.store.append_captures([CanCapture("boom", at, 0x1A0, bytes([n])) for n, at in stamps.items() if n in boom])
+        rig.store.append_captures([SerialCapture("ts", at, b"%d\r\n" % n) for n, at in stamps.items() if n in ts])
+    rig.clock.set(at_second(END_S, behind_s))
+    rig.say("stop")
+    rig.store.close()
+    logs = [path for path in export_session(config, "s1", tmp_path / "out", can_format) if path.suffix != ".csv"]
+    told = read_session_file(logs.pop())
+    came: dict[str, list[int]] = {"boom": [], "ts": []}
+    apart = []
+    for capture in merged(logs, config, told):
+        second = capture.data[0] if isinstance(capture, CanCapture) else int(capture.data)
+        came[capture.link].append(second)
+        if second > REBOOT_S and all(came.values()):
+            apart.append(max(abs(second - seconds[-1]) for seconds in came.values() if seconds[-1] > REBOOT_S))
+    assert came == {"boom": boom, "ts": ts}
+    assert max(apart) <= 1
