@@ -225,6 +225,31 @@ def far_repetitions(fixes: Sequence[ExportedFix], source: str) -> tuple[str, ...
     return (f"{source} has points twice in different places: {'; '.join(found[:3])}{more}; both are taken",)
 
 
+def several_constants(fixes: Sequence[ExportedFix], prisms: Sequence[str], source: str) -> tuple[str, ...]:
+    """Return a note on each prism that one station measured with several prism constants.
+
+    Args:
+        fixes: as the file has them.
+        prisms: of the fixes, as the rows have them.
+        source: name of the file.
+    """
+    first: dict[tuple[str, str], dict[float, ExportedFix]] = {}
+    for fix, prism in zip(fixes, prisms, strict=True):
+        if fix.prism_constant_mm is not None:
+            constant_mm = round(fix.prism_constant_mm, 1) + 0.0  # stations have it in steps of 0.1 mm; no -0
+            first.setdefault((prism, fix.station), {}).setdefault(constant_mm, fix)
+    notes = []
+    for (prism, station), constants in first.items():
+        if len(constants) > 1:
+            at = f" at {station!r}" if station else ""
+            said = [f"{mm:g} mm (from point {fix.point!r}, line {fix.line})" for mm, fix in constants.items()]
+            notes.append(
+                f"{source} has prism {prism!r}{at} measured with prism constants of {' and '.join(said)}, by which its "
+                "distances differ: leave out the points with the wrong one, or give each prism a name of its own"
+            )
+    return tuple(notes)
+
+
 def setup_names(fixes: Sequence[ExportedFix], setup: str) -> dict[str, str]:
     """Return station of the file -> set-up of its rows; every station has one of its own where the file has several.
 
@@ -272,11 +297,9 @@ def repeated_setups(fixes: Sequence[ExportedFix], source: str) -> tuple[str, ...
 
 def observations_csv(
     fixes: Sequence[ExportedFix],
-    columns: ColumnMap,
+    prisms: Sequence[str],
     source: str,
-    rig: Rig | None,
     joints: JointRows | None,
-    prism: str | None,
     setups: Mapping[str, str],
     session: str,
 ) -> str:
@@ -284,16 +307,14 @@ def observations_csv(
 
     Args:
         fixes: as the file has them.
-        columns: its map, which may name prisms.
+        prisms: of the fixes.
         source: name of the file.
-        rig: whose prisms are measured; any name is taken when None.
         joints: their joint values; none when None.
-        prism: of all fixes; by the file and the map when None.
         setups: station of the file -> set-up.
         session: of all rows; "" for none.
 
     Raises:
-        DescriptionError: a fix's prism is not known, or it has no joint values; with its line.
+        DescriptionError: a fix has no joint values; with its line.
     """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -302,13 +323,31 @@ def observations_csv(
     given = [name for name in names(LABELS) if has.get(name)]
     joint_columns = joints.columns if joints is not None else ()
     writer.writerow(["prism", *joint_columns, *names(POSITION), *given, POSE, *([TIME_S] if has_time else [])])
-    for fix in fixes:
+    for fix, prism in zip(fixes, prisms, strict=True):
         values = [] if joints is None else joints.of(fix, source)
-        cells = [prism or _prism(fix, columns, source, rig), *map(repr, map(float, values))]
+        cells = [prism, *map(repr, map(float, values))]
         labels = {"setup": setups[fix.station], "session": session}
         cells += [f"{value:.4f}" for value in fix.position_mm] + [labels[name] for name in given] + [fix.point]
         writer.writerow([*cells, *(["" if fix.time_s is None else repr(fix.time_s)] if has_time else [])])
     return out.getvalue()
+
+
+def prisms_of(
+    fixes: Sequence[ExportedFix], columns: ColumnMap, source: str, rig: Rig | None, prism: str | None
+) -> list[str]:
+    """Return the prism of each fix.
+
+    Args:
+        fixes: as the file has them.
+        columns: its map, which may name prisms.
+        source: name of the file.
+        rig: whose prisms are measured; any name is taken when None.
+        prism: of all fixes; by the file and the map when None.
+
+    Raises:
+        DescriptionError: a fix's prism is not known; with its line.
+    """
+    return [prism or _prism(fix, columns, source, rig) for fix in fixes]
 
 
 def _prism(fix: ExportedFix, columns: ColumnMap, source: str, rig: Rig | None) -> str:

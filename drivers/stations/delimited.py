@@ -6,6 +6,7 @@ import csv
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 
 from drivers.stations.export_format import (
@@ -32,6 +33,10 @@ _NAMES: Mapping[Role, str] = {
     "zenith": "v vz zenith zenithangle verticalangle vangle vcircle",
     "distance": "sd slopedistance slopedist distance range d",
     "prism": "prism code target reflector marker",
+    "prism_constant": "prismconstant prismconst prismoffset reflectorconstant reflectorconst prismenkonstante "
+    "additionskonstante",
+    "station": "station stationname stationid stationno stationnr stn setup setupname setupid setupno standpunkt "
+    "standpunktnr instrumentstation",
     "date": "date measurementdate",
     "time": "time datetime timestamp dateandtime measurementtime times utc",
 }
@@ -53,6 +58,8 @@ _ANGLE_WORDS: dict[str, AngleUnit] = {
 }
 _UNIT = re.compile(r"[\[(]\s*+([^\[\]()\s][^\[\]()]*+)[\])]|_(mm|cm|m|in|ft|deg|gon|rad)$")
 _BEFORE_UNIT = re.compile(r"(?<!\s)\s++(?=[\[(])")  # blanks between a name and its unit
+_FEW_STATIONS = 2  # may have a row each
+_OWN_VALUES = 0.8  # share of rows with a value of their own beyond which a column names no set-ups
 _LARGEST = 1e12  # of coordinates, angles and seconds in any unit
 _WHOLE = re.compile(r"[+-]?\d+", re.ASCII)
 _TWO_MEANINGS = (
@@ -173,6 +180,9 @@ def _with_header(
     notes.append(f"columns by their names: {by_role}")
     if "point" not in roles:
         notes.append("no column is known to name the points, so they are 1, 2, ... in the order of the file")
+    stations = [cell for cell in cells if "station" in _roles([cell])]
+    if len(stations) > 1:
+        notes.append(f"set-ups by {stations[0]!r} alone, though columns {', '.join(stations)} may name them")
     measured = [roles[role] for role in ("x", "y", "z", "distance") if role in roles]
     units_line = cells_of(lines[header], separator) if first > header + 1 else []
     length = _unit(measured, cells, units_line, lines[: header - 1], _LENGTH_WORDS, source)
@@ -339,12 +349,33 @@ def read_table(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
             place = polar_position_mm(number_at("hz") * rad, number_at("zenith") * rad, number_at("distance") * mm)
         else:
             place = (number_at("x") * mm, number_at("y") * mm, number_at("z") * mm)
+        constant_mm = None
+        if text_at("prism_constant"):
+            constant_mm = number_at("prism_constant") * _named_mm(places["prism_constant"], header)
         point = text_at("point") or str(len(fixes) + 1)
         time_s = _time_s(" ".join(filter(None, (text_at("date"), text_at("time")))), columns, number, source)
-        fixes.append(ExportedFix(number, point, text_at("prism"), place, time_s))
+        fix = ExportedFix(number, point, text_at("prism"), place, time_s, text_at("station"))
+        fixes.append(replace(fix, prism_constant_mm=constant_mm))
     if not fixes:
         refuse(source, "no points below the header")
+    if "station" in places:
+        _check_stations(fixes, columns, source)
     return fixes
+
+
+def _named_mm(place: int, header: list[str]) -> float:
+    """Return the millimetres of a unit that the header of a column names; 1 where it names none."""
+    found = _UNIT.search(header[place].lower()) if place < len(header) else None
+    return MM_PER[_LENGTH_WORDS.get((found[1] or found[2]).strip(), "mm")] if found else 1.0
+
+
+def _check_stations(fixes: list[ExportedFix], columns: ColumnMap, source: str) -> None:
+    """Refuse a column of stations that says another thing in nearly every row, as chainages and points' names do."""
+    found = {fix.station for fix in fixes}
+    if len(found) > max(_FEW_STATIONS, _OWN_VALUES * len(fixes)):
+        said = f"{len(found)} different values in {len(fixes)} rows, so it does not name set-ups"
+        reason = f"{said}; call the column otherwise ('point' if it names points), or leave station out of a map"
+        refuse(source, reason, columns.header_line or None, columns.columns["station"])
 
 
 def _place(column: str | int, header: list[str], header_line: int, source: str) -> int:

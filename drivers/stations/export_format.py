@@ -17,7 +17,7 @@ from drivers.stations.survey import METRES_PER_FOOT
 
 LengthUnit = Literal["mm", "cm", "m", "in", "ft"]
 AngleUnit = Literal["deg", "gon", "rad"]
-Role = Literal["point", "x", "y", "z", "hz", "zenith", "distance", "prism", "date", "time"]
+Role = Literal["point", "x", "y", "z", "hz", "zenith", "distance", "prism", "prism_constant", "station", "date", "time"]
 
 MM_PER: dict[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "ft": 1000 * METRES_PER_FOOT}
 RAD_PER: dict[str, float] = {"deg": math.pi / 180, "gon": math.pi / 200, "rad": 1.0}
@@ -68,6 +68,7 @@ class ExportedFix:
             nothing.
         station: where the instrument stood, as the file names it; another name is another set-up.
         times_set_up: how often the file had set the instrument up by then, under any name; 0 where it does not say.
+        prism_constant_mm: that the instrument applied to the distance; None where the file does not say.
     """
 
     line: int
@@ -77,6 +78,7 @@ class ExportedFix:
     time_s: float | None = None
     station: str = ""
     times_set_up: int = 0
+    prism_constant_mm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,10 @@ class Guess:
     notes: tuple[str, ...]
 
 
+def _nothing(text: str, source: str) -> tuple[str, ...]:  # noqa: ARG001 - of formats that take every record
+    return ()
+
+
 @dataclass(frozen=True, kw_only=True)
 class ExportFormat:
     """A format of files.
@@ -103,6 +109,7 @@ class ExportFormat:
         recognises: whether a text is of this format.
         guess: concludes from a text how to read it; gets the file's name for messages.
         read: reads the fixes of a text.
+        passed_over: notes on the records of a text that look like points and are none; gets the file's name as well.
     """
 
     name: str
@@ -111,6 +118,7 @@ class ExportFormat:
     recognises: Callable[[str], bool]
     guess: Callable[[str, str], Guess]
     read: Callable[[str, ColumnMap, str], list[ExportedFix]]
+    passed_over: Callable[[str, str], tuple[str, ...]] = _nothing
 
 
 def polar_position_mm(hz_rad: float, zenith_rad: float, distance_mm: float) -> tuple[float, float, float]:

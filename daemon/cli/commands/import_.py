@@ -49,11 +49,13 @@ def import_(
         far_repetitions,
         map_text,
         observations_csv,
+        prisms_of,
         read_export,
         read_joints,
         read_map,
         repeated_setups,
         setup_names,
+        several_constants,
         several_setups,
     )
     from daemon.host.safe_output import write_file
@@ -80,11 +82,13 @@ def import_(
         guess = known.guess(text, file.name)
         columns, notes = guess.map, guess.notes
     fixes = known.read(text, columns, file.name)
-    notes += far_repetitions(fixes, file.name)
+    notes += known.passed_over(text, file.name) + far_repetitions(fixes, file.name)
     rows = None if joints is None or described is None else read_joints(joints, described)
     setups = setup_names(fixes, setup)
     notes += several_setups(setups, file.name) + repeated_setups(fixes, file.name)
-    table = observations_csv(fixes, columns, file.name, described, rows, prism, setups, session)
+    prisms = prisms_of(fixes, columns, file.name, described, prism)
+    notes += several_constants(fixes, prisms, file.name)
+    table = observations_csv(fixes, prisms, file.name, rows, setups, session)
     if described is not None and rows is not None:
         parse_observations(table.encode(), described, f"what {file.name} became")
     saved = None

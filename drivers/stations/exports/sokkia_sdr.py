@@ -2,18 +2,25 @@
 
     00NM  version, date, units (angle 1 degrees, 2 gon; distance 1 metres, 2 feet)    03NM  height of the target
     10NM  job
-    02TP  point, north, east, elevation, height of the instrument: where it stood    07TP  its back-sight
-    08..  point, north, east, elevation, description
+    02TP  point, north, east, elevation, height of the instrument: where it stood
+    07TP  station, back-sight, its azimuth, reading of the circle on it
+    08TP  point, north, east, elevation, description
     09F1  station, point, slope distance, zenith angle, horizontal angle, description (09F2: face 2)
+
+The last two characters of a code say where a record comes from: TP is measured, F1 and F2 are readings in a face, KI is
+typed in on the keyboard, RS, SO, TV and others are results of programs. Of coordinates only 08TP is taken.
 
 A number in digits after the last record is a check sum, whose rule no source states; it is passed over. Coordinates are
 given from the instrument's centre, where the file says where it stood, and of the prism, not of the ground below it.
+Their north is that of the job, and that of polar measurements is the zero of the circle.
 """
 
 from __future__ import annotations
 
+import math
 import re
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 
 from drivers.stations.delimited import number_of, why_no_number
 from drivers.stations.export_format import (
@@ -33,7 +40,10 @@ _MARKS = "\ufeff\r\n\x02 "  # before the first record
 _UNITS = re.compile(r"(?P<angle>[1-4])(?P<length>[1-3])[1-9]{4}\s*$")
 _PASSED_OVER = {"00", "01", "04", "05", "06", "11", "12", "13"}  # notes, corrections, computed results
 _SETS_UP = {"02", "07", "10"}
+_MEASURED, _COORDINATES = "08TP", "08"
+_NOT_MEASURED = {"08KI": "coordinates typed in, not measured"}
 _LENGTHS: dict[str, LengthUnit] = {"1": "m", "2": "ft"}
+_SAME_FRAME_RAD = 1e-5  # between the circle and the coordinates' north: 0.1 mm at 10 m
 
 
 def _recognises(text: str) -> bool:
@@ -59,49 +69,144 @@ def _guess(text: str, source: str) -> Guess:
 
 
 def _read(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
-    mm, rad = MM_PER[columns.length_unit], RAD_PER[columns.angle_unit]
-    fixes: list[ExportedFix] = []
-    origin, job, station = (0.0, 0.0, 0.0), "", ""
-    stood = {station: origin}
-    times_set_up, has_measured = 0, True  # since it was set up
-    target_mm = 0.0
+    reading = _Reading(columns, source)
+    for line, record in _records(text):
+        reading.take(line, record)
+    if not reading.fixes:
+        passed = "".join(f"; {note}" for note in _passed_over(text, source))
+        refuse(source, f"the file has no measured point (records 08TP, 09F1 or 09F2){passed}")
+    return reading.fixes
+
+
+def _records(text: str) -> Iterator[tuple[int, str]]:
+    """Return the records of a file, each with its line from 1."""
     for number, line in enumerate(text.lstrip("\ufeff").splitlines(), 1):
         record = line.strip("\x02\x03\x04\x1a\r\n ")
-        if not record or record.isdigit():
-            continue
+        if record and not record.isdigit():
+            yield number, record
+
+
+def _passed_over(text: str, source: str) -> tuple[str, ...]:
+    """Return a note on each kind of coordinates that are no measured points."""
+    lines: dict[str, list[int]] = {}
+    for number, record in _records(text):
+        code = record[:_CODE]
+        if code.startswith(_COORDINATES) and code != _MEASURED:
+            lines.setdefault(code, []).append(number)
+    notes = []
+    for code, found in lines.items():
+        many = f"1 record {code}" if len(found) == 1 else f"{len(found)} records {code}"
+        why = _NOT_MEASURED.get(code, f"not known to be measured, as {_MEASURED} is")
+        notes.append(f"{source} has {many}, from line {found[0]} on: {why}; passed over")
+    return tuple(notes)
+
+
+@dataclass
+class _Reading:
+    """What a file has said up to a record.
+
+    Attributes:
+        columns: the map; its units count.
+        source: name of the file, for messages.
+        fixes: that were read.
+        job: that is open.
+        station: where the instrument stands.
+        origin_mm: east, north and height of the instrument's centre there.
+        stood_mm: station -> its origin.
+        turns_rad: station -> azimuth of the circle's zero, by its back-sight; None where that is no number.
+        coordinates: station -> line of its first coordinates.
+        turned: station -> line of its first polar measurement that is not known to be in the frame of coordinates.
+        target_mm: height of the target.
+        times_set_up: how often the instrument was set up.
+        has_measured: since it was set up.
+    """
+
+    columns: ColumnMap
+    source: str
+    fixes: list[ExportedFix] = field(default_factory=list)
+    job: str = ""
+    station: str = ""
+    origin_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    stood_mm: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    turns_rad: dict[str, float | None] = field(default_factory=dict)
+    coordinates: dict[str, int] = field(default_factory=dict)
+    turned: dict[str, int] = field(default_factory=dict)
+    target_mm: float = 0.0
+    times_set_up: int = 0
+    has_measured: bool = True
+
+    def take(self, line: int, record: str) -> None:
+        """Read a record."""
         code, cells = record[:_CODE], _cells(record)
-        if has_measured and code[:2] in _SETS_UP:
-            times_set_up, has_measured = times_set_up + 1, False
+        if self.has_measured and code[:2] in _SETS_UP:
+            self.times_set_up, self.has_measured = self.times_set_up + 1, False
         match code[:2]:
             case "10":
-                job = _name(cells, 0)
+                self.job = _name(cells, 0)
+                self.station, self.origin_mm = _station(self.job, ""), (0.0, 0.0, 0.0)
+                self.turns_rad.clear()
             case "02":
-                north, east, up, height = (_number(cells, n, code, number, source) * mm for n in (1, 2, 3, 4))
-                origin, station = (east, north, up + height), _station(job, _name(cells, 0))
-                if stood.setdefault(station, origin) != origin and any(fix.station == station for fix in fixes):
-                    problem = f"a second place of the station {station!r}; name it otherwise, or split the file"
-                    refuse(source, f"{problem}, one set-up each", number)
-                stood[station] = origin
+                self._stand(line, code, cells)
+            case "07":
+                self._sight_back(cells)
             case "03":
-                target_mm = _number([record[_CODE:]], 0, code, number, source) * mm
-            case "08":
-                north, east, up = (_number(cells, n, code, number, source) * mm for n in (1, 2, 3))
-                place = (east - origin[0], north - origin[1], up + target_mm - origin[2])
-                fix = ExportedFix(number, _name(cells, 0), _name(cells, 4), place)
-                fixes.append(replace(fix, station=station, times_set_up=times_set_up))
-                has_measured = True
+                self.target_mm = self._lengths_mm([record[_CODE:]], (0,), line, code)[0]
+            case "08" if code == _MEASURED:
+                self._take_coordinates(line, code, cells)
             case "09" if code in ("09F1", "09F2"):
-                distance, zenith, hz = (_number(cells, n, code, number, source) for n in (2, 3, 4))
-                place = polar_position_mm(hz * rad, zenith * rad, distance * mm)
-                at = _station(job, _name(cells, 0)) if _name(cells, 0) else station
-                fix = ExportedFix(number, _name(cells, 1), _name(cells, 5), place)
-                fixes.append(replace(fix, station=at, times_set_up=times_set_up))
-                has_measured = True
-            case kind if kind not in _PASSED_OVER | _SETS_UP:
-                refuse(source, f"records {code!r} are not known", number)
-    if not fixes:
-        refuse(source, "the file has no measured point (records 08 or 09F1)")
-    return fixes
+                self._take_polar(line, code, cells)
+            case kind if kind not in _PASSED_OVER | {_COORDINATES}:
+                refuse(self.source, f"records {code!r} are not known", line)
+
+    def _stand(self, line: int, code: str, cells: list[str]) -> None:
+        north, east, up, height = self._lengths_mm(cells, (1, 2, 3, 4), line, code)
+        self.station, origin_mm = _station(self.job, _name(cells, 0)), (east, north, up + height)
+        before_mm = self.stood_mm.setdefault(self.station, origin_mm)
+        if before_mm != origin_mm and any(fix.station == self.station for fix in self.fixes):
+            problem = f"a second place of the station {self.station!r}; name it otherwise, or split the file"
+            refuse(self.source, f"{problem}, one set-up each", line)
+        self.stood_mm[self.station] = self.origin_mm = origin_mm
+        self.turns_rad.pop(self.station, None)
+
+    def _sight_back(self, cells: list[str]) -> None:
+        azimuth, circle = (number_of(_name(cells, place), ".") for place in (2, 3))
+        turn = None if azimuth is None or circle is None else azimuth - circle
+        self.turns_rad[self._named(cells)] = None if turn is None else turn * RAD_PER[self.columns.angle_unit]
+
+    def _take_coordinates(self, line: int, code: str, cells: list[str]) -> None:
+        north, east, up = self._lengths_mm(cells, (1, 2, 3), line, code)
+        origin_mm = self.origin_mm
+        place = (east - origin_mm[0], north - origin_mm[1], up + self.target_mm - origin_mm[2])
+        self.coordinates.setdefault(self.station, line)
+        self._add(line, self.station, _name(cells, 0), _name(cells, 4), place)
+
+    def _take_polar(self, line: int, code: str, cells: list[str]) -> None:
+        distance, zenith, hz = (_number(cells, place, code, line, self.source) for place in (2, 3, 4))
+        mm, rad = MM_PER[self.columns.length_unit], RAD_PER[self.columns.angle_unit]
+        place = polar_position_mm(hz * rad, zenith * rad, distance * mm)
+        at = self._named(cells)
+        turn_rad = self.turns_rad.get(at)
+        if turn_rad is None or abs(math.remainder(turn_rad, math.tau)) > _SAME_FRAME_RAD:
+            self.turned.setdefault(at, line)
+        self._add(line, at, _name(cells, 1), _name(cells, 5), place)
+
+    def _add(self, line: int, station: str, point: str, target: str, place: tuple[float, float, float]) -> None:
+        if station in self.coordinates and station in self.turned:
+            both = f"coordinates (line {self.coordinates[station]}) and angles (line {self.turned[station]})"
+            why = "no back-sight (07) says that the circle's zero is the north of the coordinates"
+            todo = "put them into two files, and import each as a set-up of its own"
+            refuse(self.source, f"{both} of the station {station!r} are in two frames, as {why}; {todo}", line)
+        fix = ExportedFix(line, point, target, place, station=station, times_set_up=self.times_set_up)
+        self.fixes.append(fix)
+        self.has_measured = True
+
+    def _named(self, cells: list[str]) -> str:
+        """Return the station that a record names first; where it names none, that where the instrument stands."""
+        return _station(self.job, _name(cells, 0)) if _name(cells, 0) else self.station
+
+    def _lengths_mm(self, cells: list[str], places: tuple[int, ...], line: int, code: str) -> list[float]:
+        mm = MM_PER[self.columns.length_unit]
+        return [_number(cells, place, code, line, self.source) * mm for place in places]
 
 
 def _station(job: str, name: str) -> str:
@@ -125,5 +230,11 @@ def _number(cells: list[str], place: int, code: str, line: int, source: str) -> 
 
 
 FORMAT = ExportFormat(
-    name="sokkia_sdr", title="Sokkia SDR33", rank=20, recognises=_recognises, guess=_guess, read=_read
+    name="sokkia_sdr",
+    title="Sokkia SDR33",
+    rank=20,
+    recognises=_recognises,
+    guess=_guess,
+    read=_read,
+    passed_over=_passed_over,
 )

@@ -87,7 +87,7 @@ def _fix(record: str, point: str, line: int, source: str) -> ExportedFix:
     place = position_mm(found)
     if place is None:
         refuse(source, f"point {point}: {found.reason or 'the record has no position'}; leave it out of the file", line)
-    return ExportedFix(line, point, "", place)
+    return ExportedFix(line, point, "", place, prism_constant_mm=found.prism_constant_mm)
 
 
 def _blocks(text: str, source: str) -> tuple[str, list[int]]:

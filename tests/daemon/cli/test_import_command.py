@@ -126,6 +126,45 @@ def test_an_instrument_that_is_set_up_once_is_not_said_to_be_set_up_again(tmp_pa
     assert not any("again" in note for note in told(survey, "--out", tmp_path / "out.csv")["notes"])
 
 
+def test_a_table_of_two_stations_has_two_set_ups_though_one_is_given_for_all(tmp_path: Path) -> None:
+    survey, out = tmp_path / "survey.csv", tmp_path / "out.csv"
+    survey.write_text("Setup;Point;X [m];Y [m];Z [m]\nS1;1;1;2;0\nS1;2;2;2;0\nS2;1;-3;2;0\nS2;2;-3;1;0\n")
+    *_, note = told(survey, "--setup", "ALL", "--out", out)["notes"]
+    assert note.startswith("survey.csv has 2 set-ups of the instrument, and so have the rows: ALL-S1, ALL-S2; ")
+    rows = list(csv.DictReader(out.read_text(encoding="utf-8").splitlines()))
+    assert [row["setup"] for row in rows] == ["ALL-S1", "ALL-S1", "ALL-S2", "ALL-S2"]
+
+
+CONSTANTS = "Station,Point,X [m],Y [m],Z [m],Prism,Prism constant (mm)\nA,1,1,2,3,w,0\nB,2,1,2,4,w,0\n"
+
+
+def test_a_prism_that_one_station_measured_with_two_prism_constants_is_said(tmp_path: Path) -> None:
+    survey, out = tmp_path / "survey.csv", tmp_path / "out.csv"
+    survey.write_text(CONSTANTS + "B,3,1,2,5,w,-30\nA,4,1,2,5,b,-30\n")
+    found = told(survey, "--out", out)
+    for notes in (found["notes"], told(survey, "--map", found["map_file"], "--out", tmp_path / "2.csv")["notes"]):
+        said = "survey.csv has prism 'w' at 'B' measured with prism constants of 0 mm (from point '2', line 3) and -30"
+        assert sum("prism constants of" in note for note in notes) == 1
+        assert notes[-1].startswith(f"{said} mm (from point '3', line 4), by which its distances differ: ")
+
+
+@pytest.mark.parametrize(("prism", "is_said"), [(None, False), ("w", True)])
+def test_two_codes_of_one_prism_have_one_prism_constant(tmp_path: Path, prism: str | None, is_said: bool) -> None:
+    survey = tmp_path / "survey.csv"
+    survey.write_text(CONSTANTS + "A,3,1,2,5,b,-30\n")
+    notes = told(survey, *(("--prism", prism) if prism else ()), "--out", tmp_path / "out.csv")["notes"]
+    assert any("prism constants of 0 mm (from" in note for note in notes) == is_said
+
+
+def test_records_that_are_passed_over_are_said_with_a_map_as_well(tmp_path: Path) -> None:
+    survey = tmp_path / "job.sdr"
+    survey.write_text(SDR_HEAD + sdr("08KI", "1", 7.5, 1.2, 0.3) + sdr("08TP", "1", 1.0, 2.0, 3.0))
+    found = told(survey, "--out", tmp_path / "1.csv")
+    again = told(survey, "--map", found["map_file"], "--out", tmp_path / "2.csv")
+    said = "job.sdr has 1 record 08KI, from line 3 on: coordinates typed in, not measured; passed over"
+    assert (found["points"], again["points"], said in found["notes"], said in again["notes"]) == (1, 1, True, True)
+
+
 @pytest.mark.parametrize("setup", ["", "S1"])
 def test_a_station_without_a_name_shares_no_set_up_with_one_that_is_called_unnamed(setup: str) -> None:
     stations = ["unnamed", "", "unnamed-0"]

@@ -58,6 +58,10 @@ _EXPORT = (
         b"02TP",
         b"03NM",
         b"08TP",
+        b"08KI",
+        b"07TP",
+        b"Station",
+        b"Prism constant (mm)",
         b"09F1",
         b"_'_(_)",
         b"_*",
@@ -94,6 +98,7 @@ def _export(path: Path) -> None:
     known = format_of(text, str(path))
     guess = known.guess(text, str(path))
     map_text(guess.map, str(path))
+    known.passed_over(text, str(path))
     for fix in known.read(text, guess.map, str(path)):
         assert all(map(math.isfinite, (*fix.position_mm, fix.time_s or 0.0))), fix
 

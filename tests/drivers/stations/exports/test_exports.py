@@ -30,9 +30,9 @@ POINTS = [
 SETUP = "_'_(_)1.540"
 
 
-def gts_record(slope_mm: int, zenith_gon: float, hz_gon: float) -> str:
+def gts_record(slope_mm: int, zenith_gon: float, hz_gon: float, corrections: str = "+00+00") -> str:
     level_mm = round(slope_mm * math.sin(math.radians(zenith_gon * 0.9)))
-    data = f"?+{slope_mm:08d}m{round(zenith_gon * 1e4):07d}+{round(hz_gon * 1e4):07d}g+{level_mm:08d}t**+00+00"
+    data = f"?+{slope_mm:08d}m{round(zenith_gon * 1e4):07d}+{round(hz_gon * 1e4):07d}g+{level_mm:08d}t**{corrections}"
     return data + block_check(data.encode()).decode()
 
 
@@ -86,6 +86,14 @@ def test_gts_points_are_of_the_job_the_instrument_and_the_height_before_them() -
         "JOB1/ST-B/1.620",
         "JOB2/ST-A/1.500",
     ]
+
+
+def test_a_gts_point_has_the_prism_constant_of_its_record() -> None:
+    record = gts_record(8000, 100.0, 10.0, "+00-30")
+    fields = f"{SETUP}_+1_ {gts_record(8000, 100.0, 10.0)}_+2_ {record}_".ljust(128)
+    data = [fields[at : at + 128].ljust(128) + str(at // 128) for at in range(0, len(fields), 128)]
+    text = "".join(f"\x02{block}{block_check(block.encode()).decode()}\x03\n" for block in data) + "\x04\n"
+    assert [fix.prism_constant_mm for fix in fixes(text, "topcon_gts")] == [0.0, -30.0]
 
 
 def test_a_gts_download_of_more_than_ten_blocks() -> None:
@@ -157,10 +165,57 @@ def test_sdr_points_are_of_the_station_that_stood_there_though_its_coordinates_w
 
 def test_sdr_stations_of_two_jobs_are_two_set_ups_though_their_names_are_the_same() -> None:
     polar, place = sdr("09F1", "1", "1", 10.0, 90.0, 0.0, "r"), sdr("08TP", "2", 9.0, 1.0, 2.0)
-    first, second = (sdr("02TP", "1", north, 0.0, 0.0, 1.5) + polar + place for north in (0.0, 7.0))
+    measured = sdr("07TP", "1", "B", 45.0, 45.0) + polar + place
+    first, second = (sdr("02TP", "1", north, 0.0, 0.0, 1.5) + measured for north in (0.0, 7.0))
     found = fixes(SDR_HEAD + first + sdr("10NM", "JOB2") + second, "sokkia_sdr")
     assert [fix.station for fix in found] == ["JOB1/1", "JOB1/1", "JOB2/1", "JOB2/1"]
     assert [fix.times_set_up for fix in found] == [1, 1, 2, 2]
+
+
+def test_sdr_coordinates_that_were_typed_in_are_no_fixes_and_that_is_said() -> None:
+    stood, measured = sdr("02KI", "A", 0.0, 0.0, 0.0, 0.0), sdr("08TP", "1", 1.0, 2.0, 3.0)
+    text = SDR_HEAD + sdr("08KI", "1", 7.5, 1.2, 0.3) * 2 + stood + measured
+    assert [(fix.line, fix.point) for fix in fixes(text, "sokkia_sdr")] == [(6, "1")]
+    said = "job.sdr has 2 records 08KI, from line 3 on: coordinates typed in, not measured; passed over"
+    assert export_formats()["sokkia_sdr"].passed_over(text, "job.sdr") == (said,)
+
+
+@pytest.mark.parametrize("code", ["08RS", "08TV", "08NM", "08"])
+def test_sdr_coordinates_that_are_not_known_to_be_measured_are_no_fixes_and_that_is_said(code: str) -> None:
+    text = SDR_HEAD + sdr("08TP", "1", 1.0, 2.0, 3.0) + sdr(f"{code:4}", "2", 1.0, 2.0, 3.0)
+    assert [fix.point for fix in fixes(text, "sokkia_sdr")] == ["1"]
+    (note,) = export_formats()["sokkia_sdr"].passed_over(text, "job.sdr")
+    assert f"has 1 record {code}" in note
+    assert note.endswith("from line 4 on: not known to be measured, as 08TP is; passed over")
+
+
+def test_an_sdr_file_of_typed_coordinates_alone_is_refused() -> None:
+    said = refused(SDR_HEAD + sdr("08KI", "1", 1.0, 2.0, 3.0))
+    assert "no measured point (records 08TP, 09F1 or 09F2); survey.txt has 1 record 08KI, from line 3 on: coord" in said
+
+
+def test_a_new_sdr_job_has_neither_the_station_nor_the_origin_of_the_job_before() -> None:
+    place = sdr("08TP", "1", 9.0, 1.0, 2.0)
+    text = SDR_HEAD + sdr("02TP", "A", 7.0, 0.0, 0.0, 0.0) + place + sdr("10NM", "JOB2") + place
+    found = [(fix.station, fix.position_mm[1]) for fix in fixes(text, "sokkia_sdr")]
+    assert found == [("JOB1/A", 2000.0), ("JOB2", 9000.0)]
+
+
+@pytest.mark.parametrize("back", [sdr("07TP", "A", "B", 90.0, 10.0), "", sdr("07TP", "A", "B", "", 10.0)])
+@pytest.mark.parametrize("polar_first", [False, True])
+def test_sdr_coordinates_and_angles_from_another_zero_are_refused(back: str, polar_first: bool) -> None:
+    measured = [sdr("08TP", "1", 0.0, 5.0, 0.0), sdr("09F1", "A", "1", 5.0, 90.0, 10.0)]
+    text = SDR_HEAD + sdr("02TP", "A", 0.0, 0.0, 0.0, 0.0) + back
+    said = refused(text + "".join(measured[::-1] if polar_first else measured))
+    assert "of the station 'JOB1/A' are in two frames, as no back-sight (07) says that the circle's zero is" in said
+
+
+@pytest.mark.parametrize(("azimuth", "circle"), [(45.0, 45.0), (0.0, 360.0), (359.9999, 0.0001)])
+def test_sdr_coordinates_and_angles_from_their_north_are_of_one_set_up(azimuth: float, circle: float) -> None:
+    stood = sdr("02TP", "A", 0.0, 0.0, 0.0, 0.0) + sdr("07TP", "A", "B", azimuth, circle)
+    measured = sdr("08TP", "1", 0.0, 5.0, 0.0) + sdr("09F1", "A", "1", 5.0, 90.0, 90.0)
+    first, second = fixes(SDR_HEAD.replace("211111", "111111") + stood + measured, "sokkia_sdr")
+    np.testing.assert_allclose(first.position_mm, second.position_mm, atol=1e-6)
 
 
 # ---- tables ----------------------------------------------------------------------------------------------------------
@@ -217,6 +272,38 @@ def test_vicon_trajectories(semicolons: bool) -> None:
 def test_angles_and_a_distance_become_a_position() -> None:
     (fix,) = fixes(ANGLES, "plain_csv")
     np.testing.assert_allclose(fix.position_mm, (12_500.0, 0.0, 0.0), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "name", ["Station", "SETUP", "set-up", "Stn", "Standpunkt", "Station name", "Setup_ID", "Stn."]
+)
+def test_a_column_of_stations_says_where_the_instrument_stood(name: str) -> None:
+    text = f"{name};point;x;y;z\nA;1;1;2;3\nA;2;1;2;4\nB;3;5;2;3\nB;4;5;2;4\n"
+    assert [fix.station for fix in fixes(text, "plain_csv")] == ["A", "A", "B", "B"]
+
+
+@pytest.mark.parametrize("values", [range(0, 100, 20), ["P1", "P2", "P3"], [0, 20, 40, 60, 80, 100, 120, 120]])
+def test_a_column_of_stations_with_a_value_in_each_row_is_refused(values: list[object]) -> None:
+    rows = [f"{value},{n},2,3" for n, value in enumerate(values)]
+    said = refused("\n".join(["station,x,y,z", *rows]) + "\n")
+    different = len(set(values))
+    assert f"line 1, column station: {different} different values in {len(rows)} rows, so it does not name" in said
+
+
+def test_of_two_columns_that_may_name_stations_the_one_that_is_taken_is_said() -> None:
+    found = export_formats()["plain_csv"].guess("Station,Setup,x,y,z\nA,1,1,2,3\nA,2,1,2,3\n", "file")
+    assert found.map.columns["station"] == "Station"
+    assert "set-ups by 'Station' alone, though columns Station, Setup may name them" in found.notes
+
+
+@pytest.mark.parametrize(
+    ("name", "cell"), [("Prism constant (mm)", "-34.4"), ("prism const. [m]", "-0.0344"), ("Prismenkonstante", "-34.4")]
+)
+def test_a_column_of_prism_constants_is_in_mm_or_in_the_unit_of_its_name(name: str, cell: str) -> None:
+    first, second = fixes(f"{name};point;x [m];y [m];z [m]\n{cell};1;1;2;3\n;2;1;2;3\n", "plain_csv")
+    assert first.prism_constant_mm == pytest.approx(-34.4)
+    assert second.prism_constant_mm is None
+    assert "column prism constant: 'none' is not" in refused("prism constant;x;y;z\nnone;1;2;3\n")
 
 
 def test_a_table_without_a_header() -> None:
