@@ -16,7 +16,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from calibration.design.knowledge import setup_of
 from calibration.design.visibility import Bodies, Flags, is_reachable, site
-from calibration.effects.fitted import left_out
+from calibration.effects.fitted import FittedEffect, left_out
 from calibration.effects.library import library
 from calibration.errors import DataError
 from calibration.model.model import CalibratedModel
@@ -46,7 +46,7 @@ class CorrectionGrid:
         readings: (g, joints) all combinations, the last joint changing fastest.
         nominal_mm, corrected_mm: prism -> (g, 3) by the drawings, and by the model.
         reachable: (g,) True where the rig touches neither itself nor the floor.
-        left_out: a sentence for every effect of the machine that needs more than joint values.
+        lacking: the effects of the machine that need more than joint values, so that the grid has them not.
         rms_mm, p95_mm, max_mm: how far the interpolated corrections are from the model's own, in random poses on the
             grid, all prisms taken together.
         correction_rms_mm: how large the model's own corrections are there.
@@ -57,7 +57,7 @@ class CorrectionGrid:
     nominal_mm: Mapping[str, Floats]
     corrected_mm: Mapping[str, Floats]
     reachable: Flags
-    left_out: tuple[str, ...]
+    lacking: tuple[FittedEffect, ...]
     rms_mm: float
     p95_mm: float
     max_mm: float
@@ -122,7 +122,7 @@ def correction_grid(
         nominal_mm,
         corrected_mm,
         machine.reachable(readings),
-        machine.left_out(prisms[0], readings[:1]),
+        machine.lacking(machine.rows(prisms[0], readings[:1])),
         rms_mm=rms_mm,
         p95_mm=float(np.quantile(off_mm, 0.95)),
         max_mm=float(off_mm.max()),
@@ -204,11 +204,15 @@ class Machine:
         at = site(chain, values, setup=self.setup)
         return _in_chunks(lambda some: is_reachable(Bodies.of(chain, values, some), at), readings)
 
-    def left_out(self, prism: str, readings: Floats) -> tuple[str, ...]:
-        """Sentences on effects that need more than joint values."""
-        model = self.model
-        of_machine = [effect for effect in model.effects if library()[effect.family].moves_machine]
-        return left_out(of_machine, Predictor.of(model).context(self.rows(prism, readings)))
+    @property
+    def effects(self) -> tuple[FittedEffect, ...]:
+        """Those of the model's effects that move the machine."""
+        return tuple(effect for effect in self.model.effects if library()[effect.family].moves_machine)
+
+    def lacking(self, rows: Observations) -> tuple[FittedEffect, ...]:
+        """Return the effects that move the machine and lack an input in some of these rows."""
+        context = Predictor.of(self.model).context(rows)
+        return tuple(effect for effect in self.effects if left_out([effect], context))
 
     def rows(self, prism: str, readings: Floats) -> Observations:
         """Return observations of a prism at these joint values, not measured yet."""

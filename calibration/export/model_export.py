@@ -12,7 +12,7 @@ import numpy as np
 from calibration.design.knowledge import setup_of
 from calibration.effects.fitted import FittedEffect
 from calibration.effects.library import library
-from calibration.export.correction_grid import CorrectionGrid, Machine, correction_grid, trained_ranges
+from calibration.export.correction_grid import CorrectionGrid, Machine, correction_grid, interpolated, trained_ranges
 from calibration.kinematics.chain import Chain
 from calibration.model.model import CalibratedModel
 from calibration.observations import Floats
@@ -39,6 +39,26 @@ class LeftOut:
     p95_mm: float = 0.0
     max_mm: float = 0.0
     correction_rms_mm: float = 0.0
+
+    @classmethod
+    def of(cls, parts: Sequence[str], told: Sequence[str], off_mm: Floats, correction_mm: Floats) -> LeftOut:
+        """Return what is left out by its errors.
+
+        Args:
+            parts: as `parts`.
+            told: as `not_measured`.
+            off_mm: (n, 3) how far the export is from the model in poses of the work volume.
+            correction_mm: (n, 3) how far the model is from the drawings there.
+        """
+        size_mm = np.linalg.norm(off_mm, axis=1)
+        return cls(
+            tuple(parts),
+            tuple(told),
+            float(np.sqrt((size_mm**2).mean())),
+            float(np.quantile(size_mm, 0.95)),
+            float(size_mm.max()),
+            float(np.sqrt((correction_mm**2).sum(axis=1).mean())),
+        )
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -138,39 +158,60 @@ class Export:
             keeps: True for an effect that stays.
         """
         model = self.model
-        of_machine = [effect for effect in model.effects if library()[effect.family].moves_machine]
-        lost = [effect for effect in of_machine if not keeps(effect)]
-        parts = [f"{effect.family}@{effect.where}" for effect in lost]
+        whole = Machine(model, self.setup)
+        lost = [effect for effect in whole.effects if not keeps(effect)]
+        parts = [_name(effect) for effect in lost]
         parts += [f"the learned residual ({model.residual.learner.kind})"] if model.residual is not None else []
-        told = [
-            f"{effect.family}@{effect.where} moves fixes or the base and is no part of any export."
-            for effect in model.effects
-            if effect not in of_machine
-        ]
-        lacking = [e for e in lost if (need := _needs(e)) and not need.endswith("_dir")]
-        told += [f"What {e.family}@{e.where} does is not measured here: it needs {_needs(e)}." for e in lacking]
+        told = self.not_measured(lost)
         if not parts:
-            return LeftOut((), tuple(told))
-        kept = [effect for effect in model.effects if effect not in lost]
-        whole, rest = Machine(model, self.setup), Machine(without_parts(model, kept), self.setup)
-        low, high = trained_ranges(model)
-        rng = np.random.default_rng(_SEED)
-        poses = rng.uniform(low, high, (_POSES, len(low)))
-        extra = {f"{name}_dir": rng.choice([-1.0, 1.0], _POSES) for name in model.rig.joint_names}
+            return LeftOut((), told)
+        rest = Machine(without_parts(model, [effect for effect in model.effects if effect not in lost]), self.setup)
+        poses, extra = self.trial_poses()
         off, correction = [], []
         for prism in model.rig.prism_names:
             place_mm = whole.corrected_mm(prism, poses, extra)
             off.append(place_mm - rest.corrected_mm(prism, poses, extra))
             correction.append(place_mm - whole.nominal_mm(prism, poses))
-        size = np.linalg.norm(np.concatenate(off), axis=1)
-        return LeftOut(
-            tuple(parts),
-            tuple(told),
-            float(np.sqrt((size**2).mean())),
-            float(np.quantile(size, 0.95)),
-            float(size.max()),
-            float(np.sqrt((np.concatenate(correction) ** 2).sum(axis=1).mean())),
-        )
+        return LeftOut.of(parts, told, np.concatenate(off), np.concatenate(correction))
+
+    @cached_property
+    def left_out_of_grid(self) -> LeftOut:
+        """Return what the grid lacks: what bends between its nodes, and effects that need more than joint values."""
+        grid, machine = self.grid, Machine(self.model, self.setup)
+        poses, extra = self.trial_poses()
+        off, correction = [], []
+        for prism, nominal_mm in grid.nominal_mm.items():
+            correction_mm = machine.corrected_mm(prism, poses, extra) - machine.nominal_mm(prism, poses)
+            correction.append(correction_mm)
+            off.append(interpolated(grid.nodes, grid.corrected_mm[prism] - nominal_mm, poses) - correction_mm)
+        parts = [f"what lies between the nodes of {len(grid.readings)} poses", *map(_name, grid.lacking)]
+        return LeftOut.of(parts, self.not_measured(grid.lacking), np.concatenate(off), np.concatenate(correction))
+
+    def trial_poses(self) -> tuple[Floats, dict[str, Floats]]:
+        """Draw poses of the work volume: (n, joints) joint values, and further columns of the observations there.
+
+        Each joint comes from one side or the other.
+        """
+        low, high = trained_ranges(self.model)
+        rng = np.random.default_rng(_SEED)
+        poses = rng.uniform(low, high, (_POSES, len(low)))
+        return poses, {f"{name}_dir": rng.choice([-1.0, 1.0], _POSES) for name in self.model.rig.joint_names}
+
+    def not_measured(self, lost: Sequence[FittedEffect]) -> tuple[str, ...]:
+        """Return sentences on the effects whose cost trial poses do not show.
+
+        Args:
+            lost: effects that move the machine and are left out.
+        """
+        of_machine = Machine(self.model, self.setup).effects
+        told = [
+            f"{_name(effect)} moves fixes or the base and is no part of any export."
+            for effect in self.model.effects
+            if effect not in of_machine
+        ]
+        lacking = [effect for effect in lost if (need := _needs(effect)) and not need.endswith("_dir")]
+        told += [f"What {_name(effect)} does is not measured here: it needs {_needs(effect)}." for effect in lacking]
+        return tuple(told)
 
 
 def without_parts(model: CalibratedModel, effects: Sequence[FittedEffect]) -> CalibratedModel:
@@ -230,6 +271,10 @@ def shortest(value: float) -> str:
     return repr(float(value) + 0.0).removesuffix(".0")
 
 
+def _name(effect: FittedEffect) -> str:
+    return f"{effect.family}@{effect.where}"
+
+
 def _needs(effect: FittedEffect) -> str:
     """Return the column that an effect needs; empty for none."""
     column = library()[effect.family].column
@@ -237,7 +282,8 @@ def _needs(effect: FittedEffect) -> str:
 
 
 def _warnings(grid: CorrectionGrid) -> Iterator[str]:
-    yield from (f"{GRID_FILE}: {sentence}; `rigcal predict` has it where the data do" for sentence in grid.left_out)
+    for effect in grid.lacking:
+        yield f"{GRID_FILE} has no {_name(effect)}, which joint values alone do not tell; `rigcal predict` has it"
     if grid.is_coarse:
         yield (
             f"between the nodes of {GRID_FILE}, interpolated corrections are wrong by {grid.rms_mm:.2g} mm RMS, more "

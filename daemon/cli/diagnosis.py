@@ -25,6 +25,7 @@ NETWORK_DEVICES = Path("/sys/class/net")
 _NETWORKD = "edit /etc/systemd/network/80-can0.network, then `systemctl restart systemd-networkd`"
 _USUAL_RATE = 250_000  # bit/s
 _RULES_FILE = "/etc/udev/rules.d/99-rigcal-station.rules"
+_RELOAD_RULES = "`udevadm control --reload && udevadm trigger`"
 _OFTEN = 10  # silences of one channel since the start, from which on its time-out may be too short
 _LEAST_FREE = 0.1  # of the disk
 _BUSY = 1.5  # processes that want to run, for each processor, over the last minute
@@ -172,9 +173,14 @@ def devices(config: Config) -> Iterator[Finding]:
             yield can_interface(section, _link_details(section.channel), NETWORK_DEVICES / section.channel)
         elif section.interface == "slcan":
             # python-can's slcan takes PORT@BAUD
-            yield _serial_port(section.name, Path(section.channel.partition("@")[0]), "[[can]] channel")
+            port, key = section.channel.partition("@")[0], "[[can]] channel"
+            yield _serial_port(
+                section.name, Path(port), key, f"plug it in, or correct {key}", "its name in /dev/serial/by-id"
+            )
     for station in config.station:
-        yield _serial_port(station.name, Path(station.serial.path), "[station.serial] path")
+        plug_in = f"plug it in; put its serial number into {_RULES_FILE}, then {_RELOAD_RULES}"
+        key, lasting = "[station.serial] path", f"the name that {_RULES_FILE} gives the adapter"
+        yield _serial_port(station.name, Path(station.serial.path), key, plug_in, lasting)
 
 
 def _link_details(channel: str) -> Mapping[str, Any] | None:
@@ -230,21 +236,20 @@ def _controller(section: CanSection, data: Mapping[str, Any]) -> Finding:
     return Finding(section.channel, found, text, remedy)
 
 
-def _serial_port(name: str, path: Path, key: str) -> Finding:
+def _serial_port(name: str, path: Path, key: str, plug_in: str, lasting: str) -> Finding:
     if not path.exists():
         plugged = ", ".join(
             sorted(str(p) for p in Path("/dev").glob("ttyUSB*")) + sorted(str(p) for p in Path("/dev").glob("ttyACM*"))
         )
         found = f"plugged in: {plugged}" if plugged else "no serial adapter is plugged in"
-        remedy = (
-            f"plug it in; put its serial number into {_RULES_FILE}, then `udevadm control --reload && udevadm trigger`"
-        )
-        return Finding(name, "fault", f"{path} does not exist; {found}", remedy)
+        return Finding(name, "fault", f"{path} does not exist; {found}", plug_in)
+    if not path.is_char_device():
+        return Finding(name, "fault", f"{path} is no serial port", f"correct {key}")
     if not os.access(path, os.R_OK | os.W_OK):
         remedy = f"join its group: `sudo adduser {_user()} dialout`, then log in anew (the service has it already)"
         return Finding(name, "fault", f"{path} may not be opened by {_user()}", remedy)
     if path.resolve().name.startswith(("ttyUSB", "ttyACM")) and not path.is_symlink():
-        remedy = f"name the adapter in {_RULES_FILE}, and use that name in {key}"
+        remedy = f"use {lasting} as {key}"
         return Finding(
             name, "warning", f"{path} names a socket, not an adapter: it may be another one after a restart", remedy
         )

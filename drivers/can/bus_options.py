@@ -27,7 +27,7 @@ _MADE: Mapping[str, str] = MappingProxyType(
 
 
 def check_channel(interface: str, channel: str) -> None:
-    """Refuse a channel that names no network interface where one is meant.
+    """Refuse a channel that names no network interface, or no serial port, where one is meant.
 
     Args:
         interface: kind of adapter, as python-can names it.
@@ -39,7 +39,12 @@ def check_channel(interface: str, channel: str) -> None:
     if interface == "socketcan" and not _INTERFACE_NAME.fullmatch(channel):
         raise ValueError(
             f"{channel[:_LONGEST_NAME_TOLD]!r} is no name of a network interface, as can0 is one; an adapter at a "
-            "serial port has the interface slcan"
+            "serial port needs the interface slcan"
+        )
+    if interface == "slcan" and "/" not in channel:
+        raise ValueError(
+            f"{channel[:_LONGEST_NAME_TOLD]!r} is no serial port, as /dev/ttyACM0 is one; an interface of the network, "
+            "as can0, needs the interface socketcan"
         )
 
 

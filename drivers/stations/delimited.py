@@ -349,9 +349,8 @@ def read_table(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
             place = polar_position_mm(number_at("hz") * rad, number_at("zenith") * rad, number_at("distance") * mm)
         else:
             place = (number_at("x") * mm, number_at("y") * mm, number_at("z") * mm)
-        constant_mm = None
-        if text_at("prism_constant"):
-            constant_mm = number_at("prism_constant") * _named_mm(places["prism_constant"], header)
+        constant = number_of(text_at("prism_constant"), columns.decimal)  # for a note alone: anything may stand there
+        constant_mm = None if constant is None else constant * _named_mm(places["prism_constant"], header)
         point = text_at("point") or str(len(fixes) + 1)
         time_s = _time_s(" ".join(filter(None, (text_at("date"), text_at("time")))), columns, number, source)
         fix = ExportedFix(number, point, text_at("prism"), place, time_s, text_at("station"))
@@ -370,8 +369,14 @@ def _named_mm(place: int, header: list[str]) -> float:
 
 
 def _check_stations(fixes: list[ExportedFix], columns: ColumnMap, source: str) -> None:
-    """Refuse a column of stations that says another thing in nearly every row, as chainages and points' names do."""
+    """Refuse a column of stations that some rows leave open, or that says another thing in nearly every row.
+
+    An empty cell may mean the station above it, or none; chainages and points' names differ from row to row.
+    """
     found = {fix.station for fix in fixes}
+    if "" in found and len(found) > 1:
+        line = next(fix.line for fix in fixes if not fix.station)
+        refuse(source, "names no station, as other rows do; fill it in", line, columns.columns["station"])
     if len(found) > max(_FEW_STATIONS, _OWN_VALUES * len(fixes)):
         said = f"{len(found)} different values in {len(fixes)} rows, so it does not name set-ups"
         reason = f"{said}; call the column otherwise ('point' if it names points), or leave station out of a map"

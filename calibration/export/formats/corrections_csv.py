@@ -10,7 +10,7 @@ import io
 
 import numpy as np
 
-from calibration.export.model_export import GRID_FILE, Export, Format, LeftOut
+from calibration.export.model_export import GRID_FILE, Export, Format
 
 _DECIMALS = 4  # of mm
 
@@ -32,19 +32,11 @@ def _content(export: Export) -> bytes:
     return out.getvalue().encode()
 
 
-def grid_left_out(export: Export) -> LeftOut:
-    """Return the error of interpolating between the nodes, and the effects that need more than joint values."""
-    grid = export.grid
-    parts = (f"what lies between the nodes of {len(grid.readings)} poses",)
-    told = tuple(f"{sentence}." for sentence in grid.left_out)
-    return LeftOut(parts, told, grid.rms_mm, grid.p95_mm, grid.max_mm, grid.correction_rms_mm)
-
-
 FORMAT = Format(
     "grid",
     GRID_FILE,
     "CSV: at the nodes of a grid of joint values, where each prism is nominally and by the model",
     _content,
-    grid_left_out,
+    lambda export: export.left_out_of_grid,
     is_default=True,
 )

@@ -7,7 +7,6 @@ import io
 import numpy as np
 
 from calibration.errors import DataError
-from calibration.export.formats.corrections_csv import grid_left_out
 from calibration.export.model_export import Export, Format
 
 
@@ -27,11 +26,17 @@ def _content(export: Export) -> bytes:
     for kind, values in (("nominal", nominal), ("corrected", corrected), ("correction", corrected - nominal)):
         columns |= {f"{axis}_{kind}_mm": values[:, i] for i, axis in enumerate("xyz")}
     columns["reachable"] = np.tile(grid.reachable, len(prisms))
-    about = "\n".join(export.heading(grid_left_out(export)))
+    about = "\n".join(export.heading(export.left_out_of_grid))
     table = pyarrow.table(columns).replace_schema_metadata({"rigcal": about})
     out = io.BytesIO()
     parquet.write_table(table, out)
     return out.getvalue()
 
 
-FORMAT = Format("parquet", "corrections.parquet", "the grid's table as Parquet", _content, grid_left_out)
+FORMAT = Format(
+    "parquet",
+    "corrections.parquet",
+    "the grid's table as Parquet",
+    _content,
+    lambda export: export.left_out_of_grid,
+)

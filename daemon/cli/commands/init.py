@@ -61,7 +61,7 @@ PROFILE = _Profiles()
 )
 @click.option("--prism", "prisms", multiple=True, metavar="NAME", help="A prism of the rig file; `r` by default.")
 @click.option("--interface", type=click.Choice(INTERFACES), default="socketcan", show_default=True, help="CAN adapter.")
-@click.option("--channel", metavar="NAME", help="CAN interface, port or group; can0 by default.")
+@click.option("--channel", metavar="NAME", help="CAN interface, port or group: can0, or /dev/ttyACM0 for slcan.")
 @click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), help="Of the bus, for an slcan adapter.")
 @click.option("--station", "port", metavar="PORT", help="Serial port of the total station; `none` without one.")
 @click.option("--profile", type=PROFILE, help="What the station speaks; the first of them by default.")
@@ -94,7 +94,6 @@ def init(out: Path, rig: str | None, *, no_questions: bool, as_json: bool, **giv
             raise CommandError(f"no rig {rig!r} ships with rigcal; there are {', '.join(shipped_rigs())}")
     is_asking = not no_questions and not as_json and sys.stdin.isatty()
     answers = _answers(given, is_asking=is_asking)
-    _check_channel(answers)
     bus = _listen_to_bus(answers)
     station = _listen_to_station(answers)
     files = {CONFIG: _configuration(answers, rig or RIG, station)}
@@ -129,7 +128,9 @@ def _answers(given: dict[str, Any], *, is_asking: bool) -> dict[str, Any]:
         if answers[key] is None:
             answers[key] = click.prompt(question, default=usual, err=True) if is_asking else usual
 
-    answer("channel", f"CAN interface ({answers['interface']})", "can0")
+    usual_channel = "/dev/ttyACM0" if answers["interface"] == "slcan" else "can0"
+    answer("channel", f"CAN interface ({answers['interface']})", usual_channel)
+    _check_channel(answers)
     answer("port", "Serial port of the total station (none without one)", _usual_port())
     if answers["port"] != "none" and not answers["listen_s"]:
         answer("profile", f"What it speaks ({', '.join(PROFILE.choices)})", PROFILE.choices[0])

@@ -214,7 +214,7 @@ def _show(model: Mapping[str, Any]) -> None:
     echo(f"  trained on {', '.join(model['sessions'])}; manifest SHA-256 {model['manifest_sha256']}")
     for effect in model["metrics"].get("effects", ()):
         sizes = (
-            f"{name} {c['value']:.4g} {PLUS_MINUS} {INTERVAL_SIGMAS * c['standard_error']:.2g} {c['unit']}"
+            f"{name} {c['value']:.4g} {PLUS_MINUS} {INTERVAL_SIGMAS * c['standard_error']:.2g} {c['unit']} (95 %)"
             for name, c in effect["coefficients"].items()
         )
         form = f" ({effect['form']})" if effect["form"] else ""

@@ -26,6 +26,8 @@ from drivers.readings import CanCapture, Capture, SerialCapture
 
 CanFormat = Literal["log", "asc", "blf"]
 
+_BETWEEN_BOOTS_NS = 1_000_000  # at least: logs have microseconds, and what came first must come first again
+
 
 def export_session(config: Config, session_id: str, out: Path, can_format: CanFormat) -> list[Path]:
     """Write a session's captures, a file a link, what the operator said of it, and its observations.
@@ -134,7 +136,9 @@ class _SteadyTime:
     def of(self, stamp: Stamp) -> Stamp:
         """Return the stamp of an instant with steady UTC in place of the computer's."""
         if stamp.boot_id not in self._offsets_ns:
-            self._offsets_ns[stamp.boot_id] = max(stamp.utc_ns, self._latest_ns) - stamp.monotonic_ns
+            self._offsets_ns[stamp.boot_id] = (
+                max(stamp.utc_ns, self._latest_ns + _BETWEEN_BOOTS_NS) - stamp.monotonic_ns
+            )
         utc_ns = stamp.monotonic_ns + self._offsets_ns[stamp.boot_id]
         self._latest_ns = max(self._latest_ns, utc_ns)
         return replace(stamp, utc_ns=utc_ns)

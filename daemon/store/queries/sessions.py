@@ -241,7 +241,7 @@ class SessionTable:
         return [*lost_zeros(self._store, self._rig, self.zeros_known(rows[0]))] if rows else []
 
     def zeros_known(self, session: Mapping[str, Any]) -> Stamp:
-        """When the zeros of a session were the present ones: at its start, or when an operator accepted it later."""
+        """Return when the zeros of a session were the present ones: at its start, or when an operator accepted it."""
         return self._store.stamp_or_none(session, "accepted_") or self._store.stamp(session, "started_")
 
     def rig_of(self, session_ids: Sequence[str]) -> str | None:

@@ -10,7 +10,7 @@ these counts: so a clock that is wrong in a part of a boot moves no later boot f
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from daemon.store.queries.observations import first_observation
@@ -36,11 +36,13 @@ class TimeAxis:
         offsets_ns: boot -> what its monotonic clock lacks to the axis.
         end_ns: of the newest observation, on the axis.
         ends_utc_ns: UTC then, by each clock that may be right.
+        shown_ns: UTC that the computer's clock showed then.
     """
 
     offsets_ns: dict[str, int]
     end_ns: int = 0
     ends_utc_ns: tuple[int, ...] = ()
+    shown_ns: int = 0
 
     def observed(self, stamp: Stamp) -> float:
         """Return the place, s, of an instant of a boot that has observations."""
@@ -49,12 +51,12 @@ class TimeAxis:
     def present(self, stamp: Stamp) -> float | None:
         """Return the place, s, of an instant that is not before the newest observation.
 
-        In a boot without observations the computer's clock tells it; None where that shows an earlier time than any
-        clock did at the newest observation, so that it is wrong.
+        In a boot without observations the computer's clock tells it; None where that shows an earlier time than the
+        clocks did at the newest observation, so that it is wrong.
         """
         if stamp.boot_id in self.offsets_ns:
             return self.observed(stamp)
-        passed_ns = _least_ns([stamp.utc_ns], self.ends_utc_ns)
+        passed_ns = _least_ns([stamp.utc_ns], self.ends_utc_ns, self.shown_ns)
         return None if passed_ns is None else (self.end_ns + passed_ns) / NS_PER_S
 
 
@@ -63,28 +65,31 @@ def time_axis(source: RowSource) -> TimeAxis:
     offsets_ns: dict[str, int] = {}
     end_ns = 0
     ends_utc_ns: tuple[int, ...] = ()
+    shown_last_ns = 0
     for boot in source.rows(_BOOTS):
         span_ns = boot["last_ns"] - boot["first_ns"]
         shown_ns = boot["first_utc_ns"], boot["last_utc_ns"] - span_ns
         begins_utc_ns = [utc_ns for utc_ns in shown_ns if utc_ns >= SET_SINCE_NS]
-        passed_ns = _least_ns(begins_utc_ns, ends_utc_ns) or 0
+        passed_ns = _least_ns(begins_utc_ns, ends_utc_ns, shown_last_ns) or 0
         begin_ns = end_ns + passed_ns
         offsets_ns[boot["kernel_boot_id"]] = offset_ns = begin_ns - boot["first_ns"]
         end_ns = boot["last_ns"] + offset_ns
         # The latest of before may be right where this boot's clock is behind.
         begins_utc_ns += [ns + passed_ns for ns in ends_utc_ns[-1:]]
         ends_utc_ns = tuple(sorted({ns + span_ns for ns in begins_utc_ns}))
+        shown_last_ns = boot["last_utc_ns"]
     first = first_observation(source)
     zero_ns = 0 if first is None else first["monotonic_ns"] + offsets_ns[first["kernel_boot_id"]]
-    return TimeAxis({boot: ns - zero_ns for boot, ns in offsets_ns.items()}, end_ns - zero_ns, ends_utc_ns)
+    offsets_ns = {boot: ns - zero_ns for boot, ns in offsets_ns.items()}
+    return TimeAxis(offsets_ns, end_ns - zero_ns, ends_utc_ns, shown_last_ns)
 
 
-def _least_ns(begins_utc_ns: Iterable[int], ends_utc_ns: Sequence[int]) -> int | None:
+def _least_ns(begins_utc_ns: Sequence[int], ends_utc_ns: Sequence[int], shown_ns: int) -> int | None:
     """Return the least time from an end to a begin that is not before it.
 
-    None where every begin is before all ends, and where the nearest two show an earlier time: a clock is behind there.
+    None where every begin is before all ends. A begin that is before the UTC that the clock showed last, and nearest to
+    an end after it, is that of a clock that is behind: no end that is earlier is right then, so None as well.
     """
     passed_ns = [begin - end for begin in begins_utc_ns for end in ends_utc_ns]
-    if not passed_ns or min(passed_ns, key=abs) < 0:
-        return None
-    return min(ns for ns in passed_ns if ns >= 0)
+    is_behind = all(begin < shown_ns for begin in begins_utc_ns) and min(passed_ns, key=abs, default=0) < 0
+    return None if is_behind else min((ns for ns in passed_ns if ns >= 0), default=None)

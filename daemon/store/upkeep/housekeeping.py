@@ -87,7 +87,7 @@ class Housekeeping:
 
     def __init__(self, store: Store, clock: Clock, keeping: Keeping) -> None:
         self._store, self._clock, self._keeping = store, clock, keeping
-        self._packing, self._retention = Packing(store), Retention(store)
+        self._packing, self._retention = Packing(store), Retention(store, clock)
         self._real = SystemClock()
         self._told = ""
         self._told_of_room: set[str] = set()

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS
 from daemon.store.rows import RowSource
 from daemon.store.store import Store
-from drivers.clock import NS_PER_S
+from drivers.clock import NS_PER_S, Clock
 
 Place = tuple[int, int]  # row of a boot, and ns of its monotonic clock: in this order everything was measured
 
@@ -92,10 +92,11 @@ class Retention:
 
     Args:
         store: open for writing.
+        clock: of the computer.
     """
 
-    def __init__(self, store: Store) -> None:
-        self._store = store
+    def __init__(self, store: Store, clock: Clock) -> None:
+        self._store, self._clock = store, clock
 
     def delete_oldest(self, older_than_ns: int | None = None) -> int | None:
         """Delete the oldest step of what may go.
@@ -153,8 +154,8 @@ class Retention:
         """Return chunks with the latest UTC of three: their own, and the ones by the monotonic clock from two others.
 
         These are the last and the first of the boot's captures. Each of the three may be wrong, and what seems too old
-        is deleted. A UTC after that of the newest capture of all is wrong, unless it is the nearest to that one: then
-        the newest capture's clock may be behind.
+        is deleted. A UTC after both the present one and that of the newest capture of all is wrong, unless it is the
+        nearest to them: then these two may be behind.
         """
         if not chunks:
             return []
@@ -163,7 +164,7 @@ class Retention:
             boot: [self._store.rows(sql, [boot])[0]["ahead_ns"] for sql in _CLOCKS]
             for boot in {newest_boot, *(row["last_boot_id"] for row in chunks)}
         }
-        newest_ns = at_ns + ahead_ns[newest_boot][0]
+        newest_ns = max(at_ns + ahead_ns[newest_boot][0], self._clock.now().utc_ns)
         timed = []
         for row in chunks:
             shown = [row["last_utc_ns"], *(row["last_monotonic_ns"] + ns for ns in ahead_ns[row["last_boot_id"]])]

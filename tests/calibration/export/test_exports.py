@@ -1,6 +1,7 @@
 """A model for other programs: what it says, and how well its grid stands for it."""
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,8 +14,8 @@ from calibration.effects.fitted import Choice
 from calibration.effects.library import library, parse_effects
 from calibration.errors import DataError
 from calibration.export import formats as folder
-from calibration.export.correction_grid import correction_grid, interpolated
-from calibration.export.formats import export_files, formats
+from calibration.export.correction_grid import Machine, correction_grid, interpolated, trained_ranges
+from calibration.export.formats import chosen_formats, export_files, formats
 from calibration.export.formats.calibration_json import document
 from calibration.export.model_export import Export
 from calibration.kinematics.chain import Chain, Placement
@@ -94,9 +95,28 @@ def test_the_grid_is_of_the_machine_after_all_that_jumped_and_says_what_it_lacks
         Observations(np.full(n, "r"), joints, nothing, nothing, empty, empty, empty)
     )
     np.testing.assert_allclose(grid.corrected_mm["r"], true, rtol=0.0, atol=1e-6)
-    assert grid.left_out == ()
-    lacking = correction_grid(model_with(session, "backlash@theta4"), ("r",), 512, np.random.default_rng(0))
-    assert lacking.left_out == ("backlash@theta4 is left out: this data lacks the column theta4_dir",)
+    assert grid.lacking == ()
+    loose = model_with(session, "backlash@theta4")
+    assert correction_grid(loose, ("r",), 512, np.random.default_rng(0)).lacking == loose.effects
+
+
+def test_what_the_grid_lacks_counts_in_the_error_that_is_said_of_it(session: Session) -> None:
+    stiff, loose = session.model, model_with(session, "backlash@theta4")
+    (coefficient,) = loose.effects[0].coefficients
+    wide = replace(loose.effects[0], coefficients=(replace(coefficient, value=0.01),))
+    loose = replace(loose, effects=(wide,), values=np.append(stiff.values, 0.01))
+    without, found = (Export(model, "", ("r",)).left_out_of_grid for model in (stiff, loose))
+    (form,) = chosen_formats(["grid"])
+    assert form.left_out(Export(loose, "", ("r",))) == found
+    assert (*without.parts, "backlash@theta4") == found.parts
+    poses = np.random.default_rng(1).uniform(*trained_ranges(loose), (2_000, len(session.rig.joint_names)))
+    machine = Machine(loose, 0)
+    ends = [machine.corrected_mm("r", poses, {"theta4_dir": np.full(2_000, side)}) for side in (-1.0, 1.0)]
+    play_mm = np.sqrt((((ends[1] - ends[0]) / 2) ** 2).sum(axis=1).mean())
+    assert play_mm > 2.0 * without.rms_mm
+    assert found.rms_mm == pytest.approx(math.hypot(play_mm, without.rms_mm), rel=0.1)
+    (warning,) = (text for text in Export(loose, "", ("r",)).summary["warnings"] if "backlash" in text)
+    assert warning.startswith("corrections.csv has no backlash@theta4, which joint values alone do not tell")
 
 
 def test_nodes_span_what_the_model_was_trained_on_and_joints_that_matter_get_more(session: Session) -> None:

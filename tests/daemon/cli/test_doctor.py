@@ -81,9 +81,17 @@ def test_the_port_of_an_slcan_adapter_is_looked_at_as_that_of_a_station(tmp_path
     _, findings = examine("--config", str(config))
     assert findings["boom"]["state"] == "fault"
     assert f"{port} does not exist" in findings["boom"]["text"]
+    assert findings["boom"]["remedy"] == "plug it in, or correct [[can]] channel"
     port.touch()
     _, findings = examine("--config", str(config))
+    assert f"{port} is no serial port" in findings["boom"]["text"]
+    port.unlink()
+    controller, device = os.openpty()
+    port.symlink_to(os.ttyname(device))
+    _, findings = examine("--config", str(config))
     assert findings["boom"]["state"] == "good"
+    os.close(controller)
+    os.close(device)
 
 
 def test_backups_go_where_the_daemon_may_write(tmp_path: Path) -> None:

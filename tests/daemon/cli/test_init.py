@@ -64,6 +64,18 @@ def test_a_port_is_no_channel_of_socketcan(tmp_path: Path) -> None:
     assert not any(tmp_path.iterdir())
 
 
+def test_an_slcan_adapter_is_at_a_serial_port(tmp_path: Path) -> None:
+    made = init("--out", str(tmp_path), "--rig", "swdt82", "--station", "none", "--interface", "slcan")
+    assert made.exit_code == 0, made.output
+    assert read_config(tmp_path / "rigcal.toml").can[0].channel == "/dev/ttyACM0"
+    refused = init(
+        *("--out", str(tmp_path / "b"), "--rig", "swdt82", "--station", "none"),
+        *("--interface", "slcan", "--channel", "can0"),
+    )
+    assert refused.exit_code == 2
+    assert "needs the interface socketcan" in refused.stderr
+
+
 @pytest.mark.parametrize("joint", ["theta1", "theta1:round:0:1", "theta1:revolute:a:b", "t:revolute:0:1:2:3"])
 def test_a_joint_that_cannot_be_read_is_refused_with_an_example(tmp_path: Path, joint: str) -> None:
     refused = init("--out", str(tmp_path), "--joint", joint)

@@ -140,6 +140,23 @@ def test_a_boot_whose_clock_is_behind_is_not_timed_by_a_clock_that_was_wrong_bef
     assert found[fourth][0] - found[third][-1] == pytest.approx(24 * HOUR_S, abs=HOUR_S / 5)
 
 
+@pytest.mark.parametrize(("ahead_s", "pause_s"), [(24 * HOUR_S, 16 * HOUR_S), (2 * HOUR_S, 1.2 * HOUR_S)])
+def test_a_boot_after_one_whose_clock_was_ahead_until_it_was_set_lies_as_much_later_as_its_clock_says(
+    rig: Rig, ahead_s: float, pause_s: float
+) -> None:
+    step(rig, ahead_s, "boot-1")
+    rig.say("setup_new", id="S1")
+    first = controlled(rig)
+    step(rig, -ahead_s)
+    second = controlled(rig)
+    step(rig, pause_s, "boot-2")
+    before = present(rig)
+    third = controlled(rig)
+    found = times(rig, first, second, third)
+    assert before == pytest.approx(found[second][-1] + pause_s, abs=60.0)
+    assert found[third][0] - found[second][-1] == pytest.approx(pause_s, abs=60.0)
+
+
 def test_boots_after_one_whose_clock_was_years_ahead_lie_as_far_apart_as_theirs_says(rig: Rig, first: str) -> None:
     step(rig, 2 * YEARS_S, "boot-2")
     second = controlled(rig)

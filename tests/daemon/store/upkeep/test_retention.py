@@ -69,8 +69,14 @@ def minutes_left(path: Path, boot: str = "boot-a") -> list[int]:
     return sorted({round((c.stamp.monotonic_ns - at(0.0).monotonic_ns) / NS_PER_S) // 60 for c in captures})
 
 
-def delete_all(store: Store, older_than_ns: int | None = None) -> int:
-    retention = Retention(store)
+def retention_of(store: Store, now_ns: int = NOW_NS) -> Retention:
+    clock = ManualClock()
+    clock.set(Stamp(now_ns, 0, "boot-a"))
+    return Retention(store, clock)
+
+
+def delete_all(store: Store, older_than_ns: int | None = None, now_ns: int = NOW_NS) -> int:
+    retention = retention_of(store, now_ns)
     return sum(1 for _ in iter(lambda: retention.delete_oldest(older_than_ns), None))
 
 
@@ -134,7 +140,7 @@ def test_captures_of_a_boot_are_as_old_as_the_monotonic_clock_says_whatever_the_
     fill(store, 240, utc_ns=NOW_NS + round(wrong_by_days * DAY_S * NS_PER_S))
     fill(store, 60, begin_s=240 * MINUTE_S)  # the clock was set
     now_ns = NOW_NS + 5 * 3600 * NS_PER_S
-    assert Retention(store).oldest_ns() == pytest.approx(NOW_NS, abs=60 * NS_PER_S)
+    assert retention_of(store).oldest_ns() == pytest.approx(NOW_NS, abs=60 * NS_PER_S)
     assert delete_all(store, now_ns - round(30 * DAY_S * NS_PER_S)) == 0
     assert minutes_left(path) == [*range(300)]
     assert delete_all(store, now_ns - 3 * 3600 * NS_PER_S) > 0
@@ -149,7 +155,7 @@ def test_a_clock_that_is_set_wrong_at_the_end_of_a_boot_makes_its_captures_neith
     fill(store, 2, begin_s=240 * MINUTE_S, utc_ns=NOW_NS + round(wrong_by_days * DAY_S * NS_PER_S))
     fill(store, 120, begin_s=300 * MINUTE_S, boot="boot-b")
     now_ns = NOW_NS + 8 * 3600 * NS_PER_S
-    assert Retention(store).oldest_ns() == pytest.approx(NOW_NS, abs=60 * NS_PER_S)
+    assert retention_of(store).oldest_ns() == pytest.approx(NOW_NS, abs=60 * NS_PER_S)
     assert delete_all(store, now_ns - round(30 * DAY_S * NS_PER_S)) == 0
     assert minutes_left(path) == [*range(242)]
     assert delete_all(store, now_ns - 5 * 3600 * NS_PER_S) > 0
@@ -178,6 +184,17 @@ def test_a_newest_clock_that_is_behind_makes_no_capture_as_old_as_a_wrong_clock_
     newest_ns = NOW_NS + round((60 * MINUTE_S - behind_s) * NS_PER_S)
     assert delete_all(store, newest_ns - round(30 * DAY_S * NS_PER_S)) == 0
     assert minutes_left(path) == [*range(60)]
+
+
+def test_a_clock_that_was_set_after_the_newest_capture_tells_how_old_captures_are(path: Path, store: Store) -> None:
+    """A computer without a battery for its clock: each boot begins at the same wrong date."""
+    wrong_ns = NOW_NS - round(200 * DAY_S * NS_PER_S)
+    fill(store, 30, utc_ns=wrong_ns)
+    fill(store, 90, begin_s=30 * MINUTE_S)  # the clock was set
+    fill(store, 10, boot="boot-b", utc_ns=wrong_ns)
+    now_ns = NOW_NS + round(3 * DAY_S * NS_PER_S)
+    assert delete_all(store, now_ns - round(30 * DAY_S * NS_PER_S), now_ns) == 0
+    assert minutes_left(path) == [*range(120)]
 
 
 @pytest.mark.parametrize("wrong_by_days", [-150, 150])

@@ -303,7 +303,18 @@ def test_a_column_of_prism_constants_is_in_mm_or_in_the_unit_of_its_name(name: s
     first, second = fixes(f"{name};point;x [m];y [m];z [m]\n{cell};1;1;2;3\n;2;1;2;3\n", "plain_csv")
     assert first.prism_constant_mm == pytest.approx(-34.4)
     assert second.prism_constant_mm is None
-    assert "column prism constant: 'none' is not" in refused("prism constant;x;y;z\nnone;1;2;3\n")
+
+
+@pytest.mark.parametrize("cell", ["-", "n/a", "-34.4mm"])
+def test_a_prism_constant_that_is_no_number_is_not_known(cell: str) -> None:
+    (fix,) = fixes(f"prism constant;point;x [m];y [m];z [m]\n{cell};1;1;2;3\n", "plain_csv")
+    assert fix.prism_constant_mm is None
+
+
+def test_a_column_of_stations_with_empty_cells_is_refused() -> None:
+    said = refused("station;point;x;y;z\nS1;1;1;2;3\n;2;1;2;3\nS2;3;1;2;3\n;4;1;2;3\n")
+    assert "line 3, column station: names no station, as other rows do; fill it in" in said
+    assert len(fixes("station;point;x;y;z\n;1;1;2;3\n;2;1;2;3\n", "plain_csv")) == 2
 
 
 def test_a_table_without_a_header() -> None:
