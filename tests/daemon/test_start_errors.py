@@ -25,7 +25,7 @@ CONFIG = """rig = "swdt82"
 state_directory = "{state}"
 
 [[can]]
-channel = "no-such-interface"
+channel = "no-such-can"
 """
 
 
