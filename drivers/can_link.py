@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
+from drivers.can.bus_options import slcan_port
 from drivers.can.frame import Frame
 from drivers.can.ports import OVERFLOW, Batch, CanLinkConfig, CanPort, open_port
 from drivers.can.stamps import ReceiveStamps
@@ -186,7 +187,7 @@ def _watch(config: CanLinkConfig) -> DeviceWatch:
     if config.interface == "socketcan":
         return watch_interface(config.channel)
     if config.interface == "slcan":
-        return watch_path(config.channel.partition("@")[0])  # python-can's slcan takes PORT@BAUD
+        return watch_path(slcan_port(config.channel))
     return no_watch()
 
 

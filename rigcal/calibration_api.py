@@ -45,7 +45,7 @@ class Model:
         self.data = data
 
     def __repr__(self) -> str:
-        named = ", ".join(f"{effect.family}@{effect.where}" for effect in self.effects) or "no effects"
+        named = ", ".join(map(str, self.effects)) or "no effects"
         learned = " and a learned residual" if self.data.residual is not None else ""
         return f"<rigcal.Model of rig {self.rig.name}: {named}{learned}, noise {self.noise_mm:.3g} mm RMS>"
 

@@ -77,7 +77,7 @@ class Knowledge:
 
     def without(self, names: Collection[str]) -> Knowledge:
         """Return this knowledge without the effects called `names`, each `family@where`."""
-        kept_effects = tuple(e for e in self.effects if f"{e.family}@{e.where}" not in names)
+        kept_effects = tuple(e for e in self.effects if str(e) not in names)
         if kept_effects == self.effects:
             return self
         kept = np.ones(len(self.root), dtype=bool)

@@ -38,6 +38,9 @@ class FittedEffect:
     settings: Settings = field(default_factory=dict)
     regime: Regime | None = None
 
+    def __str__(self) -> str:
+        return f"{self.family}@{self.where}"
+
     def as_dict(self) -> dict[str, object]:
         """Return the JSON object (docs/reference/formats.md, gap), with the form and the numbers of the variant."""
         return {

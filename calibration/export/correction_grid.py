@@ -206,7 +206,7 @@ class Machine:
 
     @property
     def effects(self) -> tuple[FittedEffect, ...]:
-        """Those of the model's effects that move the machine."""
+        """Effects of the model that move the machine."""
         return tuple(effect for effect in self.model.effects if library()[effect.family].moves_machine)
 
     def lacking(self, rows: Observations) -> tuple[FittedEffect, ...]:

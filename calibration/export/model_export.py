@@ -160,7 +160,7 @@ class Export:
         model = self.model
         whole = Machine(model, self.setup)
         lost = [effect for effect in whole.effects if not keeps(effect)]
-        parts = [_name(effect) for effect in lost]
+        parts = [str(effect) for effect in lost]
         parts += [f"the learned residual ({model.residual.learner.kind})"] if model.residual is not None else []
         told = self.not_measured(lost)
         if not parts:
@@ -184,7 +184,7 @@ class Export:
             correction_mm = machine.corrected_mm(prism, poses, extra) - machine.nominal_mm(prism, poses)
             correction.append(correction_mm)
             off.append(interpolated(grid.nodes, grid.corrected_mm[prism] - nominal_mm, poses) - correction_mm)
-        parts = [f"what lies between the nodes of {len(grid.readings)} poses", *map(_name, grid.lacking)]
+        parts = [f"what lies between the nodes of {len(grid.readings)} poses", *map(str, grid.lacking)]
         return LeftOut.of(parts, self.not_measured(grid.lacking), np.concatenate(off), np.concatenate(correction))
 
     def trial_poses(self) -> tuple[Floats, dict[str, Floats]]:
@@ -205,12 +205,12 @@ class Export:
         """
         of_machine = Machine(self.model, self.setup).effects
         told = [
-            f"{_name(effect)} moves fixes or the base and is no part of any export."
+            f"{effect} moves fixes or the base and is no part of any export."
             for effect in self.model.effects
             if effect not in of_machine
         ]
         lacking = [effect for effect in lost if (need := _needs(effect)) and not need.endswith("_dir")]
-        told += [f"What {_name(effect)} does is not measured here: it needs {_needs(effect)}." for effect in lacking]
+        told += [f"What {effect} does is not measured here: it needs {_needs(effect)}." for effect in lacking]
         return tuple(told)
 
 
@@ -271,10 +271,6 @@ def shortest(value: float) -> str:
     return repr(float(value) + 0.0).removesuffix(".0")
 
 
-def _name(effect: FittedEffect) -> str:
-    return f"{effect.family}@{effect.where}"
-
-
 def _needs(effect: FittedEffect) -> str:
     """Return the column that an effect needs; empty for none."""
     column = library()[effect.family].column
@@ -283,7 +279,7 @@ def _needs(effect: FittedEffect) -> str:
 
 def _warnings(grid: CorrectionGrid) -> Iterator[str]:
     for effect in grid.lacking:
-        yield f"{GRID_FILE} has no {_name(effect)}, which joint values alone do not tell; `rigcal predict` has it"
+        yield f"{GRID_FILE} has no {effect}, which joint values alone do not tell; `rigcal predict` has it"
     if grid.is_coarse:
         yield (
             f"between the nodes of {GRID_FILE}, interpolated corrections are wrong by {grid.rms_mm:.2g} mm RMS, more "

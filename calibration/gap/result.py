@@ -249,7 +249,7 @@ class GapResult:
 
     def _effect(self, effect: FittedEffect) -> dict[str, object]:
         """Return the JSON object of one effect, with its evidence."""
-        name = f"{effect.family}@{effect.where}"
+        name = str(effect)
         return {**effect.as_dict(), "posterior": self.posterior[name], **self.evidence[name].as_dict()}
 
     def as_dict(self) -> dict[str, object]:

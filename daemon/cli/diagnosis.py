@@ -15,6 +15,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from drivers.can.bus_options import slcan_port
+
 if TYPE_CHECKING:
     from daemon.config.config import Config
     from daemon.config.sections import CanSection
@@ -172,10 +174,9 @@ def devices(config: Config) -> Iterator[Finding]:
         if section.interface == "socketcan":
             yield can_interface(section, _link_details(section.channel), NETWORK_DEVICES / section.channel)
         elif section.interface == "slcan":
-            # python-can's slcan takes PORT@BAUD
-            port, key = section.channel.partition("@")[0], "[[can]] channel"
+            port, key = Path(slcan_port(section.channel)), "[[can]] channel"
             yield _serial_port(
-                section.name, Path(port), key, f"plug it in, or correct {key}", "its name in /dev/serial/by-id"
+                section.name, port, key, f"plug it in, or correct {key}", "its name in /dev/serial/by-id"
             )
     for station in config.station:
         plug_in = f"plug it in; put its serial number into {_RULES_FILE}, then {_RELOAD_RULES}"

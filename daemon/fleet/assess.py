@@ -178,7 +178,7 @@ def _drift(
             is_newest = observations.session == name
             if not name or is_newest.all():
                 return None
-            effects = ",".join(f"{effect.family}@{effect.where}" for effect in model.effects) or "none"
+            effects = ",".join(map(str, model.effects)) or "none"
             earlier = observations.select(~is_newest)
             prior: Any = task.settings.prior
             model = identify(rig, task.rig_text, earlier, prior=prior, effects=effects, run=run.quiet())

@@ -48,6 +48,11 @@ def check_channel(interface: str, channel: str) -> None:
         )
 
 
+def slcan_port(channel: str) -> str:
+    """Return the path of the serial port in an slcan adapter's channel, which python-can takes as PORT@BAUD, too."""
+    return channel.partition("@")[0]
+
+
 def check_options(options: Mapping[str, object], keys: frozenset[str]) -> None:
     """Refuse options that repeat another setting, and values that no option has.
 

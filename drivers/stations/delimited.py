@@ -6,7 +6,6 @@ import csv
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
 from datetime import UTC, datetime
 
 from drivers.stations.export_format import (
@@ -353,8 +352,10 @@ def read_table(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
         constant_mm = None if constant is None else constant * _named_mm(places["prism_constant"], header)
         point = text_at("point") or str(len(fixes) + 1)
         time_s = _time_s(" ".join(filter(None, (text_at("date"), text_at("time")))), columns, number, source)
-        fix = ExportedFix(number, point, text_at("prism"), place, time_s, text_at("station"))
-        fixes.append(replace(fix, prism_constant_mm=constant_mm))
+        station = text_at("station")
+        fixes.append(
+            ExportedFix(number, point, text_at("prism"), place, time_s, station, prism_constant_mm=constant_mm)
+        )
     if not fixes:
         refuse(source, "no points below the header")
     if "station" in places:

@@ -94,10 +94,6 @@ class Guess:
     notes: tuple[str, ...]
 
 
-def _nothing(text: str, source: str) -> tuple[str, ...]:  # noqa: ARG001 - of formats that take every record
-    return ()
-
-
 @dataclass(frozen=True, kw_only=True)
 class ExportFormat:
     """A format of files.
@@ -118,7 +114,7 @@ class ExportFormat:
     recognises: Callable[[str], bool]
     guess: Callable[[str, str], Guess]
     read: Callable[[str, ColumnMap, str], list[ExportedFix]]
-    passed_over: Callable[[str, str], tuple[str, ...]] = _nothing
+    passed_over: Callable[[str, str], tuple[str, ...]] = lambda _text, _source: ()
 
 
 def polar_position_mm(hz_rad: float, zenith_rad: float, distance_mm: float) -> tuple[float, float, float]:

@@ -187,7 +187,7 @@ def _found(gap: GapResult) -> str:
         return ""
     rows = []
     for effect in gap.effects:
-        posterior = probability(gap.posterior[f"{effect.family}@{effect.where}"])
+        posterior = probability(gap.posterior[str(effect)])
         name = effect.family.replace("_", " ")
         head = [f"{name} ({effect.form})" if effect.form else name, effect.where]
         bounds = coefficient_bounds(gap, effect)

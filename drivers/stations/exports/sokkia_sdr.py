@@ -103,7 +103,7 @@ def _passed_over(text: str, source: str) -> tuple[str, ...]:
 
 @dataclass
 class _Reading:
-    """What a file has said up to a record.
+    """Reads a file record by record, and keeps what it has said up to the present one.
 
     Attributes:
         columns: the map; its units count.
