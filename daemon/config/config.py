@@ -23,6 +23,7 @@ from daemon.config.sections import (
     TipSection,
     WebSection,
 )
+from drivers.can.bus_options import slcan_port
 from drivers.files import read_text
 from drivers.stations.config import StationConfig
 
@@ -91,7 +92,7 @@ class Config(Section):
     @model_validator(mode="after")
     def _ports_differ(self) -> Config:
         ports = [link.channel for link in self.can if link.interface == "socketcan"]
-        paths = [link.channel for link in self.can if link.interface == "slcan"]
+        paths = [slcan_port(link.channel) for link in self.can if link.interface == "slcan"]
         ports += map(os.path.realpath, (*paths, *(station.serial.path for station in self.station)))
         if port := next((port for port in ports if ports.count(port) > 1), None):
             raise ValueError(f"two links are at {port!r}; a port belongs to one link")

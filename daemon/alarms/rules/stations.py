@@ -7,24 +7,24 @@ from collections.abc import Iterator
 from daemon.acquisition.status.present import SILENT, is_present
 from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
-from drivers.readings import EventKind, LockState
+from drivers.readings import EventKind, GapReason, LockState
 
 _TURNED_AWAY = (LockState.STANDBY, LockState.SEARCHING, LockState.WAITING, LockState.ROTATING)
 
 
 @rule(
-    "critical",
-    "Check that the station is on, its cable, and its settings (baud rate, parity, line end).",
-    after_s=1.0,
-    hold_s=3.0,
+    "critical", "Check that the station is on, its cable, and its settings (baud rate, parity, line end).", hold_s=3.0
 )
 def station_silent(evidence: Evidence) -> Iterator[Finding]:
-    """A station gives no records for 1 s longer than its time-out; a warning while no session is open.
+    """A station gives no records for longer than its time-out, and nothing that it has sent waits to be decoded.
 
-    Cleared 3 s after it is heard again. While its link is closed that alarm stands for this one.
+    A warning while no session is open. Cleared 3 s after it is heard again. While its link is closed that alarm stands
+    for this one.
     """
+    # A gap opens once all that was captured is decoded: a status is silent also while fixes wait for a busy computer.
+    gaps = {gap.channel for gap in evidence.acquisition.gaps if gap.reason == GapReason.SILENT}
     for station in evidence.acquisition.stations:
-        if evidence.is_storing and station.status == SILENT:
+        if evidence.is_storing and station.status == SILENT and station.name in gaps:
             yield station.name, "the station gives no records", "warning" if evidence.session is None else "critical"
 
 

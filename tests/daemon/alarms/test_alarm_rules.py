@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from daemon.acquisition.status.snapshot import (
     ChannelStatus,
     EventStatus,
     FrameStatus,
+    GapStatus,
     LinkStatus,
     StationStatus,
 )
@@ -22,6 +24,7 @@ from daemon.alarms.alarm import Alarm
 from daemon.alarms.evidence import Evidence
 from daemon.alarms.library import library
 from daemon.models.live_model import LiveModelHealth
+from daemon.service import BEAT_S
 from daemon.sessions.prisms.guard import Suspicion
 from daemon.store.health import HealthState, StoreHealth
 from daemon.store.queries.jobs import FailedJob
@@ -30,6 +33,8 @@ from daemon.store.queries.setups import SetupRow
 from daemon.store.upkeep.housekeeping import KeepingState
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import EventKind, Status
+from drivers.stations.config import StationConfig
+from drivers.stations.serial_port import SerialConfig
 
 NOW = Stamp(1_790_000_000 * NS_PER_S, 5000 * NS_PER_S, "boot")
 SESSION = OpenSessionRow("s001-r", NOW.shifted(-100 * NS_PER_S))
@@ -66,6 +71,7 @@ def known(
     frames_s: Sequence[float] = (0.1,),
     error: str | None = None,
     is_behind: bool = False,
+    gaps: Sequence[GapStatus] = (),
     **more: Any,
 ) -> Evidence:
     acquisition = AcquisitionStatus(
@@ -75,6 +81,7 @@ def known(
         last_events=[*events],
         decoding=[*decoding],
         frames=[FrameStatus("boom", f"{i:03X}", "", 5, None, age_s, None) for i, age_s in enumerate(frames_s)],
+        gaps=[*gaps],
         error=error,
         is_behind=is_behind,
     )
@@ -95,6 +102,7 @@ def failures(lately: int, share: float) -> DecodeStatus:
     return DecodeStatus("theta1", 500, "the frame has 3 bytes, the value needs 4", 400, lately, share)
 
 
+STATION_GAP = GapStatus("station", "silent", 0, 40.0)
 SILENT = channel("silent", age_s=40)
 QUIET = channel("silent", "boom_valve", "signal", age_s=40)
 E = EventKind
@@ -227,7 +235,13 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
     "signal_not_usable": [
         (known(channels=[channel("not_available", "boom_valve", "signal")]), ["boom_valve"], known()),
     ],
-    "station_silent": [(known(stations=[station("silent", "unknown")]), ["station"], known())],
+    "station_silent": [
+        (
+            known(stations=[station("silent", "unknown")], gaps=[STATION_GAP]),
+            ["station"],
+            known(stations=[station("silent", "unknown")]),  # its fixes wait to be decoded
+        )
+    ],
     "station_not_locked": [
         (
             known(stations=[station("not_available", "searching")], session=SESSION),
@@ -369,7 +383,8 @@ def test_nothing_known_raises_nothing() -> None:
 
 
 def test_a_full_disk_does_not_send_anyone_to_the_cables_of_devices_that_are_not_decoded_meanwhile() -> None:
-    quiet = {"channels": [SILENT, QUIET], "frames_s": [40.0], "stations": [station("silent", "unknown")]}
+    quiet: dict[str, Any] = {"channels": [SILENT, QUIET], "frames_s": [40.0], "gaps": [STATION_GAP]}
+    quiet["stations"] = [station("silent", "unknown")]
     alone = known(channels=[SILENT, channel(name="theta3"), QUIET], error="disk full")
     assert {a.kind for rule in library() for a in rule(known(**quiet))} == {"link_silent", "station_silent"}
     assert [a.kind for rule in library() for a in rule(known(**quiet, error="disk full"))] == ["not_storing"]
@@ -378,8 +393,15 @@ def test_a_full_disk_does_not_send_anyone_to_the_cables_of_devices_that_are_not_
 
 def test_a_silent_station_is_one_alarm_although_it_did_not_answer_a_command() -> None:
     unanswered = event(E.INSTRUMENT_ERROR, "station")
-    silent = known(unanswered, stations=[station("silent", "unknown", good_age_s=30)])
+    silent = known(unanswered, stations=[station("silent", "unknown", good_age_s=30)], gaps=[STATION_GAP])
     assert [a.kind for rule in library() for a in rule(silent)] == ["station_silent"]
+
+
+def test_a_silent_station_is_an_alarm_within_5_s_wherever_it_falls_silent_between_two_looks() -> None:
+    (rule,) = (rule for rule in library() if rule.kind == "station_silent")
+    looks = 1 + math.ceil(rule.after_s / BEAT_S)  # the first that finds it, and those until it has stood so long
+    station = StationConfig(serial=SerialConfig(path="/dev/ttyUSB0"))
+    assert station.silence_timeout_s + looks * BEAT_S <= 5.0
 
 
 def test_an_unplugged_bus_is_one_alarm_and_so_is_a_bus_that_is_cut_beyond_the_adapter() -> None:
@@ -392,10 +414,11 @@ def test_an_unplugged_bus_is_one_alarm_and_so_is_a_bus_that_is_cut_beyond_the_ad
 
 
 def test_a_station_that_is_away_between_sessions_is_a_warning_and_in_one_critical() -> None:
-    for wrong in (
-        {"stations": [station("silent", "unknown")]},
+    cases: tuple[dict[str, Any], ...] = (
+        {"stations": [station("silent", "unknown")], "gaps": [STATION_GAP]},
         {"links": [link(), link(False, "station")], "stations": [station("link_down", "unknown")]},
-    ):
+    )
+    for wrong in cases:
         idle, busy = known(**wrong), known(**wrong, session=SESSION)
         assert [alarm.severity for rule in library() for alarm in rule(idle)] == ["warning"]
         assert [alarm.severity for rule in library() for alarm in rule(busy)] == ["critical"]

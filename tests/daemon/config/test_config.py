@@ -276,3 +276,15 @@ serial.path = "{tmp_path}/by-id"
 '''
     with pytest.raises(ConfigError, match=r"two links are at '.*ttyUSB0'"):
         parse_config(text, Path("rigcal.toml"))
+
+
+def test_a_port_with_a_rate_behind_it_is_the_same_port(tmp_path: Path) -> None:
+    text = f'''rig = "swdt82"
+[[can]]
+interface = "slcan"
+channel = "{tmp_path}/ttyUSB0@115200"
+[[station]]
+serial.path = "{tmp_path}/ttyUSB0"
+'''
+    with pytest.raises(ConfigError, match=r"two links are at '.*ttyUSB0'"):
+        parse_config(text, Path("rigcal.toml"))
