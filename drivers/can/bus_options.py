@@ -12,6 +12,7 @@ from types import MappingProxyType
 
 _LONGEST_NAME_TOLD = 100
 _INTERFACE_NAME = re.compile(r"(?!\.{1,2}\Z)[^/:\s]{1,15}")  # Linux, net/core/dev.c, dev_valid_name
+_SERIAL_PORT = re.compile(r"[^@]*[^@/](@[1-9][0-9]*)?")
 
 _NO_OTHER_FILE = "no configuration of python-can is read beside this one"
 # What `open_port` gives python-can's bus itself, under names that are no keys of a link.
@@ -45,6 +46,11 @@ def check_channel(interface: str, channel: str) -> None:
         raise ValueError(
             f"{channel[:_LONGEST_NAME_TOLD]!r} is no serial port, as /dev/ttyACM0 is one; an interface of the network, "
             "as can0, needs the interface socketcan"
+        )
+    if interface == "slcan" and not _SERIAL_PORT.fullmatch(channel):
+        raise ValueError(
+            f"{channel[:_LONGEST_NAME_TOLD]!r} is no serial port: after the name of one comes nothing, or its rate, "
+            "as in /dev/ttyUSB0@115200"
         )
 
 

@@ -21,10 +21,12 @@ def station_silent(evidence: Evidence) -> Iterator[Finding]:
     A warning while no session is open. Cleared 3 s after it is heard again. While its link is closed that alarm stands
     for this one.
     """
-    # A gap opens once all that was captured is decoded: a status is silent also while fixes wait for a busy computer.
+    # A status is silent also while fixes wait for a busy computer; a gap opens once all that was captured is decoded.
+    speaks = {link.name for link in evidence.acquisition.links if link.captures_per_s > 0.0}
     gaps = {gap.channel for gap in evidence.acquisition.gaps if gap.reason == GapReason.SILENT}
     for station in evidence.acquisition.stations:
-        if evidence.is_storing and station.status == SILENT and station.name in gaps:
+        is_silent = station.status == SILENT and (station.name in gaps or station.name not in speaks)
+        if evidence.is_storing and is_silent:
             yield station.name, "the station gives no records", "warning" if evidence.session is None else "critical"
 
 

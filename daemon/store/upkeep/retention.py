@@ -41,6 +41,10 @@ _NEWEST = """SELECT last_boot_id, last_monotonic_ns FROM raw_chunks
 _CLOCK = """SELECT last_utc_ns - last_monotonic_ns AS ahead_ns FROM raw_chunks WHERE last_boot_id = ?
     ORDER BY last_monotonic_ns {} LIMIT 1"""
 _CLOCKS = (_CLOCK.format("DESC"), _CLOCK.format("ASC"))  # as a boot's captures show it last, and first
+_LATEST = """SELECT max(utc_ns) AS utc_ns FROM (
+    SELECT started_utc_ns AS utc_ns FROM calibration_sessions WHERE (started_boot_id, started_monotonic_ns) < (?1, ?2)
+    UNION ALL SELECT ended_utc_ns FROM calibration_sessions WHERE (ended_boot_id, ended_monotonic_ns) < (?1, ?2)
+    ) WHERE utc_ns <= ?3"""
 _ROWS = """DELETE FROM {0} WHERE id IN (SELECT id FROM {0}
     WHERE (boot_id, monotonic_ns) >= (?1, ?2) AND (boot_id, monotonic_ns) <= (?3, ?4) LIMIT ?5)"""
 _FIXES = """DELETE FROM fixes WHERE id IN (SELECT id FROM fixes
@@ -119,10 +123,10 @@ class Retention:
             if begin >= limit:
                 return None
             span = [*begin, *min(end, limit)]
-            found = self._timed(self._store.rows(_CHUNKS, [*span, LOOKED_AT, _ANY_NS]))
+            found = self._timed(self._store.rows(_CHUNKS, [*span, LOOKED_AT, _ANY_NS]), begin)
             if older_than_ns is not None and all(row["last_utc_ns"] < TRUE_SINCE_NS for row in found):
                 # the next one whose clock was set tells how old they are
-                found += self._timed(self._store.rows(_CHUNKS, [*span, 1, TRUE_SINCE_NS]))
+                found += self._timed(self._store.rows(_CHUNKS, [*span, 1, TRUE_SINCE_NS]), begin)
             old = (found if older_than_ns is None else self._older(found, older_than_ns))[:STEP_CHUNKS]
             if old:
                 last = old[-1]
@@ -136,7 +140,7 @@ class Retention:
         """UTC in ns of the oldest capture that may go, by a clock that was set; None where there is none."""
         for begin, end in free_stretches(self._store):
             for shown_ns in (_ANY_NS, TRUE_SINCE_NS):
-                for row in self._timed(self._store.rows(_CHUNKS, [*begin, *end, 1, shown_ns])):
+                for row in self._timed(self._store.rows(_CHUNKS, [*begin, *end, 1, shown_ns]), begin):
                     if row["last_utc_ns"] >= TRUE_SINCE_NS:
                         return int(row["last_utc_ns"])
         return None
@@ -150,12 +154,16 @@ class Retention:
         with self._store.transaction() as db:
             db.execute(f"PRAGMA user_version = {day:d}")
 
-    def _timed(self, chunks: list[dict[str, int]]) -> list[dict[str, int]]:
-        """Return chunks with the latest UTC of three: their own, and the ones by the monotonic clock from two others.
+    def _timed(self, chunks: list[dict[str, int]], begin: Place) -> list[dict[str, int]]:
+        """Return chunks with the latest UTC that tells when they were captured; a wrong one would delete young ones.
 
-        These are the last and the first of the boot's captures. Each of the three may be wrong, and what seems too old
-        is deleted. A UTC after both the present one and that of the newest capture of all is wrong, unless it is the
-        nearest to them: then these two may be behind.
+        Their own, those by the monotonic clock from the first and the last capture of their boot, and the latest of the
+        sessions before them tell it. A UTC after both the present one and that of the newest capture of all is wrong,
+        unless it is the nearest to them: then these two may be behind.
+
+        Args:
+            chunks: of one stretch between sessions.
+            begin: of the stretch.
         """
         if not chunks:
             return []
@@ -165,12 +173,13 @@ class Retention:
             for boot in {newest_boot, *(row["last_boot_id"] for row in chunks)}
         }
         newest_ns = max(at_ns + ahead_ns[newest_boot][0], self._clock.now().utc_ns)
+        session_ns = self._store.rows(_LATEST, [*begin, newest_ns])[0]["utc_ns"] or _ANY_NS
         timed = []
         for row in chunks:
             shown = [row["last_utc_ns"], *(row["last_monotonic_ns"] + ns for ns in ahead_ns[row["last_boot_id"]])]
             nearest_ns = min(shown, key=lambda utc_ns: abs(utc_ns - newest_ns))
             possible = [utc_ns for utc_ns in shown if utc_ns <= max(newest_ns, nearest_ns)]
-            timed.append({**row, "last_utc_ns": max(possible)})
+            timed.append({**row, "last_utc_ns": max(*possible, session_ns)})
         return timed
 
     @staticmethod

@@ -22,7 +22,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from drivers.stations.delimited import number_of, why_no_number
+from drivers.stations.delimited import lines_of, number_of, why_no_number
 from drivers.stations.export_format import (
     MM_PER,
     RAD_PER,
@@ -38,12 +38,13 @@ from drivers.stations.export_format import (
 _CODE, _WIDTH = 4, 16
 _MARKS = "\ufeff\r\n\x02 "  # before the first record
 _UNITS = re.compile(r"(?P<angle>[1-4])(?P<length>[1-3])[1-9]{4}\s*$")
-_PASSED_OVER = {"00", "01", "04", "05", "06", "11", "12", "13"}  # notes, corrections, computed results
+_PASSED_OVER = {"01", "04", "05", "06", "11", "12", "13"}  # notes, corrections, computed results
 _SETS_UP = {"02", "07", "10"}
 _MEASURED, _COORDINATES = "08TP", "08"
 _NOT_MEASURED = {"08KI": "coordinates typed in, not measured"}
 _LENGTHS: dict[str, LengthUnit] = {"1": "m", "2": "ft"}
 _SAME_FRAME_RAD = 1e-5  # between the circle and the coordinates' north: 0.1 mm at 10 m
+_SAME_ZERO_RAD = 1e-4  # between two back-sights: pointing differs by less, a circle that was set anew by more
 
 
 def _recognises(text: str) -> bool:
@@ -51,7 +52,7 @@ def _recognises(text: str) -> bool:
 
 
 def _guess(text: str, source: str) -> Guess:
-    head = text.lstrip(_MARKS).splitlines()[0]
+    head = lines_of(text.lstrip(_MARKS))[0]
     if not head.startswith("00NMSDR33"):
         refuse(source, f"{head[4:12].strip()} has columns of another width; export the job as SDR33", 1)
     found = _UNITS.search(head)
@@ -80,7 +81,7 @@ def _read(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
 
 def _records(text: str) -> Iterator[tuple[int, str]]:
     """Return the records of a file, each with its line from 1."""
-    for number, line in enumerate(text.lstrip("\ufeff").splitlines(), 1):
+    for number, line in enumerate(lines_of(text), 1):
         record = line.strip("\x02\x03\x04\x1a\r\n ")
         if record and not record.isdigit():
             yield number, record
@@ -116,6 +117,8 @@ class _Reading:
         turns_rad: station -> azimuth of the circle's zero, by its back-sight; None where that is no number.
         coordinates: station -> line of its first coordinates.
         turned: station -> line of its first polar measurement that is not known to be in the frame of coordinates.
+        zeros: station -> line of the first polar measurement after a back-sight, and azimuth of the circle's zero then.
+        units: as the header says them; "" before it.
         target_mm: height of the target.
         times_set_up: how often the instrument was set up.
         has_measured: since it was set up.
@@ -131,6 +134,8 @@ class _Reading:
     turns_rad: dict[str, float | None] = field(default_factory=dict)
     coordinates: dict[str, int] = field(default_factory=dict)
     turned: dict[str, int] = field(default_factory=dict)
+    zeros: dict[str, tuple[int, float]] = field(default_factory=dict)
+    units: str = ""
     target_mm: float = 0.0
     times_set_up: int = 0
     has_measured: bool = True
@@ -141,9 +146,11 @@ class _Reading:
         if self.has_measured and code[:2] in _SETS_UP:
             self.times_set_up, self.has_measured = self.times_set_up + 1, False
         match code[:2]:
+            case "00":
+                self._begin(line, record)
             case "10":
                 self.job = _name(cells, 0)
-                self.station, self.origin_mm = _station(self.job, ""), (0.0, 0.0, 0.0)
+                self.station, self.origin_mm, self.target_mm = _station(self.job, ""), (0.0, 0.0, 0.0), 0.0
                 self.turns_rad.clear()
             case "02":
                 self._stand(line, code, cells)
@@ -157,6 +164,13 @@ class _Reading:
                 self._take_polar(line, code, cells)
             case kind if kind not in _PASSED_OVER | {_COORDINATES}:
                 refuse(self.source, f"records {code!r} are not known", line)
+
+    def _begin(self, line: int, head: str) -> None:
+        found = _UNITS.search(head)
+        units = found["angle"] + found["length"] if found else ""
+        if self.units and units != self.units:
+            refuse(self.source, "a second header tells other units than the first; give each part as a file", line)
+        self.units = units
 
     def _stand(self, line: int, code: str, cells: list[str]) -> None:
         north, east, up, height = self._lengths_mm(cells, (1, 2, 3, 4), line, code)
@@ -188,6 +202,13 @@ class _Reading:
         turn_rad = self.turns_rad.get(at)
         if turn_rad is None or abs(math.remainder(turn_rad, math.tau)) > _SAME_FRAME_RAD:
             self.turned.setdefault(at, line)
+        if turn_rad is not None:
+            first, zero_rad = self.zeros.setdefault(at, (line, turn_rad))
+            if abs(math.remainder(turn_rad - zero_rad, math.tau)) > _SAME_ZERO_RAD:
+                turned = (
+                    f"the circle of the station {at!r} has another zero than in line {first}, as its back-sight says"
+                )
+                refuse(self.source, f"{turned}; put them into two files, and import each as a set-up of its own", line)
         self._add(line, at, _name(cells, 1), _name(cells, 5), place)
 
     def _add(self, line: int, station: str, point: str, target: str, place: tuple[float, float, float]) -> None:

@@ -102,6 +102,7 @@ def failures(lately: int, share: float) -> DecodeStatus:
     return DecodeStatus("theta1", 500, "the frame has 3 bytes, the value needs 4", 400, lately, share)
 
 
+SPEAKING = link(name="station", captures_per_s=5.0)
 STATION_GAP = GapStatus("station", "silent", 0, 40.0)
 SILENT = channel("silent", age_s=40)
 QUIET = channel("silent", "boom_valve", "signal", age_s=40)
@@ -239,8 +240,13 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
         (
             known(stations=[station("silent", "unknown")], gaps=[STATION_GAP]),
             ["station"],
-            known(stations=[station("silent", "unknown")]),  # its fixes wait to be decoded
-        )
+            known(stations=[station("silent", "unknown")], links=[link(), SPEAKING]),  # its fixes wait to be decoded
+        ),
+        (
+            known(stations=[station("silent", "unknown")], links=[link(), link(name="station")], is_behind=True),
+            ["station"],  # nothing of it waits, and what does is of others
+            known(),
+        ),
     ],
     "station_not_locked": [
         (

@@ -288,3 +288,10 @@ serial.path = "{tmp_path}/ttyUSB0"
 '''
     with pytest.raises(ConfigError, match=r"two links are at '.*ttyUSB0'"):
         parse_config(text, Path("rigcal.toml"))
+
+
+@pytest.mark.parametrize("channel", ["/dev/ttyUSB0@fast", "/dev/a@b@115200", "/dev/ttyUSB0@", "/dev/"])
+def test_a_serial_port_of_can_that_could_not_be_opened_is_refused(channel: str) -> None:
+    text = f'rig = "swdt82"\n[[can]]\ninterface = "slcan"\nchannel = "{channel}"\n'
+    with pytest.raises(ConfigError, match="is no serial port: after the name of one comes nothing, or its rate"):
+        parse_config(text, Path("rigcal.toml"))

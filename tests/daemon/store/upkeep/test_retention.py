@@ -197,6 +197,23 @@ def test_a_clock_that_was_set_after_the_newest_capture_tells_how_old_captures_ar
     assert minutes_left(path) == [*range(120)]
 
 
+@pytest.mark.parametrize("is_newest", [True, False])
+def test_captures_of_a_clock_that_is_behind_are_no_older_than_a_session_before_them(
+    path: Path, store: Store, is_newest: bool
+) -> None:
+    day_ns = round(DAY_S * NS_PER_S)
+    fill(store, 10)
+    begin, end = (replace(at(s), utc_ns=NOW_NS + round(s * NS_PER_S)) for s in (0.0, 10 * MINUTE_S))
+    session(store, "s1", begin, end)
+    fill(store, 100, boot="boot-b", utc_ns=NOW_NS - 200 * day_ns)  # and it was never set
+    if not is_newest:
+        fill(store, 100, boot="boot-c", utc_ns=NOW_NS + day_ns)
+    for later_days, is_kept in ((2, True), (40, False)):
+        now_ns = NOW_NS + later_days * day_ns
+        delete_all(store, now_ns - 30 * day_ns, now_ns)
+        assert (minutes_left(path, "boot-b") == [*range(100)]) is is_kept
+
+
 @pytest.mark.parametrize("wrong_by_days", [-150, 150])
 def test_captures_are_kept_while_the_newest_clock_is_wrong(path: Path, store: Store, wrong_by_days: int) -> None:
     wrong_ns = NOW_NS + round(wrong_by_days * DAY_S * NS_PER_S)

@@ -210,6 +210,35 @@ def test_sdr_coordinates_and_angles_from_another_zero_are_refused(back: str, pol
     assert "of the station 'JOB1/A' are in two frames, as no back-sight (07) says that the circle's zero is" in said
 
 
+def test_a_new_sdr_job_has_not_the_target_height_of_the_job_before() -> None:
+    place = sdr("08TP", "1", 9.0, 1.0, 2.0)
+    found = fixes(SDR_HEAD + "03NM1.60000000\n" + place + sdr("10NM", "JOB2") + place, "sokkia_sdr")
+    assert [fix.position_mm[2] for fix in found] == [3600.0, 2000.0]
+
+
+def test_an_sdr_circle_that_is_set_anew_in_a_set_up_is_refused() -> None:
+    stood = sdr("02TP", "A", 0.0, 0.0, 0.0, 0.0)
+    before = sdr("07TP", "A", "B", 45.0, 0.0) + sdr("09F1", "A", "1", 5.0, 90.0, 90.0)
+    said = refused(
+        SDR_HEAD + stood + before + sdr("07TP", "A", "B", 45.0, 45.0) + sdr("09F1", "A", "2", 5.0, 90.0, 90.0)
+    )
+    assert "line 7: the circle of the station 'JOB1/A' has another zero than in line 5, as its back-sight says" in said
+    again = sdr("07TP", "A", "B", 45.0, 0.003) + sdr("09F1", "A", "2", 5.0, 90.0, 90.0)  # sighted once more, not set
+    assert len(fixes(SDR_HEAD + stood + before + again, "sokkia_sdr")) == 2
+
+
+def test_a_second_sdr_header_of_other_units_is_refused() -> None:
+    place = sdr("08TP", "1", 9.0, 1.0, 2.0)
+    assert len(fixes((SDR_HEAD + place) * 2, "sokkia_sdr")) == 2
+    feet = SDR_HEAD.replace("211111", "221111")
+    assert "line 4: a second header tells other units than the first" in refused(SDR_HEAD + place + feet + place)
+
+
+def test_an_sdr_description_may_hold_any_character_but_a_line_end() -> None:
+    (fix,) = fixes(SDR_HEAD + sdr("08TP", "1", 1.0, 2.0, 3.0, "a\x85b\u2028c\x0b"), "sokkia_sdr")
+    assert fix.target == "a\x85b\u2028c"
+
+
 @pytest.mark.parametrize(("azimuth", "circle"), [(45.0, 45.0), (0.0, 360.0), (359.9999, 0.0001)])
 def test_sdr_coordinates_and_angles_from_their_north_are_of_one_set_up(azimuth: float, circle: float) -> None:
     stood = sdr("02TP", "A", 0.0, 0.0, 0.0, 0.0) + sdr("07TP", "A", "B", azimuth, circle)
