@@ -24,6 +24,8 @@ from calibration.evaluation.drift import check
 from calibration.evaluation.evaluation import evaluate
 from calibration.evaluation.latency import Latency, estimate_latency
 from calibration.evaluation.promotion import compare_held_out
+from calibration.identification.samples import averaged
+from calibration.kinematics.chain import Chain, Placement
 from calibration.model.model import CalibratedModel
 from calibration.observations import Observations, parse_observations
 from calibration.pipeline.calibrate import train_residual
@@ -114,7 +116,7 @@ def _find_gap(order: Order, progress: Progress) -> dict[str, Any]:
     started_ns = clock.monotonic_ns()
     text = _rig_text(order)
     rig = parse_rig(text, "the sessions' rig")
-    observations = _placing(_observations(order, rig, order.session_ids))
+    observations = _placing(rig, _observations(order, rig, order.session_ids))
     held_out = _held_out(order, rig, observations)
     models = Path(order.models_directory)
     # The job keeps its number when it runs again, so it goes on where the daemon was killed.
@@ -142,14 +144,21 @@ def _find_gap(order: Order, progress: Progress) -> dict[str, Any]:
     }
 
 
-def _placing(observations: Observations) -> Observations:
-    """The rows at set-ups with enough fixes to place a base beside what they tell of the machine: checks may have few.
+def _placing(rig: Rig, observations: Observations) -> Observations:
+    """The rows at set-ups with enough fixes to place a base beside what they tell of the machine.
 
-    All rows where no set-up has: what is wrong with them is for the calibration to say.
+    Checks may have few, and so may a session that an operator accepted. Repeats of a pose count once. All rows where no
+    set-up has enough: what is wrong with them is for the calibration to say.
     """
-    _, at, fixes = np.unique(observations.setup, return_inverse=True, return_counts=True)
-    enough = fixes[at] >= _LEAST_FIXES
-    return observations.select(enough) if enough.any() else observations
+    chain = Chain(rig, {setup: Placement.identity() for setup in np.unique(observations.setup).tolist()})
+    _, different = np.unique(averaged(chain, observations).of_row, return_index=True)
+    setups, fixes = np.unique(observations.setup[different], return_counts=True)
+    placed = fixes >= _LEAST_FIXES
+    if placed.all() or not placed.any():
+        return observations
+    for setup in setups[~placed]:
+        log.warning("set-up %s is left out: it has fewer than %d fixes in different poses", setup, _LEAST_FIXES)
+    return observations.select(np.isin(observations.setup, setups[placed]))
 
 
 def _held_out(order: Order, rig: Rig, training: Observations) -> Observations | None:

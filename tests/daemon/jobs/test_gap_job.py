@@ -167,10 +167,15 @@ def measured(rig: JobRig, name: str, poses: int, seed: int, kind: str = "static_
 
 @pytest.mark.long
 def test_the_job_names_what_is_missing_and_proposes_a_model_that_has_it(rig: JobRig) -> None:
-    """Also where a check lies at a set-up with too few fixes to place a base."""
+    """Also where a check lies at a set-up with too few fixes to place a base, be one pose measured often."""
     measured(rig, "a", 40, 20)
     measured(rig, "c", 5, 21, "check")
     measured(rig, "lost", 1, 22, "check")
+    again = simulate_observations(
+        RigTruth(SOURCE.rig, 1, effects=parse_effects(LOOSE)), 1, 22, setup="S1", prisms=["r"]
+    )
+    for _ in range(5):
+        rig.observed("lost", again)
     elsewhere = {"id": "S2", "instrument": "", "serial": "", "state": "ok"}
     rig.store.insert("station_setups", elsewhere | rig.store.instant(rig.clock.now(), "created_"))
     rig.store.update("observations", {"session_id": "lost"}, {"setup_id": "S2"})
