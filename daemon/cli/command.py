@@ -9,8 +9,9 @@ import select
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
@@ -74,6 +75,7 @@ class Command(click.Command):
     ) -> click.Context:
         as_json = "--json" in args
         try:
+            _refuse_empty(args)
             return super().make_context(info_name, args, parent, **extra)
         except click.UsageError as error:
             if as_json:
@@ -101,6 +103,23 @@ class Command(click.Command):
         if delivered.status != DONE:
             raise click.exceptions.Exit(delivered.status)
         return None
+
+
+def _refuse_empty(args: Sequence[str]) -> None:
+    """Refuse an empty argument, as of a variable that is not set: it would pass for none, or for the present directory.
+
+    Raises:
+        click.UsageError: says which.
+    """
+    for before, given in pairwise(["", *args]):
+        option, equals, value = given.partition("=")
+        is_empty_option = option.startswith("--") and equals and not value
+        if given and not is_empty_option:
+            continue
+        named = option if is_empty_option else before if before.startswith("-") else "an argument"
+        raise click.UsageError(
+            f"{named} is empty; give it a value, or leave it out (is a variable of the shell not set?)"
+        )
 
 
 def _reader_has_ended() -> bool:

@@ -72,6 +72,25 @@ def test_an_empty_variable_is_as_if_it_were_not_set(monkeypatch: pytest.MonkeyPa
     assert socket_of(None, None) == Path("rigcal-sim/control.sock")
 
 
+@pytest.mark.parametrize(
+    ("typed", "named"),
+    [
+        (["session", "guide", "--prisms", ""], "--prisms"),
+        (["run", "--sim", "--effect="], "--effect"),
+        (["init", "--out", ""], "--out"),
+        (["config", "check", ""], "an argument"),
+    ],
+)
+def test_an_empty_argument_is_refused_by_name(
+    typed: list[str], named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    refused = CliRunner().invoke(main, typed)
+    assert refused.exit_code == 2
+    assert f"Error: {named} is empty; give it a value, or leave it out" in refused.stderr
+    assert not list(tmp_path.iterdir())
+
+
 def test_no_command_uses_another_commands_module() -> None:
     for path in Path(commands.__path__[0]).glob("*.py"):
         assert "daemon.cli.commands" not in path.read_text(encoding="utf-8"), path

@@ -81,7 +81,7 @@ def test_a_file_of_two_set_ups_gives_rows_of_two_set_ups_and_says_so(
 ) -> None:
     download, out = tmp_path / "two.gts", tmp_path / "out.csv"
     download.write_text(gts_download(POINTS[:2], ("_'J_(A_)1.5", "_'J_(B_)1.6")))
-    *_, note = told(download, "--setup", setup, "--out", out)["notes"]
+    *_, note = told(download, *(["--setup", setup] if setup else []), "--out", out)["notes"]
     said = f"two.gts has 2 set-ups of the instrument, and so have the rows: {', '.join(names)}; "
     assert note == f"{said}each has a frame of its own"
     rows = list(csv.DictReader(out.read_text(encoding="utf-8").splitlines()))
