@@ -22,7 +22,7 @@ class JumpWatch:
     waits, and is stamped when it is read at last. So a sample that ends a silence, and those after it until the backlog
     is surely read, may have been taken at any time since the silence began. They are told from others by their stamps
     alone: a log is judged as what came live. Bad samples are no silence: somebody read them. Samples of doubtful time
-    are passed over, as if they had not been sent.
+    are no good ones, and those of a backlog: it is read from the first of them on.
 
     Args:
         max_rate_per_s: fastest motion of the joint, in the unit of the positions given to `jumped_from`.
@@ -41,15 +41,14 @@ class JumpWatch:
 
     def bad(self, stamp: Stamp) -> None:
         """Take a sample that carries no usable position."""
-        if not stamp.is_doubtful:
-            self._read(stamp.monotonic_ns)
+        self._read(stamp.monotonic_ns)
 
     def jumped_from(self, stamp: Stamp, position: float) -> float | None:
         """Take a good sample; return the position before it if the joint cannot have moved so far since, else None."""
-        if stamp.is_doubtful:
-            return None
         now_ns = stamp.monotonic_ns
         self._read(now_ns)
+        if stamp.is_doubtful:
+            return None
         before, before_from_ns = self._good, self._good_from_ns
         self._good, self._good_from_ns = position, self._from_ns
         if before is None:

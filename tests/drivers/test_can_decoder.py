@@ -440,6 +440,16 @@ def test_a_late_frame_is_neither_taken_for_a_jump_nor_held_against_the_next() ->
     assert kinds(feed(boom, "1A0 00 10 00 00", 0.24)) == [EventKind.PRESET_JUMP]
 
 
+def test_a_jump_is_told_from_5_s_after_the_first_late_frame_on_however_many_were_late() -> None:
+    boom = decoder(max_rate_per_s=20.0)
+    feed(boom, "1A0 00 40 00 00", 0.0)  # then nobody reads for 10 s
+    for number in range(5):
+        assert kinds(boom.feed(late("1A0 00 40 00 00", 10.0 + number * 0.2))) == []
+    for number in range(20):
+        assert kinds(feed(boom, "1A0 00 40 00 00", 11.2 + number * 0.2)) == []
+    assert kinds(feed(boom, "1A0 00 10 00 00", 15.2)) == [EventKind.PRESET_JUMP]
+
+
 def test_a_late_sync_says_nothing_of_when_a_node_was_sampled() -> None:
     boom = decoder(is_synchronous=True)
     boom.feed(late("080", 0.0))
