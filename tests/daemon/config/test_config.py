@@ -265,26 +265,15 @@ def test_a_port_belongs_to_one_link() -> None:
         parse_config(text, Path("rigcal.toml"))
 
 
-def test_a_port_is_one_whatever_it_is_called(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("can", "station"), [("ttyUSB0", "by-id"), ("ttyUSB0@115200", "ttyUSB0")])
+def test_a_port_is_one_whatever_it_is_called_and_with_its_rate(tmp_path: Path, can: str, station: str) -> None:
     (tmp_path / "by-id").symlink_to(tmp_path / "ttyUSB0")
     text = f'''rig = "swdt82"
 [[can]]
 interface = "slcan"
-channel = "{tmp_path}/ttyUSB0"
+channel = "{tmp_path}/{can}"
 [[station]]
-serial.path = "{tmp_path}/by-id"
-'''
-    with pytest.raises(ConfigError, match=r"two links are at '.*ttyUSB0'"):
-        parse_config(text, Path("rigcal.toml"))
-
-
-def test_a_port_with_a_rate_behind_it_is_the_same_port(tmp_path: Path) -> None:
-    text = f'''rig = "swdt82"
-[[can]]
-interface = "slcan"
-channel = "{tmp_path}/ttyUSB0@115200"
-[[station]]
-serial.path = "{tmp_path}/ttyUSB0"
+serial.path = "{tmp_path}/{station}"
 '''
     with pytest.raises(ConfigError, match=r"two links are at '.*ttyUSB0'"):
         parse_config(text, Path("rigcal.toml"))
