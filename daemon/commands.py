@@ -107,7 +107,9 @@ def acting_for(caller: Caller | None, has_left: Callable[[], bool] = lambda: Fal
 
 def identifier(arguments: Mapping[str, Any], key: str, what: str, default: str = "") -> str:
     """Return the name that `arguments` gives under `key`; CommandError if it is none."""
-    name = arguments.get(key) or default
+    name = arguments.get(key)
+    if name is None or name == "":
+        name = default
     if not isinstance(name, str) or not _ID.fullmatch(name):
         raise CommandError(f"{what} is 1 to 64 letters, digits, '.', '_' or '-', not {name!r:.80}")
     return name

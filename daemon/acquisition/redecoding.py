@@ -16,7 +16,13 @@ from daemon.store import Store
 from daemon.store.queries.device_states import device_states
 from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS, sessions_between
 from daemon.store.reader import Reader
-from daemon.store.upkeep.full_samples import Stretch, put_again, stretches_between, stretches_of_session
+from daemon.store.upkeep.full_samples import (
+    Stretch,
+    decoded_before,
+    put_again,
+    stretches_between,
+    stretches_of_session,
+)
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import Capture, Decoder, Fix, Reading
 
@@ -96,6 +102,8 @@ def redecode_command(
 ) -> dict[str, Any]:
     """Make all readings and fixes of a session, or of some time, again from raw captures.
 
+    It ends before the oldest captures that wait to be decoded for the first time.
+
     Args:
         store: open for writing.
         rig: the rig file that the decoders are of.
@@ -104,7 +112,8 @@ def redecode_command(
         go_on: called again and again; what it raises ends the work, and what was stored stays.
 
     Raises:
-        CommandError: there is nothing to decode, or a session in it was recorded with a rig file that gives others.
+        CommandError: there is nothing to decode, all of it waits to be decoded for the first time, or a session in it
+            was recorded with a rig file that gives others.
         StoreError: as `redecode`, or stored readings are others than those that are made again.
     """
     with store.reader() as reader:
@@ -119,6 +128,12 @@ def redecode_command(
             what = f"the time from {_text(first_ns)} to {_text(last_ns)}"
         if not stretches:
             raise CommandError(f"the store has no captures of {what}; `rigcal session list` shows the sessions")
+        stretches = decoded_before(reader, stretches, AFTER_NS)
+        if not stretches:
+            raise CommandError(
+                f"{what} waits to be decoded for the first time; ask again when `rigcal store stats` says that no "
+                "captures wait"
+            )
         may_differ = session is not None
         for since, until in stretches:
             for row in sessions_between(reader, since, until, store.boot_row(since)):

@@ -159,7 +159,7 @@ class SessionLifecycle:
         """Decide anew whether calibration may use closed sessions: an encoder has jumped, maybe once again."""
         with self._store.transaction():
             for row in self.table.closed():
-                if not _has_other_readings(row):
+                if not (row["excluded"] or "").startswith(OTHER_RIG_FILE):
                     self._judge_readings(row)
 
     def _judge_readings(self, closed: Mapping[str, Any]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from daemon.sessions.export.session_file import DeviceState, DoubtfulCaptures, S
 from daemon.sessions.session_data import sessions_csv
 from daemon.sessions.vector_channels import channel_numbers
 from daemon.store.queries.device_states import device_states
-from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS, prism_confirmations, session
+from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS, is_undecoded, prism_confirmations, session
 from daemon.store.queries.setups import control_points
 from daemon.store.reader import Reader
 from daemon.store.upkeep.full_samples import stretches_of_session
@@ -26,6 +27,8 @@ from drivers.readings import CanCapture, Capture, SerialCapture
 
 CanFormat = Literal["log", "asc", "blf"]
 
+DECODED_WITHIN_S = 5.0  # a session that was just stopped is decoded within a fraction of it
+LOOK_S = 0.1
 _BETWEEN_BOOTS_NS = 1_000_000  # at least: logs have microseconds, and what came first must come first again
 
 
@@ -109,16 +112,25 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
 
 
 def ended_session(reader: Reader, session_id: str) -> dict[str, Any]:
-    """Return the row of a session that has ended.
+    """Return the row of a session that has ended, once all its captures are decoded.
 
     Raises:
-        CommandError: no such session, or it is still open.
+        CommandError: no such session, it is still open, or its captures wait to be decoded for longer than they do
+            behind a session that was just stopped.
     """
     found = session(reader, session_id)
     if found is None:
         raise CommandError(f"{reader.path} has no session {session_id!r}; `rigcal session list` shows them")
     if found["ended_utc_ns"] is None:
         raise CommandError(f"session {session_id!r} is still open; stop it first")
+    deadline = time.monotonic() + DECODED_WITHIN_S
+    while is_undecoded(reader, session_id):
+        if time.monotonic() > deadline:
+            raise CommandError(
+                f"captures of session {session_id!r} wait to be decoded, so its tables are not whole; `rigcal run` "
+                "decodes them: export it when `rigcal store stats` says that none wait"
+            )
+        time.sleep(LOOK_S)
     return found
 
 

@@ -42,10 +42,11 @@ def export_tables(store: Path, session_id: str, out: Path, form: str) -> list[Pa
 
     Returns:
         The files: `<session>.csv`, `<session>-joints.csv` and `<session>-fixes.csv`, the same with `.parquet`, or one
-        `<session>.mat` with three structures.
+        `<session>.mat` with three structures. A table without rows is left out.
 
     Raises:
-        CommandError: no such session, it is still open, or the library that writes the format is not installed.
+        CommandError: no such session, it is still open or not decoded, or the library that writes the format is not
+            installed.
         StoreError: there is no store, or it cannot be read.
     """
     with Reader(store) as reader:
@@ -74,18 +75,17 @@ def _cell(name: str, value: str) -> object:
 
 
 def _write_csv(tables: Tables, base: Path) -> list[Path]:
-    return [_csv_file(rows, _file(base, name, "csv")) for name, rows in tables.items()]
-
-
-def _csv_file(rows: Iterable[Row], path: Path) -> Path:
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = None
-        for row in rows:
-            if writer is None:
-                writer = csv.DictWriter(stream, list(row), lineterminator="\n")
-                writer.writeheader()
-            writer.writerow(row)
-    return path
+    files = []
+    for name, rows in tables.items():
+        path = _file(base, name, "csv")
+        for i, batch in enumerate(_batches(rows)):
+            with path.open("a" if i else "w", encoding="utf-8", newline="") as stream:
+                writer = csv.DictWriter(stream, list(batch[0]), lineterminator="\n")
+                if not i:
+                    writer.writeheader()
+                    files.append(path)
+                writer.writerows(batch)
+    return files
 
 
 def _write_parquet(tables: Tables, base: Path) -> list[Path]:

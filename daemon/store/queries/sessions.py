@@ -22,11 +22,9 @@ CLOCK_STEP_NS = NS_PER_S // 20  # less may be the time between reading the one c
 
 # Fixes of these may still come: of the open ones, and of those that ended after the oldest capture that waits to be
 # decoded was made.
-_UNFINISHED = """SELECT * FROM calibration_sessions
-    WHERE state = 'open' OR (ended_boot_id, ended_monotonic_ns) >=
-        (SELECT first_boot_id, first_monotonic_ns FROM raw_chunks
-            WHERE id = (SELECT min(chunk_id) FROM undecoded_chunks))
-    ORDER BY rowid"""
+_IS_UNDECODED = """(ended_boot_id, ended_monotonic_ns) >= (SELECT first_boot_id, first_monotonic_ns FROM raw_chunks
+            WHERE id = (SELECT min(chunk_id) FROM undecoded_chunks))"""
+_UNFINISHED = f"SELECT * FROM calibration_sessions WHERE state = 'open' OR {_IS_UNDECODED} ORDER BY rowid"
 _SUMMARY = """SELECT id, rig, setup_id AS setup, prism, operator, caller_user AS user, kind, state, note,
         started_utc_ns, ended_utc_ns, excluded AS not_used, accepted_despite, accepted_by, accepted_utc_ns,
         accepted_caller_user AS accepted_user,
@@ -339,6 +337,12 @@ class SessionTable:
 def session(source: RowSource, session_id: str) -> dict[str, Any] | None:
     """Return a session's row with its `rig_text`; None where there is none."""
     return next(iter(source.rows(_SESSION, (session_id,))), None)
+
+
+def is_undecoded(source: RowSource, session_id: str) -> bool:
+    """Return True if captures from before a session's end wait to be decoded."""
+    sql = f"SELECT 1 FROM calibration_sessions WHERE id = ? AND {_IS_UNDECODED}"
+    return any(True for _ in source.rows(sql, (session_id,)))
 
 
 def sessions_between(source: RowSource, since: Stamp, until: Stamp, boot: int) -> list[dict[str, Any]]:

@@ -29,6 +29,8 @@ _STRETCHES = _OF_CHUNKS.format("last_utc_ns >= ? AND first_utc_ns <= ?")
 _BETWEEN = _OF_CHUNKS.format(
     "(last_boot_id, last_monotonic_ns) >= (?, ?) AND (first_boot_id, first_monotonic_ns) <= (?, ?)"
 )
+_OLDEST_WAITING = """SELECT first_boot_id AS boot_id, first_monotonic_ns AS ns FROM undecoded_chunks
+    JOIN raw_chunks ON raw_chunks.id = chunk_id ORDER BY boot_id, ns LIMIT 1"""
 
 Stretch = tuple[Stamp, Stamp]
 
@@ -105,6 +107,25 @@ def stretches_of_session(reader: Reader, session_id: str) -> list[Stretch]:
 def stretches_between(reader: Reader, first_utc_ns: int, last_utc_ns: int) -> list[Stretch]:
     """Return the stretches of captures between two instants of the wall clock, one a boot."""
     return _stretches(reader, _STRETCHES, (first_utc_ns, last_utc_ns), None, None)
+
+
+def decoded_before(reader: Reader, stretches: Sequence[Stretch], margin_ns: int) -> list[Stretch]:
+    """Cut stretches so long before the oldest capture that waits to be decoded; those that lie behind it are left out.
+
+    Acquisition stores the records of what waits, and does not look whether they are there already.
+    """
+    oldest = next(reader.rows(_OLDEST_WAITING), None)
+    if oldest is None:
+        return list(stretches)
+    boots = {kernel_id: row for row, kernel_id in reader.boots().items()}
+    cut = []
+    for since, until in stretches:
+        boot, last = boots[until.boot_id], until
+        if boot == oldest["boot_id"]:
+            last = until.shifted(min(oldest["ns"] - margin_ns - until.monotonic_ns, 0))
+        if boot <= oldest["boot_id"] and since.monotonic_ns <= last.monotonic_ns:
+            cut.append((since, last))
+    return cut
 
 
 def _stretches(

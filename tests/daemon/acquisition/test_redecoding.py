@@ -103,6 +103,37 @@ def test_a_stretch_has_all_readings_and_fixes_again_and_each_once(full: Path, th
     assert redecode(thinned, DECODERS, [(since, until)]) == 0
 
 
+def test_what_waits_to_be_decoded_for_the_first_time_is_not_stored_twice(
+    tmp_path: Path, sent: list[list[Capture]]
+) -> None:
+    everything = {"first_utc_ns": UTC_0_NS, "last_utc_ns": UTC_0_NS + 10 * NS_PER_S}
+    with contextlib.closing(Store(tmp_path / "rigcal.sqlite")) as store:
+        declare_channels(store, SOURCE.rig)
+        waiting = [(batch, store.append_captures(batch)) for batch in sent if batch]
+        decoding, thinning = LinkDecoders(DECODERS), Thinning(lambda _: False)
+
+        def decode(until_s: float) -> None:
+            while waiting and waiting[0][0][0].stamp.monotonic_ns < until_s * NS_PER_S:
+                batch, ids = waiting.pop(0)
+                with store.transaction():
+                    store.insert_records(thinning.kept(decoding.feed_and_tick(batch)))
+                    store.mark_decoded(ids)
+
+        decode(1.5)
+        with pytest.raises(CommandError, match=r"waits to be decoded for the first time; ask again when"):
+            redecode_command(store, SOURCE.rig, DECODERS, everything, lambda: None)
+        decode(4.0)
+        result = redecode_command(store, SOURCE.rig, DECODERS, everything, lambda: None)
+        assert result["added"] > 500
+        (stretch,) = result["stretches"]
+        assert stretch["last_utc_ns"] - UTC_0_NS == pytest.approx(2.0 * NS_PER_S, abs=0.2 * NS_PER_S)
+        decode(SECONDS)
+        assert redecode_command(store, SOURCE.rig, DECODERS, everything, lambda: None)["added"] > 500
+    for name, columns in TABLES.items():
+        rows = [(row["monotonic_ns"], row[columns[0]]) for row in table(store.path, name)]
+        assert len(rows) == len(set(rows)), name
+
+
 def test_a_fix_that_observations_name_keeps_its_row(thinned: Store) -> None:
     first = table(thinned.path, "fixes")[0]
     redecode(thinned, DECODERS, [(thinned.stamp(first), thinned.stamp(first).shifted(NS_PER_S))])

@@ -50,6 +50,15 @@ def test_sessions_before_and_after_a_jump_are_not_calibrated_together(session_ri
     assert sessions.zeros_lost() == []
 
 
+def test_an_operator_who_accepts_a_session_is_told_of_every_joint_that_has_jumped_since(session_rig: Rig) -> None:
+    before = controlled(session_rig)
+    jump(session_rig)
+    jump(session_rig, "theta3")
+    assert session_rig.say("show", id=before)["not_used"] == f"{LOST}, theta3"
+    session_rig.say("accept", id=before)
+    assert session_rig.say("show", id=before)["accepted"]["despite"] == f"{LOST}, theta3"
+
+
 def test_a_session_in_which_an_encoder_jumps_is_not_calibrated_with_the_one_that_is_begun_anew(
     session_rig: Rig,
 ) -> None:

@@ -258,6 +258,7 @@ def test_a_second_session_is_refused_while_one_is_open(rig: Rig) -> None:
         ({"prism": "r", "kind": "dance"}, "no kind 'dance'; kinds: single_joint"),
         ({"prism": "r", "setup": "S9"}, "no set-up 'S9'; known: S1"),
         ({"prism": "r", "id": "a b"}, "a session's id is 1 to 64 letters"),
+        ({"prism": "r", "id": False}, "a session's id is 1 to 64 letters"),
         ({}, "no prism ''"),
     ],
 )

@@ -50,7 +50,7 @@ def exported(directory: Path, config: Config, can_format: CanFormat, links: Sequ
     rig.say("setup_new", id="S1")
     rig.say("start", prism="r", id="s001-r")
     for link in links:
-        rig.store.append_captures(frames(link))
+        rig.store.mark_decoded(rig.store.append_captures(frames(link)))
     rig.clock.advance(2.0)
     rig.say("stop")
     rig.store.close()

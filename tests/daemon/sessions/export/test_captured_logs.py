@@ -60,8 +60,9 @@ def test_a_link_that_fell_silent_before_a_reboot_comes_beside_the_others_of_the_
         stamps = {second: at_second(second, behind_s) for second in seconds}
         rig.clock.set(stamps[seconds[0]])
         rig.store.begin_run(rig.clock.now())
-        rig.store.append_captures([CanCapture("boom", at, 0x1A0, bytes([n])) for n, at in stamps.items() if n in boom])
-        rig.store.append_captures([SerialCapture("ts", at, b"%d\r\n" % n) for n, at in stamps.items() if n in ts])
+        frames = [CanCapture("boom", at, 0x1A0, bytes([n])) for n, at in stamps.items() if n in boom]
+        lines = [SerialCapture("ts", at, b"%d\r\n" % n) for n, at in stamps.items() if n in ts]
+        rig.store.mark_decoded([*rig.store.append_captures(frames), *rig.store.append_captures(lines)])
     rig.clock.set(at_second(END_S, behind_s))
     rig.say("stop")
     rig.store.close()

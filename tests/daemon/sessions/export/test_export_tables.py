@@ -19,6 +19,7 @@ from daemon.cli.main import main
 from daemon.store import Store
 from daemon.store.queries.observations import ObservationTable
 from daemon.store.queries.sessions import SessionTable
+from drivers.readings import SerialCapture
 from tests.daemon.store_support import at, fix, reading
 
 CONFIG = 'rig = "swdt82"\nstate_directory = "."\n[[can]]\nchannel = "can0"\n[[station]]\nserial.path = "/dev/station"\n'
@@ -95,3 +96,18 @@ def test_an_unknown_session_is_refused(config: Path, tmp_path: Path, form: str) 
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code != 0
     assert "no session 'no'" in result.stderr
+
+
+def test_a_session_whose_captures_wait_to_be_decoded_is_not_exported_in_part(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daemon.sessions.export.captured_logs.DECODED_WITHIN_S", 0.2)
+    with contextlib.closing(Store(config.with_name("rigcal.sqlite"))) as store:
+        ids = store.append_captures([SerialCapture("station", at(2.5), b"Q+0")])
+        command = ["session", "export", "s001-r", "--config", str(config), "--out", str(tmp_path / "out")]
+        for form in ("csv", "log"):
+            result = CliRunner().invoke(main, [*command, "--format", form])
+            assert (result.exit_code, list(tmp_path.iterdir())) == (2, [])
+            assert "captures of session 's001-r' wait to be decoded" in result.stderr
+        store.mark_decoded(ids)
+    assert len(export(config, tmp_path, "csv")) == 3
