@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 
+from drivers.stations.cells import WHOLE, Numbers, cells_of, decimal_of, line_at, lines_of, number_of, why_too_many
 from drivers.stations.export_format import (
     MM_PER,
     RAD_PER,
-    AngleUnit,
     ColumnMap,
     ExportedFix,
     ExportFormat,
     Guess,
-    LengthUnit,
     Role,
     polar_position_mm,
     refuse,
+)
+from drivers.stations.named_units import (
+    ANGLES,
+    LENGTHS,
+    bracket_words,
+    check_seconds,
+    mm_of,
+    unit_of_columns,
+    unit_of_preamble,
+    without_unit,
 )
 
 _NAMES: Mapping[Role, str] = {
@@ -40,31 +48,12 @@ _NAMES: Mapping[Role, str] = {
     "time": "time datetime timestamp dateandtime measurementtime times utc",
 }
 SYNONYMS: Mapping[Role, frozenset[str]] = {role: frozenset(words.split()) for role, words in _NAMES.items()}
+_CARTESIAN: tuple[Role, ...] = ("x", "y", "z")
+_POLAR: tuple[Role, ...] = ("hz", "zenith", "distance")
 _SEPARATORS = (";", "\t", ",", " ")
 _HEAD_LINES = 200  # a preamble is not longer
-_NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?", re.ASCII)
-_LENGTH_WORDS: dict[str, LengthUnit] = {
-    **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), "mm"),
-    **dict.fromkeys(("cm", "centimeters", "centimetres"), "cm"),
-    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), "m"),
-    **dict.fromkeys(("in", "inch", "inches"), "in"),
-    **dict.fromkeys(("ft", "feet", "foot"), "ft"),
-}
-_ANGLE_WORDS: dict[str, AngleUnit] = {
-    **dict.fromkeys(("deg", "degree", "degrees", "°"), "deg"),
-    **dict.fromkeys(("gon", "gons", "grad", "grads"), "gon"),
-    **dict.fromkeys(("rad", "radian", "radians"), "rad"),
-}
-_UNIT = re.compile(r"[\[(]\s*+([^\[\]()\s][^\[\]()]*+)[\])]|_(mm|cm|m|in|ft|deg|gon|rad)$")
-_BEFORE_UNIT = re.compile(r"(?<!\s)\s++(?=[\[(])")  # blanks between a name and its unit
 _FEW_STATIONS = 2  # may have a row each
 _OWN_VALUES = 0.8  # share of rows with a value of their own beyond which a column names no set-ups
-_LARGEST = 1e12  # of coordinates, angles and seconds in any unit
-_WHOLE = re.compile(r"[+-]?\d+", re.ASCII)
-_TWO_MEANINGS = (
-    "{} cells where {} are due: commas separate columns and are decimal signs as well; export with decimal points, or "
-    "with semicolons between columns"
-)
 _TIME_FORMATS = ("%d.%m.%Y %H:%M:%S.%f", "%d.%m.%Y %H:%M:%S", "%m/%d/%Y %H:%M:%S.%f", "%m/%d/%Y %H:%M:%S")
 _CLOCK_FORMATS = ("%H:%M:%S.%f", "%H:%M:%S")
 
@@ -76,51 +65,6 @@ def delimited_format(name: str, title: str, rank: int, recognises: Callable[[str
         return guess_table(text, source, name)
 
     return ExportFormat(name=name, title=title, rank=rank, recognises=recognises, guess=guess, read=read_table)
-
-
-def lines_of(text: str) -> list[str]:
-    """Return the lines of a text."""
-    return text.lstrip("\ufeff").replace("\r\n", "\n").replace("\r", "\n").split("\n")
-
-
-def line_at(lines: list[str], number: int, source: str) -> str:
-    """Return the line of a number from 1, which a map names.
-
-    Raises:
-        DescriptionError: the file is shorter.
-    """
-    if number > len(lines):
-        refuse(source, f"the map's header is in line {number}, the file has {len(lines)}; is the map of another file?")
-    return lines[number - 1]
-
-
-def cells_of(line: str, separator: str) -> list[str]:
-    """Return the cells of a line."""
-    if separator == " ":
-        return _BEFORE_UNIT.sub("", line).split()
-    try:
-        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
-    except csv.Error:  # a field of more characters than any that means something
-        return []
-
-
-def number_of(cell: str, decimal: str) -> float | None:
-    """Return the number in a cell; None where there is none, or one beyond what any instrument measures."""
-    if not _NUMBER.fullmatch(cell) or (decimal == "." and "," in cell):
-        return None
-    value = float(cell.replace(",", "."))
-    return value if abs(value) < _LARGEST else None
-
-
-def why_no_number(cell: str) -> str:
-    """Return what is wrong with a cell that `number_of` finds no number in."""
-    is_too_large = _NUMBER.fullmatch(cell) and number_of(cell, ",") is None
-    return f"{cell!r} is {'beyond what any instrument measures' if is_too_large else 'not a number'}"
-
-
-def decimal_of(cells: Iterable[str]) -> str:
-    """Return the sign before fractions: a comma where it is in numbers, between quotes if it separates them too."""
-    return "," if any("," in cell and _NUMBER.fullmatch(cell) for cell in cells) else "."
 
 
 # ---- the map ---------------------------------------------------------------------------------------------------------
@@ -150,88 +94,138 @@ def guess_table(text: str, source: str, name: str) -> Guess:
     return _without_header(lines, source, name)
 
 
-def _roles(cells: list[str]) -> dict[Role, str]:
-    """Return the roles of a header's cells, each by the first that has it."""
-    roles: dict[Role, str] = {}
+def _roles(cells: list[str]) -> dict[Role, list[str]]:
+    """Return the cells of a header that may have each role: by their names, and coordinates by remarks on them too."""
+    roles: dict[Role, list[str]] = {}
     for cell in cells:
-        plain = re.sub(r"[\W_]", "", _UNIT.sub("", cell.lower()))
-        for role, words in SYNONYMS.items():
-            if plain in words:
-                roles.setdefault(role, cell)
+        own = _roles_of(without_unit(cell))
+        for remark in bracket_words(cell) if set(own) & {*_CARTESIAN, *_POLAR} else []:
+            own += [role for role in _roles_of(remark.lower()) if role not in own]
+        for role in own:
+            roles.setdefault(role, []).append(cell)
+    return roles
+
+
+def _roles_of(name: str) -> list[Role]:
+    plain = re.sub(r"(?!^-)[\W_]", "", name)  # -Z points down
+    return [role for role, words in SYNONYMS.items() if plain in words]
+
+
+def _one_of_each(found: dict[Role, list[str]], header_line: int, source: str, notes: list[str]) -> dict[Role, str]:
+    """Return the column of each role, coordinates before angles; a second one that may be measured is refused."""
+    left_out = _POLAR if found.keys() >= set(_CARTESIAN) else _CARTESIAN
+    roles: dict[Role, str] = {}
+    for role, cells in found.items():
+        if role in left_out:
+            continue
+        if len(cells) > 1 and role in (*_CARTESIAN, *_POLAR):
+            said = " and ".join(map(repr, cells))
+            todo = f"rename one, or write a map that names the right one ({role} in [columns]) and give it with --map"
+            refuse(source, f"columns {said} may both be {role}; {todo}", header_line)
+        roles[role] = cells[0]
+        if len(cells) > 1:
+            notes.append(f"{role} by {cells[0]!r} alone, though columns {', '.join(cells)} may be it")
     return roles
 
 
 def _with_header(
-    lines: list[str], separator: str, header: int, roles: dict[Role, str], name: str, source: str
+    lines: list[str], separator: str, header: int, found: dict[Role, list[str]], name: str, source: str
 ) -> Guess:
     cells = cells_of(lines[header - 1], separator)
     notes = [f"line {header} is the header; columns are separated by {_said(separator)}"]
     first = header + 1
     while first < len(lines) and not any(map(str.isdigit, lines[first - 1])):
         first += 1  # a line of units, an empty one
-    sample = [cells_of(line, separator) for line in lines[first - 1 : first + 200] if line.strip()]
-    decimal = decimal_of(cell for row in sample for cell in row)
-    if {"x", "y", "z"} <= roles.keys():
-        roles = {role: cell for role, cell in roles.items() if role not in ("hz", "zenith", "distance")}
-    else:
-        roles = {role: cell for role, cell in roles.items() if role not in ("x", "y", "z")}
+    roles = _one_of_each(found, header, source, notes)
     by_role = ", ".join(f"{role}: {cell!r}" for role, cell in roles.items())
-    notes.append(f"columns by their names: {by_role}")
+    notes.insert(1, f"columns by their names: {by_role}")
     if "point" not in roles:
         notes.append("no column is known to name the points, so they are 1, 2, ... in the order of the file")
-    stations = [cell for cell in cells if "station" in _roles([cell])]
-    if len(stations) > 1:
-        notes.append(f"set-ups by {stations[0]!r} alone, though columns {', '.join(stations)} may name them")
-    measured = [roles[role] for role in ("x", "y", "z", "distance") if role in roles]
-    units_line = cells_of(lines[header], separator) if first > header + 1 else []
-    length = _unit(measured, cells, units_line, lines[: header - 1], _LENGTH_WORDS, source)
-    if length is None:
-        places = [cells.index(cell) for cell in measured]
-        values = [number_of(row[p], decimal) for row in sample for p in places if p < len(row)]
-        largest = max((abs(value) for value in values if value is not None), default=0.0)
-        length = "m" if largest < 200 else "mm"
-        notes.append(f"no unit of length is named; {largest:g} is the greatest number, so {length} is taken")
+    sample = [cells_of(line, separator) for line in lines[first - 1 : first + 200] if line.strip()]
+
+    def sampled(of: list[str]) -> list[str]:
+        places = [cells.index(cell) for cell in of]
+        return [row[place] for row in sample for place in places if place < len(row)]
+
+    lengths = [roles[role] for role in (*_CARTESIAN, "distance") if role in roles]
     angles = [roles[role] for role in ("hz", "zenith") if role in roles]
-    angle = _unit(angles, cells, units_line, lines[: header - 1], _ANGLE_WORDS, source)
-    if angles and angle is None:
-        values = [
-            number_of(row[cells.index(a)], decimal) for row in sample for a in angles if cells.index(a) < len(row)
-        ]
-        largest = max((abs(value) for value in values if value is not None), default=0.0)
-        angle = "rad" if largest <= math.tau else "deg" if largest <= 360.0 else "gon"  # a zenith angle is near 90 deg
-        notes.append(f"no unit of angles is named; {largest:g} is the greatest number, so {angle} is taken")
-    time_format = _time_format(sample, cells, roles, notes)
-    found = ColumnMap.model_validate(
+    numbers = sampled([*lengths, *angles, *(roles[role] for role in ("time", "prism_constant") if role in roles)])
+    decimal = decimal_of(numbers)
+    notes += _decimal_note(numbers)
+    if "time" in roles:
+        check_seconds(roles["time"], header, source)
+    units_line = next((at for at in range(header + 1, first) if lines[at - 1].strip()), 0)
+    units = cells_of(lines[units_line - 1], separator) if units_line else []
+    given: dict[str, str] = {}
+    for key, quantity, of, by_size in (
+        ("length_unit", LENGTHS, lengths, _length_by_size),
+        ("angle_unit", ANGLES, angles, _angle_by_size),
+    ):
+        if not of:
+            continue
+        places = [cells.index(cell) for cell in of]
+        below = [units[place] if place < len(units) else "" for place in places]
+        named = unit_of_columns(quantity, header, of, units_line, below, source)
+        named = named or unit_of_preamble(quantity, lines[: header - 1], source)
+        if named is None:
+            largest = _largest(sampled(of), decimal)
+            given[key] = by_size(largest)
+            greatest = f"{largest:g} is the greatest number, so {given[key]} is taken"
+            notes.append(f"no unit of {quantity.name} is named that is known; {greatest}")
+        else:
+            given[key] = named[0]
+            notes.append(f"the unit of {quantity.name} is {named[0]}, as {named[1]} says")
+    map_ = ColumnMap.model_validate(
         {
             "format": name,
             "separator": separator,
             "decimal": decimal,
             "header_line": header,
             "first_line": first,
-            "length_unit": length,
-            "angle_unit": angle or "deg",
-            "time_format": time_format,
+            "time_format": _time_format(sample, cells, roles, notes),
             "columns": roles,
+            **given,
         }
     )
-    return Guess(found, tuple(notes))
+    return Guess(map_, tuple(notes))
+
+
+def _decimal_note(cells: list[str]) -> tuple[str, ...]:
+    comma = next((cell for cell in cells if decimal_of([cell]) == ","), None)
+    return () if comma is None else (f"commas are decimal signs, as in {comma!r}",)
+
+
+def _largest(cells: list[str], decimal: str) -> float:
+    values = [number_of(cell, decimal) for cell in cells]
+    return max((abs(value) for value in values if value is not None), default=0.0)
+
+
+def _length_by_size(largest: float) -> str:
+    return "m" if largest < 200 else "mm"
+
+
+def _angle_by_size(largest: float) -> str:
+    return "rad" if largest <= math.tau else "deg" if largest <= 360.0 else "gon"  # a zenith angle is near 90 deg
 
 
 def _without_header(lines: list[str], source: str, name: str) -> Guess:
     for separator in _SEPARATORS:
         for number, line in enumerate(lines[:_HEAD_LINES], 1):
             cells = cells_of(line, separator)
-            decimal = decimal_of(cells)
+            decimal = decimal_of(cells[1:4])
             numbers = [place for place, cell in enumerate(cells, 1) if number_of(cell, decimal) is not None]
             if len(cells) >= 4 and len(numbers) >= 3 and {2, 3, 4} <= set(numbers):
                 _check_without_header(lines, separator, number, source)
                 sample = [cells_of(each, separator) for each in lines[number - 1 : number + 200] if each.strip()]
-                values = [number_of(cell, decimal) for row in sample for cell in row[1:4]]
-                largest = max((abs(value) for value in values if value is not None), default=0.0)
-                length = "m" if largest < 200 else "mm"
+                coordinates = [cell for row in sample for cell in row[1:4]]
+                largest = _largest(coordinates, decimal)
+                named = unit_of_preamble(LENGTHS, lines[: number - 1], source)
+                length = named[0] if named else _length_by_size(largest)
+                why = f"{named[1]} says" if named else f"{largest:g} is the greatest coordinate"
                 notes = (
                     f"no header; from line {number} on: point, x, y, z, separated by {_said(separator)}",
-                    f"{largest:g} is the greatest coordinate, so {length} is taken",
+                    *_decimal_note(coordinates),
+                    f"the unit of length is {length}, as {why}",
                 )
                 columns = {"point": 1, "x": 2, "y": 3, "z": 4}
                 given = {"format": name, "separator": separator, "decimal": decimal, "first_line": number}
@@ -244,46 +238,19 @@ def _without_header(lines: list[str], source: str, name: str) -> Guess:
 
 
 def _check_without_header(lines: list[str], separator: str, first: int, source: str) -> None:
-    """Refuse a header that nothing is known of, and commas that are separator and decimal sign in one."""
+    """Refuse a header that is not known, a damaged row, and commas that are separator and decimal sign in one."""
     cells = cells_of(lines[first - 1], separator)
     for number, line in enumerate(lines[: first - 1], 1):
-        names = cells_of(line, separator)
-        if len(names) == len(cells) and not any(number_of(name, ",") is not None for name in names):
-            said = f"its names are not known ({', '.join(names)})"
+        before = cells_of(line, separator)
+        numbers = sum(number_of(cell, ",") is not None for cell in before)
+        if len(before) == len(cells) and any(before[1:]) and not numbers:
+            said = f"its names are not known ({', '.join(before)})"
             refuse(source, f"this is a header, and {said}; call the columns point, x, y and z in it", number)
-    if separator == "," and len(cells) >= 7 and all(map(_WHOLE.fullmatch, cells[1:7])):
-        refuse(source, _TWO_MEANINGS.format(len(cells), 4), first)
-
-
-def _unit(
-    of: list[str],
-    header: list[str],
-    units_line: list[str],
-    preamble: list[str],
-    words: Mapping[str, str],
-    source: str,
-) -> str | None:
-    """Return the unit of some columns: from their names, the line below the header, or a line before it."""
-    units: dict[str, str] = {}  # unit -> the first column that has it
-    for cell in of:
-        found = _UNIT.search(cell.lower())
-        place = header.index(cell)
-        below = units_line[place].lower() if place < len(units_line) else ""
-        for word in ((found[1] or found[2]) if found else "", below):
-            if word and word.strip("[]() ") in words:
-                units.setdefault(words[word.strip("[]() ")], cell)
-                break
-    if len(units) > 1:
-        said = " and ".join(f"{cell!r} in {unit}" for unit, cell in units.items())
-        refuse(source, f"the columns have different units, {said}; export them in one unit")
-    if units:
-        return next(iter(units))
-    for line in preamble:
-        if "unit" in line.lower():
-            for word in re.findall(r"[a-z°]+", line.lower()):
-                if word in words:
-                    return words[word]
-    return None
+        if numbers > (0 if len(before) == len(cells) else 1):
+            said = f"it has numbers, as the points from line {first} on, but is no point, x, y, z"
+            refuse(source, f"{said}; mend it, or delete it if it is a remark", number)
+    if separator == "," and len(cells) >= 7 and all(map(WHOLE.fullmatch, cells[1:7])):
+        refuse(source, why_too_many(cells, 4, separator), first)
 
 
 def _time_format(sample: list[list[str]], header: list[str], roles: dict[Role, str], notes: list[str]) -> str:
@@ -321,23 +288,23 @@ def read_table(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
     if not is_polar and not {"x", "y", "z"} <= places.keys():
         refuse(source, "the map names neither x, y, z nor hz, zenith, distance")
     fixes: list[ExportedFix] = []
+    numbers = Numbers(columns.decimal, source)
+    due = len(header)
     for number, line in enumerate(lines[columns.first_line - 1 :], columns.first_line):
         if not line.strip():
             continue
         cells = cells_of(line, columns.separator)
+        due = due or len(cells)
+        if columns.separator == " " and len(cells) != due:
+            said = f"{len(cells)} cells where the {'header has' if header else 'rows before have'} {due}"
+            todo = "an empty one between blanks cannot be told; fill it in, or separate columns otherwise"
+            refuse(source, f"{said}; {todo}", number)
         if header and any(cells[len(header) :]):
-            reason = f"{len(cells)} cells where the header has {len(header)}"
-            refuse(
-                source, _TWO_MEANINGS.format(len(cells), len(header)) if columns.separator == "," else reason, number
-            )
+            refuse(source, why_too_many(cells, len(header), columns.separator), number)
 
         def number_at(role: Role, cells: list[str] = cells, number: int = number) -> float:
             cell = _cell(cells, places[role], columns.columns[role], number, source)
-            value = number_of(cell, columns.decimal)
-            if value is None:
-                said = why_no_number(cell) if cell else "the cell is empty; leave out lines without a measurement"
-                refuse(source, said, number, columns.columns[role])
-            return value
+            return numbers.read(cell, number, columns.columns[role])
 
         def text_at(role: Role, cells: list[str] = cells) -> str:
             return cells[places[role]] if role in places and places[role] < len(cells) else ""
@@ -349,9 +316,9 @@ def read_table(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
         else:
             place = (number_at("x") * mm, number_at("y") * mm, number_at("z") * mm)
         constant = number_of(text_at("prism_constant"), columns.decimal)  # for a note alone: anything may stand there
-        constant_mm = None if constant is None else constant * _named_mm(places["prism_constant"], header)
+        constant_mm = None if constant is None else constant * mm_of("".join(header[places["prism_constant"] :][:1]))
         point = text_at("point") or str(len(fixes) + 1)
-        time_s = _time_s(" ".join(filter(None, (text_at("date"), text_at("time")))), columns, number, source)
+        time_s = _time_s(" ".join(filter(None, (text_at("date"), text_at("time")))), columns, numbers, number)
         station = text_at("station")
         fixes.append(
             ExportedFix(number, point, text_at("prism"), place, time_s, station, prism_constant_mm=constant_mm)
@@ -361,12 +328,6 @@ def read_table(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
     if "station" in places:
         _check_stations(fixes, columns, source)
     return fixes
-
-
-def _named_mm(place: int, header: list[str]) -> float:
-    """Return the millimetres of a unit that the header of a column names; 1 where it names none."""
-    found = _UNIT.search(header[place].lower()) if place < len(header) else None
-    return MM_PER[_LENGTH_WORDS.get((found[1] or found[2]).strip(), "mm")] if found else 1.0
 
 
 def _check_stations(fixes: list[ExportedFix], columns: ColumnMap, source: str) -> None:
@@ -406,11 +367,11 @@ def _time_text(cells: list[str], header: list[str], roles: Mapping[Role, str]) -
     return " ".join(cells[place] for place in places if place < len(cells))
 
 
-def _time_s(text: str, columns: ColumnMap, line: int, source: str) -> float | None:
+def _time_s(text: str, columns: ColumnMap, numbers: Numbers, line: int) -> float | None:
     """Return seconds: of a number as it is, of a date since 1970, of a time of day since midnight."""
     if not text or "time" not in columns.columns:
         return None
-    value = number_of(text, columns.decimal)
+    value = numbers.find(text, line)
     if value is not None:
         return value
     try:
@@ -418,7 +379,7 @@ def _time_s(text: str, columns: ColumnMap, line: int, source: str) -> float | No
         found = datetime.strptime(text, form) if form else datetime.fromisoformat(text)
     except ValueError:
         said = columns.time_format or "seconds, or an ISO time"
-        refuse(source, f"{text!r} is not a time of the form {said}", line, columns.columns["time"])
+        refuse(numbers.source, f"{text!r} is not a time of the form {said}", line, columns.columns["time"])
     if columns.time_format in _CLOCK_FORMATS:
         return found.hour * 3600.0 + found.minute * 60.0 + found.second + found.microsecond / 1e6
     return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()

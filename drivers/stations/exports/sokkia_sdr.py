@@ -22,10 +22,11 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from drivers.stations.delimited import lines_of, number_of, why_no_number
+from drivers.stations.cells import lines_of, number_of, why_no_number
 from drivers.stations.export_format import (
     MM_PER,
     RAD_PER,
+    AngleUnit,
     ColumnMap,
     ExportedFix,
     ExportFormat,
@@ -43,6 +44,7 @@ _SETS_UP = {"02", "07", "10"}
 _MEASURED, _COORDINATES = "08TP", "08"
 _NOT_MEASURED = {"08KI": "coordinates typed in, not measured"}
 _LENGTHS: dict[str, LengthUnit] = {"1": "m", "2": "ft"}
+_ANGLES: dict[str, AngleUnit] = {"1": "deg", "2": "gon"}
 _SAME_FRAME_RAD = 1e-5  # between the circle and the coordinates' north: 0.1 mm at 10 m
 _SAME_ZERO_RAD = 1e-4  # between two back-sights: pointing differs by less, a circle that was set anew by more
 
@@ -55,18 +57,22 @@ def _guess(text: str, source: str) -> Guess:
     head = lines_of(text.lstrip(_MARKS))[0]
     if not head.startswith("00NMSDR33"):
         refuse(source, f"{head[4:12].strip()} has columns of another width; export the job as SDR33", 1)
-    found = _UNITS.search(head)
-    if found is None:
+    units = _units(head, 1, source)
+    if units is None:
         refuse(source, "the header does not tell the units: six digits at its end", 1)
-    if found["angle"] not in "12" or found["length"] not in _LENGTHS:
-        refuse(source, "angles in mil or distances in US feet: set the instrument to degrees or gon, and metres", 1)
-    columns = ColumnMap(
-        format=FORMAT.name,
-        length_unit=_LENGTHS[found["length"]],
-        angle_unit="gon" if found["angle"] == "2" else "deg",
-    )
+    columns = ColumnMap(format=FORMAT.name, length_unit=units[0], angle_unit=units[1])
     fixes = _read(text, columns, source)
     return Guess(columns, (f"{len(fixes)} points; the header says {columns.length_unit} and {columns.angle_unit}",))
+
+
+def _units(head: str, line: int, source: str) -> tuple[LengthUnit, AngleUnit] | None:
+    """Return the units that a header tells; None where it tells none."""
+    found = _UNITS.search(head)
+    if found is None:
+        return None
+    if found["angle"] not in _ANGLES or found["length"] not in _LENGTHS:
+        refuse(source, "angles in mil or distances in US feet: set the instrument to degrees or gon, and metres", line)
+    return _LENGTHS[found["length"]], _ANGLES[found["angle"]]
 
 
 def _read(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
@@ -118,7 +124,7 @@ class _Reading:
         coordinates: station -> line of its first coordinates.
         turned: station -> line of its first polar measurement that is not known to be in the frame of coordinates.
         zeros: station -> line of the first polar measurement after a back-sight, and azimuth of the circle's zero then.
-        units: as the header says them; "" before it.
+        units: as the header says them; None before it, and where it says none.
         target_mm: height of the target.
         times_set_up: how often the instrument was set up.
         has_measured: since it was set up.
@@ -135,7 +141,7 @@ class _Reading:
     coordinates: dict[str, int] = field(default_factory=dict)
     turned: dict[str, int] = field(default_factory=dict)
     zeros: dict[str, tuple[int, float]] = field(default_factory=dict)
-    units: str = ""
+    units: tuple[LengthUnit, AngleUnit] | None = None
     target_mm: float = 0.0
     times_set_up: int = 0
     has_measured: bool = True
@@ -166,10 +172,13 @@ class _Reading:
                 refuse(self.source, f"records {code!r} are not known", line)
 
     def _begin(self, line: int, head: str) -> None:
-        found = _UNITS.search(head)
-        units = found["angle"] + found["length"] if found else ""
+        units = _units(head, line, self.source)
+        map_units = (self.columns.length_unit, self.columns.angle_unit)
         if self.units and units != self.units:
             refuse(self.source, "a second header tells other units than the first; give each part as a file", line)
+        if units is not None and units != map_units:
+            said = f"the header says {' and '.join(units)}, the map {' and '.join(map_units)}"
+            refuse(self.source, f"{said}; correct length_unit and angle_unit of the map", line)
         self.units = units
 
     def _stand(self, line: int, code: str, cells: list[str]) -> None:

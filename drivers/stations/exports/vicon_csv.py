@@ -7,17 +7,19 @@
     ,,mm,mm,mm,mm,mm,mm
     1,0,...                   empty where a marker was not seen
 
-The separator may be a semicolon. Frame 1 is at 1 / rate seconds. Other kinds of blocks are passed over.
+The separator may be a semicolon. Frame 1 is at 1 / rate seconds. Other kinds of blocks are passed over; empty lines
+within this one are, too. A marker that was not seen has no coordinate, and any other all three.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 
-from drivers.stations.delimited import cells_of, decimal_of, line_at, lines_of, number_of, why_no_number
+from drivers.stations.cells import WHOLE, Numbers, cells_of, decimal_of, line_at, lines_of, number_of, why_too_many
 from drivers.stations.export_format import MM_PER, ColumnMap, ExportedFix, ExportFormat, Guess, refuse
 
-_KINDS = {"trajectories", "objects", "devices", "joints", "segments", "model outputs"}
+_KINDS = {"objects", "devices", "joints", "segments", "model outputs"}
 
 
 def _recognises(text: str) -> bool:
@@ -64,34 +66,62 @@ def _read(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
         refuse(source, "the map of trajectories needs rate_hz and header_line")
     lines = lines_of(text)
     header = cells_of(line_at(lines, columns.header_line, source), columns.separator)
-    names = cells_of(lines[columns.header_line - 2], columns.separator)
-    axes = "".join(cell.upper() if cell.upper() in ("X", "Y", "Z") else "-" for cell in header)
-    starts = [found.start() for found in re.finditer("XYZ", axes)]
-    if not starts:
-        refuse(source, "the header has no columns X, Y, Z", columns.header_line)
+    markers = _markers(header, cells_of(lines[columns.header_line - 2], columns.separator), columns, source)
     fixes: list[ExportedFix] = []
-    mm = MM_PER[columns.length_unit]
-    for number, line in enumerate(lines[columns.first_line - 1 :], columns.first_line):
-        cells = cells_of(line, columns.separator)
-        if not any(cells) or cells[0].lower() in _KINDS:
-            break  # the next block
-        frame = number_of(cells[0], columns.decimal)
+    frames: dict[float, int] = {}
+    numbers, mm = Numbers(columns.decimal, source), MM_PER[columns.length_unit]
+    for number, cells in _rows(lines, columns, source):
+        if any(cells[len(header) :]):
+            refuse(source, why_too_many(cells, len(header), columns.separator), number)
+        frame = number_of(cells[0], ".") if WHOLE.fullmatch(cells[0]) else None
         if frame is None:
             refuse(source, f"{cells[0]!r} is not the number of a frame", number, header[0])
-        for start in starts:
-            own = cells[start : start + 3]
-            if len(own) < 3 or not any(own):
+        if frames.setdefault(frame, number) != number:
+            said = f"frame {frame:.0f} is in line {frames[frame]} already"
+            refuse(source, f"{said}; export one row a frame, without sub-frames", number, header[0])
+        for marker, start in markers.items():
+            own = dict(zip("XYZ", [*cells[start : start + 3], "", "", ""], strict=False))
+            if not any(own.values()):
                 continue
-            values = [number_of(cell, columns.decimal) for cell in own]
-            marker = names[start] if start < len(names) and names[start] else f"unnamed {start + 1}"
-            for axis, value, cell in zip("XYZ", values, own, strict=True):
-                if value is None:
-                    refuse(source, why_no_number(cell), number, f"{marker} {axis}")
-            x, y, z = (mm * value for value in values if value is not None)
-            fixes.append(ExportedFix(number, f"{frame:g}", marker, (x, y, z), frame / columns.rate_hz))
+            for axis, cell in own.items():
+                if not cell:
+                    said = "the cell is empty; a marker has all three coordinates, or none where it was not seen"
+                    refuse(source, said, number, f"{marker} {axis}")
+            x, y, z = (mm * numbers.read(cell, number, f"{marker} {axis}") for axis, cell in own.items())
+            fixes.append(ExportedFix(number, f"{frame:.0f}", marker, (x, y, z), frame / columns.rate_hz))
     if not fixes:
         refuse(source, "no marker was seen in any frame")
     return fixes
+
+
+def _markers(header: list[str], names: list[str], columns: ColumnMap, source: str) -> dict[str, int]:
+    """Return the markers, each with the place of its first column."""
+    axes = "".join(cell.upper() if cell.upper() in ("X", "Y", "Z") else "-" for cell in header)
+    markers: dict[str, int] = {}
+    for found in re.finditer("XYZ", axes):
+        at = found.start()
+        marker = (names[at] if at < len(names) else "") or f"unnamed {at + 1}"
+        if markers.setdefault(marker, at) != at:
+            refuse(source, f"two markers are called {marker!r}; name one otherwise", columns.header_line - 1)
+    if not markers:
+        refuse(source, "the header has no columns X, Y, Z", columns.header_line)
+    return markers
+
+
+def _rows(lines: list[str], columns: ColumnMap, source: str) -> Iterator[tuple[int, list[str]]]:
+    """Return the rows of frames, each with its line: up to the kind of the next block, across empty lines."""
+    is_after_empty = False
+    for number, line in enumerate(lines[columns.first_line - 1 :], columns.first_line):
+        cells = cells_of(line, columns.separator)
+        if not any(cells):
+            is_after_empty = True
+            continue
+        if cells[0].lower() == "trajectories":
+            refuse(source, "a second block of trajectories; give each as a file", number)
+        if cells[0].lower() in _KINDS or (is_after_empty and not any(cells[1:]) and number_of(cells[0], ",") is None):
+            return
+        is_after_empty = False
+        yield number, cells
 
 
 FORMAT = ExportFormat(

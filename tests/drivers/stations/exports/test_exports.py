@@ -291,11 +291,58 @@ def test_the_unit_of_angles_follows_from_their_size_where_none_is_named(right: f
     assert (guess.map.angle_unit, guess.map.length_unit) == (unit, "m")
 
 
+@pytest.mark.parametrize(
+    ("above", "length", "where"),
+    [
+        ("Job A\nAll units in mm\n", "mm", "'mm' in line 2"),
+        ("Coordinate units are in metres;;;\n", "m", "'metres' in line 1"),
+        ("Units of angles and lengths: gon, in m\n", "m", "'m' in line 1"),
+        ("Length unit = in;;;\n", "in", "'in' in line 1"),
+        ("Units: gon/mm, speeds in m/s\n", "mm", "'mm' in line 1"),
+        ('Instrument unit: TS16 M 1"\nUnit: International feet, i.e. 0.3048 m\n', "ft", "'feet' in line 2"),
+        ('Instrument unit: TS16 M 1"\n', "m", ""),
+    ],
+)
+@pytest.mark.parametrize("header", ["Point;X;Y;Z\n", ""])
+def test_a_unit_above_a_table_is_taken_and_said_with_its_line(above: str, length: str, where: str, header: str) -> None:
+    found = export_formats()["plain_csv"].guess(f"{above}{header}1;20.5;30.25;10\n", "file")
+    assert found.map.length_unit == length
+    assert (f"the unit of length is {length}, as {where} says" in found.notes) == bool(where)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "Punkt;X (Easting) [mm];Y (Northing) [mm];Z (up) [mm]\n",
+        "Point;Actual X (mm);Actual Y (mm);Actual Z (mm)\n",
+        "Point;X(actual);Y(actual);Z(actual)\n;[mm];[mm];[mm]\n",
+        "Point;X;Y;Z\n\n---;mm;mm;mm\n",
+    ],
+)
+def test_remarks_in_brackets_are_no_units(header: str) -> None:
+    (fix,) = fixes(f"{header}P1;1;2;3\n", "plain_csv")
+    assert fix.position_mm == (1.0, 2.0, 3.0)
+
+
+def test_commas_that_are_decimal_signs_are_those_of_measured_columns_and_said() -> None:
+    remark, number = ("point;x;y;z;remark\n1;1.5;2;3;4,5\n", "point;x;y;z\n1;1,234;2;3\n")
+    assert export_formats()["plain_csv"].guess(remark, "file").map.decimal == "."
+    assert "commas are decimal signs, as in '1,234'" in export_formats()["plain_csv"].guess(number, "file").notes
+
+
 @pytest.mark.parametrize("semicolons", [False, True])
 def test_vicon_trajectories(semicolons: bool) -> None:
     found = fixes(VICON.replace(",", ";") if semicolons else VICON, "vicon_csv")
     assert [(fix.point, fix.target) for fix in found] == [("1", "rig:tip"), ("1", "rig:base"), ("2", "rig:base")]
     assert (found[2].position_mm, found[2].time_s) == ((4.5, 5.5, 6.5), 0.02)
+
+
+@pytest.mark.parametrize("empty", ["", ",,,,,,,", "\n\n"])
+@pytest.mark.parametrize("after", ["Devices\n1000\n1,0,9,9,9\n", "\nGait Events,,\n1,0,9,9,9\n", ""])
+def test_vicon_frames_go_on_after_an_empty_line_until_the_next_block(empty: str, after: str) -> None:
+    text = VICON.replace("2,0,,,", f"{empty}\n1000000,0,,,").split("\nDevices")[0]
+    found = fixes(f"{text}1000001,0,1,1,1\n{after}", "vicon_csv")
+    assert [(fix.point, fix.target[4:]) for fix in found[2:]] == [("1000000", "base"), ("1000001", "tip")]
 
 
 def test_angles_and_a_distance_become_a_position() -> None:
@@ -319,10 +366,11 @@ def test_a_column_of_stations_with_a_value_in_each_row_is_refused(values: list[o
     assert f"line 1, column station: {different} different values in {len(rows)} rows, so it does not name" in said
 
 
-def test_of_two_columns_that_may_name_stations_the_one_that_is_taken_is_said() -> None:
-    found = export_formats()["plain_csv"].guess("Station,Setup,x,y,z\nA,1,1,2,3\nA,2,1,2,3\n", "file")
-    assert found.map.columns["station"] == "Station"
-    assert "set-ups by 'Station' alone, though columns Station, Setup may name them" in found.notes
+@pytest.mark.parametrize(("role", "names"), [("station", ["Station", "Setup"]), ("prism", ["Code", "Target"])])
+def test_of_two_columns_that_may_name_the_same_the_one_that_is_taken_is_said(role: str, names: list[str]) -> None:
+    found = export_formats()["plain_csv"].guess(f"{','.join(names)},x,y,z\nA,1,1,2,3\nA,2,1,2,3\n", "file")
+    assert dict(found.map.columns)[role] == names[0]
+    assert f"{role} by {names[0]!r} alone, though columns {', '.join(names)} may be it" in found.notes
 
 
 @pytest.mark.parametrize(
@@ -380,6 +428,50 @@ def test_what_is_not_named_is_guessed_and_said() -> None:
         ("name;x;y;z\nP1;1.5;2.5;3.5;4.5\n", "line 2: 5 cells where the header has 4"),
         ("name,x [mm],y [m],z [mm]\nP1,1229.5,2.5,3.5\n", "different units, 'x [mm]' in mm and 'y [m]' in m"),
         ("name,x,y,z\nP1,1229.5,,3.5\n", "line 2, column y: the cell is empty"),
+        ("name;x;y;-z\nP1;1;2;3\n", "its names are not known (name, x, y, -z)"),
+        ("name,x,y,z,Time [ms]\nP1,1,2,3,4\n", "line 1, column Time [ms]: times in 'ms' are not read"),
+        # units
+        ("Units: mm; heights in ft\nname;x;y;z\nP1;1;2;3\n", "length: 'mm' in line 1 (mm) and 'ft' in line 1 (ft)"),
+        ("Height unit: m\nUnit mm\nP1;1;2;3\n", "of length: 'm' in line 1 (m) and 'mm' in line 2 (mm); leave one"),
+        (ANGLES.replace("gon", "mil"), "line 1, column hz (mil): 'mil' is no unit of angles that is known; export deg"),
+        (LEICA.replace("[m]", "(US ft)"), "line 1, column East (US ft): 'US ft' is no unit of length that is known"),
+        ("name;x (actual) [km];y;z\nP1;1;2;3\n", "column x (actual) [km]: 'km' is no unit of length"),
+        ("name;x;y;z\n;km;km;km\nP1;1;2;3\n", "line 2, column x: 'km' is no unit of length"),
+        ("name;x [mm];y;z\n;m;m;m\nP1;1;2;3\n", "different units, 'x [mm]' in mm and 'x [mm]' in m"),
+        # cells that are lost, and rows
+        ("point prism x y z t\n1 w 1 2 3 20\n2 1 2 3 20\n", "line 3: 5 cells where the header has 6; an empty one"),
+        ("1 1.5 2 3 20\n2 1 2 3\n", "line 2: 4 cells where the rows before have 5; an empty one between blanks"),
+        ("P1,,2.0,3.0\nP2,1,2,3\n", "line 1: it has numbers, as the points from line 2 on, but is no point, x, y, z"),
+        ("P1 2.0 3.0\nP2 1 2 3\n", "line 1: it has numbers, as the points from line 2 on"),
+        # signs before fractions
+        (
+            'name,x,y,z\nP1,"1,234",5,6\nP2,7,567.8,9\n',
+            "line 3: '567.8', and '1,234' in line 2: both a point and a com",
+        ),
+        ("name;x;y;z\nP1;1.234;567,8;9\n", "line 2: '567,8', and '1.234' in line 2: both a point and a comma"),
+        (VICON.replace("1.5", '"1,234"'), "line 6: '2.5', and '1,234' in line 6: both a point and a comma"),
+        # columns of one meaning
+        (
+            "name;X;Y;Z;Actual X\nP1;1;2;3;1\n",
+            "line 1: columns 'X' and 'Actual X' may both be x; rename one, or write a map",
+        ),
+        (
+            "p;X (Northing);Y (Easting);Z\nP;1;2;3\n",
+            "columns 'X (Northing)' and 'Y (Easting)' may both be x; rename one",
+        ),
+        ("name;Height;X;Y;Z\nP1;1;2;3;1\n", "columns 'Height' and 'Z' may both be z"),
+        ("name;East;North;X;Y;Z\nP1;1;2;3;1;1\n", "columns 'East' and 'X' may both be x"),
+        (
+            "name;hz;azimuth;v;sd\nP1;1;2;3;1\n",
+            "columns 'hz' and 'azimuth' may both be hz; rename one, or write a map that",
+        ),
+        # Vicon
+        (VICON.replace("4,5,6", "4,5"), "line 6, column rig:base Z: the cell is empty; a marker has all three coord"),
+        (VICON.replace("4,5,6", "4,5,6,7"), "line 6: 9 cells where 8 are due: commas separate columns and are decimal"),
+        (VICON.replace("2,0,", "1,1,"), "line 7, column Frame: frame 1 is in line 6 already; export one row a frame"),
+        (VICON.replace("2,0,", '"1,002",0,'), "line 7, column Frame: '1,002' is not the number of a frame"),
+        (VICON.replace("base", "tip"), "line 3: two markers are called 'rig:tip'; name one otherwise"),
+        (VICON.replace("Devices", "Trajectories"), "line 9: a second block of trajectories; give each as a file"),
     ],
 )
 def test_bad_tables_are_refused_whole(text: str, said: str) -> None:
@@ -392,6 +484,16 @@ def test_bad_tables_are_refused_whole(text: str, said: str) -> None:
         (LEICA, {"header_line": 99}, "the map's header is in line 99, the file has 4"),
         (VICON, {"header_line": 99}, "the map's header is in line 99, the file has 11"),
         (LEICA, {"columns": {"point": 1, "x": 0, "y": 3, "z": 4}}, "column 0: columns of the map are counted from 1"),
+        (
+            SDR_HEAD + sdr("08TP", "1", 1.0, 2.0, 3.0),
+            {"angle_unit": "deg"},
+            "line 1: the header says m and gon, the map m and deg; ",
+        ),
+        (
+            SDR_HEAD + sdr("08TP", "1", 1.0, 2.0, 3.0),
+            {"length_unit": "ft"},
+            "the header says m and gon, the map ft and",
+        ),
     ],
 )
 def test_a_map_of_another_file_is_refused(text: str, change: dict[str, object], said: str) -> None:
