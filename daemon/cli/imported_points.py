@@ -136,7 +136,8 @@ def read_joints(path: Path, rig: Rig) -> JointRows:
     """Read a file of joint values: a column for each joint as in observations, and `pose`, `time_s` or `time` (ISO).
 
     Raises:
-        DescriptionError: a column is missing, a cell is no number, or a pose is there twice; with line and column.
+        DescriptionError: a column is missing, a cell is no number, or a pose or a time is there twice; with line
+            and column.
     """
     source = path.name
     lines = lines_of(read_export(path))
@@ -149,7 +150,7 @@ def read_joints(path: Path, rig: Rig) -> JointRows:
             source, f"needs a column {POSE!r} (the point's name or number), {TIME_S!r} or {TIME!r} to match fixes by", 1
         )
     by_pose: dict[str, list[float]] = {}
-    timed: list[tuple[float, list[float]]] = []
+    timed: dict[float, tuple[int, list[float]]] = {}
     for number, line in enumerate(lines[1:], 2):
         if not line.strip():
             continue
@@ -167,12 +168,14 @@ def read_joints(path: Path, rig: Rig) -> JointRows:
             if by_pose.setdefault(_plain(cell), row) is not row:
                 refuse(source, f"pose {cell!r} is there twice", number, POSE)
         else:
-            timed.append((_seconds(cell, source, number, key), row))
+            before, same = timed.setdefault(_seconds(cell, source, number, key), (number, row))
+            if same != row:
+                refuse(source, f"time {cell!r} is in line {before} with other joint values; leave one", number, key)
     if not by_pose and not timed:
         refuse(source, "no rows below the header")
-    timed.sort(key=lambda each: each[0])
+    times = sorted(timed)
     rates = [joint.max_rate if joint.kind == "revolute" else None for joint in rig.joints]
-    return JointRows(source, joints, by_pose, [at for at, _ in timed], [row for _, row in timed], rates)
+    return JointRows(source, joints, by_pose, times, [timed[at][1] for at in times], rates)
 
 
 def _check_joint_columns(header: Sequence[str], joints: Sequence[str], rig: Rig, source: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,9 @@ from click.testing import CliRunner, Result
 
 from calibration.observations import Observations
 from calibration.rig.description import shipped_rig
-from daemon.cli.imported_points import setup_names
+from daemon.cli.imported_points import read_joints, setup_names
 from daemon.cli.main import main
+from drivers.errors import DescriptionError
 from drivers.stations.export_format import ExportedFix
 from tests.drivers.stations.exports.test_exports import POINTS, SDR_HEAD, SETUP, VICON, gts_download, sdr
 
@@ -58,6 +60,21 @@ def test_between_two_times_a_joint_goes_on_from_the_end_of_its_turn(tmp_path: Pa
     told(survey, "--rig", "ur10", "--joints", joints, "--prism", "tmac", "--out", out)
     found = Observations.from_csv(out, RIG)
     assert [float(found.joints[name][0]) for name in RIG.joint_names] == [1.0, 0.0, 15.0, -92.5, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("times", [("10.0", "10"), ("2026-11-24T10:00:00", "2026-11-24T11:00:00+01:00")])
+@pytest.mark.parametrize("values", ["0,0,0,0,0,0", "0,0,0,0,0,5"])
+def test_joint_values_at_one_time_are_refused_where_they_differ(
+    tmp_path: Path, times: tuple[str, str], values: str
+) -> None:
+    joints, key = tmp_path / "joints.csv", "time" if "T" in times[0] else "time_s"
+    joints.write_text(f"{key},{','.join(JOINTS)}\n{times[0]},0,0,0,0,0,0\n\n{times[1]},{values}\n")
+    if values.endswith("5"):
+        said = f"joints.csv, line 4, column {key}: time {times[1]!r} is in line 2 with other joint values; leave one"
+        with pytest.raises(DescriptionError, match=re.escape(said)):
+            read_joints(joints, RIG)
+    else:
+        assert len(read_joints(joints, RIG).times_s) == 1
 
 
 def test_joints_of_a_spreadsheet_in_another_language_are_refused(tmp_path: Path) -> None:
