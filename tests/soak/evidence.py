@@ -28,6 +28,7 @@ ALARMS_REAL_S = 1.0  # how often the daemon looks for alarms
 WAIT_NS = 40 * NS_PER_S  # how long evidence is looked for, to tell late from never
 JUST_BEFORE_NS = NS_PER_S // 5
 SESSION = "session"  # in place of a link's name
+OF_SESSION = ("lock_loss: alarm", "prism_jump", "prism_jump: alarm")  # only a session has a prism that can be left
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,6 @@ class Case:
         link: whose loss would hide it.
         at_ns: when it began.
         expected: any of these will do.
-        of_session: it is shown only while a session is open.
         found: what has shown it.
     """
 
@@ -88,8 +88,12 @@ class Case:
     link: str
     at_ns: int
     expected: tuple[Expected, ...]
-    of_session: bool = False
     found: Fact | None = None
+
+    @property
+    def of_session(self) -> bool:
+        """Whether it is shown only while a session is open and the station stands on its prism."""
+        return self.name in OF_SESSION
 
     def shows(self, fact: Fact) -> bool:
         """Whether a fact is evidence of it."""

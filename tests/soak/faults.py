@@ -340,9 +340,7 @@ class Mischief:
         """The fault that has just begun lasts so long: if that is long, there must be an alarm."""
         if self._watch.alarms and lasts_s >= LONG_S:
             expected = (Expected("alarm", ALARMS[fault]),)
-            case = Case(f"{fault}: alarm", tuple(subjects), link, self._rig.now_ns(), expected)
-            case.of_session = fault in ("lock_loss", "prism_jump")
-            self._watch.expect(case)
+            self._watch.expect(Case(f"{fault}: alarm", tuple(subjects), link, self._rig.now_ns(), expected))
 
     def _expect(self, name: str, subjects: Sequence[str], link: str, *, at_ns: int | None = None) -> None:
         at_ns = self._rig.now_ns() if at_ns is None else at_ns

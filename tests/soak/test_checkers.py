@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -234,9 +235,8 @@ def test_what_only_a_session_shows_is_judged_while_one_is_open(store: Store) -> 
     turn = [Blackout(SESSION, 130 * NS_PER_S, 133 * NS_PER_S)]
 
     def never(at_s: float, blackouts: Sequence[Blackout]) -> int:
-        case = node_silent(at_s)
-        case.of_session = True
-        return judge([case], blackouts, RATE, 200 * NS_PER_S)["node_silent"].never
+        case = replace(node_silent(at_s), name="prism_jump")
+        return judge([case], blackouts, RATE, 200 * NS_PER_S)["prism_jump"].never
 
     assert [never(at_s, unwatched) for at_s in (80.0, 120.0, 148.0, 170.0)] == [0, 1, 0, 0]
     assert [never(at_s, unwatched + turn) for at_s in (120.0, 128.0, 132.0, 140.0)] == [1, 0, 0, 1]
