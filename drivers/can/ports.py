@@ -19,6 +19,7 @@ import select
 import socket
 import struct
 import termios
+import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -37,6 +38,9 @@ Interface = Literal["socketcan", "virtual", "udp_multicast", "slcan"]
 
 ADAPTER_READY_S = 1.2  # after its port was opened: some slcan adapters start anew then; with the rest under 2 s
 BATCH_MAX = 512  # frames per read, so that a flooded bus cannot keep the loop from its other duties
+GATHER_S = (
+    0.005  # frames that come so soon after the first are read with it: to wake up costs as much as some frames do
+)
 
 # Linux, include/uapi/asm-generic/socket.h; Python's socket module does not name them
 SO_RCVBUFFORCE = 33
@@ -208,7 +212,7 @@ class CanPort(abc.ABC):
 
 
 class _DatagramPort(CanPort):
-    """Base of the ports on a socket, where every datagram is a frame."""
+    """Base of the ports on a socket, where every datagram is a frame. The kernel stamps it, whenever it is read."""
 
     def __init__(self, where: str, bus: can.BusABC, descriptor: socket.socket, receive_buffer_bytes: int) -> None:
         super().__init__(where, bus)
@@ -228,8 +232,11 @@ class _DatagramPort(CanPort):
         received: list[Received] = []
         receive_message = self._socket.recvmsg
         is_last = True
+        until_s = time.monotonic() + timeout_s
         try:
             ready = self._failure is None and select.select([self._socket], [], [], timeout_s)[0]
+            if ready:
+                time.sleep(min(GATHER_S, max(0.0, until_s - time.monotonic())))
             for _ in range(BATCH_MAX if ready else 0):
                 datagram, ancillary, _flags, _sender = receive_message(4096, _ANCILLARY_BYTES, socket.MSG_DONTWAIT)
                 kernel_utc_ns = None
