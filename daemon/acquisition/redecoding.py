@@ -128,7 +128,7 @@ def redecode_command(
             what = f"the time from {_text(first_ns)} to {_text(last_ns)}"
         if not stretches:
             raise CommandError(f"the store has no captures of {what}; `rigcal session list` shows the sessions")
-        stretches = decoded_before(reader, stretches, AFTER_NS)
+        wanted, stretches = stretches, decoded_before(reader, stretches, AFTER_NS)
         if not stretches:
             raise CommandError(
                 f"{what} waits to be decoded for the first time; ask again when `rigcal store stats` says that no "
@@ -149,6 +149,7 @@ def redecode_command(
     added = redecode(store, decoders, stretches, go_on, may_differ=may_differ)
     return {
         "added": added,
+        "is_whole": stretches == wanted,  # else what is younger waits to be decoded for the first time
         "stretches": [{"first_utc_ns": first.utc_ns, "last_utc_ns": last.utc_ns} for first, last in stretches],
     }
 

@@ -106,8 +106,8 @@ class ModelRegistry:
             wanted = self._table.predecessor(live)
             if wanted is None:
                 others = [m.id for m in self._table.all() if m.state == "retired" and self._table.was_live(m)]
-                another = f"; name another, as `rigcal model rollback {others[-1]}`" if others else ""
-                raise CommandError(f"model {live.id} is the first that went live, and replaced none{another}")
+                instead = f"name another, as `rigcal model rollback {others[-1]}`" if others else "accept a better one"
+                raise CommandError(f"model {live.id} is the first that went live, and replaced none; {instead}")
         model = self._own(self._table.get(wanted))
         if model.state != "retired" or not self._table.was_live(model):
             why = {

@@ -54,7 +54,10 @@ class StationSetups:
         """
         setup_id = identifier(arguments, "id", "a set-up's id")
         if setup_id in self._table.states():
-            raise CommandError(f"set-up {setup_id!r} exists already; a station that was moved is a new set-up")
+            raise CommandError(
+                f"set-up {setup_id!r} exists already: `--setup {setup_id}` goes on in it where the station stands "
+                "as then; one that was moved is a new set-up, of another name"
+            )
         constants = mapping_argument(arguments, "prism_constants_mm")
         for prism in constants:
             number_argument(constants, prism, limit=MOST_CONSTANT_MM)

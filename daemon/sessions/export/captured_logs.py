@@ -16,7 +16,14 @@ from daemon.sessions.export.session_file import DeviceState, DoubtfulCaptures, S
 from daemon.sessions.session_data import sessions_csv
 from daemon.sessions.vector_channels import channel_numbers
 from daemon.store.queries.device_states import device_states
-from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS, is_undecoded, prism_confirmations, session
+from daemon.store.queries.sessions import (
+    AFTER_NS,
+    BEFORE_NS,
+    is_being_joined,
+    is_undecoded,
+    prism_confirmations,
+    session,
+)
 from daemon.store.queries.setups import control_points
 from daemon.store.reader import Reader
 from daemon.store.upkeep.full_samples import stretches_of_session
@@ -27,7 +34,7 @@ from drivers.readings import CanCapture, Capture, SerialCapture
 
 CanFormat = Literal["log", "asc", "blf"]
 
-DECODED_WITHIN_S = 5.0  # a session that was just stopped is decoded within a fraction of it
+JOINED_WITHIN_S = 5.0  # after its end, where links are alive; from a daemon that was killed nothing comes any more
 LOOK_S = 0.1
 _BETWEEN_BOOTS_NS = 1_000_000  # at least: logs have microseconds, and what came first must come first again
 
@@ -112,7 +119,7 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
 
 
 def ended_session(reader: Reader, session_id: str) -> dict[str, Any]:
-    """Return the row of a session that has ended, once all its captures are decoded.
+    """Return the row of a session that has ended, once its last captures are decoded and its last fixes are joined.
 
     Raises:
         CommandError: no such session, it is still open, or its captures wait to be decoded for longer than they do
@@ -123,14 +130,14 @@ def ended_session(reader: Reader, session_id: str) -> dict[str, Any]:
         raise CommandError(f"{reader.path} has no session {session_id!r}; `rigcal session list` shows them")
     if found["ended_utc_ns"] is None:
         raise CommandError(f"session {session_id!r} is still open; stop it first")
-    deadline = time.monotonic() + DECODED_WITHIN_S
-    while is_undecoded(reader, session_id):
-        if time.monotonic() > deadline:
-            raise CommandError(
-                f"captures of session {session_id!r} wait to be decoded, so its tables are not whole; `rigcal run` "
-                "decodes them: export it when `rigcal store stats` says that none wait"
-            )
+    deadline = time.monotonic() + JOINED_WITHIN_S
+    while is_being_joined(reader, session_id) and time.monotonic() < deadline:
         time.sleep(LOOK_S)
+    if is_undecoded(reader, session_id):
+        raise CommandError(
+            f"captures of session {session_id!r} wait to be decoded, so its tables are not whole; `rigcal run` "
+            "decodes them: export it when `rigcal store stats` says that none wait"
+        )
     return found
 
 

@@ -30,6 +30,14 @@ STORE, MODELS, ABOUT = "rigcal.sqlite", "models", "backup.json"
 FORM = 1
 RESERVE_BYTES = 256 * 2**20  # stays free where a backup is written
 STEP_PAGES = 4096
+# More may have come after the backup was made, another session too: whose fixes those of now are, it does not say.
+_CLOSE_OPEN_SESSIONS = """UPDATE calibration_sessions AS s SET state = 'closed',
+        (ended_utc_ns, ended_monotonic_ns, ended_boot_id) = (SELECT * FROM (
+            SELECT alive_utc_ns, alive_monotonic_ns, alive_boot_id FROM daemon_runs
+            UNION ALL SELECT s.started_utc_ns, s.started_monotonic_ns, s.started_boot_id)
+            ORDER BY alive_boot_id DESC, alive_monotonic_ns DESC LIMIT 1),
+        excluded = 'it was open when the backup was made that the store was restored from'
+    WHERE state = 'open'"""
 _FIRST_BOOT = "SELECT kernel_boot_id, booted_utc_ns FROM boots ORDER BY id LIMIT 1"
 _NAME = re.compile(r"rigcal-\d{8}T\d{6}Z")
 _UNFINISHED = ".unfinished"
@@ -181,6 +189,8 @@ def _origin(backup: Path) -> tuple[str, int] | None:
 def restore_backup(backup: Path, store: Path, models: Path, now_utc_ns: int, go_on: GoOn) -> Path | None:
     """Put a backup in the place of a store and its models; these are kept beside.
 
+    A session that was open when the backup was made is closed, and used where an operator accepts it.
+
     Ends what an earlier restore that was cut off has begun: what that one moved aside stays where it is, what it put in
     place is written over.
 
@@ -216,6 +226,7 @@ def restore_backup(backup: Path, store: Path, models: Path, now_utc_ns: int, go_
             shutil.rmtree(scratch, ignore_errors=True)
             try:
                 shutil.copytree(backup, scratch)
+                _close_open_sessions(scratch / STORE)
                 _give_to_owner_of(store.parent, scratch)
                 _sync_tree(scratch)
                 aside = _exchange(backup, scratch, store, models, f"replaced-{_named(now_utc_ns)}")
@@ -224,6 +235,11 @@ def restore_backup(backup: Path, store: Path, models: Path, now_utc_ns: int, go_
     finally:
         lock.release()
     return aside
+
+
+def _close_open_sessions(store: Path) -> None:
+    with contextlib.closing(sqlite3.connect(store)) as db, db:
+        db.execute(_CLOSE_OPEN_SESSIONS)
 
 
 def _exchange(backup: Path, scratch: Path, store: Path, models: Path, name: str) -> Path | None:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from daemon.store.errors import StoreError
+from daemon.store.queries.sessions import OLDEST_WAITING
 from daemon.store.reader import Reader
 from daemon.store.store import Store
 from drivers.clock import Stamp
@@ -29,8 +30,6 @@ _STRETCHES = _OF_CHUNKS.format("last_utc_ns >= ? AND first_utc_ns <= ?")
 _BETWEEN = _OF_CHUNKS.format(
     "(last_boot_id, last_monotonic_ns) >= (?, ?) AND (first_boot_id, first_monotonic_ns) <= (?, ?)"
 )
-_OLDEST_WAITING = """SELECT first_boot_id AS boot_id, first_monotonic_ns AS ns FROM undecoded_chunks
-    JOIN raw_chunks ON raw_chunks.id = chunk_id ORDER BY boot_id, ns LIMIT 1"""
 
 Stretch = tuple[Stamp, Stamp]
 
@@ -114,16 +113,16 @@ def decoded_before(reader: Reader, stretches: Sequence[Stretch], margin_ns: int)
 
     Acquisition stores the records of what waits, and does not look whether they are there already.
     """
-    oldest = next(reader.rows(_OLDEST_WAITING), None)
+    oldest = next(reader.rows(OLDEST_WAITING), None)
     if oldest is None:
         return list(stretches)
     boots = {kernel_id: row for row, kernel_id in reader.boots().items()}
     cut = []
     for since, until in stretches:
         boot, last = boots[until.boot_id], until
-        if boot == oldest["boot_id"]:
-            last = until.shifted(min(oldest["ns"] - margin_ns - until.monotonic_ns, 0))
-        if boot <= oldest["boot_id"] and since.monotonic_ns <= last.monotonic_ns:
+        if boot == oldest["first_boot_id"]:
+            last = until.shifted(min(oldest["first_monotonic_ns"] - margin_ns - until.monotonic_ns, 0))
+        if boot <= oldest["first_boot_id"] and since.monotonic_ns <= last.monotonic_ns:
             cut.append((since, last))
     return cut
 

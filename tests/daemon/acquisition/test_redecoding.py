@@ -125,10 +125,12 @@ def test_what_waits_to_be_decoded_for_the_first_time_is_not_stored_twice(
         decode(4.0)
         result = redecode_command(store, SOURCE.rig, DECODERS, everything, lambda: None)
         assert result["added"] > 500
+        assert not result["is_whole"]
         (stretch,) = result["stretches"]
         assert stretch["last_utc_ns"] - UTC_0_NS == pytest.approx(2.0 * NS_PER_S, abs=0.2 * NS_PER_S)
         decode(SECONDS)
-        assert redecode_command(store, SOURCE.rig, DECODERS, everything, lambda: None)["added"] > 500
+        rest = redecode_command(store, SOURCE.rig, DECODERS, everything, lambda: None)
+        assert (rest["added"] > 500, rest["is_whole"]) == (True, True)
     for name, columns in TABLES.items():
         rows = [(row["monotonic_ns"], row[columns[0]]) for row in table(store.path, name)]
         assert len(rows) == len(set(rows)), name

@@ -258,7 +258,7 @@ def test_nothing_is_named_where_no_other_model_was_ever_live(rig: ModelRig) -> N
     live = rig.accepted(30)
     rig.candidate()
     told = refusal(rig.registry.rollback_command, WRONG_USE)
-    assert told == f"model {live} is the first that went live, and replaced none"
+    assert told == f"model {live} is the first that went live, and replaced none; accept a better one"
 
 
 def test_rollback_puts_back_what_the_live_model_replaced_step_by_step(rig: ModelRig) -> None:

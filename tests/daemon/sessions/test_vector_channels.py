@@ -53,6 +53,7 @@ def exported(directory: Path, config: Config, can_format: CanFormat, links: Sequ
         rig.store.mark_decoded(rig.store.append_captures(frames(link)))
     rig.clock.advance(2.0)
     rig.say("stop")
+    rig.store.end_run(rig.clock.now())
     rig.store.close()
     export_session(config, "s001-r", directory / "out", can_format)
     return {link: directory / "out" / f"s001-r-{link}.{can_format}" for link in links}

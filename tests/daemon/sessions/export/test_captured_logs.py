@@ -65,6 +65,7 @@ def test_a_link_that_fell_silent_before_a_reboot_comes_beside_the_others_of_the_
         rig.store.mark_decoded([*rig.store.append_captures(frames), *rig.store.append_captures(lines)])
     rig.clock.set(at_second(END_S, behind_s))
     rig.say("stop")
+    rig.store.end_run(rig.clock.now())
     rig.store.close()
     logs = [path for path in export_session(config, "s1", tmp_path / "out", can_format) if path.suffix != ".csv"]
     told = read_session_file(logs.pop())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import threading
 from importlib import resources
 from pathlib import Path
 
@@ -101,7 +102,7 @@ def test_an_unknown_session_is_refused(config: Path, tmp_path: Path, form: str) 
 def test_a_session_whose_captures_wait_to_be_decoded_is_not_exported_in_part(
     config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("daemon.sessions.export.captured_logs.DECODED_WITHIN_S", 0.2)
+    monkeypatch.setattr("daemon.sessions.export.captured_logs.JOINED_WITHIN_S", 0.2)
     with contextlib.closing(Store(config.with_name("rigcal.sqlite"))) as store:
         ids = store.append_captures([SerialCapture("station", at(2.5), b"Q+0")])
         command = ["session", "export", "s001-r", "--config", str(config), "--out", str(tmp_path / "out")]
@@ -111,3 +112,19 @@ def test_a_session_whose_captures_wait_to_be_decoded_is_not_exported_in_part(
             assert "captures of session 's001-r' wait to be decoded" in result.stderr
         store.mark_decoded(ids)
     assert len(export(config, tmp_path, "csv")) == 3
+
+
+def test_a_session_that_was_just_stopped_is_exported_with_the_observations_that_still_come(
+    config: Path, tmp_path: Path
+) -> None:
+    with contextlib.closing(Store(config.with_name("rigcal.sqlite"))) as store:
+        store.begin_run(at(-5.0))
+        exported: list[Path] = []
+        exporting = threading.Thread(target=lambda: exported.extend(export(config, tmp_path, "csv")))
+        exporting.start()
+        place = {"x_mm": 300.0, "y_mm": 2.0, "z_mm": 3.0, "moving": 0, "values_json": JOINTS}
+        ObservationTable(store).add(None, at(2.9), session_id="s001-r", prism="r", pose="1.3", **place)
+        store.mark_decoded(store.append_captures([SerialCapture("station", at(5.0), b"Q+0")]))
+        exporting.join()
+        store.end_run(at(6.0))
+    assert Observations.from_csv(exported[0], RIG).position_mm[:, 0].tolist() == [100.0, 200.0, 300.0]

@@ -18,6 +18,7 @@ from pathlib import Path
 import pytest
 
 from daemon.store import Reader, Store, StoreBusyError, StoreError
+from daemon.store.queries.sessions import SessionTable
 from daemon.store.upkeep import daily_backups
 from daemon.store.upkeep.backup import backups, make_backup, restore_backup
 from daemon.store.upkeep.daily_backups import DailyBackups
@@ -99,6 +100,25 @@ def test_a_backup_of_a_store_that_is_written_to_is_restored_with_its_live_model(
     assert (site.models / "00001-gap" / "model.json").read_text() == "{}"
     with contextlib.closing(Store(site.path)) as again:
         assert again.number("SELECT sum(captures) FROM raw_chunks", []) == held
+
+
+def test_a_session_that_was_open_when_the_backup_was_made_does_not_go_on(site: Site) -> None:
+    site.store.begin_run(at(0.0))
+    sessions = SessionTable(site.store, "swdt82")
+    sessions.start(at(10.0), "name = 'swdt82'", id="s001-r", prism="r", operator="", kind="static_poses")
+    site.store.note_alive(at(20.0))
+    backup = site.back_up()
+    sessions.change("s001-r", state="closed", **site.store.instant(at(30.0), "ended_"))
+    sessions.start(at(40.0), "name = 'swdt82'", id="s002-b", prism="b", operator="", kind="static_poses")
+    site.store.close()
+    site.restore(backup)
+    (session,) = table(site.path, "calibration_sessions")
+    assert (session["id"], session["state"], session["ended_monotonic_ns"]) == (
+        "s001-r",
+        "closed",
+        at(20.0).monotonic_ns,
+    )
+    assert "open when the backup was made" in session["excluded"]
 
 
 def test_what_was_replaced_is_kept_though_it_was_within_the_same_second(site: Site) -> None:
