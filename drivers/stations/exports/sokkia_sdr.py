@@ -10,6 +10,8 @@
 The last two characters of a code say where a record comes from: TP is measured, F1 and F2 are readings in a face, KI is
 typed in on the keyboard, RS, SO, TV and others are results of programs. Of coordinates only 08TP is taken.
 
+Columns are filled up with blanks, the last one too; but heights of targets need not be.
+
 A number in digits after the last record is a check sum, whose rule no source states; it is passed over. Coordinates are
 given from the instrument's centre, where the file says where it stood, and of the prism, not of the ground below it.
 Their north is that of the job, and that of polar measurements is the zero of the circle.
@@ -88,8 +90,8 @@ def _read(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
 def _records(text: str) -> Iterator[tuple[int, str]]:
     """Return the records of a file, each with its line from 1."""
     for number, line in enumerate(lines_of(text), 1):
-        record = line.strip("\x02\x03\x04\x1a\r\n ")
-        if record and not record.isdigit():
+        record = line.lstrip("\x02\x03\x04\x1a ").rstrip("\x02\x03\x04\x1a\r\n")
+        if record and not record.strip().isdigit():
             yield number, record
 
 
@@ -256,6 +258,11 @@ def _number(cells: list[str], place: int, code: str, line: int, source: str) -> 
     value = number_of(text, ".")
     if value is None:
         refuse(source, f"{why_no_number(text)}, in column {place + 1} of a record {code}", line)
+    if len(cells[place]) < _WIDTH and not code.startswith("03"):
+        said = (
+            f"the record {code} ends with {text!r} within column {place + 1}: it is cut, or lost the blanks at its end"
+        )
+        refuse(source, f"{said}; export the file again", line)
     return value
 
 

@@ -149,6 +149,8 @@ def test_bad_sdr_files_are_refused() -> None:
     assert "line 4: 'x.0' is not a number, in column 2" in refused(SDR_HEAD + good + sdr("08TP", "2", "x.0", 2.0, 3.0))
     assert "line 3: 'nan' is not a number, in column 3" in refused(SDR_HEAD + sdr("08TP", "1", 1.0, "nan", 3.0))
     assert "columns of another width" in refused(SDR_HEAD.replace("SDR33", "SDR20") + good)
+    cut = refused(SDR_HEAD + good + sdr("08TP", "2", 1.0, 2.0, 333.123)[: 4 + 3 * 16 + 3] + "\n")
+    assert "line 4: the record 08TP ends with '333' within column 4: it is cut, or lost the blanks at its end" in cut
     moved = sdr("02TP", "3", 0.0, 0.0, 0.0, 1.5) + good + sdr("02TP", "3", 9.0, 0.0, 0.0, 1.5)
     assert "line 5: a second place of the station 'JOB1/3'; name it otherwise, or split" in refused(SDR_HEAD + moved)
 
