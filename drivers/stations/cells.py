@@ -11,6 +11,7 @@ from drivers.stations.export_format import refuse
 _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?", re.ASCII)
 _BEFORE_BRACKET = re.compile(r"(?<!\s)\s++(?=[\[(])")  # blanks between a name and its unit
 WHOLE = re.compile(r"[+-]?\d+", re.ASCII)
+_NO_BLANKS = "an empty cell between blanks, or a blank in one, cannot be told; separate columns otherwise"
 _LARGEST = 1e12  # of coordinates, angles and seconds in any unit
 
 
@@ -40,6 +41,11 @@ def cells_of(line: str, separator: str) -> list[str]:
         return []
 
 
+def is_no_row(line: str, separator: str) -> bool:
+    """Return whether a line of a table is empty in all its cells, or a remark that begins with #."""
+    return not line.strip(f'{separator} \t"') or line.lstrip().startswith("#")
+
+
 def number_of(cell: str, decimal: str) -> float | None:
     """Return the number in a cell; None where there is none, or one beyond what any instrument measures."""
     if not _NUMBER.fullmatch(cell) or (decimal == "." and "," in cell):
@@ -56,12 +62,22 @@ def why_no_number(cell: str) -> str:
 
 def why_too_many(cells: list[str], due: int, separator: str) -> str:
     """Return what is wrong with a row of more cells than are due."""
-    if separator != ",":
-        return f"{len(cells)} cells where the header has {due}"
-    return (
-        f"{len(cells)} cells where {due} are due: commas separate columns and are decimal signs as well; export with "
-        "decimal points, or with semicolons between columns"
+    said = f"{len(cells)} cells where {due} are due"
+    if separator == ",":
+        said += (
+            ": commas separate columns and are decimal signs as well; export with decimal points, or with semicolons"
+        )
+        return f"{said} between columns"
+    return f"{said}; {_NO_BLANKS}" if separator == " " else f"{said}: two lines may be one, or a cell too many"
+
+
+def why_too_few(cells: list[str], due: int, separator: str) -> str:
+    """Return what is wrong with a row of fewer cells than are due."""
+    said = (
+        f"{len(cells)} {'cell' if len(cells) == 1 else 'cells'} where {due} are due: one is missing, or the line is cut"
     )
+    todo = "give each row its empty cells too, or take a column that is mostly empty out of the file"
+    return f"{said}; {_NO_BLANKS if separator == ' ' else todo}"
 
 
 def decimal_of(cells: Iterable[str]) -> str:

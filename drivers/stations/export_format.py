@@ -17,7 +17,8 @@ from drivers.stations.survey import METRES_PER_FOOT
 
 LengthUnit = Literal["mm", "cm", "m", "in", "ft"]
 AngleUnit = Literal["deg", "gon", "rad"]
-Role = Literal["point", "x", "y", "z", "hz", "zenith", "distance", "prism", "prism_constant", "station", "date", "time"]
+_Measured = Literal["x", "y", "z", "hz", "zenith", "distance"]
+Role = Literal["point", _Measured, "prism", "prism_constant", "target_height", "station", "date", "time"]
 
 MM_PER: dict[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "ft": 1000 * METRES_PER_FOOT}
 RAD_PER: dict[str, float] = {"deg": math.pi / 180, "gon": math.pi / 200, "rad": 1.0}
@@ -69,6 +70,9 @@ class ExportedFix:
         station: where the instrument stood, as the file names it; another name is another set-up.
         times_set_up: how often the file had set the instrument up by then, under any name; 0 where it does not say.
         prism_constant_mm: that the instrument applied to the distance; None where the file does not say.
+        target_height_mm: of the prism above the place whose coordinates the file has; None where it does not say.
+        is_numbered: whether the file does not name the point, so that its number is that of the row.
+        has_zone: whether the time is of a named time zone; None where it is no date.
     """
 
     line: int
@@ -79,6 +83,9 @@ class ExportedFix:
     station: str = ""
     times_set_up: int = 0
     prism_constant_mm: float | None = None
+    target_height_mm: float | None = None
+    is_numbered: bool = False
+    has_zone: bool | None = None
 
 
 @dataclass(frozen=True)

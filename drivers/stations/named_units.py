@@ -1,4 +1,4 @@
-"""Units that a table names: in its header, in the line below that, or in the lines above."""
+"""Units: their words, and those that a table names in its header or in the line below that."""
 
 from __future__ import annotations
 
@@ -23,12 +23,15 @@ _ANGLE_WORDS: dict[str, AngleUnit] = {
 _UNIT = re.compile(r"[\[(]\s*+([^\[\]()\s][^\[\]()]*+)[\])]|_(mm|cm|m|in|ft|deg|gon|rad)$", re.IGNORECASE)
 _SAID_OF_COLUMNS = (
     "x y z e n h east easting north northing up height elevation left right face1 face2 actual measured local global "
-    "horizontal zenith slope ortho orthometric ellipsoidal rechtswert hochwert höhe hoehe"
+    "horizontal zenith slope ortho orthometric ellipsoidal rechtswert hochwert höhe hoehe rw hw grid nn nhn msl"
 )
 _REMARKS = frozenset(_SAID_OF_COLUMNS.split())
-_NO_SECONDS = frozenset(("ms", "msec", "us", "µs", "μs", "ns", "min", "minutes", "h", "hours", "days"))
-_PHRASE_ENDS = re.compile(r"[:=;,\t()\[\]\"]|/(?!s\b)|\band\b")
-_BEFORE_M = frozenset(("in", "unit", "units", "is", "are"))
+_REMARK = re.compile(r"\d+|(?:utm|gk)\d*[a-z]?")  # a number of the column, a zone of a grid
+_NO_SECONDS = re.compile(r"[mµμun]s|[mun]secs?|(?:milli|micro|nano)sec\w*|min|minutes|h|hours|days|millis")
+_OF_LENGTHS = (
+    "coordinate coordinates dimension dimensions distance distances length lengths linear koordinaten maße "
+    "abmessungen längen längeneinheit strecken"
+)
 
 
 @dataclass(frozen=True)
@@ -38,13 +41,31 @@ class Quantity:
     Attributes:
         name: in messages.
         words: word for a unit -> unit.
+        others: units that are not read.
+        subjects: words that speak of it.
     """
 
     name: str
     words: Mapping[str, str]
+    others: re.Pattern[str]
+    subjects: frozenset[str]
 
 
-LENGTHS, ANGLES = Quantity("length", _LENGTH_WORDS), Quantity("angles", _ANGLE_WORDS)
+LENGTHS = Quantity(
+    "length",
+    _LENGTH_WORDS,
+    re.compile(
+        r"\b(?:us[- ]?(?:survey[- ]?)?(?:ft|feet|foot)|survey[- ](?:ft|feet|foot)|usft|ftus|sft|km|kilomet\w+|[µμ]m|"
+        r"microns?|micromet\w+|yards?|yd)\b"
+    ),
+    frozenset(_OF_LENGTHS.split()),
+)
+ANGLES = Quantity(
+    "angles",
+    _ANGLE_WORDS,
+    re.compile(r"\b(?:dms|mils?|minutes)\b"),
+    frozenset(("angle", "angles", "angular", "winkel", "winkeleinheit")),
+)
 
 
 def without_unit(name: str) -> str:
@@ -52,11 +73,10 @@ def without_unit(name: str) -> str:
     return _UNIT.sub("", name.lower())
 
 
-def mm_of(name: str) -> float:
-    """Return the millimetres of the unit that a column's name has; 1 where it has none."""
-    return next(
-        (MM_PER[_LENGTH_WORDS[word.lower()]] for word in bracket_words(name) if word.lower() in _LENGTH_WORDS), 1.0
-    )
+def mm_of(name: str, otherwise_mm: float) -> float:
+    """Return the millimetres of the unit that a column's name has, or those given where it has none."""
+    words = [word.lower() for word in bracket_words(name)]
+    return next((MM_PER[_LENGTH_WORDS[word]] for word in words if word in _LENGTH_WORDS), otherwise_mm)
 
 
 def bracket_words(name: str) -> list[str]:
@@ -88,7 +108,7 @@ def unit_of_columns(
             plain = word.lower()
             if plain in quantity.words:
                 units.setdefault(quantity.words[plain], column)
-            elif re.sub(r"[\W_]", "", plain) not in _REMARKS and (line == header_line or any(map(str.isalpha, word))):
+            elif not _is_remark(plain) and (line == header_line or any(map(str.isalpha, word))):
                 *known, last = dict.fromkeys(quantity.words.values())
                 todo = f"export {', '.join(known)} or {last}, or take {word!r} out if it is a remark"
                 refuse(source, f"{word!r} is no unit of {quantity.name} that is known; {todo}", line, column)
@@ -98,47 +118,14 @@ def unit_of_columns(
     return next(((unit, f"column {column!r}") for unit, column in units.items()), None)
 
 
-def check_seconds(column: str, header_line: int, source: str) -> None:
-    """Refuse a column of times in another unit than seconds."""
-    for word in bracket_words(column):
-        if word.lower() in _NO_SECONDS:
-            refuse(source, f"times in {word!r} are not read; export seconds, or dates with times", header_line, column)
+def _is_remark(word: str) -> bool:
+    plain = re.sub(r"[\W_]", "", word)
+    return plain in _REMARKS or bool(_REMARK.fullmatch(plain))
 
 
-def unit_of_preamble(quantity: Quantity, lines: Sequence[str], source: str) -> tuple[str, str] | None:
-    """Return the unit that the lines above a table name, and the word and line that say it.
-
-    Raises:
-        DescriptionError: they name two.
-    """
-    units: dict[str, str] = {}
-    for number, line in enumerate(lines, 1):
-        if "unit" in line.lower():
-            for word in _unit_words(line.lower()):
-                if word in quantity.words:
-                    units.setdefault(quantity.words[word], f"{word!r} in line {number}")
-    if len(units) > 1:
-        different = " and ".join(f"{where} ({unit})" for unit, where in units.items())
-        refuse(
-            source,
-            f"the lines above the table name different units of {quantity.name}: {different}; leave one, or name "
-            f"the unit in the header, as in 'X [mm]'",
-        )
-    return next(iter(units.items()), None)
-
-
-def _unit_words(line: str) -> list[str]:
-    """Return the words of a line that may be units: `in` and `m` where they stand alone, `m` also after `in`."""
-    found = []
-    for phrase in _PHRASE_ENDS.split(line):
-        words = [word.strip(".'") for word in phrase.split()]
-        for place, word in enumerate(words):
-            is_last = place == len(words) - 1
-            if word == "in":
-                is_unit = len(words) == 1
-            elif word == "m":
-                is_unit = is_last and (place == 0 or words[place - 1] in _BEFORE_M)
-            else:
-                is_unit = True
-            found += [word] * is_unit
-    return found
+def check_seconds(column: str, header_line: int, below: str, units_line: int, source: str) -> None:
+    """Refuse a column of times in another unit than seconds, by its name or the cell below that."""
+    said = [(header_line, word) for word in bracket_words(column)] + [(units_line, below.strip("[]() "))]
+    for line, word in said:
+        if _NO_SECONDS.fullmatch(word.lower()):
+            refuse(source, f"times in {word!r} are not read; export seconds, or dates with times", line, column)

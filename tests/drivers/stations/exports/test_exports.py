@@ -279,6 +279,8 @@ def test_a_faro_table_with_a_preamble_and_decimal_commas() -> None:
         'name,x,y,z\nP1,"1000,25","2000,5","300,5"\n',
         "// Collection::Group::Target X Y Z (mm)\nP1, 1000.25, 2000.5, 300.5\n",
         "name x [mm] y [mm] z [mm]\nP1 1000.25 2000.5 300.5\n",
+        "Pkt;Rechtswert (Y) [mm];Hochwert (X) [mm];Höhe (Z) [mm]\n# moved 2 m\n;;;\nP1;1000,25;2000,5;300,5\n",
+        "punktnavn;y (HW) [mm];x (RW) [mm];z (NHN) [mm]\nP1;2000,5;1000,25;300,5\n",
     ],
 )
 def test_coordinates_are_found_however_they_are_named_and_separated(text: str) -> None:
@@ -303,6 +305,10 @@ def test_the_unit_of_angles_follows_from_their_size_where_none_is_named(right: f
         ("Units: gon/mm, speeds in m/s\n", "mm", "'mm' in line 1"),
         ('Instrument unit: TS16 M 1"\nUnit: International feet, i.e. 0.3048 m\n', "ft", "'feet' in line 2"),
         ('Instrument unit: TS16 M 1"\n', "m", ""),
+        ("Einheit: mm\n", "mm", "'mm' in line 1"),
+        ("# Alle Maße in mm\n", "mm", "'mm' in line 1"),
+        ("Coordinates (ft)\nAngle units: DMS\nPressure unit: hPa\n", "ft", "'ft' in line 1"),
+        ("Community: Foot Hills\nLength of the rod (mm): 1200\nDistance unit: cm\n", "cm", "'cm' in line 3"),
     ],
 )
 @pytest.mark.parametrize("header", ["Point;X;Y;Z\n", ""])
@@ -319,6 +325,7 @@ def test_a_unit_above_a_table_is_taken_and_said_with_its_line(above: str, length
         "Point;Actual X (mm);Actual Y (mm);Actual Z (mm)\n",
         "Point;X(actual);Y(actual);Z(actual)\n;[mm];[mm];[mm]\n",
         "Point;X;Y;Z\n\n---;mm;mm;mm\n",
+        "Point;X (1) [mm];Y (UTM32) [mm];Z (grid) [mm]\n",
     ],
 )
 def test_remarks_in_brackets_are_no_units(header: str) -> None:
@@ -350,6 +357,8 @@ def test_vicon_frames_go_on_after_an_empty_line_until_the_next_block(empty: str,
 def test_angles_and_a_distance_become_a_position() -> None:
     (fix,) = fixes(ANGLES, "plain_csv")
     np.testing.assert_allclose(fix.position_mm, (12_500.0, 0.0, 0.0), atol=1e-6)
+    first, second = fixes("p,hz [deg],v [deg],sd [m],hr\n1,9,100,5,0\n2,9,100,5,1.5\n", "plain_csv")
+    assert first.position_mm == second.position_mm  # the prism's, however high above the ground
 
 
 @pytest.mark.parametrize(
@@ -401,6 +410,19 @@ def test_a_table_without_a_header() -> None:
     assert (first.point, second.position_mm) == ("a1", (1100.0, 2000.0, 300.0))
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "p;x;y;z;code;t\n1;1;2;3\n2;1;2;3\n",
+        "p;x;y;z;;\n1;1;2;3\n2;1;2;3;\n",
+        "1,1,2,3,,\n2,1,2,3\n",
+        "1,1,2,3\n2,1,2,3,\n",
+    ],
+)
+def test_a_row_need_not_have_the_last_cells_where_they_are_empty_in_all_rows(text: str) -> None:
+    assert [fix.position_mm for fix in fixes(text, "plain_csv")] == [(1000.0, 2000.0, 3000.0)] * 2
+
+
 def test_what_is_not_named_is_guessed_and_said() -> None:
     found = export_formats()["plain_csv"].guess("point,x,y,z\n1,1.5,2,3\n", "file")
     assert found.map.length_unit == "m"
@@ -412,7 +434,10 @@ def test_what_is_not_named_is_guessed_and_said() -> None:
     [
         (LEICA.replace("1.5,2.5", "1.5,2.5x"), "survey.txt, line 2, column North [m]: '2.5x' is not a number"),
         (LEICA.replace(",b,", ",b,yesterday"), "survey.txt, line 3, column Date/Time: 'yesterday' is not a time"),
-        ("point,x,y,z\n1,2,3,4\n2,5\n", "survey.txt, line 3, column y: the line has 2 columns only"),
+        (
+            "point,x,y,z\n1,2,3,4\n2,5\n",
+            "survey.txt, line 3: 2 cells where 4 are due: one is missing, or the line is cut; give each",
+        ),
         (VICON.replace("2,0,", "two,0,"), "survey.txt, line 7, column Frame: 'two' is not the number of a frame"),
         (VICON.replace("mm", "deg"), "units are deg"),
         (VICON.replace(",,rig:base,,", ",").replace("4.5", "x"), "line 7, column unnamed 6 X: 'x' is not a number"),
@@ -427,22 +452,44 @@ def test_what_is_not_named_is_guessed_and_said() -> None:
             "line 2: 7 cells where 4 are due: commas separate columns and are dec",
         ),
         ("P1,1229,36,2472,01,120,82\n", "line 1: 7 cells where 4 are due"),
-        ("name;x;y;z\nP1;1.5;2.5;3.5;4.5\n", "line 2: 5 cells where the header has 4"),
+        ("name;x;y;z\nP1;1.5;2.5;3.5;4.5\n", "line 2: 5 cells where 4 are due: two lines may be one"),
         ("name,x [mm],y [m],z [mm]\nP1,1229.5,2.5,3.5\n", "different units, 'x [mm]' in mm and 'y [m]' in m"),
         ("name,x,y,z\nP1,1229.5,,3.5\n", "line 2, column y: the cell is empty"),
         ("name;x;y;-z\nP1;1;2;3\n", "its names are not known (name, x, y, -z)"),
         ("name,x,y,z,Time [ms]\nP1,1,2,3,4\n", "line 1, column Time [ms]: times in 'ms' are not read"),
+        ("name,x,y,z,Time (milliseconds)\nP1,1,2,3,4\n", "column Time (milliseconds): times in 'milliseconds' are not"),
+        ("name;x;y;z;Time\n;m;m;m;[ms]\nP1;1;2;3;4\n", "line 2, column Time: times in 'ms' are not read"),
+        # angles from the horizon, heights below the prism, a grid whose X is north
+        ("p;hz [deg];v [deg];sd\nP;10;-5;5\n", "line 2, column v [deg]: below 0 or beyond a full circle in deg, so it"),
+        ("p;hz [gon];v [gon];sd\nP;10;401;5\n", "line 2, column v [gon]: below 0 or beyond a full circle in gon"),
+        ("p;hz [deg];v [deg];sd\nP;9;5;5\nQ;9;356;5\n", "line 2, column v [deg]: all angles are nearer to 0 than half"),
+        ("p;x;y;z;Zielhöhe\nP;1;2;3;1,5\nQ;1;2;3;0\n", "line 3, column Zielhöhe: another target height than in line 2"),
+        ("p,x,y,z,hr\nP,1,2,3,1.5 m\n", "line 2, column hr: '1.5 m' is not a number"),
+        ("Pkt;Y [m];X [m];Z [m]\nP;1;2;3\n", "line 1: 'Y [m]' stands before 'X [m]', as in grids whose X is north"),
         # units
         ("Units: mm; heights in ft\nname;x;y;z\nP1;1;2;3\n", "length: 'mm' in line 1 (mm) and 'ft' in line 1 (ft)"),
         ("Height unit: m\nUnit mm\nP1;1;2;3\n", "of length: 'm' in line 1 (m) and 'mm' in line 2 (mm); leave one"),
         (ANGLES.replace("gon", "mil"), "line 1, column hz (mil): 'mil' is no unit of angles that is known; export deg"),
         (LEICA.replace("[m]", "(US ft)"), "line 1, column East (US ft): 'US ft' is no unit of length that is known"),
+        ("Units: micrometers\nP1;1;2;3\n", "line 1: 'micrometers' is no unit of length that is known; export mm, cm"),
+        ("Units;furlongs\nP1;1;2;3\n", "line 1: 'furlongs' is no unit of length"),
+        ("A\nUnit: US survey feet\nP1;1;2;3\n", "line 2: 'us survey feet' is no unit of length that is known"),
+        ("All coordinates in usft\nP1;1;2;3\n", "line 1: 'usft' is no unit of length that is known"),
+        ("Angle units: Degrees DMS\np;hz;v;sd [m]\nP;1;90;3\n", "line 1: 'dms' is no unit of angles that is known; ex"),
         ("name;x (actual) [km];y;z\nP1;1;2;3\n", "column x (actual) [km]: 'km' is no unit of length"),
         ("name;x;y;z\n;km;km;km\nP1;1;2;3\n", "line 2, column x: 'km' is no unit of length"),
         ("name;x [mm];y;z\n;m;m;m\nP1;1;2;3\n", "different units, 'x [mm]' in mm and 'x [mm]' in m"),
         # cells that are lost, and rows
-        ("point prism x y z t\n1 w 1 2 3 20\n2 1 2 3 20\n", "line 3: 5 cells where the header has 6; an empty one"),
-        ("1 1.5 2 3 20\n2 1 2 3\n", "line 2: 4 cells where the rows before have 5; an empty one between blanks"),
+        (
+            "point prism x y z t\n1 w 1 2 3 20\n2 1 2 3 20\n",
+            "line 3: 5 cells where 6 are due: one is missing, or the line is cut; an empty",
+        ),
+        ("1 1.5 2 3 20\n2 1 2 3\n", "line 2: 4 cells where 5 are due: one is missing, or the line is cut; an empty"),
+        ("p,x,y,z,code,t\n1,10.5,20.5,123.4,w,20\n2,10.5,20.5,12", "line 3: 4 cells where 6 are due: one is missing"),
+        ("p;x;y;z;t\n1;10.5;20.5;123.4;20\n2;10.5;123.4;20\n", "line 3: 4 cells where 5 are due: one is missing, or"),
+        ("1,1.1,2.2,3.3\n2,1.1,2.2,33,1.2,2.3,3.4\n", "line 2: 7 cells where 4 are due: commas separate columns and"),
+        ("1\t1.1\t2.2\t3.3\n2\t7\t1.1\t2.2\t3.3\n", "line 2: 5 cells where 4 are due: two lines may be one, or a"),
+        ("p;x;y;z\n#1;1;2;3\n2;1;2;3\n", "line 2: # begins a remark, but this may be a point: delete the line, or"),
         ("P1,,2.0,3.0\nP2,1,2,3\n", "line 1: it has numbers, as the points from line 2 on, but is no point, x, y, z"),
         ("P1 2.0 3.0\nP2 1 2 3\n", "line 1: it has numbers, as the points from line 2 on"),
         # signs before fractions

@@ -1,0 +1,96 @@
+"""Units that the lines above a table name."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+
+from drivers.stations.export_format import refuse
+from drivers.stations.named_units import ANGLES, LENGTHS, Quantity
+
+_UNIT_WORD = re.compile(r"\b(?:units?|\w*einheit(?:en)?)\b")
+_SAID = re.compile(r"""[\s\])"]*(?:[:=;,\t\[(]|\b(?:is|are|in)\b)(?P<said>[^;\t]*)""")
+_DIRECTLY = re.compile(r"(?:\bin\s|[:=\[(])\s*(?P<word>\w+|°)(?=\s*(?:$|[\])\",;.]))")
+_BESIDE_UNITS = (
+    "is are in of all the length lengths linear distance distances angle angles angular coordinate coordinates "
+    "international intl decimal"
+)
+_FILLERS = frozenset(_BESIDE_UNITS.split())
+_OF_ALL = frozenset(("all", "the", "export", "file", "measurement", "height", "heights", "default", "project", "job"))
+_PHRASE_ENDS = re.compile(r"[:=;,\t()\[\]\"]|/(?!s\b)|\band\b")
+_LINE_MAX = 400  # characters of a line that says something
+_BEFORE_M = frozenset(("in", "unit", "units", "is", "are", "einheit", "einheiten"))
+
+
+def unit_of_preamble(quantity: Quantity, lines: Sequence[str], source: str) -> tuple[str, str] | None:
+    """Return the unit that the lines above a table name, and the word and line that say it.
+
+    Raises:
+        DescriptionError: they name two, or one that is not known.
+    """
+    units: dict[str, str] = {}
+    for number, line in enumerate(lines, 1):
+        plain = line[:_LINE_MAX].lower()
+        unknown = next(_unknown_words(quantity, plain), None)
+        if unknown is not None:
+            *known, last = dict.fromkeys(quantity.words.values())
+            todo = f"export {', '.join(known)} or {last}, or name the unit in the header, as in 'X [mm]'"
+            refuse(source, f"{unknown!r} is no unit of {quantity.name} that is known; {todo}", number)
+        for word in _unit_words(quantity, plain):
+            if word in quantity.words:
+                units.setdefault(quantity.words[word], f"{word!r} in line {number}")
+    if len(units) > 1:
+        different = " and ".join(f"{where} ({unit})" for unit, where in units.items())
+        refuse(
+            source,
+            f"the lines above the table name different units of {quantity.name}: {different}; leave one, or name "
+            f"the unit in the header, as in 'X [mm]'",
+        )
+    return next(iter(units.items()), None)
+
+
+def _unknown_words(quantity: Quantity, line: str) -> Iterator[str]:
+    """Yield what a line says of a quantity's unit and is no unit that is known.
+
+    This is a word after `units:` that names none, or a unit that is known to be another one, as `US survey feet`.
+    """
+    other = ANGLES if quantity is LENGTHS else LENGTHS
+    for found in _UNIT_WORD.finditer(line):
+        before = set(re.findall(r"\w+", re.split(r"[:;=,\t]", line[: found.start()])[-1]))
+        said = _SAID.match(line, found.end())
+        if said is None or not before <= _OF_ALL | quantity.subjects | other.subjects or before & other.subjects:
+            continue  # of an instrument, of temperatures
+        if another := quantity.others.search(said["said"]):
+            yield another[0]
+        words = [word.strip(".'\"()[]") for word in re.split(r"[\s,/]+", said["said"])]
+        first = next((word for word in words if word and word not in _FILLERS), "")
+        if first.isalpha() and first not in {*LENGTHS.words, *ANGLES.words} and not other.others.search(first):
+            yield first
+    if quantity.subjects & set(re.findall(r"\w+", line)):
+        for another in quantity.others.finditer(line):
+            if re.search(r"(\bin\s|[:=\[(])\s*$", line[max(0, another.start() - 20) : another.start()]):
+                yield another[0]
+
+
+def _unit_words(quantity: Quantity, line: str) -> Iterator[str]:
+    """Yield the words of a line that may be units: all where it has that word, else those after `in`, `:` or a bracket.
+
+    A line without the word must speak of the quantity, and of no length of its own, as `Length of the rod (mm): 1200`.
+    `in` and `m` are units where they stand alone, `m` also after `in`.
+    """
+    if not _UNIT_WORD.search(line):
+        if quantity.subjects & set(re.findall(r"\w+", line)) and not any(map(str.isdigit, line)):
+            yield from (found["word"] for found in _DIRECTLY.finditer(line))
+        return
+    for phrase in _PHRASE_ENDS.split(line):
+        words = [word.strip(".'") for word in phrase.split()]
+        for place, word in enumerate(words):
+            is_last = place == len(words) - 1
+            if word == "in":
+                is_unit = len(words) == 1
+            elif word == "m":
+                is_unit = is_last and (place == 0 or words[place - 1] in _BEFORE_M)
+            else:
+                is_unit = True
+            if is_unit:
+                yield word
