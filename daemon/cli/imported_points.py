@@ -97,6 +97,7 @@ class JointRows:
         times_s: of the rows, rising; empty where the file has no times.
         rows: values of each row.
         max_rates: of the columns in deg/s for joints that turn; None for those that slide.
+        has_zone: whether the times are of a named time zone; None where they are no dates.
     """
 
     source: str
@@ -105,6 +106,7 @@ class JointRows:
     times_s: Sequence[float]
     rows: Sequence[Sequence[float]]
     max_rates: Sequence[float | None]
+    has_zone: bool | None = None
 
     def of(self, fix: ExportedFix, source: str) -> Sequence[float]:
         """Return the joint values of a fix: those of its pose, or between the rows before and after its time.
@@ -113,12 +115,19 @@ class JointRows:
             DescriptionError: there are none; with the line of the fix.
         """
         if self.by_pose:
+            if fix.is_numbered:
+                said = f"the point has no name of its own, and {self.source} matches joint values by {POSE!r}"
+                refuse(source, f"{said}; call the column of names 'point', or name it in [columns] of a map", fix.line)
             found = self.by_pose.get(_plain(fix.point))
             if found is None:
                 refuse(source, f"{self.source} has no pose {fix.point!r}", fix.line)
             return found
         if fix.time_s is None:
             refuse(source, f"the point has no time, and {self.source} no column {POSE!r} to match it by", fix.line)
+        if self.has_zone is not None and fix.has_zone is (not self.has_zone):
+            zoned, bare = (self.source, source) if self.has_zone else (source, self.source)
+            said = f"times of {zoned} have a time zone, and those of {bare} none, so they may differ by hours"
+            refuse(source, f"{said}; write both in UTC with a Z at the end (2026-11-24T10:00:00Z)", fix.line)
         place = bisect_left(self.times_s, fix.time_s)
         if place < len(self.times_s) and self.times_s[place] == fix.time_s:
             return self.rows[place]
@@ -151,6 +160,7 @@ def read_joints(path: Path, rig: Rig) -> JointRows:
         )
     by_pose: dict[str, list[float]] = {}
     timed: dict[float, tuple[int, list[float]]] = {}
+    zones: set[bool] = set()
     for number, line in enumerate(lines[1:], 2):
         if not line.strip():
             continue
@@ -168,14 +178,18 @@ def read_joints(path: Path, rig: Rig) -> JointRows:
             if by_pose.setdefault(_plain(cell), row) is not row:
                 refuse(source, f"pose {cell!r} is there twice", number, POSE)
         else:
-            before, same = timed.setdefault(_seconds(cell, source, number, key), (number, row))
+            time_s, has_zone = _seconds(cell, source, number, key)
+            zones |= set() if has_zone is None else {has_zone}
+            if len(zones) > 1:
+                refuse(source, f"{cell!r}: some times have a time zone, and others none; write all in UTC", number, key)
+            before, same = timed.setdefault(time_s, (number, row))
             if same != row:
                 refuse(source, f"time {cell!r} is in line {before} with other joint values; leave one", number, key)
     if not by_pose and not timed:
         refuse(source, "no rows below the header")
     times = sorted(timed)
     rates = [joint.max_rate if joint.kind == "revolute" else None for joint in rig.joints]
-    return JointRows(source, joints, by_pose, times, [timed[at][1] for at in times], rates)
+    return JointRows(source, joints, by_pose, times, [timed[at][1] for at in times], rates, next(iter(zones), None))
 
 
 def _check_joint_columns(header: Sequence[str], joints: Sequence[str], rig: Rig, source: str) -> None:
@@ -197,15 +211,16 @@ def _step(value: float, following: float, seconds: float, max_rate: float | None
     return (step + 180.0) % 360.0 - 180.0
 
 
-def _seconds(cell: str, source: str, line: int, column: str) -> float:
+def _seconds(cell: str, source: str, line: int, column: str) -> tuple[float, bool | None]:
+    """Return the seconds of a cell, and whether they are of a named time zone; None where it has no date."""
     value = number_of(cell, ".")
     if value is not None:
-        return value
+        return value, None
     try:
         found = datetime.fromisoformat(cell)
     except ValueError:
         refuse(source, f"{cell!r} is neither seconds nor an ISO time", line, column)
-    return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
+    return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp(), found.tzinfo is not None
 
 
 def _plain(pose: str) -> str:
@@ -293,6 +308,24 @@ def repeated_setups(fixes: Sequence[ExportedFix], source: str) -> tuple[str, ...
         f"{source} sets the instrument up again under a name it had before: {'; '.join(again[:3])}{more}; its points "
         "are taken as of one set-up: give the file in parts if it stood elsewhere or was turned",
     )
+
+
+def bare_times(fixes: Sequence[ExportedFix], joints: JointRows | None, source: str) -> tuple[str, ...]:
+    """Return a note on dates without a time zone: UTC is taken."""
+    bare = [source] * any(fix.has_zone is False for fix in fixes)
+    bare += [joints.source] if joints is not None and joints.has_zone is False else []
+    return (f"times of {' and '.join(bare)} have no time zone, and are taken for UTC",) if bare else ()
+
+
+def target_heights(fixes: Sequence[ExportedFix], source: str) -> tuple[str, ...]:
+    """Return a note on coordinates of places below the prism."""
+    height_mm = fixes[0].target_height_mm  # a table in which they differ is refused
+    if not height_mm:
+        return ()
+    said = (
+        f"{source} has target heights of {height_mm:g} mm, so its coordinates may be of places as far below the prism"
+    )
+    return (f"{said}; they are taken as they are: export with heights of 0 where that matters",)
 
 
 # ---- observations ----------------------------------------------------------------------------------------------------

@@ -46,6 +46,7 @@ def import_(
     """
     from calibration.observations import parse_observations
     from daemon.cli.imported_points import (
+        bare_times,
         far_repetitions,
         map_text,
         observations_csv,
@@ -57,6 +58,7 @@ def import_(
         setup_names,
         several_constants,
         several_setups,
+        target_heights,
     )
     from daemon.host.safe_output import write_file
     from daemon.rig_files import load_rig
@@ -87,7 +89,8 @@ def import_(
     setups = setup_names(fixes, setup)
     notes += several_setups(setups, file.name) + repeated_setups(fixes, file.name)
     prisms = prisms_of(fixes, columns, file.name, described, prism)
-    notes += several_constants(fixes, prisms, file.name)
+    notes += several_constants(fixes, prisms, file.name) + target_heights(fixes, file.name)
+    notes += bare_times(fixes, rows, file.name)
     table = observations_csv(fixes, prisms, file.name, rows, setups, session)
     if described is not None and rows is not None:
         parse_observations(table.encode(), described, f"what {file.name} became")

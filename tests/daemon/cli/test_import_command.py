@@ -62,7 +62,7 @@ def test_between_two_times_a_joint_goes_on_from_the_end_of_its_turn(tmp_path: Pa
     assert [float(found.joints[name][0]) for name in RIG.joint_names] == [1.0, 0.0, 15.0, -92.5, 0.0, 0.0]
 
 
-@pytest.mark.parametrize("times", [("10.0", "10"), ("2026-11-24T10:00:00", "2026-11-24T11:00:00+01:00")])
+@pytest.mark.parametrize("times", [("10.0", "10"), ("2026-11-24T10:00:00Z", "2026-11-24T11:00:00+01:00")])
 @pytest.mark.parametrize("values", ["0,0,0,0,0,0", "0,0,0,0,0,5"])
 def test_joint_values_at_one_time_are_refused_where_they_differ(
     tmp_path: Path, times: tuple[str, str], values: str
@@ -75,6 +75,51 @@ def test_joint_values_at_one_time_are_refused_where_they_differ(
             read_joints(joints, RIG)
     else:
         assert len(read_joints(joints, RIG).times_s) == 1
+
+
+def joined_by_time(folder: Path, column: str, at: str, joint_times: list[object]) -> Result:
+    """The import of one point at a time, with joint values at others."""
+    (folder / "walk.csv").write_text(f"point,x [mm],y [mm],z [mm],{column}\n1,1000,200,300,{at}\n")
+    joints = joints_csv(folder / "joints.csv", "time_s" if "T" not in str(joint_times[0]) else "time", joint_times)
+    given = ("--rig", "ur10", "--joints", joints, "--prism", "tmac")
+    return run(folder / "walk.csv", *given, "--out", folder / "out.csv", "--json")
+
+
+ZONED, BARE = ["2026-11-24T10:00:00Z"], ["2026-11-24T10:00:00"]
+NO_ZONE = "have no time zone, and are taken for UTC"
+
+
+@pytest.mark.parametrize(
+    ("column", "at", "joint_times", "said"),
+    [
+        ("time", "24.11.2026 10:00:00", BARE, f"times of walk.csv and joints.csv {NO_ZONE}"),
+        ("time", "24.11.2026 10:00:00", [1795514400], f"times of walk.csv {NO_ZONE}"),
+        ("time", "1795514400", BARE, f"times of joints.csv {NO_ZONE}"),
+        ("time", ZONED[0], ZONED, ""),
+        ("UTC", BARE[0], ZONED, ""),
+    ],
+)
+def test_times_without_a_zone_are_taken_for_utc_and_that_is_said_once(
+    tmp_path: Path, column: str, at: str, joint_times: list[object], said: str
+) -> None:
+    result = joined_by_time(tmp_path, column, at, joint_times)
+    assert result.exit_code == 0, result.output
+    assert [note for note in json.loads(result.stdout)["notes"] if "zone" in note] == [said] * bool(said)
+
+
+@pytest.mark.parametrize(
+    ("at", "joint_times", "said"),
+    [
+        (BARE[0], ZONED, "walk.csv, line 2: times of joints.csv have a time zone, and those of walk.csv none"),
+        (ZONED[0], BARE, "walk.csv, line 2: times of walk.csv have a time zone, and those of joints.csv none"),
+        (ZONED[0], ZONED + BARE, "joints.csv, line 3, column time: '2026-11-24T10:00:00': some times have a time zone"),
+    ],
+)
+def test_times_with_a_zone_are_not_matched_with_those_without(
+    tmp_path: Path, at: str, joint_times: list[object], said: str
+) -> None:
+    result = joined_by_time(tmp_path, "time", at, joint_times)
+    assert (result.exit_code, said in result.stderr) == (2, True)
 
 
 def test_joints_of_a_spreadsheet_in_another_language_are_refused(tmp_path: Path) -> None:
@@ -134,6 +179,16 @@ def test_an_instrument_that_is_set_up_again_under_the_same_name_is_said(tmp_path
     for notes in (found["notes"], told(survey, "--map", found["map_file"], "--out", tmp_path / "2.csv")["notes"]):
         assert notes[-1].startswith(f"survey.txt sets the instrument up again under a name it had before: {again}; ")
         assert notes[-1].endswith("give the file in parts if it stood elsewhere or was turned")
+
+
+@pytest.mark.parametrize(("height", "is_said"), [("1.5", True), ("0", False), ("", False)])
+def test_coordinates_of_places_below_the_prism_are_said(tmp_path: Path, height: str, is_said: bool) -> None:
+    survey = tmp_path / "survey.csv"
+    survey.write_text(f"point,x [m],y [m],z [m],Target Height\n1,1,2,3,{height}\n2,1,2,4,{height}\n")
+    found = told(survey, "--out", tmp_path / "out.csv")
+    for notes in (found["notes"], told(survey, "--map", found["map_file"], "--out", tmp_path / "2.csv")["notes"]):
+        said = "survey.csv has target heights of 1500 mm, so its coordinates may be of places as far below the prism"
+        assert any(note.startswith(said) for note in notes) == is_said
 
 
 @pytest.mark.parametrize("text", [gts_download(), SDR_HEAD + STOOD + BACK + SHOT * 3, SURVEY])
@@ -222,6 +277,16 @@ def test_a_gts_download_becomes_observations(tmp_path: Path) -> None:
     assert not out.exists()
     assert told(download, "--rig", "swdt82", "--prism", "r", "--out", out)["points"] == 3
     assert [line.split(",")[0] for line in out.read_text().splitlines()] == ["prism", "r", "r", "r"]
+
+
+@pytest.mark.parametrize("text", ["Nummer;X [m];Y [m];Z [m]\n1;1;2;3\n", "Pkt;X [m];Y [m];Z [m]\n;1;2;3\n"])
+def test_points_without_names_have_no_joint_values_by_pose(tmp_path: Path, text: str) -> None:
+    survey, joints = tmp_path / "survey.csv", joints_csv(tmp_path / "joints.csv", "pose", [1])
+    survey.write_text(text)
+    given = ("--rig", "ur10", "--prism", "tmac", "--joints", joints, "--out", tmp_path / "out.csv")
+    assert "survey.csv, line 2: the point has no name of its own, and joints.csv matches" in run(survey, *given).stderr
+    survey.write_text(text.replace("Nummer", "PktNr").replace("\n;", "\n1;"))
+    assert told(survey, *given)["points"] == 1
 
 
 @pytest.mark.parametrize(
