@@ -30,7 +30,7 @@ _REMARK = re.compile(r"\d+|(?:utm|gk)\d*[a-z]?")  # a number of the column, a zo
 _NO_SECONDS = re.compile(r"[mµμun]s|[mun]secs?|(?:milli|micro|nano)sec\w*|min|minutes|h|hours|days|millis")
 _OF_LENGTHS = (
     "coordinate coordinates dimension dimensions distance distances length lengths linear koordinaten maße "
-    "abmessungen längen längeneinheit strecken"
+    "abmessungen längen längeneinheit strecken values measurements werte"
 )
 
 

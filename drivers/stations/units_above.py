@@ -9,14 +9,15 @@ from drivers.stations.export_format import refuse
 from drivers.stations.named_units import ANGLES, LENGTHS, Quantity
 
 _UNIT_WORD = re.compile(r"\b(?:units?|\w*einheit(?:en)?)\b")
-_SAID = re.compile(r"""[\s\])"]*(?:[:=;,\t\[(]|\b(?:is|are|in)\b)(?P<said>[^;\t]*)""")
+_SAID = re.compile(r"""(?P<of>(?:\s+used|\s+of\s+\w+)?)[\s\])"]*(?:[:=;,\t\[(]|\b(?:is|are|in)\b)(?P<said>[^;\t]*)""")
 _DIRECTLY = re.compile(r"(?:\bin\s|[:=\[(])\s*(?P<word>\w+|°)(?=\s*(?:$|[\])\",;.]))")
 _BESIDE_UNITS = (
     "is are in of all the length lengths linear distance distances angle angles angular coordinate coordinates "
-    "international intl decimal"
+    "international intl decimal metric si"
 )
 _FILLERS = frozenset(_BESIDE_UNITS.split())
-_OF_ALL = frozenset(("all", "the", "export", "file", "measurement", "height", "heights", "default", "project", "job"))
+_OF_ANYTHING = "all the of used measure measurement export file height heights default project job"
+_OF_ALL = frozenset(_OF_ANYTHING.split())
 _PHRASE_ENDS = re.compile(r"[:=;,\t()\[\]\"]|/(?!s\b)|\band\b")
 _LINE_MAX = 400  # characters of a line that says something
 _BEFORE_M = frozenset(("in", "unit", "units", "is", "are", "einheit", "einheiten"))
@@ -56,9 +57,11 @@ def _unknown_words(quantity: Quantity, line: str) -> Iterator[str]:
     """
     other = ANGLES if quantity is LENGTHS else LENGTHS
     for found in _UNIT_WORD.finditer(line):
-        before = set(re.findall(r"\w+", re.split(r"[:;=,\t]", line[: found.start()])[-1]))
         said = _SAID.match(line, found.end())
-        if said is None or not before <= _OF_ALL | quantity.subjects | other.subjects or before & other.subjects:
+        if said is None:
+            continue
+        of = set(re.findall(r"\w+", re.split(r"[:;=,\t]", line[: found.start()])[-1] + said["of"]))
+        if not of <= _OF_ALL | quantity.subjects | other.subjects or of & other.subjects:
             continue  # of an instrument, of temperatures
         if another := quantity.others.search(said["said"]):
             yield another[0]
