@@ -234,27 +234,34 @@ class _DatagramPort(CanPort):
         is_last = True
         until_s = time.monotonic() + timeout_s
         try:
-            ready = self._failure is None and select.select([self._socket], [], [], timeout_s)[0]
-            if ready:
-                time.sleep(min(GATHER_S, max(0.0, until_s - time.monotonic())))
-            for _ in range(BATCH_MAX if ready else 0):
-                datagram, ancillary, _flags, _sender = receive_message(4096, _ANCILLARY_BYTES, socket.MSG_DONTWAIT)
-                kernel_utc_ns = None
-                for _level, kind, value in ancillary:
-                    if kind == SO_TIMESTAMPNS:
-                        seconds, nanoseconds = _TIMESPEC.unpack(value)
-                        kernel_utc_ns = seconds * NS_PER_S + nanoseconds
-                    elif kind == SO_RXQ_OVFL:
-                        self._count_overflows(_DROPS.unpack(value)[0])
-                frame = self._parse(datagram)
-                if frame is not None:
-                    received.append(Received(frame, kernel_utc_ns))
-            is_last = not ready
-        except BlockingIOError:
-            pass  # all read
+            ready = self._failure is not None or select.select([self._socket], [], [], timeout_s)[0]
         except OSError as error:
-            self._failure = self._gone(error)
-        # The kernel reports a failure once, and what came before it is given first
+            raise self._gone(error) from error
+        if ready and self._failure is None:
+            time.sleep(min(GATHER_S, max(0.0, until_s - time.monotonic())))
+        for _ in range(BATCH_MAX if ready else 0):
+            try:
+                datagram, ancillary, _flags, _sender = receive_message(4096, _ANCILLARY_BYTES, socket.MSG_DONTWAIT)
+            except BlockingIOError:
+                break  # all read
+            except OSError as error:
+                if self._failure is not None:
+                    break
+                self._failure = self._gone(error)
+                continue
+            kernel_utc_ns = None
+            for _level, kind, value in ancillary:
+                if kind == SO_TIMESTAMPNS:
+                    seconds, nanoseconds = _TIMESPEC.unpack(value)
+                    kernel_utc_ns = seconds * NS_PER_S + nanoseconds
+                elif kind == SO_RXQ_OVFL:
+                    self._count_overflows(_DROPS.unpack(value)[0])
+            frame = self._parse(datagram)
+            if frame is not None:
+                received.append(Received(frame, kernel_utc_ns))
+        else:
+            is_last = not ready
+        # The kernel reports a failure once, before the frames that came before it, and these are given first
         if self._failure is not None and not received:
             raise self._failure
         return Batch(received, is_last)

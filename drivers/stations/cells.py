@@ -63,11 +63,9 @@ def why_no_number(cell: str) -> str:
 def why_too_many(cells: list[str], due: int, separator: str) -> str:
     """Return what is wrong with a row of more cells than are due."""
     said = f"{len(cells)} cells where {due} are due"
-    if separator == ",":
-        said += (
-            ": commas separate columns and are decimal signs as well; export with decimal points, or with semicolons"
-        )
-        return f"{said} between columns"
+    if separator == "," and not any("." in cell for cell in cells):
+        todo = "export with decimal points, or with semicolons between columns"
+        return f"{said}: commas separate columns and are decimal signs as well; {todo}"
     return f"{said}; {_NO_BLANKS}" if separator == " " else f"{said}: two lines may be one, or a cell too many"
 
 

@@ -11,9 +11,10 @@ from drivers.stations.named_units import bracket_words, without_unit
 _NAMES: Mapping[Role, str] = {
     "point": "point pointname pointid pointnumber pointno ptid ptno pt pid name id label no nr pose punkt punktnr "
     "punktnummer punktname punktnavn punktnamn punktid ptnr pkt pktnr pktname",
-    "x": "x east easting e xcoordinate xactual actualx measuredx xmeasured rechtswert rw",
-    "y": "y north northing n ycoordinate yactual actualy measuredy ymeasured hochwert hw",
-    "z": "z height elevation elev up orthoheight zcoordinate zactual actualz measuredz zmeasured höhe hoehe",
+    "x": "x east easting e xcoordinate xactual actualx measuredx xmeasured rechtswert rw ost öst øst",
+    "y": "y north northing n ycoordinate yactual actualy measuredy ymeasured hochwert hw nord norr",
+    "z": "z height elevation elev up orthoheight zcoordinate zactual actualz measuredz zmeasured höhe hoehe h höjd "
+    "høyde ellipheight",
     "hz": "hz hzangle horizontalangle hangle azimuth hzcircle",
     "zenith": "v vz zenith zenithangle verticalangle vangle vcircle",
     "distance": "sd slopedistance slopedist distance range d",

@@ -165,7 +165,9 @@ def _check_without_header(lines: list[str], separator: str, first: int, source: 
     for number, line in enumerate(lines[: first - 1], 1):
         before = cells_of(line, separator)
         numbers = sum(number_of(cell, ",") is not None for cell in before)
-        if len(before) == len(cells) and any(before[1:]) and not numbers:
+        # Rows with a separator at their end have a cell more than their header
+        is_as_wide = len(before) == len(cells) or (separator != " " and sum(map(bool, before)) >= 4)
+        if is_as_wide and any(before[1:]) and not numbers:
             said = f"its names are not known ({', '.join(before)})"
             refuse(source, f"this is a header, and {said}; call the columns point, x, y and z in it", number)
         if numbers > (0 if len(before) == len(cells) else 1):

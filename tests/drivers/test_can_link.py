@@ -424,6 +424,23 @@ def test_a_socket_that_fails_is_a_link_error_every_time() -> None:
         port.close()
 
 
+def test_frames_that_came_before_a_socket_failed_are_read_before_the_failure_is_told() -> None:
+    ours, theirs = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+    for each in (ours, theirs):
+        each.bind(("127.0.0.1", 0))
+    ours.connect(theirs.getsockname())
+    theirs.sendto(can_frame(0x1A0, b"\x01"), ours.getsockname())
+    theirs.close()
+    ours.send(b"x")  # refused: the next call on this socket fails, whatever waits in it
+    port = SocketCanPort("boom", can.Bus(unused_channel(), "virtual", ignore_config=True), ours, 1 << 20, Path("/none"))
+    try:
+        assert [received.frame for received in port.receive(1.0).received] == [Frame(0x1A0, b"\x01")]
+        with pytest.raises(LinkError, match="Connection refused"):
+            port.receive(1.0)
+    finally:
+        port.close()
+
+
 def test_sending_to_an_adapter_that_is_gone_is_a_link_error(adapter: Adapter) -> None:
     port = open_port(settings("slcan", str(adapter.path), {"sleep_after_open": 0.0}))
     adapter.unplug()

@@ -240,7 +240,7 @@ def store_redecode(
         for stretch in result["stretches"]:
             echo(f"decoded again: {utc(stretch['first_utc_ns'])} to {utc(stretch['last_utc_ns'])}")
         echo(f"{result['added']} readings and fixes more than before")
-        if not result["is_whole"]:
+        if not result.get("is_whole", True):  # an older daemon does not say
             echo("what is younger waits to be decoded for the first time; ask again when that is done")
     return result
 

@@ -21,11 +21,12 @@ AFTER_NS = 2 * NS_PER_S  # its last fixes are interpolated between joints
 CLOCK_STEP_NS = NS_PER_S // 20  # less may be the time between reading the one clock and the other
 
 OLDEST_WAITING = """SELECT first_boot_id, first_monotonic_ns FROM undecoded_chunks
-    JOIN raw_chunks ON raw_chunks.id = chunk_id ORDER BY first_boot_id, first_monotonic_ns LIMIT 1"""
+    CROSS JOIN raw_chunks ON raw_chunks.id = chunk_id ORDER BY first_boot_id, first_monotonic_ns LIMIT 1"""
 # Fixes of these may still come: of the open ones, and of those that ended after the oldest capture that waits to be
 # decoded was made.
 _IS_UNDECODED = f"(ended_boot_id, ended_monotonic_ns) >= ({OLDEST_WAITING})"
-_IS_JOINED_YET = f"""SELECT coalesce((ended_boot_id, ended_monotonic_ns + {AFTER_NS}) < ({OLDEST_WAITING}), TRUE)
+_JOINS_UNDECODED = f"(ended_boot_id, ended_monotonic_ns + {AFTER_NS}) >= ({OLDEST_WAITING})"
+_IS_JOINED_YET = f"""SELECT coalesce(NOT {_JOINS_UNDECODED}, TRUE)
         AND (EXISTS (SELECT 1 FROM raw_chunks
                 WHERE (last_boot_id, last_monotonic_ns) >= (ended_boot_id, ended_monotonic_ns + {AFTER_NS}))
             OR NOT EXISTS (SELECT 1 FROM daemon_runs WHERE id = (SELECT max(id) FROM daemon_runs)
@@ -355,8 +356,8 @@ def is_being_joined(source: RowSource, session_id: str) -> bool:
 
 
 def is_undecoded(source: RowSource, session_id: str) -> bool:
-    """Return True if captures from before a session's end wait to be decoded."""
-    sql = f"SELECT 1 FROM calibration_sessions WHERE id = ? AND {_IS_UNDECODED}"
+    """Return True if captures wait to be decoded that observations of a session that has ended may come of."""
+    sql = f"SELECT 1 FROM calibration_sessions WHERE id = ? AND {_JOINS_UNDECODED}"
     return any(True for _ in source.rows(sql, (session_id,)))
 
 

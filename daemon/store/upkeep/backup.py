@@ -223,9 +223,11 @@ def restore_backup(backup: Path, store: Path, models: Path, now_utc_ns: int, go_
             _require_sound(check_store(backup / STORE, backup / MODELS, go_on), backup / STORE)
             _require_room(store.parent, _size(backup))
             scratch = store.parent / f".rigcal-restore{_UNFINISHED}"
+            _make_writable(scratch)
             shutil.rmtree(scratch, ignore_errors=True)
             try:
                 shutil.copytree(backup, scratch)
+                _make_writable(scratch)
                 _close_open_sessions(scratch / STORE)
                 _give_to_owner_of(store.parent, scratch)
                 _sync_tree(scratch)
@@ -235,6 +237,12 @@ def restore_backup(backup: Path, store: Path, models: Path, now_utc_ns: int, go_
     finally:
         lock.release()
     return aside
+
+
+def _make_writable(directory: Path) -> None:
+    """Let the owner change all that a directory holds: it may be the copy of a backup that nobody may change."""
+    for path in (directory, *directory.rglob("*")) if directory.exists() else ():
+        path.chmod(path.stat().st_mode | (0o700 if path.is_dir() else 0o600))
 
 
 def _close_open_sessions(store: Path) -> None:

@@ -121,6 +121,16 @@ def test_a_session_that_was_open_when_the_backup_was_made_does_not_go_on(site: S
     assert "open when the backup was made" in session["excluded"]
 
 
+def test_a_backup_that_nobody_may_change_is_restored_as_a_store_that_its_owner_may_write(site: Site) -> None:
+    backup = site.back_up()
+    site.store.close()
+    for path in (backup, *backup.rglob("*")):
+        path.chmod(0o555 if path.is_dir() else 0o444)
+    site.restore(backup)
+    modes = [path.stat().st_mode for path in (site.path, site.models, *site.models.rglob("*"))]
+    assert all(mode & 0o200 for mode in modes)
+
+
 def test_what_was_replaced_is_kept_though_it_was_within_the_same_second(site: Site) -> None:
     backup = site.back_up()
     site.store.close()

@@ -448,6 +448,7 @@ def test_what_is_not_named_is_guessed_and_said() -> None:
             "nom,est,nord,haut\nP1,1.5,2.5,3.5\n",
             "line 1: this is a header, and its names are not known (nom, est, nord",
         ),
+        ("Pkt;Hz [gon];V [gon];Q [m]\n1;131,7;97,1;43,6;\n", "line 1: this is a header, and its names are not known"),
         (
             "name,x,y,z\nP1,1229,36,2472,01,120,82\n",
             "line 2: 7 cells where 4 are due: commas separate columns and are dec",
@@ -488,7 +489,7 @@ def test_what_is_not_named_is_guessed_and_said() -> None:
         ("1 1.5 2 3 20\n2 1 2 3\n", "line 2: 4 cells where 5 are due: one is missing, or the line is cut; an empty"),
         ("p,x,y,z,code,t\n1,10.5,20.5,123.4,w,20\n2,10.5,20.5,12", "line 3: 4 cells where 6 are due: one is missing"),
         ("p;x;y;z;t\n1;10.5;20.5;123.4;20\n2;10.5;123.4;20\n", "line 3: 4 cells where 5 are due: one is missing, or"),
-        ("1,1.1,2.2,3.3\n2,1.1,2.2,33,1.2,2.3,3.4\n", "line 2: 7 cells where 4 are due: commas separate columns and"),
+        ("1,1.1,2.2,3.3\n2,1.1,2.2,33,1.2,2.3,3.4\n", "line 2: 7 cells where 4 are due: two lines may be one, or a"),
         ("1\t1.1\t2.2\t3.3\n2\t7\t1.1\t2.2\t3.3\n", "line 2: 5 cells where 4 are due: two lines may be one, or a"),
         ("p;x;y;z\n#1;1;2;3\n2;1;2;3\n", "line 2: # begins a remark, but this may be a point: delete the line, or"),
         ("P1,,2.0,3.0\nP2,1,2,3\n", "line 1: it has numbers, as the points from line 2 on, but is no point, x, y, z"),
@@ -517,7 +518,10 @@ def test_what_is_not_named_is_guessed_and_said() -> None:
         ),
         # Vicon
         (VICON.replace("4,5,6", "4,5"), "line 6, column rig:base Z: the cell is empty; a marker has all three coord"),
-        (VICON.replace("4,5,6", "4,5,6,7"), "line 6: 9 cells where 8 are due: commas separate columns and are decimal"),
+        (
+            VICON.replace("4,5,6", "4,5,6,7"),
+            "line 6: 9 cells where 8 are due: two lines may be one, or a cell too many",
+        ),
         (VICON.replace("2,0,", "1,1,"), "line 7, column Frame: frame 1 is in line 6 already; export one row a frame"),
         (VICON.replace("2,0,", '"1,002",0,'), "line 7, column Frame: '1,002' is not the number of a frame"),
         (VICON.replace("base", "tip"), "line 3: two markers are called 'rig:tip'; name one otherwise"),
