@@ -13,16 +13,11 @@ from daemon.acquisition.link_decoders import LinkDecoders
 from daemon.commands import REFUSED, CommandError
 from daemon.rig_files import HOW_TO_READ_AGAIN, misreading, tells_decoding
 from daemon.store import Store
+from daemon.store.queries.decoding import decoded_before
 from daemon.store.queries.device_states import device_states
 from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS, sessions_between
 from daemon.store.reader import Reader
-from daemon.store.upkeep.full_samples import (
-    Stretch,
-    decoded_before,
-    put_again,
-    stretches_between,
-    stretches_of_session,
-)
+from daemon.store.upkeep.full_samples import Stretch, put_again, stretches_between, stretches_of_session
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import Capture, Decoder, Fix, Reading
 

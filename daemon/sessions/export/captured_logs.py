@@ -15,12 +15,11 @@ from daemon.host.safe_output import write_file
 from daemon.sessions.export.session_file import DeviceState, DoubtfulCaptures, SessionFile
 from daemon.sessions.session_data import sessions_csv
 from daemon.sessions.vector_channels import channel_numbers
+from daemon.store.queries.decoding import is_being_joined, is_undecoded
 from daemon.store.queries.device_states import device_states
 from daemon.store.queries.sessions import (
     AFTER_NS,
     BEFORE_NS,
-    is_being_joined,
-    is_undecoded,
     prism_confirmations,
     session,
 )
@@ -131,9 +130,9 @@ def ended_session(reader: Reader, session_id: str) -> dict[str, Any]:
     if found["ended_utc_ns"] is None:
         raise CommandError(f"session {session_id!r} is still open; stop it first")
     deadline = time.monotonic() + JOINED_WITHIN_S
-    while is_being_joined(reader, session_id) and time.monotonic() < deadline:
+    while is_being_joined(reader, session_id, AFTER_NS) and time.monotonic() < deadline:
         time.sleep(LOOK_S)
-    if is_undecoded(reader, session_id):
+    if is_undecoded(reader, session_id, AFTER_NS):
         raise CommandError(
             f"captures of session {session_id!r} wait to be decoded, so its tables are not whole; `rigcal run` "
             "decodes them: export it when `rigcal store stats` says that none wait"

@@ -11,6 +11,7 @@ from typing import Any
 from daemon.host.time_service import ClockState
 from daemon.store.connection import Connection
 from daemon.store.errors import NotInStoreError
+from daemon.store.queries.decoding import OLDEST_WAITING
 from daemon.store.queries.zeros import lost_zeros, preset_jumps
 from daemon.store.rows import RowSource, marks
 from daemon.store.views import in_session
@@ -20,18 +21,9 @@ BEFORE_NS = 60 * NS_PER_S  # dwell and direction of a session's first fixes come
 AFTER_NS = 2 * NS_PER_S  # its last fixes are interpolated between joints
 CLOCK_STEP_NS = NS_PER_S // 20  # less may be the time between reading the one clock and the other
 
-OLDEST_WAITING = """SELECT first_boot_id, first_monotonic_ns FROM undecoded_chunks
-    CROSS JOIN raw_chunks ON raw_chunks.id = chunk_id ORDER BY first_boot_id, first_monotonic_ns LIMIT 1"""
 # Fixes of these may still come: of the open ones, and of those that ended after the oldest capture that waits to be
 # decoded was made.
 _IS_UNDECODED = f"(ended_boot_id, ended_monotonic_ns) >= ({OLDEST_WAITING})"
-_JOINS_UNDECODED = f"(ended_boot_id, ended_monotonic_ns + {AFTER_NS}) >= ({OLDEST_WAITING})"
-_IS_JOINED_YET = f"""SELECT coalesce(NOT {_JOINS_UNDECODED}, TRUE)
-        AND (EXISTS (SELECT 1 FROM raw_chunks
-                WHERE (last_boot_id, last_monotonic_ns) >= (ended_boot_id, ended_monotonic_ns + {AFTER_NS}))
-            OR NOT EXISTS (SELECT 1 FROM daemon_runs WHERE id = (SELECT max(id) FROM daemon_runs)
-                AND ended_utc_ns IS NULL)) AS is_joined_yet
-    FROM calibration_sessions WHERE id = ?"""
 _UNFINISHED = f"SELECT * FROM calibration_sessions WHERE state = 'open' OR {_IS_UNDECODED} ORDER BY rowid"
 _SUMMARY = """SELECT id, rig, setup_id AS setup, prism, operator, caller_user AS user, kind, state, note,
         started_utc_ns, ended_utc_ns, excluded AS not_used, accepted_despite, accepted_by, accepted_utc_ns,
@@ -345,20 +337,6 @@ class SessionTable:
 def session(source: RowSource, session_id: str) -> dict[str, Any] | None:
     """Return a session's row with its `rig_text`; None where there is none."""
     return next(iter(source.rows(_SESSION, (session_id,))), None)
-
-
-def is_being_joined(source: RowSource, session_id: str) -> bool:
-    """Return True if a daemon may still make observations of a session that has ended.
-
-    A fix waits for joints that were read after it, so captures must be decoded that are a little younger than the end.
-    """
-    return any(row["is_joined_yet"] == 0 for row in source.rows(_IS_JOINED_YET, (session_id,)))
-
-
-def is_undecoded(source: RowSource, session_id: str) -> bool:
-    """Return True if captures wait to be decoded that observations of a session that has ended may come of."""
-    sql = f"SELECT 1 FROM calibration_sessions WHERE id = ? AND {_JOINS_UNDECODED}"
-    return any(True for _ in source.rows(sql, (session_id,)))
 
 
 def sessions_between(source: RowSource, since: Stamp, until: Stamp, boot: int) -> list[dict[str, Any]]:

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from daemon.store.errors import StoreError
-from daemon.store.queries.sessions import OLDEST_WAITING
 from daemon.store.reader import Reader
 from daemon.store.store import Store
 from drivers.clock import Stamp
@@ -106,25 +105,6 @@ def stretches_of_session(reader: Reader, session_id: str) -> list[Stretch]:
 def stretches_between(reader: Reader, first_utc_ns: int, last_utc_ns: int) -> list[Stretch]:
     """Return the stretches of captures between two instants of the wall clock, one a boot."""
     return _stretches(reader, _STRETCHES, (first_utc_ns, last_utc_ns), None, None)
-
-
-def decoded_before(reader: Reader, stretches: Sequence[Stretch], margin_ns: int) -> list[Stretch]:
-    """Cut stretches so long before the oldest capture that waits to be decoded; those that lie behind it are left out.
-
-    Acquisition stores the records of what waits, and does not look whether they are there already.
-    """
-    oldest = next(reader.rows(OLDEST_WAITING), None)
-    if oldest is None:
-        return list(stretches)
-    boots = {kernel_id: row for row, kernel_id in reader.boots().items()}
-    cut = []
-    for since, until in stretches:
-        boot, last = boots[until.boot_id], until
-        if boot == oldest["first_boot_id"]:
-            last = until.shifted(min(oldest["first_monotonic_ns"] - margin_ns - until.monotonic_ns, 0))
-        if boot <= oldest["first_boot_id"] and since.monotonic_ns <= last.monotonic_ns:
-            cut.append((since, last))
-    return cut
 
 
 def _stretches(
