@@ -38,9 +38,7 @@ Interface = Literal["socketcan", "virtual", "udp_multicast", "slcan"]
 
 ADAPTER_READY_S = 1.2  # after its port was opened: some slcan adapters start anew then; with the rest under 2 s
 BATCH_MAX = 512  # frames per read, so that a flooded bus cannot keep the loop from its other duties
-GATHER_S = (
-    0.005  # frames that come so soon after the first are read with it: to wake up costs as much as some frames do
-)
+GATHER_S = 0.005  # frames that come so soon after the first are read with it: waking up costs as much as some of them
 
 # Linux, include/uapi/asm-generic/socket.h; Python's socket module does not name them
 SO_RCVBUFFORCE = 33

@@ -50,6 +50,11 @@ class Quantity:
     others: re.Pattern[str]
     subjects: frozenset[str]
 
+    def known_units(self) -> str:
+        """Return the units that are read, as a sentence lists them."""
+        *units, last = dict.fromkeys(self.words.values())
+        return f"{', '.join(units)} or {last}"
+
 
 LENGTHS = Quantity(
     "length",
@@ -102,20 +107,23 @@ def unit_of_columns(
     """
     units: dict[str, str] = {}  # unit -> the first column that has it
     for column, cell in zip(columns, below, strict=True):
-        under = cell.strip("[]() ")
-        said = [(header_line, word) for word in bracket_words(column)] + [(units_line, under)] * bool(under)
-        for line, word in said:
+        for line, word in _words_of(column, header_line, cell, units_line):
             plain = word.lower()
             if plain in quantity.words:
                 units.setdefault(quantity.words[plain], column)
             elif not _is_remark(plain) and (line == header_line or any(map(str.isalpha, word))):
-                *known, last = dict.fromkeys(quantity.words.values())
-                todo = f"export {', '.join(known)} or {last}, or take {word!r} out if it is a remark"
+                todo = f"export {quantity.known_units()}, or take {word!r} out if it is a remark"
                 refuse(source, f"{word!r} is no unit of {quantity.name} that is known; {todo}", line, column)
     if len(units) > 1:
         different = " and ".join(f"{cell!r} in {unit}" for unit, cell in units.items())
         refuse(source, f"the columns have different units, {different}; export them in one unit")
     return next(((unit, f"column {column!r}") for unit, column in units.items()), None)
+
+
+def _words_of(column: str, header_line: int, below: str, units_line: int) -> list[tuple[int, str]]:
+    """Return the words that may be a column's unit, with their lines: in its name, and in the cell below that."""
+    under = below.strip("[]() ")
+    return [(header_line, word) for word in bracket_words(column)] + [(units_line, under)] * bool(under)
 
 
 def _is_remark(word: str) -> bool:
@@ -125,7 +133,6 @@ def _is_remark(word: str) -> bool:
 
 def check_seconds(column: str, header_line: int, below: str, units_line: int, source: str) -> None:
     """Refuse a column of times in another unit than seconds, by its name or the cell below that."""
-    said = [(header_line, word) for word in bracket_words(column)] + [(units_line, below.strip("[]() "))]
-    for line, word in said:
+    for line, word in _words_of(column, header_line, below, units_line):
         if _NO_SECONDS.fullmatch(word.lower()):
             refuse(source, f"times in {word!r} are not read; export seconds, or dates with times", line, column)

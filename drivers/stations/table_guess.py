@@ -55,7 +55,7 @@ def _with_header(
     notes.insert(1, f"columns by their names: {by_role}")
     if "point" not in roles:
         notes.append("no column is known to name the points, so they are 1, 2, ... in the order of the file")
-    sample = [cells_of(line, separator) for line in lines[first - 1 : first + 200] if not is_no_row(line, separator)]
+    sample = _sample(lines, separator, first)
 
     def sampled(of: list[str]) -> list[str]:
         places = [cells.index(cell) for cell in of]
@@ -108,6 +108,11 @@ def _with_header(
     return Guess(map_, tuple(notes))
 
 
+def _sample(lines: list[str], separator: str, first: int) -> list[list[str]]:
+    """Return the cells of some rows from a line on."""
+    return [cells_of(line, separator) for line in lines[first - 1 : first + 200] if not is_no_row(line, separator)]
+
+
 def _decimal_note(cells: list[str]) -> tuple[str, ...]:
     comma = next((cell for cell in cells if decimal_of([cell]) == ","), None)
     return () if comma is None else (f"commas are decimal signs, as in {comma!r}",)
@@ -134,12 +139,7 @@ def _without_header(lines: list[str], source: str, name: str) -> Guess:
             numbers = [place for place, cell in enumerate(cells, 1) if number_of(cell, decimal) is not None]
             if len(cells) >= 4 and len(numbers) >= 3 and {2, 3, 4} <= set(numbers):
                 _check_without_header(lines, separator, number, source)
-                sample = [
-                    cells_of(each, separator)
-                    for each in lines[number - 1 : number + 200]
-                    if not is_no_row(each, separator)
-                ]
-                coordinates = [cell for row in sample for cell in row[1:4]]
+                coordinates = [cell for row in _sample(lines, separator, number) for cell in row[1:4]]
                 largest = _largest(coordinates, decimal)
                 named = unit_of_preamble(LENGTHS, lines[: number - 1], source)
                 length = named[0] if named else _length_by_size(largest)

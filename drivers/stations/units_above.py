@@ -34,8 +34,7 @@ def unit_of_preamble(quantity: Quantity, lines: Sequence[str], source: str) -> t
         plain = line[:_LINE_MAX].lower()
         unknown = next(_unknown_words(quantity, plain), None)
         if unknown is not None:
-            *known, last = dict.fromkeys(quantity.words.values())
-            todo = f"export {', '.join(known)} or {last}, or name the unit in the header, as in 'X [mm]'"
+            todo = f"export {quantity.known_units()}, or name the unit in the header, as in 'X [mm]'"
             refuse(source, f"{unknown!r} is no unit of {quantity.name} that is known; {todo}", number)
         for word in _unit_words(quantity, plain):
             if word in quantity.words:

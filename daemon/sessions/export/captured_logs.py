@@ -17,12 +17,7 @@ from daemon.sessions.session_data import sessions_csv
 from daemon.sessions.vector_channels import channel_numbers
 from daemon.store.queries.decoding import is_being_joined, is_undecoded
 from daemon.store.queries.device_states import device_states
-from daemon.store.queries.sessions import (
-    AFTER_NS,
-    BEFORE_NS,
-    prism_confirmations,
-    session,
-)
+from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS, prism_confirmations, session
 from daemon.store.queries.setups import control_points
 from daemon.store.reader import Reader
 from daemon.store.upkeep.full_samples import stretches_of_session
