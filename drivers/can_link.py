@@ -51,6 +51,7 @@ class CanLink:
         configure_at_start: bool = False,
     ) -> None:
         self.name = config.name
+        self.read_until: Stamp | None = None
         self._config = config
         self._clock = clock
         self._permission = TransmitPermission(
@@ -140,6 +141,7 @@ class CanLink:
                     self._serve(emit, stop, outage, backoff, watch)
                 except LinkError as error:
                     outage.begin(str(error), self._clock.now(), self._last_frame)
+                    self.read_until = None
                     wait_s = backoff.next_s()
                     # Of real seconds, for devices are plugged in by people; fewer where time is made to run faster
                     watch.wait(stop, min(wait_s, self._clock.real_seconds(wait_s)))
@@ -155,12 +157,14 @@ class CanLink:
             at_start, self._at_start = self._at_start, []
             self._swap_requests(at_start)
             try:
+                self.read_until = session.read_until
                 outage.end(self._clock.now(), f"{self.name}: the bus is open")
                 while True:
                     session.take(read)
                     if read.batch.received:
                         backoff.reset()
                     session.serve(self._swap_requests([]), self._take_published())
+                    self.read_until = session.read_until
                     if stop.is_set():
                         return
                     read = session.read(session.patience_s())
@@ -222,6 +226,7 @@ class _Session:
         self._stamps = ReceiveStamps(clock, opened)
         began = clock.of_host(opened)
         self._stalls = StallDetector(clock, began)
+        self.read_until = self._emptied = began  # when the port was last found empty: with its losses told, and at all
         self._sent: deque[CanCapture] = deque()  # what was received before it may still have to be read
         now = clock.now()
         self._late = LateReport(config.name, "frames", began)
@@ -263,8 +268,9 @@ class _Session:
             doubtful += stamp.is_doubtful
             arbitration_id, data, is_extended, is_remote, is_error = frame
             emit(CanCapture(name, stamp, arbitration_id, data, is_extended, is_remote, is_error))
+        began = self._clock.of_host(read.began)
         if sent and read.batch.is_last:
-            self._emit_sent(self._clock.of_host(read.began))
+            self._emit_sent(began)
         if doubtful:
             self._late.add(doubtful, NOT_READ_IN_TIME if is_late else CLOCK_WAS_SET)
         elif not is_late:
@@ -273,6 +279,8 @@ class _Session:
         if self._setup.is_active:
             for (frame, _), stamp in zip(read.batch.received, stamps, strict=True):
                 self._setup.feed(frame, stamp)
+        if read.batch.is_last and not is_late:
+            self._emptied = began
 
     def _emit_sent(self, until: Stamp) -> None:
         """Emit the frames sent until then; those still to be read were received later."""
@@ -304,6 +312,7 @@ class _Session:
         if monotonic_ns >= self._check_losses_ns:
             self._check_losses_ns = monotonic_ns + LOSS_CHECK_NS
             self._report_losses()
+            self.read_until = self._emptied
 
     def patience_s(self) -> float:
         """Return how long the next read may wait, in real seconds."""

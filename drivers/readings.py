@@ -260,7 +260,14 @@ LinkItem = Capture | DeviceEvent | Gap
 
 
 class LinkLoop(Protocol):
-    """The thin loop that owns one port: opens it, reads it, opens it again when it goes away. It decodes nothing."""
+    """The thin loop that owns one port: opens it, reads it, opens it again when it goes away. It decodes nothing.
+
+    Attributes:
+        read_until: all that the port had received by then has been handed on, and what was lost has been told; None
+            where nothing waits to be read, as while the port is not open, which has been told as well.
+    """
+
+    read_until: Stamp | None
 
     @property
     def name(self) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable
 
-from drivers.clock import NS_PER_S, Clock
+from drivers.clock import NS_PER_S, Clock, Stamp
 from drivers.readings import Capture, LinkItem
 
 
@@ -20,6 +20,7 @@ class ReplayLink:
 
     def __init__(self, name: str, captures: Iterable[Capture], clock: Clock) -> None:
         self.name = name
+        self.read_until: Stamp | None = None
         self.is_finished = threading.Event()
         self._captures = captures
         self._clock = clock

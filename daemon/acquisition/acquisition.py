@@ -48,7 +48,7 @@ log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-ALIVE_NS = 5 * NS_PER_S
+ALIVE_NS = NS_PER_S
 RETRY_S = 1.0
 STOP_S = 15.0  # real seconds
 LINKS_STOP_S = 5.0  # of them for all links together, which look at `stop` several times a second
@@ -201,9 +201,10 @@ class Acquisition:
             while not self._finish.is_set():
                 now = self._clock.now()
                 self._last_cycle_ns = now.monotonic_ns
+                read_until = self._read_until(now)
                 self._take_in()
                 if now.monotonic_ns >= next_alive_ns:
-                    self._try("its sign of life", partial(self._store.note_alive, now))
+                    self._try("its sign of life", partial(self._store.note_alive, read_until))
                     next_alive_ns = now.monotonic_ns + ALIVE_NS
                 is_done = self._decode_next(now)
                 if not is_done:
@@ -222,6 +223,11 @@ class Acquisition:
 
     def _has_time(self) -> bool:
         return not self._decode_until.is_over
+
+    def _read_until(self, now: Stamp) -> Stamp:
+        """Return until when all that has reached the computer has been captured: now, or where a link is behind."""
+        links = [intake.read_until for intake in self._intakes]
+        return min([now, *filter(None, links)], key=lambda stamp: stamp.monotonic_ns)
 
     def _take_in(self) -> None:
         """Commit what the links have captured, however long the disk is full or faulty; meanwhile captures queue."""

@@ -34,7 +34,8 @@ class LinkIntake:
         loop: the link.
         clock: for the restart's delay and stamp.
         limit: captures that may wait; events and gaps, being few, are always taken.
-        begun: when the run began; nothing is known of the link from then until its loop first tells of its port.
+        begun: when the run began; nothing is known of the link from then until its loop first tells of its port. So it
+            is from the end of a loop that died.
     """
 
     def __init__(self, loop: LinkLoop, clock: Clock, limit: int, begun: Stamp) -> None:
@@ -66,6 +67,12 @@ class LinkIntake:
         """Number of items that wait."""
         return len(self._queue)
 
+    @property
+    def read_until(self) -> Stamp | None:
+        """All that the link's port had received by then is queued, or its loss is; None where nothing waits there."""
+        begun = self._begun
+        return self._loop.read_until if begun is None else begun
+
     def drain(self) -> list[LinkItem]:
         """Return the items that wait, oldest first, and at their end a gap for those that were lost."""
         queue = self._queue
@@ -80,10 +87,10 @@ class LinkIntake:
 
     def _emit(self, item: LinkItem) -> None:
         if self._begun is not None:
-            begun, self._begun = self._begun, None
             first = _first_word(item)
-            if first is not None and first.since(begun) > 0:
-                self._queue.append(Gap(self.name, GapReason.LINK_DOWN, begun, first))
+            if first is not None and first.since(self._begun) > 0:
+                self._queue.append(Gap(self.name, GapReason.LINK_DOWN, self._begun, first))
+            self._begun = None
         if len(self._queue) < self._limit or not isinstance(item, CanCapture | SerialCapture):
             self._queue.append(item)
             return
@@ -107,7 +114,9 @@ class LinkIntake:
             if not stop.is_set():
                 self.restarts += 1
                 text = f"{self.name}: the link's loop ended ({reason}); it is started again in {RESTART_S:g} s"
-                self._emit(DeviceEvent(self.name, self._clock.now(), EventKind.LINK_LOST, text))
+                now = self._clock.now()
+                self._emit(DeviceEvent(self.name, now, EventKind.LINK_LOST, text))
+                self._begun = self._loop.read_until or now
                 self._clock.wait(stop, RESTART_S)
 
 

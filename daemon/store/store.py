@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import sqlite3
@@ -24,7 +23,6 @@ log = logging.getLogger(__name__)
 
 ChannelKind = Literal["joint", "signal"]
 
-_LAST_CHUNKS = 100  # of a killed run that are looked at: some seconds of them
 WHOLE_DAEMON = "daemon"  # the channel of gaps in which rigcal itself was not there
 
 _SAMPLE_COLUMNS = "(channel_id, utc_ns, monotonic_ns, boot_id, value, status, raw_counts) VALUES (?, ?, ?, ?, ?, ?, ?)"
@@ -118,8 +116,8 @@ class Store(Connection):
         if not runs:
             return
         self.ended_in_order = bool(runs[0]["clean"])
-        last = self.stamp_or_none(runs[0], "ended_") or self.stamp(runs[0], "alive_")
-        # A killed run may have captured something after its last sign of life.
+        last = since = self.stamp_or_none(runs[0], "ended_") or self.stamp(runs[0], "alive_")
+        # A killed run may have captured something after its last sign of life, but not all that there was.
         for row in self.rows(
             "SELECT last_utc_ns, last_monotonic_ns, last_boot_id FROM raw_chunks ORDER BY id DESC LIMIT 1"
         ):
@@ -130,46 +128,21 @@ class Store(Connection):
         ended = self.instant(last, "end_")
         settings = ", ".join(f"{name} = ?" for name in ended)
         db.execute(f"UPDATE gaps SET {settings} WHERE end_utc_ns IS NULL", [*ended.values()])
-        since = last if self.ended_in_order else self._before_unread(last)
         self.insert_records([Gap(WHOLE_DAEMON, GapReason.NOT_RUNNING, since, now)])
 
-    def note_alive(self, now: Stamp) -> None:
-        """The running daemon is alive; without it the end of a killed run is known by its last capture alone.
+    def note_alive(self, until: Stamp) -> None:
+        """The running daemon has stored all that came `until` then: what a kill loses, it loses after that.
 
         Harmless when no run has begun.
         """
         if self.run_id:
-            self.update("daemon_runs", {"id": self.run_id}, self.instant(now, "alive_"))
+            self.update("daemon_runs", {"id": self.run_id}, self.instant(until, "alive_"))
 
     def end_run(self, now: Stamp) -> None:
         """The run ends in order; harmless when none has begun."""
         if self.run_id:
             self.update("daemon_runs", {"id": self.run_id}, {**self.instant(now, "ended_"), "clean": True})
             self.run_id = 0
-
-    def _before_unread(self, end: Stamp) -> Stamp:
-        """Return since when captures may be lost that a killed run had not read: its end, or before it.
-
-        A link whose last capture is of doubtful time was read late. What was still to be read then came after its last
-        capture of certain time.
-        """
-        known: set[int] = set()
-        late: dict[int, Stamp] = {}
-        for row in self.rows("SELECT id, link_id FROM raw_chunks ORDER BY id DESC LIMIT ?", [_LAST_CHUNKS]):
-            link = row["link_id"]
-            if link in known:
-                continue
-            with contextlib.suppress(StoreError):  # a damaged chunk is told where it is decoded
-                captures = self.chunk_captures(row["id"])
-                certain = [capture.stamp for capture in captures if not capture.stamp.is_doubtful]
-                if link in late or captures[-1].stamp.is_doubtful:
-                    late[link] = certain[-1] if certain else captures[0].stamp
-                if certain:
-                    known.add(link)
-        return min(
-            [end, *(stamp for stamp in late.values() if stamp.boot_id == end.boot_id)],
-            key=lambda stamp: stamp.monotonic_ns,
-        )
 
     # ---- raw captures ----------------------------------------------------------------------------------------------
 

@@ -34,6 +34,7 @@ class StationLink:
 
     def __init__(self, config: StationConfig, clock: Clock) -> None:
         self.name = config.name
+        self.read_until: Stamp | None = None
         self._config = config
         self._clock = clock
         self._last_read = clock.now()
@@ -52,13 +53,14 @@ class StationLink:
                     port = SerialPort(self._config.serial, self.name, self._clock.real_seconds(_LONGEST_WRITE_S))
                     with closing(port):
                         watch.close()
-                        opened = self._last_read = self._clock.now()
+                        opened = self._last_read = self.read_until = self._clock.now()
                         outage.end(opened, f"{self._config.serial.path} opened")
                         self._serve(port, emit, stop, began)
                 except LinkError as error:
                     now = self._clock.now()
                     # What came since the last read is lost with the device, however long ago that was.
                     outage.begin(str(error), now, now if opened is None else self._last_read)
+                    self.read_until = None
                     is_short_lived = opened is not None and now.since(opened) < BACKOFF_MAX_S * NS_PER_S
                     if opened is not None and not is_short_lived:
                         backoff.reset()
@@ -85,9 +87,10 @@ class StationLink:
         while not stop.is_set():
             wait_s = _LONGEST_READ_S if poller is None else self._send_due(port, poller, emit)
             timeout_s = self._clock.real_seconds(wait_s)
+            began = self._clock.now()
             data = port.read(timeout_s)
             self._last_read = stamp = self._clock.now()
-            if stalls.is_late(stamp, timeout_s):
+            if is_late := stalls.is_late(stamp, timeout_s):
                 stamp = stamp.doubted()
                 late.add(len(data), NOT_READ_IN_TIME)
             else:
@@ -98,6 +101,8 @@ class StationLink:
                 emit(capture)
                 if poller is not None:
                     poller.feed(capture)
+            if not is_late:
+                self.read_until = began
         if poller is not None:
             for command in poller.closing():
                 self._send(port, command, emit)

@@ -12,9 +12,23 @@ from pathlib import Path
 
 from daemon.acquisition.acquisition import Acquisition
 from daemon.store import Reader, Store
+from drivers.can.ports import CanLinkConfig
+from drivers.can_link import CanLink
 from drivers.clock import Stamp, SystemClock
-from drivers.readings import CanCapture, Capture, Gap, GapReason, LinkItem, Reading, Record, SerialCapture, Status
+from drivers.readings import (
+    CanCapture,
+    Capture,
+    Gap,
+    GapReason,
+    LinkItem,
+    LinkLoop,
+    Reading,
+    Record,
+    SerialCapture,
+    Status,
+)
 from tests.daemon.store_support import fix, table
+from tests.drivers.multicast import GROUP
 
 DEADLINE_S = 20.0
 
@@ -48,6 +62,8 @@ class ListLink:
         items: what to emit.
         gate: emits only once it is set.
     """
+
+    read_until: Stamp | None = None
 
     def __init__(self, name: str, items: Iterable[LinkItem], gate: threading.Event | None = None) -> None:
         self.name = name
@@ -107,6 +123,7 @@ class NumberSource:
     """A link that emits numbered frames, fast, until it is stopped."""
 
     name = "boom"
+    read_until: Stamp | None = None
 
     def __init__(self, clock: SystemClock) -> None:
         self._clock = clock
@@ -120,14 +137,21 @@ class NumberSource:
 
 
 def main() -> None:
-    """A process that acquires numbered frames into the store `argv[1]` until it is killed (itself at `argv[2]`)."""
+    """A process that acquires numbered frames into the store `argv[1]` until it is killed (itself at `argv[2]`).
+
+    They are its own, or come over the bus between processes with the port `argv[3]`.
+    """
     clock = SystemClock()
     store = Store(Path(sys.argv[1]))
     store.declare_channels({"theta1": "deg"}, {})
     store.begin_run(clock.now())
     kill_at = int(sys.argv[2])
+    link: LinkLoop = NumberSource(clock)
+    if len(sys.argv) > 3:
+        options = {"port": int(sys.argv[3]), "hop_limit": 0}
+        link = CanLink(CanLinkConfig(name="boom", interface="udp_multicast", channel=GROUP, options=options), clock)
     acquisition = Acquisition(
-        [NumberSource(clock)],
+        [link],
         {"boom": lambda: NumberDecoder(kill_at)},
         store,
         clock,

@@ -51,7 +51,11 @@ TABLES: dict[str, Words] = {
             "sqlite_version": "version of SQLite",
             "clean": "1 where it ended in order, 0 after a kill or a power cut",
         },
-        {"started_": "start", "alive_": "last sign of life", "ended_": "end in order, NULL without one"},
+        {
+            "started_": "start",
+            "alive_": "until when all that came is known to be stored",
+            "ended_": "end in order, NULL without one",
+        },
     ),
     "links": Words(
         "Links",

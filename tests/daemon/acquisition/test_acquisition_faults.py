@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import can
 import pytest
 
 from daemon.acquisition import acquisition as acquisition_module
@@ -34,6 +38,7 @@ from tests.daemon.acquisition_support import (
 )
 from tests.daemon.damage import fill_up, make_room
 from tests.daemon.store_support import at, frame, table
+from tests.drivers.multicast import multicast_bus, unused_port
 
 # ---- losses are never silent -----------------------------------------------------------------------------------------
 
@@ -239,9 +244,9 @@ def test_a_writer_that_hangs_is_not_alive(acquire: Make) -> None:
 # ---- killed at any time ----------------------------------------------------------------------------------------------
 
 
-def run_process(path: Path, kill_at: int) -> subprocess.Popen[str]:
+def run_process(path: Path, *arguments: int) -> subprocess.Popen[str]:
     process = subprocess.Popen(
-        [sys.executable, "-m", "tests.daemon.acquisition_support", str(path), str(kill_at)],
+        [sys.executable, "-m", "tests.daemon.acquisition_support", str(path), *map(str, arguments)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -285,8 +290,7 @@ def test_a_process_killed_while_it_decodes_loses_no_committed_row(path: Path) ->
     assert table(path, "undecoded_chunks") == []
     (gap,) = table(path, "gaps")
     assert (gap["channel"], gap["reason"]) == ("daemon", "not_running")
-    last = raw(path)[-1].stamp
-    assert gap["start_utc_ns"] == last.utc_ns < gap["end_utc_ns"]
+    assert gap["start_utc_ns"] <= raw(path)[-1].stamp.utc_ns < gap["end_utc_ns"]
     assert [row["clean"] for row in table(path, "daemon_runs")] == [0, 1]
 
 
@@ -301,6 +305,48 @@ def test_a_process_killed_from_outside_keeps_all_that_a_reader_had_seen(path: Pa
     assert values(path)[: len(seen_values)] == seen_values
     with Store(path).transaction() as db:  # it opens again, for writing
         assert db.execute("SELECT count(*) FROM daemon_runs").fetchone()[0] == 1
+
+
+@pytest.mark.parametrize("lived_on_s", [0.0, 0.015, 0.04, 0.2])
+def test_what_a_killed_process_had_still_to_read_after_a_stall_lies_in_the_gap(path: Path, lived_on_s: float) -> None:
+    """It stands still while frames come, and is killed before it has read, or committed, those that wait."""
+    port = unused_port()
+    process = run_process(path, -1, port)
+    sent_ns = []
+    with multicast_bus(port) as bus:
+
+        def send(number: int, until: Callable[[], bool]) -> int:
+            while not until():
+                sent_ns.append(time.monotonic_ns())
+                bus.send(can.Message(arbitration_id=0x181, data=number.to_bytes(8, "little")))
+                number += 1
+                time.sleep(0.001)
+            return number
+
+        def after(seconds: float) -> Callable[[], bool]:
+            until = time.monotonic() + seconds
+            return lambda: time.monotonic() > until
+
+        number = send(0, lambda: len(table(path, "raw_chunks")) > 3)
+        number = send(number, after(1.5))  # beyond the first sign of life
+        process.send_signal(signal.SIGSTOP)
+        number = send(number, after(1.5))
+        process.send_signal(signal.SIGCONT)
+        number = send(number, after(lived_on_s))
+        process.kill()
+        send(number, after(0.1))
+    process.communicate(timeout=DEADLINE_S)
+
+    with contextlib.closing(Store(path)) as store:
+        store.begin_run(SystemClock().now())
+    (killed,) = [gap for gap in table(path, "gaps") if gap["reason"] == "not_running"]
+    stored = {int.from_bytes(capture.data, "little") for capture in raw(path)}
+    lost = [number for number in range(len(sent_ns)) if number not in stored]
+    assert lost
+    first = next(number for number in lost if number > min(stored))  # before it, the process was not there yet
+    assert sent_ns[first] > killed["start_monotonic_ns"] - 5_000_000
+    # Not more is doubted than what came since the process was stopped, and some seconds before
+    assert killed["start_monotonic_ns"] > sent_ns[number - 1] - 5_000_000_000
 
 
 def test_a_damaged_chunk_does_not_keep_the_daemon_from_starting(

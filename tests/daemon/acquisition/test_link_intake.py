@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import threading
+from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
+from daemon.acquisition import link_intake
 from daemon.acquisition.acquisition import Acquisition
+from daemon.acquisition.link_intake import LinkIntake
 from daemon.store import Store
 from drivers.clock import SystemClock
-from drivers.readings import CanCapture, DeviceEvent, EventKind, Gap, GapReason
-from tests.daemon.acquisition_support import ListLink, wait_until
+from drivers.readings import CanCapture, DeviceEvent, EventKind, Gap, GapReason, LinkItem
+from tests.daemon.acquisition_support import DEADLINE_S, ListLink, wait_until
 
 
 def test_the_time_from_the_start_of_a_run_until_a_link_is_open_is_a_gap(tmp_path: Path) -> None:
@@ -36,4 +42,50 @@ def test_the_time_from_the_start_of_a_run_until_a_link_is_open_is_a_gap(tmp_path
         ("boom", "link_down", start_ns, up_ns),
         ("station", "link_down", start_ns, up_ns),
         ("station", "link_down", up_ns, None),
+    ]
+
+
+def test_a_link_counts_as_read_from_its_first_word_on() -> None:
+    """Until then the gap until its port is open is not told yet, and a kill would lose it."""
+    clock = SystemClock()
+    begun = clock.now()
+    read, gate, stop = begun.shifted(2_000_000_000), threading.Event(), threading.Event()
+    loop = ListLink("boom", [DeviceEvent("boom", begun.shifted(1_000_000_000), EventKind.LINK_UP, "open")], gate)
+    loop.read_until = read
+    intake = LinkIntake(loop, clock, 100, begun)
+    intake.start(stop)
+    assert intake.read_until == begun
+    gate.set()
+    wait_until(lambda: intake.read_until == read)
+    stop.set()
+    intake.join(DEADLINE_S)
+    gap, _ = intake.drain()
+    assert gap == Gap("boom", GapReason.LINK_DOWN, begun, begun.shifted(1_000_000_000))
+
+
+def test_what_came_between_a_loop_s_death_and_its_next_life_lies_in_a_gap(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(link_intake, "RESTART_S", 0.01)
+    clock = SystemClock()
+    begun = clock.now()
+    read, opened = begun.shifted(1_000_000_000), begun.shifted(3_000_000_000)
+
+    class Dies(ListLink):
+        lives = 0
+
+        def run(self, emit: Callable[[LinkItem], None], stop: threading.Event) -> None:
+            self.lives += 1
+            emit(DeviceEvent("boom", begun if self.lives == 1 else opened, EventKind.LINK_UP, "open"))
+            if self.lives == 1:
+                self.read_until = read
+                raise RuntimeError("a defect")
+            super().run(emit, stop)
+
+    loop, stop = Dies("boom", []), threading.Event()
+    intake = LinkIntake(loop, clock, 100, begun)
+    intake.start(stop)
+    wait_until(loop.done.is_set)
+    stop.set()
+    intake.join(DEADLINE_S)
+    assert [item for item in intake.drain() if isinstance(item, Gap)] == [
+        Gap("boom", GapReason.LINK_DOWN, read, opened)
     ]

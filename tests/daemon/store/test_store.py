@@ -10,7 +10,6 @@ import sqlite3
 import subprocess
 import sys
 import threading
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -448,7 +447,7 @@ def test_the_time_between_two_runs_is_a_gap_and_ends_those_left_open(path: Path)
 @pytest.mark.parametrize(
     ("alive_s", "captured_s", "captured_boot", "ended_s"), [(5, 7, BOOT, 7), (9, 7, BOOT, 9), (5, 7, "boot-z", 5)]
 )
-def test_a_killed_run_ended_when_it_last_gave_a_sign(
+def test_a_killed_run_ended_at_its_last_sign_and_may_have_lost_what_came_since_it_had_stored_all(
     path: Path, alive_s: float, captured_s: float, captured_boot: str, ended_s: float
 ) -> None:
     store = Store(path)
@@ -458,33 +457,12 @@ def test_a_killed_run_ended_when_it_last_gave_a_sign(
     store.close()  # without end_run, as after a kill
     store = Store(path)
     store.begin_run(at(60, "boot-b"))
+    assert store.previous_end == at(ended_s)
     store.close()
     (gap,) = table(path, "gaps")
     with Reader(path) as reader:
-        assert reader.stamp(gap, "start_") == at(ended_s)
+        assert reader.stamp(gap, "start_") == at(alive_s)
         assert reader.stamp(gap, "end_") == at(60, "boot-b")
-
-
-@pytest.mark.parametrize("is_clean", [False, True])
-def test_what_a_killed_run_had_still_to_read_lies_in_the_gap(path: Path, is_clean: bool) -> None:
-    """Nobody read from 3 s to 9 s, and the run was killed before it had read all that waited."""
-    store = Store(path)
-    store.begin_run(at(0))
-    store.append_captures([frame(1, 2.0), frame(2, 3.0)])
-    late = [replace(frame(n), stamp=at(9.0).doubted()) for n in (3, 4)]
-    for capture in late:
-        store.append_captures([capture])
-    store.append_captures([frame(5, 9.1, link="other")])
-    store.note_alive(at(9.2))
-    if is_clean:
-        store.end_run(at(9.3))
-    store.close()
-    store = Store(path)
-    store.begin_run(at(60))
-    assert store.previous_end == at(9.3 if is_clean else 9.2)
-    store.close()
-    (gap,) = table(path, "gaps")
-    assert gap["start_utc_ns"] == at(9.3 if is_clean else 3.0).utc_ns
 
 
 def test_a_run_that_never_began_neither_lives_nor_ends(store: Store, path: Path) -> None:

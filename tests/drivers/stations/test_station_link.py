@@ -16,8 +16,10 @@ from drivers.stations.decoder import StationDecoder
 from drivers.stations.link import StationLink
 from tests.drivers.serial_support import (
     ACK_FRAME,
+    DEADLINE_S,
     SET_REPLY,
     SLOPE_MM,
+    Collected,
     Instrument,
     plugged_in,
     running,
@@ -67,6 +69,31 @@ def test_the_captures_decode_to_fixes(tmp_path: Path) -> None:
     (fix,) = [record for capture in collected.captures() for record in decoder.feed(capture) if isinstance(record, Fix)]
     assert fix.status is Status.OK
     assert fix.slope_distance_m == pytest.approx(10.0)
+
+
+def test_a_port_counts_as_read_up_to_its_last_read_and_not_while_it_is_gone(tmp_path: Path) -> None:
+    collected, stop = Collected(), threading.Event()
+    with plugged_in(tmp_path / "tty") as instrument:
+        link = StationLink(config(instrument.path), SystemClock())
+        assert link.read_until is None
+        thread = threading.Thread(target=link.run, args=(collected.emit, stop))
+        thread.start()
+        try:
+            collected.wait_for_event(EventKind.LINK_UP)
+            assert link.read_until is not None
+            instrument.send(ACK_FRAME)
+            collected.wait_for_bytes(len(ACK_FRAME))
+            heard = collected.captures()[-1].stamp
+            deadline = time.monotonic() + DEADLINE_S  # it waits for more, and finds nothing
+            while link.read_until is None or link.read_until.since(heard) <= 0:
+                assert time.monotonic() < deadline
+                time.sleep(0.01)
+            instrument.unplug()
+            collected.wait_for_event(EventKind.LINK_LOST, 2)  # and cannot be opened again
+            assert link.read_until is None
+        finally:
+            stop.set()
+            thread.join(DEADLINE_S)
 
 
 def test_the_link_survives_unplugging_and_plugging_in_again(tmp_path: Path) -> None:

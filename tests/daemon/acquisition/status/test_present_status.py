@@ -18,7 +18,7 @@ from daemon.config.config import Config
 from daemon.host.safe_output import duration
 from daemon.rig_files import load_rig
 from daemon.store import Store
-from drivers.clock import NS_PER_S, ManualClock
+from drivers.clock import NS_PER_S, ManualClock, Stamp
 from drivers.readings import Capture, DecodeFailure, DeviceEvent, EventKind, Gap, GapReason, LinkItem, Record
 from tests.daemon.acquisition_support import DEADLINE_S, ListLink, NumberDecoder, wait_until
 from tests.daemon.store_support import at, frame, serial_bytes
@@ -53,6 +53,7 @@ class Rig:
         )
 
     name = "boom"
+    read_until: Stamp | None = None
 
     def run(self, emit: Callable[[LinkItem], None], stop: threading.Event) -> None:
         while not stop.wait(0.005):
