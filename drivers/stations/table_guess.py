@@ -169,7 +169,8 @@ def _check_without_header(lines: list[str], separator: str, first: int, source: 
         is_as_wide = len(before) == len(cells) or (separator != " " and sum(map(bool, before)) >= 4)
         if is_as_wide and any(before[1:]) and not numbers:
             said = f"its names are not known ({', '.join(before)})"
-            refuse(source, f"this is a header, and {said}; call the columns point, x, y and z in it", number)
+            advice = "call the columns point, x, y and z in it, or delete it if it is a remark"
+            refuse(source, f"this is a header, and {said}; {advice}", number)
         if numbers > (0 if len(before) == len(cells) else 1):
             said = f"it has numbers, as the points from line {first} on, but is no point, x, y, z"
             refuse(source, f"{said}; mend it, or delete it if it is a remark", number)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -55,61 +56,67 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
     """
     with Reader(config.store_path) as reader:
         found = ended_session(reader, session_id)
-        started, ended = reader.stamp(found, "started_"), reader.stamp(found, "ended_")
-        since, until = started.shifted(-BEFORE_NS), ended.shifted(AFTER_NS)
         out.mkdir(parents=True, exist_ok=True)
-        files = []
-        steady = _SteadyTime()
-        for instant in (since, *(each for stretch in stretches_of_session(reader, session_id) for each in stretch)):
-            steady.of(instant)
-        doubtful: dict[str, DoubtfulCaptures] = {}
-        links = reader.links()
-        numbers = channel_numbers(config, [link["name"] for link in links if link["kind"] == "can"])
-        for link in links:
-            stored = reader.captures(link["name"], since, until)
-            doubts = _Doubts()
-            captures = doubts.noted(replace(capture, stamp=steady.of(capture.stamp)) for capture in stored)
-            if link["kind"] == "can":
-                path = out / f"{session_id}-{link['name']}.{can_format}"
-                write_can_log(path, (c for c in captures if isinstance(c, CanCapture)), numbers)
-            else:
-                path = out / f"{session_id}-{link['name']}.serial"
-                with path.open("w", encoding="utf-8", newline="\n") as stream:
-                    writer = SerialLogWriter(stream, _header(config, link["name"]))
-                    for capture in captures:
-                        if isinstance(capture, SerialCapture):
-                            writer.write(capture)
-            files.append(path)
-            if doubts.runs:
-                doubtful[link["name"]] = DoubtfulCaptures(captures=doubts.captures, runs=tuple(doubts.runs))
-        states = [
-            DeviceState(device=e.device, kind=e.kind, text=e.text, code=e.code, utc_ns=steady.of(e.stamp).utc_ns)
-            for e in device_states(reader, since)
-        ]
-        words = [
-            (row["turning"], steady.of(reader.stamp(row)).utc_ns) for row in prism_confirmations(reader, session_id)
-        ]
-        told = SessionFile(
-            prism=found["prism"],
-            kind=found["kind"],
-            since_utc_ns=steady.of(started).utc_ns,
-            until_utc_ns=steady.of(ended).utc_ns,
-            prism_confirmed_utc_ns=tuple(at_ns for turning, at_ns in words if not turning),
-            prism_turned_utc_ns=tuple(at_ns for turning, at_ns in words if turning),
-            control_points={
-                point["name"]: (point["x_mm"], point["y_mm"], point["z_mm"])
-                for point in control_points(reader, found["setup_id"])
-            },
-            doubtful=doubtful,
-            can_channels=numbers,
-            device_states=tuple(states),
-        )
-        path = out / f"{session_id}.json"
-        write_file(path, told.model_dump_json(indent=2, exclude_defaults=True).encode() + b"\n")
+        # A damaged store must leave no part of a log that looks like the whole
+        with tempfile.TemporaryDirectory(prefix=f".{session_id}.", dir=out) as scratch:
+            files = _write(reader, config, found, Path(scratch), can_format)
+            return [file.replace(out / file.name) for file in files]
+
+
+def _write(reader: Reader, config: Config, found: Mapping[str, Any], out: Path, can_format: CanFormat) -> list[Path]:
+    session_id = found["id"]
+    started, ended = reader.stamp(found, "started_"), reader.stamp(found, "ended_")
+    since, until = started.shifted(-BEFORE_NS), ended.shifted(AFTER_NS)
+    steady = _SteadyTime()
+    for instant in (since, *(each for stretch in stretches_of_session(reader, session_id) for each in stretch)):
+        steady.of(instant)
+    doubtful: dict[str, DoubtfulCaptures] = {}
+    links = reader.links()
+    numbers = channel_numbers(config, [link["name"] for link in links if link["kind"] == "can"])
+    files: list[Path] = []
+    for link in links:
+        stored = reader.captures(link["name"], since, until)
+        doubts = _Doubts()
+        captures = doubts.noted(replace(capture, stamp=steady.of(capture.stamp)) for capture in stored)
+        if link["kind"] == "can":
+            path = out / f"{session_id}-{link['name']}.{can_format}"
+            write_can_log(path, (c for c in captures if isinstance(c, CanCapture)), numbers)
+        else:
+            path = out / f"{session_id}-{link['name']}.serial"
+            with path.open("w", encoding="utf-8", newline="\n") as stream:
+                writer = SerialLogWriter(stream, _header(config, link["name"]))
+                for capture in captures:
+                    if isinstance(capture, SerialCapture):
+                        writer.write(capture)
         files.append(path)
-        table = out / f"{session_id}.csv"
-        write_file(table, sessions_csv(reader, parse_rig(found["rig_text"], "the session's rig"), [session_id]))
-        return [*files, table]
+        if doubts.runs:
+            doubtful[link["name"]] = DoubtfulCaptures(captures=doubts.captures, runs=tuple(doubts.runs))
+    states = [
+        DeviceState(device=e.device, kind=e.kind, text=e.text, code=e.code, utc_ns=steady.of(e.stamp).utc_ns)
+        for e in device_states(reader, since)
+    ]
+    words = [(row["turning"], steady.of(reader.stamp(row)).utc_ns) for row in prism_confirmations(reader, session_id)]
+    told = SessionFile(
+        prism=found["prism"],
+        kind=found["kind"],
+        since_utc_ns=steady.of(started).utc_ns,
+        until_utc_ns=steady.of(ended).utc_ns,
+        prism_confirmed_utc_ns=tuple(at_ns for turning, at_ns in words if not turning),
+        prism_turned_utc_ns=tuple(at_ns for turning, at_ns in words if turning),
+        control_points={
+            point["name"]: (point["x_mm"], point["y_mm"], point["z_mm"])
+            for point in control_points(reader, found["setup_id"])
+        },
+        doubtful=doubtful,
+        can_channels=numbers,
+        device_states=tuple(states),
+    )
+    path = out / f"{session_id}.json"
+    write_file(path, told.model_dump_json(indent=2, exclude_defaults=True).encode() + b"\n")
+    files.append(path)
+    table = out / f"{session_id}.csv"
+    write_file(table, sessions_csv(reader, parse_rig(found["rig_text"], "the session's rig"), [session_id]))
+    return [*files, table]
 
 
 def ended_session(reader: Reader, session_id: str) -> dict[str, Any]:

@@ -242,7 +242,8 @@ def restore_backup(backup: Path, store: Path, models: Path, now_utc_ns: int, go_
 def _make_writable(directory: Path) -> None:
     """Let the owner change all that a directory holds: it may be the copy of a backup that nobody may change."""
     for path in (directory, *directory.rglob("*")) if directory.exists() else ():
-        path.chmod(path.stat().st_mode | (0o700 if path.is_dir() else 0o600))
+        if not path.is_symlink():
+            path.chmod(path.stat().st_mode | (0o700 if path.is_dir() else 0o600))
 
 
 def _close_open_sessions(store: Path) -> None:

@@ -10,6 +10,7 @@ from daemon.config.config import parse_config
 from daemon.sessions.export.captured_logs import CanFormat, export_session
 from daemon.sessions.export.session_file import read_session_file
 from daemon.sessions.replay import merged
+from daemon.store.errors import StoreError
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import CanCapture, SerialCapture
 from tests.daemon.session_support import Rig
@@ -78,3 +79,23 @@ def test_a_link_that_fell_silent_before_a_reboot_comes_beside_the_others_of_the_
             apart.append(max(abs(second - seconds[-1]) for seconds in came.values() if seconds[-1] > REBOOT_S))
     assert came == {"boom": boom, "ts": ts}
     assert max(apart) <= 1
+
+
+def test_a_damaged_store_leaves_no_part_of_a_session_s_logs(tmp_path: Path) -> None:
+    config = parse_config(CONFIG, tmp_path / "rigcal.toml")
+    rig = Rig(config.store_path)
+    rig.clock.set(BEGIN)
+    rig.store.begin_run(BEGIN)
+    rig.say("setup_new", id="S1")
+    rig.say("start", prism="r", id="s1")
+    for second in (1, 2):
+        (chunk,) = rig.store.append_captures([CanCapture("boom", at_second(second, 0), 0x1A0, bytes([second]))])
+        rig.store.mark_decoded([chunk])
+    rig.clock.set(at_second(3, 0))
+    rig.say("stop")
+    rig.store.update("raw_chunks", {"id": chunk}, {"chunk": b"rust"})
+    rig.store.end_run(rig.clock.now())
+    rig.store.close()
+    with pytest.raises(StoreError, match=f"raw chunk {chunk}"):
+        export_session(config, "s1", tmp_path / "out", "log")
+    assert [*(tmp_path / "out").iterdir()] == []

@@ -131,6 +131,17 @@ def test_a_backup_that_nobody_may_change_is_restored_as_a_store_that_its_owner_m
     assert all(mode & 0o200 for mode in modes)
 
 
+def test_a_restore_that_was_broken_off_is_made_again_whatever_it_has_left(site: Site) -> None:
+    backup = site.back_up()
+    site.store.close()
+    left = site.path.parent / ".rigcal-restore.unfinished"
+    left.mkdir()
+    (left / "broken").symlink_to("nowhere")
+    left.chmod(0o555)
+    site.restore(backup)
+    assert not left.exists()
+
+
 def test_what_was_replaced_is_kept_though_it_was_within_the_same_second(site: Site) -> None:
     backup = site.back_up()
     site.store.close()
