@@ -21,9 +21,13 @@ class _Ramp:
     """One joint's way from one value to another: speed up, hold, slow down (a trapezium of the rate)."""
 
     start: float
-    distance: float
+    end: float
     rate: float
     acceleration: float
+
+    @property
+    def distance(self) -> float:
+        return self.end - self.start
 
     @property
     def peak(self) -> float:
@@ -44,7 +48,7 @@ class _Ramp:
         """Value and rate."""
         total = self.duration_s
         if elapsed_s >= total:
-            return self.start + self.distance, 0.0
+            return self.end, 0.0
         if elapsed_s <= 0.0:
             return self.start, 0.0
         sign, peak, a = math.copysign(1.0, self.distance), self.peak, self.acceleration
@@ -53,7 +57,7 @@ class _Ramp:
             return self.start + sign * a * elapsed_s**2 / 2, sign * a * elapsed_s
         left_s = total - elapsed_s
         if left_s < ramp_s:
-            return self.start + self.distance - sign * a * left_s**2 / 2, sign * a * left_s
+            return self.end - sign * a * left_s**2 / 2, sign * a * left_s
         return self.start + sign * (peak * elapsed_s - peak * ramp_s / 2), sign * peak
 
 
@@ -82,7 +86,7 @@ class BoomMotion:
         self._rig = rig
         pose = {j.name: sum(j.limits) / 2 for j in rig.joints} | dict(start or {})
         self._check(pose)
-        ramps = {j.name: _Ramp(pose[j.name], 0.0, j.max_rate, j.max_rate) for j in rig.joints}
+        ramps = {j.name: _Ramp(pose[j.name], pose[j.name], j.max_rate, j.max_rate) for j in rig.joints}
         nothing = dict.fromkeys(pose, 0.0)
         self._legs = [_Leg(-math.inf, -math.inf, ramps, dict.fromkeys(pose, 0), nothing, 0.0)]
         self._begins = [-math.inf]
@@ -117,12 +121,12 @@ class BoomMotion:
         begin = max(now_s, last.end_s)
         ramps, directions = {}, dict(last.directions)
         for joint in self._rig.joints:
-            here = last.ramps[joint.name].start + last.ramps[joint.name].distance
+            here = last.ramps[joint.name].end
+            there = target.get(joint.name, here)
             rate = speed * joint.max_rate
-            way = target.get(joint.name, here) - here
-            ramps[joint.name] = _Ramp(here, way, rate, rate / ACCELERATION_TIME_S)
-            if way:
-                directions[joint.name] = 1 if way > 0 else -1
+            ramps[joint.name] = _Ramp(here, there, rate, rate / ACCELERATION_TIME_S)
+            if there != here:
+                directions[joint.name] = 1 if there > here else -1
         arrival = begin + max(r.duration_s for r in ramps.values())
         travelled = {name: last.travelled[name] + abs(ramp.distance) for name, ramp in last.ramps.items()}
         longest = max((r.duration_s for r in last.ramps.values()), default=0.0)

@@ -60,6 +60,16 @@ def test_directions_remember_the_last_motion_of_each_joint(swdt82: Rig) -> None:
     assert motion.directions(end / 2)["theta3"] == 0
 
 
+@given(st.floats(-15.0, 60.0), st.floats(-15.0, 60.0))
+def test_a_joint_that_is_told_to_stay_where_it_is_does_not_turn_back(first: float, second: float) -> None:
+    motion = BoomMotion(RIG, {"theta4": first})
+    end = motion.move(0.0, {"theta4": second})
+    was = motion.directions(end + 1)["theta4"]
+    again = motion.move(end + 1, {"theta4": second, "theta3": 50.0})
+    assert motion.joint("theta4", end + 1) == motion.joint("theta4", again) == (second, 0.0)
+    assert motion.directions(again)["theta4"] == was
+
+
 def test_the_past_can_be_asked_until_it_is_forgotten(swdt82: Rig) -> None:
     motion = BoomMotion(swdt82, {"theta4": 0.0})
     end = motion.move(0.0, {"theta4": 10.0})
