@@ -15,7 +15,7 @@ from drivers.can.stamps import ReceiveStamps
 from drivers.canopen.node_setup import NodeSetup, SetupRunner
 from drivers.canopen.sync import SyncProducer
 from drivers.canopen.transmit import TransmitPermission
-from drivers.clock import NS_PER_S, Clock, Stamp
+from drivers.clock import NS_PER_S, Clock, Stamp, TimeBudget
 from drivers.device_watch import DeviceWatch, no_watch, watch_interface, watch_path
 from drivers.errors import DeviceError, LinkError
 from drivers.outage import Backoff, Outage
@@ -24,6 +24,7 @@ from drivers.stall_detector import CLOCK_WAS_SET, NOT_READ_IN_TIME, LateReport, 
 
 POLL_S = 0.05  # how long a stop or a set-up request may go unnoticed
 LOSS_CHECK_NS = NS_PER_S
+REST_S = 2.0  # real seconds for which what still waits is read when the link is to stop
 
 Emit = Callable[[Capture | DeviceEvent | Gap], None]
 
@@ -156,6 +157,7 @@ class CanLink:
             watch.close()
             at_start, self._at_start = self._at_start, []
             self._swap_requests(at_start)
+            rest: TimeBudget | None = None
             try:
                 self.read_until = session.read_until
                 outage.end(self._clock.now(), f"{self.name}: the bus is open")
@@ -165,13 +167,15 @@ class CanLink:
                         backoff.reset()
                     session.serve(self._swap_requests([]), self._take_published())
                     self.read_until = session.read_until
-                    if stop.is_set():
+                    if rest is not None and (read.batch.is_last or rest.is_over):
                         return
-                    read = session.read(session.patience_s())
+                    if stop.is_set() and rest is None:
+                        rest = TimeBudget(REST_S)
+                    read = session.read(0.0 if rest else session.patience_s())
             finally:
                 cause = "rigcal was stopped" if stop.is_set() else "the link was lost"
                 session.close(self._swap_requests(None), cause)
-                self._last_frame = session.last_frame
+                self._last_frame, self.read_until = session.last_frame, session.read_until
 
     def _swap_requests(self, requests: list[NodeSetup] | None) -> list[NodeSetup]:
         """Return the set-ups that were asked for, and put `requests` in their place."""
@@ -327,6 +331,7 @@ class _Session:
         """Report all that is left when the bus is given up because of `cause`."""
         self._emit_sent(self._clock.now())
         self._report_losses()
+        self.read_until = self._emptied
         for item in self._late.end(self._clock.now()):
             self._emit(item)
         for request in requests:

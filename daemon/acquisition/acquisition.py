@@ -21,7 +21,7 @@ from typing import TypeVar
 from daemon.acquisition.backlog import BATCH_CAPTURES, Backlog, Batch
 from daemon.acquisition.clock_watch import ClockWatch
 from daemon.acquisition.link_decoders import TICK_NS, LinkDecoders
-from daemon.acquisition.link_intake import LinkIntake
+from daemon.acquisition.link_intake import LinkIntake, stamp_of
 from daemon.acquisition.status.board import StatusBoard
 from daemon.acquisition.status.present import NOTHING_EXPECTED, Expected
 from daemon.acquisition.status.snapshot import AcquisitionStatus
@@ -37,7 +37,6 @@ from drivers.readings import (
     Decoder,
     DeviceEvent,
     EventKind,
-    Gap,
     LinkItem,
     LinkLoop,
     Record,
@@ -211,13 +210,18 @@ class Acquisition:
                     self._finish.wait(RETRY_S)
                 elif self._backlog.is_empty:
                     self._finish.wait(self._batch_seconds)
+            read_until = self._read_until(self._clock.now())
             self._take_in()
+            self._try("its sign of life", partial(self._store.note_alive, read_until))
             while self._has_time() and not (self._backlog.is_empty and self._decoded is None):
                 if not self._decode_next(self._clock.now()):
                     break
         except Exception as error:
             # The thread ends here; `alive` and `status` tell.
-            log.critical("the writer failed; nothing is stored any more", exc_info=error)
+            if isinstance(error, sqlite3.DatabaseError):
+                log.critical("nothing is stored any more: %s", storage_sentence(self._store.path, error))
+            else:
+                log.critical("the writer failed; nothing is stored any more", exc_info=error)
             self._board.set_error(f"the writer failed: {error}; restart rigcal")
             self._failure = error
 
@@ -317,7 +321,7 @@ class Acquisition:
         batch: list[LinkItem] = []
         starts_ns = 0
         for item in items:
-            now_ns = _stamp(item).monotonic_ns
+            now_ns = stamp_of(item).monotonic_ns
             if batch and (len(batch) >= INLINE_CAPTURES or not 0 <= now_ns - starts_ns < INLINE_SPAN_NS):
                 self._store_inline(batch)
                 batch = []
@@ -366,7 +370,7 @@ class Acquisition:
             if len(records) == 1:
                 log.exception("a record cannot be stored: %r", records[0])
                 reason = f"a {type(records[0]).__name__} cannot be stored: {str(error)!a}"
-                self._store.insert_records([DecodeFailure("store", _stamp(records[0]), reason, b"")])
+                self._store.insert_records([DecodeFailure("store", stamp_of(records[0]), reason, b"")])
                 return
             for record in records:
                 self._insert([record])
@@ -437,7 +441,7 @@ def _in_time_order(queues: Iterable[Sequence[LinkItem]]) -> list[LinkItem]:
     def keyed(items: Sequence[LinkItem]) -> Iterator[tuple[int, LinkItem]]:
         newest_ns = -(2**63)
         for item in items:
-            newest_ns = max(newest_ns, _stamp(item).monotonic_ns)
+            newest_ns = max(newest_ns, stamp_of(item).monotonic_ns)
             yield newest_ns, item
 
     return [item for _, item in heapq.merge(*map(keyed, queues), key=itemgetter(0))]
@@ -448,7 +452,3 @@ def _tell_of_links(reports: Iterable[Record]) -> None:
     for report in reports:
         if isinstance(report, DeviceEvent) and report.kind in _LINK_LEVELS:
             log.log(_LINK_LEVELS[report.kind], "%s", report.text)
-
-
-def _stamp(record: LinkItem | Record) -> Stamp:
-    return record.start if isinstance(record, Gap) else record.stamp

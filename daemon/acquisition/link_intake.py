@@ -10,12 +10,23 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 
-from drivers.clock import Clock, Stamp
-from drivers.readings import CanCapture, DeviceEvent, EventKind, Gap, GapReason, LinkItem, LinkLoop, SerialCapture
+from drivers.clock import NS_PER_S, Clock, Stamp
+from drivers.readings import (
+    CanCapture,
+    DeviceEvent,
+    EventKind,
+    Gap,
+    GapReason,
+    LinkItem,
+    LinkLoop,
+    Record,
+    SerialCapture,
+)
 
 log = logging.getLogger(__name__)
 
 RESTART_S = 1.0
+LEFT_BEHIND_S = 10.0  # real seconds for which a link is waited for
 
 
 @dataclass(slots=True)
@@ -44,6 +55,8 @@ class LinkIntake:
         self.restarts = 0
         self._loop, self._clock, self._limit = loop, clock, limit
         self._begun: Stamp | None = begun  # until the loop's first word
+        self._behind: Stamp | None = None  # since when the link is not read, where that is told
+        self._behind_lock = threading.Lock()
         # Appends and pops of a deque are atomic: one thread emits, one drains, and only the loss needs a lock.
         self._queue: deque[LinkItem] = deque()
         self._loss: _Loss | None = None
@@ -69,14 +82,22 @@ class LinkIntake:
 
     @property
     def read_until(self) -> Stamp | None:
-        """All that the link's port had received by then is queued, or its loss is; None where nothing waits there."""
+        """All that the link's port had received by then is queued, or its loss is told; None where nothing waits."""
+        until = self._unread_since()
+        return None if until == self._behind else until
+
+    def _unread_since(self) -> Stamp | None:
         begun = self._begun
         return self._loop.read_until if begun is None else begun
 
     def drain(self) -> list[LinkItem]:
-        """Return the items that wait, oldest first, and at their end a gap for those that were lost."""
+        """Return the items that wait, oldest first, and at their end a gap for those that were lost.
+
+        A link that has not been read for long, as its loop hangs or dies again and again, gets a gap of its own.
+        """
         queue = self._queue
-        items = [queue.popleft() for _ in range(len(queue))]
+        items: list[LinkItem] = self._left_behind()  # before what the loop's first word says of the same gap
+        items += [queue.popleft() for _ in range(len(queue))]
         if self._loss is not None:
             with self._loss_lock:
                 loss, self._loss = self._loss, None
@@ -85,12 +106,30 @@ class LinkIntake:
             items.append(Gap(self.name, GapReason.FRAMES_LOST, loss.first, loss.last, loss.count))
         return items
 
+    def _left_behind(self) -> list[LinkItem]:
+        with self._behind_lock:
+            now, since, behind = self._clock.now(), self._unread_since(), self._behind
+            if behind is not None and since != behind:
+                self._behind = None
+                return [Gap(self.name, GapReason.LINK_DOWN, behind, since or now)]
+            waited_s = 0.0 if since is None else self._clock.real_seconds(now.since(since) / NS_PER_S)
+            if behind is None and waited_s > LEFT_BEHIND_S:
+                self._behind = since
+                return [Gap(self.name, GapReason.LINK_DOWN, since)] if since is not None else []
+            return []
+
+    def _end_of_start(self, begun: Stamp, item: LinkItem) -> None:
+        """Tell of the time from the start of the run, or from the end of a loop that died, until the port is open."""
+        with self._behind_lock:
+            is_told = self._behind == begun
+            first = _first_word(item) or (stamp_of(item) if is_told else None)
+            if first is not None and (is_told or first.since(begun) > 0):
+                self._queue.append(Gap(self.name, GapReason.LINK_DOWN, begun, first))
+            self._begun = self._behind = None
+
     def _emit(self, item: LinkItem) -> None:
         if self._begun is not None:
-            first = _first_word(item)
-            if first is not None and first.since(self._begun) > 0:
-                self._queue.append(Gap(self.name, GapReason.LINK_DOWN, self._begun, first))
-            self._begun = None
+            self._end_of_start(self._begun, item)
         if len(self._queue) < self._limit or not isinstance(item, CanCapture | SerialCapture):
             self._queue.append(item)
             return
@@ -118,6 +157,11 @@ class LinkIntake:
                 self._emit(DeviceEvent(self.name, now, EventKind.LINK_LOST, text))
                 self._begun = self._loop.read_until or now
                 self._clock.wait(stop, RESTART_S)
+
+
+def stamp_of(record: LinkItem | Record) -> Stamp:
+    """Return when a record was made, or a gap began."""
+    return record.start if isinstance(record, Gap) else record.stamp
 
 
 def _first_word(item: LinkItem) -> Stamp | None:

@@ -116,7 +116,8 @@ class Store(Connection):
         if not runs:
             return
         self.ended_in_order = bool(runs[0]["clean"])
-        last = since = self.stamp_or_none(runs[0], "ended_") or self.stamp(runs[0], "alive_")
+        since = self.stamp(runs[0], "alive_")
+        last = self.stamp_or_none(runs[0], "ended_") or since
         # A killed run may have captured something after its last sign of life, but not all that there was.
         for row in self.rows(
             "SELECT last_utc_ns, last_monotonic_ns, last_boot_id FROM raw_chunks ORDER BY id DESC LIMIT 1"
@@ -127,11 +128,15 @@ class Store(Connection):
         self.previous_end = last
         ended = self.instant(last, "end_")
         settings = ", ".join(f"{name} = ?" for name in ended)
+        # Of a gap that began after the last thing that is known, it is known no more than that
+        itself = ", ".join(f"{name} = {name.replace('end_', 'start_')}" for name in ended)
+        began_later = "end_utc_ns IS NULL AND start_boot_id = ? AND start_monotonic_ns > ?"
+        db.execute(f"UPDATE gaps SET {itself} WHERE {began_later}", [ended["end_boot_id"], ended["end_monotonic_ns"]])
         db.execute(f"UPDATE gaps SET {settings} WHERE end_utc_ns IS NULL", [*ended.values()])
         self.insert_records([Gap(WHOLE_DAEMON, GapReason.NOT_RUNNING, since, now)])
 
     def note_alive(self, until: Stamp) -> None:
-        """The running daemon has stored all that came `until` then: what a kill loses, it loses after that.
+        """The running daemon has stored all that came `until` then: what its end loses, it loses after that.
 
         Harmless when no run has begun.
         """

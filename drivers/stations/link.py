@@ -84,8 +84,10 @@ class StationLink:
         self, port: SerialPort, emit: Emit, stop: threading.Event, late: LateReport, stalls: StallDetector
     ) -> None:
         poller = start_poller(self._config)
-        while not stop.is_set():
-            wait_s = _LONGEST_READ_S if poller is None else self._send_due(port, poller, emit)
+        is_last = False
+        while not is_last:
+            is_last = stop.is_set()  # what has come by then is still read
+            wait_s = 0.0 if is_last else _LONGEST_READ_S if poller is None else self._send_due(port, poller, emit)
             timeout_s = self._clock.real_seconds(wait_s)
             began = self._clock.now()
             data = port.read(timeout_s)

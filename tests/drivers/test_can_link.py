@@ -564,6 +564,31 @@ def test_a_scaled_clock_is_not_mixed_with_the_kernel_s_time() -> None:
 # What stays true whatever is plugged in
 
 
+def test_what_waits_to_be_read_when_a_link_is_to_stop_is_still_read() -> None:
+    channel = unused_channel()
+    heard, stop, go_on = Heard(), threading.Event(), threading.Event()
+    link = virtual_link(channel)
+
+    def emit(item: CanCapture | DeviceEvent | Gap) -> None:
+        heard(item)
+        if isinstance(item, CanCapture):
+            go_on.wait(DEADLINE_S)
+
+    with virtual_bus(channel) as bus:
+        thread = threading.Thread(target=link.run, args=(emit, stop))
+        thread.start()
+        heard.wait_for(EventKind.LINK_UP)
+        bus.send(message("1A0 00"))
+        heard.wait(lambda: heard.received, "the first frame")
+        for _ in range(2 * BATCH_MAX):
+            bus.send(message("1A0 01"))
+        stop.set()
+        go_on.set()
+        thread.join(DEADLINE_S)
+    assert not thread.is_alive()
+    assert len(heard.received) == 1 + 2 * BATCH_MAX
+
+
 def test_a_link_stops_soon_and_its_last_words_are_kept() -> None:
     link = virtual_link(unused_channel())
     with running(link) as heard:

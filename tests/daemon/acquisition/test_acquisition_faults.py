@@ -19,6 +19,8 @@ from daemon.acquisition import acquisition as acquisition_module
 from daemon.acquisition import link_intake
 from daemon.acquisition.acquisition import Acquisition
 from daemon.store import Reader, Store
+from drivers.can.ports import CanLinkConfig
+from drivers.can_link import CanLink
 from drivers.clock import SystemClock
 from drivers.readings import (
     Capture,
@@ -38,7 +40,7 @@ from tests.daemon.acquisition_support import (
 )
 from tests.daemon.damage import fill_up, make_room
 from tests.daemon.store_support import at, frame, table
-from tests.drivers.multicast import multicast_bus, unused_port
+from tests.drivers.multicast import GROUP, multicast_bus, unused_port
 
 # ---- losses are never silent -----------------------------------------------------------------------------------------
 
@@ -106,7 +108,8 @@ def test_a_disk_that_stays_full_does_not_keep_the_daemon_from_stopping(
     wait_until(lambda: acquisition.status().error is not None)
     with caplog.at_level(logging.CRITICAL):
         acquisition.stop()
-    assert "the writer failed" in caplog.text
+    assert "nothing is stored any more: " in caplog.text
+    assert "Traceback" not in caplog.text
     assert not acquisition.alive(within_s=DEADLINE_S)
 
 
@@ -347,6 +350,50 @@ def test_what_a_killed_process_had_still_to_read_after_a_stall_lies_in_the_gap(p
     assert sent_ns[first] > killed["start_monotonic_ns"] - 5_000_000
     # Not more is doubted than what came since the process was stopped, and some seconds before
     assert killed["start_monotonic_ns"] > sent_ns[number - 1] - 5_000_000_000
+
+
+def test_what_comes_while_a_run_ends_in_order_lies_in_the_gap(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A link that hangs must not hide what the others, which have stopped, read no more meanwhile."""
+    monkeypatch.setattr(acquisition_module, "LINKS_STOP_S", 0.5)
+    clock, port, release = SystemClock(), unused_port(), threading.Event()
+
+    class Hangs(ListLink):
+        def run(self, emit: Callable[[LinkItem], None], stop: threading.Event) -> None:
+            emit(DeviceEvent("aux", clock.now(), EventKind.LINK_UP, "open"))
+            release.wait(DEADLINE_S)
+
+    options = {"port": port, "hop_limit": 0}
+    link = CanLink(CanLinkConfig(name="boom", interface="udp_multicast", channel=GROUP, options=options), clock)
+    sent_ns: list[int] = []
+    has_ended = threading.Event()
+
+    def send() -> None:
+        while not has_ended.wait(0.001):
+            sent_ns.append(time.monotonic_ns())
+            bus.send(can.Message(arbitration_id=0x181, data=(len(sent_ns) - 1).to_bytes(8, "little")))
+
+    sender = threading.Thread(target=send)
+    with contextlib.closing(Store(path)) as store, multicast_bus(port) as bus:
+        store.declare_channels({"theta1": "deg"}, {})
+        store.begin_run(clock.now())
+        acquisition = Acquisition(
+            [link, Hangs("aux", [])], {"boom": NumberDecoder}, store, clock, on_records=lambda _: None
+        )
+        acquisition.start()
+        sender.start()
+        wait_until(lambda: len(table(path, "raw_chunks")) > 10)
+        acquisition.stop()
+        store.end_run(clock.now())
+        has_ended.set()
+        sender.join(DEADLINE_S)
+        release.set()
+        store.begin_run(clock.now())
+    (between,) = [gap for gap in table(path, "gaps") if gap["reason"] == "not_running"]
+    stored = {int.from_bytes(capture.data, "little") for capture in raw(path)}
+    lost = [number for number in range(min(stored), len(sent_ns)) if number not in stored]
+    assert sent_ns[-1] - sent_ns[lost[0]] > 400_000_000, "it was waited for the link that hangs"
+    assert sent_ns[lost[0]] > between["start_monotonic_ns"] - 5_000_000
+    assert between["start_monotonic_ns"] > sent_ns[lost[0]] - 2_000_000_000
 
 
 def test_a_damaged_chunk_does_not_keep_the_daemon_from_starting(

@@ -89,3 +89,35 @@ def test_what_came_between_a_loop_s_death_and_its_next_life_lies_in_a_gap(monkey
     assert [item for item in intake.drain() if isinstance(item, Gap)] == [
         Gap("boom", GapReason.LINK_DOWN, read, opened)
     ]
+
+
+@pytest.mark.parametrize("is_open", [False, True])
+def test_a_link_that_is_not_read_for_long_has_a_gap_of_its_own(monkeypatch: pytest.MonkeyPatch, is_open: bool) -> None:
+    """Its loop hangs, as it opens the port or later. What the others captured meanwhile is in no doubt."""
+    monkeypatch.setattr(link_intake, "LEFT_BEHIND_S", 0.0)
+    clock = SystemClock()
+    begun = clock.now().shifted(-2_000_000_000)
+    read = opened = begun.shifted(1_000_000_000)
+    up = DeviceEvent("boom", opened, EventKind.LINK_UP, "open")
+    gate, stop = threading.Event(), threading.Event()
+    loop = ListLink("boom", [up], gate)
+    intake = LinkIntake(loop, clock, 100, begun)
+    intake.start(stop)
+    if is_open:
+        gate.set()
+        wait_until(loop.done.is_set)
+        intake.drain()  # what came of the start
+        loop.read_until = read
+    since = read if is_open else begun
+    assert intake.drain() == [Gap("boom", GapReason.LINK_DOWN, since)]
+    assert (intake.read_until, intake.drain()) == (None, []), "it is told once, and not waited for"
+    if is_open:
+        loop.read_until = clock.now().shifted(1_000_000_000)  # it goes on
+        assert intake.drain() == [Gap("boom", GapReason.LINK_DOWN, since, loop.read_until)]
+        assert intake.read_until == loop.read_until
+    else:
+        gate.set()
+        wait_until(loop.done.is_set)
+        assert intake.drain() == [Gap("boom", GapReason.LINK_DOWN, since, opened), up]
+    stop.set()
+    intake.join(DEADLINE_S)

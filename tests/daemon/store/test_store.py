@@ -431,6 +431,7 @@ def test_the_time_between_two_runs_is_a_gap_and_ends_those_left_open(path: Path)
     store = Store(path)
     store.begin_run(at(0))
     store.insert_records([Gap("theta1", GapReason.SILENT, at(1))])
+    store.note_alive(at(4))  # so long were the links read
     store.end_run(at(5))
     store.close()
     store = Store(path)
@@ -439,7 +440,7 @@ def test_the_time_between_two_runs_is_a_gap_and_ends_those_left_open(path: Path)
     silent, stopped = table(path, "gaps")
     assert (silent["channel"], silent["end_utc_ns"]) == ("theta1", at(5).utc_ns)
     assert (stopped["channel"], stopped["reason"]) == (WHOLE_DAEMON, "not_running")
-    assert (stopped["start_utc_ns"], stopped["end_utc_ns"]) == (at(5).utc_ns, at(60).utc_ns)
+    assert (stopped["start_utc_ns"], stopped["end_utc_ns"]) == (at(4).utc_ns, at(60).utc_ns)
     first, second = table(path, "daemon_runs")
     assert (first["clean"], second["clean"]) == (1, 0)
 
@@ -463,6 +464,19 @@ def test_a_killed_run_ended_at_its_last_sign_and_may_have_lost_what_came_since_i
     with Reader(path) as reader:
         assert reader.stamp(gap, "start_") == at(alive_s)
         assert reader.stamp(gap, "end_") == at(60, "boot-b")
+
+
+def test_a_gap_that_a_killed_run_left_open_after_its_last_sign_does_not_end_before_it_began(path: Path) -> None:
+    store = Store(path)
+    store.begin_run(at(0))
+    store.note_alive(at(5))
+    store.insert_records([Gap("boom", GapReason.LINK_DOWN, at(7)), Gap("station", GapReason.LINK_DOWN, at(3))])
+    store.close()
+    store = Store(path)
+    store.begin_run(at(60))
+    store.close()
+    ends = {row["channel"]: row["end_monotonic_ns"] for row in table(path, "gaps")}
+    assert ends == {"boom": at(7).monotonic_ns, "station": at(5).monotonic_ns, WHOLE_DAEMON: at(60).monotonic_ns}
 
 
 def test_a_run_that_never_began_neither_lives_nor_ends(store: Store, path: Path) -> None:
