@@ -159,6 +159,8 @@ def session_export(name: str, config: Path, out: Path, form: Any, *, as_json: bo
     if not as_json:
         for file in files:
             echo(file)
+        if not files:
+            echo(f"session {name} has no rows, so no table was written")
     return {"files": [str(file) for file in files]}
 
 

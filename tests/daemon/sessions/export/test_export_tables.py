@@ -128,3 +128,26 @@ def test_a_session_that_was_just_stopped_is_exported_with_the_observations_that_
         exporting.join()
         store.end_run(at(6.0))
     assert Observations.from_csv(exported[0], RIG).position_mm[:, 0].tolist() == [100.0, 200.0, 300.0]
+
+
+def test_a_session_without_a_row_says_that_there_is_no_table(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(CONFIG)
+    text = resources.files("calibration").joinpath("rigs", "swdt82.toml").read_text()
+    with contextlib.closing(Store(tmp_path / "rigcal.sqlite")) as store:
+        table = SessionTable(store, "swdt82")
+        table.start(at(0.0), text, id="s001-r", prism="r", operator="", kind="static_poses")
+        table.change("s001-r", state="closed", **store.instant(at(1.0), "ended_"))
+    arguments = [
+        "session",
+        "export",
+        "s001-r",
+        "--config",
+        str(path),
+        "--out",
+        str(tmp_path / "out"),
+        "--format",
+        "csv",
+    ]
+    result = CliRunner().invoke(main, ["session", "export", "s001-r", *options])
+    assert (result.exit_code, result.output) == (0, "session s001-r has no rows, so no table was written\n")
