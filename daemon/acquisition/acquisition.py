@@ -213,20 +213,15 @@ class Acquisition:
             read_until = self._read_until(self._clock.now())
             self._take_in()
             self._try("its sign of life", partial(self._store.note_alive, read_until))
-            while self._has_time() and not (self._backlog.is_empty and self._decoded is None):
+            while not self._decode_until.is_over and not (self._backlog.is_empty and self._decoded is None):
                 if not self._decode_next(self._clock.now()):
                     break
         except Exception as error:
             # The thread ends here; `alive` and `status` tell.
-            if isinstance(error, sqlite3.DatabaseError):
-                log.critical("nothing is stored any more: %s", storage_sentence(self._store.path, error))
-            else:
-                log.critical("the writer failed; nothing is stored any more", exc_info=error)
+            why = storage_sentence(self._store.path, error) if isinstance(error, sqlite3.DatabaseError) else None
+            log.critical("the writer failed; nothing is stored any more: %s", why or error, exc_info=why is None)
             self._board.set_error(f"the writer failed: {error}; restart rigcal")
             self._failure = error
-
-    def _has_time(self) -> bool:
-        return not self._decode_until.is_over
 
     def _read_until(self, now: Stamp) -> Stamp:
         """Return until when all that has reached the computer has been captured: now, or where a link is behind."""
@@ -394,7 +389,7 @@ class Acquisition:
                 result = work()
             except sqlite3.DatabaseError as error:
                 tries += 1
-                if self._finish.is_set() and (tries > LAST_RETRIES or not self._has_time()):
+                if self._finish.is_set() and (tries > LAST_RETRIES or self._decode_until.is_over):
                     raise
                 self._note_trouble("captures", error)
                 self._finish.wait(RETRY_S)

@@ -138,16 +138,6 @@ def test_a_session_without_a_row_says_that_there_is_no_table(tmp_path: Path) -> 
         table = SessionTable(store, "swdt82")
         table.start(at(0.0), text, id="s001-r", prism="r", operator="", kind="static_poses")
         table.change("s001-r", state="closed", **store.instant(at(1.0), "ended_"))
-    arguments = [
-        "session",
-        "export",
-        "s001-r",
-        "--config",
-        str(path),
-        "--out",
-        str(tmp_path / "out"),
-        "--format",
-        "csv",
-    ]
+    options = ["--config", str(path), "--out", str(tmp_path / "out"), "--format", "csv"]
     result = CliRunner().invoke(main, ["session", "export", "s001-r", *options])
     assert (result.exit_code, result.output) == (0, "session s001-r has no rows, so no table was written\n")
